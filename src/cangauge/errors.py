@@ -1,0 +1,56 @@
+"""The exceptions that cangauge raises on purpose, and the exit codes that they mean."""
+
+from __future__ import annotations
+
+from os import PathLike
+
+
+class CangaugeError(Exception):
+    """Anything that cangauge reports in one clear line instead of a traceback (exit code 1)."""
+
+    exit_code = 1
+
+
+class InputError(CangaugeError):
+    """Bad usage or input (exit code 2): names the file, the field, the value and the cure.
+
+    Parameters
+    ----------
+    problem : str
+        What is wrong, in words ("time runs backwards").
+    source : path-like, optional
+        The file (or bus, or option) that it was found in.
+    field : str, optional
+        The column, signal, JSON field or option concerned.
+    value : object, optional
+        The offending value, as read.
+    cure : str, optional
+        What the user can do about it.
+    """
+
+    exit_code = 2
+
+    def __init__(
+        self,
+        problem: str,
+        *,
+        source: str | PathLike[str] | None = None,
+        field: str | None = None,
+        value: object = None,
+        cure: str | None = None,
+    ) -> None:
+        self.problem = problem
+        self.source = None if source is None else str(source)
+        self.field = field
+        self.value = value
+        self.cure = cure
+        super().__init__(self._line())
+
+    def _line(self) -> str:
+        where = ": ".join(part for part in (self.source, self.field) if part)
+        text = f"{where}: {self.problem}" if where else self.problem
+        if self.value is not None:
+            text += f" (got {self.value!r})"
+        if self.cure:
+            text += f"; {self.cure}"
+        return text
