@@ -1,0 +1,51 @@
+"""The typer application: registers the commands and turns errors into exit codes.
+
+Exit 0: done; 1: failed; 2: bad usage or input.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from cangauge import __version__
+from cangauge.cli.output import note
+from cangauge.errors import CangaugeError
+
+app = typer.Typer(
+    name="cangauge",
+    help="State of charge from CAN frames by an identified voltage model, live and offline."
+    " Positive current discharges, everywhere.",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"cangauge {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: bool = typer.Option(
+        False, "--version", callback=_version, is_eager=True, help="Print the version and leave."
+    ),
+) -> None:
+    del version
+
+
+def main() -> None:
+    """Run the command line and exit with its code."""
+    try:
+        app()
+    except CangaugeError as error:
+        note(f"error: {error}")
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        note("stopped")
+        sys.exit(130)
