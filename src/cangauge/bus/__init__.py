@@ -1,0 +1,1 @@
+"""Frames ↔ samples and estimates: DBC mapping, protection, captures, publishing."""

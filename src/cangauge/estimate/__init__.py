@@ -1,0 +1,1 @@
+"""Samples → estimate: Coulomb counting, inverse, fusion."""

@@ -1,0 +1,1 @@
+"""Log → model: preprocessing, charge, least squares, energy."""

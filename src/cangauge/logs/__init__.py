@@ -1,0 +1,1 @@
+"""Files → canonical log: one reader a file."""

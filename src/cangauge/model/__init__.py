@@ -1,0 +1,1 @@
+"""The voltage model, its delay line and its file."""

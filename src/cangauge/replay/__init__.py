@@ -1,0 +1,1 @@
+"""Log or capture → frames on a bus, in time."""

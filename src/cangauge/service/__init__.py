@@ -1,0 +1,1 @@
+"""The service that runs on a bus: configuration and loop."""
