@@ -36,8 +36,9 @@ SLOPE_AT_LEAST = 2e-5
 the inverse has one root, but a flat (LFP) plateau must stay possible. It is 7 mV per % for a
 Leaf, a fiftieth of its flattest slope."""
 
-SLOPE_BEYOND_AT_MOST = 4.0
-"""Steepest straight line outside the identified SoC, in mean slopes of the identified range."""
+EDGE = 0.25
+"""Outside the identified SoC the pseudo-OCV goes on with the mean slope of this outermost part of
+the range: at the very edge the fitted slope is mostly noise."""
 
 
 def scaled_soc(soc_pct: ArrayLike, epsilon: float) -> FloatArray:
@@ -139,9 +140,11 @@ class VoltageModel:
         """Return dU/dS of the pseudo-OCV [V per % SoC], shape (n,)."""
         soc = np.atleast_1d(np.asarray(soc_pct, dtype=np.float64))
         lo, hi = self.soc_range_pct
-        inside = ocv_basis_slope(np.clip(soc, lo, hi), self.epsilon) @ np.array(self.ocv_v)
+        inside: FloatArray = ocv_basis_slope(np.clip(soc, lo, hi), self.epsilon) @ np.array(
+            self.ocv_v
+        )
         low, high = self._slope_beyond
-        return np.where(soc < lo, low, np.where(soc > hi, high, inside))
+        return np.asarray(np.where(soc < lo, low, np.where(soc > hi, high, inside)))
 
     def voltage(
         self, soc_pct: ArrayLike, temperature_c: ArrayLike, delayed_current_a: ArrayLike
@@ -156,7 +159,7 @@ class VoltageModel:
             Current [A] at each delay, positive = discharge; see `delay_line.delayed_currents`.
         """
         drop = np.asarray(delayed_current_a, dtype=np.float64) @ np.array(self.resistance_ohm)
-        return self.pseudo_ocv(soc_pct, temperature_c) + drop
+        return np.asarray(self.pseudo_ocv(soc_pct, temperature_c) + drop)
 
     # --- one sample: the estimator --------------------------------------------------------
 
@@ -201,18 +204,13 @@ class VoltageModel:
         return len(self.ocv_v) + 1 + len(self.resistance_ohm)
 
     @cached_property
-    def mean_slope_v_per_pct(self) -> float:
-        """Mean slope of the pseudo-OCV over the identified SoC [V per %]."""
-        lo, hi = self.soc_range_pct
-        ends = ocv_basis(np.array([lo, hi]), self.epsilon) @ np.array(self.ocv_v)
-        return float(ends[1] - ends[0]) / (hi - lo)
-
-    @cached_property
     def _slope_beyond(self) -> tuple[float, float]:
-        edges = ocv_basis_slope(np.array(self.soc_range_pct), self.epsilon) @ np.array(self.ocv_v)
-        mean = self.mean_slope_v_per_pct
-        low, high = np.clip(edges, 0.1 * mean, SLOPE_BEYOND_AT_MOST * mean)
-        return float(low), float(high)
+        """Slopes of the straight lines below and above the identified SoC [V per %]."""
+        lo, hi = self.soc_range_pct
+        part = EDGE * (hi - lo)
+        at = np.array([lo, lo + part, hi - part, hi])
+        volts = ocv_basis(at, self.epsilon) @ np.array(self.ocv_v)
+        return float(volts[1] - volts[0]) / part, float(volts[3] - volts[2]) / part
 
     @cached_property
     def _temperature_limits_c(self) -> tuple[float, float]:

@@ -1,0 +1,75 @@
+"""Coulomb counting over irregular samples, with a stated limit on gaps.
+
+Steps up to `gap_s` count by the trapezoidal rule. Longer ones up to `BRIDGE_S` count so too, but
+their charge is uncertain by the whole recent current. Beyond that the pack is taken to have
+rested (bus asleep), and since it may have been charged meanwhile, the uncertainty grows with the
+time away.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from cangauge.identify.charge import BRIDGE_S
+
+AWAY_PCT_PER_HOUR = 20.0
+"""SoC that a pack may gain or lose unseen [% per hour]: a slow charger's rate."""
+
+AWAY_AT_MOST_PCT = 30.0
+"""However long the gap, the SoC's standard deviation does not grow beyond this [%]."""
+
+CURRENT_MEMORY_S = 300.0
+"""Over how long the recent current is averaged, for the uncertainty of a bridged gap [s]."""
+
+
+class ChargeStep(NamedTuple):
+    """What one sample added."""
+
+    seconds: float
+    """Time since the last sample [s]."""
+    discharged_pct: float
+    """Charge taken out since the last sample [% of capacity]."""
+    gap_std_pct: float
+    """Uncertainty of that charge if a gap lay in between, else 0 [%]."""
+
+
+class CoulombCounter:
+    """Charge since the start, in % of capacity.
+
+    Parameters
+    ----------
+    capacity_ah : float
+        Charge from 100 to 0 % [Ah].
+    gap_s : float
+        Longer steps between samples are gaps [s].
+    """
+
+    def __init__(self, capacity_ah: float, gap_s: float) -> None:
+        self._pct_per_as = 100.0 / (3600.0 * capacity_ah)
+        self._gap_s = gap_s
+        self._last: tuple[float, float] | None = None
+        self._mean_square_a2 = 0.0
+        self.discharged_pct = 0.0
+        """Charge taken out since the first sample [%]."""
+        self.moved_pct = 0.0
+        """Charge moved either way since the first sample [%]."""
+
+    def step(self, time_s: float, current_a: float) -> ChargeStep:
+        """Take one sample, later than the one before (positive current discharges)."""
+        last, self._last = self._last, (time_s, current_a)
+        if last is None:
+            self._mean_square_a2 = current_a * current_a
+            return ChargeStep(0.0, 0.0, 0.0)
+        seconds = time_s - last[0]
+        recent = math.exp(-seconds / CURRENT_MEMORY_S)
+        rms_a = math.sqrt(self._mean_square_a2)
+        self._mean_square_a2 = recent * self._mean_square_a2 + (1.0 - recent) * current_a**2
+        if seconds > BRIDGE_S:
+            away_pct = AWAY_PCT_PER_HOUR * seconds / 3600.0
+            return ChargeStep(seconds, 0.0, min(away_pct, AWAY_AT_MOST_PCT))
+        out_pct = 0.5 * (current_a + last[1]) * seconds * self._pct_per_as
+        self.discharged_pct += out_pct
+        self.moved_pct += abs(out_pct)
+        gap_std_pct = rms_a * seconds * self._pct_per_as if seconds > self._gap_s else 0.0
+        return ChargeStep(seconds, out_pct, gap_std_pct)

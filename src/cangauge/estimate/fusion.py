@@ -1,0 +1,240 @@
+"""Fusion of the voltage model and Coulomb counting: an extended Kalman filter (filterpy).
+
+State x = (S, o, b): SoC S [%], current sensor's offset o [A] (measured = true + o), and the
+voltage model's slow bias b [V], a first-order Gauss–Markov process whose size and duration were
+read off held-out data. Because b is a state, the standard deviation of S stops falling where the
+voltage has no more to say: an error that lasts as long as a trip does not average out.
+
+    S ← S − a·(i − o)·Δt,   a = 100/(3600·C)
+    U = OCV(S) + kt·(T − T_r) + Σ Rj·(I(t − dj) − o) + b + fast error
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+from numpy.typing import NDArray
+
+from cangauge.model.voltage_model import VoltageModel
+
+FloatArray = NDArray[np.float64]
+
+OFFSET_STD_PER_AH = 0.025
+"""Prior standard deviation of the current offset, per Ah of capacity [A/Ah] (1.5 A at 60 Ah)."""
+
+OFFSET_WALK_PER_SQRT_H = 0.1
+"""How far the offset wanders, in prior standard deviations per √hour."""
+
+CAPACITY_STD = 0.03
+"""Standard deviation of the capacity, relative: cells age and cool."""
+
+CAPACITY_SPAN_PCT = 30.0
+"""SoC travel over which a capacity error builds up in one direction [%]."""
+
+UNKNOWN_SOC_STD_PCT = 30.0
+"""Standard deviation of a SoC of which nothing is known [%] (uniform over 0–100: 29 %)."""
+
+PERSISTENT_S = 60.0
+"""Memory of the mean innovation that tells a lasting contradiction from a passing one [s]."""
+
+PERSISTENT_SIGMAS = 4.5
+"""A mean innovation beyond this many of its standard deviations contradicts the state."""
+
+OUTLIER_SIGMAS = 5.0
+"""A single innovation beyond this is weighed as if its noise were as large as itself."""
+
+RESTED_BIAS = 0.6
+"""The bias after a long rest, in units of its standard deviation while driving."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One voltage with what is needed to predict it."""
+
+    voltage_v: float
+    beside_v: float
+    """The part that does not depend on SoC, at the measured currents [V]."""
+    std_v: float
+    """Standard deviation of its fast error [V]."""
+
+
+class Fusion:
+    """The filter; see the module's text for its state and equations.
+
+    Parameters
+    ----------
+    model : VoltageModel
+    capacity_ah : float
+    slow_std_v, slow_time_s : float
+        Size [V] and duration [s] of the model's slow bias.
+    """
+
+    def __init__(
+        self, model: VoltageModel, capacity_ah: float, slow_std_v: float, slow_time_s: float
+    ) -> None:
+        self._model = model
+        self._pct_per_as = 100.0 / (3600.0 * capacity_ah)
+        self._resistance_sum = sum(model.resistance_ohm)
+        self._slow_var = slow_std_v**2
+        self._slow_time_s = slow_time_s
+        self._offset_std_a = OFFSET_STD_PER_AH * capacity_ah
+        self._mean_innovation_v = 0.0
+        self._mean_seconds = 0.0
+        self._ekf = ExtendedKalmanFilter(dim_x=3, dim_z=1, dim_u=1)
+        self._ekf.B = np.array([[1.0], [0.0], [0.0]])
+
+    def start(self, soc_pct: float, soc_std_pct: float) -> None:
+        """Begin from a SoC with its standard deviation [%]."""
+        self._ekf.x = np.array([[soc_pct], [0.0], [0.0]])
+        self._ekf.P = np.diag([soc_std_pct**2, self._offset_std_a**2, self._slow_var])
+        self._forget_innovations()
+
+    def predict(
+        self, seconds: float, discharged_pct: float, moved_pct: float, gap_var_pct2: float
+    ) -> None:
+        """Carry the state over the charge counted since the last call.
+
+        Parameters
+        ----------
+        seconds : float
+            Time passed [s].
+        discharged_pct, moved_pct : float
+            Charge taken out, and moved either way [% of capacity].
+        gap_var_pct2 : float
+            Variance of the charge lost in gaps [%²].
+        """
+        stays = math.exp(-seconds / self._slow_time_s)
+        offset_walk = OFFSET_WALK_PER_SQRT_H * self._offset_std_a
+        ekf = self._ekf
+        ekf.F = np.array(
+            [[1.0, self._pct_per_as * seconds, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, stays]]
+        )
+        ekf.Q = np.diag(
+            [
+                CAPACITY_STD**2 * CAPACITY_SPAN_PCT * moved_pct + gap_var_pct2,
+                offset_walk**2 * seconds / 3600.0,
+                self._slow_var * (1.0 - stays**2),
+            ]
+        )
+        ekf.predict(u=np.array([[-discharged_pct]]))
+        self._keep_in_range()
+
+    def update(self, measurement: Measurement, seconds: float) -> bool:
+        """Take one voltage in; return True if a lasting contradiction made SoC uncertain again.
+
+        Parameters
+        ----------
+        measurement : Measurement
+        seconds : float
+            Time since the last voltage [s].
+        """
+        contradicted = self._watch(measurement, seconds)
+        if contradicted:
+            self._doubt()
+        ekf = self._ekf
+        innovation = measurement.voltage_v - float(self._predicted(ekf.x, measurement)[0, 0])
+        jacobian = self._jacobian(ekf.x)
+        spread = float((jacobian @ ekf.P @ jacobian.T)[0, 0])
+        variance = measurement.std_v**2
+        if innovation**2 > OUTLIER_SIGMAS**2 * (spread + variance):
+            variance = max(variance, innovation**2 - spread)
+        ekf.update(
+            np.array([[measurement.voltage_v]]),
+            self._jacobian,
+            self._predicted,
+            R=variance,
+            hx_args=(measurement,),
+        )
+        self._keep_in_range()
+        return contradicted
+
+    def rested(self) -> None:
+        """Take note of a long rest: slow polarisation has decayed, so the bias is smaller."""
+        ekf = self._ekf
+        limit = RESTED_BIAS**2 * self._slow_var
+        shrink = math.sqrt(limit / ekf.P[2, 2]) if ekf.P[2, 2] > limit else 1.0
+        ekf.x[2, 0] *= shrink
+        ekf.P[2, :] *= shrink
+        ekf.P[:, 2] *= shrink
+
+    @property
+    def soc_pct(self) -> float:
+        """State of charge [%], within 0–100."""
+        return float(self._ekf.x[0, 0])
+
+    @property
+    def soc_std_pct(self) -> float:
+        """Its standard deviation [%]."""
+        return math.sqrt(max(float(self._ekf.P[0, 0]), 0.0))
+
+    @property
+    def offset_a(self) -> float:
+        """Estimated offset of the current sensor [A]."""
+        return float(self._ekf.x[1, 0])
+
+    @property
+    def bias_v(self) -> float:
+        """Estimated slow bias of the voltage model [V]."""
+        return float(self._ekf.x[2, 0])
+
+    def offset_pct(self, seconds: float) -> float:
+        """Return the SoC that the offset alone would feign in some seconds [%]."""
+        return self._pct_per_as * seconds * self.offset_a
+
+    def count_std_pct(self, start_var_pct2: float, hours: float, moved_pct: float) -> float:
+        """Return the standard deviation of counting alone [%].
+
+        Parameters
+        ----------
+        start_var_pct2 : float
+            Variance of the SoC that it began from and of gaps [%²].
+        hours, moved_pct : float
+            Time [h] and charge moved either way [%] since.
+        """
+        offset_pct = self._offset_std_a * 3600.0 * hours * self._pct_per_as
+        capacity_pct2 = CAPACITY_STD**2 * CAPACITY_SPAN_PCT * moved_pct
+        return math.sqrt(start_var_pct2 + offset_pct**2 + capacity_pct2)
+
+    def _predicted(self, x: FloatArray, measurement: Measurement) -> FloatArray:
+        volts, _ = self._model.pseudo_ocv_at(float(x[0, 0]))
+        volts += measurement.beside_v - self._resistance_sum * float(x[1, 0]) + float(x[2, 0])
+        return np.array([[volts]])
+
+    def _jacobian(self, x: FloatArray) -> FloatArray:
+        _, slope = self._model.pseudo_ocv_at(float(x[0, 0]))
+        return np.array([[slope, -self._resistance_sum, 1.0]])
+
+    def _watch(self, measurement: Measurement, seconds: float) -> bool:
+        """Whether the mean innovation, before any bias, contradicts state and model."""
+        ekf = self._ekf
+        plain = float(self._predicted(ekf.x, measurement)[0, 0]) - self.bias_v
+        weight = math.exp(-seconds / PERSISTENT_S)
+        self._mean_innovation_v *= weight
+        self._mean_innovation_v += (1.0 - weight) * (measurement.voltage_v - plain)
+        self._mean_seconds += seconds
+        if self._mean_seconds < PERSISTENT_S:
+            return False
+        slope = self._model.pseudo_ocv_at(self.soc_pct)[1]
+        mean_var = self._slow_var + slope**2 * float(ekf.P[0, 0])
+        mean_var += measurement.std_v**2 * seconds / (2.0 * PERSISTENT_S)
+        seen = 1.0 - math.exp(-self._mean_seconds / PERSISTENT_S)
+        mean = self._mean_innovation_v / seen
+        return mean**2 > PERSISTENT_SIGMAS**2 * mean_var
+
+    def _doubt(self) -> None:
+        """Forget how sure the SoC was, so that the voltage decides again."""
+        ekf = self._ekf
+        offset_var = float(ekf.P[1, 1])
+        ekf.x[2, 0] = 0.0
+        ekf.P = np.diag([UNKNOWN_SOC_STD_PCT**2, offset_var, self._slow_var])
+        self._forget_innovations()
+
+    def _forget_innovations(self) -> None:
+        self._mean_innovation_v = 0.0
+        self._mean_seconds = 0.0
+
+    def _keep_in_range(self) -> None:
+        self._ekf.x[0, 0] = min(max(float(self._ekf.x[0, 0]), 0.0), 100.0)

@@ -1,0 +1,116 @@
+"""Least squares with a rising pseudo-OCV: well scaled, with honest standard errors.
+
+The columns 1 … 1/s⁴, s, ln s, ln(1 − s) are nearly dependent (condition numbers of 10⁶ and more
+over the SoC of a few trips), so the columns are scaled to unit length and the problem is solved
+by SVD. Where the plain solution's pseudo-OCV falls anywhere in the SoC that it saw, the same
+problem is solved as a convex quadratic programme with the slope bounded from below.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import clarabel
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from cangauge.errors import CangaugeError
+
+FloatArray = NDArray[np.float64]
+
+SINGULAR = 1e-11
+"""Directions with a smaller singular value, relative to the largest, are left at zero."""
+
+BLOCK_S = 300.0
+"""Residuals further apart than this count as independent in the standard errors [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Coefficients and what is known of them."""
+
+    coefficients: FloatArray
+    """Shape (p,), in the units of the columns."""
+    std_error: FloatArray
+    """Shape (p,); robust against residuals that are correlated within `BLOCK_S`."""
+    condition_number: float
+    """Of the scaled columns."""
+    constrained: bool
+    """Whether the plain solution broke the bounds, so that they had to hold it."""
+
+
+def solve(
+    columns: FloatArray, target: FloatArray, block: NDArray[np.intp], bounds: FloatArray | None,
+    at_least: float,
+) -> Solution:  # fmt: skip
+    """Minimise |columns·x − target|² subject to bounds·x ≥ at_least.
+
+    Parameters
+    ----------
+    columns : array of shape (n, p)
+    target : array of shape (n,)
+    block : array of shape (n,)
+        Rows with the same number may have correlated residuals.
+    bounds : array of shape (m, p), optional
+    at_least : float
+
+    Raises
+    ------
+    CangaugeError
+        If the convex solver finds no solution.
+    """
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0.0] = 1.0
+    left, singular, right = np.linalg.svd(columns / scale, full_matrices=False)
+    kept = singular > SINGULAR * singular[0]
+    left, right = left[:, kept], right[kept]
+    # x = scale⁻¹·rightᵀ·(z/singular): in z the objective is |z − leftᵀ·target|², a sphere.
+    back = (right / singular[kept, None]).T / scale[:, None]
+    z = left.T @ target
+    constrained = bounds is not None and bool(np.any(bounds @ (back @ z) < at_least))
+    if constrained and bounds is not None:
+        z = _nearest(z, bounds @ back, at_least)
+    x = back @ z
+    return Solution(
+        coefficients=x,
+        std_error=_clustered_std_error(left, target - columns @ x, block, back),
+        condition_number=float(singular[0] / singular[-1]) if singular[-1] > 0 else float("inf"),
+        constrained=constrained,
+    )
+
+
+def _nearest(z: FloatArray, bounds: FloatArray, at_least: float) -> FloatArray:
+    """Return the point nearest to z with bounds·point ≥ at_least."""
+    length = np.linalg.norm(bounds, axis=1)
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    solution = clarabel.DefaultSolver(
+        sparse.csc_matrix(np.eye(z.size)),
+        -z,
+        sparse.csc_matrix(-bounds / length[:, None]),
+        -at_least / length,
+        [clarabel.NonnegativeConeT(length.size)],
+        settings,
+    ).solve()
+    if str(solution.status) not in {"Solved", "AlmostSolved"}:
+        raise CangaugeError(
+            f"the fit under a rising pseudo-OCV found no solution ({solution.status}):"
+            " is the sign of current right, and does the log move over some SoC?"
+        )
+    return np.array(solution.x)
+
+
+def _clustered_std_error(
+    left: FloatArray, residual: FloatArray, block: NDArray[np.intp], back: FloatArray
+) -> FloatArray:
+    """Return the sandwich estimate with one cluster a block (Liang and Zeger)."""
+    _, number = np.unique(block, return_inverse=True)
+    scores = np.zeros((int(number.max()) + 1, left.shape[1]))
+    np.add.at(scores, number, left * residual[:, None])
+    groups, (n, p) = scores.shape[0], left.shape
+    small_sample = (groups / max(groups - 1, 1)) * ((n - 1) / max(n - p, 1))
+    # Few blocks cannot tell p directions apart; the plain estimate is then the floor.
+    clustered = small_sample * np.sum((back @ scores.T) ** 2, axis=1)
+    plain = float(residual @ residual) / max(n - p, 1) * np.sum(back**2, axis=1)
+    return np.asarray(np.sqrt(np.maximum(clustered, plain)))

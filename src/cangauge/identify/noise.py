@@ -1,0 +1,93 @@
+"""What the model's error is like in time: a fast part, and a slow part that does not average out.
+
+The filter must know the difference. An error that is new every second averages out; one that
+lasts as long as a trip does not, however many samples are taken. Both are read off the
+autocovariance of errors on logs that the fit did not see.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+FloatArray = NDArray[np.float64]
+
+LAGS_S = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
+TIME_CONSTANTS_S = (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
+SLOW_S = 60.0
+"""Parts that last longer count as slow [s]."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The model's voltage error."""
+
+    fast_std_v: float
+    """Standard deviation of the fast part [V]."""
+    fast_time_s: float
+    """How long the fast part lasts [s]; 0 if it is new at each sample."""
+    slow_std_v: float
+    """Standard deviation of the slow part [V]."""
+    slow_time_s: float
+    """How long the slow part lasts [s]."""
+
+
+def describe_noise(residuals: Sequence[tuple[FloatArray, FloatArray]], rate_hz: float) -> Noise:
+    """Split errors into a fast and a slow part.
+
+    Parameters
+    ----------
+    residuals : sequence of (time_s, error_v)
+        Errors [V] of each log on its rows' times [s], from a fit that did not see the log.
+    rate_hz : float
+        Rate of the rows.
+
+    Notes
+    -----
+    The autocovariance at `LAGS_S` is fitted by a non-negative sum of white noise and exponentials
+    with `TIME_CONSTANTS_S` (scipy's nnls).
+    """
+    lags = np.array([0.0, *LAGS_S])
+    total, count = np.zeros(lags.size), np.zeros(lags.size)
+    for time_s, error_v in residuals:
+        on_grid, present = _on_grid(time_s, error_v, rate_hz)
+        for k, lag in enumerate(lags):
+            shift = round(lag * rate_hz)
+            if shift >= on_grid.size:
+                continue
+            both = present[shift:] & present[: on_grid.size - shift]
+            total[k] += float(on_grid[shift:][both] @ on_grid[: on_grid.size - shift][both])
+            count[k] += float(both.sum())
+    seen = count > 0
+    covariance, weight = total[seen] / count[seen], np.sqrt(count[seen] / count[0])
+    columns = np.column_stack(
+        [lags[seen] == 0.0, *(np.exp(-lags[seen] / tau) for tau in TIME_CONSTANTS_S)]
+    )
+    variance, _ = nnls(columns * weight[:, None], covariance * weight)
+    times = np.array([0.0, *TIME_CONSTANTS_S])
+    slow = times > SLOW_S
+    return Noise(
+        fast_std_v=float(np.sqrt(variance[~slow].sum())),
+        fast_time_s=_mean_time(variance[~slow], times[~slow]),
+        slow_std_v=float(np.sqrt(variance[slow].sum())),
+        slow_time_s=_mean_time(variance[slow], times[slow]) or TIME_CONSTANTS_S[-1],
+    )
+
+
+def _mean_time(variance: FloatArray, times_s: FloatArray) -> float:
+    total = float(variance.sum())
+    return float(variance @ times_s) / total if total > 0.0 else 0.0
+
+
+def _on_grid(
+    time_s: FloatArray, error_v: FloatArray, rate_hz: float
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    slot = np.round((time_s - time_s[0]) * rate_hz).astype(np.intp)
+    values, present = np.zeros(int(slot[-1]) + 1), np.zeros(int(slot[-1]) + 1, dtype=bool)
+    values[slot] = error_v
+    present[slot] = True
+    return values, present

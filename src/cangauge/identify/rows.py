@@ -1,0 +1,130 @@
+"""Log → the rows that a fit uses, at the model's own rate.
+
+Rules, in this order:
+
+1. Decimation: the first sample at or after each tick of `rate_hz`; a slower log is kept whole.
+2. Start-up and shut-down: rows with a voltage below half the log's median are removed, and so
+   are rows less than `GUARD_S` away from one (contactor open, pre-charge).
+3. Delay line: the first 70 s (the longest delay), and as long after a gap in the current longer
+   than `gap_s`, are removed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cangauge.errors import InputError
+from cangauge.identify.charge import counted_soc_pct
+from cangauge.logs.log import Log
+from cangauge.model.delay_line import GAP_S, delayed_currents, settled
+
+FloatArray = NDArray[np.float64]
+
+LOW_VOLTAGE = 0.5
+"""Rows below this fraction of the log's median voltage are start-up or shut-down."""
+
+GUARD_S = 2.0
+"""Rows closer than this to a start-up or shut-down row go too [s]."""
+
+SOC_TOLERANCE_PCT = 3.0
+"""How far a counted SoC may leave 0–100 % before the capacity or the start must be wrong."""
+
+
+@dataclass(frozen=True, eq=False)
+class FitRows:
+    """What one log gives to the fit: shape (m,) each, and (m, number of delays)."""
+
+    name: str
+    time_s: FloatArray
+    voltage_v: FloatArray
+    temperature_c: FloatArray
+    soc_pct: FloatArray
+    """Counted SoC [%]."""
+    delayed_current_a: FloatArray
+    """I(t − dj) [A], positive = discharge."""
+    removed: dict[str, int]
+    """Rows removed by each rule."""
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return int(self.time_s.size)
+
+
+def fit_rows(
+    log: Log,
+    *,
+    capacity_ah: float,
+    delay_s: Sequence[float],
+    rate_hz: float = 1.0,
+    initial_soc_pct: float | None = None,
+    gap_s: float = GAP_S,
+) -> FitRows:
+    """Return the rows of a log that take part in a fit.
+
+    Raises
+    ------
+    InputError
+        If nothing is left, or the counted SoC leaves 0–100 % by more than `SOC_TOLERANCE_PCT`.
+    """
+    where = log.source or log.name
+    soc = counted_soc_pct(log, capacity_ah, initial_soc_pct)
+    low, high = float(soc.min()), float(soc.max())
+    if low < -SOC_TOLERANCE_PCT or high > 100.0 + SOC_TOLERANCE_PCT:
+        raise InputError(
+            f"the SoC counted with {capacity_ah:.2f} Ah runs from {high:.1f} to {low:.1f} %",
+            source=where,
+            field="soc_pct",
+            cure="check --capacity-ah, --initial-soc and the sign of current (positive must"
+            " discharge; `cangauge inspect` finds it)",
+        )
+    ticks = decimate(log.time_s, rate_hz)
+    running = running_rows(log.time_s, log.voltage_v)[ticks]
+    full = settled(log.time_s, max(delay_s), log.time_s[ticks], usual_gap_s(log.time_s, gap_s))
+    keep = ticks[running & full]
+    if keep.size < 2:
+        raise InputError(
+            f"no rows are left for the fit: the log lasts {log.duration_s:.0f} s and the first"
+            f" {max(delay_s):.0f} s, and as long after each gap, fill the delay line",
+            source=where,
+            cure="give a longer log",
+        )
+    return FitRows(
+        name=log.name,
+        time_s=log.time_s[keep],
+        voltage_v=log.voltage_v[keep],
+        temperature_c=log.temperature_c[keep],
+        soc_pct=soc[keep],
+        delayed_current_a=delayed_currents(log.time_s, log.current_a, delay_s, log.time_s[keep]),
+        removed={
+            "decimation": len(log) - ticks.size,
+            "start_up_or_shut_down": int(np.sum(~running)),
+            "delay_line_filling": int(np.sum(running & ~full)),
+        },
+    )
+
+
+def decimate(time_s: FloatArray, rate_hz: float) -> NDArray[np.intp]:
+    """Return the rows of the first sample at or after each tick of `rate_hz`."""
+    tick = np.floor((time_s - time_s[0]) * rate_hz + 1e-6)
+    return np.flatnonzero(np.concatenate(([True], np.diff(tick) > 0.0)))
+
+
+def running_rows(time_s: FloatArray, voltage_v: FloatArray) -> NDArray[np.bool_]:
+    """Return which rows are neither start-up nor shut-down (rule 2 of this module)."""
+    down = voltage_v < LOW_VOLTAGE * float(np.median(voltage_v))
+    if not down.any():
+        return ~down
+    at = time_s[down]
+    right = np.searchsorted(at, time_s)
+    to_next = np.where(right < at.size, at[np.minimum(right, at.size - 1)] - time_s, np.inf)
+    to_last = np.where(right > 0, time_s - at[np.maximum(right - 1, 0)], np.inf)
+    return np.asarray(np.minimum(to_next, to_last) > GUARD_S) & ~down
+
+
+def usual_gap_s(time_s: FloatArray, gap_s: float) -> float:
+    """Return what counts as a gap in a recorded log [s]: `gap_s`, or 3 usual steps if longer."""
+    return max(gap_s, 3.0 * float(np.median(np.diff(time_s)))) if time_s.size > 1 else gap_s

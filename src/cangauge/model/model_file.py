@@ -1,0 +1,234 @@
+"""The model file: JSON, versioned, validated on load with an error that names the field."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from cangauge.errors import InputError
+from cangauge.logs.log import TemperatureSource
+from cangauge.model.voltage_model import BASIS_NAMES, VoltageModel
+
+MODEL_FORMAT = "cangauge-model"
+MODEL_VERSION = 1
+LARGEST_FILE_BYTES = 16 << 20
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Span = tuple[Finite, Finite]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Coefficient(_Strict):
+    """One coefficient of the voltage model."""
+
+    value: Finite
+    std_error: NotNegative | None = None
+    unit: Literal["V", "V/K", "ohm"]
+
+
+class Ranges(_Strict):
+    """What the model was identified on; beyond it, it is flagged and bounded."""
+
+    soc_pct: Span
+    temperature_c: Span
+    current_a: Span
+
+
+class ModelNoise(_Strict):
+    """The model's voltage error on data that its fit did not see."""
+
+    fast_std_v: NotNegative
+    fast_time_s: NotNegative
+    slow_std_v: NotNegative
+    slow_time_s: Positive
+    voltage_mae_pct: NotNegative
+    voltage_rmse_v: NotNegative
+    judged_on: str
+
+
+class Information(_Strict):
+    """Square root of the identification data's information, in scaled columns.
+
+    With X the columns divided by `scale` and y the voltage, `root` is R and `projected` is Qᵀy of
+    X = QR. The information matrix is RᵀR, the least-squares solution R⁻¹Qᵀy / scale, and data of
+    another log can be stacked below: joint identification without the old logs.
+    """
+
+    columns: list[str]
+    scale: list[Positive]
+    root: list[list[Finite]]
+    projected: list[Finite]
+    rows: Annotated[int, Field(gt=0)]
+    residual_sum_v2: NotNegative
+
+    @model_validator(mode="after")
+    def _shapes(self) -> Self:
+        n = len(self.columns)
+        lengths = [len(self.scale), len(self.projected), len(self.root), *map(len, self.root)]
+        if any(length != n for length in lengths):
+            raise ValueError(f"shapes differ: {n} columns need {n} × {n} numbers")
+        return self
+
+
+class SourceLog(_Strict):
+    """A log that the model was identified on."""
+
+    name: str
+    rows: int
+    sha256: str
+
+
+class Made(_Strict):
+    """How the model was made."""
+
+    by: str
+    options: dict[str, str | float | int | bool | list[float] | None]
+    logs: list[SourceLog]
+    fingerprint: str
+
+
+class ModelFile(_Strict):
+    """Everything that a model file holds."""
+
+    format: Literal["cangauge-model"] = "cangauge-model"
+    version: Literal[1] = 1
+    name: str
+    coefficients: dict[str, Coefficient]
+    epsilon: Annotated[float, Field(gt=0, lt=0.5)]
+    t_ref_c: Finite
+    delays_s: Annotated[list[NotNegative], Field(min_length=1, max_length=64)]
+    rate_hz: Positive
+    capacity_ah: Positive
+    effects: list[dict[str, object]] = []
+    temperature_source: TemperatureSource
+    range: Ranges
+    noise: ModelNoise
+    information: Information | None = None
+    made: Made
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        wanted = {*BASIS_NAMES, "kt", *resistance_names(len(self.delays_s))}
+        given = set(self.coefficients)
+        if given != wanted:
+            missing, extra = sorted(wanted - given), sorted(given - wanted)
+            raise ValueError(f"coefficients: missing {missing}, not known {extra}")
+        if self.effects:
+            raise ValueError("effects: this version knows no effects; the list must be empty")
+        return self
+
+    def voltage_model(self) -> VoltageModel:
+        """Return the voltage model that the file describes.
+
+        Raises
+        ------
+        InputError
+            If its pseudo-OCV does not rise, or its delays do not.
+        """
+        value = {name: item.value for name, item in self.coefficients.items()}
+        return VoltageModel(
+            ocv_v=tuple(value[name] for name in BASIS_NAMES),
+            kt_v_per_k=value["kt"],
+            resistance_ohm=tuple(value[name] for name in resistance_names(len(self.delays_s))),
+            delay_s=tuple(self.delays_s),
+            epsilon=self.epsilon,
+            t_ref_c=self.t_ref_c,
+            soc_range_pct=self.range.soc_pct,
+            temperature_range_c=self.range.temperature_c,
+            current_range_a=self.range.current_a,
+        )
+
+
+def resistance_names(number: int) -> list[str]:
+    """Return R1 … Rn."""
+    return [f"R{k}" for k in range(1, number + 1)]
+
+
+def model_json(model: ModelFile) -> str:
+    """Return the model file's text."""
+    return json.dumps(model.model_dump(mode="json"), indent=1, allow_nan=False) + "\n"
+
+
+def load_model(path: Path | str) -> ModelFile:
+    """Read and validate a model file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read or does not describe a usable model; names the field.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > LARGEST_FILE_BYTES:
+            raise InputError("too large for a model file", source=path, value=path.stat().st_size)
+        raw = json.loads(path.read_bytes(), parse_constant=_no_constant)
+    except OSError as error:
+        raise InputError(
+            f"cannot be read ({error.strerror})", source=path, cure="check the path after -m"
+        ) from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(
+            f"is no JSON ({error})", source=path, cure="a model file is made by `cangauge fit`"
+        ) from error
+    if not isinstance(raw, dict) or raw.get("format") != MODEL_FORMAT:
+        raise InputError(
+            "is no cangauge model",
+            source=path,
+            field="format",
+            value=raw.get("format") if isinstance(raw, dict) else type(raw).__name__,
+            cure="a model file is made by `cangauge fit`",
+        )
+    if raw.get("version") != MODEL_VERSION:
+        raise InputError(
+            f"this release reads version {MODEL_VERSION}",
+            source=path,
+            field="version",
+            value=raw.get("version"),
+            cure="make it again with `cangauge fit`",
+        )
+    try:
+        model = ModelFile.model_validate(raw)
+        model.voltage_model()
+    except ValidationError as error:
+        raise _as_input_error(error, path) from error
+    except InputError as error:
+        raise InputError(
+            error.problem, source=path, field=error.field, value=error.value, cure=error.cure
+        ) from error
+    return model
+
+
+def _as_input_error(error: ValidationError, path: Path) -> InputError:
+    first = error.errors()[0]
+    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    value = first["input"]
+    return InputError(
+        first["msg"] + more,
+        source=path,
+        field=".".join(str(part) for part in first["loc"]) or None,
+        value=value if isinstance(value, str | int | float) else None,
+        cure="make the file again with `cangauge fit`",
+    )
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is no number that a model may hold")
+
+
+def effective_error_std_v(noise: ModelNoise, interval_s: float) -> float:
+    """Return the standard deviation to give a voltage that is used every `interval_s` [V].
+
+    The fast error lasts `fast_time_s`, so samples closer together share it: n of them tell as
+    much as n / (1 + 2·τ/Δt) independent ones.
+    """
+    shared = 1.0 + 2.0 * noise.fast_time_s / interval_s
+    return math.sqrt(shared) * noise.fast_std_v
