@@ -34,6 +34,9 @@ REST_CURRENT_C_RATE = 0.02
 REST_S = 600.0
 """After this long at rest, slow polarisation has decayed [s]."""
 
+USUAL_CURRENT_C_RATE = 1.0 / 3.0
+"""What a current that was not seen may have been [1/h]: 20 A at 60 Ah."""
+
 CONTRADICTED_S = 300.0
 """For how long after a lasting contradiction the estimate is marked [s]."""
 
@@ -97,7 +100,8 @@ class Estimator:
         self._counter = CoulombCounter(self.capacity_ah, self.settings.gap_s)
         self._line = DelayLine(self._model.delay_s, gap_s=self.settings.gap_s)
         noise = model.noise
-        self._fusion = Fusion(self._model, self.capacity_ah, noise.slow_std_v, noise.slow_time_s)
+        self._fusion = Fusion(self._model, self.capacity_ah, noise)
+        self._bias_std_v = math.hypot(noise.slow_std_v, noise.lasting_std_v)
         self._fast_std_v = effective_error_std_v(noise, 1.0 / model.rate_hz)
         self._standing = temperature_mismatch(
             model.temperature_source, self.settings.temperature_source
@@ -198,9 +202,7 @@ class Estimator:
         self._newton = soc_from_ocv(self._model, sample.voltage_v - beside_v, guess)
         std_v = self._error_std_v()
         slope = self._model.pseudo_ocv_at(self._newton.soc_pct)[1]
-        self._newton_std_pct = min(
-            math.hypot(std_v, self._file.noise.slow_std_v) / slope, UNKNOWN_SOC_STD_PCT
-        )
+        self._newton_std_pct = min(math.hypot(std_v, self._bias_std_v) / slope, UNKNOWN_SOC_STD_PCT)
         if math.isnan(self._coulomb_start_pct):
             # Nothing known before: the voltage says where to begin, and the filter starts wide,
             # so that it learns how SoC and bias share what the voltage cannot tell apart.
@@ -215,20 +217,30 @@ class Estimator:
         """Return the fast error of this voltage [V], larger where the model is out of its depth."""
         squares = self._fast_std_v**2
         if not self._line.full:
-            filled = self._line.filled_s
-            unknown = sum(
-                abs(resistance)
-                for resistance, delay in zip(
-                    self._model.resistance_ohm, self._model.delay_s, strict=True
-                )
-                if delay > filled
-            )
-            squares += (unknown * self.capacity_ah / 3.0) ** 2
+            squares = self._filling_var_v2(squares)
         if math.isnan(self._temperature_c):
             squares += (self._model.kt_v_per_k * TEMPERATURE_STD_K) ** 2
         soc = self._fusion.soc_pct if self._fused else self._newton.soc_pct
         squares += outside_model_std_v(self._model, soc, self._temperature_c) ** 2
         return math.sqrt(squares)
+
+    def _filling_var_v2(self, settled_var_v2: float) -> float:
+        """Return the error's variance while the delay line fills [V²].
+
+        The currents before the first sample are a guess, and the same guess for all samples until
+        the line is full: together they must tell no more than one of them.
+        """
+        filled = self._line.filled_s
+        unknown_ohm = sum(
+            abs(resistance)
+            for resistance, delay in zip(
+                self._model.resistance_ohm, self._model.delay_s, strict=True
+            )
+            if delay > filled
+        )
+        guess_v = unknown_ohm * USUAL_CURRENT_C_RATE * self.capacity_ah
+        alike = max(self._model.delay_s[-1] * self._file.rate_hz, 1.0)
+        return (settled_var_v2 + guess_v**2) * alike
 
     # --- estimate -------------------------------------------------------------------------
 

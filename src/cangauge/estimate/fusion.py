@@ -1,12 +1,13 @@
 """Fusion of the voltage model and Coulomb counting: an extended Kalman filter (filterpy).
 
-State x = (S, o, b): SoC S [%], current sensor's offset o [A] (measured = true + o), and the
-voltage model's slow bias b [V], a first-order Gauss–Markov process whose size and duration were
-read off held-out data. Because b is a state, the standard deviation of S stops falling where the
-voltage has no more to say: an error that lasts as long as a trip does not average out.
+State x = (S, o, b, l): SoC S [%], current sensor's offset o [A] (measured = true + o), and the
+voltage model's bias in two parts, slow b and lasting l [V], first-order Gauss–Markov processes
+whose sizes were read off held-out data. Because they are states, the standard deviation of S
+stops falling where the voltage has no more to say: an error that lasts as long as a trip does not
+average out.
 
     S ← S − a·(i − o)·Δt,   a = 100/(3600·C)
-    U = OCV(S) + kt·(T − T_r) + Σ Rj·(I(t − dj) − o) + b + fast error
+    U = OCV(S) + kt·(T − T_r) + Σ Rj·(I(t − dj) − o) + b + l + fast error
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
 
+from cangauge.model.model_file import ModelNoise
 from cangauge.model.voltage_model import VoltageModel
 
 FloatArray = NDArray[np.float64]
@@ -46,6 +48,14 @@ PERSISTENT_SIGMAS = 4.5
 OUTLIER_SIGMAS = 5.0
 """A single innovation beyond this is weighed as if its noise were as large as itself."""
 
+SLOW_SPAN_PCT = 3.0
+LASTING_SPAN_PCT = 8.0
+"""SoC travel over which each bias becomes another [%]: the fitted curve's error changes with SoC,
+and a filter that took the bias as constant would slide along the curve until its shape fits."""
+
+LASTING_TIME_S = 7200.0
+"""How long the lasting bias lasts [s]; the logs that show it are seldom longer."""
+
 RESTED_BIAS = 0.6
 """The bias after a long rest, in units of its standard deviation while driving."""
 
@@ -68,28 +78,29 @@ class Fusion:
     ----------
     model : VoltageModel
     capacity_ah : float
-    slow_std_v, slow_time_s : float
-        Size [V] and duration [s] of the model's slow bias.
+    noise : ModelNoise
+        Size and duration of the model's biases.
     """
 
-    def __init__(
-        self, model: VoltageModel, capacity_ah: float, slow_std_v: float, slow_time_s: float
-    ) -> None:
+    def __init__(self, model: VoltageModel, capacity_ah: float, noise: ModelNoise) -> None:
         self._model = model
         self._pct_per_as = 100.0 / (3600.0 * capacity_ah)
         self._resistance_sum = sum(model.resistance_ohm)
-        self._slow_var = slow_std_v**2
-        self._slow_time_s = slow_time_s
+        self._slow_var = noise.slow_std_v**2
+        self._slow_time_s = noise.slow_time_s
+        self._lasting_var = noise.lasting_std_v**2
         self._offset_std_a = OFFSET_STD_PER_AH * capacity_ah
         self._mean_innovation_v = 0.0
         self._mean_seconds = 0.0
-        self._ekf = ExtendedKalmanFilter(dim_x=3, dim_z=1, dim_u=1)
-        self._ekf.B = np.array([[1.0], [0.0], [0.0]])
+        self._ekf = ExtendedKalmanFilter(dim_x=4, dim_z=1, dim_u=1)
+        self._ekf.B = np.array([[1.0], [0.0], [0.0], [0.0]])
 
     def start(self, soc_pct: float, soc_std_pct: float) -> None:
         """Begin from a SoC with its standard deviation [%]."""
-        self._ekf.x = np.array([[soc_pct], [0.0], [0.0]])
-        self._ekf.P = np.diag([soc_std_pct**2, self._offset_std_a**2, self._slow_var])
+        self._ekf.x = np.array([[soc_pct], [0.0], [0.0], [0.0]])
+        self._ekf.P = np.diag(
+            [soc_std_pct**2, self._offset_std_a**2, self._slow_var, self._lasting_var]
+        )
         self._forget_innovations()
 
     def predict(
@@ -106,17 +117,18 @@ class Fusion:
         gap_var_pct2 : float
             Variance of the charge lost in gaps [%²].
         """
-        stays = math.exp(-seconds / self._slow_time_s)
+        slow_stays = math.exp(-seconds / self._slow_time_s - moved_pct / SLOW_SPAN_PCT)
+        lasting_stays = math.exp(-seconds / LASTING_TIME_S - moved_pct / LASTING_SPAN_PCT)
         offset_walk = OFFSET_WALK_PER_SQRT_H * self._offset_std_a
         ekf = self._ekf
-        ekf.F = np.array(
-            [[1.0, self._pct_per_as * seconds, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, stays]]
-        )
+        ekf.F = np.diag([1.0, 1.0, slow_stays, lasting_stays])
+        ekf.F[0, 1] = self._pct_per_as * seconds
         ekf.Q = np.diag(
             [
                 CAPACITY_STD**2 * CAPACITY_SPAN_PCT * moved_pct + gap_var_pct2,
                 offset_walk**2 * seconds / 3600.0,
-                self._slow_var * (1.0 - stays**2),
+                self._slow_var * (1.0 - slow_stays**2),
+                self._lasting_var * (1.0 - lasting_stays**2),
             ]
         )
         ekf.predict(u=np.array([[-discharged_pct]]))
@@ -177,8 +189,8 @@ class Fusion:
 
     @property
     def bias_v(self) -> float:
-        """Estimated slow bias of the voltage model [V]."""
-        return float(self._ekf.x[2, 0])
+        """Estimated bias of the voltage model, slow and lasting [V]."""
+        return float(self._ekf.x[2, 0] + self._ekf.x[3, 0])
 
     def offset_pct(self, seconds: float) -> float:
         """Return the SoC that the offset alone would feign in some seconds [%]."""
@@ -200,12 +212,13 @@ class Fusion:
 
     def _predicted(self, x: FloatArray, measurement: Measurement) -> FloatArray:
         volts, _ = self._model.pseudo_ocv_at(float(x[0, 0]))
-        volts += measurement.beside_v - self._resistance_sum * float(x[1, 0]) + float(x[2, 0])
+        volts += measurement.beside_v - self._resistance_sum * float(x[1, 0])
+        volts += float(x[2, 0] + x[3, 0])
         return np.array([[volts]])
 
     def _jacobian(self, x: FloatArray) -> FloatArray:
         _, slope = self._model.pseudo_ocv_at(float(x[0, 0]))
-        return np.array([[slope, -self._resistance_sum, 1.0]])
+        return np.array([[slope, -self._resistance_sum, 1.0, 1.0]])
 
     def _watch(self, measurement: Measurement, seconds: float) -> bool:
         """Whether the mean innovation, before any bias, contradicts state and model."""
@@ -218,7 +231,7 @@ class Fusion:
         if self._mean_seconds < PERSISTENT_S:
             return False
         slope = self._model.pseudo_ocv_at(self.soc_pct)[1]
-        mean_var = self._slow_var + slope**2 * float(ekf.P[0, 0])
+        mean_var = self._slow_var + self._lasting_var + slope**2 * float(ekf.P[0, 0])
         mean_var += measurement.std_v**2 * seconds / (2.0 * PERSISTENT_S)
         seen = 1.0 - math.exp(-self._mean_seconds / PERSISTENT_S)
         mean = self._mean_innovation_v / seen
@@ -228,8 +241,8 @@ class Fusion:
         """Forget how sure the SoC was, so that the voltage decides again."""
         ekf = self._ekf
         offset_var = float(ekf.P[1, 1])
-        ekf.x[2, 0] = 0.0
-        ekf.P = np.diag([UNKNOWN_SOC_STD_PCT**2, offset_var, self._slow_var])
+        ekf.x[2:, 0] = 0.0
+        ekf.P = np.diag([UNKNOWN_SOC_STD_PCT**2, offset_var, self._slow_var, self._lasting_var])
         self._forget_innovations()
 
     def _forget_innovations(self) -> None:

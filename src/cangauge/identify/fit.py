@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -367,7 +368,8 @@ def _model_file(
     fits: Sequence[LogFit],
 ) -> ModelFile:
     names = [*BASIS_NAMES, "kt", *resistance_names(len(options.delay_s))]
-    units = ["V"] * len(BASIS_NAMES) + ["V/K"] + ["ohm"] * len(options.delay_s)
+    units: list[Literal["V", "V/K", "ohm"]] = ["V" for _ in BASIS_NAMES]
+    units += ["V/K", *("ohm" for _ in options.delay_s)]
     rows = [item.rows for item in fits]
     return ModelFile.model_validate(
         {

@@ -1,7 +1,7 @@
-"""What the model's error is like in time: a fast part, and a slow part that does not average out.
+"""What the model's error is like in time: fast, slow, and lasting.
 
 The filter must know the difference. An error that is new every second averages out; one that
-lasts as long as a trip does not, however many samples are taken. Both are read off the
+lasts as long as a trip does not, however many samples are taken. All are read off the
 autocovariance of errors on logs that the fit did not see.
 """
 
@@ -13,13 +13,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
+from scipy.stats import t as student_t
+
+from cangauge.identify.held_out import LOGS_AT_LEAST
 
 FloatArray = NDArray[np.float64]
 
 LAGS_S = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
-TIME_CONSTANTS_S = (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
-SLOW_S = 60.0
-"""Parts that last longer count as slow [s]."""
+TIME_CONSTANTS_S = (3.0, 10.0, 30.0, 100.0, 300.0, 1e6)
+"""Durations that the error is made up of [s]; the last stands for the whole log. Those in between
+cannot be told from it in trips of half an hour."""
+
+SLOW_S, LASTING_S = 60.0, 1e5
+"""Parts that last longer count as slow, and as lasting [s]."""
+
+LASTING_AT_LEAST = 0.5
+"""Fewer than three logs do not show how the error differs from log to log; the lasting part is
+then taken to be at least this large, relative to the root mean square error."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +44,8 @@ class Noise:
     """Standard deviation of the slow part [V]."""
     slow_time_s: float
     """How long the slow part lasts [s]."""
+    lasting_std_v: float
+    """Standard deviation from log to log of what lasts as long as a log [V]."""
 
 
 def describe_noise(residuals: Sequence[tuple[FloatArray, FloatArray]], rate_hz: float) -> Noise:
@@ -69,13 +81,29 @@ def describe_noise(residuals: Sequence[tuple[FloatArray, FloatArray]], rate_hz: 
     )
     variance, _ = nnls(columns * weight[:, None], covariance * weight)
     times = np.array([0.0, *TIME_CONSTANTS_S])
-    slow = times > SLOW_S
+    few = _few_logs(len(residuals))
+    slow = (times > SLOW_S) & (times < LASTING_S)
+    fast = times <= SLOW_S
+    lasting = float(variance[-1])
+    if len(residuals) < LOGS_AT_LEAST:
+        lasting = max(lasting, LASTING_AT_LEAST**2 * float(covariance[0]))
     return Noise(
-        fast_std_v=float(np.sqrt(variance[~slow].sum())),
-        fast_time_s=_mean_time(variance[~slow], times[~slow]),
-        slow_std_v=float(np.sqrt(variance[slow].sum())),
-        slow_time_s=_mean_time(variance[slow], times[slow]) or TIME_CONSTANTS_S[-1],
+        fast_std_v=float(np.sqrt(variance[fast].sum())),
+        fast_time_s=_mean_time(variance[fast], times[fast]),
+        slow_std_v=few * float(np.sqrt(variance[slow].sum())),
+        slow_time_s=_mean_time(variance[slow], times[slow]) or SLOW_S,
+        lasting_std_v=few * float(np.sqrt(lasting)),
     )
+
+
+def _few_logs(number: int) -> float:
+    """Return by how much a spread seen in a few logs understates that of the next log.
+
+    The 95 % prediction interval of a normal variable from n values, relative to ±1.96 σ.
+    """
+    if number < LOGS_AT_LEAST:
+        return 1.0
+    return float(student_t.ppf(0.975, number - 1) / 1.96 * np.sqrt(1.0 + 1.0 / number))
 
 
 def _mean_time(variance: FloatArray, times_s: FloatArray) -> float:

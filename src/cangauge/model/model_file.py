@@ -50,6 +50,7 @@ class ModelNoise(_Strict):
     fast_time_s: NotNegative
     slow_std_v: NotNegative
     slow_time_s: Positive
+    lasting_std_v: NotNegative
     voltage_mae_pct: NotNegative
     voltage_rmse_v: NotNegative
     judged_on: str
