@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cangauge.errors import InputError
-from cangauge.identify.fit import FitOptions, columns_of, prepare
 from cangauge.identify.held_out import folds
+from cangauge.identify.options import FitOptions
 from cangauge.identify.rows import FitRows
+from cangauge.identify.voltage_fit import columns_of, prepare
 from cangauge.logs.log import Log
 
 FloatArray = NDArray[np.float64]

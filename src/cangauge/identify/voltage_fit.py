@@ -1,0 +1,144 @@
+"""Rows of logs → coefficients: the columns, the bounds, the fit, and its error held out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cangauge.errors import InputError
+from cangauge.identify.held_out import folds
+from cangauge.identify.least_squares import BLOCK_S, Solution, solve
+from cangauge.identify.options import FitOptions
+from cangauge.identify.rows import FitRows, fit_rows
+from cangauge.logs.log import Log
+from cangauge.model.voltage_model import (
+    BASIS_NAMES,
+    SLOPE_AT_LEAST,
+    VoltageModel,
+    ocv_basis,
+    ocv_basis_slope,
+)
+
+FloatArray = NDArray[np.float64]
+
+SLOPE_CHECKS = 201
+"""Points over the identified SoC at which the pseudo-OCV must rise."""
+
+SOC_SPAN_AT_LEAST_PCT = 2.0
+"""A fit over less SoC than this would be all extrapolation."""
+
+
+def prepare(logs: Sequence[Log], options: FitOptions) -> list[FitRows]:
+    """Return the rows of each log that take part in the fit."""
+    if options.capacity_ah is None:
+        raise InputError("the capacity is not known", field="capacity_ah")
+    return [
+        fit_rows(
+            log,
+            capacity_ah=options.capacity_ah,
+            delay_s=options.delay_s,
+            rate_hz=options.rate_hz,
+            initial_soc_pct=options.initial_soc_pct,
+        )
+        for log in logs
+    ]
+
+
+def fit_voltage_model(
+    rows: Sequence[FitRows], options: FitOptions, keep: NDArray[np.bool_] | None = None
+) -> tuple[VoltageModel, Solution]:
+    """Fit the coefficients on the rows (of all logs in order) that `keep` selects."""
+    columns, volts, block = stack(rows, options)
+    soc = np.concatenate([item.soc_pct for item in rows])
+    temperature = np.concatenate([item.temperature_c for item in rows])
+    current = np.concatenate([item.delayed_current_a[:, 0] for item in rows])
+    if keep is not None:
+        columns, volts, block = columns[keep], volts[keep], block[keep]
+        soc, temperature, current = soc[keep], temperature[keep], current[keep]
+    _check_identifiable(rows, soc, current, columns.shape)
+    grid = np.linspace(soc.min(), soc.max(), SLOPE_CHECKS)
+    bounds = np.zeros((SLOPE_CHECKS, columns.shape[1]))
+    bounds[:, : len(BASIS_NAMES)] = ocv_basis_slope(grid, options.epsilon)
+    solution = solve(columns, volts, block, bounds, SLOPE_AT_LEAST * float(np.median(volts)))
+    x = [float(value) for value in solution.coefficients]
+    return VoltageModel(
+        ocv_v=tuple(x[: len(BASIS_NAMES)]),
+        kt_v_per_k=x[len(BASIS_NAMES)],
+        resistance_ohm=tuple(x[len(BASIS_NAMES) + 1 :]),
+        delay_s=options.delay_s,
+        epsilon=options.epsilon,
+        t_ref_c=options.t_ref_c,
+        soc_range_pct=(float(soc.min()), float(soc.max())),
+        temperature_range_c=(float(temperature.min()), float(temperature.max())),
+        current_range_a=(float(current.min()), float(current.max())),
+    ), solution
+
+
+def held_out_errors(rows: Sequence[FitRows], options: FitOptions) -> list[FloatArray]:
+    """Return each log's errors [V] under fits that did not see the rows.
+
+    NaN where no fold judged a row, or only with a fit that did not see its SoC: how far the
+    model can be trusted beyond its range is another question (the estimate is flagged there).
+    """
+    volts = np.concatenate([item.voltage_v for item in rows])
+    soc = np.concatenate([item.soc_pct for item in rows])
+    temperature = np.concatenate([item.temperature_c for item in rows])
+    delayed = np.concatenate([item.delayed_current_a for item in rows])
+    errors = np.full(volts.size, np.nan)
+    for fitted, left_out in folds(rows):
+        model, _ = fit_voltage_model(rows, options, fitted)
+        lo, hi = model.soc_range_pct
+        judged = left_out & (soc > lo - 1.0) & (soc < hi + 1.0)
+        errors[judged] = volts[judged] - model.voltage(
+            soc[judged], temperature[judged], delayed[judged]
+        )
+    return np.split(errors, np.cumsum([len(item) for item in rows])[:-1])
+
+
+def columns_of(rows: FitRows, epsilon: float, t_ref_c: float) -> FloatArray:
+    """Return the model's columns k0 … k7, kt, R1 … Rn on the rows, shape (m, 9 + n)."""
+    return np.column_stack(
+        [ocv_basis(rows.soc_pct, epsilon), rows.temperature_c - t_ref_c, rows.delayed_current_a]
+    )
+
+
+def stack(
+    rows: Sequence[FitRows], options: FitOptions
+) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
+    """Return columns (n, 9 + delays), voltage [V] (n,) and block numbers (n,) of all logs."""
+    columns = np.vstack([columns_of(item, options.epsilon, options.t_ref_c) for item in rows])
+    volts = np.concatenate([item.voltage_v for item in rows])
+    blocks, first = [], 0
+    for item in rows:
+        number = ((item.time_s - item.time_s[0]) // BLOCK_S).astype(np.intp) + first
+        first = int(number[-1]) + 1
+        blocks.append(number)
+    return columns, volts, np.concatenate(blocks)
+
+
+def _check_identifiable(
+    rows: Sequence[FitRows], soc: FloatArray, current: FloatArray, shape: tuple[int, ...]
+) -> None:
+    where = ", ".join(item.name for item in rows)
+    if shape[0] < 4 * shape[1]:
+        raise InputError(
+            f"{shape[0]} rows cannot identify {shape[1]} coefficients", source=where,
+            cure="give a longer log or more logs",
+        )  # fmt: skip
+    if np.ptp(soc) < SOC_SPAN_AT_LEAST_PCT:
+        raise InputError(
+            f"the SoC moves by only {np.ptp(soc):.2f} %, too little for a voltage model",
+            source=where,
+            field="soc_pct",
+            cure=f"give logs that together cover at least {SOC_SPAN_AT_LEAST_PCT:.0f} %,"
+            " better the whole range",
+        )
+    if np.ptp(current) == 0.0:
+        raise InputError(
+            "the current never changes, so no resistance can be told from the open-circuit voltage",
+            source=where,
+            field="current_a",
+            cure="give a log with changing load",
+        )

@@ -1,0 +1,184 @@
+"""The estimator: inverse, counting, fusion, and what it says of itself."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cangauge.errors import InputError
+from cangauge.estimate.coulomb import CoulombCounter
+from cangauge.estimate.estimator import Estimator, EstimatorSettings
+from cangauge.estimate.inverse import soc_from_ocv
+from cangauge.estimate.offline import estimate_log, run_estimator, samples_of
+from cangauge.estimate.types import Reason, Sample, Status
+from cangauge.identify.fit import FitOptions, fit
+from cangauge.model.model_file import ModelFile
+from cangauge.model.published import CAPACITY_AH, leaf_2012_model
+from synthetic import synthetic_log
+
+
+@pytest.fixture(scope="module")
+def model() -> ModelFile:
+    logs = [synthetic_log(noise_v=0.5, seed=seed) for seed in (1, 2, 3)]
+    return fit(logs, FitOptions(capacity_ah=CAPACITY_AH)).model
+
+
+@given(st.floats(0.0, 100.0), st.floats(0.0, 100.0))
+def test_inverse_undoes_the_model_from_any_start(soc: float, guess: float) -> None:
+    truth = leaf_2012_model()
+    found = soc_from_ocv(truth, truth.pseudo_ocv_at(soc)[0], guess)
+    assert found.soc_pct == pytest.approx(soc, abs=1e-6)
+
+
+@given(st.floats(-1e6, 1e6), st.floats(-50.0, 150.0))
+def test_inverse_never_diverges(volts: float, guess: float) -> None:
+    truth = leaf_2012_model()
+    found = soc_from_ocv(truth, volts, guess)
+    assert 0.0 <= found.soc_pct <= 100.0
+    within = truth.pseudo_ocv_at(0.0)[0] <= volts <= truth.pseudo_ocv_at(100.0)[0]
+    assert found.inside == within
+
+
+def test_counter_integrates_irregular_steps_and_limits_gaps() -> None:
+    counter = CoulombCounter(capacity_ah=10.0, gap_s=2.0)
+    counter.step(0.0, 0.0)
+    assert counter.step(1.0, 36.0).discharged_pct == pytest.approx(18.0 / 36000.0 * 100.0)
+    bridged = counter.step(21.0, 36.0)
+    assert bridged.discharged_pct == pytest.approx(36.0 * 20.0 / 36000.0 * 100.0)
+    assert bridged.gap_std_pct > 0.0
+    before = counter.discharged_pct
+    away = counter.step(21.0 + 8 * 3600.0, 36.0)
+    assert counter.discharged_pct == before
+    assert away.gap_std_pct == 30.0
+
+
+@pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
+def test_each_method_follows_a_clean_log(model: ModelFile, method: str) -> None:
+    log = synthetic_log(noise_v=0.2, seed=9)
+    table, scores = estimate_log(
+        log, model, EstimatorSettings(method=method, initial_soc_pct=100.0)
+    )
+    assert scores.soc_mae_pct is not None
+    assert scores.soc_mae_pct < 0.6
+    assert np.all((table.soc_pct >= 0.0) & (table.soc_pct <= 100.0))
+
+
+def test_filter_recovers_from_a_wrong_start_and_says_so(model: ModelFile) -> None:
+    log = synthetic_log(start_pct=80.0, end_pct=40.0, noise_v=0.5, seed=11, hours=1.5)
+    table, _ = estimate_log(log, model, EstimatorSettings(initial_soc_pct=60.0))
+    error = np.abs(table.soc_pct - log.soc_pct)
+    assert error[:60].mean() > 10.0
+    assert error[600:].mean() < 1.0
+    assert np.any(table.reasons & Reason.INNOVATION_LARGE)
+
+
+def test_filter_learns_the_offset_that_a_counter_drifts_with(model: ModelFile) -> None:
+    log = synthetic_log(start_pct=95.0, end_pct=20.0, noise_v=0.5, seed=12)
+    samples = [item._replace(current_a=item.current_a + 2.0) for item in samples_of(log)]
+    settings_ = EstimatorSettings(initial_soc_pct=95.0)
+    table = run_estimator(samples, model, settings_)
+    fused = np.abs(table.soc_pct - log.soc_pct).mean()
+    counted = np.abs(table.soc_coulomb_pct - log.soc_pct).mean()
+    assert fused < 0.25 * counted
+    estimator = Estimator(model, settings_)
+    for sample in samples:
+        estimator.step(sample)
+    assert estimator.offset_a == pytest.approx(2.0, abs=0.5)
+
+
+def test_standard_deviation_is_honest(model: ModelFile) -> None:
+    inside, sigma, square = [], [], []
+    for seed in range(20, 30):
+        log = synthetic_log(start_pct=90.0, end_pct=50.0, noise_v=0.5, seed=seed, hours=1.0)
+        table, _ = estimate_log(log, model, EstimatorSettings())
+        error = (table.soc_pct - log.soc_pct)[300:]
+        inside.append(np.abs(error) <= 2.0 * table.soc_std_pct[300:])
+        sigma.append(table.soc_std_pct[300:])
+        square.append(error**2)
+    assert np.mean(inside) >= 0.9
+
+
+def test_starts_without_initial_soc_from_the_first_voltage(model: ModelFile) -> None:
+    log = synthetic_log(start_pct=70.0, end_pct=60.0, noise_v=0.2, seed=4, hours=0.5)
+    first = Estimator(model).step(next(samples_of(log)))
+    assert first.soc_pct == pytest.approx(70.0, abs=8.0)
+    assert first.soc_std_pct > 1.0
+    assert first.status is Status.DEGRADED
+    assert first.reasons == Reason.DELAY_LINE_FILLING
+
+
+def test_status_is_valid_once_the_delay_line_is_full(model: ModelFile) -> None:
+    log = synthetic_log(start_pct=70.0, end_pct=60.0, noise_v=0.2, seed=4, hours=0.5)
+    table, _ = estimate_log(log, model, EstimatorSettings())
+    filling = (table.reasons & Reason.DELAY_LINE_FILLING) != 0
+    assert np.array_equal(filling, log.time_s < 70.0)
+    assert np.mean(table.status[~filling] == Status.VALID) > 0.95
+
+
+def test_gap_in_current_degrades_for_the_delay_lines_length(model: ModelFile) -> None:
+    log = synthetic_log(start_pct=70.0, end_pct=60.0, noise_v=0.2, seed=4, hours=0.5)
+    keep = (log.time_s < 600.0) | (log.time_s >= 605.0)
+    table, _ = estimate_log(log.rows(keep), model, EstimatorSettings())
+    gap = (table.reasons & Reason.CURRENT_GAP) != 0
+    assert table.time_s[gap].min() == 605.0
+    assert table.time_s[gap].max() == 674.0
+
+
+def test_missing_voltage_and_temperature_keep_the_count_going(model: ModelFile) -> None:
+    log = synthetic_log(start_pct=70.0, end_pct=60.0, noise_v=0.2, seed=4, hours=0.5)
+    samples = [
+        item._replace(voltage_v=math.nan, temperature_c=math.nan) if item.time_s > 900 else item
+        for item in samples_of(log)
+    ]
+    table = run_estimator(samples, model, EstimatorSettings(initial_soc_pct=70.0))
+    assert np.abs(table.soc_pct - log.soc_pct).max() < 1.5
+    late = table.reasons[table.time_s > 900]
+    assert np.all(late & Reason.VOLTAGE_MISSING)
+    assert np.all(late & Reason.TEMPERATURE_MISSING)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.lists(
+        st.tuples(*(st.floats(allow_nan=True, allow_infinity=True) for _ in range(4))), max_size=60
+    )
+)
+def test_no_input_raises_or_leaves_0_to_100(rows: list[tuple[float, ...]]) -> None:
+    estimator = Estimator(_MODEL)
+    for row in rows:
+        estimate = estimator.step(Sample(*row))
+        assert math.isnan(estimate.soc_pct) or 0.0 <= estimate.soc_pct <= 100.0
+
+
+_MODEL = fit([synthetic_log(noise_v=0.5)], FitOptions(capacity_ah=CAPACITY_AH)).model
+
+
+def test_refuses_time_that_does_not_increase(model: ModelFile) -> None:
+    estimator = Estimator(model)
+    estimator.step(Sample(1.0, 10.0, 380.0, 23.0))
+    again = estimator.step(Sample(1.0, 5000.0, 380.0, 23.0))
+    assert again.reasons & Reason.IMPLAUSIBLE_INPUT
+    assert again.samples == 1
+
+
+def test_temperature_measured_elsewhere_degrades(model: ModelFile) -> None:
+    estimator = Estimator(model, EstimatorSettings(temperature_source="cell"))
+    estimate = estimator.step(Sample(0.0, 10.0, 380.0, 23.0))
+    assert estimate.reasons & Reason.TEMPERATURE_SOURCE_MISMATCH
+
+
+def test_the_same_samples_give_the_same_numbers(model: ModelFile) -> None:
+    log = synthetic_log(hours=0.3, noise_v=0.5)
+    first = run_estimator(samples_of(log), model, EstimatorSettings())
+    again = run_estimator(samples_of(log), model, EstimatorSettings())
+    for name in vars(first):
+        assert np.array_equal(getattr(first, name), getattr(again, name), equal_nan=True)
+
+
+def test_settings_out_of_range_are_named() -> None:
+    with pytest.raises(InputError, match="initial_soc_pct"):
+        EstimatorSettings(initial_soc_pct=140.0)

@@ -1,0 +1,182 @@
+"""Identification: finds what made the log, and says what it cannot find."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cangauge.errors import InputError
+from cangauge.identify.charge import (
+    capacity_from_full_discharge,
+    capacity_from_reference,
+    discharged_ah,
+)
+from cangauge.identify.delays import search_delays
+from cangauge.identify.fit import FitOptions, fit
+from cangauge.identify.least_squares import solve
+from cangauge.identify.noise import describe_noise
+from cangauge.logs.log import Log
+from cangauge.model.published import CAPACITY_AH, leaf_2012_model
+from cangauge.model.voltage_model import VoltageModel
+from synthetic import synthetic_log
+
+TRUTH = leaf_2012_model()
+
+
+def test_gives_back_the_coefficients_of_a_noiseless_log() -> None:
+    found = fit([synthetic_log()])
+    model = found.voltage_model
+    soc = np.linspace(*model.soc_range_pct, 200)
+    assert model.pseudo_ocv(soc) == pytest.approx(TRUTH.pseudo_ocv(soc), abs=1e-5)
+    assert model.resistance_ohm == pytest.approx(TRUTH.resistance_ohm, abs=1e-7)
+    assert model.kt_v_per_k == pytest.approx(TRUTH.kt_v_per_k, abs=1e-6)
+    assert found.voltage_mae_pct < 1e-6
+    assert found.soc_newton_mae_pct < 1e-4
+    assert found.model.capacity_ah == pytest.approx(CAPACITY_AH, rel=1e-3)
+
+
+def test_irregular_time_stamps_give_the_same_model() -> None:
+    log = synthetic_log(rate_hz=10.0, hours=1.0, end_pct=50.0)
+    rng = np.random.default_rng(3)
+    keep = np.sort(rng.choice(len(log), len(log) // 2, replace=False))
+    # Halved at random, the current between samples is not known: only piecewise constant currents
+    # survive that. The log's are, but for the steps.
+    found = fit([log.rows(keep)], FitOptions(capacity_ah=CAPACITY_AH))
+    soc = np.linspace(55.0, 98.0, 50)
+    assert found.voltage_model.pseudo_ocv(soc) == pytest.approx(TRUTH.pseudo_ocv(soc), abs=0.1)
+
+
+def test_standard_errors_cover_the_truth() -> None:
+    truth = np.array([*TRUTH.ocv_v, TRUTH.kt_v_per_k, *TRUTH.resistance_ohm])
+    inside = []
+    for seed in range(30):
+        log = synthetic_log(noise_v=1.0, seed=seed, hours=1.5)
+        found = fit([log], FitOptions(capacity_ah=CAPACITY_AH))
+        error = found.solution.coefficients - truth
+        inside.append(np.abs(error[-5:]) < 2.0 * found.solution.std_error[-5:])
+    # 150 draws of kt and R1…R4: 2 standard errors must hold about 95 % of them.
+    assert 0.88 <= np.mean(inside) <= 1.0
+
+
+def test_removes_start_up_and_shut_down_rows() -> None:
+    log = synthetic_log(noise_v=0.2)
+    voltage = log.voltage_v.copy()
+    voltage[3000:3020] = np.linspace(150.0, 2.0, 20)
+    broken = fit([replace(log, voltage_v=voltage)], FitOptions(capacity_ah=CAPACITY_AH))
+    whole = fit([log], FitOptions(capacity_ah=CAPACITY_AH))
+    assert broken.fits[0].rows.removed["start_up_or_shut_down"] == 24
+    assert broken.voltage_mae_pct == pytest.approx(whole.voltage_mae_pct, rel=0.02)
+
+
+def test_pseudo_ocv_rises_where_the_plain_fit_would_fall() -> None:
+    rng = np.random.default_rng(0)
+    log = synthetic_log(hours=0.6, start_pct=80.0, end_pct=72.0)
+    slow = 3.0 * np.sin(np.linspace(0.0, 9.0, len(log))) + rng.normal(0.0, 0.3, len(log))
+    found = fit([replace(log, voltage_v=log.voltage_v + slow)], FitOptions(capacity_ah=CAPACITY_AH))
+    assert found.solution.constrained
+    soc = np.linspace(0.0, 100.0, 500)
+    assert np.all(np.diff(found.voltage_model.pseudo_ocv(soc)) > 0.0)
+    assert np.ptp(found.voltage_model.pseudo_ocv(soc)) < 300.0
+
+
+def test_slope_resistance_agrees_with_the_autocorrelation() -> None:
+    found = fit([synthetic_log(noise_v=0.9)])
+    assert found.slope_ohm == pytest.approx(found.slope_expected_ohm, rel=0.01)
+
+
+def test_several_logs_in_one_fit_cover_more_soc_than_each() -> None:
+    logs = [
+        synthetic_log(start_pct=start, end_pct=start - 30.0, hours=1.0, noise_v=0.3, seed=start)
+        for start in (95, 70, 45)
+    ]
+    found = fit(logs, FitOptions(capacity_ah=CAPACITY_AH))
+    soc = np.linspace(20.0, 90.0, 50)
+    assert found.voltage_model.pseudo_ocv(soc) == pytest.approx(TRUTH.pseudo_ocv(soc), abs=0.3)
+    assert found.model.noise.judged_on == "whole logs left out in turn"
+
+
+def test_capacity_needs_a_log_from_full_to_empty() -> None:
+    whole = replace(synthetic_log(end_pct=0.0), soc_pct=None)
+    assert capacity_from_full_discharge([whole], None) == pytest.approx(CAPACITY_AH, rel=0.005)
+    part = replace(synthetic_log(end_pct=30.0), soc_pct=None)
+    with pytest.raises(InputError, match="full to empty"):
+        capacity_from_full_discharge([part], None)
+    referenced = synthetic_log(start_pct=90.0, end_pct=30.0)
+    with pytest.raises(InputError, match="--capacity-ah"):
+        fit([referenced])
+    assert capacity_from_reference([referenced]) == pytest.approx(CAPACITY_AH, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("log", "words"),
+    [
+        (synthetic_log(hours=0.015, end_pct=99.0), "no rows are left"),
+        (synthetic_log(hours=0.5, start_pct=80.0, end_pct=79.5), "SoC moves by only"),
+        (replace(synthetic_log(), current_a=np.full(9000, 20.0)), "current never changes"),
+        (replace(synthetic_log(), current_a=-synthetic_log().current_a), "sign of current"),
+    ],
+)
+def test_says_what_a_log_cannot_identify(log: Log, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        fit([log], FitOptions(capacity_ah=CAPACITY_AH))
+
+
+def test_refuses_to_mix_temperatures_of_different_things() -> None:
+    log = synthetic_log(hours=0.5)
+    with pytest.raises(InputError, match="different things"):
+        fit([log, replace(log, temperature_source="cell")], FitOptions(capacity_ah=CAPACITY_AH))
+
+
+def test_information_gives_the_solution_back() -> None:
+    found = fit([synthetic_log(noise_v=0.5)])
+    information = found.model.information
+    assert information is not None
+    x = np.linalg.solve(np.array(information.root), np.array(information.projected))
+    x /= np.array(information.scale)
+    assert not found.solution.constrained
+    assert x == pytest.approx(found.solution.coefficients, rel=1e-6)
+
+
+def test_search_over_delays_finds_the_delays_that_made_the_log() -> None:
+    truth = VoltageModel(TRUTH.ocv_v, TRUTH.kt_v_per_k, (-0.1, -0.03, -0.03), (0.0, 20.0, 100.0))
+    log = synthetic_log(model=truth, noise_v=0.3)
+    found = search_delays([log], FitOptions(capacity_ah=CAPACITY_AH))
+    assert found.delay_s == (0.0, 20.0, 100.0)
+    assert found.held_out_rmse_v == pytest.approx(0.3, rel=0.1)
+
+
+def test_noise_tells_fast_from_slow() -> None:
+    rng = np.random.default_rng(5)
+    logs = []
+    for _ in range(40):
+        slow = np.zeros(3000)
+        for k in range(1, 3000):
+            slow[k] = slow[k - 1] * np.exp(-1.0 / 300.0) + rng.normal() * np.sqrt(2.0 / 300.0)
+        logs.append((np.arange(3000.0), slow + rng.normal(0.0, 0.5, 3000)))
+    noise = describe_noise(logs, 1.0)
+    assert noise.fast_std_v == pytest.approx(0.5, rel=0.15)
+    assert noise.slow_std_v == pytest.approx(1.0, rel=0.2)
+    assert noise.lasting_std_v < 0.4
+
+
+def test_trapezoidal_charge_on_irregular_steps() -> None:
+    time_s = np.array([0.0, 1.0, 4.0, 10.0])
+    current_a = np.array([0.0, 2.0, 8.0, 8.0])
+    assert discharged_ah(time_s, current_a)[-1] * 3600.0 == pytest.approx(1.0 + 15.0 + 48.0)
+
+
+def test_constrained_least_squares_is_optimal() -> None:
+    rng = np.random.default_rng(2)
+    columns, target = rng.normal(size=(200, 5)), rng.normal(size=200)
+    bounds = rng.normal(size=(8, 5))
+    block = np.arange(200) // 10
+    found = solve(columns, target, block, bounds, 0.2)
+    assert found.constrained
+    assert np.all(bounds @ found.coefficients >= 0.2 - 1e-6)
+    best = np.sum((columns @ found.coefficients - target) ** 2)
+    for _ in range(500):
+        other = found.coefficients + rng.normal(0.0, 0.05, 5)
+        if np.all(bounds @ other >= 0.2):
+            assert np.sum((columns @ other - target) ** 2) >= best - 1e-6

@@ -1,0 +1,129 @@
+"""The voltage model: equation, slope, behaviour outside its range, delay line."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cangauge.errors import InputError
+from cangauge.model.delay_line import DelayLine, delayed_currents, settled
+from cangauge.model.published import leaf_2012_model
+from cangauge.model.voltage_model import VoltageModel
+
+MODEL = leaf_2012_model()
+K = (394.4, 48.89, -4.769, 0.2158, -0.003718, -54.59, 109.3, -3.141)
+
+
+@given(
+    st.floats(0.0, 100.0),
+    st.floats(20.0, 26.0),
+    st.lists(st.floats(-50.0, 200.0), min_size=4, max_size=4),
+)
+def test_is_the_published_equation(soc: float, temperature: float, current: list[float]) -> None:
+    s = soc / 100.0 * 0.9 + 0.05
+    expected = sum(k * s**-n for n, k in enumerate(K[:5]))
+    expected += K[5] * s + K[6] * math.log(s) + K[7] * math.log(1.0 - s)
+    expected += -0.7428 * (temperature - 20.0)
+    expected += np.dot([-0.1032, -0.01501, -0.009697, -0.004652], current)
+    assert MODEL.voltage([soc], [temperature], [current])[0] == pytest.approx(expected, abs=1e-9)
+
+
+@given(
+    st.floats(-20.0, 120.0),
+    st.floats(0.0, 50.0),
+    st.lists(st.floats(-300, 300), min_size=4, max_size=4),
+)
+def test_one_sample_and_arrays_agree(soc: float, temperature: float, current: list[float]) -> None:
+    volts, slope = MODEL.pseudo_ocv_at(soc)
+    whole = MODEL.voltage([soc], [temperature], [current])[0]
+    assert volts + MODEL.offset_at(temperature, current) == pytest.approx(whole, abs=1e-9)
+    assert slope == pytest.approx(MODEL.pseudo_ocv_slope([soc])[0], rel=1e-9)
+
+
+@given(st.floats(0.5, 99.5))
+def test_slope_is_the_derivative(soc: float) -> None:
+    step = 1e-3
+    numeric = np.diff(MODEL.pseudo_ocv([soc - step, soc + step]))[0] / (2.0 * step)
+    assert MODEL.pseudo_ocv_slope([soc])[0] == pytest.approx(numeric, rel=1e-4)
+
+
+def test_rises_everywhere_and_stays_bounded_outside_the_identified_soc() -> None:
+    narrow = VoltageModel(K, -0.74, (-0.1,), (0.0,), soc_range_pct=(40.0, 80.0))
+    soc = np.linspace(-10.0, 110.0, 500)
+    volts = narrow.pseudo_ocv(soc)
+    assert np.all(np.diff(volts) > 0.0)
+    # Three times the range, at about its slope; the formula itself falls by hundreds of volts.
+    assert np.ptp(volts) < 4.0 * np.ptp(narrow.pseudo_ocv([40.0, 80.0]))
+
+
+def test_temperature_is_held_beyond_its_range() -> None:
+    far, farther = MODEL.pseudo_ocv([50.0, 50.0], [-20.0, -40.0])
+    assert far == farther
+
+
+def test_refuses_a_falling_pseudo_ocv() -> None:
+    with pytest.raises(InputError, match="falls with SoC"):
+        VoltageModel((350.0, 0, 0, 0, 0, -20.0, 0, 0), 0.0, (-0.1,), (0.0,))
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"epsilon": 0.0}, "epsilon"),
+        ({"delay_s": (0.0, 30.0, 10.0, 70.0)}, "delays"),
+        ({"resistance_ohm": (-0.1,)}, "resistance_ohm"),
+        ({"kt_v_per_k": math.nan}, "coefficients"),
+        ({"soc_range_pct": (50.0, 50.0)}, "soc_range_pct"),
+    ],
+)
+def test_names_the_field_that_is_wrong(change: dict[str, object], field: str) -> None:
+    good = {
+        "ocv_v": K,
+        "kt_v_per_k": -0.74,
+        "resistance_ohm": (-0.1, -0.01, -0.01, -0.01),
+        "delay_s": (0.0, 10.0, 30.0, 70.0),
+    }
+    with pytest.raises(InputError) as error:
+        VoltageModel(**(good | change))
+    assert error.value.field == field
+
+
+@given(st.lists(st.tuples(st.floats(0.02, 1.9), st.floats(-100, 200)), min_size=2, max_size=300))
+def test_ring_buffer_equals_interpolation_over_the_whole_log(
+    steps: list[tuple[float, float]],
+) -> None:
+    delays = (0.0, 10.0, 30.0, 70.0)
+    time_s = np.cumsum([step for step, _ in steps])
+    current_a = np.array([value for _, value in steps])
+    expected = delayed_currents(time_s, current_a, delays, time_s)
+    line = DelayLine(delays)
+    for k, (time, current) in enumerate(zip(time_s.tolist(), current_a.tolist(), strict=True)):
+        line.push(time, current)
+        assert line.currents() == pytest.approx(expected[k].tolist(), abs=1e-6)
+    full = settled(time_s, 70.0, time_s)
+    assert line.full == bool(full[-1])
+
+
+def test_a_gap_empties_the_delay_line_in_both() -> None:
+    time_s = np.concatenate([np.arange(0.0, 100.0), np.arange(103.0, 300.0)])
+    full = settled(time_s, 70.0, time_s)
+    assert full[time_s < 100.0].sum() == 30
+    assert time_s[time_s > 100.0][np.argmax(full[time_s > 100.0])] == 173.0
+    line = DelayLine((0.0, 70.0))
+    for time in time_s[time_s < 173.0].tolist():
+        line.push(time, 1.0)
+    assert not line.full
+    line.push(173.0, 1.0)
+    assert line.full
+
+
+def test_memory_is_bounded_at_any_rate() -> None:
+    line = DelayLine((0.0, 70.0))
+    for k in range(400_000):
+        line.push(k * 1e-3, float(k))
+    assert len(line._times) < 2 * 70.0 / 0.009
+    assert line.currents()[1] == pytest.approx(399_999 - 70_000, abs=0.01)

@@ -1,0 +1,50 @@
+"""Logs made from the published equation, for tests: what a fit must find is known."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cangauge.identify.charge import discharged_ah
+from cangauge.logs.log import Log
+from cangauge.model.delay_line import delayed_currents
+from cangauge.model.published import CAPACITY_AH, leaf_2012_model
+from cangauge.model.voltage_model import VoltageModel
+
+
+def drive_current(time_s: np.ndarray, mean_a: float, seed: int) -> np.ndarray:
+    """A drive-like current [A]: pulses of some seconds around a mean, with regeneration."""
+    rng = np.random.default_rng(seed)
+    edges = np.cumsum(rng.uniform(2.0, 15.0, int(time_s[-1] / 4.0) + 10))
+    levels = mean_a + rng.normal(0.0, 25.0, edges.size + 1)
+    return levels[np.searchsorted(edges, time_s)]
+
+
+def synthetic_log(
+    *,
+    hours: float = 2.5,
+    rate_hz: float = 1.0,
+    start_pct: float = 100.0,
+    end_pct: float = 1.0,
+    noise_v: float = 0.0,
+    seed: int = 1,
+    model: VoltageModel | None = None,
+    capacity_ah: float = CAPACITY_AH,
+    name: str = "synthetic",
+) -> Log:
+    """A log whose voltage is the published equation plus white noise; SoC is exact."""
+    model = model or leaf_2012_model()
+    time_s = np.arange(0.0, hours * 3600.0, 1.0 / rate_hz)
+    mean_a = (start_pct - end_pct) / 100.0 * capacity_ah / hours
+    current_a = drive_current(time_s, mean_a, seed)
+    current_a += mean_a - discharged_ah(time_s, current_a)[-1] / hours
+    soc_pct = start_pct - 100.0 * discharged_ah(time_s, current_a) / capacity_ah
+    rng = np.random.default_rng(seed + 1000)
+    temperature_c = 23.0 + 2.0 * np.sin(time_s / 700.0) + 0.5 * np.sin(time_s / 130.0)
+    voltage_v = (
+        model.voltage(
+            soc_pct, temperature_c, delayed_currents(time_s, current_a, model.delay_s, time_s)
+        )
+        + rng.normal(0.0, 1.0, time_s.size) * noise_v
+    )
+    return Log(time_s, current_a, voltage_v, temperature_c, soc_pct, name=name,
+               temperature_source="room")  # fmt: skip
