@@ -182,3 +182,18 @@ def test_the_same_samples_give_the_same_numbers(model: ModelFile) -> None:
 def test_settings_out_of_range_are_named() -> None:
     with pytest.raises(InputError, match="initial_soc_pct"):
         EstimatorSettings(initial_soc_pct=140.0)
+
+
+def test_open_contactors_do_not_disturb_the_filter(model: ModelFile) -> None:
+    log = synthetic_log(start_pct=80.0, end_pct=70.0, noise_v=0.3, seed=6, hours=0.5)
+    down = (log.time_s >= 900.0) & (log.time_s < 930.0)
+    samples = [
+        item._replace(voltage_v=1.5) if off else item
+        for item, off in zip(samples_of(log), down, strict=True)
+    ]
+    settings_ = EstimatorSettings(initial_soc_pct=80.0)
+    table = run_estimator(samples, model, settings_)
+    whole = run_estimator(samples_of(log), model, settings_)
+    assert np.abs(table.soc_pct - whole.soc_pct).max() < 0.2
+    assert np.all(table.reasons[down] & Reason.IMPLAUSIBLE_INPUT)
+    assert not np.any(table.reasons & Reason.INNOVATION_LARGE)

@@ -16,7 +16,8 @@ from cangauge.estimate.fusion import UNKNOWN_SOC_STD_PCT, Fusion, Measurement
 from cangauge.estimate.inverse import Inverse, soc_from_ocv
 from cangauge.estimate.types import Estimate, Reason, Sample, Status
 from cangauge.estimate.validity import (
-    implausible,
+    acceptable,
+    cleaned,
     outside_model,
     outside_model_std_v,
     status_of,
@@ -106,6 +107,8 @@ class Estimator:
         self._standing = temperature_mismatch(
             model.temperature_source, self.settings.temperature_source
         )
+        self._usual_v = self._model.pseudo_ocv_at(50.0)[0]
+        self._implausible = Reason.NONE
         self._samples = 0
         self._first_s = 0.0
         self._last_s = -math.inf
@@ -135,11 +138,13 @@ class Estimator:
     def step(self, sample: Sample) -> Estimate:
         """Take one sample and return the estimate after it.
 
-        A sample that is implausible or not later than the one before is refused: the last
-        estimate comes back, marked `IMPLAUSIBLE_INPUT`.
+        A sample without a believable current, or not later than the one before, is refused: the
+        last estimate comes back, marked `IMPLAUSIBLE_INPUT`. A voltage or temperature that cannot
+        be true counts as missing, and charge is still counted.
         """
-        if implausible(sample) or sample.time_s <= self._last_s:
+        if not acceptable(sample) or sample.time_s <= self._last_s:
             return self._refuse()
+        sample, self._implausible = cleaned(sample, self._usual_v)
         time_s, current_a = sample.time_s, sample.current_a
         if self._samples == 0:
             self._first_s = time_s
@@ -286,7 +291,7 @@ class Estimator:
         )
 
     def _reasons(self, sample: Sample, soc_pct: float) -> Reason:
-        reasons = self._standing
+        reasons = self._standing | self._implausible
         if math.isnan(soc_pct):
             reasons |= Reason.NO_INITIAL_SOC
         if not self._line.full:

@@ -9,9 +9,9 @@ from cangauge.logs.log import TemperatureSource
 from cangauge.model.voltage_model import VoltageModel
 
 CURRENT_AT_MOST_A = 5000.0
-VOLTAGE_AT_MOST_V = 2000.0
 TEMPERATURE_WITHIN_C = (-60.0, 120.0)
-"""Beyond these no pack current, voltage or temperature is believed."""
+VOLTAGE_WITHIN = (0.5, 1.5)
+"""Beyond these no current, temperature or voltage (relative to half charge) is believed."""
 
 SOC_MARGIN_PCT = 1.0
 TEMPERATURE_MARGIN_K = 1.0
@@ -26,18 +26,30 @@ OUTSIDE_TEMPERATURE_V_PER_K = 1e-3
 the pack's voltage (0.36 V/K for a Leaf)."""
 
 
-def implausible(sample: Sample) -> bool:
-    """Whether a sample must be refused.
+def acceptable(sample: Sample) -> bool:
+    """Whether a sample can be counted: finite time, and a current that a pack can carry."""
+    return math.isfinite(sample.time_s) and abs(sample.current_a) <= CURRENT_AT_MOST_A
 
-    Time and current must be finite numbers; voltage and temperature may be missing (NaN).
+
+def cleaned(sample: Sample, usual_v: float) -> tuple[Sample, Reason]:
+    """Return the sample with what cannot be true taken out (NaN), and the reason.
+
+    Parameters
+    ----------
+    sample : Sample
+    usual_v : float
+        Voltage of the pack at half charge [V]; a contactor that is open shows next to nothing.
     """
-    if not (math.isfinite(sample.time_s) and abs(sample.current_a) <= CURRENT_AT_MOST_A):
-        return True
-    # NaN compares false, so a missing voltage or temperature passes these.
-    if sample.voltage_v <= 0.0 or sample.voltage_v > VOLTAGE_AT_MOST_V:
-        return True
+    reason = Reason.NONE
+    low, high = VOLTAGE_WITHIN[0] * usual_v, VOLTAGE_WITHIN[1] * usual_v
+    if not math.isnan(sample.voltage_v) and not low <= sample.voltage_v <= high:
+        sample = sample._replace(voltage_v=math.nan)
+        reason = Reason.IMPLAUSIBLE_INPUT
     low, high = TEMPERATURE_WITHIN_C
-    return sample.temperature_c < low or sample.temperature_c > high
+    if not math.isnan(sample.temperature_c) and not low <= sample.temperature_c <= high:
+        sample = sample._replace(temperature_c=math.nan)
+        reason = Reason.IMPLAUSIBLE_INPUT
+    return sample, reason
 
 
 def outside_model(model: VoltageModel, soc_pct: float, sample: Sample) -> Reason:
