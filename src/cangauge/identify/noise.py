@@ -7,6 +7,7 @@ autocovariance of errors on logs that the fit did not see.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -24,12 +25,15 @@ TIME_CONSTANTS_S = (3.0, 10.0, 30.0, 100.0, 300.0, 1e6)
 """Durations that the error is made up of [s]; the last stands for the whole log. Those in between
 cannot be told from it in trips of half an hour."""
 
+SLOW_UNSEEN_S = 300.0
+"""Duration of a slow part that the logs do not show [s]."""
+
 SLOW_S, LASTING_S = 60.0, 1e5
 """Parts that last longer count as slow, and as lasting [s]."""
 
-LASTING_AT_LEAST = 0.5
-"""Fewer than three logs do not show how the error differs from log to log; the lasting part is
-then taken to be at least this large, relative to the root mean square error."""
+PARTS_AT_LEAST = 0.5
+"""Fewer than three logs do not show how the error differs from log to log; the slow and the
+lasting part are then taken to be at least this large, relative to the root mean square error."""
 
 
 @dataclass(frozen=True)
@@ -84,15 +88,19 @@ def describe_noise(residuals: Sequence[tuple[FloatArray, FloatArray]], rate_hz: 
     few = _few_logs(len(residuals))
     slow = (times > SLOW_S) & (times < LASTING_S)
     fast = times <= SLOW_S
-    lasting = float(variance[-1])
+    slow = (times > SLOW_S) & (times < LASTING_S)
+    fast = times <= SLOW_S
+    slow_v2, lasting_v2 = float(variance[slow].sum()), float(variance[-1])
     if len(residuals) < LOGS_AT_LEAST:
-        lasting = max(lasting, LASTING_AT_LEAST**2 * float(covariance[0]))
+        floor_v2 = PARTS_AT_LEAST**2 * float(covariance[0])
+        slow_v2, lasting_v2 = max(slow_v2, floor_v2), max(lasting_v2, floor_v2)
+    few = _few_logs(len(residuals))
     return Noise(
         fast_std_v=float(np.sqrt(variance[fast].sum())),
         fast_time_s=_mean_time(variance[fast], times[fast]),
-        slow_std_v=few * float(np.sqrt(variance[slow].sum())),
-        slow_time_s=_mean_time(variance[slow], times[slow]) or SLOW_S,
-        lasting_std_v=few * float(np.sqrt(lasting)),
+        slow_std_v=few * math.sqrt(slow_v2),
+        slow_time_s=_mean_time(variance[slow], times[slow]) or SLOW_UNSEEN_S,
+        lasting_std_v=few * math.sqrt(lasting_v2),
     )
 
 

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-from cangauge.model.voltage_model import VoltageModel
+import math
+
+from cangauge.model.model_file import ModelFile, resistance_names
+from cangauge.model.voltage_model import BASIS_NAMES, VoltageModel
 
 CAPACITY_AH = 51.5
 """Charge from 100 to 0 % [Ah]."""
+
+MEAN_VOLTAGE_V = 370.0
+"""About the pack's voltage over the test [V]."""
 
 VOLTAGE_MAE_PCT = 0.25
 SOC_NEWTON_MAE_PCT = 2.5
@@ -29,4 +35,55 @@ def leaf_2012_model() -> VoltageModel:
         soc_range_pct=(0.0, 100.0),
         temperature_range_c=(20.0, 26.0),
         current_range_a=(-50.0, 200.0),
+    )
+
+
+def leaf_2012_model_file() -> ModelFile:
+    """Return the published model as a model file that `estimate` and `run` take.
+
+    The paper gives no noise and no standard errors. The noise here is assumed: its sum gives the
+    published voltage error of 0.25 % (0.93 V mean, 1.16 V rms), split evenly into a fast, a slow
+    and a lasting part.
+    """
+    model = leaf_2012_model()
+    rmse_v = VOLTAGE_MAE_PCT / 100.0 * MEAN_VOLTAGE_V * math.sqrt(math.pi / 2.0)
+    part_v = rmse_v / math.sqrt(3.0)
+    names = [*BASIS_NAMES, "kt", *resistance_names(len(model.delay_s))]
+    values = [*model.ocv_v, model.kt_v_per_k, *model.resistance_ohm]
+    units = {"kt": "V/K"} | dict.fromkeys(resistance_names(len(model.delay_s)), "ohm")
+    return ModelFile.model_validate(
+        {
+            "name": "2012 Nissan Leaf, published coefficients",
+            "coefficients": {
+                name: {"value": value, "unit": units.get(name, "V")}
+                for name, value in zip(names, values, strict=True)
+            },
+            "epsilon": model.epsilon,
+            "t_ref_c": model.t_ref_c,
+            "delays_s": list(model.delay_s),
+            "rate_hz": 1.0,
+            "capacity_ah": CAPACITY_AH,
+            "temperature_source": "room",
+            "range": {
+                "soc_pct": model.soc_range_pct,
+                "temperature_c": model.temperature_range_c,
+                "current_a": model.current_range_a,
+            },
+            "noise": {
+                "fast_std_v": part_v,
+                "fast_time_s": 3.0,
+                "slow_std_v": part_v,
+                "slow_time_s": 300.0,
+                "lasting_std_v": part_v,
+                "voltage_mae_pct": VOLTAGE_MAE_PCT,
+                "voltage_rmse_v": rmse_v,
+                "judged_on": "published; split into parts by assumption",
+            },
+            "made": {
+                "by": "published Table 1",
+                "options": {},
+                "logs": [],
+                "fingerprint": "published",
+            },
+        }
     )
