@@ -23,9 +23,14 @@ def test_the_new_content_replaces_the_old_one(tmp_path: Path) -> None:
 def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "model.json"
     path.write_text("old")
-    with pytest.raises(ZeroDivisionError), atomic_path(path) as part:
-        part.write_text("half")
-        _ = 1 // 0
+
+    def write_half() -> None:
+        with atomic_path(path) as part:
+            part.write_text("half")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        write_half()
     assert path.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["model.json"]
 
@@ -64,9 +69,13 @@ def test_a_folder_without_rights_is_named(tmp_path: Path) -> None:
 
 def test_a_full_disk_is_one_line_and_leaves_no_part(tmp_path: Path) -> None:
     path = tmp_path / "x.json"
-    with pytest.raises(CangaugeError, match=r"x\.json: writing failed: .*free some space"):
+
+    def fill_up() -> None:
         with atomic_path(path):
             raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(CangaugeError, match=r"x\.json: writing failed: .*free some space"):
+        fill_up()
     assert list(tmp_path.iterdir()) == []
 
 

@@ -172,7 +172,10 @@ def test_a_temperature_can_be_given_where_the_file_has_none(tmp_path: Path) -> N
 
 
 def test_temperature_source_words_are_checked(tmp_path: Path) -> None:
-    rows = [f"{a},{b}" for a, b in zip(CSV.splitlines(), ["Temperature_Source", "Room", ""])]
+    rows = [
+        f"{a},{b}"
+        for a, b in zip(CSV.splitlines(), ["Temperature_Source", "Room", ""], strict=True)
+    ]
     assert read_log(write(tmp_path / "x.csv", "\n".join(rows) + "\n")).temperature_source == "room"
     for word, words in (("oven", "not a known word"), ("pack", "one word throughout")):
         text = "\n".join([*rows, f"0.2,1,380,20,{word}"] if word == "pack" else rows)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -13,8 +15,17 @@ import pytest
 from cangauge.errors import InputError
 from cangauge.logs.read import read_log
 
-Headers = dict[str, list[str]]
-Build = Callable[..., str]
+
+class D3(NamedTuple):
+    """Headings by spelling, and what builds a file with them."""
+
+    headers: dict[str, list[str]]
+    text: Callable[..., str]
+
+
+@pytest.fixture
+def d3(d3_headers: dict[str, list[str]], build_d3: Callable[..., str]) -> D3:
+    return D3(d3_headers, build_d3)
 
 
 def expected_current(time_s: np.ndarray) -> np.ndarray:
@@ -36,9 +47,9 @@ def write(tmp_path: Path, text: str, name: str = "61201019 Test Data.txt") -> Pa
     ],
 )
 def test_each_spelling_reads(
-    tmp_path: Path, d3_headers: Headers, build_d3: Build, spelling: str, instrument: str, soc: float
+    tmp_path: Path, d3: D3, spelling: str, instrument: str, soc: float | None
 ) -> None:
-    log = read_log(write(tmp_path, build_d3(d3_headers[spelling])))
+    log = read_log(write(tmp_path, d3.text(d3.headers[spelling])))
     np.testing.assert_allclose(log.time_s, np.arange(400) / 10, atol=1e-9)
     np.testing.assert_array_equal(log.current_a, expected_current(log.time_s))
     np.testing.assert_allclose(log.voltage_v, 380.0 - 0.1 * log.current_a)
@@ -52,25 +63,21 @@ def test_each_spelling_reads(
     assert any("test room" in text for text in log.remarks)
 
 
-def test_headings_match_without_unit_blanks_underscores_and_case(
-    tmp_path: Path, d3_headers: Headers, build_d3: Build
-) -> None:
-    text = build_d3(d3_headers["2013"])
+def test_headings_match_without_unit_blanks_underscores_and_case(tmp_path: Path, d3: D3) -> None:
+    text = d3.text(d3.headers["2013"])
     first, rest = text.split("\r\n", 1)
     first = first.replace("HV_Battery_Current[A]", "hv battery_CURRENT [A]")
     log = read_log(write(tmp_path, f"{first}\r\n{rest}"))
     np.testing.assert_array_equal(log.current_a, expected_current(log.time_s))
 
 
-def test_the_200_a_clamp_only_where_the_other_is_absent_or_empty(
-    tmp_path: Path, d3_headers: Headers, build_d3: Build
-) -> None:
-    absent = [name for name in d3_headers["2012"] if "500A" not in name]
-    log = read_log(write(tmp_path, build_d3(absent)))
+def test_the_200_a_clamp_only_where_the_other_is_absent_or_empty(tmp_path: Path, d3: D3) -> None:
+    absent = [name for name in d3.headers["2012"] if "500A" not in name]
+    log = read_log(write(tmp_path, d3.text(absent)))
     assert log.current_a.max() == 20.0  # that clamp saturates
     assert "current_a from the 200 A clamp" in log.remarks
 
-    lines = build_d3(d3_headers["2012"]).split("\r\n")
+    lines = d3.text(d3.headers["2012"]).split("\r\n")
     emptied = [lines[0]]
     for line in lines[1:-1]:
         row = line.split("\t")
@@ -81,39 +88,31 @@ def test_the_200_a_clamp_only_where_the_other_is_absent_or_empty(
     assert "HV Battery Current w/500A max clamp [A] is empty and was passed over" in log.remarks
 
 
-def test_current_and_voltage_from_two_instruments_where_none_has_both(
-    tmp_path: Path, d3_headers: Headers, build_d3: Build
-) -> None:
+def test_two_instruments_where_none_has_both(tmp_path: Path, d3: D3) -> None:
     header = [
-        name for name in d3_headers["later"] if "Volt_Hioki" not in name and "wide" not in name
+        name for name in d3.headers["later"] if "Volt_Hioki" not in name and "wide" not in name
     ]
-    log = read_log(write(tmp_path, build_d3(header)))
+    log = read_log(write(tmp_path, d3.text(header)))
     np.testing.assert_array_equal(log.current_a, expected_current(log.time_s))
     assert {"current_a from the power analyser", "voltage_v from the car's CAN"} <= set(log.remarks)
 
 
-def test_a_can_copy_is_turned_where_the_data_say_so(
-    tmp_path: Path, d3_headers: Headers, build_d3: Build
-) -> None:
-    header = [name for name in d3_headers["later"] if "Hioki" not in name]
-    log = read_log(write(tmp_path, build_d3(header, end_s=120.0)))
+def test_a_can_copy_is_turned_where_the_data_say_so(tmp_path: Path, d3: D3) -> None:
+    header = [name for name in d3.headers["later"] if "Hioki" not in name]
+    log = read_log(write(tmp_path, d3.text(header, end_s=120.0)))
     np.testing.assert_array_equal(log.current_a, expected_current(log.time_s))
     assert any(text.startswith("current negated, sign found from the data") for text in log.remarks)
 
 
-def test_a_can_copy_is_kept_where_the_data_say_nothing(
-    tmp_path: Path, d3_headers: Headers, build_d3: Build
-) -> None:
-    header = [name for name in d3_headers["later"] if "Hioki" not in name]
-    log = read_log(write(tmp_path, build_d3(header, end_s=3.0)))
+def test_a_can_copy_is_kept_where_the_data_say_nothing(tmp_path: Path, d3: D3) -> None:
+    header = [name for name in d3.headers["later"] if "Hioki" not in name]
+    log = read_log(write(tmp_path, d3.text(header, end_s=3.0)))
     np.testing.assert_array_equal(log.current_a, -expected_current(log.time_s))
     assert any("kept as stored" in text for text in log.remarks)
 
 
-def test_an_instrument_is_never_turned(
-    tmp_path: Path, d3_headers: Headers, build_d3: Build
-) -> None:
-    text = build_d3(d3_headers["2012"], end_s=120.0)
+def test_an_instrument_is_never_turned(tmp_path: Path, d3: D3) -> None:
+    text = d3.text(d3.headers["2012"], end_s=120.0)
     lines = [line.split("\t") for line in text.split("\r\n")[:-1]]
     for row in lines[1:]:
         row[6] = str(-float(row[6]))
@@ -122,12 +121,10 @@ def test_an_instrument_is_never_turned(
     assert any(text.startswith("current looks turned and was kept") for text in log.remarks)
 
 
-def test_incomplete_rows_are_dropped_up_to_a_limit(
-    tmp_path: Path, d3_headers: Headers, build_d3: Build
-) -> None:
-    lines = build_d3(d3_headers["2013"], start_s=0.0).split("\r\n")
+def test_incomplete_rows_are_dropped_up_to_a_limit(tmp_path: Path, d3: D3) -> None:
+    lines = d3.text(d3.headers["2013"], start_s=0.0).split("\r\n")
     holed = [*lines]
-    holed[5] = "\t".join(["0.4", "0", "23.5", "90", "", "381"])
+    holed[5] = "0.4\t0\t23.5\t90\t\t381"
     log = read_log(write(tmp_path, "\r\n".join(holed)))
     assert len(log) == 399
     assert any("1 rows without time, current, voltage" in text for text in log.remarks)
@@ -155,13 +152,12 @@ def test_incomplete_rows_are_dropped_up_to_a_limit(
 )
 def test_what_is_broken_is_named(
     tmp_path: Path,
-    d3_headers: Headers,
-    build_d3: Build,
+    d3: D3,
     broken: Callable[[str], str],
     field: str | None,
     words: str,
 ) -> None:
-    path = write(tmp_path, broken(build_d3(d3_headers["2013"], start_s=0.0)))
+    path = write(tmp_path, broken(d3.text(d3.headers["2013"], start_s=0.0)))
     with pytest.raises(InputError, match=words) as caught:
         read_log(path)
     assert caught.value.source == str(path)
@@ -170,10 +166,8 @@ def test_what_is_broken_is_named(
         assert caught.value.field == field
 
 
-def test_units_in_headings_are_converted(
-    tmp_path: Path, d3_headers: Headers, build_d3: Build
-) -> None:
-    text = build_d3(d3_headers["2013"]).replace("Test_Cell_Temp[C]", "Test_Cell_Temp[F]")
+def test_units_in_headings_are_converted(tmp_path: Path, d3: D3) -> None:
+    text = d3.text(d3.headers["2013"]).replace("Test_Cell_Temp[C]", "Test_Cell_Temp[F]")
     log = read_log(write(tmp_path, text))
     np.testing.assert_allclose(log.temperature_c, (23.5 - 32.0) / 1.8)
     assert "Test_Cell_Temp[F]: converted from F to temperature_c" in log.remarks
@@ -187,8 +181,8 @@ def zipped(names: dict[str, str]) -> bytes:
     return packed.getvalue()
 
 
-def test_a_vehicles_zip(tmp_path: Path, d3_headers: Headers, build_d3: Build) -> None:
-    text = build_d3(d3_headers["2012"])
+def test_a_vehicles_zip(tmp_path: Path, d3: D3) -> None:
+    text = d3.text(d3.headers["2012"])
     path = tmp_path / "leaf.zip"
     path.write_bytes(zipped({"2012 Leaf/61201019 Test Data.txt": text, "Summary.pdf": "%PDF"}))
     log = read_log(path)
@@ -202,13 +196,9 @@ def test_a_vehicles_zip(tmp_path: Path, d3_headers: Headers, build_d3: Build) ->
         read_log(path)
 
 
-def test_a_whole_test_reads_fast_enough_to_be_vectorised(
-    tmp_path: Path, d3_headers: Headers, build_d3: Build
-) -> None:
+def test_a_whole_test_reads_fast_enough_to_be_vectorised(tmp_path: Path, d3: D3) -> None:
     """90,000 rows through Python loops would take many times this limit."""
-    import time  # noqa: PLC0415  # only here
-
-    lines = build_d3(d3_headers["2013"], start_s=0.0, end_s=9000.0)
+    lines = d3.text(d3.headers["2013"], start_s=0.0, end_s=9000.0)
     path = write(tmp_path, lines)
     begin = time.perf_counter()
     assert len(read_log(path)) == 90_000

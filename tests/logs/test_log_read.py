@@ -10,7 +10,7 @@ import pytest
 
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
+from cangauge.logs.read import CaptureGivenError, read_log
 
 NAMES = (
     "log.parquet",
@@ -45,27 +45,28 @@ def test_whole_files_read_gzipped_too(
     assert again.remarks == log.remarks
 
 
+def outcome(path: Path, data: bytes) -> Log | InputError:
+    """The log, or the error that says why there is none; anything else breaks the test."""
+    path.write_bytes(data)
+    try:
+        return read_log(path)
+    except InputError as error:
+        return error
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_cut_off_at_every_byte_it_reads_or_is_refused(
     tmp_path: Path, every_format: dict[str, bytes], name: str
 ) -> None:
     path = tmp_path / name
     data = every_format[name]
-    outcomes = {"read": 0, "refused": 0}
-    for length in range(len(data)):
-        path.write_bytes(data[:length])
-        try:
-            log = read_log(path)
-        except InputError as error:
-            outcomes["refused"] += 1
-            assert str(path) in str(error)
-        else:
-            outcomes["read"] += 1
-            assert isinstance(log, Log)
-            assert np.isfinite(log.voltage_v).all()
-    assert outcomes["refused"] > 0
-    if name.endswith((".parquet", ".gz", ".zip")):
-        assert outcomes["read"] == 0
+    found = [outcome(path, data[:length]) for length in range(len(data))]
+    read = [log for log in found if isinstance(log, Log)]
+    refused = [error for error in found if isinstance(error, InputError)]
+    assert all(np.isfinite(log.voltage_v).all() for log in read)
+    assert all(str(path) in str(error) for error in refused)
+    assert refused
+    assert (not read) == name.endswith((".parquet", ".gz", ".zip"))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -78,11 +79,8 @@ def test_damaged_bytes_never_break_out(
         data = bytearray(every_format[name])
         for place in rng.integers(len(data), size=rng.integers(1, 4)):
             data[place] = rng.integers(256)
-        path.write_bytes(data)
-        try:
-            assert len(read_log(path)) > 0
-        except InputError as error:
-            assert str(path) in str(error)
+        found = outcome(path, bytes(data))
+        assert len(found) > 0 if isinstance(found, Log) else str(path) in str(found)
 
 
 @pytest.mark.parametrize(
@@ -119,5 +117,14 @@ def test_an_encrypted_zip_is_refused(tmp_path: Path, every_format: dict[str, byt
     for signature, offset in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
         data[data.index(signature) + offset] |= 1  # the flag that says so
     (tmp_path / "x.zip").write_bytes(data)
-    with pytest.raises(InputError, match="zip cannot be unpacked: .*encrypted"):
+    with pytest.raises(InputError, match=r"zip cannot be unpacked: .*encrypted"):
         read_log(tmp_path / "x.zip")
+
+
+@pytest.mark.real
+def test_a_capture_asks_for_a_vehicle(shared_data: Path) -> None:
+    paths = sorted((shared_data / "leaf_can").glob("*.gz"))
+    assert len(paths) == 9
+    for path in paths:
+        with pytest.raises(CaptureGivenError, match="this is a CAN capture, not a log; give --veh"):
+            read_log(path)

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cangauge.errors import InputError
-from cangauge.logs.content import Content
 from cangauge.logs.assemble import Draft
+from cangauge.logs.content import Content
 from cangauge.logs.units import convert
 
 
@@ -84,6 +84,17 @@ def test_a_fast_log_in_milliseconds_is_known_by_its_charge() -> None:
     del values["soc_pct"]
     with pytest.raises(InputError, match="time looks like milliseconds"):
         checked(values)
+
+
+def test_weeks_of_a_parked_cars_drain_pass() -> None:
+    rows = 40_000  # four weeks, a row every minute
+    values = {
+        "time_s": np.arange(rows) * 60.0,
+        "current_a": np.full(rows, 0.03) + 0.001 * (np.arange(rows) % 2),
+        "voltage_v": np.linspace(12.9, 12.5, rows),
+        "temperature_c": np.full(rows, 5.0),
+    }
+    assert checked(values) == ()
 
 
 def test_a_cell_in_millivolts_and_a_pack_code_for_not_available() -> None:

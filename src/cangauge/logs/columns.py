@@ -1,0 +1,219 @@
+"""Columns of numbers out of delimited text, by pyarrow, with errors that name row and value."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv as pacsv
+
+from cangauge.errors import InputError
+from cangauge.logs.content import Content, cells
+from cangauge.logs.log import FloatArray
+
+_MISSING: Final = pa.array(
+    ["", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "1.#qnan", "-1.#ind"]
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Columns:
+    """Some columns of a delimited text.
+
+    Parameters
+    ----------
+    text : dict of str to pyarrow.ChunkedArray
+        The cells as text, by the name that was asked for.
+    label : dict of str to str
+        The column's heading in the file.
+    path : Path
+        The file.
+    decimal_comma : bool
+        Whether `391,4` means 391.4.
+    remarks : tuple of str
+        Lines that were left out.
+    """
+
+    text: dict[str, Any]
+    label: dict[str, str]
+    path: object
+    decimal_comma: bool
+    remarks: tuple[str, ...]
+
+    def numbers(self, name: str) -> FloatArray:
+        """Return a column as float64 of shape (rows,), NaN where the cell is empty.
+
+        Raises
+        ------
+        InputError
+            If a cell holds something else than a number.
+        """
+        trimmed = pc.utf8_trim_whitespace(self.text[name])
+        if self.decimal_comma:
+            trimmed = pc.replace_substring(trimmed, ",", ".")
+        missing = pc.is_in(pc.utf8_lower(trimmed), value_set=_MISSING)
+        trimmed = pc.if_else(missing, pa.scalar(None, pa.string()), trimmed)
+        try:
+            return np.asarray(pc.cast(trimmed, pa.float64()).to_numpy(), dtype=np.float64)
+        except pa.ArrowInvalid as error:
+            row, value = _first_bad(trimmed)
+            raise InputError(
+                f"row {row} is not a number",
+                source=str(self.path),
+                field=self.label[name],
+                value=value,
+                cure="correct the cell, or leave it empty where the value is unknown",
+            ) from error
+
+
+def read_columns(
+    content: Content,
+    wanted: Mapping[str, int],
+    *,
+    header: list[str],
+    delimiter: str,
+    skip_lines: int,
+) -> Columns:
+    """Read some columns of the lines after the first `skip_lines`.
+
+    Lines that do not have as many cells as the first one are an error, except at the end: a last
+    line that was cut off and closing remarks of the exporter are left out, with a remark.
+
+    Parameters
+    ----------
+    content : Content
+        The unpacked file.
+    wanted : mapping of str to int
+        Index of the column [0-based] by the name to give it.
+    header : list of str
+        Headings, for messages and to see whether the first line of data is complete.
+    delimiter : str
+        One character.
+    skip_lines : int
+        Lines before the data: preamble and header.
+
+    Raises
+    ------
+    InputError
+        If there is no row, or a row in the middle has the wrong number of cells.
+    """
+    width = _width(content, header, delimiter, skip_lines)
+    odd: list[Any] = []
+
+    def keep_aside(row: Any) -> str:
+        odd.append(row)
+        return "skip"
+
+    names = [f"c{index}" for index in range(width)]
+    include = [names[index] for index in wanted.values()]
+    try:
+        table = pacsv.read_csv(
+            pa.BufferReader(content.data),
+            # One thread: only then are odd rows numbered.
+            read_options=pacsv.ReadOptions(
+                use_threads=False, column_names=names, skip_rows=skip_lines
+            ),
+            parse_options=pacsv.ParseOptions(delimiter=delimiter, invalid_row_handler=keep_aside),
+            convert_options=pacsv.ConvertOptions(
+                include_columns=include,
+                column_types=dict.fromkeys(include, pa.string()),
+                strings_can_be_null=False,
+            ),
+        )
+    except (pa.ArrowException, OSError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"the table cannot be read: {reason}", source=content.path) from error
+    if not table.num_rows:
+        raise InputError(
+            "there are no rows below the header", source=content.path, cure="check the export"
+        )
+    text = {name: table.column(f"c{index}") for name, index in wanted.items()}
+    return Columns(
+        text=text,
+        label={
+            name: header[index] if index < len(header) else f"column {index + 1}"
+            for name, index in wanted.items()
+        },
+        path=content.path,
+        decimal_comma=delimiter != "," and _has_decimal_comma(text),
+        remarks=(
+            *_judge_odd_rows(odd, table.num_rows, skip_lines, content),
+            *_unended(content),
+        ),
+    )
+
+
+def _width(content: Content, header: list[str], delimiter: str, skip_lines: int) -> int:
+    """Return the number of cells of the first data row: headers can be shorter than rows."""
+    first = next((line for line in content.head[skip_lines:] if line.strip()), None)
+    if first is None:
+        raise InputError(
+            "there are no rows below the header", source=content.path, cure="check the export"
+        )
+    width = len(cells(first, delimiter))
+    named = max((i + 1 for i, name in enumerate(header) if name), default=0)
+    if width < named:
+        raise InputError(
+            f"row 1 has {width} cells where the header has {named}",
+            source=content.path,
+            cure="the file looks cut off or has another delimiter: export it again",
+        )
+    return width
+
+
+def _judge_odd_rows(
+    odd: list[Any], rows: int, skip_lines: int, content: Content
+) -> tuple[str, ...]:
+    if not odd:
+        return ()
+    # Rows are numbered from 1, those skipped above included; only the last ones may be odd.
+    last = skip_lines + rows + len(odd)
+    tail = {last - back for back in range(len(odd))}
+    remarks = []
+    cut_off = 0
+    for row in odd:
+        closing = row.actual_columns == 1 and not _is_number(row.text)
+        is_last = row.number == last
+        if row.number in tail and closing:
+            remarks.append(f"closing line left out: {row.text.strip()[:60]!r}")
+        elif is_last and row.actual_columns < row.expected_columns:
+            cut_off += 1
+            remarks.append("the last line is cut off and was left out: the file may be incomplete")
+        else:
+            raise InputError(
+                f"row {row.number - skip_lines} has {row.actual_columns} cells where the others"
+                f" have {row.expected_columns}",
+                source=content.path,
+                cure="export the file again",
+            )
+    return tuple(remarks)
+
+
+def _unended(content: Content) -> tuple[str, ...]:
+    """Say that the last value may be cut: half a number is a number too."""
+    if content.data.endswith((b"\n", b"\r")):
+        return ()
+    return ("the last line has no line end: if the file was cut off, its last value may be short",)
+
+
+def _has_decimal_comma(text: Mapping[str, Any]) -> bool:
+    return any(pc.any(pc.match_substring(column, ",")).as_py() for column in text.values())
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _first_bad(column: Any) -> tuple[int, str]:
+    for row, value in enumerate(column.to_pylist(), start=1):
+        if value is not None and not _is_number(value):
+            return row, value
+    return 1, str(column[0])

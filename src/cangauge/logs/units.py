@@ -1,0 +1,248 @@
+"""Units: those that headers state are converted, those that values betray are refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from cangauge.errors import InputError
+from cangauge.logs.log import FloatArray
+
+# Spelling (lower case, without blanks) -> (factor, offset) to the unit of the canonical log.
+_UNITS: Final[dict[str, dict[str, tuple[float, float]]]] = {
+    "time_s": {
+        **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), (1.0, 0.0)),
+        **dict.fromkeys(("ms", "msec"), (1e-3, 0.0)),
+        **dict.fromkeys(("min", "minutes"), (60.0, 0.0)),
+        **dict.fromkeys(("h", "hr", "hours"), (3600.0, 0.0)),
+    },
+    "current_a": {
+        **dict.fromkeys(("a", "amp", "amps"), (1.0, 0.0)),
+        "ma": (1e-3, 0.0),
+    },
+    "voltage_v": {
+        **dict.fromkeys(("v", "volt", "volts"), (1.0, 0.0)),
+        "mv": (1e-3, 0.0),
+    },
+    "temperature_c": {
+        **dict.fromkeys(("c", "°c", "degc", "deg c", "celsius", "\ufffdc"), (1.0, 0.0)),
+        **dict.fromkeys(("k", "kelvin"), (1.0, -273.15)),
+        **dict.fromkeys(("f", "°f", "degf", "fahrenheit"), (5.0 / 9.0, -160.0 / 9.0)),
+    },
+    "soc_pct": {
+        **dict.fromkeys(("%", "per", "pct", "percent"), (1.0, 0.0)),
+        **dict.fromkeys(("1", "-"), (100.0, 0.0)),
+    },
+}
+
+# What a battery's log can hold: a cell of 2 V to a truck's pack of 1000 V.
+MAX_VOLTAGE_V: Final = 1500.0
+MAX_CURRENT_A: Final = 2000.0
+MAX_INTERVAL_S: Final = 90.0
+MAX_RATE_HZ: Final = 2000.0
+COLDEST_C: Final = -60.0
+HOTTEST_C: Final = 120.0
+UNUSUALLY_HOT_C: Final = 62.0
+MAX_HOURS_AT_PEAK: Final = 100.0
+"""A charge larger than this many hours of the largest current is no battery's."""
+
+_EPOCH_MS: Final = 1e11
+
+_Refuse = Callable[[str, str, float, str], InputError]
+
+
+def convert(
+    values: FloatArray, field: str, unit: str, *, source: object, label: str
+) -> tuple[FloatArray, str | None]:
+    """Convert values from the unit that the header states to the canonical one.
+
+    Parameters
+    ----------
+    values : array of shape (n,)
+    field : {"time_s", "current_a", "voltage_v", "temperature_c", "soc_pct"}
+    unit : str
+        As in the header; "" is taken for the canonical unit.
+    source, label : object, str
+        File and heading, for messages.
+
+    Returns
+    -------
+    array of shape (n,)
+    str or None
+        A remark when something had to be converted.
+
+    Raises
+    ------
+    InputError
+        If the unit is not known for this quantity.
+    """
+    spelling = unit.strip().lower()
+    if not spelling:
+        return values, None
+    try:
+        factor, offset = _UNITS[field][spelling]
+    except KeyError:
+        known = ", ".join(_UNITS[field])
+        raise InputError(
+            f"the unit is not known for {field}",
+            source=str(source),
+            field=label,
+            value=unit,
+            cure=f"convert it to one of: {known}",
+        ) from None
+    if (factor, offset) == (1.0, 0.0):
+        return values, None
+    return values * factor + offset, f"{label}: converted from {unit} to {field}"
+
+
+def refuse_wrong_units(
+    values: dict[str, FloatArray], *, source: object, labels: dict[str, str]
+) -> tuple[str, ...]:
+    """Raise InputError if the values cannot be in the canonical units.
+
+    Judged on medians, so that a few odd rows do not decide, then on single impossible values.
+
+    Parameters
+    ----------
+    values : dict of str to array of shape (n,)
+        `time_s`, `current_a`, `voltage_v`, `temperature_c` (finite) and maybe `soc_pct`.
+    source, labels : object, dict of str to str
+        File, and heading by field, for messages.
+
+    Returns
+    -------
+    tuple of str
+        Remarks on values that are possible but unusual.
+    """
+
+    def refuse(field: str, problem: str, value: float, cure: str) -> InputError:
+        return InputError(
+            problem, source=str(source), field=labels.get(field, field), value=value, cure=cure
+        )
+
+    _check_time(values, refuse)
+    _check_voltage(values["voltage_v"], refuse)
+    _check_current(values["current_a"], refuse)
+    if "soc_pct" in values:
+        _check_soc(values["soc_pct"], refuse)
+    return _check_temperature(values["temperature_c"], refuse)
+
+
+def _check_time(values: dict[str, FloatArray], refuse: _Refuse) -> None:
+    time = values["time_s"]
+    if time.size < 2:
+        return
+    interval = float(np.median(np.diff(time)))
+    if time[0] > _EPOCH_MS:
+        raise refuse(
+            "time_s", "time looks like milliseconds since 1970", float(time[0]), "divide it by 1000"
+        )
+    if interval > MAX_INTERVAL_S:
+        raise refuse(
+            "time_s",
+            f"rows are {interval:g} apart: time looks like milliseconds",
+            interval,
+            "divide it by 1000 (a log with a row every 90 s or more cannot be used)",
+        )
+    if 0.0 < interval < 1.0 / MAX_RATE_HZ:
+        raise refuse(
+            "time_s",
+            f"rows are {interval:g} apart: time looks like hours or days",
+            interval,
+            "give it in seconds",
+        )
+    whole = bool(np.all(time == np.rint(time)))
+    peak = float(np.max(np.abs(values["current_a"])))
+    # A steady drain can last for weeks; a drive that varies so much cannot.
+    varied = float(np.mean(np.abs(values["current_a"]))) < 0.5 * peak
+    if whole and varied and interval >= 5.0:
+        charge = np.cumsum(values["current_a"][:-1] * np.diff(time))
+        hours = float(np.ptp(charge)) / 3600.0 / peak
+        if hours > MAX_HOURS_AT_PEAK:
+            raise refuse(
+                "time_s",
+                f"the charge moved is {hours:.0f} h of the largest current:"
+                " time looks like milliseconds",
+                interval,
+                "divide it by 1000",
+            )
+
+
+def _check_voltage(voltage: FloatArray, refuse: _Refuse) -> None:
+    middle = float(np.median(voltage))
+    if middle > MAX_VOLTAGE_V:
+        raise refuse("voltage_v", "voltage looks like millivolts", middle, "divide it by 1000")
+    if middle <= 0.0:
+        raise refuse(
+            "voltage_v", "the median voltage is not positive", middle, "check column and polarity"
+        )
+    if middle < 1.0:
+        raise refuse("voltage_v", "voltage looks like kilovolts", middle, "give it in volts")
+    row = int(np.argmax(voltage))
+    if voltage[row] > MAX_VOLTAGE_V:
+        raise refuse(
+            "voltage_v",
+            f"row {row + 1} is not a battery's voltage",
+            float(voltage[row]),
+            "remove the row: codes such as 65535 mean 'not available'",
+        )
+
+
+def _check_current(current: FloatArray, refuse: _Refuse) -> None:
+    row = int(np.argmax(np.abs(current)))
+    if abs(current[row]) > MAX_CURRENT_A:
+        share = float(np.mean(np.abs(current) > MAX_CURRENT_A))
+        if share < 0.001 and current.size > 1000:
+            raise refuse(
+                "current_a",
+                f"row {row + 1} is not a battery's current",
+                float(current[row]),
+                "remove the row: codes such as 65535 mean 'not available'",
+            )
+        raise refuse(
+            "current_a",
+            f"current exceeds {MAX_CURRENT_A:g} A in row {row + 1}: it looks like milliamperes",
+            float(current[row]),
+            "divide it by 1000",
+        )
+
+
+def _check_temperature(temperature: FloatArray, refuse: _Refuse) -> tuple[str, ...]:
+    middle = float(np.median(temperature))
+    if 200.0 <= middle <= 400.0:
+        raise refuse("temperature_c", "temperature looks like kelvin", middle, "subtract 273.15")
+    if not COLDEST_C <= middle <= HOTTEST_C:
+        raise refuse(
+            "temperature_c", "this is no battery's temperature in °C", middle, "give it in °C"
+        )
+    odd = np.flatnonzero((temperature < COLDEST_C) | (temperature > HOTTEST_C))
+    if odd.size:
+        raise refuse(
+            "temperature_c",
+            f"row {odd[0] + 1} is no battery's temperature in °C",
+            float(temperature[odd[0]]),
+            "remove the row: codes such as 255 mean 'not available'",
+        )
+    if middle > UNUSUALLY_HOT_C:
+        return (f"temperature {middle:.0f} °C is unusually hot: if it is °F, convert it",)
+    return ()
+
+
+def _check_soc(soc: FloatArray, refuse: _Refuse) -> None:
+    finite = soc[np.isfinite(soc)]
+    if not finite.size:
+        return
+    low, high = float(finite.min()), float(finite.max())
+    if 0.0 < high <= 1.0 and low >= 0.0:
+        raise refuse(
+            "soc_pct",
+            "SoC looks like a fraction of 1",
+            high,
+            "multiply it by 100 (or leave it out if it truly stays below 1 %)",
+        )
+    if high > 110.0 or low < -10.0:
+        value = high if high > 110.0 else low
+        row = int(np.flatnonzero(soc == value)[0]) + 1
+        raise refuse("soc_pct", f"SoC of row {row} is not within 0–100 %", value, "give it in %")

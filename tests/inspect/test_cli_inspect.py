@@ -1,0 +1,112 @@
+"""`cangauge inspect`: one JSON object, or a table and sentences; clear refusals."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from rich.console import Console
+from typer.testing import CliRunner
+
+from cangauge.cli.inspect import _show, inspect_command
+from cangauge.errors import InputError
+from cangauge.logs.canonical import write_log
+from cangauge.logs.log import Log
+
+app = typer.Typer()
+app.command()(inspect_command)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    rng = np.random.default_rng(2)
+    time = np.arange(6000) / 10
+    current = np.repeat(rng.normal(10.0, 40.0, 150), 40)
+    voltage = 380.0 - 0.1 * current
+    log = Log(time, current, voltage, np.full(6000, 20.0), temperature_source="pack")
+    write_log(log, tmp_path / "drive [1].parquet")
+    return tmp_path / "drive [1].parquet"
+
+
+def test_json_is_one_object_on_stdout(path: Path) -> None:
+    result = CliRunner().invoke(app, [str(path), "--json"])
+    assert result.exit_code == 0
+    found = json.loads(result.stdout)
+    assert found["kind"] == "log"
+    assert found["rows"] == 6000
+    assert found["sign_of_current"]["sign"] == 1
+    assert found["timing"]["rate_hz"] == pytest.approx(10.0)
+    assert found["resistance"]["median_ohm"] == pytest.approx(0.1, rel=1e-3)
+
+
+def test_the_table_says_what_the_json_says(path: Path) -> None:
+    result = CliRunner().invoke(app, [str(path)])
+    assert result.exit_code == 0
+    for words in (
+        "drive [1]: 6000 rows, 10.0 min, 10 Hz (regular), temperature of: pack",
+        "Sign: positive current discharges",
+        "voltage moved against current in",
+        "ohmic resistance",
+        "rest voltage",
+    ):
+        assert words in result.stdout
+
+
+def test_a_temperature_is_taken_where_the_file_has_none(tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    path.write_text("time_s,current_a,voltage_v\n0,1,380\n1,2,379\n")
+    result = CliRunner().invoke(app, [str(path)])
+    assert isinstance(result.exception, InputError)
+    assert "--temperature" in str(result.exception)
+    result = CliRunner().invoke(app, [str(path), "--temperature", "24", "--json"])
+    assert json.loads(result.stdout)["channels"]["temperature_c"]["median"] == 24.0
+
+
+@pytest.mark.parametrize("option", ["--vehicle", "--dbc", "--map"])
+def test_a_log_needs_no_vehicle(path: Path, option: str) -> None:
+    result = CliRunner().invoke(app, [str(path), option, "x", "--json"])
+    assert isinstance(result.exception, InputError)
+    assert result.exception.field == option
+    assert result.stdout == ""
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("options", [[], ["--vehicle", "leaf_ze0"]])
+def test_a_capture_is_inspected_with_and_without_a_vehicle(
+    shared_data: Path, options: list[str]
+) -> None:
+    pytest.importorskip("cangauge.bus.capture_inspect")
+    capture = str(shared_data / "leaf_can" / "ZE0_Shift_P_D_ECO_N.log.gz")
+    result = CliRunner().invoke(app, [capture, *options, "--json"])
+    assert result.exit_code == 0, result.exception
+    assert isinstance(json.loads(result.stdout), dict)
+    table = CliRunner().invoke(app, [capture, *options])
+    assert table.exit_code == 0
+    assert len(table.stdout.splitlines()) > 5
+
+
+def test_a_nested_result_is_shown_whole() -> None:
+    found = {
+        "frames": 12,
+        "sign": None,
+        "signals": {"current_a": {"minimum": -1.25}},
+        "ids": [{"id": "0x1DB", "crc_errors": 0}, {"id": "0x55B", "lost": 3}],
+        "remarks": ["one [remark]"],
+    }
+    buffer = io.StringIO()
+    _show(Console(file=buffer, width=100), found)
+    for words in (
+        "frames",
+        "12",
+        "–",
+        "signals current a",
+        "-1.25",
+        "0x55B",
+        "lost",
+        "one [remark]",
+    ):
+        assert words in buffer.getvalue()

@@ -1,0 +1,169 @@
+"""The sign of current is found where the data hold it, and left open where they do not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cangauge.errors import InputError
+from cangauge.inspect.sign import (
+    correlation,
+    current_steps,
+    require_discharge_positive,
+    sign_of_current,
+)
+from cangauge.logs.log import Log
+from cangauge.logs.read import read_log
+
+
+def drive(
+    seed: int = 0, *, minutes: float = 10.0, resistance_ohm: float = 0.1, noise_v: float = 0.2
+) -> Log:
+    """A pack with an ohmic drop, a falling rest voltage and current that steps every 5 s."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(round(minutes * 60)) * 1.0
+    current = np.repeat(rng.normal(15.0, 40.0, time.size // 5 + 1), 5)[: time.size]
+    taken_ah = np.cumsum(current) / 3600.0
+    voltage = 380.0 - 0.5 * taken_ah - resistance_ohm * current + rng.normal(0, noise_v, time.size)
+    return Log(time, current, voltage, np.full(time.size, 20.0))
+
+
+def turned(log: Log) -> Log:
+    return replace(log, current_a=-log.current_a)
+
+
+@settings(max_examples=40)
+@given(seed=st.integers(0, 10_000), resistance_ohm=st.floats(0.05, 0.2))
+def test_both_conventions_are_told_apart(seed: int, resistance_ohm: float) -> None:
+    log = drive(seed, resistance_ohm=resistance_ohm)
+    finding = sign_of_current(log)
+    assert finding.sign == 1
+    assert finding.confidence > 0.99
+    assert sign_of_current(turned(log)).sign == -1
+    assert sign_of_current(turned(log)).confidence == finding.confidence
+
+
+@settings(max_examples=40)
+@given(seed=st.integers(0, 10_000))
+def test_voltage_that_has_nothing_to_do_with_current_leaves_it_open(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    log = drive(seed)
+    noise = replace(log, voltage_v=380.0 + rng.normal(0.0, 1.0, len(log)))
+    assert sign_of_current(noise).sign == 0
+
+
+@pytest.mark.parametrize(
+    "log",
+    [
+        Log([0.0], [1.0], [380.0], [20.0]),
+        Log([0.0, 1.0], [1.0, 2.0], [380.0, 379.0], [20.0, 20.0]),
+        Log(np.arange(500.0), np.zeros(500), np.full(500, 380.0), np.full(500, 20.0)),
+        Log(np.arange(500.0), np.full(500, 5.0), np.full(500, 380.0), np.full(500, 20.0)),
+        Log(np.arange(500.0), np.zeros(500), 380 + np.arange(500) % 7, np.full(500, 20.0)),
+    ],
+    ids=["one row", "two rows", "nothing moves", "constant current", "current dead"],
+)
+def test_logs_without_excitation_leave_it_open(log: Log) -> None:
+    finding = sign_of_current(log)
+    assert finding.sign == 0
+    assert 0.5 <= finding.confidence < 0.99
+
+
+def test_a_steady_discharge_is_known_by_its_charge() -> None:
+    time = np.arange(0.0, 3600.0)
+    log = Log(time, np.full(time.size, 30.0), 4.1 - time / 4000.0, np.full(time.size, 20.0))
+    finding = sign_of_current(log)
+    assert finding.sign == 1
+    assert finding.evidence[0].text == "no clear step of current"
+    assert "rank correlation -1.00" in finding.sentence
+    assert sign_of_current(turned(log)).sign == -1
+
+
+def test_a_reference_soc_alone_is_enough_and_may_have_holes() -> None:
+    time = np.arange(0.0, 3600.0)
+    current = 20.0 + 5.0 * np.sin(time / 300.0)
+    soc = 80.0 - np.cumsum(current) / 3600.0 / 60.0 * 100.0
+    soc[100:900] = np.nan
+    flat = np.full(time.size, 3.3)
+    log = Log(time, current, flat, np.full(time.size, 20.0), soc_pct=soc)
+    assert sign_of_current(log).sign == 1
+    assert sign_of_current(turned(log)).sign == -1
+
+
+def test_contradicting_evidence_leaves_it_open() -> None:
+    log = drive(minutes=60.0)
+    rising = 50.0 + np.cumsum(log.current_a) / 3600.0
+    assert sign_of_current(replace(log, soc_pct=rising)).sign == 0
+
+
+def test_commands_can_refuse_a_turned_log() -> None:
+    log = replace(drive(), name="drive")
+    require_discharge_positive(log)
+    with pytest.raises(
+        InputError,
+        match=r"drive: current_a: the sign of current is turned: volt.*"
+        r"in 0 of \d+ steps.*multiply the column by -1",
+    ):
+        require_discharge_positive(turned(log))
+
+
+def test_steps_are_the_changes_over_a_second() -> None:
+    time = np.arange(0.0, 60.0, 0.1)
+    current = np.where(time >= 30.0, 50.0, 0.0)
+    steps = current_steps(Log(time, current, 380.0 - 0.1 * current, np.full(time.size, 20.0)))
+    assert steps.row.tolist() == [300]
+    np.testing.assert_allclose(steps.current_a, [50.0])
+    np.testing.assert_allclose(steps.voltage_v, [-5.0])
+
+
+def test_correlation_agrees_with_numpy_and_survives_constants() -> None:
+    rng = np.random.default_rng(3)
+    a, b = rng.normal(size=50), rng.normal(size=50)
+    assert correlation(a, b) == pytest.approx(np.corrcoef(a, b)[0, 1])
+    assert correlation(a, np.ones(50)) == 0.0
+    assert correlation(np.full(50, 1e-310), b) == 0.0
+
+
+# ---- the recorded logs ---------------------------------------------------------------------
+
+UNDECIDED = {
+    # Slow scripts near empty: voltage relaxes more than it drops, charge hardly moves.
+    "A123_DYN_50_P25_s2.csv.gz",
+    "A123_OCV_P05_S2.csv.gz",
+    "A123_OCV_P25_S2.csv.gz",
+    "A123_OCV_P45_S2.csv.gz",
+}
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("folder", ["bmw_i3", "lg_hg2", "a123_lfp", "leaf_*_ornl"])
+def test_the_sign_of_every_recorded_log(shared_data: Path, folder: str) -> None:
+    paths = [*shared_data.glob(f"{folder}/*.csv.gz"), *shared_data.glob(f"{folder}/*.parquet")]
+    assert paths
+    for path in paths:
+        log = read_log(path, temperature_c=20.0)
+        expected = 0 if path.name in UNDECIDED else 1
+        assert sign_of_current(log).sign == expected, path.name
+        assert sign_of_current(turned(log)).sign == -expected, path.name
+
+
+@pytest.mark.real
+def test_no_wrong_sign_in_pieces_of_the_recorded_logs(shared_data: Path) -> None:
+    """Pieces of 20 s to 30 min: often open, never wrong."""
+    rng = np.random.default_rng(11)
+    paths = sorted(shared_data.glob("*/*.parquet")) + sorted(shared_data.glob("bmw_i3/*.gz"))
+    found = {1: 0, 0: 0, -1: 0}
+    for path in paths:
+        log = read_log(path)
+        for length_s in (20.0, 60.0, 300.0, 1800.0):
+            for start in log.time_s[0] + rng.random(4) * max(log.duration_s - length_s, 0.0):
+                rows = (log.time_s >= start) & (log.time_s <= start + length_s)
+                if rows.any():
+                    found[sign_of_current(log.rows(rows)).sign] += 1
+    assert found[-1] == 0
+    assert found[1] > 0.4 * sum(found.values())
