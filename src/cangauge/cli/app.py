@@ -10,6 +10,9 @@ import sys
 import typer
 
 from cangauge import __version__
+from cangauge.cli.estimate import estimate_command
+from cangauge.cli.fit import fit_command
+from cangauge.cli.inspect import inspect_command
 from cangauge.cli.output import note
 from cangauge.errors import CangaugeError
 
@@ -37,6 +40,11 @@ def _root(
     ),
 ) -> None:
     del version
+
+
+app.command("fit")(fit_command)
+app.command("estimate")(estimate_command)
+app.command("inspect")(inspect_command)
 
 
 def main() -> None:

@@ -1,0 +1,202 @@
+"""A mapping of signals, bound to the DBC files that define them, once."""
+
+from __future__ import annotations
+
+import math
+from os import PathLike
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from cantools.database.can import Database, Message, Signal
+
+from cangauge.bus.bound import EXTENDED, BoundSignal, MessageRule, Role, Vehicle
+from cangauge.bus.database import find_message, find_signal, load_dbc
+from cangauge.bus.mapping import SignalMap, VehicleMap
+from cangauge.bus.protection import RULES, ProtectionRule
+from cangauge.bus.signal_codec import SignalCodec, signal_codec
+from cangauge.errors import InputError
+from cangauge.logs.units import convert
+
+_LOG_FIELD: Final = {
+    "current": "current_a",
+    "voltage": "voltage_v",
+    "temperature": "temperature_c",
+    "soc_reference": "soc_pct",
+}
+_TIMEOUT_S: Final = {"current": 2.0, "voltage": 2.0, "temperature": 10.0, "soc_reference": 10.0}
+
+
+def bind_vehicle(
+    mapping: VehicleMap,
+    dbc_files: list[Path],
+    *,
+    source: str | PathLike[str],
+    temperature_c: float | None = None,
+    pair_within_s: float | None = None,
+) -> Vehicle:
+    """Find the mapping's signals in the DBC files.
+
+    Parameters
+    ----------
+    mapping : VehicleMap
+    dbc_files : list of Path
+        A signal is taken from the first file that has it.
+    source : path-like
+        Where the mapping comes from, for messages.
+    temperature_c, pair_within_s : float, optional
+        Instead of the mapping's.
+
+    Raises
+    ------
+    InputError
+        As `load_vehicle`.
+    """
+    databases = [load_dbc(path) for path in dbc_files]
+    binder = _Binder(mapping, databases, dbc_files, str(source))
+    temperature = mapping.temperature
+    fixed = temperature_c if temperature_c is not None else None
+    if fixed is None and temperature is not None:
+        fixed = temperature.fixed_c
+    current = binder.signal("current", mapping.current)
+    voltage = binder.signal("voltage", mapping.voltage)
+    bound = None if fixed is not None or temperature is None else temperature
+    within = mapping.pair_within_s if pair_within_s is None else pair_within_s
+    if not 0.0 <= within <= 1.0:
+        raise InputError("must be within 0–1 s", field="pair_within_s", value=within)
+    return Vehicle(
+        name=mapping.name,
+        current=current,
+        voltage=voltage,
+        temperature=None if bound is None else binder.signal("temperature", bound),
+        soc_reference=None
+        if mapping.soc_reference is None
+        else binder.signal("soc_reference", mapping.soc_reference),
+        fixed_temperature_c=math.nan if fixed is None else float(fixed),
+        temperature_source=mapping.temperature_source if temperature_c is None else "unknown",
+        pair_within_s=within,
+        messages=binder.messages(),
+        dbc_files=tuple(str(path) for path in dbc_files),
+    )
+
+
+class _Binder:
+    """Finds the signals of one mapping and remembers the messages that they are in."""
+
+    def __init__(
+        self, mapping: VehicleMap, databases: list[Database], files: list[Path], source: str
+    ) -> None:
+        self._mapping = mapping
+        self._databases = databases
+        self._files = files
+        self._source = source
+        self._found: dict[int, Message] = {}
+
+    def signal(self, role: Role, wanted: SignalMap) -> BoundSignal:
+        message, signal, file = self._find(role, wanted)
+        codec = signal_codec(
+            message,
+            signal,
+            source=file,
+            field=role,
+            not_available=wanted.not_available,
+            when=wanted.when,
+        )
+        key = message.frame_id | (EXTENDED if message.is_extended_frame else 0)
+        self._found[key] = message
+        factor, offset = self._unit(role, wanted, codec)
+        return BoundSignal(
+            role=role,
+            key=key,
+            message=message.name,
+            length=message.length,
+            codec=codec,
+            gain=wanted.sign * wanted.scale * factor,
+            # A stated offset is in the canonical unit; the sign does not turn it.
+            offset=wanted.offset + wanted.sign * offset,
+            timeout_s=wanted.timeout_s or _TIMEOUT_S[role],
+        )
+
+    def messages(self) -> dict[int, MessageRule]:
+        """Return protection and period of the messages found so far."""
+        stated = {}
+        for name, message_map in self._mapping.messages.items():
+            message = self._message(name)
+            key = message.frame_id | (EXTENDED if message.is_extended_frame else 0)
+            stated[key] = message_map
+        rules: dict[int, MessageRule] = {}
+        for key, message in self._found.items():
+            each = stated.get(key)
+            period = None if each is None else each.period_s
+            if period is None and message.cycle_time:
+                period = message.cycle_time / 1000.0
+            rule = None if each is None else self._rule(message, each.protection)
+            rules[key] = MessageRule(rule, period)
+        return rules
+
+    def _find(self, role: Role, wanted: SignalMap) -> tuple[Message, Signal, Path]:
+        first: InputError | None = None
+        for database, file in zip(self._databases, self._files, strict=True):
+            try:
+                message, signal = find_signal(
+                    database, wanted.message, wanted.signal, source=file, field=role
+                )
+            except InputError as error:
+                first = first or error
+            else:
+                return message, signal, file
+        raise first or InputError("no DBC is given", field=role)
+
+    def _message(self, name: str) -> Message:
+        """Return the message that a key of [messages] means."""
+        first: InputError | None = None
+        for database, file in zip(self._databases, self._files, strict=True):
+            try:
+                return find_message(database, name, source=file, field=f"messages.{name}")
+            except InputError as error:
+                first = first or error
+        raise first or InputError("no DBC is given", field=f"messages.{name}")
+
+    def _unit(self, role: Role, wanted: SignalMap, codec: SignalCodec) -> tuple[float, float]:
+        """Return factor and offset from the DBC's unit to the canonical one."""
+        if wanted.states_unit:
+            return 1.0, 0.0
+        ends = np.array([0.0, 1.0])
+        try:
+            ends, _ = convert(
+                ends, _LOG_FIELD[role], codec.unit, source=self._source, label=codec.name
+            )
+        except InputError as error:
+            raise InputError(
+                f"the DBC's unit of {codec.name} is not known for {_LOG_FIELD[role]}",
+                source=self._source,
+                field=f"{role}.signal",
+                value=codec.unit,
+                cure="name another signal, or state scale and offset in the map file"
+                " (scale = 1 takes it as it is)",
+            ) from error
+        return float(ends[1] - ends[0]), float(ends[0])
+
+    def _rule(self, message: Message, name: str | None) -> ProtectionRule | None:
+        if name is None:
+            return None
+        field = f"messages.{message.name}.protection"
+        own = self._mapping.rules.get(name)
+        rule = own.rule(name) if own is not None else RULES.get(name)
+        if rule is None:
+            known = ", ".join([*RULES, *self._mapping.rules])
+            raise InputError(
+                "unknown protection rule",
+                source=self._source,
+                field=field,
+                value=name,
+                cure=f"known are {known}; or define it under [rules.{name}]",
+            )
+        if not rule.fits(message.length):
+            raise InputError(
+                f"the rule does not fit into the {message.length} bytes of the message",
+                source=self._source,
+                field=field,
+                value=name,
+            )
+        return rule

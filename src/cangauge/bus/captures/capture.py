@@ -1,0 +1,266 @@
+"""`open_capture`: any capture file that cangauge knows → messages, by content, not by suffix."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from os import PathLike
+from pathlib import Path
+from typing import Final
+
+import can
+
+from cangauge.bus.captures.info import CaptureInfo, Stamps
+from cangauge.bus.captures.library import (
+    DAMAGE,
+    LIBRARY_FORMATS,
+    LibraryFormat,
+    library_messages,
+)
+from cangauge.bus.captures.stream import LineStream, read_head
+from cangauge.bus.captures.text_formats import TEXT_FORMATS, Parser, TextFormat
+from cangauge.errors import InputError
+
+CLOCK_ID: Final = 0x1DB
+"""Without time stamps, time is counted in frames of this id (Nissan Leaf) …"""
+CLOCK_PERIOD_S: Final = 0.010
+"""… each of which is taken to come so long after the one before [s]."""
+
+FEW_MALFORMED: Final = 100
+"""More malformed lines than this and than frames: the file is something else, or junk."""
+_HEAD_LINES: Final = 400
+
+_KNOWN = (
+    "known are: candump (log, and screen output), CRTD, Vector ASC and BLF, PEAK TRC, ASAM MF4,"
+    " python-can's CSV, tab-separated tables, and text of seconds, id, length, bytes; each may be"
+    " gzipped"
+)
+
+
+class Capture:
+    """A capture file: iterate over it for its messages, as often as needed.
+
+    Time stamps are in seconds, as recorded: from 1970, from the start of the capture or of the
+    logger. In a capture without stamps, time is counted from 0 in frames of the clock's id;
+    frames between two of them have the earlier one's time.
+
+    Parameters
+    ----------
+    path : Path
+    kind : TextFormat or LibraryFormat
+    clock : tuple of int and float
+        Id of the frames that count time where there are no stamps, and their period [s].
+    """
+
+    def __init__(
+        self, path: Path, kind: TextFormat | LibraryFormat, clock: tuple[int, float]
+    ) -> None:
+        self.path = path
+        self._kind = kind
+        self._clock = clock
+        self._reset()
+
+    def _reset(self) -> None:
+        self._frames = 0
+        self._malformed = 0
+        self._first_malformed: int | None = None
+        self._cut_off = False
+        self._remarks: list[str] = []
+
+    @property
+    def stamps(self) -> Stamps:
+        """Resolution of the time stamps."""
+        return self._kind.stamps if isinstance(self._kind, TextFormat) else "us"
+
+    @property
+    def info(self) -> CaptureInfo:
+        """What the latest reading showed so far; complete after its end."""
+        return CaptureInfo(
+            format=self._kind.name,
+            stamps=self.stamps,
+            frames=self._frames,
+            malformed=self._malformed,
+            first_malformed=self._first_malformed,
+            cut_off=self._cut_off,
+            remarks=(*self._stamp_remarks(), *self._remarks),
+        )
+
+    def _stamp_remarks(self) -> list[str]:
+        if self.stamps == "ms":
+            return ["time stamps are whole milliseconds"]
+        if self.stamps == "none":
+            number, period_s = self._clock
+            return [
+                "no time stamps: time is counted from 0 in frames of"
+                f" 0x{number:X}, one every {1000.0 * period_s:g} ms"
+            ]
+        return []
+
+    def __iter__(self) -> Iterator[can.Message]:
+        """Yield the messages in the file's order.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be read, holds no frames or is mostly junk (names the first line
+            that is), or has neither stamps nor frames of the clock's id.
+        """
+        self._reset()
+        if isinstance(self._kind, TextFormat):
+            messages = self._text(self._kind)
+            if self._kind.stamps == "none":
+                messages = self._count_time(messages)
+        else:
+            messages = self._library(self._kind)
+        yield from messages
+        self._finish()
+
+    def _text(self, kind: TextFormat) -> Iterator[can.Message]:
+        lines = LineStream(self.path)
+        parse: Parser | None = None
+        for line in lines:
+            if parse is None:
+                parse = kind.parser(line)
+                if parse is None:
+                    raise _unknown(self.path)
+            if not line.endswith("\n") and not kind.states_length and line.strip():
+                # The last line: it could have lost bytes without showing it.
+                self._cut_off = True
+                self._skip(lines.number)
+                continue
+            try:
+                message = parse(line)
+            except ValueError:
+                self._skip(lines.number)
+                continue
+            if message is not None:
+                self._frames += 1
+                yield message
+        if lines.cut_off:
+            self._cut_off = True
+
+    def _library(self, kind: LibraryFormat) -> Iterator[can.Message]:
+        try:
+            for message in library_messages(kind, self.path):
+                if not (message.is_fd or message.is_remote_frame or message.is_error_frame) and (
+                    len(message.data) != message.dlc
+                ):
+                    self._skip(None)
+                    continue
+                self._frames += 1
+                yield message
+        except DAMAGE as error:
+            self._cut_off = True
+            if not self._frames:
+                raise InputError(
+                    f"the {kind.name} file is damaged ({type(error).__name__}: {error})",
+                    source=self.path,
+                    cure="record or fetch it again",
+                ) from error
+
+    def _count_time(self, messages: Iterator[can.Message]) -> Iterator[can.Message]:
+        number, period_s = self._clock
+        ticks = 0
+        for message in messages:
+            if message.arbitration_id == number and not message.is_extended_id:
+                ticks += 1
+            message.timestamp = max(ticks - 1, 0) * period_s
+            yield message
+        if self._frames and not ticks:
+            raise InputError(
+                f"no time stamps, and no frames of 0x{number:X} to count time by",
+                source=self.path,
+                cure="record it with stamps, for instance by candump -l",
+            )
+
+    def _skip(self, line: int | None) -> None:
+        self._malformed += 1
+        if self._first_malformed is None:
+            self._first_malformed = line
+        if self._malformed > FEW_MALFORMED and self._malformed > self._frames:
+            raise self._junk()
+
+    def _junk(self) -> InputError:
+        where = "" if self._first_malformed is None else f", the first is {self._first_malformed}"
+        return InputError(
+            f"{self._malformed} lines are no frames of {self._kind.name}{where},"
+            f" and only {self._frames} are",
+            source=self.path,
+            cure="record or export it again",
+        )
+
+    def _finish(self) -> None:
+        if not self._frames:
+            raise InputError("the capture holds no frames", source=self.path, cure=_KNOWN)
+        if self._malformed > self._frames:
+            raise self._junk()
+        if self._malformed:
+            first = "" if self._first_malformed is None else f" (first: {self._first_malformed})"
+            self._remarks.append(f"{self._malformed} malformed lines skipped{first}")
+        if self._cut_off:
+            self._remarks.append(f"the file is cut off after {self._frames} frames")
+
+
+def open_capture(
+    path: str | PathLike[str], *, clock: tuple[int, float] = (CLOCK_ID, CLOCK_PERIOD_S)
+) -> Capture:
+    """Find out what kind of capture a file is.
+
+    Parameters
+    ----------
+    path : path-like
+    clock : tuple of int and float
+        Id of the frames that count time where there are no stamps, and their period [s].
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or is no known kind of capture.
+    """
+    path = Path(path)
+    kind = _recognise(read_head(path))
+    if kind is None:
+        raise _unknown(path)
+    return Capture(path, kind, clock)
+
+
+def read_capture(path: str | PathLike[str]) -> Iterator[can.Message]:
+    """Yield the messages of a capture; see `open_capture` and `Capture`."""
+    return iter(open_capture(path))
+
+
+def is_capture(path: str | PathLike[str]) -> bool:
+    """Return whether a file is a capture of a known kind; False also where it cannot be read."""
+    try:
+        return _recognise(read_head(Path(path))) is not None
+    except InputError:
+        return False
+
+
+def _recognise(head: bytes) -> TextFormat | LibraryFormat | None:
+    for kind in LIBRARY_FORMATS:
+        if kind.matches(head):
+            return kind
+    lines = head.decode("latin-1").split("\n")[:_HEAD_LINES]
+    if len(lines) > 1:
+        lines = lines[:-1]  # the last one may be cut
+    scores = {text.name: _score(text, lines) for text in TEXT_FORMATS}
+    best = max(TEXT_FORMATS, key=lambda text: scores[text.name])
+    return best if scores[best.name] > 0 else None
+
+
+def _score(kind: TextFormat, lines: list[str]) -> int:
+    """Return how many of the lines are frames; 0 if fewer are than are not."""
+    parse = kind.parser(lines[0])
+    if parse is None:
+        return 0
+    frames = malformed = 0
+    for line in lines:
+        try:
+            frames += parse(line) is not None
+        except ValueError:
+            malformed += 1
+    return frames if frames > malformed else 0
+
+
+def _unknown(path: Path) -> InputError:
+    return InputError("the file is not a known kind of capture", source=path, cure=_KNOWN)

@@ -1,0 +1,222 @@
+"""Frames → samples: only the wanted signals are looked at, and only when they are to be trusted."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import can
+
+from cangauge.bus.counters import Counters, MessageCounters
+from cangauge.bus.pairing import Pairing
+from cangauge.bus.protection import FrameChecker, Verdict
+from cangauge.bus.vehicle import EXTENDED, BoundSignal, Vehicle
+from cangauge.estimate.types import Sample
+
+
+@dataclass(slots=True)
+class _Route:
+    """What happens to the frames of one message."""
+
+    length: int
+    checker: FrameChecker | None
+    counters: MessageCounters
+    current: BoundSignal | None = None
+    voltage: BoundSignal | None = None
+    slow: tuple[BoundSignal, ...] = ()
+    last_s: float = -math.inf
+
+
+class SampleAssembler:
+    """Makes samples from a vehicle's frames; pure, driven by the frames' time stamps alone.
+
+    Refused are frames with a wrong CRC, with a counter that stands still, or that are too short,
+    and values whose code means "not available". A counter that jumps is counted as a loss, and
+    the frame is used. Error frames and remote frames are ignored, and so are extended ids where
+    the DBC means standard ones. Current and voltage pair as `pairing` says. Temperature is the
+    last value while it is not older than its time-out, else NaN.
+
+    Parameters
+    ----------
+    vehicle : Vehicle
+
+    Attributes
+    ----------
+    wanted_ids : tuple of int
+        Arbitration ids worth receiving, for filters in the kernel (see `Vehicle.filters`).
+    counters : Counters
+        What happened to the frames so far.
+    last_update_s : dict of str to float
+        Bus time of the last accepted value by role ("current", "voltage", "temperature",
+        "soc_reference") [s]; NaN before the first.
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self.vehicle = vehicle
+        self.wanted_ids = vehicle.wanted_ids
+        self.last_update_s = {signal.role: math.nan for signal in vehicle.signals}
+        self._pairing = Pairing(vehicle.pair_within_s)
+        self._routes: dict[int, _Route] = {}
+        for signal in vehicle.signals:
+            self._add(signal)
+        self._counters = Counters({key: route.counters for key, route in self._routes.items()})
+        self._temperature_c = vehicle.fixed_temperature_c
+        self._temperature_until_s = math.inf if vehicle.temperature is None else -math.inf
+        self._soc_pct = math.nan
+        self._soc_until_s = -math.inf
+        self._now_s = -math.inf
+
+    def _add(self, signal: BoundSignal) -> None:
+        route = self._routes.get(signal.key)
+        if route is None:
+            message = self.vehicle.messages[signal.key]
+            checker = None if message.rule is None else FrameChecker(message.rule, message.period_s)
+            route = _Route(signal.length, checker, MessageCounters())
+            self._routes[signal.key] = route
+        if signal.role == "current":
+            route.current = signal
+        elif signal.role == "voltage":
+            route.voltage = signal
+        else:
+            route.slow = (*route.slow, signal)
+
+    @property
+    def counters(self) -> Counters:
+        """What happened to the frames so far; kept up to date."""
+        self._counters.current_unpaired = self._pairing.current_unpaired
+        self._counters.voltage_unpaired = self._pairing.voltage_unpaired
+        return self._counters
+
+    @property
+    def reference_soc_pct(self) -> float:
+        """The car's own state of charge [%]; NaN when there is none within its time-out."""
+        return self._soc_pct if self._now_s <= self._soc_until_s else math.nan
+
+    def handle(self, message: can.Message) -> Sample | None:
+        """Take one frame; return the sample that it completes, if any.
+
+        `voltage_v` and `temperature_c` of a sample may be NaN. Samples come in the order of their
+        currents.
+        """
+        counters = self._counters
+        counters.frames += 1
+        key = message.arbitration_id
+        if message.is_extended_id:
+            key |= EXTENDED
+        route = self._routes.get(key)
+        if route is None:
+            if message.is_error_frame or message.is_remote_frame:
+                counters.ignored += 1
+            return None
+        if message.is_error_frame or message.is_remote_frame:
+            counters.ignored += 1
+            return None
+        payload = self._accept(route, message)
+        if payload is None:
+            return None
+        for signal in route.slow:
+            self._take_slow(route, signal, payload, message.timestamp)
+        if route.current is None and route.voltage is None:
+            return None
+        sample = self._take_fast(route, payload, message.timestamp)
+        if sample is not None:
+            counters.samples += 1
+        return sample
+
+    def flush(self) -> Sample | None:
+        """Return the current that still waits for a voltage, as a sample without one (the end)."""
+        sample = self._pairing.flush()
+        if sample is not None:
+            self._counters.samples += 1
+        return sample
+
+    def _accept(self, route: _Route, message: can.Message) -> bytearray | None:
+        """Return the payload, cut to the message's length, if the frame is to be used."""
+        fate, time_s = route.counters, message.timestamp
+        fate.wanted += 1
+        payload = message.data
+        length = route.length
+        if len(payload) != length:
+            if len(payload) < length:
+                fate.short += 1
+                return None
+            payload = payload[:length]
+        if time_s < route.last_s:
+            self._restart(route, time_s)
+        checker = route.checker
+        if checker is not None:
+            verdict = checker.check(payload, time_s)
+            if verdict is not Verdict.GOOD:
+                if verdict is Verdict.CRC_WRONG:
+                    fate.crc_errors += 1
+                    return None
+                if verdict is Verdict.REPEATED:
+                    fate.counter_repeats += 1
+                    return None
+                fate.counter_jumps += 1
+                fate.frames_lost += checker.lost
+        route.last_s = time_s
+        self._now_s = time_s
+        return payload
+
+    def _restart(self, route: _Route, time_s: float) -> None:
+        """Time runs backwards: a log that starts again, or a clock that was set."""
+        self._counters.time_reversals += 1
+        if route.last_s - time_s > self.vehicle.pair_within_s:
+            if self.vehicle.temperature is not None:
+                self._temperature_until_s = min(
+                    self._temperature_until_s, time_s + self.vehicle.temperature.timeout_s
+                )
+            if self.vehicle.soc_reference is not None:
+                self._soc_until_s = min(
+                    self._soc_until_s, time_s + self.vehicle.soc_reference.timeout_s
+                )
+
+    def _take_slow(
+        self, route: _Route, signal: BoundSignal, payload: bytearray, time_s: float
+    ) -> None:
+        if not signal.codec.is_in(payload):
+            return
+        value = signal.decode(payload)
+        if math.isnan(value):
+            route.counters.not_available += 1
+            return
+        self.last_update_s[signal.role] = time_s
+        if signal.role == "temperature":
+            self._temperature_c = value
+            self._temperature_until_s = time_s + signal.timeout_s
+        else:
+            self._soc_pct = value
+            self._soc_until_s = time_s + signal.timeout_s
+
+    def _take_fast(self, route: _Route, payload: bytearray, time_s: float) -> Sample | None:
+        current_a = self._read(route, route.current, payload, time_s)
+        voltage_v = self._read(route, route.voltage, payload, time_s)
+        if route.current is not None and route.voltage is not None:
+            # Both in one frame: a sample at once.
+            if math.isnan(current_a):
+                return None
+            if math.isnan(voltage_v):
+                self._pairing.current_unpaired += 1
+            return Sample(time_s, current_a, voltage_v, self._temperature_at(time_s))
+        if not math.isnan(current_a):
+            return self._pairing.current(time_s, current_a, self._temperature_at(time_s))
+        if not math.isnan(voltage_v):
+            return self._pairing.voltage(time_s, voltage_v)
+        return None
+
+    def _read(
+        self, route: _Route, signal: BoundSignal | None, payload: bytearray, time_s: float
+    ) -> float:
+        """Return the value; NaN if the frame does not hold it or it is not available."""
+        if signal is None or (signal.codec.conditions and not signal.codec.is_in(payload)):
+            return math.nan
+        value = signal.decode(payload)
+        if math.isnan(value):
+            route.counters.not_available += 1
+        else:
+            self.last_update_s[signal.role] = time_s
+        return value
+
+    def _temperature_at(self, time_s: float) -> float:
+        return self._temperature_c if time_s <= self._temperature_until_s else math.nan

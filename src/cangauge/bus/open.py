@@ -1,0 +1,304 @@
+"""Opening a bus: any interface that python-can knows, with one clear line when it cannot be.
+
+Without an interface given it is SocketCAN's vcan0 where there is one, else `udp_multicast`, which
+needs no driver and connects the programs of this machine (its packets do not leave it).
+"""
+
+from __future__ import annotations
+
+import errno
+import ipaddress
+import logging
+import os
+import socket
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import can
+from can.typechecking import CanFilter
+
+from cangauge.errors import InputError
+
+BusOption = str | int | float | bool
+
+SOCKETCAN_CHANNEL: Final = "vcan0"
+MULTICAST_CHANNEL: Final = "239.74.163.2"
+"""python-can's IPv4 group: its default is an IPv6 one, which some machines cannot reach."""
+
+MULTICAST_HOPS: Final = 0
+"""0: packets stay on this machine; 1 (`--bus-option hop_limit=1`): they reach the local network."""
+
+RECEIVE_BUFFER_BYTES: Final = 4 << 20
+"""Asked for at sockets, to ride out pauses: Linux's default holds about 270 frames only."""
+
+_DEFAULT_CHANNELS: Final = {
+    "socketcan": SOCKETCAN_CHANNEL,
+    "udp_multicast": MULTICAST_CHANNEL,
+    "virtual": "cangauge",
+}
+_ON_SOCKETS: Final = {"socketcan", "udp_multicast"}
+
+# Drivers raise what they like: python-can's own errors, the operating system's, and what a
+# missing library or a wrong option makes of the driver's code (NameError: kvaser without canlib).
+_DRIVER_ERRORS: Final = (
+    can.CanError,
+    OSError,
+    ValueError,
+    TypeError,
+    NotImplementedError,
+    NameError,
+    AttributeError,
+    ImportError,
+)
+
+# Drivers log their own lines about what is then raised and told in one; whoever sets up logging
+# still sees them.
+logging.getLogger("can").addHandler(logging.NullHandler())
+
+
+@dataclass(frozen=True)
+class BusAddress:
+    """Which bus.
+
+    Parameters
+    ----------
+    interface : str
+        One of python-can's (`can.VALID_INTERFACES`).
+    channel : str
+    options : mapping of str to (str, int, float or bool)
+        Further arguments of the driver, such as `bitrate`.
+    """
+
+    interface: str
+    channel: str
+    options: Mapping[str, BusOption] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return f"{self.interface} {self.channel}"
+
+
+def bus_address(
+    interface: str | None = None,
+    channel: str | None = None,
+    options: Mapping[str, BusOption] | None = None,
+) -> BusAddress:
+    """Fill in what was not given.
+
+    Without an interface: SocketCAN if it has that channel (default vcan0), else `udp_multicast`.
+
+    Parameters
+    ----------
+    interface, channel : str, optional
+    options : mapping, optional
+
+    Raises
+    ------
+    InputError
+        If the interface is not known or needs a channel, or the channel is on neither.
+    """
+    options = dict(options or {})
+    if interface is None:
+        interface = _guess_interface(channel)
+    if interface not in can.VALID_INTERFACES:
+        raise InputError(
+            "no such interface",
+            field="--interface",
+            value=interface,
+            cure=f"use one of: {', '.join(sorted(can.VALID_INTERFACES))}",
+        )
+    if channel is None:
+        channel = _DEFAULT_CHANNELS.get(interface)
+    if channel is None:
+        raise InputError(f"{interface} needs a channel", field="--channel", cure="name one")
+    if interface == "udp_multicast":
+        if not _is_multicast(channel):
+            raise InputError(
+                "no multicast address",
+                field="--channel",
+                value=channel,
+                cure=f"use one such as {MULTICAST_CHANNEL}",
+            )
+        options.setdefault("hop_limit", MULTICAST_HOPS)
+    return BusAddress(interface, channel, options)
+
+
+def open_bus(address: BusAddress, filters: Sequence[CanFilter] | None = None) -> can.BusABC:
+    """Open a bus.
+
+    Parameters
+    ----------
+    address : BusAddress
+    filters : sequence of CanFilter, optional
+        What to receive, as in `can.BusABC.set_filters`: in the kernel on SocketCAN, in Python on
+        interfaces that cannot.
+
+    Returns
+    -------
+    can.BusABC
+
+    Raises
+    ------
+    InputError
+        If there is no such bus, the driver or a library that it needs is missing, an option is
+        wrong, or rights are missing.
+    """
+    arguments: dict[str, Any] = dict(address.options)
+    if filters is not None:
+        arguments["can_filters"] = list(filters)
+    try:
+        bus = can.Bus(
+            channel=_as_driver_channel(address),
+            interface=address.interface,
+            ignore_config=True,
+            **arguments,
+        )
+    except _DRIVER_ERRORS as error:
+        raise _refusal(address, error) from error
+    if address.interface in _ON_SOCKETS:
+        _widen_receive_buffer(bus)
+    return bus
+
+
+def has_socketcan(channel: str) -> bool:
+    """Return whether SocketCAN is up on this machine and has that interface."""
+    if not hasattr(socket, "AF_CAN"):
+        return False
+    try:
+        socket.if_nametoindex(channel)
+        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW):
+            return True
+    except OSError:
+        return False
+
+
+def parse_bus_options(given: Sequence[str]) -> dict[str, BusOption]:
+    """Return `K=V` texts as a mapping; whole numbers, decimals, true and false are meant as such.
+
+    Raises
+    ------
+    InputError
+        If one is not of that form.
+    """
+    options: dict[str, BusOption] = {}
+    for text in given:
+        key, equals, value = text.partition("=")
+        if not equals or not key.isidentifier():
+            raise InputError(
+                "not of the form K=V", field="--bus-option", value=text, cure="e.g. bitrate=500000"
+            )
+        options[key] = _as_option(value)
+    return options
+
+
+def _as_option(text: str) -> BusOption:
+    if text.lower() in {"true", "false"}:
+        return text.lower() == "true"
+    for kind in (lambda word: int(word, 0), float):
+        with suppress(ValueError):
+            return kind(text)
+    return text
+
+
+def _guess_interface(channel: str | None) -> str:
+    if has_socketcan(channel if channel is not None else SOCKETCAN_CHANNEL):
+        return "socketcan"
+    if channel is None or _is_multicast(channel):
+        return "udp_multicast"
+    raise InputError(
+        "there is no such SocketCAN interface on this machine",
+        field="--channel",
+        value=channel,
+        cure="bring it up (sudo ip link add dev vcan0 type vcan; sudo ip link set vcan0 up),"
+        " or name the interface too, e.g. --interface udp_multicast",
+    )
+
+
+def _is_multicast(channel: str) -> bool:
+    try:
+        return ipaddress.ip_address(channel).is_multicast
+    except ValueError:
+        return False
+
+
+def _as_driver_channel(address: BusAddress) -> str | int:
+    """Return the channel as python-can's own configuration would: whole numbers as such."""
+    if address.interface not in _ON_SOCKETS and address.channel.isdigit():
+        return int(address.channel)
+    return address.channel
+
+
+def _widen_receive_buffer(bus: can.BusABC) -> None:
+    if sys.platform == "win32":
+        return
+    # The driver keeps its socket to itself; a duplicate of the descriptor is the same socket.
+    # What cannot be had is left: the system caps the size silently, or refuses.
+    with suppress(OSError), socket.socket(fileno=os.dup(bus.fileno())) as own:
+        own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+
+
+def _refusal(address: BusAddress, error: BaseException) -> InputError:
+    """Return what the driver's error means, in one line with a cure."""
+    cause = error
+    while not isinstance(cause, OSError) and cause.__cause__ is not None:
+        cause = cause.__cause__
+    code = cause.errno if isinstance(cause, OSError) else None
+    channel, interface = address.channel, address.interface
+    if code in {errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT} and interface == "socketcan":
+        return InputError(
+            "this machine has no SocketCAN",
+            field="--interface",
+            value=interface,
+            cure="use another interface, e.g. --interface udp_multicast",
+        )
+    if code in {errno.ENODEV, errno.ENXIO, errno.ENOENT}:
+        cure = f"check the name{_socketcan_names()}" if interface == "socketcan" else "check it"
+        return InputError(
+            f"{interface} has no such bus", field="--channel", value=channel, cure=cure
+        )
+    if code in {errno.EPERM, errno.EACCES}:
+        return InputError(
+            f"no permission to open this bus ({interface})",
+            field="--channel",
+            value=channel,
+            cure="run as a user with the right to it",
+        )
+    if code in {errno.ENETUNREACH, errno.EADDRNOTAVAIL} and interface == "udp_multicast":
+        return InputError(
+            "no network carries multicast on this machine",
+            field="--interface",
+            value=interface,
+            cure="bring a network interface up, or use SocketCAN",
+        )
+    missing = isinstance(error, can.CanInterfaceNotImplementedError | ImportError | NameError)
+    said = " ".join(str(cause).split()) or type(cause).__name__
+    if missing or "library" in said or "module" in said or "install" in said:
+        return InputError(
+            f"a library for this interface is missing ({said})",
+            field="--interface",
+            value=interface,
+            cure=_library_cure(interface),
+        )
+    return InputError(
+        f"{interface} cannot open this bus ({said})",
+        field="--channel",
+        value=channel,
+        cure="check channel and --bus-option",
+    )
+
+
+def _library_cure(interface: str) -> str:
+    if interface == "udp_multicast":
+        return "install msgpack (pip install 'python-can[multicast]')"
+    return f"install what python-can's documentation names for {interface}"
+
+
+def _socketcan_names() -> str:
+    """Return " (there is …)" with the CAN interfaces of this machine."""
+    with suppress(OSError):
+        names = [name for _, name in socket.if_nameindex() if "can" in name]
+        if names:
+            return f"; there is {', '.join(names)}"
+    return "; none is up: sudo ip link add dev vcan0 type vcan && sudo ip link set vcan0 up"

@@ -1,0 +1,206 @@
+"""Counter and CRC: which frames are new and whole, and how many are missing between them.
+
+A frame with a wrong CRC, or whose counter repeats, is refused. A counter that jumps while the
+CRC agrees means that frames were lost: they are counted and the frame is used.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Final
+
+from cangauge.errors import InputError
+
+
+class Verdict(enum.IntEnum):
+    """What a frame's CRC and counter say."""
+
+    GOOD = 0
+    """The frame that was expected."""
+    AFTER_LOSS = 1
+    """A good frame, but frames before it are missing."""
+    CRC_WRONG = 2
+    """Refused: damaged."""
+    REPEATED = 3
+    """Refused: the counter stands still, so this is no new frame."""
+
+
+@lru_cache(maxsize=64)
+def crc8_table(polynomial: int) -> bytes:
+    """Return the 256 entries of the table-driven CRC-8 (not reflected) of a polynomial."""
+    table = bytearray(256)
+    for value in range(256):
+        crc = value
+        for _ in range(8):
+            crc = ((crc << 1) ^ polynomial if crc & 0x80 else crc << 1) & 0xFF
+        table[value] = crc
+    return bytes(table)
+
+
+@dataclass(frozen=True, slots=True)
+class ProtectionRule:
+    """How a message is protected: a CRC-8 byte over all others, and a counter.
+
+    Parameters
+    ----------
+    name : str
+    polynomial, initial, xor_out : int
+        Of the CRC-8, not reflected, 0–255.
+    crc_byte : int
+        Its place, from the end when negative.
+    counter_bits : int
+        Width of the counter; 0: there is none.
+    counter_byte, counter_shift : int
+        Its byte, from the end when negative, and the bit that it starts at.
+
+    Raises
+    ------
+    InputError
+        If a figure is impossible.
+    """
+
+    name: str
+    polynomial: int
+    initial: int = 0
+    xor_out: int = 0
+    crc_byte: int = -1
+    counter_bits: int = 4
+    counter_byte: int = -2
+    counter_shift: int = 0
+    counter_mask: int = field(init=False, repr=False, compare=False)
+    """Mask of the counter, shifted down to bit 0."""
+    _table: bytes = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        for name in ("polynomial", "initial", "xor_out"):
+            self._require(name, 0, 255)
+        self._require("counter_shift", 0, 7)
+        self._require("counter_bits", 0, 8 - self.counter_shift)
+        if self.counter_bits == 1:
+            raise InputError("a counter of one bit tells too little", field=f"{self.name}.counter")
+        if self.counter_bits and self.counter_byte == self.crc_byte:
+            raise InputError(
+                "counter and CRC cannot share a byte",
+                field=f"{self.name}.counter_byte",
+                value=self.counter_byte,
+            )
+        object.__setattr__(self, "counter_mask", (1 << self.counter_bits) - 1)
+        object.__setattr__(self, "_table", crc8_table(self.polynomial))
+
+    def _require(self, name: str, low: int, high: int) -> None:
+        value = getattr(self, name)
+        if not low <= value <= high:
+            raise InputError(
+                f"must be within {low}–{high}", field=f"{self.name}.{name}", value=value
+            )
+
+    @property
+    def modulus(self) -> int:
+        """How many values the counter has; 0 without a counter."""
+        return 1 << self.counter_bits if self.counter_bits else 0
+
+    def fits(self, length: int) -> bool:
+        """Return whether a payload of so many bytes has both bytes."""
+        places = (self.crc_byte, self.counter_byte) if self.counter_bits else (self.crc_byte,)
+        found = {place if place >= 0 else length + place for place in places}
+        return all(0 <= place < length for place in found) and len(found) == len(places)
+
+    def crc(self, data: bytes | bytearray) -> int:
+        """Return the CRC that belongs into the payload `data` (of any content in its CRC byte)."""
+        table, crc = self._table, self.initial
+        if self.crc_byte == -1:
+            covered = data[:-1]
+        else:
+            covered = data[: self.crc_byte] + data[self.crc_byte :][1:]
+        for byte in covered:
+            crc = table[crc ^ byte]
+        return crc ^ self.xor_out
+
+    def counter(self, data: bytes | bytearray) -> int:
+        """Return the counter of a payload; 0 without a counter."""
+        return (data[self.counter_byte] >> self.counter_shift) & self.counter_mask
+
+    def protect(self, data: bytes | bytearray, counter: int) -> bytes:
+        """Return the payload with counter (taken modulo its width) and CRC set."""
+        out = bytearray(data)
+        if self.counter_bits:
+            mask = self.counter_mask << self.counter_shift
+            place = self.counter_byte
+            out[place] = (out[place] & ~mask) | ((counter << self.counter_shift) & mask)
+        out[self.crc_byte] = self.crc(out)
+        return bytes(out)
+
+
+LEAF_RULE: Final = ProtectionRule("leaf", polynomial=0x85, counter_bits=2)
+"""Nissan Leaf EV-CAN: 0x1DB, 0x1DC, 0x55B."""
+
+GENERIC_RULE: Final = ProtectionRule(
+    "generic", polynomial=0x1D, initial=0xFF, xor_out=0xFF, counter_bits=4, counter_shift=4
+)
+"""CRC-8 SAE J1850 in the last byte, counter in the high half of the byte before it: what
+cangauge itself sends."""
+
+CRC_ONLY_RULE: Final = ProtectionRule(
+    "crc_only", polynomial=0x1D, initial=0xFF, xor_out=0xFF, counter_bits=0
+)
+"""CRC-8 SAE J1850 in the last byte, no counter: REPLAY_CLOCK, whose time counts."""
+
+RULES: Final = {rule.name: rule for rule in (LEAF_RULE, GENERIC_RULE, CRC_ONLY_RULE)}
+"""The rules that a mapping can name."""
+
+
+class FrameChecker:
+    """Checks the frames of one message, one after the other.
+
+    A standing counter is no new frame, unless so much time has passed that the counter can have
+    gone round: on a bus that loses frames, one in `modulus` of the survivors looks like that.
+
+    Parameters
+    ----------
+    rule : ProtectionRule
+    period_s : float, optional
+        Time between frames when none is lost [s]. Without it a standing counter is always a
+        repetition.
+
+    Attributes
+    ----------
+    lost : int
+        Frames missing right before the latest accepted one. The counter proves at least so many;
+        whole rounds of it that went by unseen do not show.
+    """
+
+    __slots__ = ("_half_round_s", "_last", "_last_s", "_refused", "_rule", "lost")
+
+    def __init__(self, rule: ProtectionRule, period_s: float | None = None) -> None:
+        self._rule = rule
+        self._half_round_s = math.inf if period_s is None else period_s * rule.modulus / 2
+        self._last = -1
+        self._last_s = 0.0
+        self._refused = 0
+        self.lost = 0
+
+    def check(self, data: bytes | bytearray, time_s: float) -> Verdict:
+        """Judge one payload, cut to the message's length, received at bus time `time_s` [s]."""
+        rule = self._rule
+        if rule.crc(data) != data[rule.crc_byte]:
+            self._refused += 1
+            return Verdict.CRC_WRONG
+        if not rule.counter_bits:
+            return Verdict.GOOD
+        last, counter = self._last, rule.counter(data)
+        elapsed_s, self._last_s = time_s - self._last_s, time_s
+        steps = (counter - last) & rule.counter_mask
+        if steps == 1 or last < 0:
+            self._last, self._refused = counter, 0
+            return Verdict.GOOD
+        if steps == 0:
+            if elapsed_s <= self._half_round_s:
+                return Verdict.REPEATED
+            steps = rule.modulus
+        # Frames that came damaged are counted as such, not as lost.
+        self.lost = max(steps - 1 - self._refused, 0)
+        self._last, self._refused = counter, 0
+        return Verdict.AFTER_LOSS if self.lost else Verdict.GOOD

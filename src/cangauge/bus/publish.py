@@ -1,0 +1,259 @@
+"""What cangauge puts on the bus, and how to read it: SOC_ESTIMATE and SOC_DETAIL.
+
+When, on bus time, while samples arrive
+- SOC_ESTIMATE: with the first sample at or after every 100 ms (every sample of a 10 Hz log).
+- SOC_DETAIL: with the first sample at or after every second; and, where it serves `replay` as
+  acknowledgement (`acknowledge_every`), at the latest after so many samples.
+What is repeated by the wall clock while no sample arrives is the service's business.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import can
+from can.typechecking import CanFilter
+from cantools.database.can import Database
+
+from cangauge.bus.database import load_dbc
+from cangauge.bus.protection import GENERIC_RULE
+from cangauge.bus.signal_codec import SignalCodec, signal_codec
+from cangauge.bus.time_source import REPLAY_CLOCK_ID
+from cangauge.errors import InputError
+from cangauge.estimate.types import Estimate, Reason, Status
+from cangauge.share import shared_file
+
+ESTIMATE_EVERY_S: Final = 0.1
+DETAIL_EVERY_S: Final = 1.0
+
+EARLY_S: Final = 0.01
+"""A sample so much before its turn is taken for it, so that jitter does not halve the rate [s]."""
+
+SAMPLES_MODULO: Final = 1 << 16
+"""SOC_DETAIL counts samples modulo this."""
+
+_LENGTH: Final = 8
+_DBC: Final = "soc_estimate.dbc"
+
+
+@dataclass(frozen=True)
+class FrameIds:
+    """Standard ids of the frames; they must differ.
+
+    Raises
+    ------
+    InputError
+        If one is no standard id, or two are the same.
+    """
+
+    soc_estimate: int = 0x5A0
+    soc_detail: int = 0x5A1
+    replay_clock: int = REPLAY_CLOCK_ID
+
+    def __post_init__(self) -> None:
+        seen: dict[int, str] = {}
+        for name in ("soc_estimate", "soc_detail", "replay_clock"):
+            value = getattr(self, name)
+            if not 0 <= value <= 0x7FF:
+                raise InputError(
+                    "no standard CAN id", field=f"ids.{name}", value=value, cure="use 0x000–0x7FF"
+                )
+            if value in seen:
+                raise InputError(
+                    f"{seen[value]} has the same id", field=f"ids.{name}", value=f"0x{value:X}"
+                )
+            seen[value] = name
+
+
+class SocEstimate(NamedTuple):
+    """Content of a SOC_ESTIMATE."""
+
+    soc_pct: float
+    """State of charge [%]; NaN: not available."""
+    soc_std_pct: float
+    """Its standard deviation [%]; NaN: not available."""
+    status: Status
+    reasons: Reason
+
+
+class SocDetail(NamedTuple):
+    """Content of a SOC_DETAIL."""
+
+    soc_newton_pct: float
+    soc_coulomb_pct: float
+    residual_v: float
+    """Measured minus predicted voltage [V]; NaN: not available."""
+    samples: int
+    """Samples processed so far, modulo `SAMPLES_MODULO`."""
+
+
+class _Layout:
+    """A message of soc_estimate.dbc: its signals by name, its counter and CRC."""
+
+    def __init__(self, database: Database, name: str, path: Path) -> None:
+        message = database.get_message_by_name(name)
+        self._codecs: dict[str, SignalCodec] = {
+            signal.name: signal_codec(message, signal, source=path, field=name)
+            for signal in message.signals
+            if not signal.name.startswith(("counter_", "crc_"))
+        }
+        self._limits = {signal: codec.range for signal, codec in self._codecs.items()}
+
+    def encode(self, counter: int, **values: float) -> bytes:
+        """Return the payload; values are clipped to what the signal holds, NaN has its code."""
+        payload = bytearray(_LENGTH)
+        for name, codec in self._codecs.items():
+            value = values[name]
+            if not math.isnan(value):
+                low, high = self._limits[name]
+                value = min(max(value, low), high)
+            codec.encode_into(payload, value)
+        return GENERIC_RULE.protect(payload, counter)
+
+    def decode(self, data: bytes | bytearray) -> dict[str, float] | None:
+        """Return the values by name; None if the frame is damaged."""
+        if len(data) != _LENGTH or GENERIC_RULE.crc(data) != data[GENERIC_RULE.crc_byte]:
+            return None
+        return {name: codec.decode(data) for name, codec in self._codecs.items()}
+
+
+def _layouts() -> tuple[_Layout, _Layout]:
+    path = shared_file("dbc", _DBC)
+    database = load_dbc(path)
+    return _Layout(database, "SOC_ESTIMATE", path), _Layout(database, "SOC_DETAIL", path)
+
+
+class SocPublisher:
+    """Makes the frames of estimates.
+
+    Parameters
+    ----------
+    ids : FrameIds, optional
+    acknowledge_every : int, optional
+        Send SOC_DETAIL at the latest after so many samples.
+    """
+
+    def __init__(self, ids: FrameIds | None = None, acknowledge_every: int | None = None) -> None:
+        self.ids = ids or FrameIds()
+        self._acknowledge_every = acknowledge_every or math.inf
+        self._estimate, self._detail = _layouts()
+        self._estimates_made = 0
+        self._details_made = 0
+        self._estimate_due_s = -math.inf
+        self._detail_due_s = -math.inf
+        self.samples_told = 0
+        """Samples that the latest SOC_DETAIL told."""
+
+    def publish(self, estimate: Estimate, samples: int) -> list[can.Message]:
+        """Return the frames that are due with an estimate.
+
+        Parameters
+        ----------
+        estimate : Estimate
+        samples : int
+            Samples processed so far, those refused included.
+        """
+        now_s = estimate.time_s
+        frames = []
+        if now_s >= self._estimate_due_s - EARLY_S:
+            self._estimate_due_s = _next(self._estimate_due_s, ESTIMATE_EVERY_S, now_s)
+            frames.append(self.estimate_frame(estimate))
+        is_due = now_s >= self._detail_due_s - EARLY_S
+        if is_due or samples - self.samples_told >= self._acknowledge_every:
+            if is_due:
+                self._detail_due_s = _next(self._detail_due_s, DETAIL_EVERY_S, now_s)
+            frames.append(self.detail_frame(estimate, samples))
+        return frames
+
+    def restart(self) -> None:
+        """Forget the times: those of a new log may lie before them."""
+        self._estimate_due_s = self._detail_due_s = -math.inf
+
+    def estimate_frame(self, estimate: Estimate) -> can.Message:
+        """Return SOC_ESTIMATE with the next counter."""
+        data = self._estimate.encode(
+            self._estimates_made,
+            soc_pct=estimate.soc_pct,
+            soc_std_pct=estimate.soc_std_pct,
+            reason=float(estimate.reasons),
+            status=float(estimate.status),
+        )
+        self._estimates_made += 1
+        return _message(self.ids.soc_estimate, data)
+
+    def detail_frame(self, estimate: Estimate, samples: int) -> can.Message:
+        """Return SOC_DETAIL with the next counter."""
+        data = self._detail.encode(
+            self._details_made,
+            soc_newton_pct=estimate.soc_newton_pct,
+            soc_coulomb_pct=estimate.soc_coulomb_pct,
+            samples=float(samples % SAMPLES_MODULO),
+            residual_v=estimate.residual_v,
+        )
+        self._details_made += 1
+        self.samples_told = samples
+        return _message(self.ids.soc_detail, data)
+
+
+class SocReader:
+    """Reads what a `SocPublisher` sent.
+
+    Parameters
+    ----------
+    ids : FrameIds, optional
+
+    Attributes
+    ----------
+    refused : int
+        Damaged frames.
+    """
+
+    def __init__(self, ids: FrameIds | None = None) -> None:
+        self.ids = ids or FrameIds()
+        self.refused = 0
+        self._estimate, self._detail = _layouts()
+
+    def read(self, message: can.Message) -> SocEstimate | SocDetail | None:
+        """Return the content of a frame; None for other frames and damaged ones."""
+        if message.is_extended_id or message.is_error_frame or message.is_remote_frame:
+            return None
+        if message.arbitration_id == self.ids.soc_estimate:
+            values = self._estimate.decode(message.data)
+            if values is not None:
+                return SocEstimate(
+                    values["soc_pct"],
+                    values["soc_std_pct"],
+                    Status(int(values["status"])),
+                    Reason(int(values["reason"])),
+                )
+        elif message.arbitration_id == self.ids.soc_detail:
+            values = self._detail.decode(message.data)
+            if values is not None:
+                return SocDetail(
+                    values["soc_newton_pct"],
+                    values["soc_coulomb_pct"],
+                    values["residual_v"],
+                    int(values["samples"]),
+                )
+        else:
+            return None
+        self.refused += 1
+        return None
+
+
+def standard_filter(frame_id: int) -> CanFilter:
+    """Return python-can's filter for one standard id."""
+    return {"can_id": frame_id, "can_mask": 0x7FF, "extended": False}
+
+
+def _next(due_s: float, every_s: float, now_s: float) -> float:
+    """Return the next due time on the grid, or on a new one after a pause."""
+    following = due_s + every_s
+    return following if following > now_s else now_s + every_s
+
+
+def _message(frame_id: int, data: bytes) -> can.Message:
+    return can.Message(arbitration_id=frame_id, is_extended_id=False, data=data)

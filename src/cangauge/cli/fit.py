@@ -1,0 +1,269 @@
+"""`cangauge fit`: recorded logs → model file and report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cangauge.atomic import atomic_path
+from cangauge.cli.inputs import (
+    DbcOption,
+    JsonOption,
+    MapOption,
+    ReportOption,
+    TemperatureOption,
+    TemperatureSourceOption,
+    VehicleOption,
+    check_outputs,
+    load_log,
+    within,
+)
+from cangauge.cli.output import console, emit_json, note
+from cangauge.cli.tables import print_table
+from cangauge.errors import InputError
+from cangauge.identify.charge import capacity_from_full_discharge, capacity_from_reference
+from cangauge.identify.delays import DelaySearch, search_delays
+from cangauge.identify.fit import FitOptions, Identification, fit
+from cangauge.logs.log import Log
+from cangauge.model.model_file import model_json
+from cangauge.report.words import number, significant, span
+
+FROM_SOC = "from-soc"
+AUTO = "auto"
+SHOWN_CHOICES = 8
+"""So many of the best choices of delays are shown and reported."""
+
+
+def fit_command(  # noqa: PLR0917 - typer passes options by name
+    logs: Annotated[
+        list[Path],
+        typer.Argument(metavar="LOG", help="Recorded logs or captures of one pack, one or more."),
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="MODEL", help="The model file (JSON).")
+    ],
+    capacity_ah: Annotated[
+        str | None,
+        typer.Option(
+            metavar="A|from-soc",
+            help="Charge from 100 to 0 % [Ah], or `from-soc`: the charge per 100 % of the logs'"
+            " own soc_pct. Default: from a log that runs from full to empty.",
+        ),
+    ] = None,
+    initial_soc: Annotated[
+        float | None,
+        typer.Option(
+            metavar="P", help="SoC at the first row of each log [%]. Default: its soc_pct, or 100."
+        ),
+    ] = None,
+    rate_hz: Annotated[
+        float, typer.Option(metavar="HZ", help="Rate of the fit [Hz]; logs are decimated to it.")
+    ] = 1.0,
+    delays: Annotated[
+        str,
+        typer.Option(
+            metavar="S,S,…|auto",
+            help="Delays of the current [s], or `auto`: a search by error on data held out.",
+        ),
+    ] = "0,10,30,70",
+    epsilon: Annotated[
+        float, typer.Option(metavar="E", help="Margin ε of the scaled SoC [-], 0 < ε < 0.5.")
+    ] = 0.05,
+    t_ref: Annotated[
+        float, typer.Option(metavar="C", help="Reference temperature T_r [°C].")
+    ] = 20.0,
+    effects: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ID…|auto", help="Effects beyond the baseline; none yet."),
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the model. Default: the logs' names.")
+    ] = None,
+    vehicle: VehicleOption = None,
+    dbc: DbcOption = None,
+    map_file: MapOption = None,
+    temperature: TemperatureOption = None,
+    temperature_source: TemperatureSourceOption = None,
+    report: ReportOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Identify the voltage model of a pack from one or more recorded logs.
+
+    Positive current discharges. A log has time_s [s], current_a [A], voltage_v [V],
+    temperature_c [°C] and perhaps soc_pct [%]; `cangauge inspect` tells what a file holds.
+
+    For example:
+
+    `cangauge fit full_discharge.parquet -o pack.json --report pack.html`
+
+    `cangauge fit trip1.csv trip2.csv trip3.csv -o pack.json --capacity-ah from-soc`
+
+    `cangauge fit drive.log --vehicle leaf_ze0 -o pack.json --capacity-ah 51.5 --initial-soc 92`
+
+    The model file and the report are written only when all has succeeded.
+    """
+    if effects:
+        raise InputError(
+            "this release knows no effects yet",
+            field="--effects",
+            value=", ".join(effects),
+            cure="leave the option out",
+        )
+    options = FitOptions(
+        capacity_ah=_capacity(capacity_ah),
+        initial_soc_pct=initial_soc
+        if initial_soc is None
+        else within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%"),
+        rate_hz=within(rate_hz, 0.01, 1000.0, option="--rate-hz", unit="Hz"),
+        epsilon=within(epsilon, 1e-4, 0.49, option="--epsilon", unit=""),
+        t_ref_c=within(t_ref, -60.0, 120.0, option="--t-ref", unit="°C"),
+        name=name,
+    )
+    if delays != AUTO:
+        options = replace(options, delay_s=_delays(delays))
+    check_outputs([output, report], logs)
+    with console.status("reading") as status:
+        recorded = []
+        for path in logs:
+            status.update(f"reading {path}")
+            recorded.append(
+                load_log(
+                    path,
+                    vehicle=vehicle,
+                    dbc=dbc,
+                    map_file=map_file,
+                    temperature_c=temperature,
+                    temperature_source=temperature_source,
+                    refuse_turned=True,
+                )
+            )
+        if capacity_ah == FROM_SOC:
+            options = replace(options, capacity_ah=capacity_from_reference(recorded))
+        search = None
+        if delays == AUTO:
+            options, search = _search(recorded, options)
+        result = fit(recorded, options, status.update)
+        page = None
+        if report is not None:
+            status.update("drawing the report")
+            # bokeh takes half a second to import.
+            from cangauge.report.fit_report import fit_report  # noqa: PLC0415
+
+            page = fit_report(result)
+    _write({output: model_json(result.model)} | ({report: page} if report and page else {}))
+    if json_output:
+        extra: dict[str, object] = {"model": str(output), "report": report and str(report)}
+        if search is not None:
+            extra["delay_search"] = [
+                {"delays_s": tried, "held_out_rmse_v": error} for tried, error in _best(search)
+            ]
+        emit_json(result.to_dict() | extra)
+        return
+    _show(result, search)
+    for remark in result.remarks:
+        note(f"note: {remark}")
+    note(f"model: {output}" + (f"\nreport: {report}" if report else ""))
+
+
+def _capacity(given: str | None) -> float | None:
+    if given is None or given == FROM_SOC:
+        return None
+    try:
+        return within(float(given), 1e-3, 1e5, option="--capacity-ah", unit="Ah")
+    except ValueError as error:
+        raise InputError(
+            "not a number of Ah",
+            field="--capacity-ah",
+            value=given,
+            cure=f"give it as 51.5, or as {FROM_SOC} to take it from the logs' soc_pct",
+        ) from error
+
+
+def _delays(given: str) -> tuple[float, ...]:
+    cure = "give increasing seconds from 0, such as 0,10,30,70, or auto"
+    try:
+        delays = tuple(float(text) for text in given.split(","))
+    except ValueError as error:
+        raise InputError(
+            "not a list of seconds", field="--delays", value=given, cure=cure
+        ) from error
+    increasing = all(low < high for low, high in pairwise(delays))
+    if not (delays[0] >= 0.0 and increasing and delays[-1] <= 3600.0):
+        raise InputError(
+            "delays must increase within 0 … 3600 s", field="--delays", value=given, cure=cure
+        )
+    return delays
+
+
+def _search(logs: Sequence[Log], options: FitOptions) -> tuple[FitOptions, DelaySearch]:
+    capacity = options.capacity_ah
+    if capacity is None:
+        capacity = capacity_from_full_discharge(logs, options.initial_soc_pct)
+    options = replace(options, capacity_ah=capacity)
+    found = search_delays(logs, options, note)
+    return replace(options, delay_s=found.delay_s), found
+
+
+def _best(search: DelaySearch) -> list[tuple[tuple[float, ...], float]]:
+    return sorted(search.tried, key=lambda choice: choice[1])[:SHOWN_CHOICES]
+
+
+def _write(texts: dict[Path, str]) -> None:
+    """Write all files or none of them."""
+    with ExitStack() as stack:
+        for path, text in texts.items():
+            part = stack.enter_context(atomic_path(path))
+            part.write_text(text, encoding="utf-8", newline="\n")
+
+
+def _show(result: Identification, search: DelaySearch | None) -> None:
+    model, energy = result.model, result.energy
+    if search is not None:
+        print_table(
+            "Delays tried (the best)",
+            ["delays [s]", "held-out RMSE [V]"],
+            [[", ".join(f"{d:g}" for d in tried), significant(e, 4)] for tried, e in _best(search)],
+        )
+    print_table(
+        f"Model {model.name}",
+        ["", "value", "<unit"],
+        [
+            ["voltage MAE", number(result.voltage_mae_pct, 3), "%"],
+            ["voltage RMSE", significant(result.voltage_rmse_v, 3), "V"],
+            ["voltage MAE held out", number(model.noise.voltage_mae_pct, 3), "%"],
+            ["SoC by inverse, MAE", number(result.soc_newton_mae_pct, 2), "%"],
+            ["capacity", number(model.capacity_ah, 2), "Ah"],
+            ["slope resistance", significant(result.slope_ohm, 4), "Ω"],
+            ["  expected (R1 + Σ Rj·ρj)", significant(result.slope_expected_ohm, 4), "Ω"],
+            ["condition number", significant(result.solution.condition_number, 2), ""],
+            ["identified over SoC", span(*model.range.soc_pct, 1), "%"],
+            ["identified over temperature", span(*model.range.temperature_c, 1), "°C"],
+            ["rows used", str(sum(len(item.rows) for item in result.fits)), ""],
+        ],
+    )
+    print_table(
+        "Coefficients",
+        ["", "value", "std. error", "<unit"],
+        [
+            [name, significant(item.value, 5), significant(item.std_error, 2),
+             item.unit.replace("ohm", "Ω")]
+            for name, item in model.coefficients.items()
+        ],
+    )  # fmt: skip
+    print_table(
+        "Energy at the terminals",
+        ["", "value", "<unit"],
+        [
+            ["driven", significant(energy.driven_kwh, 4), "kWh"],
+            ["regenerated", significant(energy.regenerated_kwh, 4), "kWh"],
+            ["net", significant(energy.net_kwh, 4), "kWh"],
+            ["Joule heat", significant(energy.heat_kwh, 4), "kWh"],
+            ["efficiency", number(energy.efficiency_pct, 1), "%"],
+        ],
+    )

@@ -1,0 +1,227 @@
+"""`cangauge replay`: a log or a capture → frames on a bus."""
+
+from __future__ import annotations
+
+import math
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import typer
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from cangauge.bus.captures import is_capture
+from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.open import bus_address, open_bus, parse_bus_options
+from cangauge.bus.publish import FrameIds, standard_filter
+from cangauge.bus.receive import BusPort
+from cangauge.bus.vehicle import Vehicle, load_vehicle
+from cangauge.cli.bus_options import (
+    BusDbcOption,
+    BusMapOption,
+    BusOptionOption,
+    BusTemperatureOption,
+    BusVehicleOption,
+    ChannelOption,
+    ClockIdOption,
+    DetailIdOption,
+    EstimateIdOption,
+    InterfaceOption,
+    frame_ids,
+)
+from cangauge.cli.inputs import JsonOption
+from cangauge.cli.output import console, emit_json, note
+from cangauge.errors import InputError
+from cangauge.logs.read import read_log
+from cangauge.replay.player import ReplaySettings, ReplayState, play
+from cangauge.replay.steps import CaptureSource, LogSource, Source
+from cangauge.report.words import duration, number
+from cangauge.service.config import DEFAULT_VEHICLE
+from cangauge.service.signals import stop_on_signals
+
+MAX = "max"
+
+
+def replay_command(  # noqa: PLR0917 - typer passes options by name
+    recorded: Annotated[
+        Path, typer.Argument(metavar="LOG|CAPTURE", help="Recorded log, or recorded frames.")
+    ],
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
+    bus_option: BusOptionOption = None,
+    vehicle: BusVehicleOption = None,
+    dbc: BusDbcOption = None,
+    map_file: BusMapOption = None,
+    temperature: BusTemperatureOption = None,
+    speed: Annotated[
+        str,
+        typer.Option(
+            metavar="1|N|max",
+            help="1: in real time; N: N times faster; max: as fast as `cangauge run` acknowledges,"
+            " losing nothing.",
+        ),
+    ] = "1",
+    loop: Annotated[
+        bool, typer.Option("--loop", help="Again and again, until Ctrl-C; time goes on.")
+    ] = False,
+    wait_s: Annotated[
+        float | None,
+        typer.Option(
+            "--wait",
+            metavar="S",
+            help="Wait at most so long for `cangauge run` to be there before beginning [s].",
+        ),
+    ] = None,
+    acknowledge_s: Annotated[
+        float,
+        typer.Option(
+            "--acknowledge-within",
+            metavar="S",
+            help="At full speed: how long an acknowledgement may take [s].",
+        ),
+    ] = 10.0,
+    soc_estimate_id: EstimateIdOption = None,
+    soc_detail_id: DetailIdOption = None,
+    replay_clock_id: ClockIdOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Play a recorded log or capture on a bus.
+
+    A log's current [A], voltage [V], temperature [°C] and SoC [%] go out as the vehicle's frames,
+    a capture's own frames as they were recorded. Recorded timing is kept. At every speed but 1
+    the log's time goes out too (REPLAY_CLOCK, 0x5AF), so that `cangauge run --time-source
+    replay-clock` counts the same charge at any speed.
+
+    For example:
+
+    `cangauge replay trip.parquet`
+
+    `cangauge replay trip.parquet --speed max --vehicle leaf_aze0`
+
+    `cangauge replay candump.log.gz --speed 10 --interface socketcan --channel vcan0 --loop`
+    """
+    ids = FrameIds(**frame_ids(soc_estimate_id, soc_detail_id, replay_clock_id))
+    settings = ReplaySettings(
+        speed=_speed(speed),
+        loop=loop,
+        wait_s=_seconds(wait_s, "--wait"),
+        acknowledge_s=_seconds(acknowledge_s, "--acknowledge-within") or 0.0,
+        ids=ids,
+    )
+    described = (vehicle, dbc, map_file) != (None, None, None)
+    car: Vehicle | None = None
+    if described:
+        car = load_vehicle(vehicle, dbc, map_file, temperature_c=temperature)
+    source = _source(recorded, car, ids)
+    address = bus_address(interface, channel, parse_bus_options(bus_option or []))
+    with ExitStack() as stack:
+        stop = stack.enter_context(stop_on_signals())
+        filters = [standard_filter(ids.soc_estimate), standard_filter(ids.soc_detail)]
+        port = stack.enter_context(BusPort(open_bus(address, filters), str(address)))
+        note(f"playing {recorded} on {address}, speed {speed}")
+        bar = stack.enter_context(_Bar(source, loop=loop)) if console.is_terminal else None
+        state = play(
+            port, source, settings, stop=stop, show=None if bar is None else bar.show, warn=note
+        )
+        stopped = stop()
+    note(_summary_line(state))
+    if port.unsent:
+        note(f"warning: {port.unsent} frames were not sent: the transmit queue stayed full")
+    if json_output:
+        emit_json(_as_json(state, port, source))
+    if stopped and not loop:
+        raise KeyboardInterrupt
+
+
+def _source(recorded: Path, car: Vehicle | None, ids: FrameIds) -> Source:
+    if is_capture(recorded):
+        return CaptureSource(recorded, car, ids)
+    log = read_log(recorded)
+    for remark in log.remarks:
+        note(f"{recorded}: {remark}")
+    return LogSource(log, car or load_vehicle(DEFAULT_VEHICLE))
+
+
+def _speed(text: str) -> float:
+    if text == MAX:
+        return math.inf
+    try:
+        speed = float(text)
+    except ValueError:
+        speed = math.nan
+    if not 1e-3 <= speed <= 1e6:
+        raise InputError(
+            "no speed",
+            field="--speed",
+            value=text,
+            cure="give 1 (real time), another number (so many times faster), or max",
+        )
+    return speed
+
+
+def _seconds(value: float | None, option: str) -> float | None:
+    if value is not None and not 0.0 < value <= 1e6:
+        raise InputError("must be more than 0 s", field=option, value=value)
+    return value
+
+
+class _Bar:
+    """Progress on the terminal: log time, speed, the SoC that comes back."""
+
+    def __init__(self, source: Source, *, loop: bool) -> None:
+        length_s = None if loop else source.duration_s
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.fields[words]}"),
+            TimeRemainingColumn(),
+        )
+        # Without a thread of its own: it is drawn when there is something new.
+        self._bar = Progress(*columns, console=console, transient=True, auto_refresh=False)
+        self._task: TaskID = self._bar.add_task(source.name, total=length_s, words="")
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def show(self, state: ReplayState) -> None:
+        words = f"{duration(state.log_seconds)}, {number(state.speed, 1)}×"
+        if state.soc is not None:
+            words += f", SoC {number(state.soc.soc_pct, 2)} ± {number(state.soc.soc_std_pct, 2)} %"
+        self._bar.update(self._task, completed=state.log_seconds, words=words, refresh=True)
+
+
+def _summary_line(state: ReplayState) -> str:
+    text = (
+        f"{state.frames} frames, {duration(state.log_seconds)} of log in {state.seconds:.2f} s"
+        f" ({number(state.speed, 2)}×)"
+    )
+    if state.acknowledged is not None:
+        text += f"; {state.acknowledged} of {state.samples} samples acknowledged"
+    if state.soc is not None:
+        text += f"; last SoC received {number(state.soc.soc_pct, 2, '%')}"
+    return text
+
+
+def _as_json(state: ReplayState, port: BusPort, source: Source) -> dict[str, Any]:
+    result: dict[str, Any] = {
+        "bus": port.name,
+        "frames": state.frames,
+        "clock_frames": state.clocks,
+        "samples": state.samples if source.counts_samples else None,
+        "acknowledged": state.acknowledged,
+        "seconds": state.seconds,
+        "log_seconds": state.log_seconds,
+        "speed": state.speed,
+        "unsent": port.unsent,
+        "soc_pct": None if state.soc is None else state.soc.soc_pct,
+        "soc_std_pct": None if state.soc is None else state.soc.soc_std_pct,
+    }
+    if isinstance(source, LogSource):
+        result["quantisation"] = FrameEncoder(source.vehicle).quantisation()
+    if isinstance(source, CaptureSource):
+        result["dropped"] = source.dropped
+    return result

@@ -1,0 +1,81 @@
+"""One line on a terminal that shows the running estimate, a few times a second."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Final, Self
+
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from cangauge.estimate.types import Status
+from cangauge.service.gauge import Gauge
+
+SHOW_EVERY_S: Final = 0.25
+
+_STYLE: Final = {
+    Status.INITIALISING: "yellow",
+    Status.VALID: "green",
+    Status.DEGRADED: "yellow",
+    Status.INVALID: "red",
+}
+
+
+class LiveLine:
+    """SoC ± standard deviation, status, voltage, residual and rate, on a terminal.
+
+    Parameters
+    ----------
+    console : rich.console.Console
+    gauge : Gauge
+    """
+
+    def __init__(self, console: Console, gauge: Gauge) -> None:
+        self._gauge = gauge
+        # Without a thread of its own: it is drawn when it is told to.
+        self._live = Live(console=console, auto_refresh=False, transient=True)
+        self._due_s = 0.0
+        self._last: tuple[float, int] | None = None
+        self._rate = 0.0
+
+    def __enter__(self) -> Self:
+        self._live.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._live.stop()
+
+    def show(self, now_s: float) -> None:
+        """Draw if it is time to (monotonic clock [s])."""
+        if now_s < self._due_s:
+            return
+        self._due_s = now_s + SHOW_EVERY_S
+        samples = self._gauge.samples
+        if self._last is not None and now_s > self._last[0]:
+            self._rate = (samples - self._last[1]) / (now_s - self._last[0])
+        self._last = (now_s, samples)
+        self._live.update(live_text(self._gauge, self._rate), refresh=True)
+
+
+def live_text(gauge: Gauge, samples_per_s: float) -> Text:
+    """Return the line."""
+    estimate = gauge.latest
+    text = Text("SoC ")
+    text.append(f"{estimate.soc_pct:6.2f} ± {estimate.soc_std_pct:.2f} %", style="bold")
+    status = estimate.status.name.lower()
+    why = [reason.name.lower().replace("_", " ") for reason in estimate.reasons if reason.name]
+    text.append("  ")
+    text.append(status, style=_STYLE[estimate.status])
+    if why:
+        text.append(f" ({', '.join(why)})", style="dim")
+    sample = gauge.latest_sample
+    if sample is not None:
+        text.append(f"  {sample.voltage_v:.2f} V  residual {1e3 * estimate.residual_v:+.0f} mV")
+    text.append(f"  {samples_per_s:.0f} samples/s")
+    return text

@@ -1,0 +1,290 @@
+"""Capture + vehicle → samples and log."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+from cangauge.bus.capture_inspect import inspect_capture
+from cangauge.bus.capture_log import capture_samples, capture_to_log
+from cangauge.bus.decode import SampleAssembler
+from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.protection import LEAF_RULE
+from cangauge.bus.time_source import ClockFrames, ReceiveTime
+from cangauge.bus.vehicle import Vehicle, load_vehicle
+from cangauge.errors import InputError
+from cangauge.estimate.types import Sample
+
+CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID = 0x400, 0x401, 0x402
+
+
+@pytest.fixture(scope="module")
+def generic() -> Vehicle:
+    return load_vehicle("generic")
+
+
+def drive(vehicle: Vehicle, seconds: float = 20.0, start_s: float = 1000.0) -> list[can.Message]:
+    """A drive at 10 Hz with steps of current, as frames."""
+    encoder, frames = FrameEncoder(vehicle), []
+    for n in range(round(10 * seconds)):
+        current_a = 40.0 * (n // 20 % 2)
+        sample = Sample(start_s + n / 10.0, current_a, 380.0 - 0.1 * current_a, 20.0 + n / 1000.0)
+        for frame in encoder.encode(sample, 80.0 - n / 100.0):
+            frame.channel = "can0"
+            frames.append(frame)
+    return frames
+
+
+def record(path: Path, frames: list[can.Message]) -> Path:
+    with can.CanutilsLogWriter(path) as writer:
+        for frame in frames:
+            writer.on_message_received(frame)
+    return path
+
+
+def test_a_recorded_drive_becomes_a_log(tmp_path: Path, generic: Vehicle) -> None:
+    log = capture_to_log(record(tmp_path / "drive.log", drive(generic)), generic)
+    assert len(log) == 200
+    assert log.time_s[0] == 1000.0  # bus time as recorded
+    assert log.duration_s == pytest.approx(19.9)
+    assert set(log.current_a) == {0.0, 40.0}
+    assert set(log.voltage_v) == {380.0, 376.0}
+    assert log.temperature_c == pytest.approx(20.0 + np.arange(200) / 1000.0, abs=0.005001)
+    assert log.soc_pct == pytest.approx(80.0 - np.arange(200) / 100.0, abs=0.002501)
+    assert log.name == "drive"
+    assert log.remarks == ()
+
+
+def test_samples_are_those_of_the_live_service_to_the_last_bit(
+    tmp_path: Path, generic: Vehicle
+) -> None:
+    frames = [
+        f for f in drive(generic) if not (f.arbitration_id == VOLTAGE_ID and f.timestamp < 1003)
+    ]
+    path = record(tmp_path / "drive.log", frames)
+    live, clock, assembler = [], ReceiveTime(), SampleAssembler(generic)
+    for message in can.LogReader(path):
+        time_s = clock.time_of(message)
+        assert time_s is not None
+        message.timestamp = time_s
+        if (sample := assembler.handle(message)) is not None:
+            live.append(sample)
+    offline = list(capture_samples(path, generic))
+    assert len(live) == len(offline) == 200
+    np.testing.assert_array_equal(np.array(live), np.array(offline))
+
+
+def test_the_replay_clock_gives_the_logs_own_time(tmp_path: Path, generic: Vehicle) -> None:
+    clock, frames = ClockFrames(), []
+    for frame in drive(generic, start_s=-10.0):
+        told = clock.at(round(frame.timestamp * 1e6))
+        frame.timestamp = 5000.0 + frame.timestamp / 10.0  # replayed ten times faster
+        told.timestamp, told.channel = frame.timestamp, "can0"
+        frames += [told, frame]
+    path = record(tmp_path / "replay.log", frames)
+    log = capture_to_log(path, generic, source="replay-clock")
+    assert log.time_s.tolist() == [round(-10e6 + n * 1e5) / 1e6 for n in range(200)]
+    assert capture_to_log(path, generic).duration_s == pytest.approx(1.99)
+
+
+def test_voltage_that_misses_is_interpolated_or_left_out(tmp_path: Path, generic: Vehicle) -> None:
+    def kept(frame: can.Message) -> bool:
+        time_s = frame.timestamp - 1000.0
+        missing = time_s < 0.25 or 5.05 < time_s < 5.45 or 10.05 < time_s < 14.05
+        return not (frame.arbitration_id == VOLTAGE_ID and missing)
+
+    path = record(tmp_path / "x.log", [frame for frame in drive(generic) if kept(frame)])
+    samples = capture_samples(path, generic)
+    assert len(samples) == 200  # charge is complete
+    log = capture_to_log(path, generic)
+    assert len(log) == 200 - 3 - 40
+    assert "4 samples without voltage: interpolated" in log.remarks
+    assert "43 samples without voltage left out" in log.remarks
+    assert log.voltage_v[log.time_s > 1005.0][0] == 380.0
+    assert log.time_s[0] == pytest.approx(1000.3)
+
+
+def test_slow_voltage_keeps_every_current(tmp_path: Path, generic: Vehicle) -> None:
+    frames = [
+        frame
+        for frame in drive(generic)
+        if frame.arbitration_id != VOLTAGE_ID or round(10 * frame.timestamp) % 5 == 0
+    ]
+    log = capture_to_log(record(tmp_path / "x.log", frames), generic)
+    assert len(log) >= 195
+    assert np.isfinite(log.voltage_v).all()
+
+
+def test_temperature_before_the_first_is_the_first(tmp_path: Path, generic: Vehicle) -> None:
+    frames = [f for f in drive(generic) if f.arbitration_id != TEMPERATURE_ID or f.timestamp > 1005]
+    log = capture_to_log(record(tmp_path / "x.log", frames), generic)
+    assert log.temperature_c[0] == pytest.approx(20.05, abs=0.011)
+    assert any("without temperature: the nearest is used" in remark for remark in log.remarks)
+
+
+def test_no_temperature_at_all_asks_for_one(tmp_path: Path, generic: Vehicle) -> None:
+    frames = [frame for frame in drive(generic) if frame.arbitration_id != TEMPERATURE_ID]
+    path = record(tmp_path / "x.log", frames)
+    with pytest.raises(InputError, match="no temperature") as caught:
+        capture_to_log(path, generic)
+    assert "--temperature" in str(caught.value.cure)
+    log = capture_to_log(path, load_vehicle("generic", temperature_c=7.0))
+    assert set(log.temperature_c) == {7.0}
+
+
+def test_losses_and_refusals_are_told(tmp_path: Path, generic: Vehicle) -> None:
+    frames = drive(generic)
+    currents = [frame for frame in frames if frame.arbitration_id == CURRENT_ID]
+    currents[50].data[0] ^= 1
+    frames = [frame for frame in frames if frame is not currents[100]]
+    log = capture_to_log(record(tmp_path / "x.log", frames), generic)
+    assert "1 frames refused: CRC wrong" in log.remarks
+    assert "1 counter jumps: at least 1 frames lost" in log.remarks
+    assert len(log) == 198
+
+
+def test_of_several_buses_the_one_with_most_samples_is_taken(
+    tmp_path: Path, generic: Vehicle
+) -> None:
+    frames = drive(generic)
+    twice = []
+    for n, frame in enumerate(frames):
+        twice.append(frame)
+        if n < 100:  # a gateway repeats some of them on the other bus
+            other = can.Message(
+                timestamp=frame.timestamp + 0.001,
+                arbitration_id=frame.arbitration_id,
+                is_extended_id=False,
+                data=frame.data,
+                channel="can1",
+            )
+            twice.append(other)
+    log = capture_to_log(record(tmp_path / "x.log", twice), generic)
+    assert len(log) == 200
+    assert any("bus can0 is used" in remark for remark in log.remarks)
+    assert not any("refused" in remark for remark in log.remarks)
+
+
+def test_the_wrong_vehicle_is_told(tmp_path: Path, generic: Vehicle) -> None:
+    path = record(tmp_path / "x.log", drive(generic))
+    with pytest.raises(InputError, match=r"no frames of 0x1DB \(BATTERY_1DB\)") as caught:
+        capture_to_log(path, load_vehicle("leaf_ze0"))
+    assert caught.value.source == str(path)
+
+
+def test_a_wrong_sign_in_the_map_is_seen_in_the_data(tmp_path: Path, generic: Vehicle) -> None:
+    path = record(tmp_path / "x.log", drive(generic, seconds=600))
+    (tmp_path / "turned.toml").write_text(
+        'current.signal = "current_a"\ncurrent.sign = -1\nvoltage.signal = "voltage_v"\n'
+        'temperature.signal = "temperature_c"\n'
+    )
+    turned = load_vehicle(dbc=generic.dbc_files[0], map_file=tmp_path / "turned.toml")
+    assert any("current looks turned" in each for each in capture_to_log(path, turned).remarks)
+    assert not any("turned" in each for each in capture_to_log(path, generic).remarks)
+
+
+def test_a_wrong_scale_in_the_map_is_refused(tmp_path: Path, generic: Vehicle) -> None:
+    path = record(tmp_path / "x.log", drive(generic))
+    (tmp_path / "milli.toml").write_text(
+        'current.signal = "current_a"\nvoltage.signal = "voltage_v"\nvoltage.scale = 1000\n'
+        'temperature.signal = "temperature_c"\n'
+    )
+    vehicle = load_vehicle(dbc=generic.dbc_files[0], map_file=tmp_path / "milli.toml")
+    with pytest.raises(InputError, match="millivolts") as caught:
+        capture_to_log(path, vehicle)
+    assert caught.value.field == "voltage_v"
+
+
+def test_time_that_stands_still_is_refused(tmp_path: Path, generic: Vehicle) -> None:
+    frames = drive(generic)
+    for frame in frames:
+        frame.timestamp = 5.0
+    with pytest.raises(InputError, match="stands still"):
+        capture_to_log(record(tmp_path / "x.log", frames), generic)
+
+
+def test_stamps_out_of_order_are_dropped_until_time_goes_on(
+    tmp_path: Path, generic: Vehicle
+) -> None:
+    frames = drive(generic)
+    for frame in frames:
+        if 1010.0 <= frame.timestamp < 1010.45:
+            frame.timestamp -= 0.5  # five samples arrive late
+    log = capture_to_log(record(tmp_path / "x.log", frames), generic)
+    assert len(log) == 195
+    assert "5 samples with time not going on dropped" in log.remarks
+
+
+def test_inspection_tells_frames_protection_and_vehicle(tmp_path: Path, generic: Vehicle) -> None:
+    frames = drive(generic)
+    frames = [f for f in frames if not 1005.0 < f.timestamp < 1007.95]
+    frames.append(can.Message(timestamp=1021.0, is_error_frame=True, channel="can0"))
+    frames.append(
+        can.Message(
+            timestamp=1021.0,
+            arbitration_id=5,
+            is_remote_frame=True,
+            is_extended_id=False,
+            dlc=1,
+            channel="can0",
+        )
+    )
+    path = record(tmp_path / "x.log", frames)
+    found = inspect_capture(path)
+    assert found.matching == ("generic",)
+    assert found.duration_s == pytest.approx(21.0, abs=0.01)
+    assert (found.error_frames, found.remote_frames) == (1, 1)
+    assert [(g.start_s, round(g.length_s, 3)) for g in found.gaps] == [(1005.0, 3.0), (1019.9, 1.1)]
+    current = next(each for each in found.ids if each.id == "400")
+    assert (current.protection, current.bytes, current.bus) == ("generic", "6", "can0")
+    assert current.period_s == pytest.approx(0.1)
+    assert current.longest_s == pytest.approx(3.0)
+    assert (current.crc_errors, current.counter_jumps) == (0, 1)
+    assert current.frames_lost == 29 % 16
+    match = next(each for each in found.presets if each.preset == "generic")
+    assert match.current_a == (0.0, 40.0)
+    assert match.voltage_v == (376.0, 380.0)
+    assert found.log is None
+    assert found.to_dict()["matching_presets"] == "generic"
+
+
+def test_inspection_with_a_vehicle_has_the_log_too(tmp_path: Path, generic: Vehicle) -> None:
+    path = record(tmp_path / "x.log", drive(generic))
+    found = inspect_capture(path, generic)
+    assert found.log is not None
+    assert found.log.rows == 200
+    assert found.to_dict()["log"]["rows"] == 200
+
+
+def test_inspection_of_somebody_elses_frames(tmp_path: Path) -> None:
+    frames = [
+        can.Message(
+            timestamp=n / 10,
+            arbitration_id=0x100 + n % 3,
+            is_extended_id=n % 3 == 0,
+            data=bytes([n % 256, n // 256]),
+            channel="can0",
+        )
+        for n in range(300)
+    ]
+    constant = LEAF_RULE.protect(bytes(8), 0)  # a CRC that is right by chance
+    frames += [
+        can.Message(
+            timestamp=30.0 + n,
+            arbitration_id=7,
+            is_extended_id=False,
+            data=constant,
+            channel="can0",
+        )
+        for n in range(100)
+    ]
+    found = inspect_capture(record(tmp_path / "x.log", frames))
+    assert found.matching == ()
+    assert [each.id for each in found.ids] == ["007", "00000100", "101", "102"]
+    assert all(each.protection == "" for each in found.ids)
+    assert all(not match.because.startswith("all") for match in found.presets)
+    assert not math.isnan(found.duration_s)

@@ -1,0 +1,316 @@
+"""Capture files of all kinds → messages."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import can
+import pytest
+
+from cangauge.bus.captures import is_capture, open_capture, read_capture
+from cangauge.errors import InputError
+
+SPACED = (
+    "0000.000000 000001D4 8 F7 07 00 00 87 44 30 7B\r\n"
+    "0000.016722 0000056E 1 46       \r\n"
+    "0000.021044 0000050C 6 00 00 00 02 5D 63  \r\n"
+    "0000.022044 18FF0001 2 AA BB\r\n"
+)
+TABLE = (
+    "ParserFlags\tCh\tCounter\tT/R\tTime\tFlags\tCAN ID\tLen\tData\tParser Name\tdefault\n"
+    "1\t0\t14767\tRX\t1052620673\t\t0x000001da\t8\t0xc8 32 18 00 00 01 01 59 \tDefault Parser\t\n"
+    "1\t0\t14768\tTX\t1052620674\t\t0x18ff0001\t2\t0x10 64 \tDefault Parser\t\n"
+)
+TABLE_WITHOUT_PARSER = (
+    "ParserFlags\tCh\tCounter\tT/R\tTime\tFlags\tCAN ID\tLen\tData\t\n"
+    "1\t0\t1\tRX\t565214935\t\t0x00000603\t1\t0x00 \t\n"
+    "1\t0\t2\tRX\t565214958\t\t0x0000068c\t1\t0x00 \t\n"
+)
+CRTD = (
+    "1632509059.533816 CXX OVMS CRTD\n"
+    "1632509059.536559 1CXX Info Type:vfs Format:crtd(discard) Vehicle:NL\n"
+    "1632509059.541604 2R11 174 00 00 00 aa 0f 00 00 00\n"
+    "1632509064.511234 2CER Error intr=2171314 rxpkt=2184796 txpkt=24 errflags=0x22401c02\n"
+    "1632509072.204836 1T11 797 03 22 12 05 55 55 55 55\n"
+    "1632509072.304836 R29 18ff0001 03 22\n"
+    "1632509072.683420 1CEV Event vehicle.awake\n"
+)
+SCREEN = (
+    "  can0  1DB   [8]  00 04 C2 62 00 00 03 B6\n"
+    "  can0  1ED   [3]  FF E3 62\n"
+    "  can0  1DB   [8]  00 04 C2 62 00 00 00 BC\n"
+    "  can0  18FF0001   [2]  01 02\n"
+)
+SCREEN_WITH_STAMPS = (
+    " (1436509052.249713)  can0  1DB   [8]  00 04 C2 62 00 00 03 B6\n"
+    " (1436509052.259713)  can0  123   [0]  remote request\n"
+    " (1436509052.269713)  can0  20000080   [8]  00 00 00 00 00 00 00 00   ERRORFRAME\n"
+    " (1436509052.279713)  can0  18FF0001   [2]  01 02   '..'\n"
+)
+CANDUMP_LOG = (
+    "(1436509052.249713) vcan0 044#2A366C2BBA\n"
+    "(1436509052.449847) vcan0 18FF0001#F6ADE003 T\n"
+    "(1436509052.650004) vcan0 123#R\n"
+    "(1436509052.650005) vcan0 124##1AABB\n"
+    "(1436509052.650006) vcan0 20000080#0000000000000000\n"
+)
+TEXTS = {
+    "seconds, id, length, bytes": (SPACED, 4),
+    "tab-separated table": (TABLE, 2),
+    "CRTD (OVMS)": (CRTD, 3),
+    "candump without stamps": (SCREEN, 4),
+    "candump with stamps": (SCREEN_WITH_STAMPS, 4),
+    "candump log": (CANDUMP_LOG, 5),
+}
+
+
+def write(folder: Path, content: str | bytes, name: str = "capture.txt") -> Path:
+    path = folder / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def facts(message: can.Message) -> tuple[float, int, bool, str]:
+    return (
+        message.timestamp,
+        message.arbitration_id,
+        message.is_extended_id,
+        message.data.hex(),
+    )
+
+
+@pytest.mark.parametrize("name", list(TEXTS))
+@pytest.mark.parametrize("packed", [False, True])
+def test_every_text_format_is_recognised_and_read(tmp_path: Path, name: str, packed: bool) -> None:
+    text, frames = TEXTS[name]
+    path = write(tmp_path, gzip.compress(text.encode()) if packed else text, "any.name")
+    capture = open_capture(path)
+    messages = list(capture)
+    info = capture.info
+    assert (info.format, info.frames, info.malformed) == (name, frames, 0)
+    assert len(messages) == frames
+    assert is_capture(path)
+    assert messages[-1].is_extended_id or name in {"tab-separated table", "candump log"}
+    assert [facts(each) for each in capture] == [facts(each) for each in messages]  # again
+
+
+def test_seconds_id_length_bytes(tmp_path: Path) -> None:
+    first, second, third, _ = read_capture(write(tmp_path, SPACED))
+    assert facts(first) == (0.0, 0x1D4, False, "f70700008744307b")
+    assert facts(second) == (0.016722, 0x56E, False, "46")
+    assert facts(third) == (0.021044, 0x50C, False, "000000025d63")
+
+
+def test_tables_have_whole_milliseconds_and_say_so(tmp_path: Path) -> None:
+    capture = open_capture(write(tmp_path, TABLE))
+    first, second = capture
+    assert facts(first) == (1052620.673, 0x1DA, False, "c832180000010159")
+    assert facts(second) == (1052620.674, 0x18FF0001, True, "1064")
+    assert (first.is_rx, second.is_rx) == (True, False)
+    assert capture.info.stamps == "ms"
+    assert capture.info.remarks == ("time stamps are whole milliseconds",)
+    other = list(read_capture(write(tmp_path, TABLE_WITHOUT_PARSER)))
+    assert [facts(each) for each in other] == [
+        (565214.935, 0x603, False, "00"),
+        (565214.958, 0x68C, False, "00"),
+    ]
+
+
+def test_crtd_keeps_the_buses_apart(tmp_path: Path) -> None:
+    first, second, third = read_capture(write(tmp_path, CRTD))
+    assert facts(first) == (1632509059.541604, 0x174, False, "000000aa0f000000")
+    assert (first.channel, second.channel, third.channel) == (2, 1, 1)
+    assert (first.is_rx, second.is_rx) == (True, False)
+
+
+def test_without_stamps_frames_of_the_clock_count_time(tmp_path: Path) -> None:
+    path = write(tmp_path, SCREEN)
+    capture = open_capture(path)
+    assert [each.timestamp for each in capture] == [0.0, 0.0, 0.01, 0.01]
+    assert capture.info.stamps == "none"
+    assert "0x1DB, one every 10 ms" in capture.info.remarks[0]
+    slower = open_capture(path, clock=(0x1ED, 0.5))
+    assert [each.timestamp for each in slower] == [0.0, 0.0, 0.0, 0.0]
+    with pytest.raises(InputError, match="no frames of 0x123"):
+        list(open_capture(path, clock=(0x123, 0.1)))
+
+
+def test_kinds_of_frames_in_candump(tmp_path: Path) -> None:
+    for text in (SCREEN_WITH_STAMPS, CANDUMP_LOG):
+        messages = list(read_capture(write(tmp_path, text)))
+        assert sum(each.is_remote_frame for each in messages) == 1
+        assert sum(each.is_error_frame for each in messages) == 1
+    assert sum(each.is_fd for each in messages) == 1
+    assert facts(messages[3]) == (1436509052.650005, 0x124, False, "aabb")
+    assert messages[1].is_rx is False
+
+
+WRITERS: dict[str, Callable[[Path], can.MessageWriter]] = {
+    "x.asc": can.ASCWriter,
+    "x.blf": can.BLFWriter,
+    "x.csv": can.CSVWriter,
+    "x.log": can.CanutilsLogWriter,
+    "x.trc": can.TRCWriter,
+}
+
+
+def recorded(folder: Path, name: str, count: int = 50) -> tuple[Path, list[can.Message]]:
+    messages = [
+        can.Message(
+            timestamp=1000.0 + 0.01 * n,
+            arbitration_id=0x18FF0001 if n % 7 == 3 else 0x100 + n,
+            is_extended_id=n % 7 == 3,
+            data=bytes(range(n % 9)),
+            channel=0,
+        )
+        for n in range(count)
+    ]
+    path = folder / name
+    with WRITERS[name](path) as writer:
+        for message in messages:
+            writer.on_message_received(message)
+    return path, messages
+
+
+@pytest.mark.parametrize("name", list(WRITERS))
+@pytest.mark.parametrize("packed", [False, True])
+def test_what_python_can_records_is_read_back(tmp_path: Path, name: str, packed: bool) -> None:
+    path, messages = recorded(tmp_path, name)
+    if packed:
+        path = write(tmp_path, gzip.compress(path.read_bytes()), name + ".gz")
+    assert is_capture(path)
+    found = list(read_capture(path))
+    assert [facts(each)[1:] for each in found] == [facts(each)[1:] for each in messages]
+    steps = [each.timestamp - found[0].timestamp for each in found]
+    assert steps == pytest.approx([0.01 * n for n in range(50)], abs=2e-6)
+
+
+def read_or_refuse(path: Path) -> int:
+    """Return how many frames there are; 0 where it is refused. Anything else is an error."""
+    try:
+        return sum(1 for _ in read_capture(path))
+    except InputError as error:
+        assert "\n" not in str(error)  # noqa: PT017  # both outcomes are right here
+        return 0
+
+
+@pytest.mark.parametrize("name", list(TEXTS))
+def test_cut_at_every_byte(tmp_path: Path, name: str) -> None:
+    text, frames = TEXTS[name]
+    complete = [facts(each) for each in read_capture(write(tmp_path, text))]
+    for cut in range(len(text)):
+        path = write(tmp_path, text[:cut])
+        if read_or_refuse(path):
+            found = [facts(each) for each in read_capture(path)]
+            assert found == complete[: len(found)]  # never a frame that was not there
+    assert frames == len(complete)
+
+
+@pytest.mark.parametrize("name", list(WRITERS))
+def test_recordings_of_python_can_cut_at_every_byte(tmp_path: Path, name: str) -> None:
+    path, _ = recorded(tmp_path, name, count=8)
+    content = path.read_bytes()
+    counts = [read_or_refuse(write(tmp_path, content[:cut], "cut")) for cut in range(len(content))]
+    assert max(counts) <= 8
+
+
+def test_a_gzip_cut_at_every_byte_gives_what_can_be_read(tmp_path: Path) -> None:
+    lines = "".join(
+        f"{n / 100:.6f} 000001DB 8 " + " ".join(f"{n * k % 251:02X}" for k in range(8)) + "\n"
+        for n in range(600)
+    )
+    packed = gzip.compress(lines.encode())
+    for cut in range(0, len(packed), 13):
+        readable = zlib.decompressobj(wbits=31).decompress(packed[:cut]).count(b"\n")
+        frames = read_or_refuse(write(tmp_path, packed[:cut]))
+        assert readable <= frames <= readable + 1  # the last line may lack its end alone
+    capture = open_capture(write(tmp_path, packed[:-20]))
+    frames = sum(1 for _ in capture)
+    assert capture.info.cut_off
+    assert f"cut off after {frames} frames" in capture.info.remarks[-1]
+
+
+def test_bytes_flipped_anywhere_are_no_disaster(tmp_path: Path) -> None:
+    for name in WRITERS:
+        path, _ = recorded(tmp_path, name, count=8)
+        content = path.read_bytes()
+        for place in range(0, len(content), 3):
+            damaged = bytearray(content)
+            damaged[place] ^= 0xA5
+            read_or_refuse(write(tmp_path, bytes(damaged), "damaged"))
+
+
+def test_a_few_malformed_lines_are_skipped_and_counted(tmp_path: Path) -> None:
+    lines = SPACED.splitlines(keepends=True) * 5
+    lines[3] = "0000.022044 000001FF 2 AA\r\n"  # a byte is missing
+    lines[9] = "!!! buffer overrun\r\n"
+    lines[10] = "0000.000000 00000001 65" + " 00" * 65 + "\r\n"  # longer than any frame
+    lines[12] = "0000.000000 FFFFFFFF 1 00\r\n"  # no such id
+    capture = open_capture(write(tmp_path, "".join(lines)))
+    assert sum(1 for _ in capture) == 16
+    assert (capture.info.malformed, capture.info.first_malformed) == (4, 4)
+    assert capture.info.remarks == ("4 malformed lines skipped (first: 4)",)
+
+
+def test_a_banner_before_the_frames_is_skipped(tmp_path: Path) -> None:
+    capture = open_capture(write(tmp_path, "welcome to my logger\n" * 50 + SPACED * 100))
+    assert sum(1 for _ in capture) == 400
+    assert capture.info.malformed == 50
+
+
+def test_mostly_junk_is_refused_by_line(tmp_path: Path) -> None:
+    text = SPACED * 120 + "junk\n" * 2000
+    with pytest.raises(InputError, match="the first is 481") as caught:
+        list(read_capture(write(tmp_path, text)))
+    assert caught.value.exit_code == 2
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"\n\n",
+        b"hello world\n" * 10,
+        b"time_s,current_a,voltage_v,temperature_c\n0,1,2,3\n1,1,2,3\n",
+        b"PAR1" + bytes(100),
+        bytes(range(256)) * 20,
+        b"\x1f\x8b" + bytes(50),
+        b"ParserFlags\tCh\tCounter\tT/R\tTime\tFlags\tCAN ID\tLen\tData\t\n",
+    ],
+)
+def test_what_is_no_capture(tmp_path: Path, content: bytes) -> None:
+    path = write(tmp_path, content)
+    assert not is_capture(path)
+    with pytest.raises(InputError, match="not a known kind of capture") as caught:
+        open_capture(path)
+    assert "candump" in str(caught.value.cure)
+
+
+def test_absent_file_and_folder(tmp_path: Path) -> None:
+    assert not is_capture(tmp_path / "absent")
+    with pytest.raises(InputError, match="no such file"):
+        open_capture(tmp_path / "absent")
+    with pytest.raises(InputError, match="folder"):
+        open_capture(tmp_path)
+
+
+def test_lines_without_end_take_no_memory(tmp_path: Path) -> None:
+    path = write(tmp_path, gzip.compress((SPACED * 30).encode() + b"A" * 50_000_000))
+    assert path.stat().st_size < 100_000
+    with pytest.raises(InputError, match="lines are no frames"):
+        list(read_capture(path))
+
+
+def test_mf4_without_its_reader_says_what_to_install(tmp_path: Path) -> None:
+    path = write(tmp_path, b"MDF     4.10    " + struct.pack("<100x"))
+    try:
+        import asammdf  # noqa: F401, PLC0415
+    except ModuleNotFoundError:
+        with pytest.raises(InputError, match=r"cangauge\[mf4\]"):
+            list(read_capture(path))
+    else:
+        assert read_or_refuse(path) == 0

@@ -1,0 +1,291 @@
+"""Presets, DBC and map files: what is found, and what users are told when it is not."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from cangauge.bus.presets import PRESETS
+from cangauge.bus.protection import LEAF_RULE
+from cangauge.bus.vehicle import Vehicle, load_vehicle
+from cangauge.errors import InputError
+
+DBC = """VERSION ""
+
+BU_: BMS
+
+BO_ 256 BMS_Status: 8 BMS
+ SG_ PackCurrent : 7|16@0- (0.1,0) [-1000|1000] "A" X
+ SG_ PackVoltage : 23|16@0+ (0.1,0) [0|1000] "V" X
+ SG_ CellMilliVolts : 39|16@0+ (1,0) [0|5000] "mV" X
+ SG_ Counter : 51|4@0+ (1,0) [0|15] "" X
+ SG_ Crc : 63|8@0+ (1,0) [0|255] "" X
+
+BO_ 2566851454 BMS_Temps: 8 BMS
+ SG_ PackTemperature : 0|8@1+ (1,-40) [-40|215] "degC" X
+ SG_ CoolantKelvin : 8|16@1+ (0.1,0) [0|500] "K" X
+ SG_ OddUnit : 24|16@1+ (0.1,0) [0|500] "furlong" X
+ SG_ PackSoc : 40|8@1+ (0.5,0) [0|100] "%" X
+
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
+BA_DEF_DEF_ "GenMsgCycleTime" 0;
+BA_ "GenMsgCycleTime" BO_ 256 20;
+"""
+
+MAP = """name = "my car"
+temperature_source = "pack"
+
+[current]
+message = "BMS_Status"
+signal = "PackCurrent"
+sign = -1
+
+[voltage]
+signal = "PackVoltage"
+
+[temperature]
+signal = "PackTemperature"
+"""
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Path:
+    (tmp_path / "car.dbc").write_text(DBC)
+    (tmp_path / "car.toml").write_text(MAP)
+    return tmp_path
+
+
+def load(folder: Path, text: str | None = None, **options: float) -> Vehicle:
+    if text is not None:
+        (folder / "car.toml").write_text(text)
+    return load_vehicle(dbc=folder / "car.dbc", map_file=folder / "car.toml", **options)
+
+
+@pytest.mark.parametrize("name", list(PRESETS))
+def test_every_preset_loads_and_wants_its_three_signals(name: str) -> None:
+    temperature_c = 20.0 if PRESETS[name].lacks_temperature else None
+    vehicle = load_vehicle(name, temperature_c=temperature_c)
+    assert vehicle.current.codec.unit == "A"
+    assert vehicle.voltage.codec.unit == "V"
+    assert vehicle.soc_reference is not None
+    if temperature_c is None:
+        assert vehicle.temperature is not None
+        assert math.isnan(vehicle.fixed_temperature_c)
+    else:
+        assert vehicle.fixed_temperature_c == temperature_c
+        assert vehicle.temperature_source == "unknown"
+    assert set(vehicle.messages) == {signal.key for signal in vehicle.signals}
+    assert len(vehicle.filters) == len(vehicle.wanted_ids)
+    assert vehicle.pair_within_s == 0.020
+
+
+def test_presets_are_known_in_any_spelling() -> None:
+    assert load_vehicle("Leaf-ZE0").name == "Nissan Leaf ZE0"
+    assert load_vehicle("leaf_ze0").messages[0x1DB].rule is LEAF_RULE
+
+
+def test_a_car_without_temperature_on_its_bus_asks_for_one() -> None:
+    with pytest.raises(InputError, match="no pack temperature") as caught:
+        load_vehicle("leaf_ze1")
+    assert caught.value.field == "--vehicle"
+    assert "--temperature" in str(caught.value.cure)
+
+
+@pytest.mark.parametrize("temperature_c", [math.nan, math.inf, 300.0, -61.0])
+def test_a_fixed_temperature_must_be_one(temperature_c: float) -> None:
+    with pytest.raises(InputError, match="--temperature"):
+        load_vehicle("leaf_ze1", temperature_c=temperature_c)
+
+
+def test_an_unknown_vehicle_is_answered_with_the_closest() -> None:
+    with pytest.raises(InputError, match="did you mean leaf_ze0") as caught:
+        load_vehicle("leafze0")
+    assert caught.value.value == "leafze0"
+    with pytest.raises(InputError, match="known are generic, leaf_ze0"):
+        load_vehicle("tesla")
+
+
+def test_what_is_given_must_be_complete_and_not_too_much(own: Path) -> None:
+    with pytest.raises(InputError, match="no vehicle is given"):
+        load_vehicle()
+    with pytest.raises(InputError, match=r"--map.*does not say which signals"):
+        load_vehicle(dbc=own / "car.dbc")
+    with pytest.raises(InputError, match=r"dbc: is missing"):
+        load_vehicle(map_file=own / "car.toml")
+    with pytest.raises(InputError, match="given together"):
+        load_vehicle("generic", dbc=own / "car.dbc")
+
+
+def test_own_dbc_and_map(own: Path) -> None:
+    vehicle = load(own)
+    assert vehicle.name == "my car"
+    assert vehicle.wanted_ids == (256, 0x18FF0B7E)
+    payload = bytes.fromhex("FF380FA000000000")
+    assert vehicle.current.decode(payload) == pytest.approx(20.0)  # −20 A on the bus
+    assert vehicle.voltage.decode(payload) == pytest.approx(400.0)
+    assert vehicle.temperature is not None
+    assert vehicle.temperature.is_extended
+    assert vehicle.messages[256].period_s == 0.020  # as the DBC says
+    assert vehicle.soc_reference is None
+
+
+def test_the_dbc_may_stand_in_the_map_file(own: Path) -> None:
+    (own / "car.toml").write_text('dbc = "car.dbc"\n' + MAP)
+    assert load_vehicle(map_file=own / "car.toml").dbc_files == (str(own / "car.dbc"),)
+
+
+def test_signals_may_come_from_two_dbc_files(own: Path) -> None:
+    (own / "more.dbc").write_text(
+        'BO_ 512 MORE: 8 X\n SG_ AmbientTemp : 0|8@1- (1,0) [0|0] "degC" X\n'
+    )
+    text = 'dbc = ["more.dbc"]\n' + MAP.replace("PackTemperature", "AmbientTemp")
+    assert load(own, text).wanted_ids == (256, 512)
+
+
+def test_units_of_the_dbc_are_converted(own: Path) -> None:
+    text = MAP.replace("PackVoltage", "CellMilliVolts").replace("PackTemperature", "CoolantKelvin")
+    vehicle = load(own, text)
+    assert vehicle.voltage.decode(bytes([0, 0, 0, 0, 0x0E, 0x74, 0, 0])) == pytest.approx(3.7)
+    assert vehicle.temperature is not None
+    assert vehicle.temperature.decode(
+        bytes([0]) + (2931).to_bytes(2, "little") + bytes(5)
+    ) == pytest.approx(19.95)
+
+
+def test_the_sign_turns_the_converted_value(own: Path) -> None:
+    text = MAP.replace("PackTemperature", "CoolantKelvin") + "sign = -1\n"
+    temperature = load(own, text).temperature
+    assert temperature is not None
+    payload = bytes([0]) + (2931).to_bytes(2, "little") + bytes(5)
+    assert temperature.decode(payload) == pytest.approx(-19.95)
+
+
+def test_a_strange_unit_must_be_explained(own: Path) -> None:
+    text = MAP.replace("PackTemperature", "OddUnit")
+    with pytest.raises(InputError, match=r"temperature\.signal.*OddUnit.*furlong") as caught:
+        load(own, text)
+    assert "scale" in str(caught.value.cure)
+    assert load(own, text + "scale = 2\noffset = -40\n").temperature is not None
+
+
+def test_wrong_sign_and_scale_of_a_dbc_can_be_put_right(own: Path) -> None:
+    text = MAP.replace("sign = -1", "sign = -1\nscale = 0.5\noffset = 3.0")
+    payload = bytes.fromhex("FF380FA000000000")
+    assert load(own, text).current.decode(payload) == pytest.approx(0.5 * 20.0 + 3.0)
+
+
+def test_fixed_temperature_in_the_map(own: Path) -> None:
+    vehicle = load(own, MAP.replace('signal = "PackTemperature"', "fixed_c = 21.5"))
+    assert vehicle.temperature is None
+    assert vehicle.fixed_temperature_c == 21.5
+    assert load(own, temperature_c=5.0).fixed_temperature_c == 5.0
+
+
+def test_codes_and_conditions_of_the_map(own: Path) -> None:
+    text = MAP.replace(
+        "[temperature]", "not_available = [9999]\nwhen = { Counter = 3 }\n\n[temperature]"
+    )
+    voltage = load(own, text).voltage.codec
+    assert 9999 in voltage.not_available
+    assert voltage.is_in(bytes([0, 0, 0, 0, 0, 0, 3, 0]))
+    assert not voltage.is_in(bytes([0, 0, 0, 0, 0, 0, 2, 0]))
+
+
+def test_own_protection_rules(own: Path) -> None:
+    text = MAP + (
+        '\n[messages.0x100]\nprotection = "mine"\nperiod_s = 0.5\n'
+        "[rules.mine]\npolynomial = 0x2F\ninitial = 0xFF\ncounter_bits = 4\n"
+    )
+    message = load(own, text).messages[256]
+    assert message.period_s == 0.5
+    assert message.rule is not None
+    assert (message.rule.polynomial, message.rule.counter_byte) == (0x2F, -2)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field", "told"),
+    [
+        ('signal = "PackCurrent"', 'signal = "PackCurent"', "current.signal", "mean PackCurrent"),
+        ('"PackVoltage"', '"PackTension"', "voltage.signal", "no such signal"),
+        ('"BMS_Status"', '"BMS_Stats"', "current.message", "mean BMS_Status"),
+        ('"BMS_Status"', '"0x101"', "current.message", "BMS_Status (0x100)"),
+        ('"BMS_Status"', '"BMS_Temps"', "current.signal", "it is in BMS_Status"),
+        ("sign = -1", "sign = 2", "current.sign", "input should be"),
+        ("sign = -1", "scale = 0", "current.scale", "greater than 0"),
+        ("sign = -1", "scale = nan", "current.scale", "finite"),
+        ("sign = -1", 'scale = "a"', "current.scale", "number"),
+        ("sign = -1", "singn = -1", "current.singn", "did you mean sign"),
+        ("sign = -1", "when = { Nonsense = 1 }", "current.when", "no such signal"),
+        ("[voltage]", "[volts]", "volts", "did you mean voltage?"),
+        ('[voltage]\nsignal = "PackVoltage"\n', "", "voltage", "is missing"),
+        ('"pack"', '"battery"', "temperature_source", "'battery'"),
+        ('name = "my car"', "pair_within_s = 5", "pair_within_s", "less than or equal to 1"),
+        ('signal = "PackTemperature"', "", "temperature", "either signal or fixed_c"),
+        ('signal = "PackTemperature"', "fixed_c = 900", "temperature.fixed_c", "120"),
+    ],
+)
+def test_mistakes_in_a_map_name_field_and_cure(
+    own: Path, old: str, new: str, field: str, told: str
+) -> None:
+    assert old in MAP
+    with pytest.raises(InputError) as caught:
+        load(own, MAP.replace(old, new, 1))
+    assert caught.value.field == field
+    assert told in str(caught.value)
+    assert caught.value.source is not None
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("more", "field", "told"),
+    [
+        ('[messages.BMS_Status]\nprotection = "laef"', "messages.BMS_Status.protection", "known"),
+        ('[messages.Nonsense]\nprotection = "leaf"', "messages.Nonsense", "no such message"),
+        ("[messages.BMS_Status]\nperiod_s = -1", "messages.BMS_Status.period_s", "greater"),
+        (
+            '[messages.BMS_Status]\nprotection = "r"\n[rules.r]\npolynomial = 7\ncrc_byte = 9',
+            "messages.BMS_Status.protection",
+            "does not fit",
+        ),
+        ("[rules.r]\npolynomial = 300", "rules.r.polynomial", "255"),
+        ("[rules.r]\n", "rules.r.polynomial", "is missing"),
+    ],
+)
+def test_mistakes_in_protection(own: Path, more: str, field: str, told: str) -> None:
+    with pytest.raises(InputError) as caught:
+        load(own, MAP + "\n" + more + "\n")
+    assert caught.value.field == field
+    assert told in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b"a = ", "not TOML"),
+        (b"\xff\xfe\x00", "not TOML"),
+        (b"[" * 5000, "not TOML"),
+        (b"", "missing"),
+    ],
+)
+def test_what_is_no_map(own: Path, content: bytes, told: str) -> None:
+    (own / "car.toml").write_bytes(content)
+    with pytest.raises(InputError, match=told) as caught:
+        load(own)
+    assert caught.value.source == str(own / "car.toml")
+
+
+def test_a_map_that_is_too_large_or_absent(own: Path) -> None:
+    (own / "car.toml").write_bytes(b"#" * 300_000)
+    with pytest.raises(InputError, match="larger than"):
+        load(own)
+    with pytest.raises(InputError, match="no such file"):
+        load_vehicle(dbc=own / "car.dbc", map_file=own / "absent.toml")
+
+
+def test_a_map_without_temperature_asks_for_one(own: Path) -> None:
+    text = MAP.replace('[temperature]\nsignal = "PackTemperature"\n', "")
+    with pytest.raises(InputError, match="temperature: is missing"):
+        load(own, text)
+    assert load(own, text, temperature_c=20.0).fixed_temperature_c == 20.0

@@ -1,0 +1,230 @@
+"""`cangauge fit`: its JSON contract, its files, its refusals."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cangauge.errors import CangaugeError
+from cangauge.logs.canonical import write_log
+from cangauge.logs.read import read_log
+from cangauge.model.model_file import load_model
+from cangauge.model.published import CAPACITY_AH
+
+Run = Callable[..., object]
+
+CONTRACT = {
+    "voltage_mae_pct",
+    "voltage_rmse_v",
+    "soc_newton_mae_pct",
+    "capacity_ah",
+    "slope_ohm",
+    "condition_number",
+    "coefficients",
+    "energy",
+}
+ENERGY = {"driven_kwh", "regenerated_kwh", "net_kwh", "heat_kwh", "efficiency_pct"}
+NAMES = ["k0", "k1", "k2", "k3", "k4", "k5", "k6", "k7", "kt", "R1", "R2", "R3", "R4"]
+
+
+def files(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_json_is_one_object_that_keeps_the_contract(run: Run, made: Path, tmp_path: Path) -> None:
+    ran = run("fit", made / "full.parquet", "-o", tmp_path / "m.json", "--json")
+    assert ran.code == 0
+    found = json.loads(ran.out)
+    assert set(found) >= CONTRACT
+    assert set(found["energy"]) == ENERGY
+    assert list(found["coefficients"]) == NAMES
+    assert all(
+        set(item) == {"value", "std_error", "unit"} for item in found["coefficients"].values()
+    )
+    assert {item["unit"] for item in found["coefficients"].values()} == {"V", "V/K", "ohm"}
+    assert found["capacity_ah"] == pytest.approx(CAPACITY_AH, rel=0.02)
+    assert found["coefficients"]["R1"]["value"] == pytest.approx(-0.1032, rel=0.02)
+    model = load_model(tmp_path / "m.json")
+    assert model.coefficients["kt"].value == found["coefficients"]["kt"]["value"]
+    assert model.capacity_ah == found["capacity_ah"]
+
+
+def test_people_see_tables_with_units_and_errors(run: Run, made: Path, tmp_path: Path) -> None:
+    ran = run("fit", made / "full.parquet", "-o", tmp_path / "m.json")
+    assert ran.code == 0
+    for text in ("std. error", "R4", "Ω", "V/K", "kWh", "condition number", "held out"):
+        assert text in ran.out
+    assert str(tmp_path / "m.json") in ran.err
+
+
+def test_options_go_into_the_model_file(run: Run, made: Path, tmp_path: Path) -> None:
+    ran = run(
+        "fit", made / "full.parquet", "-o", tmp_path / "m.json", "--capacity-ah", "51",
+        "--rate-hz", "0.5", "--delays", "0,20", "--epsilon", "0.04", "--t-ref", "25",
+        "--name", "my pack", "--temperature-source", "cell", "--initial-soc", "99.5",
+    )  # fmt: skip
+    assert ran.code == 0, ran.err
+    model = load_model(tmp_path / "m.json")
+    assert model.capacity_ah == 51.0
+    assert model.rate_hz == 0.5
+    assert model.delays_s == [0.0, 20.0]
+    assert model.epsilon == 0.04
+    assert model.t_ref_c == 25.0
+    assert model.name == "my pack"
+    assert model.temperature_source == "cell"
+    assert model.made.options["initial_soc_pct"] == 99.5
+
+
+def test_capacity_from_the_logs_own_soc(run: Run, made: Path, tmp_path: Path) -> None:
+    part = made / "part.csv"
+    ran = run("fit", part, "-o", tmp_path / "m.json", "--capacity-ah", "from-soc", "--json")
+    assert ran.code == 0, ran.err
+    assert json.loads(ran.out)["capacity_ah"] == pytest.approx(CAPACITY_AH, rel=1e-3)
+
+
+def test_delays_by_search(run: Run, made: Path, tmp_path: Path) -> None:
+    ran = run("fit", made / "full.parquet", "-o", tmp_path / "m.json", "--delays", "auto", "--json")
+    assert ran.code == 0, ran.err
+    found = json.loads(ran.out)
+    best = found["delay_search"][0]
+    errors = [item["held_out_rmse_v"] for item in found["delay_search"]]
+    assert errors == sorted(errors)
+    assert best["delays_s"][0] == 0.0
+    assert len(found["delays_s"]) > 1
+    assert load_model(tmp_path / "m.json").delays_s == found["delays_s"]
+
+
+def test_several_logs_and_a_report(run: Run, made: Path, tmp_path: Path) -> None:
+    logs = (made / "full.parquet", made / "part.csv")
+    out = ("-o", tmp_path / "m.json", "--report", tmp_path / "m.html")
+    ran = run("fit", *logs, *out, "--capacity-ah", "from-soc", "--json")
+    assert ran.code == 0, ran.err
+    found = json.loads(ran.out)
+    assert [item["name"] for item in found["logs"]] == ["full", "part"]
+    assert found["report"] == str(tmp_path / "m.html")
+    assert "<html" in (tmp_path / "m.html").read_text(encoding="utf-8")
+    assert files(tmp_path) == ["m.html", "m.json"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--effects", "hysteresis"], ["--effects", "this release knows no effects yet"]),
+        (["--delays", "0,10,5"], ["--delays", "increase", "0,10,5"]),
+        (["--delays", "0;10"], ["--delays", "0;10"]),
+        (["--epsilon", "0.6"], ["--epsilon", "0.6"]),
+        (["--rate-hz", "0"], ["--rate-hz"]),
+        (["--rate-hz", "nan"], ["--rate-hz"]),
+        (["--capacity-ah", "many"], ["--capacity-ah", "many", "from-soc"]),
+        (["--capacity-ah", "-51"], ["--capacity-ah", "-51"]),
+        (["--capacity-ah", "0.5"], ["soc_pct", "--capacity-ah"]),
+        (["--initial-soc", "120"], ["--initial-soc", "120"]),
+        (["--temperature-source", "moon"], ["--temperature-source", "moon", "cell"]),
+        (["--report", "no/such/folder/m.html"], ["no/such/folder/m.html", "folder"]),
+    ],
+)
+def test_bad_options_get_one_line_and_write_nothing(
+    run: Run, made: Path, tmp_path: Path, options: list[str], words: list[str]
+) -> None:
+    ran = run("fit", made / "full.parquet", "-o", tmp_path / "m.json", *options)
+    refused(ran, *words)
+    assert files(tmp_path) == []
+
+
+def refused(ran: object, *words: str) -> None:
+    """Assert exit code 2, nothing on stdout, and one line of error that has these words."""
+    assert ran.code == 2
+    assert ran.out == ""
+    errors = [line for line in ran.err.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1
+    assert "Traceback" not in ran.err
+    for word in words:
+        assert word in errors[0]
+
+
+def test_no_capacity_names_the_cure(run: Run, made: Path, tmp_path: Path) -> None:
+    ran = run("fit", made / "part.csv", "-o", tmp_path / "m.json")
+    refused(ran, "part.csv", "capacity_ah", "--capacity-ah")
+    assert files(tmp_path) == []
+
+
+def test_turned_current_is_refused(run: Run, made: Path, tmp_path: Path) -> None:
+    log = read_log(made / "full.parquet")
+    write_log(replace(log, current_a=-log.current_a), tmp_path / "turned.parquet")
+    ran = run("fit", tmp_path / "turned.parquet", "-o", tmp_path / "m.json")
+    refused(ran, "turned.parquet", "current_a", "multiply the column by -1")
+    assert files(tmp_path) == ["turned.parquet"]
+
+
+def test_missing_log(run: Run, tmp_path: Path) -> None:
+    ran = run("fit", tmp_path / "none.csv", "-o", tmp_path / "m.json")
+    refused(ran, "none.csv", "no such file")
+
+
+def test_nan_in_a_column(run: Run, made: Path, tmp_path: Path) -> None:
+    text = (made / "part.csv").read_text(encoding="utf-8").splitlines()
+    cells = text[100].split(",")
+    cells[text[0].replace('"', "").split(",").index("voltage_v")] = "nan"
+    text[100] = ",".join(cells)
+    (tmp_path / "holes.csv").write_text("\n".join(text) + "\n", encoding="utf-8")
+    ran = run("fit", tmp_path / "holes.csv", "-o", tmp_path / "m.json", "--capacity-ah", "51")
+    refused(ran, "holes.csv", "voltage_v", "row 100")
+    assert files(tmp_path) == ["holes.csv"]
+
+
+def test_no_option_left_out_silently(run: Run, made: Path) -> None:
+    assert run("fit", made / "full.parquet").code == 2
+
+
+def test_outputs_must_not_overwrite_input_or_each_other(run: Run, made: Path) -> None:
+    log = made / "part.csv"
+    before = log.read_bytes()
+    refused(run("fit", log, "-o", log), "part.csv", "also an input")
+    both = made / "both"
+    refused(run("fit", log, "-o", both, "--report", both), "two outputs")
+    assert log.read_bytes() == before
+    assert not both.exists()
+
+
+def test_a_report_that_fails_leaves_no_model(
+    run: Run, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(_result: object) -> str:
+        raise CangaugeError("no ink")
+
+    monkeypatch.setattr("cangauge.report.fit_report.fit_report", broken)
+    (tmp_path / "m.json").write_text("the model before", encoding="utf-8")
+    out = ("-o", tmp_path / "m.json", "--report", tmp_path / "m.html")
+    ran = run("fit", made / "full.parquet", *out)
+    assert ran.code == 1
+    assert "no ink" in ran.err
+    assert files(tmp_path) == ["m.json"]
+    assert (tmp_path / "m.json").read_text(encoding="utf-8") == "the model before"
+
+
+@pytest.mark.real
+def test_a_capture_needs_its_vehicle(run: Run, shared_data: Path, tmp_path: Path) -> None:
+    capture = shared_data / "leaf_can" / "ZE0w24kWhstock.log.gz"
+    refused(run("fit", capture, "-o", tmp_path / "m.json"), "CAN capture", "--vehicle")
+    # Parked for 78 s: read well, but it cannot give a model.
+    ran = run(
+        "fit", capture, "-o", tmp_path / "m.json", "--vehicle", "leaf_ze0", "--capacity-ah", "50"
+    )
+    refused(ran, "ZE0w24kWhstock")
+    assert files(tmp_path) == []
+
+
+def test_a_log_that_the_vehicle_options_do_not_apply_to(
+    run: Run, made: Path, tmp_path: Path
+) -> None:
+    ran = run(
+        "fit", made / "full.parquet", "-o", tmp_path / "m.json", "--vehicle", "leaf_ze0", "--json"
+    )
+    assert ran.code == 0
+    assert "do not apply" in ran.err
+    assert np.isfinite(json.loads(ran.out)["voltage_rmse_v"])

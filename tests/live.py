@@ -1,0 +1,204 @@
+"""What the tests of the live side have in common: a short drive, a model, both commands at once."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+import can
+import pytest
+
+from cangauge.bus.open import BusAddress, open_bus
+from cangauge.bus.receive import BusPort
+from cangauge.bus.vehicle import Vehicle, load_vehicle
+from cangauge.cli.app import main
+from cangauge.estimate.types import Estimate
+from cangauge.logs.log import Log
+from cangauge.model.model_file import ModelFile, load_model
+from cangauge.service.gauge import Gauge, GaugeSettings
+from cangauge.service.loop import LoopSettings, Outputs, RunSummary, serve
+from cangauge.share import shared_file
+from synthetic import synthetic_log
+
+COMMAND = "import sys; from cangauge.cli.app import main; main()"
+
+
+def leaf_model_path() -> Path:
+    return shared_file("replay", "leaf2012_published_model.json")
+
+
+def leaf_model() -> ModelFile:
+    return load_model(leaf_model_path())
+
+
+def short_log(seconds: float = 100.0, rate_hz: float = 10.0, *, noise_v: float = 0.3) -> Log:
+    """A drive from 80 %; values of many digits, so that rounding in frames shows."""
+    return synthetic_log(
+        hours=seconds / 3600.0,
+        rate_hz=rate_hz,
+        start_pct=80.0,
+        end_pct=80.0 - 0.01 * seconds,
+        noise_v=noise_v,
+        seed=3,
+    )
+
+
+@dataclass
+class Service:
+    """`serve` on a bus of its own, in a thread; estimates and warnings are kept."""
+
+    port: BusPort
+    gauge: Gauge
+    settings: LoopSettings = field(default_factory=LoopSettings)
+    record: Any = None
+    rows: list[tuple[float, Estimate]] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    summary: RunSummary | None = None
+    error: BaseException | None = None
+
+    def __enter__(self) -> Self:
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def end(self) -> None:
+        self._stop.set()
+        self._thread.join(10.0)
+        self.port.close()
+        assert not self._thread.is_alive()
+
+    def join(self, seconds: float = 10.0) -> None:
+        self._thread.join(seconds)
+        assert not self._thread.is_alive()
+
+    def _run(self) -> None:
+        outputs = Outputs(
+            record=self.record,
+            table=lambda time_s, estimate: self.rows.append((time_s, estimate)),
+            warn=self.warnings.append,
+        )
+        try:
+            self.summary = serve(self.port, self.gauge, self.settings, outputs, self._stop.is_set)
+        except Exception as error:  # noqa: BLE001 - told to the test
+            self.error = error
+
+
+def virtual_port(channel: str, filters: Sequence[Any] | None = None) -> BusPort:
+    return BusPort(open_bus(BusAddress("virtual", channel), filters), f"virtual {channel}")
+
+
+def virtual_service(
+    channel: str,
+    settings: GaugeSettings | None = None,
+    loop: LoopSettings | None = None,
+    vehicle: Vehicle | None = None,
+    record: Any = None,
+) -> Service:
+    gauge = Gauge(vehicle or load_vehicle("generic"), leaf_model(), settings)
+    port = virtual_port(channel, gauge.filters)
+    return Service(port, gauge, loop or LoopSettings(), record)
+
+
+def never() -> bool:
+    return False
+
+
+def collect(port: BusPort, seconds: float) -> list[can.Message]:
+    """All frames that come within that time."""
+    until = time.monotonic() + seconds
+    found = []
+    while (left := until - time.monotonic()) > 0.0:
+        message = port.receive(left)
+        if message is not None:
+            found.append(message)
+    return found
+
+
+@dataclass
+class Ended:
+    code: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> dict[str, Any]:
+        result: dict[str, Any] = json.loads(self.out)
+        return result
+
+
+class Command:
+    """A `cangauge` command in a process of its own."""
+
+    def __init__(self, *arguments: object) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", COMMAND, *map(str, arguments)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "COLUMNS": "200"},
+        )
+        self._said: list[str] = []
+
+    def wait_for(self, text: str) -> None:
+        """Wait until it says something on stderr."""
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            self._said.append(line)
+            if text in line:
+                return
+        raise AssertionError(f"ended without {text!r}: {''.join(self._said)}")
+
+    def end(self, seconds: float = 60.0) -> Ended:
+        try:
+            out, err = self.process.communicate(timeout=seconds)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            out, err = self.process.communicate()
+            raise AssertionError(f"did not end: {''.join(self._said)}{err}") from None
+        return Ended(self.process.returncode, out, "".join(self._said) + err)
+
+
+def run_to_end(*arguments: object, seconds: float = 60.0) -> Ended:
+    return Command(*arguments).end(seconds)
+
+
+def in_process(*arguments: object) -> Ended:
+    """A command that ends at once, without the price of a process."""
+    out, err = io.StringIO(), io.StringIO()
+    code: object = 0
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        patch.setattr(sys, "argv", ["cangauge", *map(str, arguments)])
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code
+    assert isinstance(code, int)
+    return Ended(code, out.getvalue(), err.getvalue())
+
+
+def waits(condition: Callable[[], bool], seconds: float = 5.0) -> bool:
+    """Whether a condition comes true in time."""
+    until = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > until:
+            return False
+        time.sleep(0.005)
+    return True

@@ -1,0 +1,308 @@
+"""Replay and service on one bus: nothing lost, timing kept, clear words when nobody listens."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+import threading
+import time
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.open import BusAddress, open_bus
+from cangauge.bus.publish import FrameIds, SocPublisher, standard_filter
+from cangauge.bus.receive import BusPort
+from cangauge.bus.time_source import is_clock
+from cangauge.bus.vehicle import load_vehicle
+from cangauge.errors import CangaugeError, InputError
+from cangauge.estimate.estimator import EstimatorSettings
+from cangauge.estimate.offline import run_estimator, samples_of
+from cangauge.replay.bound import quantisation_bound
+from cangauge.replay.player import ReplaySettings, ReplayState, play
+from cangauge.replay.steps import CaptureSource, LogSource
+from cangauge.service.gauge import GaugeSettings
+from cangauge.service.record import Recorder
+from cangauge.service.stream import NOTHING_YET
+from live import (
+    Service,
+    collect,
+    leaf_model,
+    never,
+    short_log,
+    virtual_port,
+    virtual_service,
+    waits,
+)
+
+MAX = ReplaySettings(speed=math.inf, acknowledge_s=3.0)
+REPLAYED = GaugeSettings(time_source="replay-clock")
+SOC_FRAMES = [standard_filter(0x5A0), standard_filter(0x5A1)]
+
+
+def play_log(
+    channel: str, seconds: float, settings: ReplaySettings, preset: str = "generic"
+) -> ReplayState:
+    with virtual_port(channel, SOC_FRAMES) as port:
+        source = LogSource(short_log(seconds), load_vehicle(preset))
+        return play(port, source, settings, stop=never)
+
+
+@pytest.mark.parametrize(
+    ("preset", "method"),
+    [("generic", "ekf"), ("generic", "newton"), ("generic", "coulomb"), ("leaf_aze0", "ekf")],
+)
+def test_the_replayed_soc_is_the_offline_one_within_the_quantisation_bound(
+    preset: str, method: str
+) -> None:
+    vehicle, log, model = load_vehicle(preset), short_log(200.0), leaf_model()
+    estimator = EstimatorSettings(method=method, initial_soc_pct=80.0)  # type: ignore[arg-type] # parametrised
+    settings = GaugeSettings(estimator, "replay-clock")
+    with virtual_service(f"{preset}{method}", settings, vehicle=vehicle) as service:
+        state = play_log(f"{preset}{method}", 200.0, MAX, preset)
+    assert state.acknowledged == state.samples == len(log) == len(service.rows)
+    assert service.gauge.counts.lost == 0
+    offline = run_estimator(samples_of(log), model, estimator).soc_pct
+    live = np.array([estimate.soc_pct for _, estimate in service.rows])
+    bound = quantisation_bound(vehicle, model, log)
+    limit = {"ekf": bound.ekf_pct, "newton": bound.newton_pct, "coulomb": bound.coulomb_pct}
+    worst = float(np.max(np.abs(live - offline)))
+    assert worst <= limit[method] + 1e-9
+    # The bound is no empty word: rounding does show, and the bound is not far above it.
+    assert worst > limit[method] / 100.0
+
+
+def test_the_bound_is_what_its_equation_says() -> None:
+    log, model = short_log(200.0), leaf_model()
+    bound = quantisation_bound(load_vehicle("leaf_aze0"), model, log)
+    # 0.25 A over the log's length; no stamp of this log needs rounding.
+    assert bound.coulomb_pct == pytest.approx(0.25 * log.duration_s / 36.0 / 51.5, rel=1e-6)
+    resistance = 0.1032 + 0.01501 + 0.009697 + 0.004652
+    volts = 0.25 + 0.7428 * 0.25 + 0.25 * resistance
+    slope = min(model.voltage_model().pseudo_ocv_at(soc)[1] for soc in np.arange(0.0, 100.1, 0.1))
+    assert bound.newton_pct == pytest.approx(volts / slope, rel=1e-3)
+    assert bound.ekf_pct == bound.coulomb_pct + bound.newton_pct
+
+
+def test_started_before_the_service_it_waits_and_loses_nothing() -> None:
+    result: list[ReplayState] = []
+    player = threading.Thread(target=lambda: result.append(play_log("early", 30.0, MAX)))
+    player.start()
+    time.sleep(0.7)
+    with virtual_service("early", REPLAYED) as service:
+        player.join(10.0)
+        assert service.gauge.samples == 300
+    assert result[0].acknowledged == 300
+
+
+def test_one_replay_after_the_other() -> None:
+    with virtual_service("twice", REPLAYED) as service:
+        first = play_log("twice", 20.0, MAX)
+        second = play_log("twice", 20.0, MAX)
+    assert (first.acknowledged, second.acknowledged) == (200, 200)
+    soc = [estimate.soc_pct for _, estimate in service.rows]
+    assert soc[:200] == soc[200:]
+
+
+def test_a_log_of_a_prime_number_of_rows_is_acknowledged_to_the_last() -> None:
+    with virtual_service("prime", REPLAYED):
+        assert play_log("prime", 10.1, MAX).acknowledged == 101
+
+
+def test_nobody_listening_is_told_in_one_line() -> None:
+    settings = ReplaySettings(speed=math.inf, acknowledge_s=0.4)
+    with pytest.raises(CangaugeError, match="--time-source replay-clock") as caught:
+        play_log("alone", 10.0, settings)
+    assert caught.value.exit_code == 1
+    assert "\n" not in str(caught.value)
+
+
+def test_a_service_for_another_vehicle_is_told() -> None:
+    settings = ReplaySettings(speed=math.inf, wait_s=3.0, acknowledge_s=0.5)
+    with (
+        virtual_service("other", REPLAYED, vehicle=load_vehicle("leaf_aze0")),
+        pytest.raises(CangaugeError, match=r"0 of \d+ samples sent have been processed"),
+    ):
+        play_log("other", 100.0, settings)
+
+
+def test_a_second_sender_on_the_bus_is_told() -> None:
+    with virtual_service("crowd", REPLAYED), virtual_port("crowd") as intruder:
+        stop = threading.Event()
+
+        def intrude() -> None:
+            encoder = FrameEncoder(load_vehicle("generic"))
+            for sample in itertools.cycle(samples_of(short_log(20.0))):
+                if stop.is_set():
+                    return
+                for frame in encoder.encode(sample):
+                    intruder.send(frame)
+
+        other = threading.Thread(target=intrude)
+        other.start()
+        try:
+            with pytest.raises(CangaugeError, match=r"somebody else sends|have been processed"):
+                play_log("crowd", 100.0, MAX)
+        finally:
+            stop.set()
+            other.join()
+
+
+class LossyBus:
+    """Passes to another bus all but some frames."""
+
+    def __init__(self, bus: can.BusABC, lose: set[int]) -> None:
+        self._bus = bus
+        self._lose = lose
+        self._sent = 0
+
+    def send(self, message: can.Message) -> None:
+        self._sent += 1
+        if self._sent not in self._lose:
+            self._bus.send(message)
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._bus, name)
+
+
+def test_a_frame_lost_on_the_way_does_not_pass_unnoticed() -> None:
+    settings = ReplaySettings(speed=math.inf, wait_s=3.0, acknowledge_s=0.5)
+    bus = LossyBus(open_bus(BusAddress("virtual", "lossy"), SOC_FRAMES), {200, 400, 401, 402})
+    source = LogSource(short_log(30.0), load_vehicle("leaf_aze0"))
+    with virtual_service("lossy", REPLAYED, vehicle=load_vehicle("leaf_aze0")) as service:
+        port = BusPort(bus, "lossy")  # type: ignore[arg-type] # has what is used of a bus
+        with port, pytest.raises(CangaugeError, match="of 300 samples sent have been processed"):
+            play(port, source, settings, stop=never)
+        assert service.gauge.counts.lost > 0
+
+
+def test_frames_under_way_are_bounded() -> None:
+    """No more waits in the receiver's socket than a default buffer holds."""
+    bus = open_bus(BusAddress("virtual", "window"), SOC_FRAMES)
+    receiver = open_bus(BusAddress("virtual", "window"))
+    publisher = SocPublisher(acknowledge_every=1)
+    most, samples = 0, 0
+
+    def receive() -> None:
+        nonlocal most, samples
+        receiver.send(publisher.detail_frame(NOTHING_YET, 0))
+        while samples < 500:
+            most = max(most, receiver.queue.qsize())  # type: ignore[attr-defined] # VirtualBus
+            message = receiver.recv(1.0)
+            if message is None:
+                return
+            if message.arbitration_id == 0x401:
+                samples += 1
+                time.sleep(0.0005)
+                if samples % 4 == 0:
+                    receiver.send(publisher.detail_frame(NOTHING_YET, samples))
+
+    thread = threading.Thread(target=receive)
+    with BusPort(bus, "window") as port:
+        thread.start()
+        source = LogSource(short_log(50.0), load_vehicle("generic"))
+        state = play(port, source, MAX, stop=never)
+    thread.join()
+    receiver.shutdown()
+    assert state.acknowledged == 500
+    assert 20 < most < 220
+
+
+@pytest.mark.parametrize(("speed", "seconds"), [(1.0, 3.0), (20.0, 40.0)])
+def test_recorded_timing_is_kept(tmp_path: Path, speed: float, seconds: float) -> None:
+    rng = random.Random(4)  # noqa: S311 - not for secrets
+    frames = []
+    time_s = 1.7e9
+    while time_s < 1.7e9 + seconds:
+        frames.append(can.Message(timestamp=time_s, arbitration_id=0x1F0, is_extended_id=False))
+        time_s += rng.uniform(0.001, 0.02)
+    frames.append(
+        can.Message(timestamp=1.7e9 + seconds, arbitration_id=0x1F1, is_extended_id=False)
+    )
+    path = tmp_path / "bus.log"
+    with Recorder(path) as recorder:
+        for frame in frames:
+            recorder.write(frame)
+    channel = f"timing{speed}"
+    with virtual_port(channel) as listener, virtual_port(channel, SOC_FRAMES) as port:
+        state = play(port, CaptureSource(path), ReplaySettings(speed), stop=never)
+        heard = collect(listener, 0.2)
+    assert state.seconds == pytest.approx(seconds / speed, abs=0.1)
+    clocks = [each for each in heard if is_clock(each)]
+    heard = [each for each in heard if not is_clock(each)]
+    assert len(heard) == len(frames)
+    assert len(clocks) == (0 if speed == 1.0 else len(frames))
+    shift = heard[0].timestamp - frames[0].timestamp / speed
+    late = [a.timestamp - b.timestamp / speed - shift for a, b in zip(heard, frames, strict=True)]
+    assert max(map(abs, late)) < 0.05
+
+
+def test_at_n_times_the_speed_the_estimate_is_the_same() -> None:
+    log, model = short_log(40.0), leaf_model()
+    with virtual_service("fast", REPLAYED) as service:
+        state = play_log("fast", 40.0, ReplaySettings(speed=40.0, wait_s=3.0))
+        assert waits(lambda: service.gauge.samples == 400)
+    assert state.seconds == pytest.approx(39.9 / 40.0, abs=0.1)
+    assert state.acknowledged is None
+    sent = FrameEncoder(load_vehicle("generic")).quantise(log)
+    offline = run_estimator(samples_of(sent), model, EstimatorSettings()).soc_pct
+    assert [estimate.soc_pct for _, estimate in service.rows] == offline.tolist()
+
+
+def test_in_real_time_nobody_needs_to_listen_and_no_clock_is_sent() -> None:
+    with virtual_port("radio") as listener:
+        state = play_log("radio", 1.0, ReplaySettings())
+        heard = collect(listener, 0.1)
+    assert state.frames == len(heard)
+    assert not any(is_clock(each) for each in heard)
+
+
+def test_looping_goes_on_until_it_is_stopped() -> None:
+    with virtual_service("loop", REPLAYED) as service, virtual_port("loop", SOC_FRAMES) as port:
+        source = LogSource(short_log(5.0), load_vehicle("generic"))
+        settings = ReplaySettings(speed=math.inf, loop=True)
+        state = play(port, source, settings, stop=lambda: service.gauge.samples >= 220)
+        assert state.samples >= 220
+        assert service.gauge.counts.beginnings == 0
+        assert service.rows[219][0] == pytest.approx(21.9)
+
+
+def test_full_speed_needs_the_vehicle_of_a_capture(tmp_path: Path) -> None:
+    path = tmp_path / "a.log"
+    with Recorder(path) as recorder:
+        recorder.write(can.Message(timestamp=1.0, arbitration_id=1, data=b"1"))
+    with virtual_port("blind") as port, pytest.raises(InputError, match="--vehicle"):
+        play(port, CaptureSource(path), MAX, stop=never)
+
+
+def test_fd_frames_need_a_bus_for_them(tmp_path: Path) -> None:
+    path = tmp_path / "fd.log"
+    path.write_text("(1.000000) can0 123##000112233445566778899AABB\n")
+    with virtual_port("classic") as port, pytest.raises(InputError, match="fd=true"):
+        play(port, CaptureSource(path), ReplaySettings(), stop=never)
+
+
+def test_ids_can_be_others() -> None:
+    ids = FrameIds(0x111, 0x112, 0x113)
+    filters = [standard_filter(0x111), standard_filter(0x112)]
+    settings = GaugeSettings(time_source="replay-clock", ids=ids)
+    with virtual_service("ids", settings), virtual_port("ids", filters) as port:
+        source = LogSource(short_log(10.0), load_vehicle("generic"))
+        state = play(port, source, ReplaySettings(math.inf, ids=ids), stop=never)
+    assert state.acknowledged == 100
+    assert state.soc is not None
+
+
+@pytest.mark.real
+def test_a_real_leafs_capture_at_full_speed(shared_data: Path) -> None:
+    path = shared_data / "leaf_can" / "ZE0w24kWhstock.log.gz"
+    vehicle = load_vehicle("leaf_ze0")
+    with virtual_service("leaf", REPLAYED, vehicle=vehicle) as service:
+        assert isinstance(service, Service)
+        with virtual_port("leaf", SOC_FRAMES) as port:
+            state = play(port, CaptureSource(path, vehicle), MAX, stop=never)
+    assert state.acknowledged == state.samples > 100

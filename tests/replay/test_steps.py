@@ -1,0 +1,107 @@
+"""What is sent, and when in log time."""
+
+from __future__ import annotations
+
+from itertools import islice
+from pathlib import Path
+
+import can
+import pytest
+
+from cangauge.bus.publish import SocPublisher
+from cangauge.bus.time_source import ClockFrames
+from cangauge.bus.vehicle import load_vehicle
+from cangauge.errors import InputError
+from cangauge.replay.steps import CaptureSource, LogSource
+from cangauge.service.record import Recorder
+from cangauge.service.stream import NOTHING_YET
+from live import short_log
+
+
+def frame(time_s: float, frame_id: int = 0x123, data: bytes = b"\x01") -> can.Message:
+    return can.Message(timestamp=time_s, arbitration_id=frame_id, is_extended_id=False, data=data)
+
+
+def write(path: Path, frames: list[can.Message]) -> Path:
+    with Recorder(path) as recorder:
+        for each in frames:
+            recorder.write(each)
+    return path
+
+
+@pytest.mark.parametrize("preset", ["generic", "leaf_aze0"])
+def test_each_row_is_one_sample_at_its_time(preset: str) -> None:
+    log = short_log(10.0)
+    steps = list(LogSource(log, load_vehicle(preset)).steps(loop=False))
+    assert [step.time_us for step in steps] == [round(1e6 * t) for t in log.time_s]
+    assert [step.samples for step in steps] == list(range(1, len(log) + 1))
+
+
+def test_played_again_time_and_counters_go_on() -> None:
+    log = short_log(2.0)
+    source = LogSource(log, load_vehicle("generic"))
+    steps = list(islice(source.steps(loop=True), 3 * len(log)))
+    times = [step.time_us for step in steps]
+    assert times == [100_000 * number for number in range(60)]
+    assert steps[-1].samples == 60
+    currents = [each for step in steps for each in step.frames if each.arbitration_id == 0x400]
+    assert [each.data[-2] >> 4 for each in currents] == [number % 16 for number in range(60)]
+
+
+def test_a_value_that_fits_into_no_frame_is_refused_before_anything_is_sent() -> None:
+    log = short_log(2.0)
+    high = log.voltage_v + 300.0
+    too_high = type(log)(log.time_s, log.current_a, high, log.temperature_c, log.soc_pct)
+    with pytest.raises(InputError, match="voltage_v"):
+        LogSource(too_high, load_vehicle("leaf_aze0"))
+
+
+def test_a_captures_frames_are_sent_as_they_were(tmp_path: Path) -> None:
+    frames = [frame(1.7e9 + 0.013 * n, 0x100 + n % 3, bytes([n])) for n in range(30)]
+    path = write(tmp_path / "a.log", frames)
+    steps = list(CaptureSource(path).steps(loop=False))
+    assert [bytes(step.frames[0].data) for step in steps] == [bytes([n]) for n in range(30)]
+    assert [step.frames[0].arbitration_id for step in steps] == [0x100 + n % 3 for n in range(30)]
+    assert steps[-1].time_us - steps[0].time_us == 29 * 13_000
+    assert all(step.is_wanted for step in steps)
+
+
+def test_own_frames_in_a_capture_are_left_out_and_its_replay_clock_is_time(
+    tmp_path: Path,
+) -> None:
+    publisher, clock = SocPublisher(), ClockFrames()
+    frames = []
+    for number in range(5):
+        mark = clock.at(1_000_000 * number)
+        told = publisher.estimate_frame(NOTHING_YET)
+        for each in (mark, frame(0.0, data=bytes([number])), told):
+            each.timestamp = 1.7e9 + 1e-3 * len(frames)
+            frames.append(each)
+    source = CaptureSource(write(tmp_path / "a.log", frames))
+    steps = list(source.steps(loop=False))
+    assert [step.time_us for step in steps] == [1_000_000 * number for number in range(5)]
+    assert {step.frames[0].arbitration_id for step in steps} == {0x123}
+    assert source.dropped == 10
+
+
+def test_several_replays_in_one_capture_are_refused(tmp_path: Path) -> None:
+    clock = ClockFrames()
+    frames = []
+    for time_us in (0, 50_000_000, 0, 50_000_000):
+        frames += [clock.at(time_us), frame(0.0)]
+    for number, each in enumerate(frames):
+        each.timestamp = 1.7e9 + number
+    with pytest.raises(InputError, match="several replays"):
+        list(CaptureSource(write(tmp_path / "a.log", frames)).steps(loop=False))
+
+
+@pytest.mark.real
+def test_samples_of_a_real_capture_are_counted_as_the_receiver_does(shared_data: Path) -> None:
+    from cangauge.bus.capture_log import capture_samples  # noqa: PLC0415 - needs the real data
+
+    path = shared_data / "leaf_can" / "ZE0w24kWhstock.log.gz"
+    vehicle = load_vehicle("leaf_ze0")
+    steps = list(CaptureSource(path, vehicle).steps(loop=False))
+    assert steps[-1].samples == len(capture_samples(path, vehicle))
+    wanted = {each.frames[0].arbitration_id for each in steps if each.is_wanted}
+    assert wanted == set(vehicle.wanted_ids)

@@ -1,0 +1,123 @@
+"""A recording gives the live numbers, to the last bit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.time_source import ClockFrames
+from cangauge.bus.vehicle import load_vehicle
+from cangauge.errors import InputError
+from cangauge.estimate.offline import samples_of
+from cangauge.estimate.types import Estimate
+from cangauge.service.capture_estimate import estimate_capture
+from cangauge.service.gauge import Gauge, GaugeSettings
+from cangauge.service.record import Recorder
+from live import leaf_model, short_log
+
+NUMBERS = ("soc_pct", "soc_std_pct", "soc_newton_pct", "voltage_model_v", "residual_v")
+
+
+def live_and_recorded(
+    frames: list[can.Message], settings: GaugeSettings, path: Path, preset: str
+) -> list[Estimate]:
+    """Handle frames as the loop does, recording them, and return the estimates."""
+    gauge = Gauge(load_vehicle(preset), leaf_model(), settings)
+    found = []
+    with Recorder(path) as recorder:
+        for frame in frames:
+            recorder.write(frame)
+            before = gauge.samples
+            gauge.handle(frame)
+            if gauge.samples != before:
+                found.append(gauge.latest)
+        before = gauge.samples
+        gauge.finish()
+        if gauge.samples != before:
+            found.append(gauge.latest)
+    return found
+
+
+def assert_same(live: list[Estimate], path: Path, preset: str) -> None:
+    recorded = estimate_capture(path, load_vehicle(preset), leaf_model())
+    assert len(live) == recorded.table.soc_pct.size > 0
+    for name in NUMBERS:
+        expected = np.array([getattr(each, name) for each in live])
+        assert np.array_equal(getattr(recorded.table, name), expected, equal_nan=True), name
+
+
+@pytest.mark.parametrize("suffix", [".log", ".csv", ".log.gz"])
+@pytest.mark.parametrize("preset", ["generic", "leaf_aze0"])
+def test_recorded_stamps_are_the_live_ones(tmp_path: Path, suffix: str, preset: str) -> None:
+    rng = np.random.default_rng(5)
+    encoder = FrameEncoder(load_vehicle(preset))
+    frames = []
+    for sample in samples_of(short_log(90.0)):
+        for frame in encoder.encode(sample, 55.0):
+            frame.timestamp += 1.7e9
+            frames.append(frame)
+    # Stamps as a kernel gives them, to the nanosecond; and a clock that is set back.
+    for frame, late_s in zip(frames, np.sort(rng.uniform(0.0, 1.0, len(frames))), strict=True):
+        frame.timestamp += float(late_s) - (4000.0 if late_s > 0.5 else 0.0)
+    path = tmp_path / f"drive{suffix}"
+    live = live_and_recorded(frames, GaugeSettings(), path, preset)
+    assert_same(live, path, preset)
+
+
+def test_of_a_recorded_replay_time_is_the_logs(tmp_path: Path) -> None:
+    clock, encoder = ClockFrames(), FrameEncoder(load_vehicle("generic"))
+    frames = []
+    for _ in range(2):  # two replays, one after the other: each log is estimated for itself
+        for sample in samples_of(short_log(30.0)):
+            frames.append(clock.at(round(sample.time_s * 1e6)))
+            frames += encoder.encode(sample)
+    for number, frame in enumerate(frames):
+        frame.timestamp = 1.7e9 + 1e-4 * number
+    path = tmp_path / "replayed.log"
+    live = live_and_recorded(frames, GaugeSettings(time_source="replay-clock"), path, "generic")
+    assert_same(live, path, "generic")
+    recorded = estimate_capture(path, load_vehicle("generic"), leaf_model())
+    assert recorded.time_source == "replay-clock"
+    assert recorded.counts.beginnings == 1
+    assert recorded.table.time_s[:3].tolist() == [0.0, 0.1, 0.2]
+
+
+def test_samples_without_voltage_are_estimated_too(tmp_path: Path) -> None:
+    encoder = FrameEncoder(load_vehicle("generic"))
+    frames = []
+    for row, sample in enumerate(samples_of(short_log(30.0))):
+        for frame in encoder.encode(sample):
+            if frame.arbitration_id != 0x401 or row % 3:  # every third voltage is missing
+                frames.append(frame)  # noqa: PERF401 - two loops and a condition read better so
+    path = tmp_path / "gappy.log"
+    live = live_and_recorded(frames, GaugeSettings(), path, "generic")
+    assert_same(live, path, "generic")
+    recorded = estimate_capture(path, load_vehicle("generic"), leaf_model())
+    assert np.count_nonzero(np.isnan(recorded.voltage_v)) == 100
+
+
+def test_another_buses_capture_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "other.log"
+    with Recorder(path) as recorder:
+        recorder.write(can.Message(timestamp=1.0, arbitration_id=5, data=b"1"))
+    with pytest.raises(InputError, match="no sample"):
+        estimate_capture(path, load_vehicle("generic"), leaf_model())
+
+
+def test_formats_that_round_stamps_are_refused(tmp_path: Path) -> None:
+    for name in ("a.asc", "a.trc", "a.blf", "a"):
+        with pytest.raises(InputError, match="microsecond"):
+            Recorder(tmp_path / name)
+        assert not (tmp_path / name).exists()
+
+
+@pytest.mark.real
+def test_a_real_leafs_capture(shared_data: Path) -> None:
+    path = shared_data / "leaf_can" / "ZE0w24kWhstock.log.gz"
+    recorded = estimate_capture(path, load_vehicle("leaf_ze0"), leaf_model())
+    assert recorded.table.soc_pct.size > 100
+    assert np.nanmin(recorded.table.soc_pct) >= 0.0

@@ -1,0 +1,206 @@
+"""`cangauge run` and `cangauge replay`, each in a process of its own, over udp_multicast."""
+
+from __future__ import annotations
+
+import re
+import signal
+import time
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pyarrow.csv
+import pyarrow.parquet
+import pytest
+
+from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.vehicle import load_vehicle
+from cangauge.estimate.offline import samples_of
+from cangauge.logs.canonical import write_log
+from cangauge.service.capture_estimate import estimate_capture
+from cangauge.service.record import Recorder
+from live import Command, in_process, leaf_model, leaf_model_path, run_to_end, short_log
+
+pytestmark = pytest.mark.slow
+
+MODEL = ("-m", leaf_model_path())
+
+
+@pytest.fixture
+def bus(request: pytest.FixtureRequest) -> list[str]:
+    """Options of a bus that no other test uses."""
+    port = 20_000 + zlib.crc32(request.node.nodeid.encode()) % 20_000
+    channel = ["--interface", "udp_multicast", "--channel", "239.74.163.2"]
+    return [*channel, "--bus-option", f"port={port}"]
+
+
+@pytest.fixture
+def log_path(tmp_path: Path) -> Path:
+    path = tmp_path / "drive.parquet"
+    write_log(short_log(120.0), path)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_a_log_at_full_speed_from_one_process_to_the_other(
+    bus: list[str], log_path: Path, tmp_path: Path, suffix: str
+) -> None:
+    record, output = tmp_path / "drive.log", tmp_path / f"live{suffix}"
+    service = Command(
+        "run", *bus, *MODEL, "--time-source", "replay-clock", "--until-idle", "1", "--json",
+        "--record", record, "-o", output,
+    )  # fmt: skip
+    replayed = run_to_end("replay", log_path, *bus, "--speed", "max", "--json")
+    ended = service.end()
+    assert (replayed.code, ended.code) == (0, 0), replayed.err + ended.err
+    assert replayed.json["acknowledged"] == replayed.json["samples"] == 1200
+    result = ended.json
+    assert result["samples"] == 1200
+    assert result["lost"] == result["crc_errors"] == result["untimed"] == 0
+    assert result["estimate"]["soc_pct"] == pytest.approx(replayed.json["soc_pct"], abs=0.002)
+    # Bit for bit: the recording, offline.
+    offline = estimate_capture(record, load_vehicle("generic"), leaf_model()).table
+    read = pyarrow.csv.read_csv if suffix == ".csv" else pyarrow.parquet.read_table
+    live = read(output)
+    names = ["time_s", "soc_pct", "soc_std_pct", "soc_newton_pct", "soc_coulomb_pct",
+             "voltage_model_v", "residual_v", "status", "reasons"]  # fmt: skip
+    assert live.column_names == names
+    for name in names[:-2]:
+        assert np.array_equal(live[name].to_numpy(), getattr(offline, name), equal_nan=True), name
+    assert "samples, 0 lost, 0 CRC errors; last SoC" in ended.err
+
+
+def test_a_capture_in_real_time(bus: list[str], tmp_path: Path) -> None:
+    # 6 s of a Leaf's battery, 100 frames a second and some others, not quite regular.
+    capture, again = tmp_path / "drive.log", tmp_path / "again.log"
+    rng = np.random.default_rng(8)
+    vehicle = load_vehicle("leaf_aze0")
+    encoder = FrameEncoder(vehicle)
+    with Recorder(capture) as recorder:
+        for sample in samples_of(short_log(6.01, rate_hz=100.0)):
+            for frame in encoder.encode(sample):
+                # Within a millisecond, and the last exactly 6 s after the first.
+                late_s = float(rng.uniform(0.0, 0.001)) if 0.0 < sample.time_s < 6.0 else 0.0
+                frame.timestamp = 1.7e9 + sample.time_s + late_s
+                recorder.write(frame)
+    service = Command(
+        "run", *bus, *MODEL, "--vehicle", "leaf_aze0", "--record", again, "--until-idle", "1",
+        "--json",
+    )  # fmt: skip
+    service.wait_for("listening")
+    replayed = run_to_end("replay", capture, *bus, "--json")
+    assert replayed.json["seconds"] == pytest.approx(6.0, abs=0.1)
+    result = service.end().json
+    assert result["frames"] == replayed.json["frames"]
+    assert result["samples"] == 601
+    # As it was, and not only as long as it was.
+    stamps = [
+        np.array([float(stamp) for stamp in re.findall(r"^\(([\d.]+)\)", text, re.MULTILINE)])
+        for text in (capture.read_text(), again.read_text())
+    ]
+    late = (stamps[1] - stamps[1][0]) - (stamps[0] - stamps[0][0])
+    assert np.max(np.abs(late)) < 0.1
+
+
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_service_within_a_second(
+    bus: list[str], tmp_path: Path, kind: signal.Signals
+) -> None:
+    output = tmp_path / "live.csv"
+    service = Command("run", *bus, *MODEL, "-o", output, "--json")
+    service.wait_for("listening")
+    began = time.monotonic()
+    service.process.send_signal(kind)
+    ended = service.end(5.0)
+    assert time.monotonic() - began < 1.5  # the end of the interpreter included
+    assert ended.code == 0
+    assert ended.json["samples"] == 0
+    assert ended.json["estimate"]["soc_pct"] is None
+    assert "0 samples" in ended.err
+    assert output.read_text().startswith("time_s,soc_pct")
+
+
+def test_an_interrupted_replay_says_how_far_it_came(bus: list[str], log_path: Path) -> None:
+    replay = Command("replay", log_path, *bus, "--json")
+    replay.wait_for("playing")
+    time.sleep(0.5)
+    replay.process.send_signal(signal.SIGINT)
+    ended = replay.end(5.0)
+    assert ended.code == 130
+    assert 0 < ended.json["frames"] < 100
+    looped = Command("replay", log_path, *bus, "--loop", "--speed", "100", "--json")
+    looped.wait_for("playing")
+    time.sleep(2.0)
+    looped.process.send_signal(signal.SIGTERM)
+    ended = looped.end(5.0)
+    assert ended.code == 0
+    assert ended.json["log_seconds"] > 120.0
+
+
+def test_full_speed_with_nobody_listening(bus: list[str], log_path: Path) -> None:
+    ended = run_to_end(
+        "replay", log_path, *bus, "--speed", "max", "--acknowledge-within", "0.5", "--json"
+    )
+    assert ended.code == 1
+    assert ended.out == ""
+    assert "--time-source replay-clock" in ended.err.splitlines()[-1]
+    assert ended.err.count("error:") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "say"),
+    [
+        (["--interface", "socketcan", "--channel", "nosuch0"], "nosuch0|no SocketCAN"),
+        (["--interface", "carrier_pigeon"], "carrier_pigeon"),
+        (["--channel", "can7x"], "can7x"),
+        (["--interface", "pcan", "--channel", "PCAN_USBBUS1"], "pcan"),
+        (["--vehicle", "moped"], "moped"),
+        (["--dbc", "car.dbc"], "--map"),
+        (["--bus-option", "fast"], "K=V"),
+        (["--soc-estimate-id", "none"], "--soc-estimate-id"),
+    ],
+)
+@pytest.mark.parametrize("command", ["run", "replay"])
+def test_bad_options_of_both_commands(
+    log_path: Path, tmp_path: Path, command: str, arguments: list[str], say: str
+) -> None:
+    before = set(tmp_path.iterdir())
+    first = [*MODEL, "-o", tmp_path / "out.csv"] if command == "run" else [log_path]
+    ended = in_process(command, *first, *arguments)
+    assert ended.code == 2
+    assert ended.out == ""
+    lines = ended.err.splitlines()
+    assert len(lines) == 1, ended.err
+    assert re.search(say, lines[0])
+    assert set(tmp_path.iterdir()) == before
+
+
+def test_the_shell_sees_one_line_and_exit_2() -> None:
+    ended = run_to_end("run", *MODEL, "--interface", "socketcan", "--channel", "nosuch0")
+    assert (ended.code, ended.out, len(ended.err.splitlines())) == (2, "", 1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "say"),
+    [
+        (["run"], "--model"),
+        (["run", "-m", "/nowhere/model.json"], "/nowhere/model.json"),
+        (["run", *MODEL, "--method", "magic"], "magic"),
+        (["run", *MODEL, "--initial-soc", "150"], "150"),
+        (["run", *MODEL, "--time-source", "sundial"], "sundial"),
+        (["run", *MODEL, "--config", "/nowhere/car.toml"], "/nowhere/car.toml"),
+        (["run", *MODEL, "--record", "drive.asc"], r"drive\.asc"),
+        (["run", *MODEL, "-o", "/nowhere/live.csv"], "/nowhere/live.csv"),
+        (["replay", "/nowhere/log.csv"], "/nowhere/log.csv"),
+        (["replay", leaf_model_path()], "not a known kind of log"),
+        (["replay", leaf_model_path(), "--speed", "fast"], "fast"),
+        (["replay", leaf_model_path(), "--speed", "0"], "--speed"),
+        (["replay", leaf_model_path(), "--wait", "-1"], "--wait"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_2(arguments: list[str], say: str) -> None:
+    ended = in_process(*arguments)
+    assert ended.code == 2
+    assert ended.out == ""
+    assert len(ended.err.splitlines()) == 1, ended.err
+    assert re.search(say, ended.err)

@@ -1,0 +1,131 @@
+"""The configuration: file, command line, and errors that say where and what."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from cangauge.errors import InputError
+from cangauge.service.config import load_config
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "car.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_whole_file(tmp_path: Path) -> None:
+    path = write(
+        tmp_path,
+        """
+        model = "leaf.json"
+        interface = "socketcan"
+        channel = "can3"
+        vehicle = "leaf_aze0"
+        method = "newton"
+        initial_soc = 81.5
+        initial_soc_std = 3
+        time_source = "replay-clock"
+        timeout_s = 0.5
+        record = "out/drive.log"
+        [bus_options]
+        bitrate = 500000
+        fd = false
+        [ids]
+        soc_estimate = 0x123
+        """,
+    )
+    config = load_config(path)
+    assert config.model == str(tmp_path / "leaf.json")
+    assert config.record == str(tmp_path / "out" / "drive.log")
+    address = config.address()
+    assert (address.interface, address.channel) == ("socketcan", "can3")
+    assert dict(address.options) == {"bitrate": 500000, "fd": False}
+    settings = config.gauge_settings()
+    assert settings.ids.soc_estimate == 0x123
+    assert settings.ids.soc_detail == 0x5A1
+    assert settings.time_source == "replay-clock"
+    assert settings.estimator.method == "newton"
+    assert settings.estimator.initial_soc_pct == 81.5
+    assert config.loop_settings().timeout_s == 0.5
+    assert config.load_vehicle().name == "Nissan Leaf AZE0"
+
+
+def test_the_command_line_goes_before_the_file(tmp_path: Path) -> None:
+    path = write(
+        tmp_path,
+        'model = "a.json"\nvehicle = "leaf_aze0"\ninitial_soc = 50\n'
+        "[ids]\nsoc_estimate = 0x10\nsoc_detail = 0x11\n",
+    )
+    config = load_config(
+        path,
+        {
+            "model": "b.json",
+            "dbc": "car.dbc",
+            "map": "car.toml",
+            "initial_soc": "auto",
+            "method": None,
+            "ids": {"soc_detail": 0x99},
+        },
+    )
+    assert config.model == "b.json"
+    assert config.vehicle is None  # the file's car is not mixed with another one's DBC
+    assert config.dbc == "car.dbc"
+    assert config.initial_soc is None
+    assert config.method == "ekf"
+    assert (config.ids.soc_estimate, config.ids.soc_detail) == (0x10, 0x99)
+
+
+@pytest.mark.parametrize(
+    ("text", "field", "say"),
+    [
+        ('model = "m"\nmetod = "ekf"', "metod", "method"),
+        ('model = "m"\nmethod = "magic"', "method", "magic"),
+        ('model = "m"\ninitial_soc = 130', "initial_soc", "130"),
+        ('model = "m"\ninitial_soc = "full"', "initial_soc", "neither a number nor auto"),
+        ('model = "m"\ntimeout_s = 0', "timeout_s", "greater than 0"),
+        ('model = "m"\n[ids]\nsoc_detail = 0x800', "ids.soc_detail", "2047"),
+        ('model = "m"\ntimeout_s = nan', "timeout_s", "finite"),
+        ('vehicle = "generic"', "model", "is missing"),
+        ("model = 3", "model", "string"),
+        ("model = ", None, "not TOML"),
+    ],
+)
+def test_errors_name_file_field_and_value(
+    tmp_path: Path, text: str, field: str | None, say: str
+) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(InputError) as caught:
+        load_config(path)
+    assert caught.value.source == str(path)
+    assert caught.value.field == field
+    assert say in str(caught.value)
+    assert caught.value.exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "field"),
+    [
+        ({"model": "m", "method": "magic"}, "--method"),
+        ({"model": "m", "initial_soc": "x"}, "--initial-soc"),
+        ({"model": "m", "ids": {"soc_estimate": -1}}, "--soc-estimate-id"),
+        ({}, "-m/--model"),
+    ],
+)
+def test_errors_of_the_command_line_name_the_option(options: dict[str, object], field: str) -> None:
+    with pytest.raises(InputError) as caught:
+        load_config(None, options)
+    assert caught.value.field == field
+
+
+def test_equal_ids_are_refused(tmp_path: Path) -> None:
+    config = load_config(write(tmp_path, 'model = "m"\n[ids]\nsoc_detail = 0x5A0\n'))
+    with pytest.raises(InputError, match="same id"):
+        config.gauge_settings()
+
+
+def test_no_such_file() -> None:
+    with pytest.raises(InputError, match="no such file"):
+        load_config("/nowhere/car.toml")

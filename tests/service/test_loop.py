@@ -1,0 +1,212 @@
+"""The receive loop on a bus: rates, silence, ends, a bus that fails."""
+
+from __future__ import annotations
+
+import errno
+import itertools
+import time
+from pathlib import Path
+
+import can
+import pytest
+
+from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.publish import SocDetail, SocEstimate, SocReader
+from cangauge.bus.receive import BusError, BusPort
+from cangauge.bus.time_source import ClockFrames
+from cangauge.bus.vehicle import load_vehicle
+from cangauge.estimate.offline import samples_of
+from cangauge.estimate.types import Reason, Status
+from cangauge.service.capture_estimate import estimate_capture
+from cangauge.service.gauge import Gauge, GaugeSettings
+from cangauge.service.loop import LoopSettings
+from cangauge.service.record import Recorder
+from live import Service, collect, leaf_model, short_log, virtual_port, virtual_service, waits
+
+
+def send_log(port: BusPort, seconds: float, pause_s: float = 0.0) -> None:
+    encoder = FrameEncoder(load_vehicle("generic"))
+    for sample in samples_of(short_log(seconds)):
+        for frame in encoder.encode(sample):
+            port.send(frame)
+        time.sleep(pause_s)
+
+
+def test_before_any_frame_it_publishes_that_it_knows_nothing() -> None:
+    with virtual_port("quiet") as listener, virtual_service("quiet"):
+        frames = collect(listener, 1.25)
+    reader = SocReader()
+    contents = [reader.read(frame) for frame in frames]
+    told = [each for each in contents if isinstance(each, SocEstimate)]
+    assert 11 <= len(told) <= 14
+    assert {each.status for each in told} == {Status.INITIALISING}
+    assert sum(isinstance(each, SocDetail) for each in contents) == 2
+
+
+def test_an_estimate_is_published_every_100_ms_also_where_samples_are_slower() -> None:
+    with virtual_port("slow") as port, virtual_service("slow"):
+        for sample in samples_of(short_log(2.0, rate_hz=2.0)):
+            for frame in FrameEncoder(load_vehicle("generic")).encode(sample):
+                port.send(frame)
+            time.sleep(0.5)
+        frames = [each for each in collect_queue(port) if each.arbitration_id == 0x5A0]
+    steps = [b.timestamp - a.timestamp for a, b in itertools.pairwise(frames)]
+    assert max(steps) < 0.16
+    assert 18 <= len(frames) <= 30
+
+
+def collect_queue(port: BusPort) -> list[can.Message]:
+    found = []
+    while (message := port.receive(0.01)) is not None:
+        found.append(message)
+        if len(found) > 500:
+            break
+    return found
+
+
+def test_silence_becomes_stale_and_input_becomes_valid_again() -> None:
+    loop = LoopSettings(timeout_s=0.3)
+    reader = SocReader()
+    with virtual_port("stale") as port, virtual_service("stale", loop=loop) as service:
+        send_log(port, 10.0)
+        assert waits(lambda: service.gauge.samples == 100)
+        collect_queue(port)
+        contents = [reader.read(frame) for frame in collect(port, 0.8)]
+        told = [each for each in contents if isinstance(each, SocEstimate)]
+        assert told[0].status is Status.DEGRADED  # not yet: its delay line is filling
+        assert told[-1].status is Status.INVALID
+        assert told[-1].reasons & Reason.INPUT_STALE
+        send_log(port, 1.0, pause_s=0.02)
+        contents = [reader.read(frame) for frame in collect_queue(port)]
+        told = [each for each in contents if isinstance(each, SocEstimate)]
+        assert told[-1].status is Status.DEGRADED
+        assert not told[-1].reasons & Reason.INPUT_STALE
+
+
+def test_recording_and_table_hold_what_was_live(tmp_path: Path) -> None:
+    path = tmp_path / "live.log"
+    with (
+        Recorder(path) as recorder,
+        virtual_port("record") as port,
+        virtual_service("record", record=recorder) as service,
+    ):
+        send_log(port, 20.0)
+        assert waits(lambda: service.gauge.samples == 200)
+    recorded = estimate_capture(path, load_vehicle("generic"), leaf_model())
+    assert recorded.table.soc_pct.tolist() == [each.soc_pct for _, each in service.rows]
+    assert recorded.table.residual_v.tolist() == [each.residual_v for _, each in service.rows]
+    assert recorded.time_source == "receive"
+
+
+def test_it_ends_after_a_time_or_when_idle() -> None:
+    with virtual_service("brief", loop=LoopSettings(duration_s=0.3)) as service:
+        service.join(2.0)
+    assert service.summary is not None
+    assert service.summary.seconds == pytest.approx(0.3, abs=0.15)
+    loop = LoopSettings(until_idle_s=0.3)
+    with virtual_port("idle") as port, virtual_service("idle", loop=loop) as service:
+        time.sleep(0.5)  # idle from the beginning is no end
+        send_log(port, 3.0)
+        service.join(3.0)
+    assert service.gauge.samples == 30
+
+
+def test_a_replays_clock_on_the_bus_is_warned_of_once_and_not_recorded(tmp_path: Path) -> None:
+    path = tmp_path / "receive.log"
+    with (
+        Recorder(path) as recorder,
+        virtual_port("clock") as port,
+        virtual_service("clock", record=recorder) as service,
+    ):
+        for _ in range(3):
+            port.send(ClockFrames().at(5_000_000))
+        send_log(port, 2.0)
+        assert waits(lambda: service.gauge.samples == 20)
+    assert len(service.warnings) == 1
+    assert "--time-source replay-clock" in service.warnings[0]
+    assert "#" in path.read_text()
+    assert "5AF#" not in path.read_text()
+
+
+class BrokenBus:
+    """A bus whose calls fail as drivers' do."""
+
+    protocol = can.CanProtocol.CAN_20
+
+    def __init__(self, receiving: list[object], sending: BaseException | None = None) -> None:
+        self._receiving = receiving
+        self._sending = sending
+        self.sent: list[can.Message] = []
+
+    def recv(self, timeout: float | None) -> can.Message | None:
+        if not self._receiving:
+            time.sleep(timeout or 0.0)
+            return None
+        first = self._receiving.pop(0)
+        if isinstance(first, BaseException):
+            raise first
+        return first  # type: ignore[return-value] # a message or None
+
+    def send(self, message: can.Message) -> None:
+        if self._sending is not None:
+            raise self._sending
+        self.sent.append(message)
+
+    def set_filters(self, filters: object) -> None:
+        pass
+
+    def shutdown(self) -> None:
+        pass
+
+
+def unpack_error() -> can.CanOperationError:
+    error = can.CanOperationError("could not unpack received message")
+    error.__cause__ = ValueError("junk")
+    return error
+
+
+def down() -> can.CanOperationError:
+    error = can.CanOperationError("Failed to receive: Network is down", errno.ENETDOWN)
+    error.__cause__ = OSError(errno.ENETDOWN, "Network is down")
+    return error
+
+
+def serve_on(bus: BrokenBus, seconds: float) -> Service:
+    gauge = Gauge(load_vehicle("generic"), leaf_model(), GaugeSettings())
+    port = BusPort(bus, "fake bus")  # type: ignore[arg-type] # has what a bus is used for
+    with Service(port, gauge, LoopSettings(duration_s=seconds)) as service:
+        service.join(5.0)
+    return service
+
+
+def test_a_packet_of_junk_is_passed_over() -> None:
+    service = serve_on(BrokenBus([unpack_error(), unpack_error()]), 0.25)
+    assert service.error is None
+    assert service.port.garbled == 2
+
+
+def test_error_frames_are_counted() -> None:
+    service = serve_on(BrokenBus([can.Message(is_error_frame=True)]), 0.2)
+    assert service.port.error_frames == 1
+    assert service.gauge.counts.frames == 0
+
+
+@pytest.mark.parametrize("error", [down(), OSError(errno.ENODEV, "No such device")])
+def test_a_bus_that_is_gone_ends_the_service_with_a_clear_line(error: BaseException) -> None:
+    service = serve_on(BrokenBus([error]), 5.0)
+    assert isinstance(service.error, BusError)
+    assert "fake bus: receiving failed" in str(service.error)
+    assert service.error.exit_code == 1
+
+
+def test_a_full_queue_costs_frames_and_not_the_service() -> None:
+    full = can.CanOperationError("Failed to transmit: No buffer space", errno.ENOBUFS)
+    service = serve_on(BrokenBus([], sending=full), 0.5)
+    assert service.error is None
+    assert service.port.unsent > 2
+
+
+def test_sending_on_a_dead_bus_ends_it() -> None:
+    service = serve_on(BrokenBus([], sending=down()), 5.0)
+    assert isinstance(service.error, BusError)
+    assert "sending failed" in str(service.error)

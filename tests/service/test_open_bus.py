@@ -1,0 +1,120 @@
+"""Buses that cannot be opened: one clear line each, and nothing else on stderr."""
+
+from __future__ import annotations
+
+import os
+import socket
+
+import can
+import pytest
+
+from cangauge.bus import open as opening
+from cangauge.bus.open import BusAddress, bus_address, open_bus, parse_bus_options
+from cangauge.errors import InputError
+
+GROUP = "239.74.163.2"
+
+
+def test_udp_multicast_stays_on_this_machine() -> None:
+    address = bus_address("udp_multicast")
+    assert address.channel == GROUP
+    assert address.options["hop_limit"] == 0
+    bus = open_bus(address)
+    try:
+        with socket.socket(fileno=os.dup(bus.fileno())) as own:
+            assert own.getsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL) == 0
+    finally:
+        bus.shutdown()
+    assert bus_address("udp_multicast", options={"hop_limit": 1}).options["hop_limit"] == 1
+
+
+def test_two_ports_of_one_machine_hear_each_other() -> None:
+    address = bus_address("udp_multicast", options={"port": 43987})
+    first, second = open_bus(address), open_bus(address)
+    try:
+        first.send(can.Message(arbitration_id=0x42, is_extended_id=False, data=b"hi"))
+        message = second.recv(2.0)
+        assert message is not None
+        assert bytes(message.data) == b"hi"
+    finally:
+        first.shutdown()
+        second.shutdown()
+
+
+def test_without_socketcan_the_default_is_multicast(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(opening, "has_socketcan", lambda _channel: False)
+    assert bus_address().interface == "udp_multicast"
+    assert bus_address(None, "239.1.1.1").channel == "239.1.1.1"
+    with pytest.raises(InputError, match="no such SocketCAN interface"):
+        bus_address(None, "can0")
+    monkeypatch.setattr(opening, "has_socketcan", lambda channel: channel == "vcan0")
+    assert (bus_address().interface, bus_address().channel) == ("socketcan", "vcan0")
+
+
+@pytest.mark.parametrize(
+    ("interface", "channel", "field", "say"),
+    [
+        ("carrier_pigeon", None, "--interface", "use one of"),
+        ("pcan", None, "--channel", "needs a channel"),
+        ("udp_multicast", "vcan0", "--channel", "no multicast address"),
+        ("udp_multicast", "10.0.0.1", "--channel", "no multicast address"),
+    ],
+)
+def test_addresses_that_mean_nothing(
+    interface: str, channel: str | None, field: str, say: str
+) -> None:
+    with pytest.raises(InputError, match=say) as caught:
+        bus_address(interface, channel)
+    assert caught.value.field == field
+
+
+def test_a_driver_that_is_missing(capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(InputError) as caught:
+        open_bus(BusAddress("pcan", "PCAN_USBBUS1"))
+    assert "library" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr().err == ""
+
+
+def test_socketcan_channel_that_is_not_there(capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(InputError) as caught:
+        open_bus(BusAddress("socketcan", "nosuch0"))
+    # Either the machine has no SocketCAN at all, or not this interface.
+    assert "no SocketCAN" in str(caught.value) or "nosuch0" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr().err == ""
+
+
+def test_multicast_without_msgpack_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("can.interfaces.udp_multicast.utils.msgpack", None)
+    with pytest.raises(InputError, match="msgpack") as caught:
+        open_bus(bus_address("udp_multicast"))
+    assert caught.value.field == "--interface"
+
+
+@pytest.mark.parametrize(
+    ("error", "say"),
+    [
+        (PermissionError(1, "Operation not permitted"), "no permission"),
+        (OSError(19, "No such device"), "no such bus"),
+        (ValueError("bitrate 3 is no bitrate"), "bitrate 3"),
+        (ImportError("No module named 'canlib'"), "library"),
+    ],
+)
+def test_what_drivers_raise(monkeypatch: pytest.MonkeyPatch, error: Exception, say: str) -> None:
+    def refuse(**_: object) -> object:
+        raise error
+
+    monkeypatch.setattr(can, "Bus", refuse)
+    with pytest.raises(InputError, match=say) as caught:
+        open_bus(BusAddress("pcan", "PCAN_USBBUS1"))
+    assert caught.value.exit_code == 2
+
+
+def test_bus_options() -> None:
+    assert parse_bus_options(["bitrate=500000", "fd=True", "x=0x10", "f=0.5", "name=a=b"]) == {
+        "bitrate": 500000, "fd": True, "x": 16, "f": 0.5, "name": "a=b",
+    }  # fmt: skip
+    for text in ("bitrate", "=5", "a b=3"):
+        with pytest.raises(InputError, match="K=V"):
+            parse_bus_options([text])

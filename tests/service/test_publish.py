@@ -1,0 +1,147 @@
+"""What is published, bit by bit and when."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import can
+import cantools
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cangauge.bus.publish import FrameIds, SocDetail, SocEstimate, SocPublisher, SocReader
+from cangauge.errors import InputError
+from cangauge.estimate.types import Estimate, Reason, Status
+
+numbers = st.floats(-1e4, 1e4) | st.just(math.nan)
+
+
+def estimate(time_s: float = 0.0, **values: object) -> Estimate:
+    base = Estimate(time_s, 63.217, 1.5, 62.1, 63.9, 370.0, -0.25, Status.VALID, Reason.NONE, 1)
+    return base._replace(**values)
+
+
+def decoded(project: Path, message: can.Message) -> dict[str, object]:
+    database = cantools.database.load_file(project / "dbc" / "soc_estimate.dbc")
+    return database.decode_message(message.arbitration_id, message.data, decode_choices=False)
+
+
+def test_the_dbc_decodes_what_is_sent(project: Path) -> None:
+    publisher = SocPublisher()
+    first, detail = publisher.publish(
+        estimate(status=Status.DEGRADED, reasons=Reason.CURRENT_GAP | Reason.INPUT_STALE), 70_000
+    )
+    assert first.arbitration_id == 0x5A0
+    assert detail.arbitration_id == 0x5A1
+    values = decoded(project, first)
+    assert values["soc_pct"] == pytest.approx(63.217, abs=0.001)
+    assert values["soc_std_pct"] == pytest.approx(1.5, abs=0.001)
+    assert values["status"] == 2
+    assert values["reason"] == (1 << 1) | (1 << 11)
+    values = decoded(project, detail)
+    assert values["soc_newton_pct"] == pytest.approx(62.1, abs=0.0125)
+    assert values["soc_coulomb_pct"] == pytest.approx(63.9, abs=0.0125)
+    assert values["residual_v"] == pytest.approx(-0.25, abs=0.005)
+    assert values["samples"] == 70_000 % 65_536
+
+
+def test_unknown_values_have_their_codes(project: Path) -> None:
+    nan = math.nan
+    unknown = estimate(
+        soc_pct=nan, soc_std_pct=nan, soc_newton_pct=nan, soc_coulomb_pct=nan, residual_v=nan,
+        status=Status.INITIALISING, reasons=Reason.NO_INITIAL_SOC,
+    )  # fmt: skip
+    publisher = SocPublisher()
+    first, detail = publisher.estimate_frame(unknown), publisher.detail_frame(unknown, 0)
+    assert first.data[:4] == b"\xff\xff\xff\xff"
+    values = decoded(project, first)
+    assert (values["status"], values["reason"]) == (0, 1 << 10)
+    reader = SocReader()
+    read = reader.read(first)
+    assert isinstance(read, SocEstimate)
+    assert math.isnan(read.soc_pct)
+    told = reader.read(detail)
+    assert isinstance(told, SocDetail)
+    assert math.isnan(told.residual_v)
+    assert math.isnan(told.soc_newton_pct)
+
+
+@given(numbers, numbers, numbers)
+def test_any_number_can_be_sent_and_is_read_back_clipped(
+    soc: float, std: float, residual: float
+) -> None:
+    publisher, reader = SocPublisher(), SocReader()
+    given_estimate = estimate(soc_pct=soc, soc_std_pct=std, residual_v=residual)
+    read = reader.read(publisher.estimate_frame(given_estimate))
+    told = reader.read(publisher.detail_frame(given_estimate, 5))
+    assert isinstance(read, SocEstimate)
+    assert isinstance(told, SocDetail)
+    for value, sent, low, high, step in (
+        (read.soc_pct, soc, 0.0, 131.068, 0.002),
+        (read.soc_std_pct, std, 0.0, 131.068, 0.002),
+        (told.residual_v, residual, -20.47, 20.47, 0.01),
+    ):
+        if math.isnan(sent):
+            assert math.isnan(value)
+        else:
+            assert value == pytest.approx(min(max(sent, low), high), abs=0.5001 * step)
+
+
+def test_counters_count_and_damaged_frames_are_refused() -> None:
+    publisher, reader = SocPublisher(), SocReader()
+    counters = [publisher.estimate_frame(estimate()).data[6] >> 4 for _ in range(18)]
+    assert counters == [*range(16), 0, 1]
+    broken = publisher.estimate_frame(estimate())
+    broken.data[0] ^= 4
+    assert reader.read(broken) is None
+    assert reader.refused == 1
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 100.0, 12.5])
+def test_an_estimate_every_100_ms_and_details_every_second_of_bus_time(rate_hz: float) -> None:
+    publisher = SocPublisher()
+    times: dict[int, list[float]] = {0x5A0: [], 0x5A1: []}
+    for sample in range(int(20.0 * rate_hz)):
+        now_s = 1_700_000_000.0 + sample / rate_hz
+        for message in publisher.publish(estimate(now_s), sample + 1):
+            times[message.arbitration_id].append(now_s)
+    # Samples come when they come: the grid is kept on the average, within one sample.
+    for frame_id, every_s in ((0x5A0, 0.1), (0x5A1, 1.0)):
+        assert len(times[frame_id]) == pytest.approx(20.0 / every_s, abs=1)
+        steps = [b - a for a, b in zip(times[frame_id], times[frame_id][1:], strict=False)]
+        assert max(steps) <= every_s + 1.0 / rate_hz + 1e-6
+
+
+def test_jitter_does_not_halve_the_rate() -> None:
+    publisher = SocPublisher()
+    sent = 0
+    for sample in range(1000):
+        jitter = 0.004 if sample % 2 else -0.004
+        sent += any(
+            message.arbitration_id == 0x5A0
+            for message in publisher.publish(estimate(100.0 + 0.1 * sample + jitter), sample)
+        )
+    assert sent == 1000
+
+
+def test_samples_are_acknowledged_every_so_often() -> None:
+    publisher = SocPublisher(acknowledge_every=4)
+    told = [
+        sample
+        for sample in range(1, 40)
+        for message in publisher.publish(estimate(0.001 * sample), sample)
+        if message.arbitration_id == 0x5A1
+    ]
+    assert told == list(range(1, 40, 4))
+
+
+def test_ids_must_be_standard_and_differ() -> None:
+    with pytest.raises(InputError, match=r"ids\.soc_detail"):
+        FrameIds(soc_estimate=0x100, soc_detail=0x100)
+    with pytest.raises(InputError, match="no standard CAN id"):
+        FrameIds(soc_estimate=0x800)
+    frame = SocPublisher(FrameIds(0x10, 0x11, 0x12)).estimate_frame(estimate())
+    assert frame.arbitration_id == 0x10
+    assert SocReader().read(frame) is None

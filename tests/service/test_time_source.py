@@ -1,0 +1,81 @@
+"""Bus time: whole microseconds, the replay clock, clocks that are set."""
+
+from __future__ import annotations
+
+import can
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cangauge.bus.time_source import ClockFrames, ReceiveTime, ReplayClock, time_source
+
+
+def frame(time_s: float = 0.0, frame_id: int = 0x401) -> can.Message:
+    return can.Message(timestamp=time_s, arbitration_id=frame_id, is_extended_id=False, data=b"12")
+
+
+@given(st.integers(0, 2_000_000_000_000_000))
+def test_a_stamp_of_whole_microseconds_stays_what_it_is(time_us: int) -> None:
+    source = ReceiveTime()
+    assert source.time_of(frame(time_us / 1e6)) == time_us / 1e6
+    # What a candump file holds reads back as the same number.
+    assert float(f"{time_us / 1e6:f}") == time_us / 1e6
+
+
+def test_finer_stamps_are_rounded_to_the_microsecond() -> None:
+    assert ReceiveTime().time_of(frame(1.23456789)) == 1.234568
+
+
+def test_a_clock_set_back_goes_on_from_where_it_was() -> None:
+    source = ReceiveTime()
+    assert source.time_of(frame(5000.0)) == 5000.0
+    assert source.time_of(frame(1400.0)) == 5000.0
+    assert source.time_of(frame(1400.5)) == 5000.5
+    assert source.steps_back == 1
+
+
+def test_frames_a_little_out_of_order_are_left_so() -> None:
+    source = ReceiveTime()
+    source.time_of(frame(10.0))
+    assert source.time_of(frame(9.9)) == 9.9
+    assert source.steps_back == 0
+
+
+@given(st.integers(-(1 << 52), 1 << 52))
+def test_the_replay_clock_carries_any_time_exactly(time_us: int) -> None:
+    clock = ReplayClock()
+    assert clock.time_of(ClockFrames().at(time_us)) is None
+    assert clock.time_of(frame()) == time_us / 1e6
+
+
+def test_frames_before_the_first_clock_have_no_time() -> None:
+    assert ReplayClock().time_of(frame(3.0)) is None
+
+
+def test_a_damaged_clock_frame_is_refused() -> None:
+    clock, frames = ReplayClock(), ClockFrames()
+    clock.time_of(frames.at(1_000_000))
+    broken = frames.at(9_000_000)
+    broken.data[0] ^= 1
+    clock.time_of(broken)
+    assert clock.time_of(frame()) == 1.0
+    assert clock.refused == 1
+
+
+def test_the_replay_clock_jumping_back_is_a_new_log() -> None:
+    clock, frames = ReplayClock(), ClockFrames()
+    for time_us in (0, 100_000_000, 99_500_000):
+        clock.time_of(frames.at(time_us))
+    assert clock.beginnings == 0
+    clock.time_of(frames.at(0))
+    assert clock.beginnings == 1
+
+
+def test_an_extended_frame_with_the_clocks_number_is_no_clock() -> None:
+    clock = time_source("replay-clock", 0x123)
+    message = ClockFrames(0x123).at(5)
+    message.is_extended_id = True
+    clock.time_of(message)
+    assert clock.time_of(frame()) is None
+    assert clock.time_of(ClockFrames(0x123).at(7)) is None
+    assert clock.time_of(frame()) == pytest.approx(7e-6)
