@@ -1,0 +1,194 @@
+"""What reference logs say: how far the model strays without a cause, and what structure it lacks.
+
+Everything is judged on whole logs left out: fitted on the other references (and the model's own
+information), seen on the one left out. Without at least two references the model file's own noise
+stands in.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cangauge.gap.columns import LogTerms
+from cangauge.gap.evidence import ErrorModel, Frame, Gram, gather
+from cangauge.model.model_file import ModelNoise
+
+FloatArray = NDArray[np.float64]
+
+REPAIRS = (
+    "fast_polarization",
+    "slow_diffusion",
+    "resistance_temperature",
+    "resistance_soc",
+    "charge_transfer",
+    "resistance_asymmetry",
+)
+"""Effects that a clean pack may well have and the 13 coefficients lack. Sensor errors are not among
+them, nor what would take a change of the pack."""
+
+REPAIRS_AT_MOST = 4
+REPAIR_GAIN = 0.02
+"""A repair must lower the references' left-out error by this much, relative."""
+
+SOC_STD_PCT = 0.7
+"""How well a log's assumed initial SoC is known without a cause [%]."""
+
+MEMORY_S = 600
+"""Over how long residuals may be correlated [s]."""
+
+ALIKE_WITHIN = (20.0, 200.0)
+"""Bounds of κ, the rows that tell as much as one."""
+
+KNOWN_LOGS = 2.0
+"""The model file's noise counts like this many reference logs."""
+
+
+def error_from_noise(noise: ModelNoise, rate_hz: float) -> ErrorModel:
+    """Return the error that a model file states, for want of references."""
+    slow_v2, fast_v2 = noise.slow_std_v**2, noise.fast_std_v**2
+    total_v2 = max(slow_v2 + fast_v2, 1e-12)
+    seconds = (slow_v2 * noise.slow_time_s + fast_v2 * noise.fast_time_s) / total_v2
+    return ErrorModel(
+        rmse_v=math.sqrt(total_v2),
+        rows_alike=float(np.clip(1.0 + 2.0 * seconds * rate_hz, *ALIKE_WITHIN)),
+        own_voltage_std_v=max(noise.lasting_std_v, 0.25 * math.sqrt(total_v2)),
+        own_soc_std_pct=SOC_STD_PCT,
+    )
+
+
+def left_out_errors(
+    frame: Frame, terms: Sequence[LogTerms], grams: Sequence[Gram], error: ErrorModel
+) -> list[FloatArray]:
+    """Return each reference's error under a fit to the others [V], shape (m,) each."""
+    errors = []
+    for number, log in enumerate(terms):
+        others = [gram for k, gram in enumerate(grams) if k != number]
+        solution = gather(frame, others, [], error).mean
+        errors.append(log.residual_v - _predicted(frame, log, solution))
+    return errors
+
+
+def error_from_references(
+    errors: Sequence[FloatArray], stated: ErrorModel, rate_hz: float
+) -> ErrorModel:
+    """Return the error that references show under fits to the others.
+
+    Parameters
+    ----------
+    errors : sequence of arrays
+        Each reference's left-out error [V].
+    stated : ErrorModel
+        What the model file says; it counts like `KNOWN_LOGS` logs for what differs between logs.
+    rate_hz : float
+        Rate of the rows.
+    """
+    means = np.array([float(values.mean()) for values in errors])
+    centred = [values - values.mean() for values in errors]
+    within_v2 = float(np.mean(np.concatenate(centred) ** 2))
+    between_v2 = (float(means @ means) + KNOWN_LOGS * stated.own_voltage_std_v**2) / (
+        means.size + KNOWN_LOGS
+    )
+    return ErrorModel(
+        rmse_v=math.sqrt(max(within_v2, 1e-12)),
+        rows_alike=_rows_alike(centred, within_v2, rate_hz),
+        own_voltage_std_v=math.sqrt(max(between_v2, (0.1 * stated.rmse_v) ** 2)),
+        own_soc_std_pct=stated.own_soc_std_pct,
+    )
+
+
+def find_repairs(
+    frame: Frame, terms: Sequence[LogTerms], grams: Sequence[Gram], error: ErrorModel
+) -> tuple[int, ...]:
+    """Return the candidates that lower the references' left-out error, the most useful first.
+
+    One shape of an effect at most; none without three references.
+    """
+    if len(terms) < 3:
+        return ()
+    chosen: tuple[int, ...] = ()
+    best = _left_out_rmse(frame, grams, error)
+    while len(chosen) < REPAIRS_AT_MOST:
+        taken = {frame.choices[k].effect.id for k in chosen}
+        trials = [
+            (_left_out_rmse(_with_repairs(frame, (*chosen, k)), grams, error), k)
+            for k, choice in enumerate(frame.choices)
+            if choice.effect.id in REPAIRS and choice.effect.id not in taken
+        ]
+        if not trials:
+            break
+        rmse, k = min(trials)
+        if rmse > (1.0 - REPAIR_GAIN) * best:
+            break
+        best, chosen = rmse, (*chosen, k)
+    return chosen
+
+
+def _with_repairs(frame: Frame, repairs: tuple[int, ...]) -> Frame:
+    return Frame(frame.choices, frame.prior_root, frame.scale, repairs)
+
+
+def _left_out_rmse(frame: Frame, grams: Sequence[Gram], error: ErrorModel) -> float:
+    square, rows = 0.0, 0
+    for number, left_out in enumerate(grams):
+        others = [gram for k, gram in enumerate(grams) if k != number]
+        square += squares_of(frame, left_out, gather(frame, others, [], error).mean)
+        rows += left_out.rows
+    return math.sqrt(max(square, 0.0) / rows)
+
+
+def squares_of(
+    frame: Frame, gram: Gram, solution: FloatArray, effect: tuple[int, FloatArray] | None = None
+) -> float:
+    """Return the sum of squared errors of a log under a solution, optionally with one effect [V²].
+
+    Parameters
+    ----------
+    frame : Frame
+    gram : Gram
+        The log's products.
+    solution : array
+        δθ (scaled), then the repairs; what follows is ignored.
+    effect : pair, optional
+        Candidate and its amplitudes.
+    """
+    p = frame.scale.size
+    repairs = frame.amplitudes_of(frame.repairs)
+    coefficients = np.zeros(gram.products.shape[0])
+    coefficients[:p] = -solution[:p]
+    coefficients[p + repairs] = -solution[p : p + repairs.size]
+    if effect is not None:
+        coefficients[p + frame.amplitudes_of([effect[0]])] -= effect[1]
+    coefficients[-1] = 1.0
+    return float(coefficients @ gram.products @ coefficients)
+
+
+def _predicted(frame: Frame, log: LogTerms, solution: FloatArray) -> FloatArray:
+    p = frame.scale.size
+    volts = (log.baseline / frame.scale) @ solution[:p]
+    at = p
+    for k in frame.repairs:
+        width = log.effects[k].shape[1]
+        volts = volts + log.effects[k] @ solution[at : at + width]
+        at += width
+    return np.asarray(volts)
+
+
+def _rows_alike(centred: Sequence[FloatArray], variance: float, rate_hz: float) -> float:
+    """Return 1 + 2·Σρ over the lags up to `MEMORY_S`, as far as the correlation is positive."""
+    lags = round(MEMORY_S * rate_hz)
+    total = np.zeros(lags + 1)
+    rows = 0
+    for values in centred:
+        size = values.size
+        spectrum = np.abs(np.fft.rfft(values, 2 * size)) ** 2
+        covariance = np.fft.irfft(spectrum)[: min(lags + 1, size)]
+        total[: covariance.size] += covariance
+        rows += size
+    correlation = total / (rows * max(variance, 1e-12))
+    negative = np.flatnonzero(correlation <= 0.0)
+    end = int(negative[0]) if negative.size else correlation.size
+    return float(np.clip(1.0 + 2.0 * correlation[1:end].sum(), *ALIKE_WITHIN))
