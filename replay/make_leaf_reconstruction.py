@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from cangauge.atomic import atomic_path
 from cangauge.errors import CangaugeError, InputError
-from cangauge.identify.charge import discharged_ah
+from cangauge.model.charge import discharged_ah
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.published import CAPACITY_AH, VOLTAGE_MAE_PCT, leaf_2012_model
 

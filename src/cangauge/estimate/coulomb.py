@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from cangauge.identify.charge import BRIDGE_S
+from cangauge.model.charge import BRIDGE_S
 
 AWAY_PCT_PER_HOUR = 20.0
 """SoC that a pack may gain or lose unseen [% per hour]: a slow charger's rate."""

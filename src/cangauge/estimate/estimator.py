@@ -7,6 +7,7 @@ or after each tick of bus time. The same samples give the same numbers, live or 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -25,6 +26,7 @@ from cangauge.estimate.validity import (
 )
 from cangauge.logs.log import TemperatureSource
 from cangauge.model.delay_line import GAP_S, DelayLine
+from cangauge.model.effects.effect import Reading
 from cangauge.model.model_file import ModelFile, effective_error_std_v
 
 Method = Literal["ekf", "newton", "coulomb"]
@@ -96,12 +98,14 @@ class Estimator:
     def __init__(self, model: ModelFile, settings: EstimatorSettings | None = None) -> None:
         self.settings = settings or EstimatorSettings()
         self._file = model
-        self._model = model.voltage_model()
-        self.capacity_ah = self.settings.capacity_ah or model.capacity_ah
+        extended = model.extended_model()
+        self._model = extended.model
+        self._online = extended.online(self.settings.capacity_ah)
+        self.capacity_ah = self._online.capacity_ah
         self._counter = CoulombCounter(self.capacity_ah, self.settings.gap_s)
         self._line = DelayLine(self._model.delay_s, gap_s=self.settings.gap_s)
         noise = model.noise
-        self._fusion = Fusion(self._model, self.capacity_ah, noise)
+        self._fusion = Fusion(self._online, self.capacity_ah, noise)
         self._bias_std_v = math.hypot(noise.slow_std_v, noise.lasting_std_v)
         self._fast_std_v = effective_error_std_v(noise, 1.0 / model.rate_hz)
         self._standing = temperature_mismatch(
@@ -128,7 +132,8 @@ class Estimator:
         self._prediction = (math.nan, math.nan)
         self._last_estimate = _nothing_yet()
         if self.settings.initial_soc_pct is not None:
-            self._begin(self.settings.initial_soc_pct, self.settings.initial_soc_std_pct)
+            start = self._online.initial_soc_pct(self.settings.initial_soc_pct)
+            self._begin(start, self.settings.initial_soc_std_pct)
 
     @property
     def offset_a(self) -> float:
@@ -141,26 +146,54 @@ class Estimator:
         A sample without a believable current, or not later than the one before, is refused: the
         last estimate comes back, marked `IMPLAUSIBLE_INPUT`. A voltage or temperature that cannot
         be true counts as missing, and charge is still counted.
+
+        With effects in the model the sample is corrected first. An effect may hold a sample back
+        until it knows the current that belongs to it (`time_skew`); the estimate then is the one
+        after the last sample that was given out.
         """
         if not acceptable(sample) or sample.time_s <= self._last_s:
             return self._refuse()
         sample, self._implausible = cleaned(sample, self._usual_v)
-        time_s, current_a = sample.time_s, sample.current_a
         if self._samples == 0:
-            self._first_s = time_s
+            self._first_s = sample.time_s
         self._samples += 1
-        self._last_s = time_s
-        charge = self._counter.step(time_s, current_a)
+        self._last_s = sample.time_s
+        corrected = self._corrected(sample)
+        for item in corrected:
+            self._take(item)
+        if corrected:
+            self._last_estimate = self._estimate(corrected[-1], sample.time_s)
+        else:
+            self._last_estimate = self._last_estimate._replace(
+                time_s=sample.time_s, samples=self._samples
+            )
+        return self._last_estimate
+
+    def _corrected(self, sample: Sample) -> Sequence[Sample]:
+        if self._online.plain:
+            return (sample,)
+        return [Sample(*reading) for reading in self._online.correct(Reading(*sample))]
+
+    def _take(self, sample: Sample) -> None:
+        time_s, current_a = sample.time_s, sample.current_a
+        charge = self._counter.step(time_s, self._online.counted(current_a))
         self._line.push(time_s, current_a)
         self._account(charge, time_s, current_a)
         if math.isfinite(sample.temperature_c):
             self._temperature_c = sample.temperature_c
+        if not self._online.plain:
+            self._online.advance(
+                time_s, current_a, self._known_temperature_c(), self._line.currents()
+            )
         tick = math.floor((time_s - self._first_s) * self._file.rate_hz + 1e-6)
         if tick > self._tick:
             self._tick = tick
             self._use_voltage(sample)
-        self._last_estimate = self._estimate(sample)
-        return self._last_estimate
+
+    def _known_temperature_c(self) -> float:
+        """Return the last temperature, or where none was ever known the model's reference."""
+        known = math.isfinite(self._temperature_c)
+        return self._temperature_c if known else self._model.t_ref_c
 
     # --- charge ---------------------------------------------------------------------------
 
@@ -199,14 +232,11 @@ class Estimator:
         if not math.isfinite(sample.voltage_v):
             self._newton = Inverse(math.nan, inside=True)
             return
-        temperature_c = self._temperature_c
-        if math.isnan(temperature_c):
-            temperature_c = self._model.t_ref_c
-        beside_v = self._model.offset_at(temperature_c, self._line.currents())
+        beside_v = self._model.offset_at(self._known_temperature_c(), self._line.currents())
         guess = self._newton.soc_pct if math.isfinite(self._newton.soc_pct) else 50.0
-        self._newton = soc_from_ocv(self._model, sample.voltage_v - beside_v, guess)
+        self._newton = soc_from_ocv(self._online, sample.voltage_v - beside_v, guess)
         std_v = self._error_std_v()
-        slope = self._model.pseudo_ocv_at(self._newton.soc_pct)[1]
+        slope = self._online.pseudo_ocv_at(self._newton.soc_pct)[1]
         self._newton_std_pct = min(math.hypot(std_v, self._bias_std_v) / slope, UNKNOWN_SOC_STD_PCT)
         if math.isnan(self._coulomb_start_pct):
             # Nothing known before: the voltage says where to begin, and the filter starts wide,
@@ -249,19 +279,16 @@ class Estimator:
 
     # --- estimate -------------------------------------------------------------------------
 
-    def _estimate(self, sample: Sample) -> Estimate:
+    def _estimate(self, sample: Sample, time_s: float) -> Estimate:
         coulomb = self._coulomb_start_pct - self._counter.discharged_pct
         soc, std = self._chosen(coulomb)
         voltage_model_v = math.nan
         if math.isfinite(soc):
-            temperature_c = self._temperature_c
-            if math.isnan(temperature_c):
-                temperature_c = self._model.t_ref_c
-            beside_v = self._model.offset_at(temperature_c, self._line.currents())
-            voltage_model_v = self._model.pseudo_ocv_at(soc)[0] + beside_v
+            beside_v = self._model.offset_at(self._known_temperature_c(), self._line.currents())
+            voltage_model_v = self._online.pseudo_ocv_at(soc)[0] + beside_v
         reasons = self._reasons(sample, soc)
         return Estimate(
-            time_s=sample.time_s,
+            time_s=time_s,
             soc_pct=soc,
             soc_std_pct=std,
             soc_newton_pct=self._newton.soc_pct,

@@ -19,6 +19,7 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
 
+from cangauge.model.extended import OnlineExtendedModel
 from cangauge.model.model_file import ModelNoise
 from cangauge.model.voltage_model import VoltageModel
 
@@ -76,13 +77,15 @@ class Fusion:
 
     Parameters
     ----------
-    model : VoltageModel
+    model : VoltageModel or OnlineExtendedModel
     capacity_ah : float
     noise : ModelNoise
         Size and duration of the model's biases.
     """
 
-    def __init__(self, model: VoltageModel, capacity_ah: float, noise: ModelNoise) -> None:
+    def __init__(
+        self, model: VoltageModel | OnlineExtendedModel, capacity_ah: float, noise: ModelNoise
+    ) -> None:
         self._model = model
         self._pct_per_as = 100.0 / (3600.0 * capacity_ah)
         self._resistance_sum = sum(model.resistance_ohm)

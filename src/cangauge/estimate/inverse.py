@@ -7,15 +7,20 @@ what the model can give between 0 and 100 %.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
-from cangauge.model.voltage_model import VoltageModel
+from typing import NamedTuple, Protocol
 
 TOLERANCE_PCT = 1e-9
 """The root is found when a step is smaller than this [% SoC]."""
 
 STEPS_AT_MOST = 80
 """Halving alone needs 37 steps from 100 % down to the tolerance."""
+
+
+class Curve(Protocol):
+    """What can be inverted: a voltage model, or one extended by effects."""
+
+    def pseudo_ocv_at(self, soc_pct: float) -> tuple[float, float]:
+        """Return voltage [V] and its slope [V per %], positive, at one SoC [%]."""
 
 
 class Inverse(NamedTuple):
@@ -27,12 +32,12 @@ class Inverse(NamedTuple):
     """False if the voltage lies outside the model's range and SoC was clipped."""
 
 
-def soc_from_ocv(model: VoltageModel, ocv_v: float, guess_pct: float = 50.0) -> Inverse:
+def soc_from_ocv(model: Curve, ocv_v: float, guess_pct: float = 50.0) -> Inverse:
     """Return the SoC at which the pseudo-OCV at reference temperature equals a voltage.
 
     Parameters
     ----------
-    model : VoltageModel
+    model : VoltageModel or OnlineExtendedModel
     ocv_v : float
         Voltage [V] less the parts that do not depend on SoC (`VoltageModel.offset_at`).
     guess_pct : float

@@ -14,15 +14,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cangauge.identify.charge import discharged_ah
 from cangauge.identify.options import FitOptions
 from cangauge.identify.rows import FitRows
 from cangauge.identify.voltage_fit import columns_of, prepare
 from cangauge.logs.log import Log
+from cangauge.model.charge import BRIDGE_S, discharged_ah
 from cangauge.model.effects.effect import Effect, Pack, Signals, Values
+from cangauge.model.effects.first_order import low_passed
 from cangauge.model.extended import ExtendedModel
 
 FloatArray = NDArray[np.float64]
+
+OWN = ("constant voltage [V]", "assumed initial SoC [%]", "slow polarisation", "resistance level")
+"""What differs from log to log without a cause; the last two in parts of the pack's resistance.
+Trips of one pack differ in the state that they begin from, in how hard they are, in how warm the
+cells inside are."""
+
+OWN_SLOW_S = 150.0
+"""Time constant of a log's own slow polarisation [s]."""
 
 STEP = 0.02
 """Finite-difference step, relative to the width of the amplitude's bounds."""
@@ -74,8 +83,7 @@ class LogTerms:
     baseline: FloatArray
     """Columns of the voltage model's coefficients, shape (m, 9 + delays)."""
     own: FloatArray
-    """Columns of what differs from log to log without a cause: a constant voltage and the assumed
-    initial SoC, shape (m, 2)."""
+    """Columns of what differs from log to log without a cause (`OWN`), shape (m, 4)."""
     effects: tuple[FloatArray, ...]
     """Columns of each candidate, shape (m, k) each."""
 
@@ -185,7 +193,16 @@ def log_terms(prepared: Prepared, model: ExtendedModel, choices: Sequence[Candid
     voltage_model = model.model
     plain = residual(prepared, model)
     rows = prepared.rows
-    own = np.column_stack([np.ones(len(rows)), voltage_model.pseudo_ocv_slope(rows.soc_pct)])
+    current = prepared.log.current_a
+    slow = low_passed(prepared.log.time_s, current, OWN_SLOW_S, 0.0, rest_s=BRIDGE_S)
+    own = np.column_stack(
+        [
+            np.ones(len(rows)),
+            voltage_model.pseudo_ocv_slope(rows.soc_pct),
+            -model.pack.resistance_ohm * slow[prepared.at],
+            -model.pack.resistance_ohm * current[prepared.at],
+        ]
+    )
     return LogTerms(
         prepared=prepared,
         residual_v=plain,

@@ -1,12 +1,11 @@
 """The evidence for each effect: one linear Gaussian model of all logs, references and diagnosed.
 
-    residual = baseline·δθ + own·(b, s) + repairs·ρ + effect·a + error
+    residual = baseline·δθ + own·o + repairs·ρ + effect·a + error
 
-δθ are the voltage model's coefficients, held by the information that its own logs gave; (b, s) is
-what differs from log to log without a cause (a constant voltage, the assumed initial SoC), held by
-how much references differ; ρ are effects that clean logs show too; a is the effect in question,
-which only the diagnosed logs have. All but a are integrated out. What is left is a quadratic form
-in a, for all candidates at once:
+δθ are the voltage model's coefficients, held by the information that its own logs gave; o is what
+differs from log to log without a cause (`columns.OWN`), held by how much clean logs differ; ρ are
+effects that clean logs show too; a is the effect in question, which only the diagnosed logs have.
+All but a are integrated out. What is left is a quadratic form in a, for all candidates at once:
 
     ln evidence(a) = g·a − ½ a·S·a,    and with a ~ N(0, τ²) the Bayes factor against no effect.
 
@@ -24,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from cangauge.gap.columns import Candidate, LogTerms
+from cangauge.gap.columns import OWN, Candidate, LogTerms
 
 FloatArray = NDArray[np.float64]
 
@@ -43,10 +42,8 @@ class ErrorModel:
     """Of a reference log under a model that did not see it [V]."""
     rows_alike: float
     """κ: so many rows in a row tell as much as one."""
-    own_voltage_std_v: float
-    """Constant voltage of a log, from log to log [V]."""
-    own_soc_std_pct: float
-    """Assumed initial SoC of a log [%]."""
+    own_std: tuple[float, ...]
+    """Standard deviation, from log to log, of each of `columns.OWN`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +58,7 @@ class Evidence:
     squares: float
     """Weighted sum of squares that is left without any effect."""
     mean: FloatArray
-    """Solution without any effect: δθ (scaled), repairs, then (b, s) of each log."""
+    """Solution without any effect: δθ (scaled), repairs, then what is each log's own."""
     per_amplitude: FloatArray
     """How that solution falls as an amplitude rises, shape (…, all amplitudes)."""
 
@@ -97,7 +94,7 @@ class Score:
 class Gram:
     """Products of a log's columns with each other: all that linear models need of its rows.
 
-    Columns: baseline (p), all candidates' amplitudes, own (2), residual.
+    Columns: baseline (p), all candidates' amplitudes, own (`columns.OWN`), residual.
     """
 
     products: FloatArray
@@ -162,18 +159,21 @@ def gather(
     """
     weight = 1.0 / (error.rmse_v**2 * error.rows_alike)
     p, amplitudes = frame.scale.size, int(frame.first[-1])
-    own, residual = p + amplitudes + np.arange(2), p + amplitudes + 2
+    own = p + amplitudes + np.arange(len(OWN))
+    residual = int(own[-1]) + 1
     effects = p + np.arange(amplitudes)
     shared = np.concatenate((np.arange(p), p + frame.amplitudes_of(frame.repairs)))
     logs = [*references, *diagnosed]
-    size = shared.size + 2 * len(logs)
+    size = shared.size + own.size * len(logs)
     precision, right = np.zeros((size, size)), np.zeros(size)
     cross = np.zeros((size, amplitudes))
     curvature, gradient, squares = np.zeros((amplitudes, amplitudes)), np.zeros(amplitudes), 0.0
     for number, log in enumerate(logs):
         products = weight * log.products
         columns = np.concatenate((shared, own))
-        used = np.concatenate((np.arange(shared.size), shared.size + 2 * number + np.arange(2)))
+        used = np.concatenate(
+            (np.arange(shared.size), shared.size + own.size * number + np.arange(own.size))
+        )
         precision[np.ix_(used, used)] += products[np.ix_(columns, columns)]
         right[used] += products[columns, residual]
         squares += float(products[residual, residual])
@@ -204,8 +204,8 @@ def _add_priors(precision: FloatArray, frame: Frame, error: ErrorModel, weight: 
     at = p + np.arange(repairs.shape[0])
     precision[np.ix_(at, at)] += repairs
     own = np.arange(p + at.size, precision.shape[0])
-    precision[own[::2], own[::2]] += error.own_voltage_std_v**-2
-    precision[own[1::2], own[1::2]] += error.own_soc_std_pct**-2
+    logs = own.size // len(OWN)
+    precision[own, own] += np.tile(np.array(error.own_std) ** -2.0, logs)
 
 
 def _solver(precision: FloatArray) -> Callable[[FloatArray], FloatArray]:

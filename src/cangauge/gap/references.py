@@ -37,6 +37,10 @@ REPAIR_GAIN = 0.02
 SOC_STD_PCT = 0.7
 """How well a log's assumed initial SoC is known without a cause [%]."""
 
+SLOW_STD, LEVEL_STD = 0.08, 0.03
+"""How much slow polarisation and resistance differ from log to log without a cause, in parts of
+the pack's resistance."""
+
 MEMORY_S = 600
 """Over how long residuals may be correlated [s]."""
 
@@ -55,9 +59,12 @@ def error_from_noise(noise: ModelNoise, rate_hz: float) -> ErrorModel:
     return ErrorModel(
         rmse_v=math.sqrt(total_v2),
         rows_alike=float(np.clip(1.0 + 2.0 * seconds * rate_hz, *ALIKE_WITHIN)),
-        own_voltage_std_v=max(noise.lasting_std_v, 0.25 * math.sqrt(total_v2)),
-        own_soc_std_pct=SOC_STD_PCT,
+        own_std=_own_std(max(noise.lasting_std_v, 0.25 * math.sqrt(total_v2))),
     )
+
+
+def _own_std(voltage_v: float) -> tuple[float, ...]:
+    return (voltage_v, SOC_STD_PCT, SLOW_STD, LEVEL_STD)
 
 
 def left_out_errors(
@@ -89,14 +96,13 @@ def error_from_references(
     means = np.array([float(values.mean()) for values in errors])
     centred = [values - values.mean() for values in errors]
     within_v2 = float(np.mean(np.concatenate(centred) ** 2))
-    between_v2 = (float(means @ means) + KNOWN_LOGS * stated.own_voltage_std_v**2) / (
+    between_v2 = (float(means @ means) + KNOWN_LOGS * stated.own_std[0] ** 2) / (
         means.size + KNOWN_LOGS
     )
     return ErrorModel(
         rmse_v=math.sqrt(max(within_v2, 1e-12)),
         rows_alike=_rows_alike(centred, within_v2, rate_hz),
-        own_voltage_std_v=math.sqrt(max(between_v2, (0.1 * stated.rmse_v) ** 2)),
-        own_soc_std_pct=stated.own_soc_std_pct,
+        own_std=_own_std(math.sqrt(max(between_v2, (0.1 * stated.rmse_v) ** 2))),
     )
 
 

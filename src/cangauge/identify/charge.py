@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
+from cangauge.model.charge import discharged_ah
 
 FloatArray = NDArray[np.float64]
-
-BRIDGE_S = 60.0
-"""Over a longer gap in the current no charge is counted [s]: the pack is taken to have rested."""
 
 FULL_PCT, EMPTY_PCT = 98.0, 2.0
 """A log whose reference SoC starts above and ends below these shows the whole capacity [%]."""
@@ -24,19 +22,6 @@ FULL_PCT, EMPTY_PCT = 98.0, 2.0
 KNEE_STEEPNESS = 5.0
 """A log without reference SoC ran empty if its voltage falls this much more steeply against
 charge at the end than in its middle."""
-
-
-def discharged_ah(time_s: FloatArray, current_a: FloatArray) -> FloatArray:
-    """Return the charge taken out since the first row [Ah], shape (n,), by the trapezoidal rule.
-
-    Parameters
-    ----------
-    time_s, current_a : array of shape (n,)
-        Time [s] and current [A], positive = discharge. Steps longer than `BRIDGE_S` count nothing.
-    """
-    step_s = np.diff(time_s)
-    step_ah = np.where(step_s > BRIDGE_S, 0.0, (current_a[1:] + current_a[:-1]) * step_s / 7200.0)
-    return np.concatenate(([0.0], np.cumsum(step_ah)))
 
 
 def counted_soc_pct(log: Log, capacity_ah: float, initial_soc_pct: float | None) -> FloatArray:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cangauge.identify.charge import BRIDGE_S
 from cangauge.logs.log import Log
+from cangauge.model.charge import BRIDGE_S
 
 JOULE_PER_KWH = 3.6e6
 

@@ -11,6 +11,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from cangauge.errors import InputError
 from cangauge.logs.log import TemperatureSource
+from cangauge.model.effects.effect import Pack
+from cangauge.model.effects.library import parse_effects
+from cangauge.model.extended import ExtendedModel
 from cangauge.model.voltage_model import BASIS_NAMES, VoltageModel
 
 MODEL_FORMAT = "cangauge-model"
@@ -123,8 +126,6 @@ class ModelFile(_Strict):
         if given != wanted:
             missing, extra = sorted(wanted - given), sorted(given - wanted)
             raise ValueError(f"coefficients: missing {missing}, not known {extra}")
-        if self.effects:
-            raise ValueError("effects: this version knows no effects; the list must be empty")
         return self
 
     def voltage_model(self) -> VoltageModel:
@@ -147,6 +148,18 @@ class ModelFile(_Strict):
             temperature_range_c=self.range.temperature_c,
             current_range_a=self.range.current_a,
         )
+
+    def extended_model(self) -> ExtendedModel:
+        """Return the voltage model with the file's effects.
+
+        Raises
+        ------
+        InputError
+            As `voltage_model`, or if an effect is unknown or a parameter out of its bounds.
+        """
+        model = self.voltage_model()
+        effects = parse_effects(self.effects, Pack.of(model, self.capacity_ah))
+        return ExtendedModel(model, self.capacity_ah, tuple(effects))
 
 
 def resistance_names(number: int) -> list[str]:
@@ -198,7 +211,7 @@ def load_model(path: Path | str) -> ModelFile:
         )
     try:
         model = ModelFile.model_validate(raw)
-        model.voltage_model()
+        model.extended_model()
     except ValidationError as error:
         raise _as_input_error(error, path) from error
     except InputError as error:

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cangauge.identify.charge import discharged_ah
 from cangauge.identify.evaluate import LogFit
 from cangauge.identify.fit import Identification
 from cangauge.identify.rows import running_rows
+from cangauge.model.charge import discharged_ah
 from cangauge.report.bars import bars, histogram
 from cangauge.report.figures import (
     BLACK,

@@ -10,15 +10,19 @@ An effect acts in one or more of three places, in this order:
 Offline works on whole logs as arrays, online on one sample at a time; both are written in the
 effect's file and must agree. With neutral values an effect does nothing.
 
+Parameters are amplitudes, which enter the voltage (nearly) linearly and have a neutral value, or
+shapes (a time constant, a moment), which have values to try and mean nothing alone. `time_skew`
+has a single parameter that is both.
+
 Labels are signatures seen at the terminals, not proof of a mechanism.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +47,10 @@ Family = Literal[
 
 Scale = Literal["one", "capacity", "voltage", "resistance"]
 
+RESISTANCE_AT_LEAST = 0.002
+"""Least resistance that bounds are relative to, in voltage over 1 C current (a Leaf has 0.018): a
+model whose resistances happen to cancel must not shut every resistance effect out."""
+
 
 @dataclass(frozen=True)
 class Pack:
@@ -63,7 +71,9 @@ class Pack:
         return cls(
             voltage_v=volts,
             capacity_ah=capacity_ah,
-            resistance_ohm=abs(sum(model.resistance_ohm)),
+            resistance_ohm=max(
+                abs(sum(model.resistance_ohm)), RESISTANCE_AT_LEAST * volts / capacity_ah
+            ),
             cells=max(1, round(volts / 3.7)),
         )
 
@@ -77,8 +87,9 @@ class Parameter:
     name, unit : str
     low, high : float
         Physical bounds, in units of `scale`.
-    neutral : float
-        Value at which the effect does nothing (amplitudes); ignored for shapes.
+    neutral : float, optional
+        Value at which the effect does nothing, in units of `scale`; None for a shape that has no
+        such value.
     scale : {"one", "capacity", "voltage", "resistance"}
         What the bounds are multiplied by to get the parameter's unit.
     grid : tuple of floats, optional
@@ -90,7 +101,7 @@ class Parameter:
     unit: str
     low: float
     high: float
-    neutral: float = 0.0
+    neutral: float | None = 0.0
     scale: Scale = "one"
     grid: tuple[float, ...] | None = None
 
@@ -108,6 +119,11 @@ class Parameter:
         """Return the physical bounds in the parameter's unit."""
         factor = self.factor(pack)
         return self.low * factor, self.high * factor
+
+    def trials(self, pack: Pack) -> tuple[float, ...]:
+        """Return the values to try for a shape, in the parameter's unit; none for an amplitude."""
+        factor = self.factor(pack)
+        return tuple(value * factor for value in self.grid or ())
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +145,16 @@ class Counting:
     charge_efficiency: float = 1.0
     """η: part of the charge put in that can be taken out again."""
 
+    def counted(self, current_a: FloatArray) -> FloatArray:
+        """Return I⁺ + η·I⁻ [A], shape (n,): the current whose charge counts."""
+        if self.charge_efficiency == 1.0:
+            return current_a
+        return np.where(current_a < 0.0, self.charge_efficiency * current_a, current_a)
+
+    def counted_at(self, current_a: float) -> float:
+        """Return I⁺ + η·I⁻ [A] of one sample."""
+        return self.charge_efficiency * current_a if current_a < 0.0 else current_a
+
 
 @dataclass(frozen=True, eq=False)
 class PackState:
@@ -142,15 +168,33 @@ class PackState:
     """Σ Rj·I(t − dj) of the voltage model [V]; negative while discharging."""
 
 
+class Reading(NamedTuple):
+    """One sample on its way through the corrections.
+
+    Voltage and temperature may be NaN where that signal is missing; current never is.
+    """
+
+    time_s: float
+    current_a: float
+    """Positive = discharge [A]."""
+    voltage_v: float
+    temperature_c: float
+
+
 class OnlineEffect:
     """An effect at work in the estimator: its state, advanced one sample at a time."""
 
-    def correct(
-        self, time_s: float, current_a: float, voltage_v: float, temperature_c: float
-    ) -> tuple[float, float, float]:
-        """Return current, voltage and temperature as a perfect sensor would have shown them."""
-        del time_s
-        return current_a, voltage_v, temperature_c
+    uses_soc: ClassVar[bool] = False
+    """Whether `extra_voltage` depends on the SoC that it is asked for."""
+
+    def correct(self, reading: Reading) -> Sequence[Reading]:
+        """Return what perfect sensors would have shown, as far as it is known by now.
+
+        Mostly one reading for each that comes in. An effect that needs a later current for a
+        voltage (`time_skew`) holds readings back and gives them out, in order and with their own
+        times, once it knows; nothing is made up or dropped.
+        """
+        return (reading,)
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         """Carry the state to this sample (corrected values; every sample, in order)."""
@@ -174,9 +218,38 @@ class Effect(ABC):
     separated_by: ClassVar[str]
     """What test would tell it from its look-alikes."""
 
-    def correct(self, signals: Signals, values: Values) -> Signals:
+    @property
+    def amplitudes(self) -> tuple[Parameter, ...]:
+        """Parameters without values to try: they enter the voltage nearly linearly."""
+        return tuple(parameter for parameter in self.parameters if parameter.grid is None)
+
+    @property
+    def shapes(self) -> tuple[Parameter, ...]:
+        """Parameters with values to try."""
+        return tuple(parameter for parameter in self.parameters if parameter.grid is not None)
+
+    def neutral(self, pack: Pack) -> dict[str, float]:
+        """Return values with which the effect does nothing."""
+        values = {}
+        for parameter in self.parameters:
+            if parameter.neutral is None:
+                trials = parameter.trials(pack)
+                values[parameter.name] = trials[len(trials) // 2]
+            else:
+                values[parameter.name] = parameter.neutral * parameter.factor(pack)
+        return values
+
+    def trials(self, parameter: Parameter, pack: Pack, time_s: FloatArray) -> tuple[float, ...]:
+        """Return the values to try for a shape on a log with these times, in its unit.
+
+        The k-th value means the same on every log of a group that shares one cause.
+        """
+        del time_s
+        return parameter.trials(pack)
+
+    def correct(self, signals: Signals, values: Values, pack: Pack) -> Signals:
         """Return the signals as perfect sensors would have shown them."""
-        del values
+        del values, pack
         return signals
 
     def count(self, counting: Counting, values: Values) -> Counting:

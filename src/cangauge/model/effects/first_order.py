@@ -3,6 +3,9 @@
 The same recursion offline and online, so that both give the same numbers to rounding:
 
     y_k = a·y_{k−1} + (1 − a)·x_k + b·(x_{k−1} − x_k),   a = e^(−Δ/τ),   b = (1 − a)·τ/Δ − a
+
+Over a step longer than `rest_s` nobody saw x, and it counts as zero: y_k = a·y_{k−1}. That is the
+rule of the Coulomb counter, which takes the pack to have rested.
 """
 
 from __future__ import annotations
@@ -15,31 +18,26 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-DECAY_A_BLOCK = 30.0
-"""Time constants summed up at once: e³⁰ is far from overflow."""
+DECAY_A_BLOCK = 300.0
+"""Time constants summed up at once: e³⁰⁰, and e⁵⁰ for a last step, are far from overflow."""
+
+NOTHING_LEFT = 50.0
+"""After so many time constants nothing is left (2·10⁻²²)."""
 
 
-def low_passed(time_s: FloatArray, values: FloatArray, tau_s: float, start: float) -> FloatArray:
-    """Return the lagged values, shape (n,).
+def decaying_sum(decay: FloatArray, drive: FloatArray, start: float) -> FloatArray:
+    """Return y_k = e^(−decay_k)·y_{k−1} + drive_k with y_0 = start, shape (n + 1,).
 
     Parameters
     ----------
-    time_s, values : array of shape (n,)
-    tau_s : float
-        Time constant [s].
+    decay, drive : array of shape (n,)
+        Decay over each step, 0 or more, and what each step adds.
     start : float
-        Value of y at the first sample.
     """
-    result = np.empty_like(values)
+    result = np.empty(decay.size + 1)
     result[0] = start
-    if values.size == 1:
-        return result
-    step = np.diff(time_s) / tau_s
-    a = np.exp(-step)
-    b = -np.expm1(-step) / step - a
-    drive = (1.0 - a) * values[1:] + b * (values[:-1] - values[1:])
-    # After 50 time constants nothing is left; counting no further keeps e^elapsed finite.
-    elapsed = np.concatenate(([0.0], np.cumsum(np.minimum(step, 50.0))))
+    # Counting no further than `NOTHING_LEFT` a step keeps e^elapsed finite.
+    elapsed = np.concatenate(([0.0], np.cumsum(np.minimum(decay, NOTHING_LEFT))))
     block = (elapsed[1:] // DECAY_A_BLOCK).astype(np.intp)
     edges = np.concatenate(([0], np.flatnonzero(np.diff(block)) + 1, [block.size]))
     last = start
@@ -50,12 +48,50 @@ def low_passed(time_s: FloatArray, values: FloatArray, tau_s: float, start: floa
     return result
 
 
-class LowPass:
-    """The same lag, one sample at a time; the first sample sets the state to `start`."""
+def low_passed(
+    time_s: FloatArray,
+    values: FloatArray,
+    tau_s: float,
+    start: float,
+    rest_s: float = math.inf,
+) -> FloatArray:
+    """Return the lagged values, shape (n,).
 
-    def __init__(self, tau_s: float, start: float | None = None) -> None:
+    Parameters
+    ----------
+    time_s, values : array of shape (n,)
+    tau_s : float
+        Time constant [s].
+    start : float
+        Value of y at the first sample.
+    rest_s : float
+        Over a longer step the input counts as zero [s].
+    """
+    seconds = np.diff(time_s)
+    step = seconds / tau_s
+    a = np.exp(-step)
+    b = -np.expm1(-step) / step - a
+    drive = (1.0 - a) * values[1:] + b * (values[:-1] - values[1:])
+    return decaying_sum(step, np.where(seconds > rest_s, 0.0, drive), start)
+
+
+class LowPass:
+    """The same lag, one sample at a time; the first sample sets the state to `start`.
+
+    Parameters
+    ----------
+    tau_s : float
+        Time constant [s].
+    start : float, optional
+        Value of y at the first sample; the first sample's own by default.
+    rest_s : float
+        Over a longer step the input counts as zero [s].
+    """
+
+    def __init__(self, tau_s: float, start: float | None = None, rest_s: float = math.inf) -> None:
         self._tau_s = tau_s
         self._start = start
+        self._rest_s = rest_s
         self._last: tuple[float, float] | None = None
         self.value = 0.0
 
@@ -64,9 +100,12 @@ class LowPass:
         if self._last is None:
             self.value = value if self._start is None else self._start
         else:
-            step = (time_s - self._last[0]) / self._tau_s
+            seconds = time_s - self._last[0]
+            step = seconds / self._tau_s
             a = math.exp(-step)
-            b = -math.expm1(-step) / step - a
-            self.value = a * self.value + (1.0 - a) * value + b * (self._last[1] - value)
+            self.value *= a
+            if seconds <= self._rest_s:
+                b = -math.expm1(-step) / step - a
+                self.value += (1.0 - a) * value + b * (self._last[1] - value)
         self._last = (time_s, value)
         return self.value

@@ -1,0 +1,84 @@
+"""Charge-transfer overpotential after Butler and Volmer: it flattens with current."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from cangauge.model.effects.effect import (
+    Effect,
+    FloatArray,
+    OnlineEffect,
+    Pack,
+    PackState,
+    Parameter,
+    Values,
+)
+from cangauge.model.voltage_model import VoltageModel
+
+ALIKE_AT_C_RATE = 1.0
+"""At this current [1/h] the effect adds nothing, as at none: the model's own resistance already
+holds the mean slope over the currents of a drive, and only the bend is left to explain."""
+
+
+class ChargeTransfer(Effect):
+    """The bend of asinh(I/2I₀) against a straight line that meets it at 0 and ±1 C.
+
+    `scale_v` is 2RT/F a cell and electrode (51 mV at 25 °C) times the cells in series, so the
+    bound is that of two electrodes.
+    """
+
+    id = "charge_transfer"
+    family = "dynamics"
+    parameters = (
+        Parameter("scale_v", "V", 0.0, 0.03, scale="voltage"),
+        Parameter(
+            "exchange_a", "A", 0.01, 2.0, neutral=None, scale="capacity",
+            grid=(0.02, 0.05, 0.12, 0.3, 0.8),
+        ),
+    )  # fmt: skip
+    signature = "I − c·asinh(I/2I₀): too much drop at small currents, too little at large ones"
+    equation = "ΔU = −v·(asinh(I/2I₀) − (I/I₁)·asinh(I₁/2I₀)), I₁ = 1 C"
+    source = "Newman, Thomas-Alyea, Electrochemical Systems, 3rd ed., Wiley 2004, ch. 8"
+    separated_by = (
+        "pulses of several sizes in both directions; resistance_asymmetry is straight on each"
+        " side of zero"
+    )
+
+    def extra_voltage(
+        self, state: PackState, values: Values, model: VoltageModel, pack: Pack
+    ) -> FloatArray:
+        """Return the bend [V]."""
+        del model
+        per_a, slope = _shape(values["exchange_a"], pack)
+        bend = np.arcsinh(state.current_a * per_a) - slope * state.current_a
+        return np.asarray(-values["scale_v"] * bend)
+
+    def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
+        """Return the bend at one sample at a time."""
+        del model
+        return _Online(values["scale_v"], *_shape(values["exchange_a"], pack))
+
+
+def _shape(exchange_a: float, pack: Pack) -> tuple[float, float]:
+    """Return 1/2I₀ and the straight line's slope [1/A]."""
+    per_a, alike_a = 0.5 / exchange_a, ALIKE_AT_C_RATE * pack.capacity_ah
+    return per_a, math.asinh(alike_a * per_a) / alike_a
+
+
+class _Online(OnlineEffect):
+    def __init__(self, scale_v: float, per_a: float, slope: float) -> None:
+        self._scale_v = scale_v
+        self._per_a = per_a
+        self._slope = slope
+        self._volts = 0.0
+
+    def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
+        del time_s, temperature_c, drop_v
+        bend = math.asinh(current_a * self._per_a) - self._slope * current_a
+        self._volts = -self._scale_v * bend
+
+    def extra_voltage(self, soc_pct: float) -> float:
+        del soc_pct
+        return self._volts

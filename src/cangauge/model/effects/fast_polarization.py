@@ -1,0 +1,44 @@
+"""Polarisation within seconds: an RC element below 10 s."""
+
+from __future__ import annotations
+
+from cangauge.model.effects.effect import (
+    Effect,
+    FloatArray,
+    OnlineEffect,
+    Pack,
+    PackState,
+    Parameter,
+    Values,
+)
+from cangauge.model.effects.rc_element import OnlineRc, rc_voltage
+from cangauge.model.voltage_model import VoltageModel
+
+
+class FastPolarization(Effect):
+    """Double layer and charge transfer, faster than the model's first delay."""
+
+    id = "fast_polarization"
+    family = "dynamics"
+    parameters = (
+        Parameter("ohm", "ohm", 0.0, 1.0, scale="resistance"),
+        Parameter("tau_s", "s", 0.3, 9.0, neutral=None, grid=(0.5, 1.0, 2.0, 3.5, 6.0, 9.0)),
+    )
+    signature = "a tail of seconds after every change of load"
+    equation = "ΔU = −R·y, τ·dy/dt = I − y"
+    source = "Hu, Li, Peng, J. Power Sources 198 (2012) 359"
+    separated_by = (
+        "a log at 10 Hz or faster with sharp pulses: time_skew gives spikes without tails"
+    )
+
+    def extra_voltage(
+        self, state: PackState, values: Values, model: VoltageModel, pack: Pack
+    ) -> FloatArray:
+        """Return the element's voltage [V]."""
+        del model, pack
+        return rc_voltage(state, values["ohm"], values["tau_s"])
+
+    def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
+        """Return the element, one sample at a time."""
+        del model, pack
+        return OnlineRc(values["ohm"], values["tau_s"])

@@ -1,0 +1,271 @@
+"""The extended model: the voltage model with effects, over whole logs and one sample at a time.
+
+Both do the same in the same order: correct the signals, count charge, delay the current, and add
+the effects' voltages to the voltage model's. Without effects they are the voltage model, to the
+last bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cangauge.model.charge import discharged_ah
+from cangauge.model.delay_line import delayed_currents
+from cangauge.model.effects.effect import (
+    Counting,
+    Effect,
+    FloatArray,
+    Pack,
+    PackState,
+    Reading,
+    Signals,
+    Values,
+)
+from cangauge.model.effects.library import LIBRARY
+from cangauge.model.voltage_model import SLOPE_AT_LEAST, VoltageModel
+
+SLOPE_STEP_PCT = 0.05
+"""Half the step of the numerical slope of the effects' voltage over SoC [%]."""
+
+_ORDER = {effect_id: number for number, effect_id in enumerate(LIBRARY)}
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What the extended model says of a log."""
+
+    rows: NDArray[np.intp]
+    """Rows of the log that the voltage was predicted at, shape (m,)."""
+    voltage_v: FloatArray
+    """Predicted voltage [V], shape (m,)."""
+    signals: Signals
+    """All rows as perfect sensors would have shown them, shape (n,)."""
+    soc_pct: FloatArray
+    """Counted SoC of all rows [%], shape (n,)."""
+
+    @property
+    def residual_v(self) -> FloatArray:
+        """Corrected measured voltage minus predicted [V], shape (m,)."""
+        return self.signals.voltage_v[self.rows] - self.voltage_v
+
+
+@dataclass(frozen=True)
+class ExtendedModel:
+    """A voltage model with effects.
+
+    Parameters
+    ----------
+    model : VoltageModel
+    capacity_ah : float
+        The model's own capacity [Ah], which the effects' bounds and C-rates are relative to.
+    effects : sequence of (Effect, values)
+        They are applied in the library's order, whatever order they are given in.
+    """
+
+    model: VoltageModel
+    capacity_ah: float
+    effects: tuple[tuple[Effect, Values], ...] = ()
+
+    def __post_init__(self) -> None:
+        last = len(_ORDER)
+        ordered = sorted(self.effects, key=lambda item: _ORDER.get(item[0].id, last))
+        object.__setattr__(self, "effects", tuple(ordered))
+
+    @cached_property
+    def pack(self) -> Pack:
+        """The pack's sizes."""
+        return Pack.of(self.model, self.capacity_ah)
+
+    def with_effect(self, effect: Effect, values: Values) -> ExtendedModel:
+        """Return the model with one more effect."""
+        return replace(self, effects=(*self.effects, (effect, values)))
+
+    def online(self, capacity_ah: float | None = None) -> OnlineExtendedModel:
+        """Return the model for the estimator, at its first sample.
+
+        Parameters
+        ----------
+        capacity_ah : float, optional
+            A capacity that the user insists on [Ah]; the effects leave it alone.
+        """
+        return OnlineExtendedModel(self, capacity_ah)
+
+    # --- over a whole log -----------------------------------------------------------------
+
+    def predict(
+        self,
+        signals: Signals,
+        initial_soc_pct: float,
+        at_rows: NDArray[np.intp],
+        *,
+        anchor_row: int = 0,
+    ) -> Prediction:
+        """Return what the model says of a log.
+
+        Parameters
+        ----------
+        signals : Signals
+            All measured rows, shape (n,).
+        initial_soc_pct : float
+            SoC at `anchor_row` [%].
+        at_rows : array of int, shape (m,)
+            Rows to predict the voltage at.
+        anchor_row : int
+            Row that the initial SoC belongs to.
+        """
+        corrected = self.corrected(signals)
+        soc = self.counted_soc(corrected, initial_soc_pct, anchor_row=anchor_row)
+        time, current = corrected.time_s, corrected.current_a
+        volts = self.model.voltage(
+            soc[at_rows],
+            corrected.temperature_c[at_rows],
+            delayed_currents(time, current, self.model.delay_s, time[at_rows]),
+        )
+        if self.effects:
+            volts = volts + self.extra_voltage(self.state(corrected, soc))[at_rows]
+        return Prediction(at_rows, volts, corrected, soc)
+
+    def corrected(self, signals: Signals) -> Signals:
+        """Return the signals as perfect sensors would have shown them."""
+        for effect, values in self.effects:
+            signals = effect.correct(signals, values, self.pack)
+        return signals
+
+    def counting(self, initial_soc_pct: float) -> Counting:
+        """Return how charge is counted from an assumed initial SoC [%]."""
+        counting = Counting(self.capacity_ah, initial_soc_pct)
+        for effect, values in self.effects:
+            counting = effect.count(counting, values)
+        return counting
+
+    def counted_soc(
+        self, corrected: Signals, initial_soc_pct: float, *, anchor_row: int = 0
+    ) -> FloatArray:
+        """Return the SoC counted from corrected signals [%], shape (n,)."""
+        counting = self.counting(initial_soc_pct)
+        out = discharged_ah(corrected.time_s, counting.counted(corrected.current_a))
+        moved = 100.0 * (out - out[anchor_row]) / counting.capacity_ah
+        return np.asarray(counting.initial_soc_pct - moved)
+
+    def state(self, corrected: Signals, soc_pct: FloatArray) -> PackState:
+        """Return what extra voltages depend on, for all rows of corrected signals."""
+        time, current = corrected.time_s, corrected.current_a
+        delayed = delayed_currents(time, current, self.model.delay_s, time)
+        return PackState(
+            time_s=time,
+            current_a=current,
+            temperature_c=corrected.temperature_c,
+            soc_pct=soc_pct,
+            drop_v=delayed @ np.array(self.model.resistance_ohm),
+        )
+
+    def extra_voltage(self, state: PackState) -> FloatArray:
+        """Return the sum of the effects' voltages [V], shape (n,)."""
+        volts = np.zeros_like(state.time_s)
+        for effect, values in self.effects:
+            extra = effect.extra_voltage(state, values, self.model, self.pack)
+            if extra is not None:
+                volts += extra
+        return volts
+
+
+class OnlineExtendedModel:
+    """The extended model in the estimator: call `correct`, then `advance` for each that comes out.
+
+    `pseudo_ocv_at` then takes the place of the voltage model's, the effects' voltages included.
+
+    Parameters
+    ----------
+    extended : ExtendedModel
+    capacity_ah : float, optional
+        A capacity that the user insists on [Ah].
+    """
+
+    def __init__(self, extended: ExtendedModel, capacity_ah: float | None = None) -> None:
+        self.model = extended.model
+        self._extended = extended
+        # 50 % stands for any: capacity and efficiency do not depend on it.
+        self._counting = extended.counting(50.0)
+        self.capacity_ah = capacity_ah or self._counting.capacity_ah
+        """Charge from 100 to 0 % that the counter is to use [Ah]."""
+        working = [
+            effect.online(values, extended.model, extended.pack)
+            for effect, values in extended.effects
+        ]
+        self._effects = working
+        self._beside_soc = [effect for effect in working if not effect.uses_soc]
+        self._over_soc = [effect for effect in working if effect.uses_soc]
+        self._beside_soc_v = 0.0
+        self._slope_at_least = SLOPE_AT_LEAST * extended.pack.voltage_v
+
+    @property
+    def resistance_ohm(self) -> tuple[float, ...]:
+        """The voltage model's resistances [Ω]."""
+        return self.model.resistance_ohm
+
+    @property
+    def plain(self) -> bool:
+        """Whether there are no effects: then nothing needs correcting or advancing."""
+        return not self._effects
+
+    def initial_soc_pct(self, assumed_pct: float) -> float:
+        """Return the SoC to begin from, within 0–100 [%], where the user assumes one."""
+        return min(max(self._extended.counting(assumed_pct).initial_soc_pct, 0.0), 100.0)
+
+    def counted(self, current_a: float) -> float:
+        """Return the part of a (corrected) current whose charge counts [A]."""
+        return self._counting.counted_at(current_a)
+
+    def correct(self, reading: Reading) -> Sequence[Reading]:
+        """Return the corrected readings that can be given out by now: mostly one, in order."""
+        readings: Sequence[Reading] = (reading,)
+        for effect in self._effects:
+            if len(readings) == 1:
+                readings = effect.correct(readings[0])
+            else:
+                readings = [done for item in readings for done in effect.correct(item)]
+        return readings
+
+    def advance(
+        self, time_s: float, current_a: float, temperature_c: float,
+        delayed_current_a: Sequence[float],
+    ) -> None:  # fmt: skip
+        """Carry the effects' states to a corrected reading (every one, in order).
+
+        Parameters
+        ----------
+        time_s, current_a, temperature_c : float
+            Time [s], current [A] and temperature [°C], the last one that was known.
+        delayed_current_a : sequence of floats
+            Current at each delay, from the delay line of corrected currents [A].
+        """
+        drop_v = 0.0
+        for resistance, current in zip(self.model.resistance_ohm, delayed_current_a, strict=True):
+            drop_v += resistance * current
+        for effect in self._effects:
+            effect.advance(time_s, current_a, temperature_c, drop_v)
+        self._beside_soc_v = sum((item.extra_voltage(0.0) for item in self._beside_soc), 0.0)
+
+    def pseudo_ocv_at(self, soc_pct: float) -> tuple[float, float]:
+        """Return voltage without the model's drop and kt [V], and its slope [V per %], at one SoC.
+
+        The effects' voltages at the last reading are part of it. The slope is kept positive, so
+        that Newton's method and the filter can use it: an effect may turn the voltage around over
+        a few per cent (resistance that rises toward empty, while charging).
+        """
+        volts, slope = self.model.pseudo_ocv_at(soc_pct)
+        volts += self._beside_soc_v
+        if self._over_soc:
+            volts += self._over_soc_v(soc_pct)
+            above = self._over_soc_v(soc_pct + SLOPE_STEP_PCT)
+            slope += (above - self._over_soc_v(soc_pct - SLOPE_STEP_PCT)) / (2.0 * SLOPE_STEP_PCT)
+            slope = max(slope, self._slope_at_least)
+        return volts, slope
+
+    def _over_soc_v(self, soc_pct: float) -> float:
+        return sum((effect.extra_voltage(soc_pct) for effect in self._over_soc), 0.0)

@@ -1,0 +1,78 @@
+"""Effects in a model file: read back, and refused with the field named."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from stepping import EFFECTS, PACK, middle, within
+
+from cangauge.errors import InputError
+from cangauge.model.effects.effect import Effect
+from cangauge.model.effects.library import LIBRARY, effect_entries, effect_of, parse_effects
+
+OFFSET = {"id": "current_offset", "parameters": {"offset_a": 1.5}}
+
+
+def test_all_effects_survive_json() -> None:
+    effects = [(effect, middle(effect)) for effect in EFFECTS]
+    text = json.dumps(effect_entries(effects), allow_nan=False)
+    assert parse_effects(json.loads(text), PACK) == effects
+
+
+@given(st.sampled_from(EFFECTS), st.floats(0.0, 1.0))
+def test_everything_in_bounds_is_taken(effect: Effect, part: float) -> None:
+    values = {item.name: within(item, part) for item in effect.parameters}
+    assert parse_effects(effect_entries([(effect, values)]), PACK) == [(effect, values)]
+
+
+@pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.id)
+def test_far_out_of_bounds_is_refused_naming_the_parameter(effect: Effect) -> None:
+    for parameter in effect.parameters:
+        low, high = parameter.bounds(PACK)
+        for wrong in (high + 2.5 * (high - low), low - 2.5 * (high - low)):
+            values = middle(effect) | {parameter.name: wrong}
+            with pytest.raises(InputError, match="must lie within") as error:
+                parse_effects([OFFSET | {}, *effect_entries([(effect, values)])][-1:], PACK)
+            assert error.value.field == f"effects.0.parameters.{parameter.name}"
+
+
+def test_a_bound_of_zero_stays_zero() -> None:
+    """The leeway of bounds that are relative to the pack must not let a resistance turn sign."""
+    entry = {"id": "slow_diffusion", "parameters": {"ohm": -0.001, "tau_s": 500.0}}
+    with pytest.raises(InputError, match="must lie within 0 "):
+        parse_effects([entry], PACK)
+
+
+@pytest.mark.parametrize(
+    ("entries", "field", "words"),
+    [
+        ([7], "effects.0", "fields id and parameters"),
+        ([OFFSET, {"id": "capacity"}], "effects.1", "fields id and parameters"),
+        ([OFFSET | {"note": ""}], "effects.0", "no others"),
+        ([{"id": "gremlin", "parameters": {}}], "effects.0.id", "known are current_offset"),
+        ([{"id": ["x"], "parameters": {}}], "effects.0.id", "no effect"),
+        ([OFFSET, OFFSET], "effects.1.id", "twice"),
+        ([OFFSET | {"parameters": {}}], "effects.0.parameters", "offset_a"),
+        ([OFFSET | {"parameters": [1]}], "effects.0.parameters", "offset_a"),
+        ([OFFSET | {"parameters": {"offset": 1.0}}], "effects.0.parameters", "offset_a"),
+        ([OFFSET | {"parameters": {"offset_a": "1"}}], "effects.0.parameters.offset_a", "number"),
+        ([OFFSET | {"parameters": {"offset_a": True}}], "effects.0.parameters.offset_a", "number"),
+        ([OFFSET | {"parameters": {"offset_a": math.nan}}], "effects.0.parameters.offset_a",
+         "finite"),
+        ([OFFSET | {"parameters": {"offset_a": 90.0}}], "effects.0.parameters.offset_a", " A for"),
+    ],
+)  # fmt: skip
+def test_bad_entries_name_the_field(entries: list[object], field: str, words: str) -> None:
+    with pytest.raises(InputError, match=words) as error:
+        parse_effects(entries, PACK)
+    assert error.value.field == field
+
+
+def test_an_unknown_id_lists_the_known_ones() -> None:
+    with pytest.raises(InputError) as error:
+        effect_of("current_ofset", "--effects")
+    assert all(known in str(error.value) for known in LIBRARY)

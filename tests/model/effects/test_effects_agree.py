@@ -1,0 +1,261 @@
+"""Every effect: neutral does nothing, batch equals online, bounds scale, mid-range is visible."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stepping import EFFECTS, MODEL, PACK, irregular_signals, middle, step_through, within
+
+from cangauge.model.effects.effect import Effect, Pack, Reading, Signals
+from cangauge.model.effects.library import LIBRARY
+from cangauge.model.extended import ExtendedModel
+from cangauge.model.published import CAPACITY_AH
+from cangauge.model.voltage_model import VoltageModel
+from synthetic import synthetic_log
+
+each_effect = pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.id)
+
+FAMILIES = {
+    "current_sensing": {"current_offset", "current_gain"},
+    "voltage_sensing": {"voltage_offset", "voltage_gain"},
+    "thermal": {"temperature_lag", "core_temperature"},
+    "timing": {"time_skew"},
+    "charge": {"capacity", "initial_soc", "coulombic_efficiency"},
+    "resistance": {
+        "resistance_temperature", "resistance_soc", "resistance_asymmetry", "resistance_step",
+    },
+    "dynamics": {"charge_transfer", "fast_polarization", "slow_diffusion"},
+    "equilibrium": {"hysteresis", "entropic_coefficient"},
+    "imbalance": {"weak_cell"},
+}  # fmt: skip
+
+CELL = VoltageModel(
+    (3.2, 0.0, 0.0, 0.0, 0.0, 0.9, 0.0, 0.0), 0.0005, (-0.02, -0.01), (0.0, 10.0), 0.05, 25.0,
+    temperature_range_c=(0.0, 40.0),
+)  # fmt: skip
+
+
+def test_library_holds_every_effect_of_the_contract_in_its_family() -> None:
+    found: dict[str, set[str]] = {}
+    for key, effect in LIBRARY.items():
+        assert key == effect.id
+        found.setdefault(effect.family, set()).add(effect.id)
+    assert found == FAMILIES
+
+
+@each_effect
+def test_describes_itself(effect: Effect) -> None:
+    for text in (effect.signature, effect.equation, effect.source, effect.separated_by):
+        assert len(text.strip()) > 8 or text == "definition"
+    assert effect.parameters
+    assert len({parameter.name for parameter in effect.parameters}) == len(effect.parameters)
+    for parameter in effect.parameters:
+        assert parameter.low < parameter.high
+        assert parameter.neutral is None or parameter.low <= parameter.neutral <= parameter.high
+        assert parameter.neutral is not None or parameter.grid
+        for value in parameter.grid or ():
+            assert parameter.low <= value <= parameter.high
+    assert set(effect.parameters) == {*effect.amplitudes, *effect.shapes}
+
+
+@each_effect
+def test_neutral_values_do_exactly_nothing(effect: Effect) -> None:
+    signals = irregular_signals()
+    rows = np.arange(0, signals.time_s.size, 3)
+    plain = ExtendedModel(MODEL, CAPACITY_AH)
+    expected = plain.predict(signals, 90.0, rows)
+    for shape in range(max(len(item.grid or ()) for item in effect.parameters) or 1):
+        values = effect.neutral(PACK)
+        for parameter in effect.parameters:
+            if parameter.neutral is None:
+                trials = parameter.trials(PACK)
+                values[parameter.name] = trials[shape % len(trials)]
+        extended = plain.with_effect(effect, values)
+        found = extended.predict(signals, 90.0, rows)
+        assert np.array_equal(found.voltage_v, expected.voltage_v)
+        assert np.array_equal(found.soc_pct, expected.soc_pct)
+        for name in ("time_s", "current_a", "voltage_v", "temperature_c"):
+            assert np.array_equal(getattr(found.signals, name), getattr(signals, name))
+    few = irregular_signals(300)
+    assert np.array_equal(
+        step_through(extended, few, 90.0).voltage_v, step_through(plain, few, 90.0).voltage_v
+    )
+
+
+@each_effect
+@pytest.mark.parametrize("part", [0.0, 0.3, 0.8, 1.0])
+def test_offline_equals_online_on_irregular_samples_with_gaps(effect: Effect, part: float) -> None:
+    signals = irregular_signals(seed=int(10 * part) + 3)
+    values = {item.name: within(item, part) for item in effect.parameters}
+    if effect.id == "resistance_step":
+        values["start_s"] = part * 3000.0
+    extended = ExtendedModel(MODEL, CAPACITY_AH).with_effect(effect, values)
+    every = np.arange(signals.time_s.size)
+    batch = extended.predict(signals, 80.0, every)
+    online = step_through(extended, signals, 80.0, batch.soc_pct)
+    n = len(online.readings)
+    assert n >= signals.time_s.size - 200 * (effect.id == "time_skew")
+    found = np.array(online.readings)
+    for k, name in enumerate(("time_s", "current_a", "voltage_v", "temperature_c")):
+        expected = getattr(batch.signals, name)[:n]
+        np.testing.assert_allclose(found[:, k], expected, rtol=0.0, atol=1e-7)
+    np.testing.assert_allclose(online.soc_pct, batch.soc_pct[:n], rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(online.voltage_v, batch.voltage_v[:n], rtol=0.0, atol=1e-6)
+
+
+@each_effect
+def test_mid_range_is_visible_on_a_drive(effect: Effect) -> None:
+    log = synthetic_log(hours=1.5, start_pct=90.0, end_pct=8.0)
+    signals = Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c - 15.0)
+    rows = np.arange(70, log.time_s.size)
+    base = ExtendedModel(replace(MODEL, temperature_range_c=(-20.0, 60.0)), CAPACITY_AH)
+    plain = base.predict(signals, 90.0, rows).residual_v
+    changed = base.with_effect(effect, middle(effect)).predict(signals, 90.0, rows).residual_v
+    assert np.sqrt(np.mean((changed - plain) ** 2)) > 0.1
+
+
+@each_effect
+def test_amplitudes_enter_the_voltage_nearly_linearly(effect: Effect) -> None:
+    signals = irregular_signals(gaps=False)
+    rows = np.arange(100, signals.time_s.size)
+    base = ExtendedModel(MODEL, CAPACITY_AH)
+    plain = base.predict(signals, 80.0, rows).residual_v
+    for parameter in effect.amplitudes:
+        neutral = effect.neutral(PACK)
+        changes = []
+        for part in (0.01, 0.02):
+            step = part * (middle(effect)[parameter.name] - neutral[parameter.name])
+            values = neutral | {parameter.name: neutral[parameter.name] + step}
+            changes.append(base.with_effect(effect, values).predict(signals, 80.0, rows).residual_v)
+        once, twice = changes[0] - plain, changes[1] - plain
+        assert np.linalg.norm(once) > 0.0
+        assert np.linalg.norm(twice - 2.0 * once) < 0.05 * np.linalg.norm(twice)
+
+
+@each_effect
+def test_bounds_scale_with_the_pack(effect: Effect) -> None:
+    """96 cells with 20 times the capacity: volts, amperes and ohms grow, ratios and times stay."""
+    cell = Pack.of(CELL, 2.5)
+    pack = Pack(96.0 * cell.voltage_v, 50.0, 96.0 / 20.0 * cell.resistance_ohm, 96 * cell.cells)
+    ratio = {"V": 96.0, "V/K": 96.0, "A": 20.0, "ohm": 4.8}
+    for parameter in effect.parameters:
+        expected = np.array(parameter.bounds(cell)) * ratio.get(parameter.unit, 1.0)
+        np.testing.assert_allclose(parameter.bounds(pack), expected, rtol=1e-12)
+        np.testing.assert_allclose(
+            parameter.trials(pack),
+            np.array(parameter.trials(cell)) * ratio.get(parameter.unit, 1.0),
+            rtol=1e-12,
+        )
+
+
+@each_effect
+def test_a_pack_of_cells_is_the_cell_times_their_number(effect: Effect) -> None:
+    """At the same part of its bounds, and currents in C-rates, the effect is as large a part."""
+    many = 96.0
+    pack_model = VoltageModel(
+        tuple(many * k for k in CELL.ocv_v), many * CELL.kt_v_per_k,
+        tuple(many / 20.0 * r for r in CELL.resistance_ohm), CELL.delay_s, CELL.epsilon,
+        CELL.t_ref_c, temperature_range_c=CELL.temperature_range_c,
+    )  # fmt: skip
+    big = irregular_signals(800)
+    small = Signals(big.time_s, big.current_a / 20.0, big.voltage_v / many, big.temperature_c)
+    rows = np.arange(800)
+    found = []
+    for model, capacity, signals in ((CELL, 2.5, small), (pack_model, 50.0, big)):
+        values = middle(effect, Pack.of(model, capacity))
+        extended = ExtendedModel(model, capacity).with_effect(effect, values)
+        found.append(extended.predict(signals, 70.0, rows).residual_v)
+    np.testing.assert_allclose(many * found[0], found[1], rtol=0.0, atol=1e-6)
+
+
+signal_rows = st.lists(
+    st.tuples(
+        st.floats(1e-3, 1e5), st.floats(-5000.0, 5000.0), st.floats(0.0, 1000.0),
+        st.floats(-60.0, 120.0),
+    ),
+    min_size=1,
+    max_size=25,
+)  # fmt: skip
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    st.sampled_from(EFFECTS),
+    st.lists(st.floats(0.0, 1.0), min_size=3, max_size=3),
+    signal_rows,
+    st.floats(0.0, 100.0),
+    st.booleans(),
+)
+def test_nothing_in_bounds_gives_nan_or_infinity(
+    effect: Effect,
+    parts: list[float],
+    rows: list[tuple[float, ...]],
+    start_pct: float,
+    leaf: bool,
+) -> None:
+    model, capacity = (MODEL, CAPACITY_AH) if leaf else (CELL, 2.5)
+    pack = Pack.of(model, capacity)
+    values = {
+        item.name: within(item, part, pack)
+        for item, part in zip(effect.parameters, parts, strict=False)
+    }
+    columns = np.array(rows)
+    signals = Signals(np.cumsum(columns[:, 0]), columns[:, 1], columns[:, 2], columns[:, 3])
+    extended = ExtendedModel(model, capacity).with_effect(effect, values)
+    batch = extended.predict(signals, start_pct, np.arange(len(rows)))
+    assert np.all(np.isfinite(batch.voltage_v))
+    assert np.all(np.isfinite(batch.soc_pct))
+    assert np.all(np.isfinite(batch.residual_v))
+    stepped = step_through(extended, signals, start_pct)
+    assert np.all(np.isfinite(stepped.voltage_v))
+    assert np.all(np.isfinite(np.array(stepped.readings)))
+    online = extended.online()
+    for soc in (-20.0, 0.0, 50.0, 100.0, 120.0):
+        volts, slope = online.pseudo_ocv_at(soc)
+        assert math.isfinite(volts)
+        assert slope > 0.0
+
+
+@each_effect
+def test_missing_voltage_and_temperature_spoil_nothing_but_themselves(effect: Effect) -> None:
+    signals = irregular_signals(400, gaps=False)
+    missing = slice(100, 150)
+    voltage, temperature = signals.voltage_v.copy(), signals.temperature_c.copy()
+    voltage[missing], temperature[missing] = math.nan, math.nan
+    online = effect.online(middle(effect), MODEL, PACK)
+    found = []
+    for row in zip(
+        signals.time_s.tolist(), signals.current_a.tolist(), voltage.tolist(),
+        temperature.tolist(), strict=True,
+    ):  # fmt: skip
+        found.extend(online.correct(Reading(*row)))
+    found_rows = np.array(found)
+    assert np.all(np.isfinite(found_rows[:, 1]))
+    bad = np.isnan(found_rows[:, 2])
+    assert np.array_equal(np.flatnonzero(bad), np.arange(100, 150))
+    assert np.array_equal(bad, np.isnan(found_rows[:, 3]))
+
+
+@each_effect
+def test_is_fast_enough_for_a_search(effect: Effect) -> None:
+    """90,000 rows (2.5 h at 10 Hz) in about 10 ms; the limit leaves room for a busy machine."""
+    n = 90_000
+    time_s = np.arange(n) * 0.1
+    signals = Signals(
+        time_s, 25.0 + 30.0 * np.sin(time_s / 7.0), np.full(n, 370.0), 20.0 + time_s / 2000.0
+    )
+    extended = ExtendedModel(MODEL, CAPACITY_AH).with_effect(effect, middle(effect))
+    state = extended.state(signals, 100.0 - 0.011 * time_s)
+    best = math.inf
+    for _ in range(5):
+        began = time.perf_counter()
+        extended.corrected(signals)
+        extended.extra_voltage(state)
+        best = min(best, time.perf_counter() - began)
+    assert best < 0.05

@@ -1,0 +1,315 @@
+"""What each effect does to a pack, against results worked out by hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from stepping import MODEL, PACK, irregular_signals, step_through
+
+from cangauge.model.effects.effect import PackState, Reading, Signals, Values
+from cangauge.model.effects.first_order import LowPass, decaying_sum, low_passed
+from cangauge.model.effects.library import LIBRARY
+from cangauge.model.extended import ExtendedModel
+from cangauge.model.published import CAPACITY_AH
+
+
+def steady(
+    seconds: float, current_a: float, *, soc_pct: float = 50.0, temperature_c: float = 23.0
+) -> PackState:
+    """A constant current from 0 s on, at 1 Hz, at one SoC."""
+    time_s = np.arange(0.0, seconds + 1.0)
+    current = np.full_like(time_s, current_a)
+    drop = current * sum(MODEL.resistance_ohm)
+    return PackState(
+        time_s, current, np.full_like(time_s, temperature_c), np.full_like(time_s, soc_pct), drop
+    )
+
+
+def extra(effect_id: str, state: PackState, values: Values) -> np.ndarray:
+    found = LIBRARY[effect_id].extra_voltage(state, values, MODEL, PACK)
+    assert found is not None
+    return found
+
+
+def with_current(state: PackState, current_a: np.ndarray) -> PackState:
+    return replace(state, current_a=current_a, drop_v=current_a * sum(MODEL.resistance_ohm))
+
+
+# --- sensing ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("effect_id", "values", "channel", "wrong"),
+    [
+        ("current_offset", {"offset_a": 2.5}, "current_a", lambda x: x + 2.5),
+        ("current_gain", {"gain_pct": 4.0}, "current_a", lambda x: x * 1.04),
+        ("voltage_offset", {"offset_v": -3.0}, "voltage_v", lambda x: x - 3.0),
+        ("voltage_gain", {"gain_pct": -1.5}, "voltage_v", lambda x: x * 0.985),
+    ],
+)
+def test_a_sensors_error_is_undone(
+    effect_id: str, values: Values, channel: str, wrong: Callable[[np.ndarray], np.ndarray]
+) -> None:
+    true = irregular_signals(200)
+    shown = replace(true, **{channel: wrong(getattr(true, channel))})
+    found = LIBRARY[effect_id].correct(shown, values, PACK)
+    np.testing.assert_allclose(getattr(found, channel), getattr(true, channel), rtol=1e-12)
+
+
+@pytest.mark.parametrize("skew_s", [-1.2, -0.3, 0.3, 1.2])
+def test_a_late_or_early_current_is_put_back(skew_s: float) -> None:
+    """A current that is straight between 0.1 s rows: moving it back loses nothing."""
+    time_s = np.arange(0.0, 300.0, 0.1)
+    rng = np.random.default_rng(5)
+    current = np.interp(time_s, np.arange(0.0, 301.0, 0.5), rng.normal(20.0, 40.0, 602))
+    late = np.interp(time_s - skew_s, time_s, current)
+    shown = Signals(time_s, late, np.full_like(time_s, 370.0), np.full_like(time_s, 20.0))
+    found = LIBRARY["time_skew"].correct(shown, {"skew_s": skew_s}, PACK)
+    inner = slice(20, -20)
+    np.testing.assert_allclose(found.current_a[inner], current[inner], atol=1e-9)
+
+
+def test_online_a_voltage_waits_for_its_late_current_and_no_longer() -> None:
+    signals = irregular_signals(2000, gaps=False)
+    extended = ExtendedModel(MODEL, CAPACITY_AH).with_effect(LIBRARY["time_skew"], {"skew_s": 0.8})
+    times = [reading.time_s for reading in step_through(extended, signals, 90.0).readings]
+    known = signals.time_s + 0.8 <= signals.time_s[-1]
+    assert times == signals.time_s[known].tolist()
+
+
+def test_online_a_voltage_is_given_out_with_the_very_sample_that_brings_its_current() -> None:
+    online = LIBRARY["time_skew"].online({"skew_s": 0.5}, MODEL, PACK)
+    assert online.correct(Reading(10.0, 1.0, 371.0, 20.0)) == []
+    assert online.correct(Reading(10.25, 2.0, 372.0, 20.0)) == []
+    assert online.correct(Reading(10.5, 3.0, 373.0, 20.0)) == [Reading(10.0, 3.0, 371.0, 20.0)]
+
+
+@pytest.mark.parametrize("skew_s", [-1.5, 1.5])
+def test_skew_remembers_no_more_than_it_needs(skew_s: float) -> None:
+    online = LIBRARY["time_skew"].online({"skew_s": skew_s}, MODEL, PACK)
+    for k in range(20_000):
+        online.correct(Reading(0.01 * k, float(k % 7), 370.0, 20.0))
+    assert len(online._times) < 3 * 150
+
+
+# --- thermal ------------------------------------------------------------------------------
+
+
+def test_a_lagging_sensor_is_put_ahead_on_a_ramp() -> None:
+    """Behind a ramp of 10 K an hour a lag of 600 s is 1.67 K too low, once settled."""
+    time_s = np.arange(0.0, 7200.0)
+    true = 20.0 + time_s * 10.0 / 3600.0
+    shown = low_passed(time_s, true, 600.0, 20.0)
+    signals = Signals(time_s, np.zeros_like(time_s), np.full_like(time_s, 370.0), shown)
+    found = LIBRARY["temperature_lag"].correct(signals, {"tau_s": 600.0}, PACK)
+    assert true[-1] - shown[-1] == pytest.approx(600.0 * 10.0 / 3600.0, abs=1e-3)
+    assert found.temperature_c[-1] == pytest.approx(true[-1], abs=1e-3)
+
+
+def test_core_rises_with_the_square_of_a_lasting_current() -> None:
+    for c_rate, sign in ((1.0, 1.0), (2.0, -1.0)):
+        state = steady(20_000.0, sign * c_rate * PACK.capacity_ah)
+        signals = Signals(
+            state.time_s, state.current_a, np.full_like(state.time_s, 370.0), state.temperature_c
+        )
+        found = LIBRARY["core_temperature"].correct(signals, {"rise_k": 4.0, "tau_s": 1000.0}, PACK)
+        rise = found.temperature_c - 23.0
+        assert rise[0] == 0.0
+        assert rise[1000] == pytest.approx(4.0 * c_rate**2 * (1.0 - math.exp(-1.0)), rel=1e-6)
+        assert rise[-1] == pytest.approx(4.0 * c_rate**2, rel=1e-6)
+
+
+# --- charge -------------------------------------------------------------------------------
+
+
+def counted(effect_id: str, values: Values, current_a: float, hours: float) -> float:
+    state = steady(3600.0 * hours, current_a)
+    signals = Signals(state.time_s, state.current_a, state.current_a, state.temperature_c)
+    extended = ExtendedModel(MODEL, 50.0).with_effect(LIBRARY[effect_id], values)
+    return float(extended.counted_soc(signals, 60.0)[-1])
+
+
+def test_charge_effects_count_as_stated() -> None:
+    assert counted("capacity", {"change_pct": -20.0}, 10.0, 1.0) == pytest.approx(60.0 - 25.0)
+    assert counted("initial_soc", {"offset_pct": 5.0}, 10.0, 1.0) == pytest.approx(65.0 - 20.0)
+    for current, expected in ((-10.0, 60.0 + 19.0), (10.0, 60.0 - 20.0)):
+        found = counted("coulombic_efficiency", {"efficiency": 0.95}, current, 1.0)
+        assert found == pytest.approx(expected)
+
+
+def test_a_capacity_that_the_user_insists_on_is_left_alone() -> None:
+    extended = ExtendedModel(MODEL, 50.0).with_effect(LIBRARY["capacity"], {"change_pct": -20.0})
+    assert extended.online().capacity_ah == pytest.approx(40.0)
+    assert extended.online(47.0).capacity_ah == 47.0
+
+
+# --- resistance ---------------------------------------------------------------------------
+
+
+def test_resistance_follows_arrhenius_from_the_middle_of_the_models_range() -> None:
+    values = {"activation_k": 4000.0}
+    at_23 = extra("resistance_temperature", steady(10.0, 50.0, temperature_c=23.0), values)
+    np.testing.assert_allclose(at_23, 0.0, atol=1e-12)
+    cold = steady(10.0, 50.0, temperature_c=0.0)
+    factor = math.exp(4000.0 * (1.0 / 273.15 - 1.0 / 296.15))
+    assert 2.5 < factor < 3.5
+    found = extra("resistance_temperature", cold, values)
+    np.testing.assert_allclose(found, cold.drop_v * (factor - 1.0), rtol=1e-12)
+
+
+def test_resistance_rises_toward_empty_and_full() -> None:
+    values = {"at_empty": 2.0, "at_full": 0.5, "width_pct": 10.0}
+    for soc, share in ((0.0, 2.0), (100.0, 0.5), (10.0, 2.0 / math.e), (50.0, 0.0168)):
+        state = steady(3.0, 50.0, soc_pct=soc)
+        np.testing.assert_allclose(
+            extra("resistance_soc", state, values) / state.drop_v, share, rtol=3e-3
+        )
+
+
+def test_asymmetry_acts_on_charging_current_alone() -> None:
+    values = {"charging_ohm": 0.05}
+    assert not np.any(extra("resistance_asymmetry", steady(5.0, 40.0), values))
+    np.testing.assert_allclose(extra("resistance_asymmetry", steady(5.0, -40.0), values), 2.0)
+
+
+def test_a_step_begins_at_its_moment_and_stays() -> None:
+    state = steady(1000.0, 40.0)
+    moved = replace(state, time_s=state.time_s + 5e5)
+    found = extra("resistance_step", moved, {"step_ohm": 0.05, "start_s": 300.0})
+    np.testing.assert_array_equal(found[:300], 0.0)
+    np.testing.assert_allclose(found[300:], -2.0)
+
+
+def test_a_steps_moments_to_try_lie_within_the_log() -> None:
+    effect = LIBRARY["resistance_step"]
+    start = effect.parameters[1]
+    for hours in (0.2, 3.0):
+        time_s = np.linspace(100.0, 100.0 + 3600.0 * hours, 50)
+        trials = effect.trials(start, PACK, time_s)
+        assert trials[0] == 0.0
+        assert trials[-1] == pytest.approx(0.9 * 3600.0 * hours)
+        low, high = start.bounds(PACK)
+        assert low <= trials[0] <= trials[-1] <= high
+
+
+# --- dynamics -----------------------------------------------------------------------------
+
+
+def test_charge_transfer_bends_between_rest_and_1c() -> None:
+    current = PACK.capacity_ah * np.array([-3.0, -1.0, -0.2, 0.0, 0.2, 1.0, 3.0])
+    state = with_current(steady(6.0, 0.0), current)
+    found = extra("charge_transfer", state, {"scale_v": 5.0, "exchange_a": 3.0})
+    np.testing.assert_allclose(found[[1, 3, 5]], 0.0, atol=1e-12)
+    np.testing.assert_allclose(found, -found[::-1], atol=1e-12)
+    assert found[4] < -1.0
+    assert found[6] > 1.0
+
+
+@pytest.mark.parametrize("effect_id", ["fast_polarization", "slow_diffusion"])
+def test_polarisation_charges_and_decays_with_its_time_constant(effect_id: str) -> None:
+    tau = 5.0 if effect_id == "fast_polarization" else 400.0
+    values = {"ohm": 0.02, "tau_s": tau}
+    state = steady(40.0 * tau, 50.0)
+    current = np.where(state.time_s < 20.0 * tau, 50.0, 0.0)
+    found = extra(effect_id, with_current(state, current), values)
+    assert found[0] == 0.0
+    assert found[int(tau)] == pytest.approx(-1.0 * (1.0 - math.exp(-1.0)), rel=1e-6)
+    assert found[int(20 * tau) - 1] == pytest.approx(-1.0, rel=1e-6)
+    ratio = found[int(23 * tau)] / found[int(22 * tau)]
+    assert ratio == pytest.approx(math.exp(-1.0), rel=1e-6)
+
+
+def test_polarisation_has_decayed_after_a_night_asleep() -> None:
+    time_s = np.concatenate([np.arange(0.0, 3600.0), 3600.0 + 8 * 3600.0 + np.arange(10.0)])
+    current = np.full_like(time_s, 50.0)
+    state = PackState(time_s, current, current, current, current)
+    found = extra("slow_diffusion", state, {"ohm": 0.02, "tau_s": 1000.0})
+    assert found[3599] == pytest.approx(-1.0 * (1.0 - math.exp(-3.599)), rel=1e-3)
+    assert abs(found[3600]) < 1e-6
+
+
+# --- equilibrium and imbalance ------------------------------------------------------------
+
+
+def test_hysteresis_turns_with_charge_and_stays_through_a_rest() -> None:
+    values = {"half_width_v": 2.0, "travel_pct": 2.0}
+    per_hour = PACK.capacity_ah
+    time_s = np.concatenate([np.arange(0.0, 10_000.0), 50_000.0 + np.arange(10_000.0)])
+    current = np.select([time_s < 3600.0, time_s < 55_000.0], [per_hour * 0.2, 0.0], -per_hour)
+    state = with_current(replace(steady(1.0, 0.0), time_s=time_s), current)
+    found = extra("hysteresis", state, values)
+    # 20 % of discharge are ten times the travel: the lower branch, from the middle.
+    assert found[0] == 0.0
+    assert found[360] == pytest.approx(-2.0 * (1.0 - math.exp(-1.0)), rel=1e-3)
+    assert found[3700] == pytest.approx(-2.0, rel=1e-3)
+    resting = (time_s > 3700.0) & (time_s < 54_999.0)
+    assert np.ptp(found[resting]) == 0.0
+    # One travel of charge: from −1 to 1 − 2/e.
+    assert found[np.searchsorted(time_s, 55_000.0 + 72.0)] == pytest.approx(
+        2.0 * (1.0 - 2.0 / math.e), abs=0.03
+    )
+
+
+def test_entropy_bounds_are_tenths_of_a_millivolt_per_kelvin_and_cell() -> None:
+    effect = LIBRARY["entropic_coefficient"]
+    for parameter in effect.parameters:
+        low, high = parameter.bounds(PACK)
+        assert -low == high
+        assert 1e-4 < high / PACK.cells < 5e-4
+    warm = steady(3.0, 0.0, soc_pct=100.0, temperature_c=MODEL.t_ref_c + 10.0)
+    found = extra("entropic_coefficient", warm, {"slope_v_per_k": 0.01, "curve_v_per_k": 0.02})
+    np.testing.assert_allclose(found, 10.0 * 0.03)
+
+
+def test_weak_cells_bring_the_knee_forward_and_keep_the_pack_rising() -> None:
+    soc = np.linspace(0.0, 100.0, 1001)
+    state = replace(steady(1000.0, 0.0), soc_pct=soc, temperature_c=np.full(1001, MODEL.t_ref_c))
+    found = extra("weak_cell", state, {"fraction": 0.1, "deficit_pct": 15.0})
+    assert found[-1] == 0.0
+    assert np.all(found <= 0.0)
+    assert np.argmin(found) < 150
+    assert np.all(np.diff(MODEL.pseudo_ocv(soc) + found) > 0.0)
+
+
+# --- the lag itself -----------------------------------------------------------------------
+
+
+@given(
+    st.lists(st.tuples(st.floats(1e-3, 1e4), st.floats(-500.0, 500.0)), min_size=1, max_size=60),
+    st.floats(0.2, 3000.0),
+    st.floats(-100.0, 100.0),
+    st.sampled_from([60.0, math.inf]),
+)
+def test_lag_over_arrays_equals_lag_sample_by_sample(
+    rows: list[tuple[float, float]], tau_s: float, start: float, rest_s: float
+) -> None:
+    time_s = np.cumsum([step for step, _ in rows])
+    values = np.array([value for _, value in rows])
+    lag = LowPass(tau_s, start, rest_s)
+    expected = [lag.step(t, x) for t, x in zip(time_s.tolist(), values.tolist(), strict=True)]
+    np.testing.assert_allclose(
+        low_passed(time_s, values, tau_s, start, rest_s), expected, rtol=1e-9, atol=1e-9
+    )
+
+
+def test_lag_solves_its_equation_on_a_ramp() -> None:
+    """y' = (x − y)/τ with x = t and y(0) = 0: y = t − τ·(1 − e^(−t/τ)), at any sampling."""
+    time_s = np.array([0.0, 0.1, 0.5, 3.0, 3.001, 20.0, 400.0])
+    found = low_passed(time_s, time_s, 7.0, 0.0)
+    np.testing.assert_allclose(found, time_s - 7.0 * -np.expm1(-time_s / 7.0), atol=1e-12)
+
+
+@given(st.lists(st.floats(0.0, 2000.0), min_size=1, max_size=80), st.integers(0, 1000))
+def test_decaying_sum_equals_its_recursion(decay: list[float], seed: int) -> None:
+    drive = np.random.default_rng(seed).normal(0.0, 100.0, len(decay))
+    expected = [5.0]
+    for k, d in zip(decay, drive.tolist(), strict=True):
+        expected.append(math.exp(-k) * expected[-1] + d)
+    found = decaying_sum(np.array(decay), drive, 5.0)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)

@@ -1,0 +1,153 @@
+"""The extended model: nothing without effects, order, several at once, its slope over SoC."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stepping import EFFECTS, MODEL, irregular_signals, middle, step_through
+
+from cangauge.estimate.inverse import soc_from_ocv
+from cangauge.identify.rows import fit_rows
+from cangauge.logs.log import Log
+from cangauge.logs.read import read_log
+from cangauge.model.effects.effect import Reading, Signals
+from cangauge.model.effects.library import LIBRARY
+from cangauge.model.extended import ExtendedModel
+from cangauge.model.published import CAPACITY_AH
+from synthetic import synthetic_log
+
+ALL = tuple((effect, middle(effect)) for effect in EFFECTS)
+
+
+def signals_of(log: Log) -> Signals:
+    return Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
+
+
+def assert_equals_the_voltage_model(log: Log, capacity_ah: float, start_pct: float) -> None:
+    rows = fit_rows(log, capacity_ah=capacity_ah, delay_s=MODEL.delay_s, initial_soc_pct=start_pct)
+    expected = MODEL.voltage(rows.soc_pct, rows.temperature_c, rows.delayed_current_a)
+    at = np.searchsorted(log.time_s, rows.time_s)
+    found = ExtendedModel(MODEL, capacity_ah).predict(signals_of(log), start_pct, at)
+    assert np.array_equal(found.soc_pct[at], rows.soc_pct)
+    assert np.array_equal(found.voltage_v, expected)
+    assert np.array_equal(found.residual_v, rows.voltage_v - expected)
+
+
+def test_without_effects_it_is_the_voltage_model_to_the_last_bit() -> None:
+    log = synthetic_log(rate_hz=10.0, hours=0.7, start_pct=90.0, end_pct=60.0)
+    assert_equals_the_voltage_model(log, CAPACITY_AH, 90.0)
+
+
+@pytest.mark.real
+def test_without_effects_it_is_the_voltage_model_on_a_real_trip(shared_data: Path) -> None:
+    log = read_log(shared_data / "bmw_i3" / "TripA05.csv.gz")
+    assert_equals_the_voltage_model(log, 61.75, 80.0)
+
+
+def test_without_effects_the_online_model_is_the_voltage_model_to_the_last_bit() -> None:
+    online = ExtendedModel(MODEL, CAPACITY_AH).online()
+    assert online.plain
+    assert online.capacity_ah == CAPACITY_AH
+    reading = Reading(1.0, 50.0, 370.0, 20.0)
+    assert online.correct(reading) == (reading,)
+    assert online.counted(-33.3) == -33.3
+    assert online.initial_soc_pct(88.8) == 88.8
+    online.advance(1.0, 50.0, 20.0, [50.0] * 4)
+    for soc in np.linspace(-10.0, 110.0, 57).tolist():
+        assert online.pseudo_ocv_at(soc) == MODEL.pseudo_ocv_at(soc)
+
+
+def test_soc_may_be_anchored_at_any_row() -> None:
+    signals = irregular_signals(500)
+    extended = ExtendedModel(MODEL, CAPACITY_AH)
+    first = extended.predict(signals, 80.0, np.array([0]))
+    again = extended.predict(signals, float(first.soc_pct[300]), np.array([0]), anchor_row=300)
+    np.testing.assert_allclose(again.soc_pct, first.soc_pct, atol=1e-10)
+
+
+def test_the_order_in_which_effects_are_given_does_not_matter() -> None:
+    signals = irregular_signals(600)
+    rows = np.arange(600)
+    forward = ExtendedModel(MODEL, CAPACITY_AH, ALL).predict(signals, 80.0, rows)
+    backward = ExtendedModel(MODEL, CAPACITY_AH, ALL[::-1]).predict(signals, 80.0, rows)
+    assert np.array_equal(forward.voltage_v, backward.voltage_v)
+
+
+def test_an_offset_is_taken_off_before_a_gain() -> None:
+    signals = irregular_signals(50)
+    extended = ExtendedModel(
+        MODEL,
+        CAPACITY_AH,
+        (
+            (LIBRARY["current_gain"], {"gain_pct": 5.0}),
+            (LIBRARY["current_offset"], {"offset_a": 2.0}),
+        ),
+    )
+    found = extended.corrected(signals).current_a
+    np.testing.assert_allclose(found, (signals.current_a - 2.0) / 1.05, rtol=1e-12)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.sets(st.sampled_from(sorted(LIBRARY)), min_size=2, max_size=6), st.integers(0, 99))
+def test_several_effects_at_once_agree_offline_and_online(chosen: set[str], seed: int) -> None:
+    signals = irregular_signals(400, seed)
+    effects = tuple((LIBRARY[key], middle(LIBRARY[key])) for key in sorted(chosen))
+    extended = ExtendedModel(MODEL, CAPACITY_AH, effects)
+    batch = extended.predict(signals, 85.0, np.arange(400))
+    online = step_through(extended, signals, 85.0)
+    n = len(online.readings)
+    assert n >= 200
+    # The SoC is the counter's own here, so the knee's slope magnifies rounding.
+    np.testing.assert_allclose(online.soc_pct, batch.soc_pct[:n], atol=1e-8)
+    np.testing.assert_allclose(online.voltage_v, batch.voltage_v[:n], atol=1e-6)
+
+
+def test_slope_over_soc_is_the_derivative_and_stays_positive() -> None:
+    extended = ExtendedModel(MODEL, CAPACITY_AH, ALL)
+    online = extended.online()
+    for time_s, current in enumerate((60.0, 0.0, -40.0, -200.0)):
+        online.advance(float(time_s), current, 5.0, [current] * 4)
+        for soc in np.linspace(1.0, 99.0, 50).tolist():
+            slope = online.pseudo_ocv_at(soc)[1]
+            step = 0.01
+            above, below = (online.pseudo_ocv_at(soc + d)[0] for d in (step, -step))
+            numeric = (above - below) / (2.0 * step)
+            assert slope > 0.0
+            if numeric > 0.05:
+                assert slope == pytest.approx(numeric, rel=0.02, abs=0.01)
+
+
+def test_slope_stays_positive_where_the_voltage_turns_around() -> None:
+    """Charging hard near empty: as the SoC rises, the rise over the resistance fades faster."""
+    values = {"at_empty": 3.0, "at_full": 0.0, "width_pct": 10.0}
+    online = ExtendedModel(MODEL, CAPACITY_AH, ((LIBRARY["resistance_soc"], values),)).online()
+    online.advance(0.0, -200.0, 20.0, [-200.0] * 4)
+    (low, slope), (high, _) = online.pseudo_ocv_at(14.0), online.pseudo_ocv_at(15.0)
+    assert high < low
+    assert 0.0 < slope < 0.1
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.floats(-400.0, 400.0), st.floats(-30.0, 50.0), st.floats(0.0, 100.0), st.floats(0.0, 1.0))
+def test_newton_finds_a_root_with_all_effects_at_once(
+    current: float, temperature: float, soc: float, part: float
+) -> None:
+    """Even where an effect turns the curve around, what comes back gives the voltage asked for."""
+    values = {"at_empty": 3.0 * part, "at_full": 1.0, "width_pct": 10.0}
+    effects = tuple(
+        (effect, values if effect.id == "resistance_soc" else middle(effect)) for effect in EFFECTS
+    )
+    online = ExtendedModel(
+        replace(MODEL, temperature_range_c=(-30.0, 50.0)), 51.5, effects
+    ).online()
+    online.advance(0.0, current, temperature, [current] * 4)
+    wanted = online.pseudo_ocv_at(soc)[0]
+    found = soc_from_ocv(online, wanted)
+    assert 0.0 <= found.soc_pct <= 100.0
+    if found.inside:
+        assert online.pseudo_ocv_at(found.soc_pct)[0] == pytest.approx(wanted, abs=1e-6)
