@@ -10,10 +10,13 @@ import sys
 import typer
 
 from cangauge import __version__
+from cangauge.cli.demo import demo_command
 from cangauge.cli.estimate import estimate_command
 from cangauge.cli.fit import fit_command
 from cangauge.cli.inspect import inspect_command
 from cangauge.cli.output import note
+from cangauge.cli.replay import replay_command
+from cangauge.cli.run import run_command
 from cangauge.errors import CangaugeError
 
 app = typer.Typer(
@@ -42,8 +45,11 @@ def _root(
     del version
 
 
+app.command("demo")(demo_command)
 app.command("fit")(fit_command)
 app.command("estimate")(estimate_command)
+app.command("run")(run_command)
+app.command("replay")(replay_command)
 app.command("inspect")(inspect_command)
 
 

@@ -190,7 +190,7 @@ class _Bar:
     def show(self, state: ReplayState) -> None:
         words = f"{duration(state.log_seconds)}, {number(state.speed, 1)}×"
         if state.soc is not None:
-            words += f", SoC {number(state.soc.soc_pct, 2)} ± {number(state.soc.soc_std_pct, 2)} %"
+            words += f", SoC {number(state.soc.soc_pct, 2, '%')}"
         self._bar.update(self._task, completed=state.log_seconds, words=words, refresh=True)
 
 
