@@ -30,6 +30,9 @@ FloatArray = NDArray[np.float64]
 PRIOR_SIGMAS = 2.0
 """Half the width of an amplitude's bounds is this many prior standard deviations."""
 
+PIN = 0.01
+"""How far the structure of clean logs may move with the diagnosed ones, in parts of its bounds."""
+
 JITTER = 1e-10
 """Relative diagonal load: coefficients that no log moves stay where they are."""
 
@@ -61,6 +64,8 @@ class Evidence:
     """Solution without any effect: δθ (scaled), repairs, then what is each log's own."""
     per_amplitude: FloatArray
     """How that solution falls as an amplitude rises, shape (…, all amplitudes)."""
+    precision: FloatArray
+    """Of that solution, shape (…, …)."""
 
     def of(self, k: int) -> slice:
         """Return where candidate k's amplitudes are."""
@@ -103,6 +108,10 @@ class Gram:
     def __add__(self, other: Gram) -> Gram:
         """Return the products over the rows of both."""
         return Gram(self.products + other.products, self.rows + other.rows)
+
+    def weakened(self, factor: float) -> Gram:
+        """Return the products as if the errors' variance were `factor` times larger."""
+        return Gram(self.products / factor, self.rows)
 
     def __sub__(self, other: Gram) -> Gram:
         """Return the products over the rows that the other has not."""
@@ -182,6 +191,8 @@ def gather(
             curvature += products[np.ix_(effects, effects)]
             gradient += products[effects, residual]
     _add_priors(precision, frame, error, weight)
+    if references and diagnosed and frame.repairs:
+        _pin_repairs(precision, right, frame, gather(frame, references, [], error).mean)
     solve = _solver(precision)
     mean, per_amplitude = solve(right), solve(cross)
     return Evidence(
@@ -191,6 +202,7 @@ def gather(
         squares=squares - float(right @ mean),
         mean=mean,
         per_amplitude=per_amplitude,
+        precision=precision,
     )
 
 
@@ -206,6 +218,20 @@ def _add_priors(precision: FloatArray, frame: Frame, error: ErrorModel, weight: 
     own = np.arange(p + at.size, precision.shape[0])
     logs = own.size // len(OWN)
     precision[own, own] += np.tile(np.array(error.own_std) ** -2.0, logs)
+
+
+def _pin_repairs(precision: FloatArray, right: FloatArray, frame: Frame, clean: FloatArray) -> None:
+    """Hold the structure of clean logs near what the references say of it.
+
+    Else it would take up a cause of its own kind: cold logs would only teach what resistance does
+    in the cold, and nothing would be left to attribute.
+    """
+    p = frame.scale.size
+    bounds = frame.bounds_of(frame.repairs)
+    at = p + np.arange(bounds.shape[0])
+    pin = (PIN * (bounds[:, 1] - bounds[:, 0])) ** -2.0
+    precision[at, at] += pin
+    right[at] += pin * clean[at]
 
 
 def _solver(precision: FloatArray) -> Callable[[FloatArray], FloatArray]:

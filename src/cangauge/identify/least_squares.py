@@ -70,7 +70,7 @@ def solve(
     z = left.T @ target
     constrained = bounds is not None and bool(np.any(bounds @ (back @ z) < at_least))
     if constrained and bounds is not None:
-        z = _nearest(z, bounds @ back, at_least)
+        z = _nearest(z, bounds @ back, np.full(bounds.shape[0], at_least))
     x = back @ z
     return Solution(
         coefficients=x,
@@ -80,7 +80,31 @@ def solve(
     )
 
 
-def _nearest(z: FloatArray, bounds: FloatArray, at_least: float) -> FloatArray:
+def nearest_rising(
+    root: FloatArray, target: FloatArray, bounds: FloatArray, at_least: FloatArray
+) -> FloatArray:
+    """Minimise |root·x − target|² subject to bounds·x ≥ at_least; root is square and regular.
+
+    Parameters
+    ----------
+    root : array of shape (p, p)
+    target : array of shape (p,)
+    bounds : array of shape (m, p)
+    at_least : array of shape (m,)
+
+    Raises
+    ------
+    CangaugeError
+        If the convex solver finds no solution.
+    """
+    inverse = np.linalg.inv(root)
+    plain = inverse @ target
+    if np.all(bounds @ plain >= at_least):
+        return np.asarray(plain)
+    return np.asarray(inverse @ _nearest(target, bounds @ inverse, at_least))
+
+
+def _nearest(z: FloatArray, bounds: FloatArray, at_least: FloatArray) -> FloatArray:
     """Return the point nearest to z with bounds·point ≥ at_least."""
     length = np.linalg.norm(bounds, axis=1)
     settings = clarabel.DefaultSettings()

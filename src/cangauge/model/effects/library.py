@@ -91,11 +91,10 @@ def parse_effects(entries: Sequence[object], pack: Pack) -> list[tuple[Effect, V
     Raises
     ------
     InputError
-        If an entry is no effect, is given twice, or a parameter is missing, unknown, no number,
+        If an entry is no effect, or a parameter is missing, unknown, no number,
         or outside its physical bounds; names the field.
     """
     parsed: list[tuple[Effect, Values]] = []
-    seen: set[str] = set()
     for number, entry in enumerate(entries):
         field = f"effects.{number}"
         if not isinstance(entry, Mapping) or set(entry) != {"id", "parameters"}:
@@ -105,9 +104,6 @@ def parse_effects(entries: Sequence[object], pack: Pack) -> list[tuple[Effect, V
                 value=sorted(map(str, entry)) if isinstance(entry, Mapping) else entry,
             )
         effect = effect_of(entry["id"], f"{field}.id")
-        if effect.id in seen:
-            raise InputError("is given twice", field=f"{field}.id", value=effect.id)
-        seen.add(effect.id)
         parsed.append((effect, _values(effect, entry["parameters"], pack, f"{field}.parameters")))
     return parsed
 

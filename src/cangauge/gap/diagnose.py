@@ -1,0 +1,226 @@
+"""The diagnosis: model, references and logs in; where, which, how far out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cangauge.gap.evidence import gather
+from cangauge.gap.extend import Extension, cause_parameters, extend, library_without
+from cangauge.gap.held_out import Judged, closed_fraction, closed_interval, judge, rms
+from cangauge.gap.settle import Settled, settle
+from cangauge.gap.verdict import ACCEPT_LOG_BAYES, NONE, UNKNOWN, Verdict, decide
+from cangauge.gap.where import Place, places, worst_moments
+from cangauge.logs.log import Log
+from cangauge.model.model_file import ModelFile
+
+FloatArray = NDArray[np.float64]
+
+SHOWN = 6
+"""So many candidates are judged on rows held out and listed in full."""
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """What the diagnosis found."""
+
+    settled: Settled
+    verdict: Verdict
+    baseline_rmse_v: float
+    extended_rmse_v: float
+    floor_v: float
+    closed: float | None
+    closed_ci: tuple[float, float] | None
+    where: tuple[Place, ...]
+    worst: tuple[dict[str, object], ...]
+    candidates: tuple[dict[str, Any], ...]
+    observability: tuple[dict[str, object], ...]
+    extension: Extension
+
+    def to_dict(self, extended_model: str | None = None) -> dict[str, Any]:
+        """Return the object that `cangauge gap --json` prints."""
+        verdict = self.verdict
+        return {
+            "schema": 1,
+            "gap": {
+                "baseline_rmse_v": self.baseline_rmse_v,
+                "extended_rmse_v": self.extended_rmse_v,
+                "floor_sensor_v": self.floor_v,
+                "floor_explainable_v": None,
+                "closed_fraction": self.closed,
+                "closed_fraction_ci": None if self.closed_ci is None else list(self.closed_ci),
+                "baseline_soc_mae_pct": None,
+                "extended_soc_mae_pct": None,
+            },
+            "where": [place.to_dict() for place in self.where],
+            "worst_moments": list(self.worst),
+            "cause": {
+                "verdict": verdict.cause,
+                "probability": verdict.probability,
+                "ambiguous_with": list(verdict.ambiguous_with),
+                "explained_fraction": verdict.explained,
+                "accepted": [
+                    {
+                        "effect": effect_id,
+                        "parameters": values,
+                        "closed_fraction": self.closed,
+                    }
+                    for effect_id, values in self.extension.cause.items()
+                ],
+                "candidates": list(self.candidates),
+            },
+            "observability": list(self.observability),
+            "extended_model": extended_model,
+        }
+
+
+def diagnose(
+    logs: Sequence[Log],
+    model_file: ModelFile,
+    references: Sequence[Log],
+    *,
+    leave_out: Sequence[str] = (),
+    initial_soc_pct: float | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Diagnosis:
+    """Find where, which and how far.
+
+    Parameters
+    ----------
+    logs : sequence of Log
+        Logs that the model does not explain, sharing one cause.
+    model_file : ModelFile
+    references : sequence of Log
+        Logs on which the model is known to be good.
+    leave_out : sequence of str
+        Effects that the library is to be without.
+    initial_soc_pct : float, optional
+        SoC at each diagnosed log's first row [%].
+    progress : callable, optional
+        Called with a line of text before each long step.
+
+    Raises
+    ------
+    InputError
+        If a log cannot be diagnosed: too short, of another pack, counted out of 0–100 %.
+    """
+    say = progress or _silent
+    settled = settle(
+        logs,
+        model_file,
+        references,
+        library_without(leave_out),
+        initial_soc_pct=initial_soc_pct,
+        progress=progress,
+    )
+    say("weighing the evidence")
+    verdict = decide(settled)
+    accepted = [score.effect_id for score in verdict.accepted]
+    say("judging on rows left out")
+    judged = judge(settled, accepted)
+    floor = _floor_v(settled, model_file)
+    baseline = rms(np.concatenate([item.baseline_v for item in judged]))
+    extended = rms(np.concatenate([item.extended_v for item in judged]))
+    is_gap = verdict.cause != NONE
+    say("extending the model")
+    return Diagnosis(
+        settled=settled,
+        verdict=verdict,
+        baseline_rmse_v=baseline,
+        extended_rmse_v=extended,
+        floor_v=floor,
+        closed=closed_fraction(baseline, extended, floor) if is_gap else None,
+        closed_ci=closed_interval(settled, judged, floor) if is_gap else None,
+        where=tuple(places(settled.diagnosed, model_file.capacity_ah)),
+        worst=tuple(worst_moments(settled.diagnosed)),
+        candidates=tuple(_candidates(settled, verdict, floor)),
+        observability=tuple(_observability(settled)),
+        extension=extend(settled, verdict.accepted),
+    )
+
+
+def _candidates(settled: Settled, verdict: Verdict, floor: float) -> list[dict[str, Any]]:
+    result = []
+    for number, score in enumerate(verdict.candidates):
+        judged = judge(settled, [score.effect_id]) if number < SHOWN else []
+        result.append(
+            {
+                "effect": score.effect_id,
+                "probability": verdict.chances[score.effect_id],
+                "log_bayes_factor": score.log_bayes_factor,
+                **_errors(settled, judged, floor),
+                "parameters": cause_parameters(score, settled),
+            }
+        )
+    return result
+
+
+def _errors(settled: Settled, judged: Sequence[Judged], floor: float) -> dict[str, Any]:
+    if not judged:
+        return {"rmse_v": None, "closed_fraction": None, "ci": None}
+    baseline = rms(np.concatenate([item.baseline_v for item in judged]))
+    extended = rms(np.concatenate([item.extended_v for item in judged]))
+    interval = closed_interval(settled, judged, floor)
+    return {
+        "rmse_v": extended,
+        "closed_fraction": closed_fraction(baseline, extended, floor),
+        "ci": None if interval is None else list(interval),
+    }
+
+
+def _floor_v(settled: Settled, model_file: ModelFile) -> float:
+    """Return the model's error on the references, or what the model file states without any."""
+    if not settled.references:
+        return model_file.noise.voltage_rmse_v
+    return rms(np.concatenate([terms.residual_v for terms in settled.references]))
+
+
+def _observability(settled: Settled) -> list[dict[str, object]]:
+    """Return how much of each effect's physical range these logs could show.
+
+    `visible` is 1 less the smallest amplitude that would be accepted, in parts of the bounds.
+    """
+    evidence = gather(
+        settled.frame, settled.reference_grams, settled.diagnosed_grams, settled.error
+    )
+    best: dict[str, float] = {}
+    needs: dict[str, str] = {}
+    for k, choice in enumerate(settled.frame.choices):
+        at = evidence.of(k)
+        information = np.diag(evidence.curvature[at, at])
+        reach = np.abs(choice.bounds).max(axis=1)
+        smallest = np.sqrt(2.0 * (ACCEPT_LOG_BAYES + 2.0) / np.maximum(information, 1e-30)) / reach
+        visible = float(np.clip(1.0 - smallest.min(), 0.0, 1.0))
+        best[choice.effect.id] = max(best.get(choice.effect.id, 0.0), visible)
+        needs[choice.effect.id] = choice.effect.separated_by
+    return [
+        {"effect": effect_id, "visible": visible, "needs": needs[effect_id]}
+        for effect_id, visible in sorted(best.items(), key=lambda item: -item[1])
+    ]
+
+
+def in_words(diagnosis: Diagnosis) -> str:
+    """Return the verdict in one sentence."""
+    verdict = diagnosis.verdict
+    gap = f"{diagnosis.baseline_rmse_v:.2f} V where references show {diagnosis.floor_v:.2f} V"
+    if verdict.cause == NONE:
+        return f"No gap beyond what the references show ({gap})."
+    if verdict.cause == UNKNOWN:
+        return f"A gap ({gap}) that no effect in the library explains."
+    alike = (
+        f", not to be told from {', '.join(verdict.ambiguous_with)}"
+        if verdict.ambiguous_with
+        else ""
+    )
+    return (
+        f"{gap}: {verdict.cause} (probability {verdict.probability:.2f}{alike});"
+        f" with it {diagnosis.extended_rmse_v:.2f} V on rows left out."
+    )
+
+
+def _silent(_text: str) -> None:
+    """Say nothing."""

@@ -1,0 +1,233 @@
+"""The extended model: the given model, what the references add to it, and the accepted effects."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from cangauge import __version__
+from cangauge.errors import InputError
+from cangauge.gap.columns import residual
+from cangauge.gap.evidence import Evidence, Score, gather
+from cangauge.gap.held_out import solution_with
+from cangauge.gap.settle import Settled
+from cangauge.identify.least_squares import nearest_rising
+from cangauge.identify.voltage_fit import SLOPE_CHECKS
+from cangauge.model.effects.effect import Effect, Values
+from cangauge.model.effects.library import LIBRARY, effect_entries
+from cangauge.model.extended import ExtendedModel
+from cangauge.model.model_file import Made, ModelFile
+from cangauge.model.voltage_model import (
+    BASIS_NAMES,
+    SLOPE_AT_LEAST,
+    VoltageModel,
+    ocv_basis_slope,
+)
+
+FloatArray = NDArray[np.float64]
+
+NEGLIGIBLE = 1e-3
+"""A repair smaller than this part of its bounds is left out."""
+
+BELONGS_TO_A_LOG = frozenset({"initial_soc"})
+"""Effects of one log that a model for later drives must not carry on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Extension:
+    """The extended model with what could not be carried over."""
+
+    model: ExtendedModel
+    cause: dict[str, dict[str, float]]
+    """Parameters of each accepted effect, refined on the model's own equations."""
+    remarks: tuple[str, ...]
+
+
+def extend(settled: Settled, accepted: Sequence[Score]) -> Extension:
+    """Return the extended model, its cause refined beyond the linear solution.
+
+    Parameters
+    ----------
+    settled : Settled
+    accepted : sequence of Score
+    """
+    evidence = gather(
+        settled.frame, settled.reference_grams, settled.diagnosed_grams, settled.error
+    )
+    solution = solution_with(evidence, [score.effect_id for score in accepted])
+    base, remarks = _base(settled, evidence, solution)
+    frame = settled.frame
+    cause: dict[str, dict[str, float]] = {}
+    model = base
+    for score in accepted:
+        choice = frame.choices[score.candidate]
+        at = frame.scale.size + frame.amplitudes_of([score.candidate])
+        if score.candidate in frame.repairs:
+            start = score.amplitude
+        else:
+            start = np.clip(solution[at], choice.bounds[:, 0], choice.bounds[:, 1])
+        model, values = _refined(settled, model, score, start)
+        cause[choice.effect.id] = values
+    return Extension(model, cause, tuple(remarks))
+
+
+def _base(
+    settled: Settled, evidence: Evidence, solution: FloatArray
+) -> tuple[ExtendedModel, list[str]]:
+    """Return the given model with coefficients and structure that the references add."""
+    given, frame = settled.model, settled.frame
+    p = frame.scale.size
+    remarks: list[str] = []
+    voltage_model = _moved(given.model, _rising(given.model, frame.scale, evidence, solution))
+    if voltage_model is None:
+        voltage_model = given.model
+        remarks.append("the coefficients stay: moved, the pseudo-OCV would not rise everywhere")
+    base = replace(given, model=voltage_model)
+    for k in frame.repairs:
+        choice = frame.choices[k]
+        amplitude = solution[p + frame.amplitudes_of([k])]
+        amplitude = np.clip(amplitude, choice.bounds[:, 0], choice.bounds[:, 1])
+        width = choice.bounds[:, 1] - choice.bounds[:, 0]
+        if np.any(np.abs(amplitude) > NEGLIGIBLE * width):
+            base = base.with_effect(choice.effect, choice.values(amplitude))
+    return base, remarks
+
+
+def _rising(
+    model: VoltageModel, scale: FloatArray, evidence: Evidence, solution: FloatArray
+) -> FloatArray:
+    """Return δθ, moved as little as the data allow so that the pseudo-OCV rises."""
+    p, n = scale.size, len(BASIS_NAMES)
+    rest = np.linalg.solve(evidence.precision[p:, p:], evidence.precision[p:, :p])
+    information = evidence.precision[:p, :p] - evidence.precision[:p, p:] @ rest
+    root = np.linalg.cholesky(information + 1e-12 * np.trace(information) * np.eye(p)).T
+    bounds = np.zeros((SLOPE_CHECKS, p))
+    grid = np.linspace(*model.soc_range_pct, SLOPE_CHECKS)
+    slopes = ocv_basis_slope(grid, model.epsilon)
+    bounds[:, :n] = slopes / scale[:n]
+    needed = SLOPE_AT_LEAST * model.pseudo_ocv_at(50.0)[0] - slopes @ np.array(model.ocv_v)
+    target = root @ (solution[:p] * scale)
+    moved = nearest_rising(root, target, bounds, needed)
+    return moved / scale
+
+
+def _moved(model: VoltageModel, change: FloatArray) -> VoltageModel | None:
+    n = len(BASIS_NAMES)
+    moved = change.tolist()
+    try:
+        return replace(
+            model,
+            ocv_v=tuple(a + b for a, b in zip(model.ocv_v, moved[:n], strict=True)),
+            kt_v_per_k=model.kt_v_per_k + moved[n],
+            resistance_ohm=tuple(
+                a + b for a, b in zip(model.resistance_ohm, moved[n + 1 :], strict=True)
+            ),
+        )
+    except InputError:
+        return None
+
+
+def _refined(
+    settled: Settled, model: ExtendedModel, score: Score, start: FloatArray
+) -> tuple[ExtendedModel, dict[str, float]]:
+    """Return model and parameters with the amplitudes fitted through the model's own equations."""
+    choice = settled.frame.choices[score.candidate]
+    low, high = choice.bounds[:, 0], choice.bounds[:, 1]
+    scale = high - low
+    prior = 4.0 * settled.error.rmse_v * np.sqrt(settled.error.rows_alike)
+
+    def errors(unit: FloatArray) -> FloatArray:
+        trial = model.with_effect(choice.effect, choice.values(unit * scale))
+        volts = [residual(terms.prepared, trial) for terms in settled.diagnosed]
+        return np.concatenate([*volts, prior * unit])
+
+    inside = np.clip(start / scale, low / scale + 1e-9, high / scale - 1e-9)
+    found = least_squares(errors, inside, bounds=(low / scale, high / scale), diff_step=1e-3,
+                          max_nfev=12)  # fmt: skip
+    values = choice.values(found.x * scale)
+    return model.with_effect(choice.effect, values), values
+
+
+def model_file_of(extension: Extension, given: ModelFile, floor_v: float) -> ModelFile:
+    """Return the extended model as a model file that estimator and service run.
+
+    Parameters
+    ----------
+    extension : Extension
+    given : ModelFile
+        The model that was diagnosed.
+    floor_v : float
+        Error that is left on rows held out [V].
+    """
+    model = extension.model
+    values = [*model.model.ocv_v, model.model.kt_v_per_k, *model.model.resistance_ohm]
+    coefficients = {
+        name: item.model_copy(update={"value": value, "std_error": None})
+        for (name, item), value in zip(given.coefficients.items(), values, strict=True)
+    }
+    noise = given.noise
+    shrink = min(floor_v / noise.voltage_rmse_v, 1.0) if noise.voltage_rmse_v > 0.0 else 1.0
+    smaller = noise.model_copy(
+        update={
+            "fast_std_v": shrink * noise.fast_std_v,
+            "slow_std_v": shrink * noise.slow_std_v,
+            "lasting_std_v": shrink * noise.lasting_std_v,
+            "voltage_rmse_v": floor_v,
+            "voltage_mae_pct": shrink * noise.voltage_mae_pct,
+            "judged_on": "logs left out by `cangauge gap`",
+        }
+    )
+    kept = [
+        (effect, _for_later_drives(effect, item))
+        for effect, item in model.effects
+        if effect.id not in BELONGS_TO_A_LOG
+    ]
+    made = Made(
+        by=f"cangauge {__version__} gap",
+        options=given.made.options,
+        logs=given.made.logs,
+        fingerprint=given.made.fingerprint,
+    )
+    return given.model_copy(
+        update={
+            "name": f"{given.name}, extended",
+            "coefficients": coefficients,
+            "effects": effect_entries(kept),
+            "noise": smaller,
+            "information": None,
+            "made": made,
+        }
+    )
+
+
+def _for_later_drives(effect: Effect, values: Values) -> Values:
+    # A step that has happened stays; online its time counts from the service's first sample.
+    return {**values, "start_s": 0.0} if effect.id == "resistance_step" else values
+
+
+def cause_parameters(score: Score, settled: Settled) -> dict[str, dict[str, object]]:
+    """Return each parameter of a candidate with its 95 % interval and unit."""
+    choice = settled.frame.choices[score.candidate]
+    std = np.sqrt(np.diag(score.covariance))
+    units = {parameter.name: parameter.unit for parameter in choice.effect.parameters}
+    result: dict[str, dict[str, object]] = {}
+    for k, name in enumerate(choice.amplitudes):
+        value = float(choice.neutral[k] + score.amplitude[k])
+        low, high = choice.neutral[k] + choice.bounds[k]
+        result[name] = {
+            "value": value,
+            "ci": [max(value - 1.96 * std[k], low), min(value + 1.96 * std[k], high)],
+            "unit": units[name],
+        }
+    for name, shape in choice.shape.items():
+        result[name] = {"value": shape, "ci": None, "unit": units[name]}
+    return result
+
+
+def library_without(left_out: Sequence[str]) -> list[Effect]:
+    """Return the library's effects but some."""
+    return [effect for effect in LIBRARY.values() if effect.id not in left_out]

@@ -1,0 +1,198 @@
+"""Where the gap lies: shares of the squared error over SoC, temperature, current, rest and time."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cangauge.gap.columns import LogTerms
+from cangauge.gap.held_out import DRAWS, PIECE_S
+
+FloatArray = NDArray[np.float64]
+
+SCALES_S = (0.0, 10.0, 100.0, 1000.0, np.inf)
+"""Edges of the time scales: faster than 10 s, 10–100 s, …, slower than 1000 s."""
+
+REST_C_RATE = 0.02
+"""Below this current the pack rests [1/h]."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """A part of the logs and its share in the gap."""
+
+    axis: str
+    low: float
+    high: float
+    unit: str
+    share: float
+    rmse_v: float
+    ci: tuple[float, float]
+    """95 % interval of the share."""
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the place as `gap --json` prints it."""
+        return {
+            "axis": self.axis,
+            "range": [self.low, self.high],
+            "unit": self.unit,
+            "share": self.share,
+            "rmse_v": self.rmse_v,
+            "ci": list(self.ci),
+        }
+
+
+def places(logs: Sequence[LogTerms], capacity_ah: float) -> list[Place]:
+    """Return the shares of every axis; on each axis they sum to one.
+
+    Parameters
+    ----------
+    logs : sequence of LogTerms
+        Diagnosed logs; their residual is that of the model as it is.
+    capacity_ah : float
+        To tell rest from drive [Ah].
+    """
+    square = np.concatenate([terms.residual_v**2 for terms in logs])
+    piece = _pieces(logs)
+    result = []
+    for axis, unit, values, edges in _axes(logs, capacity_ah):
+        for low, high in itertools.pairwise(edges.tolist()):
+            inside = (values >= low) & ((values < high) | (high >= edges[-1]))
+            if inside.any():
+                result.append(
+                    _place(axis, unit, (low, high), square * inside, (inside, square, piece))
+                )
+    return result + _time_scales(logs, piece)
+
+
+def _axes(
+    logs: Sequence[LogTerms], capacity_ah: float
+) -> Iterator[tuple[str, str, FloatArray, FloatArray]]:
+    rows = [terms.prepared.rows for terms in logs]
+    current = np.concatenate([item.delayed_current_a[:, 0] for item in rows])
+    yield "soc", "%", np.concatenate([item.soc_pct for item in rows]), np.linspace(-5, 105, 12)
+    temperature = np.concatenate([item.temperature_c for item in rows])
+    yield "temperature", "°C", temperature, _even_edges(temperature, 5.0)
+    yield "current", "A", current, capacity_ah * np.array([-20.0, -0.5, -0.02, 0.02, 0.5, 1, 2, 20])
+    resting = (np.abs(current) < REST_C_RATE * capacity_ah).astype(np.float64)
+    yield "rest", "1 = rest", resting, np.array([0.0, 0.5, 1.0])
+    passed = np.concatenate([item.time_s - item.time_s[0] for item in rows])
+    yield "time", "s", passed, np.linspace(0.0, float(passed.max()) + 1e-9, 6)
+
+
+def _even_edges(values: FloatArray, width: float) -> FloatArray:
+    low = width * np.floor(values.min() / width)
+    return (
+        np.arange(low, values.max() + width, width)
+        if np.ptp(values) > 0
+        else np.array([low, low + width])
+    )
+
+
+def _place(
+    axis: str,
+    unit: str,
+    span: tuple[float, float],
+    mine: FloatArray,
+    rows: tuple[NDArray[np.bool_], FloatArray, NDArray[np.intp]],
+) -> Place:
+    inside, square, piece = rows
+    per_piece, whole = _sums(piece, mine), _sums(piece, square)
+    return Place(
+        axis=axis,
+        low=span[0],
+        high=span[1],
+        unit=unit,
+        share=float(mine.sum() / max(float(square.sum()), 1e-12)),
+        rmse_v=float(np.sqrt(square[inside].mean())),
+        ci=_interval(per_piece, whole),
+    )
+
+
+def _sums(piece: NDArray[np.intp], values: FloatArray) -> FloatArray:
+    return np.bincount(piece, weights=values).astype(np.float64)
+
+
+def _interval(mine: FloatArray, whole: FloatArray) -> tuple[float, float]:
+    rng = np.random.default_rng(0)
+    draw = rng.integers(0, whole.size, (DRAWS, whole.size))
+    share = mine[draw].sum(axis=1) / np.maximum(whole[draw].sum(axis=1), 1e-12)
+    low, high = np.quantile(share, [0.025, 0.975])
+    return float(low), float(high)
+
+
+def _time_scales(logs: Sequence[LogTerms], piece: NDArray[np.intp]) -> list[Place]:
+    """Split the residual into bands by moving averages; a band's share is its squares'."""
+    bands: list[list[FloatArray]] = [[] for _ in SCALES_S[1:]]
+    for terms in logs:
+        rest = terms.residual_v
+        for k, width in enumerate(SCALES_S[1:]):
+            smooth = _moving_average(rest, width)
+            bands[k].append(rest - smooth if np.isfinite(width) else rest)
+            rest = smooth
+    squares = [np.concatenate(parts) ** 2 for parts in bands]
+    whole = _sums(piece, np.sum(squares, axis=0))
+    result = []
+    for k, square in enumerate(squares):
+        mine = _sums(piece, square)
+        result.append(
+            Place(
+                axis="timescale",
+                low=SCALES_S[k],
+                high=min(SCALES_S[k + 1], 1e6),
+                unit="s",
+                share=float(mine.sum() / max(whole.sum(), 1e-12)),
+                rmse_v=float(np.sqrt(square.mean())),
+                ci=_interval(mine, whole),
+            )
+        )
+    return result
+
+
+def _moving_average(values: FloatArray, width: float) -> FloatArray:
+    if not np.isfinite(width) or width >= values.size:
+        return np.full_like(values, values.mean())
+    half = int(width) // 2
+    total = np.concatenate(([0.0], np.cumsum(values)))
+    at = np.arange(values.size)
+    low, high = np.maximum(at - half, 0), np.minimum(at + half + 1, values.size)
+    return np.asarray((total[high] - total[low]) / (high - low))
+
+
+def _pieces(logs: Sequence[LogTerms]) -> NDArray[np.intp]:
+    numbers, first = [], 0
+    for terms in logs:
+        time_s = terms.prepared.rows.time_s
+        number = ((time_s - time_s[0]) // PIECE_S).astype(np.intp) + first
+        first = int(number[-1]) + 1
+        numbers.append(number)
+    return np.concatenate(numbers)
+
+
+def worst_moments(logs: Sequence[LogTerms], number: int = 10) -> list[dict[str, object]]:
+    """Return the moments with the largest error, at least a minute apart."""
+    found: list[dict[str, object]] = []
+    for terms in logs:
+        rows = terms.prepared.rows
+        taken = np.zeros(len(rows), dtype=bool)
+        for at in np.argsort(-np.abs(terms.residual_v)):
+            if taken[at]:
+                continue
+            taken |= np.abs(rows.time_s - rows.time_s[at]) < 60.0
+            found.append(
+                {
+                    "log": rows.name,
+                    "time_s": float(rows.time_s[at]),
+                    "residual_v": float(terms.residual_v[at]),
+                    "soc_pct": float(rows.soc_pct[at]),
+                    "current_a": float(rows.delayed_current_a[at, 0]),
+                    "temperature_c": float(rows.temperature_c[at]),
+                }
+            )
+            if taken.all() or len(found) > 4 * number:
+                break
+    return sorted(found, key=lambda item: -abs(float(str(item["residual_v"]))))[:number]
