@@ -145,7 +145,7 @@ def test_a_second_sender_on_the_bus_is_told() -> None:
         other = threading.Thread(target=intrude)
         other.start()
         try:
-            with pytest.raises(CangaugeError, match=r"somebody else sends|have been processed"):
+            with pytest.raises(CangaugeError, match=r"somebody else|have been processed"):
                 play_log("crowd", 100.0, MAX)
         finally:
             stop.set()
@@ -238,7 +238,9 @@ def test_recorded_timing_is_kept(tmp_path: Path, speed: float, seconds: float) -
     assert len(clocks) == (0 if speed == 1.0 else len(frames))
     shift = heard[0].timestamp - frames[0].timestamp / speed
     late = [a.timestamp - b.timestamp / speed - shift for a, b in zip(heard, frames, strict=True)]
-    assert max(map(abs, late)) < 0.05
+    # A busy machine makes single frames late, but not those after them.
+    assert abs(late[-1]) < 0.1
+    assert np.quantile(np.abs(late), 0.9) < 0.02
 
 
 def test_at_n_times_the_speed_the_estimate_is_the_same() -> None:

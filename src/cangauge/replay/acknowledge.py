@@ -78,9 +78,13 @@ class Receiver:
         self._marks: deque[tuple[int, int]] = deque()
         self._frames_acknowledged = 0
 
-    def listen(self) -> None:
-        """Take in what has arrived, without waiting."""
-        while self._take(0.0):
+    def listen(self, within_s: float) -> None:
+        """Take in what arrives, for so long at most [s]; return when the bus is quiet.
+
+        Not without any time: where Python filters, one's own frames must be passed over first.
+        """
+        until_s = time.monotonic() + within_s
+        while (left_s := until_s - time.monotonic()) > 0.0 and self.take(left_s):
             pass
 
     def wait_until_ready(self, within_s: float) -> None:
@@ -98,7 +102,7 @@ class Receiver:
                     f"{self._port.name}: nobody acknowledges: no SOC_DETAIL in {within_s:g} s;"
                     f" {_HINT}"
                 )
-            self._take(_LOOK_S)
+            self.take(_LOOK_S)
 
     def sent(self, samples: int, frames: int) -> None:
         """Note how many samples and frames have been sent so far."""
@@ -143,7 +147,7 @@ class Receiver:
         began_s = last_s = time.monotonic()
         before = self.acknowledged
         while not is_enough() and not self._stop():
-            self._take(_LOOK_S)
+            self.take(_LOOK_S)
             now_s = time.monotonic()
             if self.acknowledged != before:
                 before, last_s = self.acknowledged, now_s
@@ -157,7 +161,8 @@ class Receiver:
                 self._warn(f"the receiver acknowledges slowly; {_HINT}")
                 self._warn = None
 
-    def _take(self, timeout_s: float) -> bool:
+    def take(self, timeout_s: float) -> bool:
+        """Take in one frame; return whether one came in time [s]."""
         message = self._port.receive(timeout_s)
         if message is None:
             return False
@@ -180,7 +185,7 @@ class Receiver:
             raise CangaugeError(
                 f"{self._port.name}: the receiver has processed {more} samples where"
                 f" {self._under_way} were under way: it was started again, or somebody else sends"
-                " on this bus too"
+                " or answers on this bus too"
             )
         self._told = told
         self.acknowledged += more

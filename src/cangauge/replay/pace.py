@@ -9,8 +9,8 @@ from typing import Final
 AHEAD_S: Final = 0.0002
 """Frames so near to their time are sent at once: sleeping would cost more than it mends [s]."""
 
-SLEEP_AT_MOST_S: Final = 0.2
-"""Longer pauses are slept in parts, so that a signal is noticed."""
+REST_AT_MOST_S: Final = 0.2
+"""Longer pauses are passed in parts, so that a signal is noticed."""
 
 
 class Pacer:
@@ -25,11 +25,19 @@ class Pacer:
         Log seconds per second.
     stop : callable
         Asked while waiting; True ends it.
+    rest : callable
+        Passes at most so many seconds; may return earlier.
     """
 
-    def __init__(self, speed: float, stop: Callable[[], bool]) -> None:
+    def __init__(
+        self,
+        speed: float,
+        stop: Callable[[], bool],
+        rest: Callable[[float], object] = time.sleep,
+    ) -> None:
         self._us_per_s = 1e6 * speed
         self._stop = stop
+        self._rest = rest
         self._origin: tuple[int, float] | None = None
 
     def wait(self, time_us: int) -> None:
@@ -39,4 +47,4 @@ class Pacer:
         first_us, first_s = self._origin
         due_s = first_s + (time_us - first_us) / self._us_per_s
         while (ahead_s := due_s - time.monotonic()) > AHEAD_S and not self._stop():
-            time.sleep(min(ahead_s, SLEEP_AT_MOST_S))
+            self._rest(min(ahead_s, REST_AT_MOST_S))

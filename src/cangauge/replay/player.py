@@ -20,6 +20,12 @@ from cangauge.replay.steps import Source, Step
 
 SHOW_EVERY_S: Final = 0.2
 
+LISTEN_S: Final = 0.001
+"""How long to listen then, where there was no pause to do it in [s]."""
+
+LAST_WORDS_S: Final = 0.15
+"""How long to listen for what the receiver publishes after the last frame [s]."""
+
 
 @dataclass(frozen=True)
 class ReplaySettings:
@@ -65,6 +71,7 @@ class ReplayState:
     """Samples that the receiver says it has processed; None where that is not asked."""
     log_seconds: float = 0.0
     seconds: float = 0.0
+    """Since the first frame [s]."""
     soc: SocEstimate | None = None
     """The latest that the receiver published."""
 
@@ -142,7 +149,8 @@ class _Player:
         self._stop = stop
         self._show = show
         self._receiver = Receiver(port, SocReader(settings.ids), stop, warn)
-        self._pacer = None if settings.is_max else Pacer(settings.speed, stop)
+        # Pauses are passed with listening.
+        self._pacer = None if settings.is_max else Pacer(settings.speed, stop, self._receiver.take)
         self._clock = None if settings.speed == 1.0 else ClockFrames(settings.ids.replay_clock)
         self._clock_us: int | None = None
         self._first_us: int | None = None
@@ -157,7 +165,6 @@ class _Player:
             wait_s = settings.acknowledge_s
         if wait_s is not None:
             self._receiver.wait_until_ready(wait_s)
-        self._began_s = time.monotonic()
 
     def send(self, step: Step) -> None:
         state = self.state
@@ -165,6 +172,9 @@ class _Player:
             self._receiver.wait_for_room(self._settings.acknowledge_s)
         else:
             self._pacer.wait(step.time_us)
+        if self._first_us is None:
+            self._first_us = step.time_us
+            self._began_s = time.monotonic()
         if self._clock is not None and step.is_wanted and step.time_us != self._clock_us:
             self._clock_us = step.time_us
             self._send_one(self._clock.at(step.time_us))
@@ -179,8 +189,6 @@ class _Player:
             self._send_one(frame)
         state.frames += len(step.frames)
         state.samples = step.samples
-        if self._first_us is None:
-            self._first_us = step.time_us
         state.log_seconds = (step.time_us - self._first_us) / 1e6
         if self._pacer is None:
             self._receiver.sent(step.samples, state.frames + state.clocks)
@@ -189,7 +197,7 @@ class _Player:
     def end(self) -> None:
         if self._pacer is None and not self._stop():
             self._receiver.wait_for_all(self._settings.acknowledge_s)
-        self._look()
+        self._look(LAST_WORDS_S)
         if self._show is not None:
             self._show(self.state)
 
@@ -204,14 +212,15 @@ class _Player:
         now_s = time.monotonic()
         if now_s >= self._show_s:
             self._show_s = now_s + SHOW_EVERY_S
-            self._look()
+            self._look(LISTEN_S)
             if self._show is not None:
                 self._show(self.state)
 
-    def _look(self) -> None:
-        self._receiver.listen()
+    def _look(self, within_s: float) -> None:
         state = self.state
-        state.seconds = time.monotonic() - self._began_s
+        if self._first_us is not None:
+            state.seconds = time.monotonic() - self._began_s
+        self._receiver.listen(within_s)
         state.soc = self._receiver.soc
         if state.acknowledged is not None:
             state.acknowledged = self._receiver.acknowledged

@@ -35,8 +35,10 @@ class CaptureEstimate:
     Parameters
     ----------
     table : EstimateTable
-    voltage_v : array of shape (n,)
-        Measured voltage [V]; NaN where the sample has none.
+    time_s, current_a : array of shape (n,)
+        Bus time [s] and current [A], positive = discharge, of the samples.
+    voltage_v, temperature_c : array of shape (n,)
+        Measured voltage [V] and temperature [°C]; NaN where the sample has none.
     soc_reference_pct : array of shape (n,)
         The car's own state of charge [%]; NaN where there is none.
     counts : FrameCounts
@@ -50,7 +52,10 @@ class CaptureEstimate:
     """
 
     table: EstimateTable
+    time_s: FloatArray
+    current_a: FloatArray
     voltage_v: FloatArray
+    temperature_c: FloatArray
     soc_reference_pct: FloatArray
     counts: FrameCounts
     time_source: TimeSourceName
@@ -64,16 +69,16 @@ class _Lane:
 
     stream: EstimateStream
     estimates: list[Estimate] = field(default_factory=list)
-    voltage_v: array[float] = field(default_factory=lambda: array("d"))
-    soc_pct: array[float] = field(default_factory=lambda: array("d"))
+    # Of each sample in turn: time, current, voltage, temperature, the car's own SoC.
+    values: array[float] = field(default_factory=lambda: array("d"))
 
     def take(self, estimate: Estimate | None) -> None:
         sample = self.stream.latest_sample
         if estimate is None or sample is None:
             return
         self.estimates.append(estimate)
-        self.voltage_v.append(sample.voltage_v)
-        self.soc_pct.append(self.stream.reference_soc_pct)
+        self.values.extend(sample)
+        self.values.append(self.stream.reference_soc_pct)
 
 
 def estimate_capture(
@@ -126,10 +131,14 @@ def estimate_capture(
             cure=f"check that this is the bus of {vehicle.name} (`cangauge inspect` tells)",
         )
     remarks = [*capture.info.remarks, *reader.remarks(lane)]
+    time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(lane.values).reshape(-1, 5).T
     return CaptureEstimate(
         table=EstimateTable.of(lane.estimates),
-        voltage_v=np.array(lane.voltage_v),
-        soc_reference_pct=np.array(lane.soc_pct),
+        time_s=time_s,
+        current_a=current_a,
+        voltage_v=voltage_v,
+        temperature_c=temperature_c,
+        soc_reference_pct=soc_pct,
         counts=lane.stream.counts,
         time_source=reader.time_source,
         seconds=time.perf_counter() - began,

@@ -10,6 +10,7 @@ from rich.live import Live
 from rich.text import Text
 
 from cangauge.estimate.types import Status
+from cangauge.report.words import number, reason_names
 from cangauge.service.gauge import Gauge
 
 SHOW_EVERY_S: Final = 0.25
@@ -66,16 +67,18 @@ class LiveLine:
 def live_text(gauge: Gauge, samples_per_s: float) -> Text:
     """Return the line."""
     estimate = gauge.latest
-    text = Text("SoC ")
-    text.append(f"{estimate.soc_pct:6.2f} ± {estimate.soc_std_pct:.2f} %", style="bold")
+    text = Text("SoC ", no_wrap=True, overflow="ellipsis")
+    soc = f"{number(estimate.soc_pct, 2)} ± {number(estimate.soc_std_pct, 2, '%')}"
+    text.append(soc, style="bold")
     status = estimate.status.name.lower()
-    why = [reason.name.lower().replace("_", " ") for reason in estimate.reasons if reason.name]
+    why = reason_names(int(estimate.reasons))
     text.append("  ")
     text.append(status, style=_STYLE[estimate.status])
     if why:
-        text.append(f" ({', '.join(why)})", style="dim")
+        text.append(f" ({why})", style="dim")
     sample = gauge.latest_sample
     if sample is not None:
-        text.append(f"  {sample.voltage_v:.2f} V  residual {1e3 * estimate.residual_v:+.0f} mV")
+        residual = number(1e3 * estimate.residual_v, 0, "mV")
+        text.append(f"  {number(sample.voltage_v, 2, 'V')}  residual {residual}")
     text.append(f"  {samples_per_s:.0f} samples/s")
     return text

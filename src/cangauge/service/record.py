@@ -15,7 +15,7 @@ import can
 
 from cangauge.atomic import check_writable
 from cangauge.bus.time_source import whole_us
-from cangauge.errors import InputError
+from cangauge.errors import CangaugeError, InputError
 
 EXACT_FORMATS: Final = (".log", ".csv")
 
@@ -49,6 +49,7 @@ class Recorder:
                 cure="name a .log (candump) or a .csv file",
             )
         check_writable(path)
+        self._path = path
         self._logger = can.Logger(path)
         if isinstance(self._logger, can.CanutilsLogWriter):
             # It would raise stamps below the first one, and so hide a clock that was set back.
@@ -69,5 +70,8 @@ class Recorder:
     def write(self, message: can.Message) -> None:
         """Write a frame as received; its stamp becomes the one that is written."""
         message.timestamp = whole_us(message.timestamp) / 1e6
-        self._logger.on_message_received(message)
+        try:
+            self._logger.on_message_received(message)
+        except OSError as error:
+            raise CangaugeError(f"{self._path}: recording failed: {error.strerror}") from error
         self.frames += 1

@@ -1,0 +1,342 @@
+"""Load, speed, timing and memory of the live side, measured.
+
+    python benchmarks/bus_load.py [--only load|max|offline|timing|memory]… [--seconds 20] [--json]
+
+load     4,000 frames/s (a saturated 500 kbit/s bus), 200 of them wanted: CPU time of `cangauge run`
+         and wanted frames lost; beside it the same bus read by a bare python-can loop.
+max      a 2.5 h, 10 Hz log from `cangauge replay --speed max` to `cangauge run`.
+offline  the same log by `cangauge estimate`'s way.
+timing   a capture of 120 s in real time.
+memory   24 h of bus time at 10 Hz through the gauge.
+
+The bus is udp_multicast on this machine, where every frame reaches the process and the filter is
+Python's; on SocketCAN the kernel filters, and the 3,800 unwanted frames cost the process nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import math
+import multiprocessing
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.open import BusAddress, bus_address, open_bus
+from cangauge.bus.vehicle import load_vehicle
+from cangauge.estimate.estimator import EstimatorSettings
+from cangauge.estimate.offline import estimate_log
+from cangauge.estimate.types import Sample
+from cangauge.logs.log import Log
+from cangauge.logs.read import read_log
+from cangauge.model.model_file import load_model
+from cangauge.replay.pace import Pacer
+from cangauge.service.gauge import Gauge, GaugeSettings
+from cangauge.service.record import Recorder
+from cangauge.share import shared_file
+
+RATE = 4000
+"""Frames a second of a saturated 500 kbit/s bus."""
+WANTED_RATE = 200
+PORT = 43_555
+
+Result = dict[str, Any]
+Row = tuple[str, str, str]
+
+
+def model_path() -> Path:
+    """Return a model to run with."""
+    return shared_file("replay", "leaf2012_published_model.json")
+
+
+def long_log() -> Log:
+    """Return a drive of at least 2.5 h at 10 Hz."""
+    return read_log(shared_file("replay", "leaf2012_reconstruction_white.parquet"))
+
+
+def bus() -> BusAddress:
+    """Return a bus that nobody else uses."""
+    return bus_address("udp_multicast", options={"port": PORT})
+
+
+def command(*arguments: object) -> list[str]:
+    """Return a `cangauge` command on the bus."""
+    main = "from cangauge.cli.app import main; main()"
+    name, *rest = map(str, arguments)
+    on = ["--interface", "udp_multicast", "--bus-option", f"port={PORT}", "--json"]
+    return [sys.executable, "-c", main, name, *rest, *on]
+
+
+@contextmanager
+def service(*arguments: object) -> Iterator[subprocess.Popen[str]]:
+    """Run `cangauge run` until the block ends; wait until it listens."""
+    process = subprocess.Popen(
+        command("run", "-m", model_path(), *arguments),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        if process.stderr is None or "listening" not in process.stderr.readline():
+            raise SystemExit("cangauge run does not start")
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+# --- load -------------------------------------------------------------------------------------
+
+
+def load(seconds: float) -> tuple[Result, list[Row]]:
+    """Measure `cangauge run` and a bare loop on a saturated bus."""
+    with service("--until-idle", "1.5") as process:
+        sent = send_load(seconds)
+        out, _ = process.communicate(timeout=60)
+    run = json.loads(out)
+    bare = bare_loop(seconds)
+    wanted = int(sent["wanted"])
+    result = {
+        "sent": sent,
+        "run": run,
+        "bare": bare,
+        # Its own second and a half of waiting at the end counts as time, but costs nothing.
+        "run_cores": run["cpu_seconds"] / sent["seconds"],
+        "bare_cores": bare["cpu_seconds"] / sent["seconds"],
+        "wanted_lost": wanted - run["frames"],
+    }
+    rows = [
+        ("frames sent", f"{sent['frames'] / sent['seconds']:.0f}/s over {sent['seconds']:.1f} s",
+         f"{RATE}/s"),
+        ("of them wanted", f"{wanted / sent['seconds']:.0f}/s", ""),
+        ("wanted frames lost", f"{result['wanted_lost']} of {wanted}", "0"),
+        ("CPU of `cangauge run`", f"{100 * result['run_cores']:.1f} % of a core", "< 50 %"),
+        ("CPU of a bare python-can loop", f"{100 * result['bare_cores']:.1f} % of a core", ""),
+        ("  frames that it lost", f"{sent['frames'] - bare['frames']} of {sent['frames']}", ""),
+        ("run against bare loop", f"{result['run_cores'] / result['bare_cores']:.2f}×", ""),
+    ]  # fmt: skip
+    return result, rows
+
+
+def send_load(seconds: float) -> Result:
+    """Send wanted frames (current and voltage at 100 Hz) among others, evenly."""
+    encoder = FrameEncoder(load_vehicle("generic"))
+    others = itertools.cycle(
+        can.Message(arbitration_id=0x200 + number, is_extended_id=False, data=bytes(8))
+        for number in range(100)
+    )
+    every = RATE // WANTED_RATE
+    sender = open_bus(bus())
+    pacer = Pacer(1.0, lambda: False)
+    began = time.monotonic()
+    pacer.wait(0)
+    frames = wanted = 0
+    queue: list[can.Message] = []
+    for number in range(int(seconds * RATE)):
+        if number % every == 0:
+            if not queue:
+                time_s = number / RATE
+                queue = encoder.encode(Sample(time_s, 20 + 10 * math.sin(time_s), 380.0, 25.0))
+            sender.send(queue.pop(0))
+            wanted += 1
+        else:
+            sender.send(next(others))
+        frames += 1
+        if number % 4 == 3:
+            pacer.wait(int((number + 1) * 1e6 / RATE))
+    took = time.monotonic() - began
+    sender.shutdown()
+    return {"frames": frames, "wanted": wanted, "seconds": took}
+
+
+def bare_loop(seconds: float) -> Result:
+    """Receive the same load with python-can alone, and count."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_count_frames, args=(theirs,))
+    process.start()
+    ours.recv()
+    send_load(seconds)
+    result: Result = ours.recv()
+    process.join()
+    return result
+
+
+def _count_frames(pipe: Any) -> None:
+    receiver = open_bus(bus())
+    pipe.send("ready")
+    cpu, frames = time.process_time(), 0
+    while True:
+        message = receiver.recv(1.5 if frames else 30.0)
+        if message is None:
+            break
+        frames += 1
+    pipe.send({"frames": frames, "cpu_seconds": time.process_time() - cpu})
+    receiver.shutdown()
+
+
+# --- speed and timing -------------------------------------------------------------------------
+
+
+def full_speed() -> tuple[Result, list[Row]]:
+    """Measure a 2.5 h log through the bus."""
+    path = shared_file("replay", "leaf2012_reconstruction_white.parquet")
+    with service("--time-source", "replay-clock", "--until-idle", "1") as process:
+        done = subprocess.run(
+            command("replay", path, "--speed", "max"), capture_output=True, text=True, check=True
+        )
+        out, _ = process.communicate(timeout=60)
+    replay, run = json.loads(done.stdout), json.loads(out)
+    lost = replay["samples"] - run["samples"]
+    rows = [
+        ("log", f"{replay['log_seconds'] / 3600:.2f} h, {replay['samples']} samples", ""),
+        ("through the bus in", f"{replay['seconds']:.1f} s", "< 60 s"),
+        ("samples lost", str(lost), "0"),
+        ("CPU of `cangauge run`", f"{run['cpu_seconds']:.1f} s", ""),
+        ("a step, median", f"{run['step_p50_us']:.0f} µs", ""),
+    ]
+    return {"replay": replay, "run": run, "lost": lost}, rows
+
+
+def offline() -> tuple[Result, list[Row]]:
+    """Measure the same log offline."""
+    began = time.monotonic()
+    log = long_log()
+    read_s = time.monotonic() - began
+    settings = EstimatorSettings(temperature_source=log.temperature_source)
+    _, scores = estimate_log(log, load_model(model_path()), settings)
+    result = {"rows": len(log), "read_seconds": read_s, "seconds": scores.seconds}
+    rows = [
+        ("log", f"{log.duration_s / 3600:.2f} h, {len(log)} samples", ""),
+        ("estimated in", f"{scores.seconds:.2f} s", "< 5 s"),
+        ("read in", f"{read_s:.2f} s", ""),
+    ]
+    return result, rows
+
+
+def timing(seconds: float = 120.0) -> tuple[Result, list[Row]]:
+    """Measure a capture in real time: 100 frames/s of the battery, 100 others."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "capture.log"
+        rng = np.random.default_rng(1)
+        stamps = np.sort(rng.uniform(0.0, seconds, int(200 * seconds) - 2))
+        with Recorder(path) as recorder:
+            for stamp in [0.0, *stamps.tolist(), seconds]:
+                recorder.write(
+                    can.Message(timestamp=1.7e9 + stamp, arbitration_id=0x1F2, is_extended_id=False)
+                )
+        done = subprocess.run(command("replay", path), capture_output=True, text=True, check=True)
+    replay: Result = json.loads(done.stdout)
+    rows = [
+        ("capture", f"{replay['log_seconds']:.3f} s, {replay['frames']} frames", ""),
+        ("played in", f"{replay['seconds']:.3f} s", f"{seconds:.1f} ± 0.1 s"),
+    ]
+    return replay, rows
+
+
+# --- memory -----------------------------------------------------------------------------------
+
+
+def memory(hours: float = 24.0) -> tuple[Result, list[Row]]:
+    """Measure the memory of a process that sees a day of bus time."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_live_a_day, args=(theirs, hours))
+    process.start()
+    result: Result = ours.recv()
+    process.join()
+    rows = [
+        ("bus time, samples", f"{hours:.0f} h, {result['samples']}", ""),
+        ("memory after half an hour", f"{result['mb_first']:.1f} MB", ""),
+        ("memory at the end", f"{result['mb_last']:.1f} MB", ""),
+        ("growth", f"{result['mb_last'] - result['mb_first']:+.2f} MB", "flat"),
+        ("computed in", f"{result['seconds']:.0f} s", ""),
+    ]
+    return result, rows
+
+
+def _live_a_day(pipe: Any, hours: float) -> None:
+    vehicle = load_vehicle("generic")
+    gauge = Gauge(vehicle, load_model(model_path()), GaugeSettings())
+    encoder = FrameEncoder(vehicle)
+    log = long_log()
+    columns = (log.current_a.tolist(), log.voltage_v.tolist(), log.temperature_c.tolist())
+    rows = itertools.cycle(list(zip(*columns, strict=True)))
+    for _ in range(len(log)):  # the cycle keeps what it has seen: once round, it grows no more
+        next(rows)
+    began, first = time.monotonic(), math.nan
+    total = int(hours * 36_000)
+    for number in range(total):
+        sample = Sample(1.7e9 + 0.1 * number, *next(rows))
+        for frame in encoder.encode(sample):
+            gauge.handle(frame)
+        if number == min(18_000, total // 2):
+            first = _resident_mb()
+    pipe.send(
+        {
+            "samples": gauge.samples,
+            "mb_first": first,
+            "mb_last": _resident_mb(),
+            "seconds": time.monotonic() - began,
+        }
+    )
+
+
+def _resident_mb() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+# --- main -------------------------------------------------------------------------------------
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--seconds", type=float, default=20.0, help="length of the load")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parts: dict[str, Callable[[], tuple[Result, list[Row]]]] = {
+        "load": lambda: load(options.seconds),
+        "max": full_speed,
+        "offline": offline,
+        "timing": timing,
+        "memory": memory,
+    }
+    parser.add_argument("--only", action="append", choices=list(parts), help="may be repeated")
+    options = parser.parse_args()
+    results: Result = {"bus": str(bus()), "cores": os.cpu_count()}
+    tables = []
+    for name in options.only or parts:
+        sys.stderr.write(f"measuring: {name} …\n")
+        results[name], rows = parts[name]()
+        tables.append((name, rows))
+    if options.json:
+        sys.stdout.write(json.dumps(results) + "\n")
+        return 0
+    console = Console()
+    for name, rows in tables:
+        table = Table("", "measured", "wanted", title=f"{name} ({bus()}, {os.cpu_count()} cores)")
+        for row in rows:
+            table.add_row(*row)
+        console.print(table)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,170 @@
+"""Real trips of a BMW i3 over a CAN bus: the replayed SoC against the offline one.
+
+    python benchmarks/bus_trips.py --data FOLDER [--trip A02]… [--vehicle generic] [--json]
+
+The model is that of `real_trips.py` (fitted on A01, A03 … A21). Each of A02, A04 … A22 longer than
+15 minutes is played at full speed on vcan0 (where there is none: udp_multicast), and estimated
+there from the frames. Printed are, for each trip, the largest difference from the estimate of the
+log itself, the bound that the rounding in frames sets to it, and whether the estimate of the
+recorded frames is the live one to the last bit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from cangauge.bus.open import BusAddress, bus_address, open_bus
+from cangauge.bus.publish import standard_filter
+from cangauge.bus.receive import BusPort
+from cangauge.bus.vehicle import Vehicle, load_vehicle
+from cangauge.estimate.estimator import EstimatorSettings
+from cangauge.estimate.offline import run_estimator, samples_of
+from cangauge.estimate.types import Estimate
+from cangauge.logs.log import Log
+from cangauge.model.model_file import ModelFile
+from cangauge.replay.bound import quantisation_bound
+from cangauge.replay.player import ReplaySettings, play
+from cangauge.replay.steps import LogSource
+from cangauge.service.capture_estimate import estimate_capture
+from cangauge.service.gauge import Gauge, GaugeSettings
+from cangauge.service.loop import LoopSettings, Outputs, serve
+from cangauge.service.record import Recorder
+from real_trips import DATA, JUDGED_S, TEST, TRAINING, identify, read_trips
+
+NUMBERS = ("soc_pct", "soc_std_pct", "soc_newton_pct", "soc_coulomb_pct", "residual_v")
+FULL_SPEED = ReplaySettings(speed=math.inf, acknowledge_s=20.0)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What came of one trip."""
+
+    trip: str
+    samples: int
+    lost: int
+    seconds: float
+    difference_pct: float
+    bound_pct: float
+    newton_difference_pct: float
+    newton_bound_pct: float
+    is_bit_for_bit: bool
+
+
+def over_bus(
+    log: Log, vehicle: Vehicle, model: ModelFile, address: BusAddress, record: Path
+) -> tuple[list[Estimate], Gauge, float]:
+    """Play a log on a bus and estimate it there; return the estimates, the gauge and seconds."""
+    gauge = Gauge(vehicle, model, GaugeSettings(time_source="replay-clock"))
+    rows: list[Estimate] = []
+    done = threading.Event()
+    with (
+        BusPort(open_bus(address, gauge.filters), str(address)) as ears,
+        BusPort(open_bus(address, [standard_filter(0x5A1)]), str(address)) as mouth,
+        Recorder(record) as recorder,
+    ):
+        outputs = Outputs(record=recorder, table=lambda _, estimate: rows.append(estimate))
+        service = threading.Thread(
+            target=serve, args=(ears, gauge, LoopSettings(), outputs, done.is_set)
+        )
+        service.start()
+        began = time.monotonic()
+        try:
+            play(mouth, LogSource(log, vehicle), FULL_SPEED, stop=lambda: not service.is_alive())
+        finally:
+            done.set()
+            service.join()
+        return rows, gauge, time.monotonic() - began
+
+
+def compare(log: Log, vehicle: Vehicle, model: ModelFile, address: BusAddress) -> Comparison:
+    """Return how the bus's estimate of a log differs from the log's own."""
+    with tempfile.TemporaryDirectory() as folder:
+        record = Path(folder) / "trip.log"
+        rows, gauge, seconds = over_bus(log, vehicle, model, address, record)
+        recorded = estimate_capture(record, vehicle, model).table
+    settings = EstimatorSettings(temperature_source=vehicle.temperature_source)
+    offline = run_estimator(samples_of(log), model, settings)
+    live = {name: np.array([getattr(each, name) for each in rows]) for name in NUMBERS}
+    bound = quantisation_bound(vehicle, model, log)
+
+    def largest(name: str) -> float:
+        return float(np.nanmax(np.abs(live[name] - getattr(offline, name))))
+
+    return Comparison(
+        trip=log.name,
+        samples=len(rows),
+        lost=len(log) - len(rows) + gauge.counts.lost,
+        seconds=seconds,
+        difference_pct=largest("soc_pct"),
+        bound_pct=bound.ekf_pct,
+        newton_difference_pct=largest("soc_newton_pct"),
+        newton_bound_pct=bound.newton_pct,
+        is_bit_for_bit=all(
+            np.array_equal(live[name], getattr(recorded, name), equal_nan=True) for name in NUMBERS
+        ),
+    )
+
+
+def show(rows: list[Comparison], address: BusAddress, vehicle: Vehicle) -> None:
+    """Print the table."""
+    table = Table(title=f"Real trips over {address} as {vehicle.name}, at full speed")
+    headings = ("trip", "samples", "lost", "s", "EKF: largest difference [% SoC]", "bound",
+                "Newton: largest", "bound", "recorded = live, bit for bit")  # fmt: skip
+    for heading in headings:
+        table.add_column(heading, justify="right")
+    for row in rows:
+        table.add_row(
+            row.trip, str(row.samples), str(row.lost), f"{row.seconds:.1f}",
+            f"{row.difference_pct:.2e}", f"{row.bound_pct:.2e}",
+            f"{row.newton_difference_pct:.2e}", f"{row.newton_bound_pct:.2e}",
+            "yes" if row.is_bit_for_bit else "NO",
+        )  # fmt: skip
+    Console(width=150).print(table)
+
+
+def main() -> int:
+    """Run the comparison; exit 1 if a trip lost a sample, left the bound or differs recorded."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the trips")
+    parser.add_argument("--trip", action="append", help="only this one; may be repeated")
+    parser.add_argument("--vehicle", default="generic", help="preset whose frames are sent")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args()
+    if not options.data.is_dir():
+        sys.stderr.write(f"{options.data}: no such folder; give the trips' with --data\n")
+        return 2
+    sys.stderr.write("fitting the model on the training trips …\n")
+    model = identify(read_trips(options.data, TRAINING)).model
+    address, vehicle = bus_address(), load_vehicle(options.vehicle)
+    rows = []
+    for trip in read_trips(options.data, options.trip or TEST):
+        if trip.duration_s > JUDGED_S:
+            sys.stderr.write(f"playing {trip.name} …\n")
+            rows.append(compare(trip, vehicle, model, address))
+    if options.json:
+        result = {"bus": str(address), "trips": [asdict(row) for row in rows]}
+        sys.stdout.write(json.dumps(result) + "\n")
+    else:
+        show(rows, address, vehicle)
+    good = all(
+        row.is_bit_for_bit and not row.lost and row.difference_pct <= row.bound_pct for row in rows
+    )
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,216 @@
+"""The live side on a real SocketCAN interface: kernel filters, counts, bits, a bus that goes."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.open import BusAddress, bus_address, has_socketcan, open_bus
+from cangauge.bus.publish import FrameIds, SocEstimate, SocReader, standard_filter
+from cangauge.bus.receive import BusPort
+from cangauge.bus.vehicle import load_vehicle
+from cangauge.errors import InputError
+from cangauge.estimate.estimator import EstimatorSettings
+from cangauge.estimate.offline import run_estimator, samples_of
+from cangauge.replay.bound import quantisation_bound
+from cangauge.replay.player import ReplaySettings, play
+from cangauge.replay.steps import CaptureSource, LogSource
+from cangauge.service.capture_estimate import estimate_capture
+from cangauge.service.gauge import Gauge, GaugeSettings
+from cangauge.service.loop import LoopSettings
+from cangauge.service.record import Recorder
+from live import Command, Service, leaf_model, leaf_model_path, never, run_to_end, short_log, waits
+
+pytestmark = pytest.mark.socketcan
+
+VCAN = BusAddress("socketcan", "vcan0")
+SOC_FRAMES = [standard_filter(0x5A0), standard_filter(0x5A1)]
+MAX = ReplaySettings(speed=float("inf"), acknowledge_s=20.0)
+
+
+@pytest.fixture(autouse=True)
+def _vcan0() -> None:
+    if not has_socketcan("vcan0"):
+        pytest.skip("no SocketCAN interface vcan0 on this machine (see tests/socketcan)")
+
+
+@pytest.fixture
+def replay_port() -> Iterator[BusPort]:
+    with BusPort(open_bus(VCAN, SOC_FRAMES), str(VCAN)) as port:
+        yield port
+
+
+def service(preset: str, settings: GaugeSettings, record: Recorder | None = None) -> Service:
+    gauge = Gauge(load_vehicle(preset), leaf_model(), settings)
+    return Service(BusPort(open_bus(VCAN, gauge.filters), str(VCAN)), gauge, LoopSettings(), record)
+
+
+def test_the_default_bus_is_vcan0() -> None:
+    assert str(bus_address()) == "socketcan vcan0"
+
+
+@pytest.mark.parametrize("preset", ["generic", "leaf_aze0"])
+def test_a_log_at_full_speed_within_the_bound_and_bit_for_bit(
+    replay_port: BusPort, tmp_path: Path, preset: str
+) -> None:
+    log, vehicle, path = short_log(60.0), load_vehicle(preset), tmp_path / "vcan0.log"
+    estimator = EstimatorSettings(initial_soc_pct=80.0)
+    settings = GaugeSettings(estimator, "replay-clock")
+    with Recorder(path) as recorder, service(preset, settings, recorder) as live:
+        state = play(replay_port, LogSource(log, vehicle), MAX, stop=never)
+    assert state.acknowledged == len(live.rows) == len(log)
+    assert live.gauge.counts.lost == live.gauge.counts.crc_errors == 0
+    soc = np.array([estimate.soc_pct for _, estimate in live.rows])
+    residual = np.array([estimate.residual_v for _, estimate in live.rows])
+    offline = run_estimator(samples_of(log), leaf_model(), estimator)
+    worst = float(np.max(np.abs(soc - offline.soc_pct)))
+    assert 0.0 < worst <= quantisation_bound(vehicle, leaf_model(), log).ekf_pct
+    recorded = estimate_capture(path, vehicle, leaf_model(), estimator)
+    assert np.array_equal(recorded.table.soc_pct, soc)
+    assert np.array_equal(recorded.table.residual_v, residual, equal_nan=True)
+
+
+def test_in_real_time_the_kernels_stamps_are_bus_time(replay_port: BusPort, tmp_path: Path) -> None:
+    log, path = short_log(6.01), tmp_path / "vcan0.log"
+    with Recorder(path) as recorder, service("generic", GaugeSettings(), recorder) as live:
+        state = play(
+            replay_port, LogSource(log, load_vehicle("generic")), ReplaySettings(), stop=never
+        )
+        assert waits(lambda: live.gauge.samples == len(log))
+    assert state.seconds == pytest.approx(6.0, abs=0.1)
+    times = np.array([time_s for time_s, _ in live.rows])
+    assert np.max(np.abs(times - times[0] - log.time_s)) < 0.1
+    recorded = estimate_capture(path, load_vehicle("generic"), leaf_model())
+    assert recorded.time_source == "receive"
+    assert recorded.table.time_s.tolist() == times.tolist()
+    assert recorded.table.soc_pct.tolist() == [each.soc_pct for _, each in live.rows]
+
+
+def test_the_kernel_filters_the_wanted_ids() -> None:
+    gauge = Gauge(load_vehicle("leaf_aze0"), leaf_model())
+    bus = open_bus(VCAN, gauge.filters)
+    raw = bus.socket.getsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, 64)  # type: ignore[attr-defined] # SocketcanBus
+    assert len(raw) == 8 * 3
+    sender = can.Bus("vcan0", interface="socketcan", ignore_config=True)
+    for number in range(0x800):
+        sender.send(can.Message(arbitration_id=number, is_extended_id=False))
+    # An extended id of the same number is another message.
+    sender.send(can.Message(arbitration_id=0x1DB, is_extended_id=True))
+    received = []
+    while (message := bus.recv(0.3)) is not None:
+        received.append(message.arbitration_id)
+    assert received == [0x1DB, 0x55B, 0x5C0]
+    sender.shutdown()
+    bus.shutdown()
+
+
+def test_unwanted_traffic_costs_no_wanted_frame(replay_port: BusPort, tmp_path: Path) -> None:
+    """2,000 unwanted frames for 100 wanted ones, as fast as they can be sent."""
+    encoder, path = FrameEncoder(load_vehicle("leaf_aze0")), tmp_path / "busy.log"
+    time_s = 1.7e9
+    with Recorder(path) as recorder:
+        for sample in samples_of(short_log(10.0)):
+            for frame in encoder.encode(sample._replace(time_s=time_s)):
+                recorder.write(frame)
+            for number in range(20):
+                recorder.write(
+                    can.Message(
+                        timestamp=time_s + 0.0004 * number,
+                        arbitration_id=0x300 + number,
+                        is_extended_id=False,
+                        data=b"\x00" * 8,
+                    )
+                )
+            time_s += 0.01
+    vehicle = load_vehicle("leaf_aze0")
+    settings = GaugeSettings(time_source="replay-clock")
+    with service("leaf_aze0", settings) as live:
+        state = play(replay_port, CaptureSource(path, vehicle), MAX, stop=never)
+    assert state.acknowledged == state.samples == 100
+    assert live.gauge.counts.lost == 0
+    assert live.gauge.counts.frames < 150  # the rest never left the kernel
+
+
+def test_what_is_published_can_be_read_by_others(replay_port: BusPort) -> None:
+    listener = can.Bus("vcan0", interface="socketcan", ignore_config=True, can_filters=SOC_FRAMES)
+    with service("generic", GaugeSettings(time_source="replay-clock")) as live:
+        log = short_log(20.0)
+        play(replay_port, LogSource(log, load_vehicle("generic")), MAX, stop=never)
+        assert waits(lambda: live.gauge.samples == len(log))
+        time.sleep(0.3)
+    reader = SocReader(FrameIds())
+    frames = []
+    while (message := listener.recv(0.1)) is not None:
+        frames.append(message)
+    listener.shutdown()
+    told = [each for each in map(reader.read, frames) if isinstance(each, SocEstimate)]
+    assert reader.refused == 0
+    assert len(told) >= len(log)  # every 100 ms of bus time
+    assert told[-1].soc_pct == pytest.approx(live.rows[-1][1].soc_pct, abs=0.001)
+
+
+def test_a_bus_that_does_not_exist(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="nosuch0") as caught:
+        open_bus(BusAddress("socketcan", "nosuch0"))
+    assert "vcan0" in str(caught.value)  # what there is instead
+    with pytest.raises(InputError, match="nosuch0"):
+        bus_address(None, "nosuch0")
+
+
+def test_both_commands_and_a_bus_that_goes_down(tmp_path: Path) -> None:
+    """Processes start slowly in a guest, so the commands are gone through once, in one test."""
+    from cangauge.logs.canonical import write_log  # noqa: PLC0415 - pyarrow, for this test alone
+
+    log_path, record = tmp_path / "drive.parquet", tmp_path / "drive.log"
+    write_log(short_log(20.0), log_path)
+    live = Command(
+        "run", "-m", leaf_model_path(), "--time-source", "replay-clock", "--record", record,
+        "--json",
+    )  # fmt: skip
+    replayed = run_to_end("replay", log_path, "--speed", "max", "--wait", "60", "--json")
+    assert replayed.code == 0, replayed.err
+    assert replayed.json["bus"] == "socketcan vcan0"
+    assert replayed.json["acknowledged"] == 200
+    if shutil.which("ip") is None:
+        live.process.terminate()
+        assert live.end().code == 0
+        pytest.skip("no `ip` command to take the interface down")
+    subprocess.run(["ip", "link", "set", "vcan0", "down"], check=True)
+    try:
+        ended = live.end(20.0)
+    finally:
+        subprocess.run(["ip", "link", "set", "vcan0", "up"], check=True)
+    assert ended.code == 1
+    assert ended.err.splitlines()[-1].startswith("error: socketcan vcan0: ")
+    assert "down" in ended.err.splitlines()[-1]
+    # What was recorded until then is there.
+    recorded = estimate_capture(record, load_vehicle("generic"), leaf_model())
+    assert recorded.table.soc_pct.size == 200
+
+
+@pytest.mark.real
+@pytest.mark.slow
+def test_a_real_trip_within_the_bound_and_bit_for_bit(shared_data: Path) -> None:
+    """One of the trips; `benchmarks/bus_trips.py` does them all."""
+    from bus_trips import compare  # noqa: PLC0415 - needs the real data
+    from real_trips import identify, read_trips  # noqa: PLC0415
+
+    folder = shared_data / "bmw_i3"
+    model = identify(read_trips(folder, ["A01", "A03", "A05"])).model
+    trip = read_trips(folder, ["A02"])[0].rows(slice(0, 6000))
+    for preset in ("generic", "leaf_aze0"):
+        result = compare(trip, load_vehicle(preset), model, VCAN)
+        assert result.samples == 6000
+        assert result.lost == 0
+        assert result.is_bit_for_bit
+        assert result.difference_pct <= result.bound_pct
+        assert result.newton_difference_pct <= result.newton_bound_pct
