@@ -95,11 +95,14 @@ def test_a_counter_that_can_have_gone_round_is_a_loss() -> None:
     assert checker.lost == 3
 
 
-def test_without_a_period_a_standing_counter_is_always_refused() -> None:
+def test_without_a_period_a_standing_counter_is_refused_until_a_silence() -> None:
     checker = FrameChecker(GENERIC_RULE)
     frame = GENERIC_RULE.protect(bytes(6), 2)
     checker.check(frame, 0.0)
-    assert checker.check(frame, 100.0) is Verdict.REPEATED
+    assert checker.check(frame, 1.5) is Verdict.REPEATED
+    assert checker.check(frame, 3.0) is Verdict.REPEATED
+    # The sender began anew: after a silence any counter will do.
+    assert checker.check(frame, 103.0) is Verdict.AFTER_LOSS
 
 
 def test_a_damaged_frame_is_not_counted_as_lost_too() -> None:

@@ -7,7 +7,6 @@ CRC agrees means that frames were lost: they are counted and the frame is used.
 from __future__ import annotations
 
 import enum
-import math
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Final
@@ -152,6 +151,10 @@ RULES: Final = {rule.name: rule for rule in (LEAF_RULE, GENERIC_RULE, CRC_ONLY_R
 """The rules that a mapping can name."""
 
 
+SILENCE_S: Final = 2.0
+"""After so long without a frame the sender may have begun anew, with any counter [s]."""
+
+
 class FrameChecker:
     """Checks the frames of one message, one after the other.
 
@@ -162,8 +165,8 @@ class FrameChecker:
     ----------
     rule : ProtectionRule
     period_s : float, optional
-        Time between frames when none is lost [s]. Without it a standing counter is always a
-        repetition.
+        Time between frames when none is lost [s]. Without it a standing counter is a repetition
+        unless `SILENCE_S` went by without a frame.
 
     Attributes
     ----------
@@ -176,7 +179,7 @@ class FrameChecker:
 
     def __init__(self, rule: ProtectionRule, period_s: float | None = None) -> None:
         self._rule = rule
-        self._half_round_s = math.inf if period_s is None else period_s * rule.modulus / 2
+        self._half_round_s = SILENCE_S if period_s is None else period_s * rule.modulus / 2
         self._last = -1
         self._last_s = 0.0
         self._refused = 0

@@ -15,18 +15,9 @@ from cangauge.errors import InputError
 from cangauge.estimate.offline import EstimateTable
 from cangauge.estimate.types import Status
 from cangauge.report.words import reason_names
+from cangauge.service.table import NUMBERS
 
 SUFFIXES = (".csv", ".parquet")
-
-NUMBERS = (
-    "soc_pct",
-    "soc_std_pct",
-    "soc_newton_pct",
-    "soc_coulomb_pct",
-    "voltage_model_v",
-    "residual_v",
-)
-"""Columns of numbers after `time_s`; `status` and `reasons` follow, in words."""
 
 
 def check_suffix(output: Path) -> None:

@@ -11,7 +11,7 @@ from rich.progress import Progress
 
 from cangauge.cli.inputs import refuse_turned_current
 from cangauge.cli.output import console, note
-from cangauge.errors import CangaugeError, InputError
+from cangauge.errors import InputError
 from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import EstimateTable, Scores, estimate_log, score
 from cangauge.identify.charge import counted_soc_pct
@@ -110,7 +110,6 @@ def from_capture(
         If the capture gives no sample, its current is turned, or it is another pack's.
     """
     # python-can and cantools are slow to import; logs do without.
-    from cangauge.bus.capture_log import capture_samples  # noqa: PLC0415
     from cangauge.service.capture_estimate import estimate_capture  # noqa: PLC0415
 
     if settings.temperature_source == "unknown":
@@ -124,18 +123,12 @@ def from_capture(
             settings,
             progress=lambda done: progress.update(task, completed=done),
         )
-    # The estimates do not carry current and temperature along; the samples do.
-    samples = capture_samples(path, vehicle, source=found.time_source)
-    if len(samples) != found.table.soc_pct.size:
-        raise CangaugeError(
-            f"{path}: {len(samples)} samples, but {found.table.soc_pct.size} estimates"
-        )
     recording = Recording(
-        time_s=_running_on(samples.time_s),
-        current_a=samples.current_a,
-        voltage_v=samples.voltage_v,
-        temperature_c=samples.temperature_c,
-        soc_pct=samples.soc_pct if np.isfinite(samples.soc_pct).any() else None,
+        time_s=_running_on(found.time_s),
+        current_a=found.current_a,
+        voltage_v=found.voltage_v,
+        temperature_c=found.temperature_c,
+        soc_pct=found.soc_reference_pct if np.isfinite(found.soc_reference_pct).any() else None,
         name=path.name.split(".")[0],
         source=str(path),
         temperature_source=settings.temperature_source,
