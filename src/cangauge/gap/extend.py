@@ -17,7 +17,7 @@ from cangauge.gap.held_out import solution_with
 from cangauge.gap.settle import Settled
 from cangauge.identify.least_squares import nearest_rising
 from cangauge.identify.voltage_fit import SLOPE_CHECKS
-from cangauge.model.effects.effect import Effect, Values
+from cangauge.model.effects.effect import Effect, Pack, Values
 from cangauge.model.effects.library import LIBRARY, effect_entries
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Made, ModelFile
@@ -196,12 +196,29 @@ def model_file_of(extension: Extension, given: ModelFile, floor_v: float) -> Mod
         update={
             "name": f"{given.name}, extended",
             "coefficients": coefficients,
-            "effects": effect_entries(kept),
+            "effects": effect_entries(_merged(kept, model.pack)),
             "noise": smaller,
             "information": None,
             "made": made,
         }
     )
+
+
+def _merged(effects: Sequence[tuple[Effect, Values]], pack: Pack) -> list[tuple[Effect, Values]]:
+    """Return the effects, those of one kind and shape added up, within physical bounds."""
+    merged: dict[tuple[object, ...], tuple[Effect, dict[str, float]]] = {}
+    for effect, values in effects:
+        key = (effect.id, *(values[parameter.name] for parameter in effect.shapes))
+        if key not in merged:
+            merged[key] = (effect, dict(values))
+            continue
+        neutral = effect.neutral(pack)
+        _, total = merged[key]
+        for parameter in effect.amplitudes:
+            low, high = parameter.bounds(pack)
+            more = total[parameter.name] + values[parameter.name] - neutral[parameter.name]
+            total[parameter.name] = min(max(more, low), high)
+    return list(merged.values())
 
 
 def _for_later_drives(effect: Effect, values: Values) -> Values:

@@ -1,4 +1,4 @@
-"""What reference logs say: how far the model strays without a cause, and what structure it lacks.
+"""What reference logs say: how far the model strays without a cause.
 
 Everything is judged on whole logs left out: fitted on the other references (and the model's own
 information), seen on the one left out. Without at least two references the model file's own noise
@@ -9,30 +9,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cangauge.gap.columns import LogTerms
+from cangauge.gap.columns import OWN, LogTerms
 from cangauge.gap.evidence import ErrorModel, Frame, Gram, gather
 from cangauge.model.model_file import ModelNoise
 
 FloatArray = NDArray[np.float64]
-
-REPAIRS = (
-    "fast_polarization",
-    "slow_diffusion",
-    "resistance_temperature",
-    "resistance_soc",
-    "charge_transfer",
-    "resistance_asymmetry",
-)
-"""Effects that a clean pack may well have and the 13 coefficients lack. Sensor errors are not among
-them, nor what would take a change of the pack."""
-
-REPAIRS_AT_MOST = 4
-REPAIR_GAIN = 0.02
-"""A repair must lower the references' left-out error by this much, relative."""
 
 SOC_STD_PCT = 0.7
 """How well a log's assumed initial SoC is known without a cause [%]."""
@@ -46,6 +32,8 @@ MEMORY_S = 600
 
 ALIKE_WITHIN = (20.0, 200.0)
 """Bounds of κ, the rows that tell as much as one."""
+
+OWN_ROUNDS = 6
 
 KNOWN_LOGS = 2.0
 """The model file's noise counts like this many reference logs."""
@@ -96,7 +84,9 @@ def error_from_references(
     means = np.array([float(values.mean()) for values in errors])
     centred = [values - values.mean() for values in errors]
     within_v2 = float(np.mean(np.concatenate(centred) ** 2))
-    between_v2 = (float(means @ means) + KNOWN_LOGS * stated.own_std[0] ** 2) / (
+    # The median, since one reference far outside the others' temperatures tells nothing of theirs.
+    usual_v = 1.48 * float(np.median(np.abs(means)))
+    between_v2 = (means.size * usual_v**2 + KNOWN_LOGS * stated.own_std[0] ** 2) / (
         means.size + KNOWN_LOGS
     )
     return ErrorModel(
@@ -106,70 +96,31 @@ def error_from_references(
     )
 
 
-def find_repairs(
-    frame: Frame, terms: Sequence[LogTerms], grams: Sequence[Gram], error: ErrorModel
-) -> tuple[int, ...]:
-    """Return the candidates that lower the references' left-out error, the most useful first.
+def own_from_references(frame: Frame, grams: Sequence[Gram], error: ErrorModel) -> ErrorModel:
+    """Return the error with what differs from log to log learned from the references.
 
-    One shape of an effect at most; none without three references.
-    """
-    if len(terms) < 3:
-        return ()
-    chosen: tuple[int, ...] = ()
-    best = _left_out_rmse(frame, grams, error)
-    while len(chosen) < REPAIRS_AT_MOST:
-        taken = {frame.choices[k].effect.id for k in chosen}
-        trials = [
-            (_left_out_rmse(_with_repairs(frame, (*chosen, k)), grams, error), k)
-            for k, choice in enumerate(frame.choices)
-            if choice.effect.id in REPAIRS and choice.effect.id not in taken
-        ]
-        if not trials:
-            break
-        rmse, k = min(trials)
-        if rmse > (1.0 - REPAIR_GAIN) * best:
-            break
-        best, chosen = rmse, (*chosen, k)
-    return chosen
-
-
-def _with_repairs(frame: Frame, repairs: tuple[int, ...]) -> Frame:
-    return Frame(frame.choices, frame.prior_root, frame.scale, repairs)
-
-
-def _left_out_rmse(frame: Frame, grams: Sequence[Gram], error: ErrorModel) -> float:
-    square, rows = 0.0, 0
-    for number, left_out in enumerate(grams):
-        others = [gram for k, gram in enumerate(grams) if k != number]
-        square += squares_of(frame, left_out, gather(frame, others, [], error).mean)
-        rows += left_out.rows
-    return math.sqrt(max(square, 0.0) / rows)
-
-
-def squares_of(
-    frame: Frame, gram: Gram, solution: FloatArray, effect: tuple[int, FloatArray] | None = None
-) -> float:
-    """Return the sum of squared errors of a log under a solution, optionally with one effect [V²].
+    Expectation maximisation on the variance of each of `columns.OWN`; what `error` says of them
+    counts like `KNOWN_LOGS` logs.
 
     Parameters
     ----------
     frame : Frame
-    gram : Gram
-        The log's products.
-    solution : array
-        δθ (scaled), then the repairs; what follows is ignored.
-    effect : pair, optional
-        Candidate and its amplitudes.
+    grams : sequence of Gram
+        Of the references.
+    error : ErrorModel
     """
-    p = frame.scale.size
-    repairs = frame.amplitudes_of(frame.repairs)
-    coefficients = np.zeros(gram.products.shape[0])
-    coefficients[:p] = -solution[:p]
-    coefficients[p + repairs] = -solution[p : p + repairs.size]
-    if effect is not None:
-        coefficients[p + frame.amplitudes_of([effect[0]])] -= effect[1]
-    coefficients[-1] = 1.0
-    return float(coefficients @ gram.products @ coefficients)
+    stated = np.array(error.own_std)
+    shared = frame.scale.size + frame.amplitudes_of(frame.repairs).size
+    for _ in range(OWN_ROUNDS):
+        evidence = gather(frame, grams, [], error)
+        balance = 1.0 / np.sqrt(np.diag(evidence.precision))
+        inverse = np.linalg.inv(evidence.precision * balance * balance[:, None])
+        variance = (np.diag(inverse) * balance**2)[shared:].reshape(-1, len(OWN))
+        mean = evidence.mean[shared:].reshape(-1, len(OWN))
+        total = np.sum(mean**2 + variance, axis=0) + KNOWN_LOGS * stated**2
+        own = np.sqrt(total / (len(grams) + KNOWN_LOGS))
+        error = replace(error, own_std=tuple(own.tolist()))
+    return error
 
 
 def _predicted(frame: Frame, log: LogTerms, solution: FloatArray) -> FloatArray:

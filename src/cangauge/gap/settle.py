@@ -17,6 +17,7 @@ from cangauge.gap.references import (
     error_from_noise,
     error_from_references,
     left_out_errors,
+    own_from_references,
 )
 from cangauge.identify.options import FitOptions
 from cangauge.logs.log import Log
@@ -37,12 +38,15 @@ CLEAN_STRUCTURE: tuple[tuple[str, dict[str, float]], ...] = (
 """Structure that a clean pack may well have and the 13 coefficients lack: all logs share it, so it
 is learned from the references and is no cause."""
 
+COVERED_K = 3.0
+"""References cover temperatures up to this far outside their own [K]."""
+
 INFORMATION_WEIGHT = 0.1
 """How far the model's own information is trusted where the structure above joins it: it was
 gathered without that structure."""
 
-STATED_WEIGHT = 0.5
-"""Weight of the error that the model file states beside that of a few references."""
+STATED_LOGS = 2.0
+"""The error that the model file states counts like this many references."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +136,7 @@ def settle(
         return tuple(result)
 
     reference_terms, diagnosed_terms = terms_of(references, clean=True), terms_of(logs, clean=False)
-    frame = _frame(model_file, choices, reference_terms)
+    frame = _frame(model_file, choices, reference_terms, diagnosed_terms)
     stated = error_from_noise(model_file.noise, model_file.rate_hz)
     error = stated
     if len(reference_terms) >= 2:
@@ -140,8 +144,9 @@ def settle(
         seen = error_from_references(
             left_out_errors(frame, reference_terms, grams, stated), stated, model_file.rate_hz
         )
-        mixed = (1.0 - STATED_WEIGHT) * seen.rmse_v**2 + STATED_WEIGHT * stated.rmse_v**2
-        error = replace(seen, rmse_v=math.sqrt(mixed))
+        stated_part = STATED_LOGS / (STATED_LOGS + len(reference_terms))
+        mixed = (1.0 - stated_part) * seen.rmse_v**2 + stated_part * stated.rmse_v**2
+        error = own_from_references(frame, grams, replace(seen, rmse_v=math.sqrt(mixed)))
     return Settled(model, options, frame, error, reference_terms, diagnosed_terms)
 
 
@@ -160,12 +165,17 @@ def _terms(
 
 
 def _frame(
-    model_file: ModelFile, choices: Sequence[Candidate], references: Sequence[LogTerms]
+    model_file: ModelFile,
+    choices: Sequence[Candidate],
+    references: Sequence[LogTerms],
+    diagnosed: Sequence[LogTerms],
 ) -> Frame:
+    known = [item for item in CLEAN_STRUCTURE if references]
+    if references and not _temperatures_covered(references, diagnosed):
+        # References that were never so cold cannot have shown what resistance does there.
+        known = [item for item in known if item[0] != "resistance_temperature"]
     repairs = tuple(
-        k
-        for k, choice in enumerate(choices)
-        if references and (choice.effect.id, dict(choice.shape)) in CLEAN_STRUCTURE
+        k for k, choice in enumerate(choices) if (choice.effect.id, dict(choice.shape)) in known
     )
     information = model_file.information
     number = 9 + len(model_file.delays_s)
@@ -174,6 +184,13 @@ def _frame(
     weight = INFORMATION_WEIGHT if repairs else 1.0
     root = math.sqrt(weight) * np.array(information.root)
     return Frame(tuple(choices), root, np.array(information.scale), repairs)
+
+
+def _temperatures_covered(references: Sequence[LogTerms], diagnosed: Sequence[LogTerms]) -> bool:
+    seen = np.concatenate([terms.prepared.rows.temperature_c for terms in references])
+    asked = np.concatenate([terms.prepared.rows.temperature_c for terms in diagnosed])
+    low, high = seen.min() - COVERED_K, seen.max() + COVERED_K
+    return bool(np.mean((asked >= low) & (asked <= high)) > 0.5)
 
 
 def _check_pack(log: Log, model: ExtendedModel) -> None:

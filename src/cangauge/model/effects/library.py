@@ -91,10 +91,11 @@ def parse_effects(entries: Sequence[object], pack: Pack) -> list[tuple[Effect, V
     Raises
     ------
     InputError
-        If an entry is no effect, or a parameter is missing, unknown, no number,
+        If an entry is no effect, is given twice with the same shape, or a parameter is missing, unknown, no number,
         or outside its physical bounds; names the field.
     """
     parsed: list[tuple[Effect, Values]] = []
+    seen: set[tuple[object, ...]] = set()
     for number, entry in enumerate(entries):
         field = f"effects.{number}"
         if not isinstance(entry, Mapping) or set(entry) != {"id", "parameters"}:
@@ -104,7 +105,13 @@ def parse_effects(entries: Sequence[object], pack: Pack) -> list[tuple[Effect, V
                 value=sorted(map(str, entry)) if isinstance(entry, Mapping) else entry,
             )
         effect = effect_of(entry["id"], f"{field}.id")
-        parsed.append((effect, _values(effect, entry["parameters"], pack, f"{field}.parameters")))
+        values = _values(effect, entry["parameters"], pack, f"{field}.parameters")
+        # Two elements of different time constants are a chain; the same one twice is a slip.
+        one = (effect.id, *(values[parameter.name] for parameter in effect.shapes))
+        if one in seen:
+            raise InputError("is given twice", field=f"{field}.id", value=effect.id)
+        seen.add(one)
+        parsed.append((effect, values))
     return parsed
 
 
