@@ -13,6 +13,7 @@ from cangauge import __version__
 from cangauge.cli.demo import demo_command
 from cangauge.cli.estimate import estimate_command
 from cangauge.cli.fit import fit_command
+from cangauge.cli.gap import gap_command
 from cangauge.cli.inspect import inspect_command
 from cangauge.cli.output import note
 from cangauge.cli.replay import replay_command
@@ -48,6 +49,7 @@ def _root(
 app.command("demo")(demo_command)
 app.command("fit")(fit_command)
 app.command("estimate")(estimate_command)
+app.command("gap")(gap_command)
 app.command("run")(run_command)
 app.command("replay")(replay_command)
 app.command("inspect")(inspect_command)

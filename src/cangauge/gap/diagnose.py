@@ -176,7 +176,7 @@ def _floor_v(settled: Settled, model_file: ModelFile) -> float:
     """Return the model's error on the references, or what the model file states without any."""
     if not settled.references:
         return model_file.noise.voltage_rmse_v
-    return rms(np.concatenate([terms.residual_v for terms in settled.references]))
+    return rms(np.concatenate(settled.given_errors_v[0]))
 
 
 def _observability(settled: Settled) -> list[dict[str, object]]:

@@ -20,7 +20,7 @@ from cangauge.identify.voltage_fit import SLOPE_CHECKS
 from cangauge.model.effects.effect import Effect, Pack, Values
 from cangauge.model.effects.library import LIBRARY, effect_entries
 from cangauge.model.extended import ExtendedModel
-from cangauge.model.model_file import Made, ModelFile
+from cangauge.model.model_file import Made, ModelFile, Ranges
 from cangauge.model.voltage_model import (
     BASIS_NAMES,
     SLOPE_AT_LEAST,
@@ -196,6 +196,11 @@ def model_file_of(extension: Extension, given: ModelFile, floor_v: float) -> Mod
         update={
             "name": f"{given.name}, extended",
             "coefficients": coefficients,
+            "range": Ranges(
+                soc_pct=model.model.soc_range_pct,
+                temperature_c=model.model.temperature_range_c,
+                current_a=model.model.current_range_a,
+            ),
             "effects": effect_entries(_merged(kept, model.pack)),
             "noise": smaller,
             "information": None,

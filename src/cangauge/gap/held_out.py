@@ -47,13 +47,16 @@ def judge(settled: Settled, effects: Sequence[str]) -> list[Judged]:
         Effects to add, in order; their shapes are chosen on the rows of the fit.
     """
     result = []
+    _, given = settled.given_errors_v
     for fit_on, judged in _folds(settled):
         evidence = gather(settled.frame, settled.reference_grams, fit_on, settled.error)
         solution = solution_with(evidence, effects)
         for number, keep in judged:
             terms = settled.diagnosed[number].at(keep)
             result.append(
-                Judged(number, keep, terms.residual_v, terms.residual_v - _volts(terms, solution))
+                Judged(
+                    number, keep, given[number][keep], terms.residual_v - _volts(terms, solution)
+                )
             )
     return result
 

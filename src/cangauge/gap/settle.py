@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cangauge.errors import InputError
-from cangauge.gap.columns import Candidate, LogTerms, candidates, log_terms, prepare_log
+from cangauge.gap.columns import (
+    Candidate,
+    LogTerms,
+    candidates,
+    log_terms,
+    prepare_log,
+    residual,
+)
 from cangauge.gap.evidence import ErrorModel, Frame, Gram, gram_of
 from cangauge.gap.references import (
     error_from_noise,
@@ -59,6 +66,16 @@ class Settled:
     error: ErrorModel
     references: tuple[LogTerms, ...]
     diagnosed: tuple[LogTerms, ...]
+    as_given: ExtendedModel
+    """The model before its temperatures were widened; what the gap is measured from."""
+
+    @cached_property
+    def given_errors_v(self) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...]]:
+        """Errors of the model as given on the references and on the diagnosed logs [V]."""
+        return (
+            tuple(residual(terms.prepared, self.as_given) for terms in self.references),
+            tuple(residual(terms.prepared, self.as_given) for terms in self.diagnosed),
+        )
 
     @cached_property
     def reference_grams(self) -> tuple[Gram, ...]:
@@ -113,7 +130,8 @@ def settle(
     InputError
         If a log gives no rows or does not match the model's pack.
     """
-    model = model_file.extended_model()
+    given = model_file.extended_model()
+    model = _over_all_temperatures(given, [*logs, *references])
     options = FitOptions(
         capacity_ah=model_file.capacity_ah,
         initial_soc_pct=initial_soc_pct,
@@ -147,7 +165,7 @@ def settle(
         stated_part = STATED_LOGS / (STATED_LOGS + len(reference_terms))
         mixed = (1.0 - stated_part) * seen.rmse_v**2 + stated_part * stated.rmse_v**2
         error = own_from_references(frame, grams, replace(seen, rmse_v=math.sqrt(mixed)))
-    return Settled(model, options, frame, error, reference_terms, diagnosed_terms)
+    return Settled(model, options, frame, error, reference_terms, diagnosed_terms, given)
 
 
 def _terms(
@@ -184,6 +202,26 @@ def _frame(
     weight = INFORMATION_WEIGHT if repairs else 1.0
     root = math.sqrt(weight) * np.array(information.root)
     return Frame(tuple(choices), root, np.array(information.scale), repairs)
+
+
+def _over_all_temperatures(model: ExtendedModel, logs: Sequence[Log]) -> ExtendedModel:
+    """Return the model with its temperature and current ranges widened to those of the logs.
+
+    It is about to learn from them; where it held the temperature at the edge of what it had seen,
+    it may now follow. Its SoC stays as it is: beyond, the pseudo-OCV's formula is not to be used.
+    """
+    low, high = model.model.temperature_range_c
+    least, most = model.model.current_range_a
+    for log in logs:
+        low, high = (
+            min(low, float(log.temperature_c.min())),
+            max(high, float(log.temperature_c.max())),
+        )
+        least, most = min(least, float(log.current_a.min())), max(most, float(log.current_a.max()))
+    voltage_model = replace(
+        model.model, temperature_range_c=(low, high), current_range_a=(least, most)
+    )
+    return replace(model, model=voltage_model)
 
 
 def _temperatures_covered(references: Sequence[LogTerms], diagnosed: Sequence[LogTerms]) -> bool:

@@ -91,7 +91,8 @@ def parse_effects(entries: Sequence[object], pack: Pack) -> list[tuple[Effect, V
     Raises
     ------
     InputError
-        If an entry is no effect, is given twice with the same shape, or a parameter is missing, unknown, no number,
+        If an entry is no effect, is given twice with one shape, or a parameter is missing,
+        unknown, no number,
         or outside its physical bounds; names the field.
     """
     parsed: list[tuple[Effect, Values]] = []

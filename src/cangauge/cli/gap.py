@@ -1,0 +1,144 @@
+"""`cangauge gap`: what a model misses on logs, where, which effect, how far it shrinks."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from cangauge.atomic import atomic_path
+from cangauge.cli.inputs import (
+    DbcOption,
+    JsonOption,
+    MapOption,
+    ReportOption,
+    TemperatureOption,
+    VehicleOption,
+    check_outputs,
+    load_log,
+)
+from cangauge.cli.output import console, emit_json, note
+from cangauge.errors import InputError
+from cangauge.gap.diagnose import Diagnosis, diagnose, in_words
+from cangauge.gap.extend import model_file_of
+from cangauge.logs.log import Log
+from cangauge.model.model_file import ModelFile, load_model, model_json
+
+SHOWN = 5
+SHORTEST_S = 300.0
+"""A log shorter than this shows nothing but its start [s]."""
+
+
+def gap_command(  # noqa: PLR0917 - typer passes options by name
+    logs: Annotated[
+        list[Path],
+        typer.Argument(metavar="LOG", help="Logs that the model does not explain; one cause."),
+    ],
+    model: Annotated[Path, typer.Option("-m", "--model", metavar="MODEL", help="Model file.")],
+    reference: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="LOG", help="A log on which the model is good; repeat it."),
+    ] = None,
+    initial_soc: Annotated[
+        float | None,
+        typer.Option(metavar="P", help="SoC at each diagnosed log's first row [%]."),
+    ] = None,
+    capacity_ah: Annotated[
+        float | None, typer.Option(metavar="A", help="Capacity instead of the model's [Ah].")
+    ] = None,
+    extended: Annotated[
+        Path | None, typer.Option(metavar="MODEL", help="Write the extended model here.")
+    ] = None,
+    vehicle: VehicleOption = None,
+    dbc: DbcOption = None,
+    map_file: MapOption = None,
+    temperature: TemperatureOption = None,
+    report: ReportOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Diagnose the gap between a model and logs: where, which effect, how far it shrinks.
+
+    The verdict is an effect, `none` (no gap beyond what the references show) or `unknown` (a gap
+    that no effect in the library explains). It is early work: the README says how often it is
+    right. Give at least three references, more are better.
+
+    For example:
+
+    `cangauge gap cold1.csv cold2.csv -m pack.json --reference mild1.csv --reference mild2.csv
+    --reference mild3.csv --report gap.html --extended cold.json`
+    """
+    given = list(reference or [])
+    check_outputs([report, extended], [*logs, *given, model])
+    model_file = load_model(model)
+    if capacity_ah is not None:
+        model_file = _with_capacity(model_file, capacity_ah)
+
+    def read(path: Path) -> Log:
+        return load_log(
+            path,
+            vehicle=vehicle,
+            dbc=dbc,
+            map_file=map_file,
+            temperature_c=temperature,
+            temperature_source=None,
+            refuse_turned=True,
+        )
+
+    diagnosed = [_long_enough(read(path)) for path in logs]
+    references = [read(path) for path in given]
+    found = diagnose(diagnosed, model_file, references, initial_soc_pct=initial_soc, progress=note)
+    with ExitStack() as stack:
+        if extended is not None:
+            better = model_file_of(found.extension, model_file, found.extended_rmse_v)
+            stack.enter_context(atomic_path(extended)).write_text(model_json(better))
+        if report is not None:
+            # Drawing is slow to import; the diagnosis does without.
+            from cangauge.report.gap_report import gap_report  # noqa: PLC0415
+
+            stack.enter_context(atomic_path(report)).write_text(gap_report(found))
+    if json_output:
+        emit_json(found.to_dict(None if extended is None else str(extended)))
+        return
+    _show(found)
+    for written in (extended, report):
+        if written is not None:
+            note(f"wrote {written}")
+
+
+def _with_capacity(model: ModelFile, capacity_ah: float) -> ModelFile:
+    if not 1e-3 <= capacity_ah <= 1e5:
+        raise InputError(
+            "must lie within 0.001 … 100000 Ah", field="--capacity-ah", value=capacity_ah
+        )
+    return model.model_copy(update={"capacity_ah": capacity_ah})
+
+
+def _long_enough(log: Log) -> Log:
+    if log.duration_s < SHORTEST_S:
+        raise InputError(
+            f"{log.duration_s:.0f} s of data show nothing but the start: nothing can be concluded",
+            source=log.source or log.name,
+            cure=f"give a log of at least {SHORTEST_S:.0f} s, better half an hour with changing"
+            " load and SoC",
+        )
+    return log
+
+
+def _show(found: Diagnosis) -> None:
+    note(in_words(found))
+    table = Table(title="Candidates")
+    for heading in ("effect", "probability", "log evidence", "error left out [V]", "closed"):
+        table.add_column(heading, justify="right")
+    for item in found.candidates[:SHOWN]:
+        rmse, closed = item["rmse_v"], item["closed_fraction"]
+        table.add_row(
+            str(item["effect"]),
+            f"{item['probability']:.2f}",
+            f"{item['log_bayes_factor']:.1f}",
+            "–" if rmse is None else f"{rmse:.2f}",
+            "–" if closed is None else f"{100.0 * closed:.0f} %",
+        )
+    console.print(table)

@@ -1,0 +1,158 @@
+"""Diagnosis: names what was done to a log, says none or unknown, and its model runs."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cangauge.errors import InputError
+from cangauge.estimate.estimator import EstimatorSettings
+from cangauge.estimate.offline import estimate_log
+from cangauge.gap.diagnose import Diagnosis, diagnose, in_words
+from cangauge.gap.extend import model_file_of
+from cangauge.identify.fit import FitOptions, fit
+from cangauge.logs.log import Log
+from cangauge.model.model_file import ModelFile, load_model, model_json
+from cangauge.model.published import CAPACITY_AH
+from cangauge.report.gap_report import gap_report
+from synthetic import synthetic_log
+
+
+def day(seed: int) -> Log:
+    return synthetic_log(
+        hours=0.8,
+        start_pct=85.0,
+        end_pct=60.0,
+        noise_v=0.5,
+        seed=seed,
+        name=f"day {seed}",
+        **change,
+    )
+
+
+@pytest.fixture(scope="module")
+def model() -> ModelFile:
+    logs = [synthetic_log(noise_v=0.5, seed=seed) for seed in (1, 2, 3)]
+    return fit(logs, FitOptions(capacity_ah=CAPACITY_AH)).model
+
+
+@pytest.fixture(scope="module")
+def references() -> list[Log]:
+    return [day(seed) for seed in (11, 12, 13)]
+
+
+FAULTS = {
+    "current_offset": lambda log: replace(log, current_a=log.current_a + 4.0),
+    "voltage_offset": lambda log: replace(log, voltage_v=log.voltage_v + 2.5),
+    "resistance_asymmetry": lambda log: replace(
+        log, voltage_v=log.voltage_v - 0.06 * np.minimum(log.current_a, 0.0)
+    ),
+    "resistance_step": lambda log: replace(
+        log, voltage_v=log.voltage_v - 0.05 * log.current_a * (log.time_s > 1400.0)
+    ),
+    "initial_soc": lambda log: replace(log, soc_pct=log.soc_pct + 5.0),
+    "time_skew": lambda log: replace(
+        log, current_a=np.interp(log.time_s - 1.0, log.time_s, log.current_a)
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def offset(model: ModelFile, references: list[Log]) -> Diagnosis:
+    return diagnose([FAULTS["current_offset"](day(21))], model, references)
+
+
+@pytest.mark.parametrize("effect", FAULTS)
+def test_names_a_clear_fault_or_says_what_it_cannot_tell_it_from(
+    effect: str, model: ModelFile, references: list[Log]
+) -> None:
+    found = diagnose([FAULTS[effect](day(21)), FAULTS[effect](day(22))], model, references)
+    assert effect in {found.verdict.cause, *found.verdict.ambiguous_with}
+    assert len(found.verdict.ambiguous_with) <= 2
+    assert found.extended_rmse_v < found.baseline_rmse_v
+
+
+def test_says_none_on_clean_logs(model: ModelFile, references: list[Log]) -> None:
+    for seed in range(30, 36):
+        found = diagnose([day(seed)], model, references)
+        assert found.verdict.cause == "none"
+        assert found.closed is None
+
+
+def test_says_unknown_of_what_no_effect_is_like(model: ModelFile, references: list[Log]) -> None:
+    log = day(21)
+    wave = 6.0 * np.sin(2.0 * np.pi * log.time_s / 240.0)
+    found = diagnose([replace(log, voltage_v=log.voltage_v + wave)], model, references)
+    assert found.verdict.cause in {"none", "unknown"}
+
+
+def test_parameter_and_closed_fraction_are_those_put_in(offset: Diagnosis) -> None:
+    parameters = offset.candidates[0]["parameters"]["offset_a"]
+    low, high = parameters["ci"]
+    assert low < 4.0 < high
+    assert offset.closed is not None
+    assert offset.closed > 0.9
+    assert offset.extension.cause["current_offset"]["offset_a"] == pytest.approx(4.0, abs=0.6)
+
+
+def test_extended_model_runs_in_the_estimator(
+    offset: Diagnosis, model: ModelFile, tmp_path: Path
+) -> None:
+    path = tmp_path / "better.json"
+    path.write_text(model_json(model_file_of(offset.extension, model, offset.extended_rmse_v)))
+    log = FAULTS["current_offset"](day(40))
+    settings = EstimatorSettings(initial_soc_pct=85.0, method="coulomb")
+    _, plain = estimate_log(log, model, settings)
+    _, better = estimate_log(log, load_model(path), settings)
+    assert plain.soc_mae_pct is not None
+    assert better.soc_mae_pct is not None
+    assert better.soc_mae_pct < 0.25 * plain.soc_mae_pct
+
+
+def test_json_has_the_contracts_keys(offset: Diagnosis) -> None:
+    found = json.loads(json.dumps(offset.to_dict("better.json")))
+    assert found["schema"] == 1
+    assert {
+        "baseline_rmse_v", "extended_rmse_v", "floor_sensor_v", "floor_explainable_v",
+        "closed_fraction", "closed_fraction_ci", "baseline_soc_mae_pct", "extended_soc_mae_pct",
+    } == set(found["gap"])  # fmt: skip
+    assert {"verdict", "probability", "ambiguous_with", "accepted", "candidates"} <= set(
+        found["cause"]
+    )
+    assert {item["axis"] for item in found["where"]} == {
+        "soc", "temperature", "current", "rest", "time", "timescale",
+    }  # fmt: skip
+    for axis in ("soc", "current", "time", "timescale"):
+        shares = [item["share"] for item in found["where"] if item["axis"] == axis]
+        assert sum(shares) == pytest.approx(1.0, abs=1e-6)
+    assert len(found["observability"]) == 20
+    assert found["extended_model"] == "better.json"
+
+
+def test_page_tells_the_verdict_and_loads_nothing(offset: Diagnosis) -> None:
+    page = gap_report(offset)
+    assert "current_offset" in page
+    assert in_words(offset).split(":")[0] in page
+    assert "default-src 'none'" in page
+
+
+def test_without_references_the_models_noise_is_the_floor(model: ModelFile) -> None:
+    found = diagnose([day(21)], model, [])
+    assert found.floor_v == model.noise.voltage_rmse_v
+    assert found.verdict.cause == "none"
+
+
+def test_refuses_a_log_of_another_pack(model: ModelFile, references: list[Log]) -> None:
+    log = day(21)
+    with pytest.raises(InputError, match="another pack"):
+        diagnose([replace(log, voltage_v=log.voltage_v / 4.0)], model, references)
+
+
+def test_refuses_a_turned_current_by_its_count(model: ModelFile, references: list[Log]) -> None:
+    log = day(21)
+    with pytest.raises(InputError, match="sign of current"):
+        diagnose([replace(log, current_a=-log.current_a)], model, references)
