@@ -30,7 +30,6 @@ def day(seed: int) -> Log:
         noise_v=0.5,
         seed=seed,
         name=f"day {seed}",
-        **change,
     )
 
 

@@ -77,7 +77,10 @@ def _axes(
     yield "soc", "%", np.concatenate([item.soc_pct for item in rows]), np.linspace(-5, 105, 12)
     temperature = np.concatenate([item.temperature_c for item in rows])
     yield "temperature", "°C", temperature, _even_edges(temperature, 5.0)
-    yield "current", "A", current, capacity_ah * np.array([-20.0, -0.5, -0.02, 0.02, 0.5, 1, 2, 20])
+    inner = capacity_ah * np.array([-0.5, -0.02, 0.02, 0.5, 1.0, 2.0])
+    ends = float(current.min()), float(current.max())
+    inside = inner[(inner > ends[0]) & (inner < ends[1])]
+    yield "current", "A", current, np.array([ends[0], *inside, ends[1]])
     resting = (np.abs(current) < REST_C_RATE * capacity_ah).astype(np.float64)
     yield "rest", "1 = rest", resting, np.array([0.0, 0.5, 1.0])
     passed = np.concatenate([item.time_s - item.time_s[0] for item in rows])

@@ -27,6 +27,7 @@ from cangauge.report.page import (
 from cangauge.report.words import number, significant, span
 
 SHOWN = 8
+LONGEST_S = 1e6
 BLUE, GREY = "#1f77b4", "#b0b0b0"
 AXIS_WORDS = {
     "soc": "state of charge [%]",
@@ -65,7 +66,7 @@ def gap_page(diagnosis: Diagnosis) -> Page:
 def _tiles(diagnosis: Diagnosis) -> list[Tile]:
     verdict = diagnosis.verdict
     tiles = [
-        Tile("Verdict", verdict.cause, f"probability {verdict.probability:.2f}"),
+        Tile("Verdict", verdict.cause.replace("_", " "), f"probability {verdict.probability:.2f}"),
         Tile("Error of the model", number(diagnosis.baseline_rmse_v, 2, "V"), "RMS, these logs"),
         Tile("Floor", number(diagnosis.floor_v, 2, "V"), "RMS, reference logs"),
     ]
@@ -83,14 +84,14 @@ def _which(diagnosis: Diagnosis) -> Section:
     blocks: list[Block] = [Paragraph(_cause_words(diagnosis))]
     ranked = diagnosis.candidates[:SHOWN]
     chances = [
-        (str(item["effect"]), float(item["probability"]), BLUE if k == 0 else GREY)
+        (str(item["effect"]), 100.0 * float(item["probability"]), BLUE if k == 0 else GREY)
         for k, item in enumerate(ranked)
     ]
-    chances.extend((name, verdict.chances[name], GREY) for name in (UNKNOWN, NONE))
+    chances.extend((name, 100.0 * verdict.chances[name], GREY) for name in (UNKNOWN, NONE))
     blocks.append(
         Figure(
             "How probable each cause is",
-            bars("probability", "1", chances),
+            bars("probability", "%", chances),
             "Tempered evidence: bars of like height cannot be told apart by these logs.",
         )
     )
@@ -149,7 +150,11 @@ def _where(diagnosis: Diagnosis) -> Section:
             blocks.append(
                 Figure(
                     f"Share of the squared error over {words}",
-                    bars("share", "1", [(_range(place), place.share, BLUE) for place in places]),
+                    bars(
+                        "share",
+                        "%",
+                        [(_range(place), 100.0 * place.share, BLUE) for place in places],
+                    ),
                     _where_words(places),
                 )
             )
@@ -157,6 +162,10 @@ def _where(diagnosis: Diagnosis) -> Section:
 
 
 def _range(place: Place) -> str:
+    if place.axis == "rest":
+        return "rest" if place.low > 0.0 else "drive"
+    if place.axis == "timescale" and place.high >= LONGEST_S:
+        return f"over {number(place.low, 0)}"
     return span(place.low, place.high, 0)
 
 
