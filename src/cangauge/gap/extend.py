@@ -12,8 +12,7 @@ from scipy.optimize import least_squares
 from cangauge import __version__
 from cangauge.errors import InputError
 from cangauge.gap.columns import residual
-from cangauge.gap.evidence import Evidence, Score, gather
-from cangauge.gap.held_out import solution_with
+from cangauge.gap.evidence import Evidence, Score, gather, prior_precision
 from cangauge.gap.settle import Settled
 from cangauge.identify.least_squares import nearest_rising
 from cangauge.identify.voltage_fit import SLOPE_CHECKS
@@ -58,61 +57,94 @@ def extend(settled: Settled, accepted: Sequence[Score]) -> Extension:
     evidence = gather(
         settled.frame, settled.reference_grams, settled.diagnosed_grams, settled.error
     )
-    solution = solution_with(evidence, [score.effect_id for score in accepted])
-    base, remarks = _base(settled, evidence, solution)
+    solution, amplitudes = _within_bounds(settled, evidence, accepted)
+    base, remarks = _base(settled, solution)
     frame = settled.frame
     cause: dict[str, dict[str, float]] = {}
     model = base
-    for score in accepted:
+    for score, start in zip(accepted, amplitudes, strict=True):
         choice = frame.choices[score.candidate]
-        at = frame.scale.size + frame.amplitudes_of([score.candidate])
-        if score.candidate in frame.repairs:
-            start = score.amplitude
-        else:
-            start = np.clip(solution[at], choice.bounds[:, 0], choice.bounds[:, 1])
         model, values = _refined(settled, model, score, start)
         cause[choice.effect.id] = values
     return Extension(model, cause, tuple(remarks))
 
 
-def _base(
-    settled: Settled, evidence: Evidence, solution: FloatArray
-) -> tuple[ExtendedModel, list[str]]:
+def _within_bounds(
+    settled: Settled, evidence: Evidence, accepted: Sequence[Score]
+) -> tuple[FloatArray, list[FloatArray]]:
+    """Return the most probable coefficients, structure and amplitudes that physics allows.
+
+    One convex problem for all of them, so that what a bound takes from one goes to the others:
+    the pseudo-OCV rises over the identified SoC, and structure and effects keep their bounds.
+
+    Returns
+    -------
+    solution : array
+        δθ [V, V/K, Ω], then the amplitudes of `frame.repairs`.
+    amplitudes : list of arrays
+        Of each accepted effect, beside the neutral values.
+    """
+    frame, model = settled.frame, settled.model.model
+    p, n = frame.scale.size, len(BASIS_NAMES)
+    chosen = [score.candidate for score in accepted]
+    at = frame.amplitudes_of(chosen)
+    limits = np.vstack([frame.bounds_of(frame.repairs), frame.bounds_of(chosen)])
+    first, size = evidence.precision.shape[0], evidence.precision.shape[0] + at.size
+    curvature = evidence.curvature[np.ix_(at, at)] + prior_precision(frame.bounds_of(chosen))
+    upper = _root(evidence.precision)
+    root, target = np.zeros((size, size)), np.zeros(size)
+    root[:first, :first] = upper
+    root[:first, first:] = upper @ evidence.per_amplitude[:, at]
+    target[:first] = upper @ evidence.mean
+    if at.size:
+        lower = _root(curvature)
+        root[first:, first:] = lower
+        target[first:] = lower @ np.linalg.solve(curvature, evidence.gradient[at])
+    slopes = ocv_basis_slope(np.linspace(*model.soc_range_pct, SLOPE_CHECKS), model.epsilon)
+    rising = np.zeros((SLOPE_CHECKS, size))
+    rising[:, :n] = slopes / frame.scale[:n]
+    needed = SLOPE_AT_LEAST * model.pseudo_ocv_at(50.0)[0] - slopes @ np.array(model.ocv_v)
+    repairs = p + np.arange(limits.shape[0] - at.size)
+    bounded = np.concatenate((repairs, first + np.arange(at.size)))
+    kept = np.zeros((bounded.size, size))
+    kept[np.arange(bounded.size), bounded] = 1.0
+    found = nearest_rising(
+        root,
+        target,
+        np.vstack([rising, kept, -kept]),
+        np.concatenate((needed, limits[:, 0], -limits[:, 1])),
+    )
+    solution = found[: p + repairs.size].copy()
+    solution[:p] /= frame.scale
+    widths = np.cumsum([len(frame.choices[k].amplitudes) for k in chosen])[:-1]
+    return solution, np.split(found[first:], widths)
+
+
+def _root(matrix: FloatArray) -> FloatArray:
+    """Return the upper root R of a positive matrix, RᵀR, balanced by its diagonal."""
+    scale = np.sqrt(np.diag(matrix))
+    return np.asarray(np.linalg.cholesky(matrix / scale / scale[:, None]).T * scale)
+
+
+def _base(settled: Settled, solution: FloatArray) -> tuple[ExtendedModel, list[str]]:
     """Return the given model with coefficients and structure that the references add."""
     given, frame = settled.model, settled.frame
     p = frame.scale.size
     remarks: list[str] = []
-    voltage_model = _moved(given.model, _rising(given.model, frame.scale, evidence, solution))
+    voltage_model = _moved(given.model, solution[:p])
     if voltage_model is None:
         voltage_model = given.model
         remarks.append("the coefficients stay: moved, the pseudo-OCV would not rise everywhere")
     base = replace(given, model=voltage_model)
+    at = p
     for k in frame.repairs:
         choice = frame.choices[k]
-        amplitude = solution[p + frame.amplitudes_of([k])]
-        amplitude = np.clip(amplitude, choice.bounds[:, 0], choice.bounds[:, 1])
-        width = choice.bounds[:, 1] - choice.bounds[:, 0]
-        if np.any(np.abs(amplitude) > NEGLIGIBLE * width):
+        low, high = choice.bounds[:, 0], choice.bounds[:, 1]
+        amplitude = np.clip(solution[at : at + low.size], low, high)
+        at += low.size
+        if np.any(np.abs(amplitude) > NEGLIGIBLE * (high - low)):
             base = base.with_effect(choice.effect, choice.values(amplitude))
     return base, remarks
-
-
-def _rising(
-    model: VoltageModel, scale: FloatArray, evidence: Evidence, solution: FloatArray
-) -> FloatArray:
-    """Return δθ, moved as little as the data allow so that the pseudo-OCV rises."""
-    p, n = scale.size, len(BASIS_NAMES)
-    rest = np.linalg.solve(evidence.precision[p:, p:], evidence.precision[p:, :p])
-    information = evidence.precision[:p, :p] - evidence.precision[:p, p:] @ rest
-    root = np.linalg.cholesky(information + 1e-12 * np.trace(information) * np.eye(p)).T
-    bounds = np.zeros((SLOPE_CHECKS, p))
-    grid = np.linspace(*model.soc_range_pct, SLOPE_CHECKS)
-    slopes = ocv_basis_slope(grid, model.epsilon)
-    bounds[:, :n] = slopes / scale[:n]
-    needed = SLOPE_AT_LEAST * model.pseudo_ocv_at(50.0)[0] - slopes @ np.array(model.ocv_v)
-    target = root @ (solution[:p] * scale)
-    moved = nearest_rising(root, target, bounds, needed)
-    return moved / scale
 
 
 def _moved(model: VoltageModel, change: FloatArray) -> VoltageModel | None:
