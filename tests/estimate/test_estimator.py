@@ -197,3 +197,20 @@ def test_open_contactors_do_not_disturb_the_filter(model: ModelFile) -> None:
     assert np.abs(table.soc_pct - whole.soc_pct).max() < 0.2
     assert np.all(table.reasons[down] & Reason.IMPLAUSIBLE_INPUT)
     assert not np.any(table.reasons & Reason.INNOVATION_LARGE)
+
+
+def test_a_long_rest_draws_the_soc_toward_the_rest_voltage(model: ModelFile) -> None:
+    log = synthetic_log(start_pct=80.0, end_pct=70.0, noise_v=0.3, seed=6, hours=0.4)
+    # The drive ends with a SoC that is 4 % off, and the pack rests for 40 minutes.
+    soc_pct = float(log.soc_pct[-1])
+    rest_v = leaf_2012_model().pseudo_ocv([soc_pct], [23.0])[0]
+    end_s = float(log.time_s[-1])
+    samples = [*samples_of(log)]
+    samples += [Sample(end_s + 1.0 + k, 0.0, rest_v, 23.0) for k in range(2400)]
+    table = run_estimator(samples, model, EstimatorSettings(initial_soc_pct=76.0))
+    error = table.soc_pct[len(log) :] - soc_pct
+    sigma = table.soc_std_pct[len(log) :]
+    assert abs(error[-1]) < abs(error[0])
+    assert abs(error[-1]) < 1.5
+    # After ten minutes slow polarisation has decayed, so the voltage is worth more.
+    assert sigma[620] < sigma[590]

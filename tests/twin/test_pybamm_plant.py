@@ -1,0 +1,74 @@
+"""The PyBaMM plant: charge, voltage and faults behind the same door as the twin's cells."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import numpy as np
+import pytest
+
+from cangauge.errors import InputError
+from cangauge.twin.condition import HEALTHY, Condition, WeakCells
+from cangauge.twin.day import Day, draw_day
+from cangauge.twin.pack import draw_pack
+from cangauge.twin.pybamm_plant import PARAMETER_SETS, PybammPlant, draw_pybamm_plant
+from cangauge.twin.simulate import simulate
+
+needs_pybamm = pytest.mark.skipif(
+    importlib.util.find_spec("pybamm") is None, reason="the extra pybamm is not installed"
+)
+
+
+@pytest.fixture(scope="module")
+def plant() -> PybammPlant:
+    rng = np.random.default_rng(5)
+    return draw_pybamm_plant(rng, draw_pack(rng, "leaf40"), "Mohtat2020")
+
+
+@pytest.fixture(scope="module")
+def day(plant: PybammPlant) -> Day:
+    return draw_day(np.random.default_rng(6), plant.pack, hours=0.3, ambient_c=15.0, start_soc=0.6)
+
+
+@needs_pybamm
+@pytest.mark.slow
+@pytest.mark.parametrize("parameter_set", PARAMETER_SETS)
+def test_every_parameter_set_drives(parameter_set: str) -> None:
+    rng = np.random.default_rng(5)
+    plant = draw_pybamm_plant(rng, draw_pack(rng, "leaf24"), parameter_set)
+    day = draw_day(rng, plant.pack, hours=0.2, ambient_c=20.0, start_soc=0.7)
+    truth = simulate(plant, day)
+    assert truth.rows == day.time_s.size
+    # At rest it shows the open-circuit voltage of its own table.
+    assert truth.voltage_v[0] + plant.pack.resistance_ohm * day.current_a[0] == pytest.approx(
+        truth.equilibrium_v[0], abs=3.0
+    )
+    # Quick changes of the current are answered by its resistance.
+    moved, answer = np.diff(day.current_a), -np.diff(truth.voltage_v)
+    slope = np.sum(moved * answer) / np.sum(moved**2)
+    assert 0.4 < slope / plant.pack.resistance_ohm < 1.3
+
+
+@needs_pybamm
+@pytest.mark.slow
+def test_faults_act_on_it(plant: PybammPlant, day: Day) -> None:
+    clean = simulate(plant, day)
+    rms = {}
+    for name, condition in (
+        ("none", HEALTHY),
+        ("capacity", Condition(capacity_factor=0.9)),
+        ("kinetics", Condition(transfer_slowdown=1.0)),
+        ("contact", Condition(step_ohm=0.02, step_at_s=300.0)),
+        ("weak", Condition(weak=WeakCells(2, 0.3, 0.05))),
+    ):
+        gap = simulate(plant, day, condition, clean).voltage_v - clean.voltage_v
+        rms[name] = float(np.sqrt(np.mean(gap**2)))
+    assert rms["none"] < 1e-6
+    assert all(size > 0.02 for name, size in rms.items() if name != "none")
+
+
+@pytest.mark.skipif(importlib.util.find_spec("pybamm") is not None, reason="pybamm is installed")
+def test_without_the_extra_it_says_what_to_install() -> None:
+    rng = np.random.default_rng(1)
+    with pytest.raises(InputError, match=r"cangauge\[pybamm\]"):
+        draw_pybamm_plant(rng, draw_pack(rng))

@@ -1,0 +1,64 @@
+"""The sensor chain: steps, jitter, losses, rates, and what a gauge may know of the charge."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cangauge.twin.day import Day, draw_day
+from cangauge.twin.faults import Fault
+from cangauge.twin.pack import Pack, draw_pack
+from cangauge.twin.plant import TwinPlant
+from cangauge.twin.world import record_day, rms
+
+
+def with_sensors(pack: Pack, **changes: float) -> Pack:
+    return replace(pack, sensors=replace(pack.sensors, **changes))
+
+
+def test_values_are_multiples_of_the_steps(pack: Pack, day: Day) -> None:
+    plant = TwinPlant(
+        with_sensors(pack, current_step_a=0.5, voltage_step_v=0.25, temperature_step_k=1.0)
+    )
+    log = record_day(plant, day, ()).log
+    for values, step in ((log.current_a, 0.5), (log.voltage_v, 0.25), (log.temperature_c, 1.0)):
+        np.testing.assert_allclose(values / step, np.rint(values / step), atol=1e-6)
+
+
+def test_only_the_start_of_the_charge_is_told(plant: TwinPlant, day: Day) -> None:
+    log = record_day(plant, day, ()).log
+    assert log.soc_pct is not None
+    assert log.soc_pct[0] == pytest.approx(90.0, abs=0.6)
+    assert np.all(np.isnan(log.soc_pct[1:]))
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 2.0, 5.0, 10.0])
+def test_frames_come_at_the_rate_with_jitter_and_losses(rate_hz: float) -> None:
+    rng = np.random.default_rng(4)
+    pack = with_sensors(draw_pack(rng, "leaf40"), rate_hz=rate_hz, jitter=0.05, drop_share=0.01)
+    day = draw_day(rng, pack, hours=0.4)
+    log = record_day(TwinPlant(pack), day, ()).log
+    intervals = np.diff(log.time_s)
+    assert np.median(intervals) == pytest.approx(1.0 / rate_hz, rel=0.02)
+    assert 0.02 < np.std(intervals[intervals < 1.5 / rate_hz]) * rate_hz < 0.1
+    expected = log.duration_s * rate_hz
+    assert 0.97 * expected < len(log) < 0.9985 * expected
+
+
+def test_the_floor_is_what_a_perfect_model_cannot_avoid(plant: TwinPlant, day: Day) -> None:
+    recording = record_day(plant, day, ())
+    assert np.all(recording.gap_v == 0.0)
+    sensors = plant.pack.sensors
+    least = np.hypot(sensors.voltage_noise_v, sensors.voltage_step_v / np.sqrt(12.0))
+    assert 0.95 * least < rms(recording.floor_v) < 4.0 * least + 0.3
+    error = recording.log.voltage_v - recording.expected_voltage_v
+    assert rms(error) < 1.3 * rms(recording.floor_v) + 0.05
+
+
+def test_a_car_stops_before_its_weakest_cell_is_ruined(plant: TwinPlant, day: Day) -> None:
+    whole = record_day(plant, day, ()).log
+    short = record_day(plant, day, (Fault("capacity", 0.4),)).log
+    assert short.duration_s < 0.9 * whole.duration_s
+    assert short.voltage_v.min() / plant.pack.cells > 2.0
