@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from cangauge.errors import InputError
 from cangauge.estimate.coulomb import CoulombCounter
 from cangauge.estimate.estimator import Estimator, EstimatorSettings
-from cangauge.estimate.inverse import soc_from_ocv
 from cangauge.estimate.offline import estimate_log, run_estimator, samples_of
 from cangauge.estimate.types import Reason, Sample, Status
 from cangauge.identify.fit import FitOptions, fit
+from cangauge.model.inverse import soc_from_ocv
 from cangauge.model.model_file import ModelFile
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 from synthetic import synthetic_log

@@ -14,7 +14,6 @@ from typing import Literal
 from cangauge.errors import InputError
 from cangauge.estimate.coulomb import ChargeStep, CoulombCounter
 from cangauge.estimate.fusion import UNKNOWN_SOC_STD_PCT, Fusion, Measurement
-from cangauge.estimate.inverse import Inverse, soc_from_ocv
 from cangauge.estimate.types import Estimate, Reason, Sample, Status
 from cangauge.estimate.validity import (
     acceptable,
@@ -27,6 +26,7 @@ from cangauge.estimate.validity import (
 from cangauge.logs.log import TemperatureSource
 from cangauge.model.delay_line import GAP_S, DelayLine
 from cangauge.model.effects.effect import Reading
+from cangauge.model.inverse import Inverse, soc_from_ocv
 from cangauge.model.model_file import ModelFile, effective_error_std_v
 
 Method = Literal["ekf", "newton", "coulomb"]

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cangauge.estimate.inverse import soc_from_ocv
 from cangauge.identify.rows import FitRows
+from cangauge.model.inverse import soc_from_ocv
 from cangauge.model.voltage_model import VoltageModel
 
 FloatArray = NDArray[np.float64]

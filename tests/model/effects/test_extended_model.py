@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stepping import EFFECTS, MODEL, irregular_signals, middle, step_through
 
-from cangauge.estimate.inverse import soc_from_ocv
 from cangauge.identify.rows import fit_rows
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.effects.effect import Reading, Signals
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.extended import ExtendedModel
+from cangauge.model.inverse import soc_from_ocv
 from cangauge.model.published import CAPACITY_AH
 from synthetic import synthetic_log
 
