@@ -116,8 +116,12 @@ def _within_bounds(
     )
     solution = found[: p + repairs.size].copy()
     solution[:p] /= frame.scale
-    widths = np.cumsum([len(frame.choices[k].amplitudes) for k in chosen])[:-1]
-    return solution, np.split(found[first:], widths)
+    amplitudes, begin = [], first
+    for k in chosen:
+        end = begin + len(frame.choices[k].amplitudes)
+        amplitudes.append(found[begin:end])
+        begin = end
+    return solution, amplitudes
 
 
 def _root(matrix: FloatArray) -> FloatArray:
