@@ -107,7 +107,7 @@ def test_commands_can_refuse_a_turned_log() -> None:
     with pytest.raises(
         InputError,
         match=r"drive: current_a: the sign of current is turned: volt.*"
-        r"in 0 of \d+ steps.*multiply the column by -1",
+        r"age moved with current in (\d+) of \1 steps.*multiply the column by -1",
     ):
         require_discharge_positive(turned(log))
 

@@ -36,9 +36,11 @@ from cangauge.estimate.types import Reason
 from cangauge.logs.read import CaptureGivenError
 from cangauge.model.delay_line import GAP_S
 from cangauge.model.model_file import ModelFile, load_model
-from cangauge.report.words import number, reason_name
+from cangauge.report.words import number, reason_name, reason_names
 
 AUTO = "auto"
+DOUBTFUL_VALID, DOUBTFUL_COVER = 0.1, 0.5
+"""Below these fractions (of valid samples, of the reference within 2σ) the user is warned."""
 
 
 def estimate_command(  # noqa: PLR0917 - typer passes options by name
@@ -156,11 +158,30 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
         write_estimates(part, done.recorded.time_s, done.table)
         if page is not None and report is not None:
             both.enter_context(atomic_path(report)).write_text(page, encoding="utf-8")
+    _warn(done, model)
     if json_output:
         emit_json(_as_json(done, model) | {"output": str(output), "report": report and str(report)})
         return
     _show(done)
     note(f"estimates: {output}" + (f"\nreport: {report}" if report else ""))
+
+
+def _warn(done: Estimated, model: ModelFile) -> None:
+    """Say on stderr what makes the estimate doubtful as a whole."""
+    scores, name = done.scores, done.recorded.source or done.recorded.name
+    if scores.valid_fraction < DOUBTFUL_VALID:
+        words = reason_names(int(np.bitwise_or.reduce(done.table.reasons)))
+        note(
+            f"warning: {name}: only {100.0 * scores.valid_fraction:.0f} % of the samples have a"
+            f" valid estimate ({words}); is {model.name} the model of this pack, at these"
+            " temperatures?"
+        )
+    if scores.cover_2sigma is not None and scores.cover_2sigma < DOUBTFUL_COVER:
+        note(
+            f"warning: {name}: the reference SoC lies within 2σ in only"
+            f" {100.0 * scores.cover_2sigma:.0f} % of the samples; is {model.name} the model of"
+            " this pack, and is its capacity right?"
+        )
 
 
 def _method(given: str) -> Method:

@@ -194,9 +194,13 @@ def _delays(given: str) -> tuple[float, ...]:
             "not a list of seconds", field="--delays", value=given, cure=cure
         ) from error
     increasing = all(low < high for low, high in pairwise(delays))
-    if not (delays[0] >= 0.0 and increasing and delays[-1] <= 3600.0):
+    # Without the current now, slope resistance and heat would lose their meaning.
+    if not (delays[0] == 0.0 and increasing and delays[-1] <= 3600.0):
         raise InputError(
-            "delays must increase within 0 … 3600 s", field="--delays", value=given, cure=cure
+            "delays must begin with 0 and increase to 3600 s at most",
+            field="--delays",
+            value=given,
+            cure=cure,
         )
     return delays
 

@@ -198,6 +198,11 @@ def _run(config: RunConfig) -> dict[str, Any]:
         )
         summary = serve(port, gauge, config.loop_settings(), outputs, stop)
     note(_summary_line(gauge, summary))
+    if not gauge.counts.frames:
+        note(
+            f"warning: {port.name}: no wanted frame arrived; check channel, bit rate and the car"
+            " (--vehicle, or --dbc and --map)"
+        )
     for path in written:
         note(f"written: {path}")
     return _as_json(gauge, port, summary, config)

@@ -154,7 +154,6 @@ def require_discharge_positive(log: Log) -> None:
             f"the sign of current is turned: {finding.evidence[0].text}",
             source=log.source or log.name,
             field="current_a",
-            value=finding.sign,
             cure="multiply the column by -1: positive current discharges",
         )
 
@@ -183,8 +182,12 @@ def _from_steps(log: Log) -> Evidence:
     cast = fell + rose
     if cast == 0:
         return Evidence("steps", 0.0, "no clear step of current")
-    text = f"voltage moved against current in {fell} of {cast} steps"
     larger = max(fell, rose)
+    text = (
+        f"voltage moved against current in {fell} of {cast} steps"
+        if fell >= rose
+        else f"voltage moved with current in {rose} of {cast} steps"
+    )
     share = larger / cast
     # Steps follow one another and share slow voltage changes: votes count for fewer.
     free = max(1, round(cast / VOTES_PER_FREE_ONE))

@@ -125,7 +125,12 @@ class ModelFile(_Strict):
         given = set(self.coefficients)
         if given != wanted:
             missing, extra = sorted(wanted - given), sorted(given - wanted)
-            raise ValueError(f"coefficients: missing {missing}, not known {extra}")
+            words = [f"missing are {', '.join(missing)}"] if missing else []
+            words += [f"not known are {', '.join(extra)}"] if extra else []
+            count = len(self.delays_s)
+            raise ValueError(
+                f"coefficients: {'; '.join(words)} ({count} delays_s need R1 … R{count})"
+            )
         return self
 
     def voltage_model(self) -> VoltageModel:
@@ -226,7 +231,7 @@ def _as_input_error(error: ValidationError, path: Path) -> InputError:
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
     value = first["input"]
     return InputError(
-        first["msg"] + more,
+        first["msg"].removeprefix("Value error, ") + more,
         source=path,
         field=".".join(str(part) for part in first["loc"]) or None,
         value=value if isinstance(value, str | int | float) else None,
