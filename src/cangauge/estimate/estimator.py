@@ -129,7 +129,6 @@ class Estimator:
         self._gap_until_s = -math.inf
         self._contradicted_until_s = -math.inf
         self._rest_since_s = math.nan
-        self._prediction = (math.nan, math.nan)
         self._last_estimate = _nothing_yet()
         if self.settings.initial_soc_pct is not None:
             start = self._online.initial_soc_pct(self.settings.initial_soc_pct)

@@ -71,12 +71,6 @@ class Evidence:
         """Return where candidate k's amplitudes are."""
         return slice(int(self.frame.first[k]), int(self.frame.first[k + 1]))
 
-    def solution(self, k: int, amplitude: FloatArray) -> FloatArray:
-        """Return δθ (scaled) and repairs once candidate k has these amplitudes."""
-        whole = self.mean - self.per_amplitude[:, self.of(k)] @ amplitude
-        shared = self.frame.scale.size + self.frame.amplitudes_of(self.frame.repairs).size
-        return whole[:shared]
-
 
 @dataclass(frozen=True, eq=False)
 class Score:

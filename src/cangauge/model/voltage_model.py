@@ -198,11 +198,6 @@ class VoltageModel:
 
     # --- facts of the model ---------------------------------------------------------------
 
-    @property
-    def number_of_coefficients(self) -> int:
-        """Coefficients that the least-squares fit finds: 8 + kt + resistances."""
-        return len(self.ocv_v) + 1 + len(self.resistance_ohm)
-
     @cached_property
     def _slope_beyond(self) -> tuple[float, float]:
         """Slopes of the straight lines below and above the identified SoC [V per %]."""
