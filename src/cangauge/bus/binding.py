@@ -12,8 +12,10 @@ from cantools.database.can import Database, Message, Signal
 
 from cangauge.bus.bound import EXTENDED, BoundSignal, MessageRule, Role, Vehicle
 from cangauge.bus.database import find_message, find_signal, load_dbc
-from cangauge.bus.mapping import SignalMap, VehicleMap
-from cangauge.bus.protection import RULES, ProtectionRule
+from cangauge.bus.mapping import CheckMap, RuleMap, SignalMap, VehicleMap
+from cangauge.bus.overrides import NO_OVERRIDES, Overrides
+from cangauge.bus.rule_choice import choose_rule
+from cangauge.bus.signal_checks import SignalChecks, checks_of
 from cangauge.bus.signal_codec import SignalCodec, signal_codec
 from cangauge.errors import InputError
 from cangauge.logs.units import convert
@@ -24,7 +26,6 @@ _LOG_FIELD: Final = {
     "temperature": "temperature_c",
     "soc_reference": "soc_pct",
 }
-_TIMEOUT_S: Final = {"current": 2.0, "voltage": 2.0, "temperature": 10.0, "soc_reference": 10.0}
 
 
 def bind_vehicle(
@@ -34,6 +35,7 @@ def bind_vehicle(
     source: str | PathLike[str],
     temperature_c: float | None = None,
     pair_within_s: float | None = None,
+    overrides: Overrides = NO_OVERRIDES,
 ) -> Vehicle:
     """Find the mapping's signals in the DBC files.
 
@@ -46,6 +48,8 @@ def bind_vehicle(
         Where the mapping comes from, for messages.
     temperature_c, pair_within_s : float, optional
         Instead of the mapping's.
+    overrides : Overrides, optional
+        Protection and checks that go before the mapping's.
 
     Raises
     ------
@@ -53,7 +57,7 @@ def bind_vehicle(
         As `load_vehicle`.
     """
     databases = [load_dbc(path) for path in dbc_files]
-    binder = _Binder(mapping, databases, dbc_files, str(source))
+    binder = _Binder(mapping, databases, dbc_files, str(source), overrides)
     temperature = mapping.temperature
     fixed = temperature_c if temperature_c is not None else None
     if fixed is None and temperature is not None:
@@ -84,12 +88,18 @@ class _Binder:
     """Finds the signals of one mapping and remembers the messages that they are in."""
 
     def __init__(
-        self, mapping: VehicleMap, databases: list[Database], files: list[Path], source: str
+        self,
+        mapping: VehicleMap,
+        databases: list[Database],
+        files: list[Path],
+        source: str,
+        overrides: Overrides,
     ) -> None:
         self._mapping = mapping
         self._databases = databases
         self._files = files
         self._source = source
+        self._overrides = overrides
         self._found: dict[int, Message] = {}
 
     def signal(self, role: Role, wanted: SignalMap) -> BoundSignal:
@@ -114,25 +124,34 @@ class _Binder:
             gain=wanted.sign * wanted.scale * factor,
             # A stated offset is in the canonical unit; the sign does not turn it.
             offset=wanted.offset + wanted.sign * offset,
-            timeout_s=wanted.timeout_s or _TIMEOUT_S[role],
+            checks=self._checks(role, wanted),
         )
 
     def messages(self) -> dict[int, MessageRule]:
         """Return protection and period of the messages found so far."""
-        stated = {}
-        for name, message_map in self._mapping.messages.items():
-            message = self._message(name)
-            key = message.frame_id | (EXTENDED if message.is_extended_frame else 0)
-            stated[key] = message_map
+        stated = self._overrides.stated_messages(self._mapping, self._source, self._key)
+        own: dict[str, RuleMap] = {**self._mapping.rules, **self._overrides.rules}
         rules: dict[int, MessageRule] = {}
         for key, message in self._found.items():
-            each = stated.get(key)
+            each, source = stated.get(key, (None, self._source))
             period = None if each is None else each.period_s
             if period is None and message.cycle_time:
                 period = message.cycle_time / 1000.0
-            rule = None if each is None else self._rule(message, each.protection)
+            rule = None if each is None else choose_rule(message, each, own, source=source)
             rules[key] = MessageRule(rule, period)
         return rules
+
+    def _checks(self, role: Role, wanted: SignalMap) -> SignalChecks:
+        first = self._overrides.checks.get(role, CheckMap())
+        checks = checks_of(role, wanted, first)
+        if checks.lowest >= checks.highest:
+            raise InputError(
+                "nothing lies between lowest and highest",
+                source=self._source,
+                field=role,
+                value=f"{checks.lowest:g} … {checks.highest:g}",
+            )
+        return checks
 
     def _find(self, role: Role, wanted: SignalMap) -> tuple[Message, Signal, Path]:
         first: InputError | None = None
@@ -147,14 +166,16 @@ class _Binder:
                 return message, signal, file
         raise first or InputError("no DBC is given", field=role)
 
-    def _message(self, name: str) -> Message:
-        """Return the message that a key of [messages] means."""
+    def _key(self, name: str) -> int:
+        """Return the key of the message that a key of [messages] means."""
         first: InputError | None = None
         for database, file in zip(self._databases, self._files, strict=True):
             try:
-                return find_message(database, name, source=file, field=f"messages.{name}")
+                message = find_message(database, name, source=file, field=f"messages.{name}")
             except InputError as error:
                 first = first or error
+            else:
+                return message.frame_id | (EXTENDED if message.is_extended_frame else 0)
         raise first or InputError("no DBC is given", field=f"messages.{name}")
 
     def _unit(self, role: Role, wanted: SignalMap, codec: SignalCodec) -> tuple[float, float]:
@@ -176,27 +197,3 @@ class _Binder:
                 " (scale = 1 takes it as it is)",
             ) from error
         return float(ends[1] - ends[0]), float(ends[0])
-
-    def _rule(self, message: Message, name: str | None) -> ProtectionRule | None:
-        if name is None:
-            return None
-        field = f"messages.{message.name}.protection"
-        own = self._mapping.rules.get(name)
-        rule = own.rule(name) if own is not None else RULES.get(name)
-        if rule is None:
-            known = ", ".join([*RULES, *self._mapping.rules])
-            raise InputError(
-                "unknown protection rule",
-                source=self._source,
-                field=field,
-                value=name,
-                cure=f"known are {known}; or define it under [rules.{name}]",
-            )
-        if not rule.fits(message.length):
-            raise InputError(
-                f"the rule does not fit into the {message.length} bytes of the message",
-                source=self._source,
-                field=field,
-                value=name,
-            )
-        return rule

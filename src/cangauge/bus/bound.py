@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cangauge.bus.protection import ProtectionRule
+from cangauge.bus.protection import Protection
+from cangauge.bus.signal_checks import SignalChecks
 from cangauge.bus.signal_codec import SignalCodec
 from cangauge.logs.log import FloatArray, TemperatureSource
 
@@ -33,8 +34,8 @@ class BoundSignal:
     codec : SignalCodec
     gain, offset : float
         value = gain × (value in the DBC's unit) + offset, in A (positive = discharge), V, °C, %.
-    timeout_s : float
-        The value holds for so long [s].
+    checks : SignalChecks
+        When its values are believed.
     """
 
     role: Role
@@ -44,7 +45,7 @@ class BoundSignal:
     codec: SignalCodec
     gain: float
     offset: float
-    timeout_s: float
+    checks: SignalChecks = field(default_factory=SignalChecks)
 
     def decode(self, payload: bytes | bytearray) -> float:
         """Return the value in A, V, °C or % of a payload of `length` bytes; NaN: not available."""
@@ -95,7 +96,7 @@ class BoundSignal:
 class MessageRule:
     """Protection and period of one message."""
 
-    rule: ProtectionRule | None
+    rule: Protection | None
     period_s: float | None
 
 

@@ -23,6 +23,12 @@ class MessageCounters:
     """Refused: fewer bytes than the DBC says."""
     not_available: int = 0
     """Values refused because the code means "not available"."""
+    implausible: int = 0
+    """Values refused because they are out of range or changed too fast."""
+    stuck: int = 0
+    """Values refused because the signal stands still while it should move."""
+    held_back: int = 0
+    """Good values not used yet, because too many before them failed."""
 
 
 @dataclass(slots=True)
@@ -87,6 +93,21 @@ class Counters:
         """Values refused because their code means "not available"."""
         return self._sum("not_available")
 
+    @property
+    def implausible(self) -> int:
+        """Values refused because they are out of range or changed too fast."""
+        return self._sum("implausible")
+
+    @property
+    def stuck(self) -> int:
+        """Values refused because their signal stands still while it should move."""
+        return self._sum("stuck")
+
+    @property
+    def held_back(self) -> int:
+        """Good values not used yet, because too many before them failed."""
+        return self._sum("held_back")
+
     def to_dict(self) -> dict[str, object]:
         """Return totals, and the counters of every message by its id ("0x1DB")."""
         totals = {
@@ -105,6 +126,9 @@ class Counters:
                 "frames_lost",
                 "short",
                 "not_available",
+                "implausible",
+                "stuck",
+                "held_back",
             )
         }
         per_message = {

@@ -8,8 +8,11 @@ from dataclasses import dataclass
 import can
 
 from cangauge.bus.counters import Counters, MessageCounters
+from cangauge.bus.input_health import InputHealth
 from cangauge.bus.pairing import Pairing
 from cangauge.bus.protection import FrameChecker, Verdict
+from cangauge.bus.signal_health import Fault
+from cangauge.bus.stuck import Pack
 from cangauge.bus.vehicle import EXTENDED, BoundSignal, Vehicle
 from cangauge.estimate.types import Sample
 
@@ -31,39 +34,38 @@ class SampleAssembler:
     """Makes samples from a vehicle's frames; pure, driven by the frames' time stamps alone.
 
     Refused are frames with a wrong CRC, with a counter that stands still, or that are too short,
-    and values whose code means "not available". A counter that jumps is counted as a loss, and
-    the frame is used. Error frames and remote frames are ignored, and so are extended ids where
-    the DBC means standard ones. Current and voltage pair as `pairing` says. Temperature is the
-    last value while it is not older than its time-out, else NaN.
+    and values whose code means "not available", that are out of range, change too fast or are
+    stuck; what follows from several of them in a row, `signal_health` says. A counter that jumps
+    is counted as a loss, and the frame is used. Error frames and remote frames are ignored, and
+    so are extended ids where the DBC means standard ones. Current and voltage pair as `pairing`
+    says. Temperature is the last value while it is trusted and not older than its time-out, else
+    NaN.
 
     Parameters
     ----------
     vehicle : Vehicle
+    pack : Pack, optional
+        What the model knows of the pack; see `InputHealth`.
 
     Attributes
     ----------
+    health : InputHealth
+        What is known of the signals; to be read only.
     wanted_ids : tuple of int
         Arbitration ids worth receiving, for filters in the kernel (see `Vehicle.filters`).
     counters : Counters
         What happened to the frames so far.
-    last_update_s : dict of str to float
-        Bus time of the last accepted value by role ("current", "voltage", "temperature",
-        "soc_reference") [s]; NaN before the first.
     """
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle: Vehicle, pack: Pack | None = None) -> None:
         self.vehicle = vehicle
         self.wanted_ids = vehicle.wanted_ids
-        self.last_update_s = {signal.role: math.nan for signal in vehicle.signals}
         self._pairing = Pairing(vehicle.pair_within_s)
         self._routes: dict[int, _Route] = {}
         for signal in vehicle.signals:
             self._add(signal)
+        self.health = InputHealth(vehicle, pack)
         self._counters = Counters({key: route.counters for key, route in self._routes.items()})
-        self._temperature_c = vehicle.fixed_temperature_c
-        self._temperature_until_s = math.inf if vehicle.temperature is None else -math.inf
-        self._soc_pct = math.nan
-        self._soc_until_s = -math.inf
         self._now_s = -math.inf
 
     def _add(self, signal: BoundSignal) -> None:
@@ -81,6 +83,19 @@ class SampleAssembler:
             route.slow = (*route.slow, signal)
 
     @property
+    def last_update_s(self) -> dict[str, float]:
+        """Bus time of the last good value by role [s]; NaN before the first.
+
+        Roles are "current", "voltage", "temperature" and "soc_reference".
+        """
+        return self.health.latest_s
+
+    @property
+    def now_s(self) -> float:
+        """Bus time of the latest wanted frame [s]; −inf before the first."""
+        return self._now_s
+
+    @property
     def counters(self) -> Counters:
         """What happened to the frames so far; kept up to date."""
         self._counters.current_unpaired = self._pairing.current_unpaired
@@ -90,7 +105,7 @@ class SampleAssembler:
     @property
     def reference_soc_pct(self) -> float:
         """The car's own state of charge [%]; NaN when there is none within its time-out."""
-        return self._soc_pct if self._now_s <= self._soc_until_s else math.nan
+        return self.health.latest("soc_reference", self._now_s)
 
     def handle(self, message: can.Message) -> Sample | None:
         """Take one frame; return the sample that it completes, if any.
@@ -111,11 +126,11 @@ class SampleAssembler:
         if message.is_error_frame or message.is_remote_frame:
             counters.ignored += 1
             return None
-        payload = self._accept(route, message)
+        payload = self._accept(key, route, message)
         if payload is None:
             return None
         for signal in route.slow:
-            self._take_slow(route, signal, payload, message.timestamp)
+            self._read(route, signal, payload, message.timestamp)
         if route.current is None and route.voltage is None:
             return None
         sample = self._take_fast(route, payload, message.timestamp)
@@ -130,64 +145,43 @@ class SampleAssembler:
             self._counters.samples += 1
         return sample
 
-    def _accept(self, route: _Route, message: can.Message) -> bytearray | None:
+    def _accept(self, key: int, route: _Route, message: can.Message) -> bytearray | None:
         """Return the payload, cut to the message's length, if the frame is to be used."""
         fate, time_s = route.counters, message.timestamp
         fate.wanted += 1
+        if time_s < route.last_s:
+            self._restart(route.last_s, time_s)
+        self._now_s = time_s
         payload = message.data
         length = route.length
         if len(payload) != length:
             if len(payload) < length:
                 fate.short += 1
+                self.health.refused(key, Fault.PROTECTION)
                 return None
             payload = payload[:length]
-        if time_s < route.last_s:
-            self._restart(route, time_s)
         checker = route.checker
         if checker is not None:
             verdict = checker.check(payload, time_s)
             if verdict is not Verdict.GOOD:
                 if verdict is Verdict.CRC_WRONG:
                     fate.crc_errors += 1
+                    self.health.refused(key, Fault.PROTECTION)
                     return None
                 if verdict is Verdict.REPEATED:
                     fate.counter_repeats += 1
+                    self.health.refused(key, Fault.REPEATED)
                     return None
                 fate.counter_jumps += 1
                 fate.frames_lost += checker.lost
         route.last_s = time_s
-        self._now_s = time_s
         return payload
 
-    def _restart(self, route: _Route, time_s: float) -> None:
+    def _restart(self, last_s: float, time_s: float) -> None:
         """Time runs backwards: a log that starts again, or a clock that was set."""
         self._counters.time_reversals += 1
-        if route.last_s - time_s > self.vehicle.pair_within_s:
-            if self.vehicle.temperature is not None:
-                self._temperature_until_s = min(
-                    self._temperature_until_s, time_s + self.vehicle.temperature.timeout_s
-                )
-            if self.vehicle.soc_reference is not None:
-                self._soc_until_s = min(
-                    self._soc_until_s, time_s + self.vehicle.soc_reference.timeout_s
-                )
-
-    def _take_slow(
-        self, route: _Route, signal: BoundSignal, payload: bytearray, time_s: float
-    ) -> None:
-        if not signal.codec.is_in(payload):
-            return
-        value = signal.decode(payload)
-        if math.isnan(value):
-            route.counters.not_available += 1
-            return
-        self.last_update_s[signal.role] = time_s
-        if signal.role == "temperature":
-            self._temperature_c = value
-            self._temperature_until_s = time_s + signal.timeout_s
-        else:
-            self._soc_pct = value
-            self._soc_until_s = time_s + signal.timeout_s
+        if last_s - time_s > self.vehicle.pair_within_s:
+            self.health.rewind(time_s)
 
     def _take_fast(self, route: _Route, payload: bytearray, time_s: float) -> Sample | None:
         current_a = self._read(route, route.current, payload, time_s)
@@ -208,15 +202,12 @@ class SampleAssembler:
     def _read(
         self, route: _Route, signal: BoundSignal | None, payload: bytearray, time_s: float
     ) -> float:
-        """Return the value; NaN if the frame does not hold it or it is not available."""
+        """Return the value; NaN if the frame does not hold it or it is not to be used."""
         if signal is None or (signal.codec.conditions and not signal.codec.is_in(payload)):
             return math.nan
-        value = signal.decode(payload)
-        if math.isnan(value):
-            route.counters.not_available += 1
-        else:
-            self.last_update_s[signal.role] = time_s
-        return value
+        return self.health.passed(signal, signal.decode(payload), time_s, route.counters)
 
     def _temperature_at(self, time_s: float) -> float:
-        return self._temperature_c if time_s <= self._temperature_until_s else math.nan
+        if self.vehicle.temperature is None:
+            return self.vehicle.fixed_temperature_c
+        return self.health.latest("temperature", time_s)

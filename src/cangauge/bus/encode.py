@@ -10,7 +10,7 @@ from typing import Final
 import can
 import numpy as np
 
-from cangauge.bus.protection import ProtectionRule
+from cangauge.bus.protection import Protection
 from cangauge.bus.signal_codec import Condition
 from cangauge.bus.vehicle import BoundSignal, Vehicle
 from cangauge.errors import InputError
@@ -36,7 +36,7 @@ class _Outgoing:
     """One frame to send: signals of one message that can stand in one payload."""
 
     signals: tuple[BoundSignal, ...]
-    rule: ProtectionRule | None
+    rule: Protection | None
     is_slow: bool
     last: bytes = b""
     last_s: float = -math.inf

@@ -11,6 +11,13 @@ A map file in TOML, for any car with a DBC::
     message = "BMS_Status"          # name or id ("0x1DB"); optional where the signal is unique
     signal = "PackCurrent"
     sign = -1                       # -1: on the bus, negative current discharges
+    lowest = -400                   # optional, as all below: [A], [V], [°C], in cangauge's sign
+    highest = 400
+    max_jump = 300                  # between two values, whatever the time between them …
+    max_rate_per_s = 5000           # … and so much more a second
+    invalid_after = 5               # refused values in a row, then the signal is invalid …
+    valid_after = 3                 # … until so many good ones in a row
+    timeout_s = 0.5                 # without: from the message's period
 
     [voltage]
     signal = "PackVoltage"
@@ -23,8 +30,21 @@ A map file in TOML, for any car with a DBC::
     signal = "DisplaySoc"
 
     [messages.BMS_Status]           # optional
-    protection = "my_rule"          # leaf, generic, crc_only, or one of [rules]
-    period_s = 0.01
+    protection = "my_rule"          # leaf, generic, crc_only, counter, e2e_01, e2e_02, e2e_04,
+                                    # e2e_05, e2e_06, e2e_07, e2e_11, or one of [rules]
+    period_s = 0.01                 # without: the DBC's, or learned from the frames
+
+    [messages.BMS_Temps]
+    protection = "e2e_05"           # AUTOSAR end-to-end protection
+    data_id = 0x1234                # e2e_02: data_id_list = [16 numbers of 0-255]
+    # data_id_mode = "nibble"       # e2e_01, e2e_11: both (default), alternating, low, nibble
+    # header_byte = 0               # where the header begins
+    # protected_bytes = 8           # default: all bytes of the message
+
+    [messages.BMS_Limits]
+    protection = "counter"          # no CRC that is known
+    counter = "AliveCounter"        # signal of the DBC
+    counter_modulus = 15            # default: all values of its bits
 
     [rules.my_rule]
     polynomial = 0x2F
@@ -37,10 +57,11 @@ A map file in TOML, for any car with a DBC::
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
+from cangauge.bus.e2e_rule import LIST_LENGTH, DataIdMode
 from cangauge.bus.protection import ProtectionRule
 from cangauge.logs.log import TemperatureSource
 
@@ -56,7 +77,44 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
 
 
-class SignalMap(_Strict):
+class CheckMap(_Strict):
+    """When values of a signal are believed; what is not stated is by default (`checks_of`).
+
+    Parameters
+    ----------
+    lowest, highest : float, optional
+        What a value can be [A, positive = discharge; V; °C; %].
+    max_jump, max_rate_per_s : float, optional
+        A value may differ from the one before by `max_jump`, and by `max_rate_per_s` more for
+        every second between them [A, V, K, %].
+    invalid_after, valid_after : int, optional
+        So many refused values in a row make the signal invalid; so many good ones valid again.
+    stuck_after_s : float, optional
+        Standing still for so long is suspicious [s]: current and voltage while the other one
+        moves, temperature whatever the others do (only where this is stated).
+    timeout_s : float, optional
+        The value holds for so long [s]; by default a multiple of the message's period.
+    """
+
+    lowest: FiniteFloat | None = None
+    highest: FiniteFloat | None = None
+    max_jump: _Positive | None = None
+    max_rate_per_s: Annotated[FiniteFloat, Field(ge=0.0)] | None = None
+    invalid_after: Annotated[int, Field(ge=1, le=1000)] | None = None
+    valid_after: Annotated[int, Field(ge=1, le=1000)] | None = None
+    stuck_after_s: _Positive | None = None
+    timeout_s: _Positive | None = None
+
+    @model_validator(mode="after")
+    def _a_range(self) -> Self:
+        if self.lowest is not None and self.highest is not None and self.lowest >= self.highest:
+            raise ValueError("lowest must lie below highest")
+        if self.max_rate_per_s is not None and self.max_jump is None:
+            raise ValueError("max_rate_per_s needs max_jump, at least a step of the signal")
+        return self
+
+
+class SignalMap(CheckMap):
     """One signal of the DBC and what it means: value = sign × scale × (DBC value) + offset.
 
     Parameters
@@ -72,8 +130,8 @@ class SignalMap(_Strict):
         Raw values that other signals of the frame must have (multiplexers that the DBC lacks).
     not_available : tuple of int
         Raw codes that mean "no value", besides those that the DBC's value table names so.
-    timeout_s : float, optional
-        The value holds for so long [s].
+    lowest, … timeout_s
+        As in `CheckMap`.
     """
 
     message: str | int | None = None
@@ -83,7 +141,6 @@ class SignalMap(_Strict):
     offset: FiniteFloat = 0.0
     when: dict[str, int] = Field(default_factory=dict)
     not_available: tuple[int, ...] = ()
-    timeout_s: _Positive | None = None
 
     @property
     def states_unit(self) -> bool:
@@ -105,10 +162,32 @@ class TemperatureMap(SignalMap):
 
 
 class MessageMap(_Strict):
-    """What is known of a message: its protection, and its period when no frame is lost [s]."""
+    """What is known of a message: its protection, and its period when no frame is lost [s].
+
+    Parameters
+    ----------
+    protection : str, optional
+        A rule that is known, one of [rules], "counter", or a profile of `e2e_rule.PROFILES`.
+    period_s : float, optional
+    data_id, data_id_list, data_id_mode, header_byte, protected_bytes
+        Of a profile; see `E2eRule`.
+    counter : str, optional
+        Signal that counts, for "counter".
+    counter_modulus : int, optional
+        Its number of values, where they are not all that its bits can hold.
+    """
 
     protection: str | None = None
     period_s: _Positive | None = None
+    data_id: Annotated[int, Field(ge=0, lt=1 << 32)] | None = None
+    data_id_list: (
+        Annotated[tuple[_Byte, ...], Field(min_length=LIST_LENGTH, max_length=LIST_LENGTH)] | None
+    ) = None
+    data_id_mode: DataIdMode | None = None
+    header_byte: Annotated[int, Field(ge=0, le=63)] | None = None
+    protected_bytes: Annotated[int, Field(ge=1, le=64)] | None = None
+    counter: str | None = None
+    counter_modulus: Annotated[int, Field(ge=3, lt=1 << 32)] | None = None
 
 
 class RuleMap(_Strict):

@@ -1,15 +1,18 @@
 """Counter and CRC: which frames are new and whole, and how many are missing between them.
 
 A frame with a wrong CRC, or whose counter repeats, is refused. A counter that jumps while the
-CRC agrees means that frames were lost: they are counted and the frame is used.
+CRC agrees means that frames were lost: they are counted and the frame is used. Rules: those of
+known cars and a user's own here, the profiles of AUTOSAR in `e2e_rule`, a counter without a CRC
+in `counter_rule`.
 """
 
 from __future__ import annotations
 
 import enum
+import math
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Final
+from typing import Final, Protocol
 
 from cangauge.errors import InputError
 
@@ -25,6 +28,30 @@ class Verdict(enum.IntEnum):
     """Refused: damaged."""
     REPEATED = 3
     """Refused: the counter stands still, so this is no new frame."""
+
+
+class Protection(Protocol):
+    """How a message shows that it is new and whole."""
+
+    @property
+    def name(self) -> str:
+        """What a mapping calls it."""
+
+    @property
+    def modulus(self) -> int:
+        """How many values the counter has; 0 without a counter."""
+
+    def fits(self, length: int) -> bool:
+        """Return whether a payload of so many bytes has room for it."""
+
+    def is_whole(self, data: bytes | bytearray) -> bool:
+        """Return whether the CRC agrees, and the counter is one that there is."""
+
+    def counter(self, data: bytes | bytearray) -> int:
+        """Return the counter of a payload; 0 without a counter."""
+
+    def protect(self, data: bytes | bytearray, counter: int) -> bytes:
+        """Return the payload with counter (taken modulo `modulus`) and CRC set."""
 
 
 @lru_cache(maxsize=64)
@@ -118,6 +145,10 @@ class ProtectionRule:
             crc = table[crc ^ byte]
         return crc ^ self.xor_out
 
+    def is_whole(self, data: bytes | bytearray) -> bool:
+        """Return whether the CRC agrees."""
+        return self.crc(data) == data[self.crc_byte]
+
     def counter(self, data: bytes | bytearray) -> int:
         """Return the counter of a payload; 0 without a counter."""
         return (data[self.counter_byte] >> self.counter_shift) & self.counter_mask
@@ -154,6 +185,10 @@ RULES: Final = {rule.name: rule for rule in (LEAF_RULE, GENERIC_RULE, CRC_ONLY_R
 SILENCE_S: Final = 2.0
 """After so long without a frame the sender may have begun anew, with any counter [s]."""
 
+WIDE: Final = 256
+"""A counter of so many values or more does not go round in no time: one that goes back sooner is
+that of a sender that began anew, or of a frame out of its order, and proves no loss."""
+
 
 class FrameChecker:
     """Checks the frames of one message, one after the other.
@@ -163,7 +198,7 @@ class FrameChecker:
 
     Parameters
     ----------
-    rule : ProtectionRule
+    rule : Protection
     period_s : float, optional
         Time between frames when none is lost [s]. Without it a standing counter is a repetition
         unless `SILENCE_S` went by without a frame.
@@ -175,11 +210,24 @@ class FrameChecker:
         whole rounds of it that went by unseen do not show.
     """
 
-    __slots__ = ("_half_round_s", "_last", "_last_s", "_refused", "_rule", "lost")
+    __slots__ = (
+        "_half_round_s",
+        "_last",
+        "_last_s",
+        "_modulus",
+        "_period_s",
+        "_refused",
+        "_rule",
+        "lost",
+    )
 
-    def __init__(self, rule: ProtectionRule, period_s: float | None = None) -> None:
+    def __init__(self, rule: Protection, period_s: float | None = None) -> None:
         self._rule = rule
-        self._half_round_s = SILENCE_S if period_s is None else period_s * rule.modulus / 2
+        self._modulus = rule.modulus
+        self._period_s = math.inf if period_s is None else period_s
+        self._half_round_s = (
+            SILENCE_S if period_s is None else period_s * min(rule.modulus, WIDE) / 2
+        )
         self._last = -1
         self._last_s = 0.0
         self._refused = 0
@@ -187,22 +235,24 @@ class FrameChecker:
 
     def check(self, data: bytes | bytearray, time_s: float) -> Verdict:
         """Judge one payload, cut to the message's length, received at bus time `time_s` [s]."""
-        rule = self._rule
-        if rule.crc(data) != data[rule.crc_byte]:
+        rule, modulus = self._rule, self._modulus
+        if not rule.is_whole(data):
             self._refused += 1
             return Verdict.CRC_WRONG
-        if not rule.counter_bits:
+        if not modulus:
             return Verdict.GOOD
         last, counter = self._last, rule.counter(data)
         elapsed_s, self._last_s = time_s - self._last_s, time_s
-        steps = (counter - last) & rule.counter_mask
+        steps = (counter - last) % modulus
         if steps == 1 or last < 0:
             self._last, self._refused = counter, 0
             return Verdict.GOOD
         if steps == 0:
             if elapsed_s <= self._half_round_s:
                 return Verdict.REPEATED
-            steps = rule.modulus
+            steps = min(modulus, WIDE)
+        elif modulus >= WIDE and steps > modulus // 2 and elapsed_s < self._period_s * steps / 2:
+            steps = 1
         # Frames that came damaged are counted as such, not as lost.
         self.lost = max(steps - 1 - self._refused, 0)
         self._last, self._refused = counter, 0

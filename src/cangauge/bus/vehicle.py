@@ -10,6 +10,7 @@ from cangauge.bus.binding import bind_vehicle
 from cangauge.bus.bound import EXTENDED, BoundSignal, MessageRule, Role, Vehicle
 from cangauge.bus.database import closest
 from cangauge.bus.mapping import VehicleMap
+from cangauge.bus.overrides import NO_OVERRIDES, Overrides
 from cangauge.bus.presets import PRESETS, Preset
 from cangauge.bus.validation import read_toml, validated
 from cangauge.errors import InputError
@@ -34,6 +35,7 @@ def load_vehicle(
     *,
     temperature_c: float | None = None,
     pair_within_s: float | None = None,
+    overrides: Overrides = NO_OVERRIDES,
 ) -> Vehicle:
     """Return a vehicle by the name of a preset, or by a DBC and a map file.
 
@@ -47,6 +49,8 @@ def load_vehicle(
         Fixed temperature instead of the bus's [°C]; its source is then unknown.
     pair_within_s : float, optional
         Instead of the mapping's [s].
+    overrides : Overrides, optional
+        Protection and checks that go before the mapping's.
 
     Raises
     ------
@@ -64,7 +68,7 @@ def load_vehicle(
                 value=preset,
                 cure="give one or the other",
             )
-        return _from_preset(preset, temperature_c, pair_within_s)
+        return _from_preset(preset, temperature_c, pair_within_s, overrides)
     if map_file is None:
         raise InputError(
             "no vehicle is given" if dbc is None else "a DBC alone does not say which signals",
@@ -82,7 +86,12 @@ def load_vehicle(
             "is missing", source=map_file, field="dbc", cure="add it, or give --dbc FILE"
         )
     vehicle = bind_vehicle(
-        mapping, files, source=map_file, temperature_c=temperature_c, pair_within_s=pair_within_s
+        mapping,
+        files,
+        source=map_file,
+        temperature_c=temperature_c,
+        pair_within_s=pair_within_s,
+        overrides=overrides,
     )
     if vehicle.temperature is None and math.isnan(vehicle.fixed_temperature_c):
         raise InputError(
@@ -94,7 +103,12 @@ def load_vehicle(
     return vehicle
 
 
-def _from_preset(name: str, temperature_c: float | None, pair_within_s: float | None) -> Vehicle:
+def _from_preset(
+    name: str,
+    temperature_c: float | None,
+    pair_within_s: float | None,
+    overrides: Overrides,
+) -> Vehicle:
     preset = find_preset(name)
     if preset.lacks_temperature and temperature_c is None:
         raise InputError(
@@ -103,7 +117,9 @@ def _from_preset(name: str, temperature_c: float | None, pair_within_s: float | 
             value=name,
             cure="give --temperature °C",
         )
-    return preset_vehicle(preset, temperature_c=temperature_c, pair_within_s=pair_within_s)
+    return preset_vehicle(
+        preset, temperature_c=temperature_c, pair_within_s=pair_within_s, overrides=overrides
+    )
 
 
 def find_preset(name: str) -> Preset:
@@ -128,7 +144,11 @@ def find_preset(name: str) -> Preset:
 
 
 def preset_vehicle(
-    preset: Preset, *, temperature_c: float | None = None, pair_within_s: float | None = None
+    preset: Preset,
+    *,
+    temperature_c: float | None = None,
+    pair_within_s: float | None = None,
+    overrides: Overrides = NO_OVERRIDES,
 ) -> Vehicle:
     """Return a preset's vehicle, even if it then has no temperature at all."""
     dbc = shared_file("dbc", preset.dbc)
@@ -138,6 +158,7 @@ def preset_vehicle(
         source=dbc,
         temperature_c=temperature_c,
         pair_within_s=pair_within_s,
+        overrides=overrides,
     )
 
 

@@ -57,7 +57,13 @@ class Reason(enum.IntFlag):
     INPUT_STALE = 1 << 11
     """No wanted frame within the time-out."""
     IMPLAUSIBLE_INPUT = 1 << 12
-    """A sample was refused: not finite, or outside physical limits."""
+    """A value or sample was refused: not finite, out of its range, or changed too fast."""
+    PROTECTION_FAILED = 1 << 13
+    """Frames were refused, several in a row: CRC wrong, counter standing still, or too short."""
+    SIGNAL_STUCK = 1 << 14
+    """A signal stands still while another one proves that it should move."""
+    CURRENT_MISSING = 1 << 15
+    """No current within its time-out, or none that is believed: charge is not counted."""
 
 
 class Estimate(NamedTuple):

@@ -95,6 +95,6 @@ def status_of(reasons: Reason) -> Status:
     """Return the status that the reasons amount to."""
     if reasons & Reason.NO_INITIAL_SOC:
         return Status.INITIALISING
-    if reasons & Reason.INPUT_STALE:
+    if reasons & (Reason.INPUT_STALE | Reason.CURRENT_MISSING):
         return Status.INVALID
     return Status.DEGRADED if reasons else Status.VALID

@@ -25,7 +25,10 @@ REASON_WORDS: Final = {
     Reason.INNOVATION_LARGE: "voltage and prediction disagree lastingly: σ was enlarged",
     Reason.NO_INITIAL_SOC: "no SoC is known yet",
     Reason.INPUT_STALE: "no wanted frame within the time-out",
-    Reason.IMPLAUSIBLE_INPUT: "a sample was refused: not finite or physically impossible",
+    Reason.IMPLAUSIBLE_INPUT: "a value was refused: out of its range, or it changed too fast",
+    Reason.PROTECTION_FAILED: "frames were refused: CRC wrong, counter still, or too short",
+    Reason.SIGNAL_STUCK: "a signal stands still while another one proves that it should move",
+    Reason.CURRENT_MISSING: "no current that is believed: charge is not counted",
 }
 
 
