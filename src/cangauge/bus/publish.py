@@ -1,10 +1,9 @@
 """What cangauge puts on the bus, and how to read it: SOC_ESTIMATE and SOC_DETAIL.
 
-When, on bus time, while samples arrive
-- SOC_ESTIMATE: with the first sample at or after every 100 ms (every sample of a 10 Hz log).
-- SOC_DETAIL: with the first sample at or after every second; and, where it serves `replay` as
-  acknowledgement (`acknowledge_every`), at the latest after so many samples.
-What is repeated by the wall clock while no sample arrives is the service's business.
+Both are published at a fixed rate by the clock of whoever owns the loop (`SocPublisher.beat`),
+whether samples come or not: every beat has a SOC_ESTIMATE, every tenth a SOC_DETAIL. Where
+SOC_DETAIL serves `replay` as acknowledgement (`acknowledge_every`), it comes after so many samples,
+too. Counter and CRC are those of AUTOSAR E2E profile 2, with the data ids that the DBC tells.
 """
 
 from __future__ import annotations
@@ -16,10 +15,10 @@ from typing import Final, NamedTuple
 
 import can
 from can.typechecking import CanFilter
-from cantools.database.can import Database
+from cantools.database.can import Database, Message
 
 from cangauge.bus.database import load_dbc
-from cangauge.bus.protection import GENERIC_RULE
+from cangauge.bus.e2e_rule import E2eRule
 from cangauge.bus.signal_codec import SignalCodec, signal_codec
 from cangauge.bus.time_source import REPLAY_CLOCK_ID
 from cangauge.errors import InputError
@@ -27,10 +26,12 @@ from cangauge.estimate.types import Estimate, Reason, Status
 from cangauge.share import shared_file
 
 ESTIMATE_EVERY_S: Final = 0.1
-DETAIL_EVERY_S: Final = 1.0
+"""Time between two beats [s]."""
+DETAIL_EVERY_BEATS: Final = 10
+"""Every so many beats carry a SOC_DETAIL: one a second."""
 
-EARLY_S: Final = 0.01
-"""A sample so much before its turn is taken for it, so that jitter does not halve the rate [s]."""
+AGE_AT_MOST_S: Final = 30.0
+"""Ages beyond are told as this [s]."""
 
 SAMPLES_MODULO: Final = 1 << 16
 """SOC_DETAIL counts samples modulo this."""
@@ -77,6 +78,8 @@ class SocEstimate(NamedTuple):
     """Its standard deviation [%]; NaN: not available."""
     status: Status
     reasons: Reason
+    age_s: float = math.nan
+    """Whole seconds since charge was last counted, 30 for more [s]; NaN: never yet."""
 
 
 class SocDetail(NamedTuple):
@@ -100,6 +103,7 @@ class _Layout:
             for signal in message.signals
             if not signal.name.startswith(("counter_", "crc_"))
         }
+        self._rule = E2eRule("e2e_02", data_ids=_data_ids(message, path))
         self._limits = {signal: codec.range for signal, codec in self._codecs.items()}
 
     def encode(self, counter: int, **values: float) -> bytes:
@@ -111,13 +115,24 @@ class _Layout:
                 low, high = self._limits[name]
                 value = min(max(value, low), high)
             codec.encode_into(payload, value)
-        return GENERIC_RULE.protect(payload, counter)
+        return self._rule.protect(payload, counter)
 
     def decode(self, data: bytes | bytearray) -> dict[str, float] | None:
         """Return the values by name; None if the frame is damaged."""
-        if len(data) != _LENGTH or GENERIC_RULE.crc(data) != data[GENERIC_RULE.crc_byte]:
+        if len(data) != _LENGTH or not self._rule.is_whole(data):
             return None
         return {name: codec.decode(data) for name, codec in self._codecs.items()}
+
+
+def _data_ids(message: Message, path: Path) -> bytes:
+    """Return the data ids that the DBC states for a message."""
+    attributes = getattr(message.dbc, "attributes", {})
+    try:
+        return bytes.fromhex(str(attributes["E2EDataIdList"].value))
+    except (KeyError, ValueError) as error:
+        raise InputError(
+            "has no list of data ids", source=path, field=f"{message.name}.E2EDataIdList"
+        ) from error
 
 
 def _layouts() -> tuple[_Layout, _Layout]:
@@ -133,51 +148,51 @@ class SocPublisher:
     ----------
     ids : FrameIds, optional
     acknowledge_every : int, optional
-        Send SOC_DETAIL at the latest after so many samples.
+        Send SOC_DETAIL after so many samples, and at every beat after any.
     """
 
     def __init__(self, ids: FrameIds | None = None, acknowledge_every: int | None = None) -> None:
         self.ids = ids or FrameIds()
-        self._acknowledge_every = acknowledge_every or math.inf
+        self._acknowledge_every = acknowledge_every
         self._estimate, self._detail = _layouts()
         self._estimates_made = 0
         self._details_made = 0
-        self._estimate_due_s = -math.inf
-        self._detail_due_s = -math.inf
+        self._beats = 0
         self.samples_told = 0
         """Samples that the latest SOC_DETAIL told."""
 
-    def publish(self, estimate: Estimate, samples: int) -> list[can.Message]:
-        """Return the frames that are due with an estimate.
+    def beat(self, estimate: Estimate, samples: int, age_s: float) -> list[can.Message]:
+        """Return the frames of one beat; due every `ESTIMATE_EVERY_S`.
 
         Parameters
         ----------
         estimate : Estimate
         samples : int
             Samples processed so far, those refused included.
+        age_s : float
+            Time since the latest of them [s]; NaN: none yet.
         """
-        now_s = estimate.time_s
-        frames = []
-        if now_s >= self._estimate_due_s - EARLY_S:
-            self._estimate_due_s = _next(self._estimate_due_s, ESTIMATE_EVERY_S, now_s)
-            frames.append(self.estimate_frame(estimate))
-        is_due = now_s >= self._detail_due_s - EARLY_S
-        if is_due or samples - self.samples_told >= self._acknowledge_every:
-            if is_due:
-                self._detail_due_s = _next(self._detail_due_s, DETAIL_EVERY_S, now_s)
+        frames = [self.estimate_frame(estimate, age_s)]
+        is_due = self._beats % DETAIL_EVERY_BEATS == 0
+        self._beats += 1
+        if is_due or (self._acknowledge_every is not None and samples != self.samples_told):
             frames.append(self.detail_frame(estimate, samples))
         return frames
 
-    def restart(self) -> None:
-        """Forget the times: those of a new log may lie before them."""
-        self._estimate_due_s = self._detail_due_s = -math.inf
+    def acknowledge(self, estimate: Estimate, samples: int) -> list[can.Message]:
+        """Return the SOC_DETAIL that is due after a sample, if any; arguments as `beat`."""
+        every = self._acknowledge_every
+        if every is None or samples - self.samples_told < every:
+            return []
+        return [self.detail_frame(estimate, samples)]
 
-    def estimate_frame(self, estimate: Estimate) -> can.Message:
-        """Return SOC_ESTIMATE with the next counter."""
+    def estimate_frame(self, estimate: Estimate, age_s: float = 0.0) -> can.Message:
+        """Return SOC_ESTIMATE with the next counter; arguments as `beat`."""
         data = self._estimate.encode(
             self._estimates_made,
             soc_pct=estimate.soc_pct,
             soc_std_pct=estimate.soc_std_pct,
+            age_s=age_s if math.isnan(age_s) else min(math.floor(age_s), AGE_AT_MOST_S),
             reason=float(estimate.reasons),
             status=float(estimate.status),
         )
@@ -228,6 +243,7 @@ class SocReader:
                     values["soc_std_pct"],
                     Status(int(values["status"])),
                     Reason(int(values["reason"])),
+                    values["age_s"],
                 )
         elif message.arbitration_id == self.ids.soc_detail:
             values = self._detail.decode(message.data)
@@ -247,12 +263,6 @@ class SocReader:
 def standard_filter(frame_id: int) -> CanFilter:
     """Return python-can's filter for one standard id."""
     return {"can_id": frame_id, "can_mask": 0x7FF, "extended": False}
-
-
-def _next(due_s: float, every_s: float, now_s: float) -> float:
-    """Return the next due time on the grid, or on a new one after a pause."""
-    following = due_s + every_s
-    return following if following > now_s else now_s + every_s
 
 
 def _message(frame_id: int, data: bytes) -> can.Message:

@@ -15,6 +15,13 @@ Keys are the options' names, with underscores::
 
     [ids]
     soc_estimate = 0x5A0
+
+    [messages.BATTERY_1DB]          # protection and period: as in a map file, and before it
+    protection = "leaf"
+
+    [checks.voltage]                # likewise: range, rate, how many failures, time-out
+    lowest = 240
+    highest = 410
 """
 
 from __future__ import annotations
@@ -26,7 +33,9 @@ from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, StrictBool
 
+from cangauge.bus.mapping import CheckMap, MessageMap, RuleMap
 from cangauge.bus.open import BusAddress, bus_address
+from cangauge.bus.overrides import Overrides
 from cangauge.bus.publish import FrameIds
 from cangauge.bus.time_source import TimeSourceName
 from cangauge.bus.validation import read_toml, validated
@@ -71,6 +80,15 @@ class IdsConfig(_Strict):
     replay_clock: StandardId = 0x5AF
 
 
+class ChecksConfig(_Strict):
+    """When values are believed, by signal; see `CheckMap`."""
+
+    current: CheckMap = CheckMap()
+    voltage: CheckMap = CheckMap()
+    temperature: CheckMap = CheckMap()
+    soc_reference: CheckMap = CheckMap()
+
+
 class RunConfig(_Strict):
     """All that `cangauge run` can be told; defaults are those of the command line.
 
@@ -103,6 +121,12 @@ class RunConfig(_Strict):
     timeout_s : float
         Without a sample for so long the estimate is published as stale [s].
     ids : IdsConfig
+    messages : dict of str to MessageMap
+        Protection and period of messages, by name or id, before those of the vehicle.
+    rules : dict of str to RuleMap
+        Protection rules of one's own.
+    checks : ChecksConfig
+        When values are believed, before what the vehicle's mapping states.
     record, output : str, optional
         Files to write: the frames received, the estimates.
     duration_s, until_idle_s : float, optional
@@ -127,6 +151,9 @@ class RunConfig(_Strict):
     time_source: TimeSourceName = "receive"
     timeout_s: Seconds = 2.0
     ids: IdsConfig = IdsConfig()
+    messages: dict[str, MessageMap] = Field(default_factory=dict)
+    rules: dict[str, RuleMap] = Field(default_factory=dict)
+    checks: ChecksConfig = ChecksConfig()
     record: str | None = None
     output: str | None = None
     duration_s: Seconds | None = None
@@ -147,6 +174,9 @@ class RunConfig(_Strict):
             self.map,
             temperature_c=self.temperature,
             pair_within_s=self.pair_within_s,
+            overrides=Overrides(
+                "the service's configuration", self.messages, self.rules, dict(self.checks)
+            ),
         )
 
     def gauge_settings(self) -> GaugeSettings:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -13,15 +14,13 @@ from cangauge.bus.time_source import TimeSourceName
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.estimator import EstimatorSettings
-from cangauge.estimate.types import Estimate, Reason, Sample, Status
+from cangauge.estimate.types import Estimate, Reason, Sample
+from cangauge.estimate.validity import status_of
 from cangauge.model.model_file import ModelFile
 from cangauge.service.stream import EstimateStream, FrameCounts
 
 ACKNOWLEDGE_EVERY: Final = 4
 """Samples between two SOC_DETAIL at most, under the replay clock: `replay` waits for them."""
-
-DETAIL_EVERY_BEATS: Final = 10
-"""Every so many heartbeats carry a SOC_DETAIL: one a second while no sample arrives."""
 
 
 @dataclass(frozen=True)
@@ -65,10 +64,8 @@ class Gauge:
         self._stream = EstimateStream(
             vehicle, model, self.settings.estimator, self.settings.time_source, ids.replay_clock
         )
-        is_replay = self.settings.time_source == "replay-clock"
-        self._publisher = SocPublisher(ids, ACKNOWLEDGE_EVERY if is_replay else None)
-        self._beginnings = 0
-        self._beats = 0
+        self._is_replay = self.settings.time_source == "replay-clock"
+        self._publisher = SocPublisher(ids, ACKNOWLEDGE_EVERY if self._is_replay else None)
 
     @property
     def filters(self) -> list[CanFilter]:
@@ -86,33 +83,41 @@ class Gauge:
         return wanted
 
     def handle(self, message: can.Message) -> list[can.Message]:
-        """Take one frame; return those to send."""
+        """Take one frame; return those to send at once: acknowledgements of a replay."""
         estimate = self._stream.handle(message)
-        return [] if estimate is None else self._publish(estimate)
+        return [] if estimate is None else self._publisher.acknowledge(estimate, self.samples)
 
     def finish(self) -> list[can.Message]:
         """Return the last frames to send, at the end."""
         estimate = self._stream.finish()
-        return [] if estimate is None else self._publish(estimate)
+        return [] if estimate is None else self._publisher.beat(estimate, self.samples, 0.0)
 
-    def heartbeat(self, *, is_stale: bool) -> list[can.Message]:
-        """Return what to send when nothing was sent for a while.
+    def heartbeat(self, *, is_stale: bool, silent_s: float = 0.0) -> list[can.Message]:
+        """Return what to send now; due every `publish.ESTIMATE_EVERY_S`, whatever came.
 
         Parameters
         ----------
         is_stale : bool
-            No sample within the time-out: the latest estimate is repeated as invalid.
+            No sample within the service's time-out: the latest estimate is told as invalid.
+        silent_s : float
+            Time since the latest sample by the loop's monotonic clock [s]. While the receive
+            stamps are bus time, the current's own time-out counts, too.
         """
-        estimate = self.latest
+        estimate = self._stream.told
+        is_stale = is_stale or (not self._is_replay and silent_s > self._stream.current_timeout_s)
         if is_stale and self.samples:
-            estimate = estimate._replace(
-                status=Status.INVALID, reasons=estimate.reasons | Reason.INPUT_STALE
-            )
-        frames = [self._publisher.estimate_frame(estimate)]
-        self._beats += 1
-        if self.samples != self._publisher.samples_told or self._beats % DETAIL_EVERY_BEATS == 1:
-            frames.append(self._publisher.detail_frame(estimate, self.samples))
-        return frames
+            reasons = estimate.reasons | Reason.INPUT_STALE
+            estimate = estimate._replace(status=status_of(reasons), reasons=reasons)
+        age_s = silent_s if self.samples else math.nan
+        return self._publisher.beat(estimate, self.samples, age_s)
+
+    @property
+    def patience_s(self) -> float:
+        """How long to wait for a sample at least before the input is stale [s].
+
+        A source that is slower than the service's time-out is not stale between two samples.
+        """
+        return 0.0 if self._is_replay else self._stream.current_patience_s
 
     @property
     def latest(self) -> Estimate:
@@ -138,12 +143,6 @@ class Gauge:
     def reference_soc_pct(self) -> float:
         """The car's own state of charge [%]; NaN while there is none."""
         return self._stream.reference_soc_pct
-
-    def _publish(self, estimate: Estimate) -> list[can.Message]:
-        if self._stream.beginnings != self._beginnings:
-            self._beginnings = self._stream.beginnings
-            self._publisher.restart()
-        return self._publisher.publish(estimate, self.samples)
 
 
 def _check_ids(vehicle: Vehicle, ids: FrameIds) -> None:

@@ -1,10 +1,11 @@
 """The receive loop: receives, hands to the gauge, sends.
 
-It alone knows the wall clock, and only to notice silence.
+It alone knows a clock, a monotonic one: for the rate of publishing, and to notice silence.
 """
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from collections import deque
@@ -21,7 +22,7 @@ from cangauge.estimate.types import Estimate
 from cangauge.service.gauge import Gauge
 
 LATE_S: Final = 0.01
-"""So much later than due an estimate may come before the latest is repeated in its place [s]."""
+"""So much later than due a beat may come, so that it tells of a sample that is about to [s]."""
 
 LOOK_EVERY_S: Final = 0.1
 """How long receiving may block before signals and heartbeats are looked at again [s]."""
@@ -158,16 +159,25 @@ class _Loop:
         )
 
     def turn(self) -> None:
-        message = self._port.receive(min(max(self._beat_s - self._now_s, 0.0), LOOK_EVERY_S))
+        left_s = self._beat_s + LATE_S - self._now_s
+        message = self._port.receive(min(max(left_s, 0.0), LOOK_EVERY_S))
+        before = self._gauge.samples
         if message is not None:
             self._take(message)
         self._now_s = time.monotonic()
-        if self._now_s >= self._beat_s:
-            is_stale = self._now_s - self._sample_s > self._settings.timeout_s
-            self._send(self._gauge.heartbeat(is_stale=is_stale))
-            self._beat_s = self._now_s + ESTIMATE_EVERY_S
+        late_s = 0.0 if self._gauge.samples != before else LATE_S
+        if self._now_s >= self._beat_s + late_s:
+            self._beat()
         if self._outputs.show is not None:
             self._outputs.show(self._now_s)
+
+    def _beat(self) -> None:
+        gauge, silent_s = self._gauge, self._now_s - self._sample_s
+        is_stale = silent_s > max(self._settings.timeout_s, gauge.patience_s)
+        self._send(gauge.heartbeat(is_stale=is_stale, silent_s=silent_s))
+        # On the grid of the clock, whatever came when; beats that were slept through are left out.
+        missed = max(math.floor((self._now_s - self._beat_s) / ESTIMATE_EVERY_S), 0)
+        self._beat_s += (missed + 1) * ESTIMATE_EVERY_S
 
     def finish(self) -> None:
         before = self._gauge.samples
@@ -193,7 +203,6 @@ class _Loop:
         self._tell()
         if frames:
             self._send(frames)
-            self._beat_s = self._sample_s + ESTIMATE_EVERY_S + LATE_S
 
     def _tell(self) -> None:
         sample = self._gauge.latest_sample

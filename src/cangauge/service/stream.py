@@ -12,6 +12,8 @@ from typing import Final
 import can
 
 from cangauge.bus.decode import SampleAssembler
+from cangauge.bus.signal_health import MISSED_AT_LEAST
+from cangauge.bus.stuck import Pack
 from cangauge.bus.time_source import (
     REPLAY_CLOCK_ID,
     ReceiveTime,
@@ -22,7 +24,8 @@ from cangauge.bus.time_source import (
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.estimator import Estimator, EstimatorSettings
 from cangauge.estimate.types import Estimate, Reason, Sample, Status
-from cangauge.model.model_file import ModelFile
+from cangauge.estimate.validity import status_of
+from cangauge.model.model_file import ModelFile, effective_error_std_v
 
 NOTHING_YET: Final = Estimate(
     *(math.nan,) * 7, Status.INITIALISING, Reason.NO_INITIAL_SOC | Reason.INPUT_STALE, 0
@@ -42,6 +45,18 @@ class FrameCounts:
     """Wanted frames that their counters say are missing."""
     crc_errors: int = 0
     """Wanted frames with a wrong CRC."""
+    repeated: int = 0
+    """Wanted frames whose counter stood still."""
+    short: int = 0
+    """Wanted frames with too few bytes."""
+    not_available: int = 0
+    """Values whose code means "not available"."""
+    implausible: int = 0
+    """Values out of range, or changed too fast."""
+    stuck: int = 0
+    """Values of a signal that stood still while it should move."""
+    held_back: int = 0
+    """Good values not used yet, because too many before them failed."""
     untimed: int = 0
     """Frames before the first REPLAY_CLOCK, where that is the clock."""
     beginnings: int = 0
@@ -96,8 +111,10 @@ class EstimateStream:
         self.latest = NOTHING_YET
         """The latest estimate; `NOTHING_YET` before the first."""
         self.latest_sample: Sample | None = None
-        self._assembler = SampleAssembler(vehicle)
+        self._pack = pack_of(model, settings.capacity_ah)
+        self._assembler = SampleAssembler(vehicle, self._pack)
         self._estimator = Estimator(model, settings)
+        self._estimated = NOTHING_YET
 
     def handle(self, message: can.Message) -> Estimate | None:
         """Take one frame; return the estimate after the sample that it completes, if any.
@@ -127,6 +144,12 @@ class EstimateStream:
             samples=now.samples,
             lost=now.frames_lost,
             crc_errors=now.crc_errors,
+            repeated=now.counter_repeats,
+            short=now.short,
+            not_available=now.not_available,
+            implausible=now.implausible,
+            stuck=now.stuck,
+            held_back=now.held_back,
             untimed=self._untimed,
         )
 
@@ -140,12 +163,63 @@ class EstimateStream:
             return None
         self.samples += 1
         self.latest_sample = sample
-        self.latest = self._estimator.step(sample)
+        self._estimated = self._estimator.step(sample)
+        self.latest = self._judged(sample.time_s)
         return self.latest
+
+    @property
+    def told(self) -> Estimate:
+        """The latest estimate, with what the signals are worth since: for the next heartbeat."""
+        return self._judged(self._assembler.now_s)
+
+    @property
+    def current_timeout_s(self) -> float:
+        """How long a current holds [s]."""
+        return self._assembler.health["current"].timeout_s
+
+    @property
+    def current_patience_s(self) -> float:
+        """How long to wait for a current at least [s]; 0 while its period is not known."""
+        period_s = self._assembler.health["current"].period_s
+        return 0.0 if math.isnan(period_s) else MISSED_AT_LEAST * period_s
+
+    def _judged(self, now_s: float) -> Estimate:
+        """Return the latest estimate, marked by what the signals are worth at bus time `now_s`.
+
+        One voltage that failed or has not come yet is no missing voltage: several in a row are,
+        and one that is too old.
+        """
+        estimate, sample = self._estimated, self.latest_sample
+        missing = self._assembler.health.reasons(now_s)
+        reasons = estimate.reasons
+        if sample is not None and math.isnan(sample.voltage_v):
+            reasons &= ~Reason.VOLTAGE_MISSING
+        reasons |= missing
+        if reasons == estimate.reasons:
+            return estimate
+        return estimate._replace(reasons=reasons, status=status_of(reasons))
 
     def _begin_anew(self) -> None:
         self._past = replace(self.counts, beginnings=self._past.beginnings + 1)
         self._untimed = 0
         self.beginnings = self._time.beginnings
-        self._assembler = SampleAssembler(self._vehicle)
+        self._assembler = SampleAssembler(self._vehicle, self._pack)
         self._estimator = Estimator(self._model, self._settings)
+
+
+def pack_of(model: ModelFile, capacity_ah: float | None = None) -> Pack:
+    """Return what a model knows of a pack that helps to judge its signals.
+
+    Parameters
+    ----------
+    model : ModelFile
+    capacity_ah : float, optional
+        Instead of the model's [Ah].
+    """
+    voltage = model.extended_model().model
+    return Pack(
+        resistance_ohm=abs(voltage.resistance_ohm[0]) if voltage.resistance_ohm else 0.0,
+        error_std_v=effective_error_std_v(model.noise, 1.0 / model.rate_hz),
+        capacity_ah=model.capacity_ah if capacity_ah is None else capacity_ah,
+        usual_v=voltage.pseudo_ocv_at(50.0)[0],
+    )
