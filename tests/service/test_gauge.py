@@ -95,6 +95,7 @@ def test_before_the_first_sample_it_says_that_it_knows_nothing() -> None:
     assert math.isnan(contents[0].soc_pct)
     assert contents[0].status is Status.INITIALISING
     assert contents[0].reasons & Reason.INPUT_STALE
+    assert math.isnan(contents[0].age_s)
     assert contents[1] == SocDetail(*contents[1][:3], samples=0)  # type: ignore[index] # a SocDetail
 
 
@@ -104,13 +105,15 @@ def test_silence_is_published_as_invalid_with_the_last_soc(log: Log) -> None:
     estimates(gauge, frames_of(log, vehicle))
     reader = SocReader()
     fresh = reader.read(gauge.heartbeat(is_stale=False)[0])
-    stale = reader.read(gauge.heartbeat(is_stale=True)[0])
+    stale = reader.read(gauge.heartbeat(is_stale=True, silent_s=7.9)[0])
     assert isinstance(fresh, SocEstimate)
     assert isinstance(stale, SocEstimate)
     assert not fresh.reasons & Reason.INPUT_STALE
     assert stale.status is Status.INVALID
     assert stale.reasons & Reason.INPUT_STALE
-    assert stale.soc_pct == fresh.soc_pct == pytest.approx(gauge.latest.soc_pct, abs=0.001)
+    # Rounded to steps of 0.004 %.
+    assert stale.soc_pct == fresh.soc_pct == pytest.approx(gauge.latest.soc_pct, abs=0.002)
+    assert (fresh.age_s, stale.age_s) == (0.0, 7.0)
     # Once frames come again, so does a valid estimate.
     again = frames_of(log.rows(slice(0, 2)), vehicle, shift_s=log.time_s[-1] + 0.1)
     assert estimates(gauge, again)[-1].status is not Status.INVALID

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import can
 import cantools
+import crccheck.crc
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -30,16 +31,19 @@ def decoded(project: Path, message: can.Message) -> dict[str, object]:
 
 def test_the_dbc_decodes_what_is_sent(project: Path) -> None:
     publisher = SocPublisher()
-    first, detail = publisher.publish(
-        estimate(status=Status.DEGRADED, reasons=Reason.CURRENT_GAP | Reason.INPUT_STALE), 70_000
+    first, detail = publisher.beat(
+        estimate(status=Status.DEGRADED, reasons=Reason.CURRENT_GAP | Reason.CURRENT_MISSING),
+        70_000,
+        age_s=12.9,
     )
     assert first.arbitration_id == 0x5A0
     assert detail.arbitration_id == 0x5A1
     values = decoded(project, first)
-    assert values["soc_pct"] == pytest.approx(63.217, abs=0.001)
-    assert values["soc_std_pct"] == pytest.approx(1.5, abs=0.001)
+    assert values["soc_pct"] == pytest.approx(63.217, abs=0.002)
+    assert values["soc_std_pct"] == pytest.approx(1.5, abs=0.0125)
     assert values["status"] == 2
-    assert values["reason"] == (1 << 1) | (1 << 11)
+    assert values["age_s"] == 12
+    assert values["reason"] == (1 << 1) | (1 << 15)
     values = decoded(project, detail)
     assert values["soc_newton_pct"] == pytest.approx(62.1, abs=0.0125)
     assert values["soc_coulomb_pct"] == pytest.approx(63.9, abs=0.0125)
@@ -54,14 +58,18 @@ def test_unknown_values_have_their_codes(project: Path) -> None:
         status=Status.INITIALISING, reasons=Reason.NO_INITIAL_SOC,
     )  # fmt: skip
     publisher = SocPublisher()
-    first, detail = publisher.estimate_frame(unknown), publisher.detail_frame(unknown, 0)
-    assert first.data[:4] == b"\xff\xff\xff\xff"
+    first, detail = publisher.beat(unknown, 0, math.nan)
     values = decoded(project, first)
     assert (values["status"], values["reason"]) == (0, 1 << 10)
+    # The codes that the DBC names so: 31, 32767 and 4095.
+    assert (values["age_s"], values["soc_pct"]) == (31, pytest.approx(32767 * 0.004))
+    assert values["soc_std_pct"] == pytest.approx(4095 * 0.025)
     reader = SocReader()
     read = reader.read(first)
     assert isinstance(read, SocEstimate)
     assert math.isnan(read.soc_pct)
+    assert math.isnan(read.soc_std_pct)
+    assert math.isnan(read.age_s)
     told = reader.read(detail)
     assert isinstance(told, SocDetail)
     assert math.isnan(told.residual_v)
@@ -79,8 +87,8 @@ def test_any_number_can_be_sent_and_is_read_back_clipped(
     assert isinstance(read, SocEstimate)
     assert isinstance(told, SocDetail)
     for value, sent, low, high, step in (
-        (read.soc_pct, soc, 0.0, 131.068, 0.002),
-        (read.soc_std_pct, std, 0.0, 131.068, 0.002),
+        (read.soc_pct, soc, 0.0, 131.064, 0.004),
+        (read.soc_std_pct, std, 0.0, 102.35, 0.025),
         (told.residual_v, residual, -20.47, 20.47, 0.01),
     ):
         if math.isnan(sent):
@@ -89,41 +97,53 @@ def test_any_number_can_be_sent_and_is_read_back_clipped(
             assert value == pytest.approx(min(max(sent, low), high), abs=0.5001 * step)
 
 
-def test_counters_count_and_damaged_frames_are_refused() -> None:
+def test_counters_count_and_every_damaged_bit_is_refused() -> None:
     publisher, reader = SocPublisher(), SocReader()
-    counters = [publisher.estimate_frame(estimate()).data[6] >> 4 for _ in range(18)]
+    counters = [publisher.estimate_frame(estimate()).data[1] & 15 for _ in range(18)]
     assert counters == [*range(16), 0, 1]
-    broken = publisher.estimate_frame(estimate())
-    broken.data[0] ^= 4
-    assert reader.read(broken) is None
-    assert reader.refused == 1
+    good = bytes(publisher.estimate_frame(estimate()).data)
+    for bit in range(64):
+        broken = publisher.estimate_frame(estimate())
+        broken.data = bytearray(good)
+        broken.data[bit // 8] ^= 1 << bit % 8
+        assert reader.read(broken) is None
+    assert reader.refused == 64
 
 
-@pytest.mark.parametrize("rate_hz", [10.0, 100.0, 12.5])
-def test_an_estimate_every_100_ms_and_details_every_second_of_bus_time(rate_hz: float) -> None:
+def test_an_independent_check_of_the_profile_agrees(project: Path) -> None:
+    database = cantools.database.load_file(project / "dbc" / "soc_estimate.dbc")
     publisher = SocPublisher()
-    times: dict[int, list[float]] = {0x5A0: [], 0x5A1: []}
-    for sample in range(int(20.0 * rate_hz)):
-        now_s = 1_700_000_000.0 + sample / rate_hz
-        for message in publisher.publish(estimate(now_s), sample + 1):
-            times[message.arbitration_id].append(now_s)
-    # Samples come when they come: the grid is kept on the average, within one sample.
-    for frame_id, every_s in ((0x5A0, 0.1), (0x5A1, 1.0)):
-        assert len(times[frame_id]) == pytest.approx(20.0 / every_s, abs=1)
-        steps = [b - a for a, b in zip(times[frame_id], times[frame_id][1:], strict=False)]
-        assert max(steps) <= every_s + 1.0 / rate_hz + 1e-6
+    for _ in range(20):
+        for message in publisher.beat(estimate(), 7, 0.0):
+            attributes = database.get_message_by_frame_id(message.arbitration_id).dbc.attributes
+            data_ids = list(bytes.fromhex(attributes["E2EDataIdList"].value))
+            # CRC-8H2F over bytes 1-7, then the data id of this counter.
+            covered = bytes([*message.data[1:], data_ids[message.data[1] & 15]])
+            assert crccheck.crc.Crc8Autosar.calc(covered) == message.data[0]
 
 
-def test_jitter_does_not_halve_the_rate() -> None:
+def test_a_detail_taken_for_an_estimate_is_refused() -> None:
+    swapped = SocReader(FrameIds(soc_estimate=0x5A1, soc_detail=0x5A0))
+    for message in SocPublisher().beat(estimate(), 7, 0.0):
+        assert swapped.read(message) is None
+    assert swapped.refused == 2
+
+
+def test_every_beat_has_an_estimate_and_every_tenth_the_details() -> None:
     publisher = SocPublisher()
-    sent = 0
-    for sample in range(1000):
-        jitter = 0.004 if sample % 2 else -0.004
-        sent += any(
-            message.arbitration_id == 0x5A0
-            for message in publisher.publish(estimate(100.0 + 0.1 * sample + jitter), sample)
-        )
-    assert sent == 1000
+    beats = [publisher.beat(estimate(), beat, 0.0) for beat in range(40)]
+    assert all(frames[0].arbitration_id == 0x5A0 for frames in beats)
+    assert [beat for beat, frames in enumerate(beats) if len(frames) == 2] == [0, 10, 20, 30]
+
+
+def test_an_age_is_told_in_whole_seconds_and_not_beyond_30() -> None:
+    publisher, reader = SocPublisher(), SocReader()
+    told = []
+    for age_s in (0.0, 0.99, 1.0, 29.99, 30.0, 31.0, 1e9):
+        read = reader.read(publisher.estimate_frame(estimate(), age_s))
+        assert isinstance(read, SocEstimate)
+        told.append(read.age_s)
+    assert told == [0.0, 0.0, 1.0, 29.0, 30.0, 30.0, 30.0]
 
 
 def test_samples_are_acknowledged_every_so_often() -> None:
@@ -131,10 +151,14 @@ def test_samples_are_acknowledged_every_so_often() -> None:
     told = [
         sample
         for sample in range(1, 40)
-        for message in publisher.publish(estimate(0.001 * sample), sample)
+        for message in publisher.acknowledge(estimate(0.001 * sample), sample)
         if message.arbitration_id == 0x5A1
     ]
-    assert told == list(range(1, 40, 4))
+    assert told == list(range(4, 40, 4))
+    # What is left over is acknowledged by the next beat, and without any by none.
+    assert len(publisher.beat(estimate(), 39, 0.0)) == 2
+    assert [len(publisher.beat(estimate(), 39, 0.0)) for _ in range(3)] == [1, 1, 1]
+    assert SocPublisher().acknowledge(estimate(), 4000) == []
 
 
 def test_ids_must_be_standard_and_differ() -> None:

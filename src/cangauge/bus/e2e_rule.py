@@ -167,6 +167,8 @@ class E2eRule:
 
     def is_whole(self, data: bytes | bytearray) -> bool:
         """Return whether header and CRC agree, and the counter is one that there is."""
+        if isinstance(data, bytes):
+            data = bytearray(data)  # some of the library's checks take nothing else
         return (
             self._profile.check(data, self.data_ids or self.data_id, **self._arguments)
             and self.counter(data) < self._profile.modulus

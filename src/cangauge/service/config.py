@@ -29,9 +29,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, StrictBool
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    PrivateAttr,
+    StrictBool,
+)
 
 from cangauge.bus.mapping import CheckMap, MessageMap, RuleMap
 from cangauge.bus.open import BusAddress, bus_address
@@ -158,6 +166,12 @@ class RunConfig(_Strict):
     output: str | None = None
     duration_s: Seconds | None = None
     until_idle_s: Seconds | None = None
+    _file: str = PrivateAttr("the configuration")
+
+    def named(self, file: str | PathLike[str]) -> Self:
+        """Note which file it came from, for messages; return itself."""
+        self._file = str(file)
+        return self
 
     def address(self) -> BusAddress:
         """Return which bus; may raise InputError."""
@@ -174,9 +188,7 @@ class RunConfig(_Strict):
             self.map,
             temperature_c=self.temperature,
             pair_within_s=self.pair_within_s,
-            overrides=Overrides(
-                "the service's configuration", self.messages, self.rules, dict(self.checks)
-            ),
+            overrides=Overrides(self._file, self.messages, self.rules, dict(self.checks)),
         )
 
     def gauge_settings(self) -> GaugeSettings:
@@ -243,7 +255,7 @@ def load_config(
     merged = {**data, **given}
     if "model" not in merged:
         raise InputError("is missing", source=path, field="model", cure="add it, or give -m MODEL")
-    return validated(RunConfig, merged, path)
+    return validated(RunConfig, merged, path).named(path)
 
 
 def _check_options(given: Mapping[str, Any]) -> None:
