@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from cangauge.bus.e2e_rule import E2eRule
+from cangauge.bus.protection import GENERIC_RULE
 from cangauge.errors import InputError
 from cangauge.service.config import load_config
 
@@ -129,3 +131,61 @@ def test_equal_ids_are_refused(tmp_path: Path) -> None:
 def test_no_such_file() -> None:
     with pytest.raises(InputError, match="no such file"):
         load_config("/nowhere/car.toml")
+
+
+def test_protection_and_checks_go_before_the_cars(tmp_path: Path) -> None:
+    path = write(
+        tmp_path,
+        """
+        model = "leaf.json"
+        vehicle = "generic"
+        [messages.PACK_CURRENT]
+        protection = "e2e_05"
+        data_id = 0x1234
+        period_s = 0.05
+        [messages.0x401]
+        protection = "counter_of_mine"
+        [rules.counter_of_mine]
+        polynomial = 7
+        [checks.voltage]
+        lowest = 240
+        highest = 410
+        invalid_after = 7
+        [checks.temperature]
+        max_jump = 2
+        max_rate_per_s = 0.1
+        timeout_s = 3.5
+        """,
+    )
+    vehicle = load_config(path).load_vehicle()
+    assert vehicle.messages[0x400].rule == E2eRule("e2e_05", data_id=0x1234)
+    assert vehicle.messages[0x400].period_s == 0.05
+    rule = vehicle.messages[0x401].rule
+    assert rule is not None
+    assert rule.name == "counter_of_mine"
+    assert vehicle.messages[0x402].rule is GENERIC_RULE
+    checks = vehicle.voltage.checks
+    assert (checks.lowest, checks.highest, checks.invalid_after) == (240.0, 410.0, 7)
+    assert vehicle.temperature is not None
+    assert vehicle.temperature.checks.timeout_s == 3.5
+
+
+@pytest.mark.parametrize(
+    ("text", "field"),
+    [
+        ("[checks.voltage]\nlowest = 5\nhighest = 5", "checks.voltage"),
+        ("[checks.voltage]\nmax_jump = 5", "checks.voltage"),
+        ("[checks.volts]\nlowest = 5", "checks.volts"),
+        ("[checks.current]\nlowest = nan", "checks.current.lowest"),
+        ("[checks.current]\ninvalid_after = 0", "checks.current.invalid_after"),
+        ('[messages.PACK_CURRENT]\nprotection = "e2e_05"', "messages.PACK_CURRENT.data_id"),
+        ('[messages.PACK_CURENT]\nprotection = "leaf"', "messages.PACK_CURENT"),
+        ("[messages.PACK_CURRENT]\ndata_id = -1", "messages.PACK_CURRENT.data_id"),
+    ],
+)
+def test_mistakes_in_them_name_file_and_field(tmp_path: Path, text: str, field: str) -> None:
+    path = write(tmp_path, f'model = "leaf.json"\n{text}\n')
+    with pytest.raises(InputError) as caught:
+        load_config(path).load_vehicle()
+    assert caught.value.field == field
+    assert field == "messages.PACK_CURENT" or caught.value.source == str(path)

@@ -85,8 +85,8 @@ class CheckMap(_Strict):
     lowest, highest : float, optional
         What a value can be [A, positive = discharge; V; °C; %].
     max_jump, max_rate_per_s : float, optional
-        A value may differ from the one before by `max_jump`, and by `max_rate_per_s` more for
-        every second between them [A, V, K, %].
+        A value may differ from the latest good one by `max_jump`, and by `max_rate_per_s` more
+        for every second since [A, V, K, %].
     invalid_after, valid_after : int, optional
         So many refused values in a row make the signal invalid; so many good ones valid again.
     stuck_after_s : float, optional
@@ -99,7 +99,7 @@ class CheckMap(_Strict):
     lowest: FiniteFloat | None = None
     highest: FiniteFloat | None = None
     max_jump: _Positive | None = None
-    max_rate_per_s: Annotated[FiniteFloat, Field(ge=0.0)] | None = None
+    max_rate_per_s: _Positive | None = None
     invalid_after: Annotated[int, Field(ge=1, le=1000)] | None = None
     valid_after: Annotated[int, Field(ge=1, le=1000)] | None = None
     stuck_after_s: _Positive | None = None
@@ -109,8 +109,8 @@ class CheckMap(_Strict):
     def _a_range(self) -> Self:
         if self.lowest is not None and self.highest is not None and self.lowest >= self.highest:
             raise ValueError("lowest must lie below highest")
-        if self.max_rate_per_s is not None and self.max_jump is None:
-            raise ValueError("max_rate_per_s needs max_jump, at least a step of the signal")
+        if (self.max_rate_per_s is None) is not (self.max_jump is None):
+            raise ValueError("max_jump and max_rate_per_s belong together")
         return self
 
 

@@ -22,7 +22,7 @@ class SignalChecks:
     lowest, highest : float
         What a value can be [A, positive = discharge; V; °C; %].
     max_jump, max_rate_per_s : float
-        A value may differ from the one before by the first, and for every second between them by
+        A value may differ from the latest good one by the first, and for every second since by
         the second more [A, V, K, %].
     invalid_after, valid_after : int
         So many refused values in a row make the signal invalid; so many good ones valid again.

@@ -6,8 +6,8 @@ Rules
 - So many failures in a row make the signal invalid; then good values are held back, too, until so
   many of them came in a row (copies of a frame between them do not matter). A signal that was
   never valid becomes so with its first good value.
-- Too fast means: compared with the latest good value; once invalid, with the latest believable
-  one, so that a signal that really is elsewhere now comes back.
+- Too fast means: farther from the latest good value than the time since allows. That grows, so that
+  a signal that really is elsewhere now comes back.
 - A signal without a good value for longer than its time-out is old, until the next good one.
 - The time-out is the stated one. Otherwise it comes from the period p, stated or learned from the
   frames' stamps: 10·p, within half a second and what is usual for the role; at least 3·p.
@@ -88,8 +88,6 @@ class SignalHealth:
         "_learned_s",
         "_passes",
         "_period_s",
-        "_seen",
-        "_seen_s",
         "_steps",
         "fault",
         "latest",
@@ -107,8 +105,6 @@ class SignalHealth:
         self.fault = Fault.NONE
         self.latest = self.latest_s = math.nan
         self._failures = self._passes = 0
-        # The latest value within the range, good or not, and when.
-        self._seen = self._seen_s = math.nan
         self._arrived_s = math.nan
         self._learned_s = math.nan
         self._steps = 0
@@ -129,9 +125,11 @@ class SignalHealth:
         checks = self._checks
         if not checks.lowest <= value <= checks.highest:
             return Fault.RANGE
-        fault = Fault.NONE if checks.max_jump == math.inf else self._rate(value, time_s)
-        self._seen, self._seen_s = value, time_s
-        return fault
+        if checks.max_jump < math.inf:
+            most = checks.max_jump + checks.max_rate_per_s * abs(time_s - self.latest_s)
+            if abs(value - self.latest) > most:  # never before the first good value: NaN
+                return Fault.RATE
+        return Fault.NONE
 
     def take(self, value: float, time_s: float) -> bool:
         """Take a good value; return whether it may be used, or is held back."""
@@ -157,7 +155,6 @@ class SignalHealth:
     def rewind(self, time_s: float) -> None:
         """Time runs backwards to `time_s` [s]: what came later counts as of that moment."""
         self.latest_s = min(self.latest_s, time_s)
-        self._seen_s = min(self._seen_s, time_s)
 
     def is_old(self, now_s: float) -> bool:
         """Return whether there is no good value within the time-out before `now_s` [s]."""
@@ -191,16 +188,6 @@ class SignalHealth:
         if self._is_cyclic:
             usual_s = min(max(MISSED_UNTIL_OLD * period_s, TIMEOUT_AT_LEAST_S), usual_s)
         return max(usual_s, MISSED_AT_LEAST * period_s)
-
-    def _rate(self, value: float, time_s: float) -> Fault:
-        before, before_s = self.latest, self.latest_s
-        if self.trust is Trust.INVALID:
-            before, before_s = self._seen, self._seen_s
-        if math.isnan(before):
-            return Fault.NONE
-        checks = self._checks
-        most = checks.max_jump + checks.max_rate_per_s * abs(time_s - before_s)
-        return Fault.RATE if abs(value - before) > most else Fault.NONE
 
     def _learn(self, time_s: float) -> None:
         step_s, self._arrived_s = time_s - self._arrived_s, time_s
