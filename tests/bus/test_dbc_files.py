@@ -86,7 +86,7 @@ def test_estimate_frames_say_what_the_estimator_says() -> None:
     status = message.get_signal_by_name("status").choices
     assert status == {int(each): each.name.lower() for each in Status}
     reason = message.get_signal_by_name("reason")
-    assert reason.length == 18
+    assert reason.length == 17
     for bit in range(16):
         assert f" {bit}: " in str(reason.comment)
     assert max(Reason).bit_length() == 16

@@ -39,7 +39,7 @@ def test_the_dbc_decodes_what_is_sent(project: Path) -> None:
     assert first.arbitration_id == 0x5A0
     assert detail.arbitration_id == 0x5A1
     values = decoded(project, first)
-    assert values["soc_pct"] == pytest.approx(63.217, abs=0.002)
+    assert values["soc_pct"] == pytest.approx(63.217, abs=0.001)
     assert values["soc_std_pct"] == pytest.approx(1.5, abs=0.0125)
     assert values["status"] == 2
     assert values["age_s"] == 12
@@ -61,8 +61,8 @@ def test_unknown_values_have_their_codes(project: Path) -> None:
     first, detail = publisher.beat(unknown, 0, math.nan)
     values = decoded(project, first)
     assert (values["status"], values["reason"]) == (0, 1 << 10)
-    # The codes that the DBC names so: 31, 32767 and 4095.
-    assert (values["age_s"], values["soc_pct"]) == (31, pytest.approx(32767 * 0.004))
+    # The codes that the DBC names so: 31, 65535 and 4095.
+    assert (values["age_s"], values["soc_pct"]) == (31, pytest.approx(65535 * 0.002))
     assert values["soc_std_pct"] == pytest.approx(4095 * 0.025)
     reader = SocReader()
     read = reader.read(first)
@@ -87,7 +87,7 @@ def test_any_number_can_be_sent_and_is_read_back_clipped(
     assert isinstance(read, SocEstimate)
     assert isinstance(told, SocDetail)
     for value, sent, low, high, step in (
-        (read.soc_pct, soc, 0.0, 131.064, 0.004),
+        (read.soc_pct, soc, 0.0, 131.068, 0.002),
         (read.soc_std_pct, std, 0.0, 102.35, 0.025),
         (told.residual_v, residual, -20.47, 20.47, 0.01),
     ):
@@ -146,19 +146,45 @@ def test_an_age_is_told_in_whole_seconds_and_not_beyond_30() -> None:
     assert told == [0.0, 0.0, 1.0, 29.0, 30.0, 30.0, 30.0]
 
 
+@pytest.mark.parametrize("rate_hz", [10.0, 100.0, 12.5])
+def test_a_replay_is_followed_at_the_rate_of_its_own_time(rate_hz: float) -> None:
+    publisher = SocPublisher()
+    times: dict[int, list[float]] = {0x5A0: [], 0x5A1: []}
+    for sample in range(int(20.0 * rate_hz)):
+        now_s = 1_700_000_000.0 + sample / rate_hz
+        for message in publisher.publish(estimate(now_s), sample + 1):
+            times[message.arbitration_id].append(now_s)
+    # Samples come when they come: the grid is kept on the average, within one sample.
+    for frame_id, every_s in ((0x5A0, 0.1), (0x5A1, 1.0)):
+        assert len(times[frame_id]) == pytest.approx(20.0 / every_s, abs=1)
+        steps = [b - a for a, b in zip(times[frame_id], times[frame_id][1:], strict=False)]
+        assert max(steps) <= every_s + 1.0 / rate_hz + 1e-6
+
+
+def test_jitter_does_not_halve_the_rate() -> None:
+    publisher = SocPublisher()
+    sent = 0
+    for sample in range(1000):
+        jitter = 0.004 if sample % 2 else -0.004
+        sent += any(
+            message.arbitration_id == 0x5A0
+            for message in publisher.publish(estimate(100.0 + 0.1 * sample + jitter), sample)
+        )
+    assert sent == 1000
+
+
 def test_samples_are_acknowledged_every_so_often() -> None:
     publisher = SocPublisher(acknowledge_every=4)
     told = [
         sample
         for sample in range(1, 40)
-        for message in publisher.acknowledge(estimate(0.001 * sample), sample)
+        for message in publisher.publish(estimate(0.001 * sample), sample)
         if message.arbitration_id == 0x5A1
     ]
-    assert told == list(range(4, 40, 4))
+    assert told == list(range(1, 40, 4))
     # What is left over is acknowledged by the next beat, and without any by none.
     assert len(publisher.beat(estimate(), 39, 0.0)) == 2
     assert [len(publisher.beat(estimate(), 39, 0.0)) for _ in range(3)] == [1, 1, 1]
-    assert SocPublisher().acknowledge(estimate(), 4000) == []
 
 
 def test_ids_must_be_standard_and_differ() -> None:

@@ -1,9 +1,14 @@
 """What cangauge puts on the bus, and how to read it: SOC_ESTIMATE and SOC_DETAIL.
 
 Both are published at a fixed rate by the clock of whoever owns the loop (`SocPublisher.beat`),
-whether samples come or not: every beat has a SOC_ESTIMATE, every tenth a SOC_DETAIL. Where
-SOC_DETAIL serves `replay` as acknowledgement (`acknowledge_every`), it comes after so many samples,
-too. Counter and CRC are those of AUTOSAR E2E profile 2, with the data ids that the DBC tells.
+whether samples come or not: every beat has a SOC_ESTIMATE, every tenth a SOC_DETAIL.
+
+While a log is replayed at another speed than its own, the rate is that of the log's time
+(`SocPublisher.publish`): SOC_ESTIMATE with the first sample at or after every 100 ms of it,
+SOC_DETAIL with the first at or after every second and, as acknowledgement, at the latest after so
+many samples (`acknowledge_every`). Beats then fill the silences.
+
+Counter and CRC are those of AUTOSAR E2E profile 2, with the data ids that the DBC tells.
 """
 
 from __future__ import annotations
@@ -29,6 +34,10 @@ ESTIMATE_EVERY_S: Final = 0.1
 """Time between two beats [s]."""
 DETAIL_EVERY_BEATS: Final = 10
 """Every so many beats carry a SOC_DETAIL: one a second."""
+
+DETAIL_EVERY_S: Final = 1.0
+EARLY_S: Final = 0.01
+"""A sample so much before its turn is taken for it, so that jitter does not halve the rate [s]."""
 
 AGE_AT_MOST_S: Final = 30.0
 """Ages beyond are told as this [s]."""
@@ -158,6 +167,8 @@ class SocPublisher:
         self._estimates_made = 0
         self._details_made = 0
         self._beats = 0
+        self._estimate_due_s = -math.inf
+        self._detail_due_s = -math.inf
         self.samples_told = 0
         """Samples that the latest SOC_DETAIL told."""
 
@@ -179,12 +190,23 @@ class SocPublisher:
             frames.append(self.detail_frame(estimate, samples))
         return frames
 
-    def acknowledge(self, estimate: Estimate, samples: int) -> list[can.Message]:
-        """Return the SOC_DETAIL that is due after a sample, if any; arguments as `beat`."""
-        every = self._acknowledge_every
-        if every is None or samples - self.samples_told < every:
-            return []
-        return [self.detail_frame(estimate, samples)]
+    def publish(self, estimate: Estimate, samples: int) -> list[can.Message]:
+        """Return the frames that are due with a sample of a replayed log; arguments as `beat`."""
+        now_s = estimate.time_s
+        frames = []
+        if now_s >= self._estimate_due_s - EARLY_S:
+            self._estimate_due_s = _next(self._estimate_due_s, ESTIMATE_EVERY_S, now_s)
+            frames.append(self.estimate_frame(estimate))
+        is_due = now_s >= self._detail_due_s - EARLY_S
+        if is_due or samples - self.samples_told >= (self._acknowledge_every or math.inf):
+            if is_due:
+                self._detail_due_s = _next(self._detail_due_s, DETAIL_EVERY_S, now_s)
+            frames.append(self.detail_frame(estimate, samples))
+        return frames
+
+    def restart(self) -> None:
+        """Forget the log's times: those of a new log may lie before them."""
+        self._estimate_due_s = self._detail_due_s = -math.inf
 
     def estimate_frame(self, estimate: Estimate, age_s: float = 0.0) -> can.Message:
         """Return SOC_ESTIMATE with the next counter; arguments as `beat`."""
@@ -263,6 +285,12 @@ class SocReader:
 def standard_filter(frame_id: int) -> CanFilter:
     """Return python-can's filter for one standard id."""
     return {"can_id": frame_id, "can_mask": 0x7FF, "extended": False}
+
+
+def _next(due_s: float, every_s: float, now_s: float) -> float:
+    """Return the next due time on the grid, or on a new one after a pause."""
+    following = due_s + every_s
+    return following if following > now_s else now_s + every_s
 
 
 def _message(frame_id: int, data: bytes) -> can.Message:

@@ -66,6 +66,7 @@ class Gauge:
         )
         self._is_replay = self.settings.time_source == "replay-clock"
         self._publisher = SocPublisher(ids, ACKNOWLEDGE_EVERY if self._is_replay else None)
+        self._beginnings = 0
 
     @property
     def filters(self) -> list[CanFilter]:
@@ -83,9 +84,9 @@ class Gauge:
         return wanted
 
     def handle(self, message: can.Message) -> list[can.Message]:
-        """Take one frame; return those to send at once: acknowledgements of a replay."""
+        """Take one frame; return those to send at once, which only a replay's time asks for."""
         estimate = self._stream.handle(message)
-        return [] if estimate is None else self._publisher.acknowledge(estimate, self.samples)
+        return [] if estimate is None else self._publish(estimate)
 
     def finish(self) -> list[can.Message]:
         """Return the last frames to send, at the end."""
@@ -93,7 +94,7 @@ class Gauge:
         return [] if estimate is None else self._publisher.beat(estimate, self.samples, 0.0)
 
     def heartbeat(self, *, is_stale: bool, silent_s: float = 0.0) -> list[can.Message]:
-        """Return what to send now; due every `publish.ESTIMATE_EVERY_S`, whatever came.
+        """Return what to send now: every `publish.ESTIMATE_EVERY_S`, or so long after `handle`.
 
         Parameters
         ----------
@@ -143,6 +144,14 @@ class Gauge:
     def reference_soc_pct(self) -> float:
         """The car's own state of charge [%]; NaN while there is none."""
         return self._stream.reference_soc_pct
+
+    def _publish(self, estimate: Estimate) -> list[can.Message]:
+        if not self._is_replay:
+            return []
+        if self._stream.beginnings != self._beginnings:
+            self._beginnings = self._stream.beginnings
+            self._publisher.restart()
+        return self._publisher.publish(estimate, self.samples)
 
 
 def _check_ids(vehicle: Vehicle, ids: FrameIds) -> None:

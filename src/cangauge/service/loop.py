@@ -203,6 +203,7 @@ class _Loop:
         self._tell()
         if frames:
             self._send(frames)
+            self._beat_s = self._sample_s + ESTIMATE_EVERY_S
 
     def _tell(self) -> None:
         sample = self._gauge.latest_sample
