@@ -32,7 +32,9 @@ values at most this far apart [s]; rows further from a voltage are left out."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CaptureSamples:
-    """All samples of a capture, exactly as the live service makes them.
+    """All samples of a capture, as the live service makes them before it knows a pack's model.
+
+    With one the service also leaves out what no such pack can be; see `input_health`.
 
     Parameters
     ----------
@@ -105,6 +107,8 @@ def capture_samples(
     path: str | PathLike[str], vehicle: Vehicle, *, source: TimeSourceName = "receive"
 ) -> CaptureSamples:
     """Return the samples of a capture, bit for bit as the live service makes them of the frames.
+
+    What a pack's model would have it leave out is in them; see `CaptureSamples`.
 
     Where the capture holds several buses, each is decoded for itself and the one with most
     samples is taken.

@@ -114,7 +114,8 @@ class EstimateStream:
         self._pack = pack_of(model, settings.capacity_ah)
         self._assembler = SampleAssembler(vehicle, self._pack)
         self._estimator = Estimator(model, settings)
-        self._estimated = NOTHING_YET
+        # The latest estimate as the estimator gave it; None until there was a sample.
+        self._estimated: Estimate | None = None
 
     def handle(self, message: can.Message) -> Estimate | None:
         """Take one frame; return the estimate after the sample that it completes, if any.
@@ -189,7 +190,8 @@ class EstimateStream:
         One voltage that failed or has not come yet is no missing voltage: several in a row are,
         and one that is too old.
         """
-        estimate, sample = self._estimated, self.latest_sample
+        sample = self.latest_sample
+        estimate = self.latest if self._estimated is None else self._estimated
         missing = self._assembler.health.reasons(now_s)
         reasons = estimate.reasons
         if sample is not None and math.isnan(sample.voltage_v):
@@ -205,6 +207,7 @@ class EstimateStream:
         self.beginnings = self._time.beginnings
         self._assembler = SampleAssembler(self._vehicle, self._pack)
         self._estimator = Estimator(self._model, self._settings)
+        self._estimated = None
 
 
 def pack_of(model: ModelFile, capacity_ah: float | None = None) -> Pack:
