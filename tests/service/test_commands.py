@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import time
@@ -28,8 +29,8 @@ MODEL = ("-m", leaf_model_path())
 
 @pytest.fixture
 def bus(request: pytest.FixtureRequest) -> list[str]:
-    """Options of a bus that no other test uses."""
-    port = 20_000 + zlib.crc32(request.node.nodeid.encode()) % 20_000
+    """Options of a bus that no other test uses, nor the same test of another checkout."""
+    port = 20_000 + zlib.crc32(f"{request.node.nodeid} {os.getpid()}".encode()) % 20_000
     channel = ["--interface", "udp_multicast", "--channel", "239.74.163.2"]
     return [*channel, "--bus-option", f"port={port}"]
 

@@ -139,6 +139,15 @@ class Estimator:
         """Estimated offset of the current sensor [A]; 0 without fusion."""
         return self._fusion.offset_a if self._fused else 0.0
 
+    def take_over(self, before: Estimator) -> None:
+        """Go on where another estimator stands, of another model or other settings.
+
+        SoC and standard deviation are carried over, and so are the delay line, the last sample,
+        from which charge is counted on, and the marks of gaps. What was learned of the current's
+        offset and the model's bias belongs to the other model, and is learned anew; so are the
+        inner states of effects. Where the other one knows no SoC yet, neither does this one.
+        """
+
     def step(self, sample: Sample) -> Estimate:
         """Take one sample and return the estimate after it.
 

@@ -78,9 +78,7 @@ class EstimateStream:
         time_source: TimeSourceName = "receive",
         clock_id: int = REPLAY_CLOCK_ID,
     ) -> None:
-        settings = settings or EstimatorSettings()
-        if settings.temperature_source == "unknown":
-            settings = replace(settings, temperature_source=vehicle.temperature_source)
+        settings = _filled(settings or EstimatorSettings(), vehicle)
         self._vehicle = vehicle
         self._model = model
         self._settings = settings
@@ -118,6 +116,32 @@ class EstimateStream:
         """Return the estimate after a last current that still waits for a voltage, if any."""
         return self._step(self._assembler.flush())
 
+    def reconfigure(
+        self, vehicle: Vehicle | None, model: ModelFile, settings: EstimatorSettings
+    ) -> None:
+        """Go on with another vehicle (None: the same), model and settings.
+
+        What does not change is not touched: the numbers then go on bit for bit. Else the
+        estimator is made anew and takes SoC and delay line over; the initial SoC stays what it
+        was.
+        """
+        if vehicle is not None:
+            self._past, self._untimed = self.counts, 0
+            self._vehicle = vehicle
+            self._assembler = SampleAssembler(vehicle)
+        old = self._settings
+        settings = replace(
+            _filled(settings, self._vehicle),
+            initial_soc_pct=old.initial_soc_pct,
+            initial_soc_std_pct=old.initial_soc_std_pct,
+        )
+        if (model, settings) == (self._model, old):
+            return
+        before = self._estimator
+        self._model, self._settings = model, settings
+        self._estimator = Estimator(model, settings)
+        self._estimator.take_over(before)
+
     @property
     def counts(self) -> FrameCounts:
         """What happened to the frames so far."""
@@ -149,3 +173,9 @@ class EstimateStream:
         self.beginnings = self._time.beginnings
         self._assembler = SampleAssembler(self._vehicle)
         self._estimator = Estimator(self._model, self._settings)
+
+
+def _filled(settings: EstimatorSettings, vehicle: Vehicle) -> EstimatorSettings:
+    if settings.temperature_source != "unknown":
+        return settings
+    return replace(settings, temperature_source=vehicle.temperature_source)
