@@ -147,6 +147,20 @@ class Estimator:
         offset and the model's bias belongs to the other model, and is learned anew; so are the
         inner states of effects. Where the other one knows no SoC yet, neither does this one.
         """
+        self._samples = before._samples
+        self._first_s = before._first_s
+        self._last_s = before._last_s
+        self._temperature_c = before._temperature_c
+        self._gap_until_s = before._gap_until_s
+        self._rest_since_s = before._rest_since_s
+        self._line.take_over(before._line)
+        self._counter.take_over(before._counter)
+        self._last_estimate = latest = before._last_estimate
+        if math.isfinite(latest.soc_pct) and math.isfinite(latest.soc_std_pct):
+            self._begin(latest.soc_pct, latest.soc_std_pct)
+        elif math.isfinite(latest.soc_coulomb_pct):
+            # The inverse without a voltage knows nothing; counting still does.
+            self._begin(latest.soc_coulomb_pct, UNKNOWN_SOC_STD_PCT)
 
     def step(self, sample: Sample) -> Estimate:
         """Take one sample and return the estimate after it.
