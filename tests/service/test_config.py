@@ -129,3 +129,12 @@ def test_equal_ids_are_refused(tmp_path: Path) -> None:
 def test_no_such_file() -> None:
     with pytest.raises(InputError, match="no such file"):
         load_config("/nowhere/car.toml")
+
+
+def test_a_bus_that_is_waited_for_need_not_be_seen_to_be_known() -> None:
+    waiting = load_config(None, {"model": "a.json", "channel": "can7", "wait_for_bus": True})
+    assert str(waiting.address()) == "socketcan can7"
+    group = load_config(None, {"model": "a.json", "channel": "239.1.1.1", "wait_for_bus": True})
+    assert group.address().interface == "udp_multicast"
+    with pytest.raises(InputError, match="can7"):
+        load_config(None, {"model": "a.json", "channel": "can7"}).address()
