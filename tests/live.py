@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import json
 import os
@@ -111,6 +112,54 @@ def virtual_service(
     gauge = Gauge(vehicle or load_vehicle("generic"), leaf_model(), settings)
     port = virtual_port(channel, gauge.filters)
     return Service(port, gauge, loop or LoopSettings(), record)
+
+
+class BrokenBus:
+    """A bus whose calls fail as drivers' do."""
+
+    protocol = can.CanProtocol.CAN_20
+
+    def __init__(self, receiving: list[object], sending: BaseException | None = None) -> None:
+        self._receiving = receiving
+        self._sending = sending
+        self.sent: list[can.Message] = []
+        self.filters: object = None
+        self.closed = 0
+
+    def recv(self, timeout: float | None) -> can.Message | None:
+        if not self._receiving:
+            time.sleep(timeout or 0.0)
+            return None
+        first = self._receiving.pop(0)
+        if isinstance(first, BaseException):
+            raise first
+        return first  # type: ignore[return-value] # a message or None
+
+    def send(self, message: can.Message) -> None:
+        if self._sending is not None:
+            raise self._sending
+        self.sent.append(message)
+
+    def set_filters(self, filters: object) -> None:
+        self.filters = filters
+
+    def fileno(self) -> int:
+        raise NotImplementedError
+
+    def shutdown(self) -> None:
+        self.closed += 1
+
+
+def unpack_error() -> can.CanOperationError:
+    error = can.CanOperationError("could not unpack received message")
+    error.__cause__ = ValueError("junk")
+    return error
+
+
+def network_down() -> can.CanOperationError:
+    error = can.CanOperationError("Failed to receive: Network is down", errno.ENETDOWN)
+    error.__cause__ = OSError(errno.ENETDOWN, "Network is down")
+    return error
 
 
 def never() -> bool:

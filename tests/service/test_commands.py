@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import time
@@ -28,8 +29,8 @@ MODEL = ("-m", leaf_model_path())
 
 @pytest.fixture
 def bus(request: pytest.FixtureRequest) -> list[str]:
-    """Options of a bus that no other test uses."""
-    port = 20_000 + zlib.crc32(request.node.nodeid.encode()) % 20_000
+    """Options of a bus that no other test uses, nor the same test of another checkout."""
+    port = 20_000 + zlib.crc32(f"{request.node.nodeid} {os.getpid()}".encode()) % 20_000
     channel = ["--interface", "udp_multicast", "--channel", "239.74.163.2"]
     return [*channel, "--bus-option", f"port={port}"]
 
@@ -118,6 +119,27 @@ def test_a_signal_ends_the_service_within_a_second(
     assert ended.json["estimate"]["soc_pct"] is None
     assert "0 samples" in ended.err
     assert output.read_text().startswith("time_s,soc_pct")
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no SIGHUP on this system")
+def test_a_hangup_reads_the_configuration_again_and_soc_goes_on(
+    bus: list[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "car.toml"
+    path.write_text("timeout_s = 1\n")
+    service = Command("run", *bus, *MODEL, "--config", path, "--json")
+    service.wait_for("listening")
+    path.write_text("timeout_s = [")
+    service.process.send_signal(signal.SIGHUP)
+    service.wait_for("warning: new configuration refused, the old one goes on: ")
+    path.write_text("timeout_s = 0.5\n")
+    service.process.send_signal(signal.SIGHUP)
+    service.wait_for("configuration read again; changed: timeout_s")
+    service.process.terminate()
+    ended = service.end(5.0)
+    assert ended.code == 0
+    assert ended.json["stamps"] == "kernel"
+    assert ended.json["rival_frames"] == 0  # its own frames come back on this bus
 
 
 def test_an_interrupted_replay_says_how_far_it_came(bus: list[str], log_path: Path) -> None:

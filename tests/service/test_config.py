@@ -189,3 +189,12 @@ def test_mistakes_in_them_name_file_and_field(tmp_path: Path, text: str, field: 
         load_config(path).load_vehicle()
     assert caught.value.field == field
     assert field == "messages.PACK_CURENT" or caught.value.source == str(path)
+
+
+def test_a_bus_that_is_waited_for_need_not_be_seen_to_be_known() -> None:
+    waiting = load_config(None, {"model": "a.json", "channel": "can7", "wait_for_bus": True})
+    assert str(waiting.address()) == "socketcan can7"
+    group = load_config(None, {"model": "a.json", "channel": "239.1.1.1", "wait_for_bus": True})
+    assert group.address().interface == "udp_multicast"
+    with pytest.raises(InputError, match="can7"):
+        load_config(None, {"model": "a.json", "channel": "can7"}).address()

@@ -10,6 +10,7 @@ import can
 import pytest
 
 from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.interface_facts import UNKNOWN_INTERFACE
 from cangauge.bus.publish import SocDetail, SocEstimate, SocReader
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.estimate.types import Reason, Sample, Status
@@ -21,6 +22,9 @@ from live import leaf_model, never
 
 class Desk:
     """A port and the clock in one: receiving waits until the next frame, or the time is up."""
+
+    facts = UNKNOWN_INTERFACE
+    queue_drops = None
 
     def __init__(self, frames: list[tuple[float, can.Message]], began_s: float = 5000.0) -> None:
         self.now_s = began_s
@@ -36,9 +40,8 @@ class Desk:
         self.now_s += max(timeout_s, 1e-6)
         return None
 
-    def send(self, frame: can.Message, _within_s: float) -> bool:
+    def post(self, frame: can.Message, _within_s: float) -> None:
         self.sent.append((self.now_s - self._began_s, frame))
-        return True
 
     def set_filters(self, _filters: object) -> None:
         pass

@@ -21,7 +21,18 @@ from cangauge.service.capture_estimate import estimate_capture
 from cangauge.service.gauge import Gauge, GaugeSettings
 from cangauge.service.loop import LoopSettings
 from cangauge.service.record import Recorder
-from live import Service, collect, leaf_model, short_log, virtual_port, virtual_service, waits
+from live import (
+    BrokenBus,
+    Service,
+    collect,
+    leaf_model,
+    network_down,
+    short_log,
+    unpack_error,
+    virtual_port,
+    virtual_service,
+    waits,
+)
 
 
 def send_log(port: BusPort, seconds: float, pause_s: float = 0.0) -> None:
@@ -128,49 +139,6 @@ def test_a_replays_clock_on_the_bus_is_warned_of_once_and_not_recorded(tmp_path:
     assert "5AF#" not in path.read_text()
 
 
-class BrokenBus:
-    """A bus whose calls fail as drivers' do."""
-
-    protocol = can.CanProtocol.CAN_20
-
-    def __init__(self, receiving: list[object], sending: BaseException | None = None) -> None:
-        self._receiving = receiving
-        self._sending = sending
-        self.sent: list[can.Message] = []
-
-    def recv(self, timeout: float | None) -> can.Message | None:
-        if not self._receiving:
-            time.sleep(timeout or 0.0)
-            return None
-        first = self._receiving.pop(0)
-        if isinstance(first, BaseException):
-            raise first
-        return first  # type: ignore[return-value] # a message or None
-
-    def send(self, message: can.Message) -> None:
-        if self._sending is not None:
-            raise self._sending
-        self.sent.append(message)
-
-    def set_filters(self, filters: object) -> None:
-        pass
-
-    def shutdown(self) -> None:
-        pass
-
-
-def unpack_error() -> can.CanOperationError:
-    error = can.CanOperationError("could not unpack received message")
-    error.__cause__ = ValueError("junk")
-    return error
-
-
-def down() -> can.CanOperationError:
-    error = can.CanOperationError("Failed to receive: Network is down", errno.ENETDOWN)
-    error.__cause__ = OSError(errno.ENETDOWN, "Network is down")
-    return error
-
-
 def serve_on(bus: BrokenBus, seconds: float) -> Service:
     gauge = Gauge(load_vehicle("generic"), leaf_model(), GaugeSettings())
     port = BusPort(bus, "fake bus")  # type: ignore[arg-type] # has what a bus is used for
@@ -191,7 +159,7 @@ def test_error_frames_are_counted() -> None:
     assert service.gauge.counts.frames == 0
 
 
-@pytest.mark.parametrize("error", [down(), OSError(errno.ENODEV, "No such device")])
+@pytest.mark.parametrize("error", [network_down(), OSError(errno.ENODEV, "No such device")])
 def test_a_bus_that_is_gone_ends_the_service_with_a_clear_line(error: BaseException) -> None:
     service = serve_on(BrokenBus([error]), 5.0)
     assert isinstance(service.error, BusError)
@@ -207,6 +175,6 @@ def test_a_full_queue_costs_frames_and_not_the_service() -> None:
 
 
 def test_sending_on_a_dead_bus_ends_it() -> None:
-    service = serve_on(BrokenBus([], sending=down()), 5.0)
+    service = serve_on(BrokenBus([], sending=network_down()), 5.0)
     assert isinstance(service.error, BusError)
     assert "sending failed" in str(service.error)

@@ -95,3 +95,12 @@ def test_it_is_drawn_a_few_times_a_second_at_most() -> None:
         for millisecond in range(1000):
             line.show(50.0 + 1e-3 * millisecond)
         assert out.getvalue().count("samples/s") - before <= 5
+
+
+def test_what_is_wrong_with_the_bus_is_on_the_line() -> None:
+    out = io.StringIO()
+    console = Console(file=out, force_terminal=True, width=120)
+    gauge = Gauge(load_vehicle("generic"), leaf_model())
+    with LiveLine(console, gauge, lambda: "bus away for 12 s") as line:
+        line.show(50.0)
+    assert "bus away for 12 s" in out.getvalue()

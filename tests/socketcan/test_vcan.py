@@ -186,12 +186,13 @@ def test_both_commands_and_a_bus_that_goes_down(tmp_path: Path) -> None:
         pytest.skip("no `ip` command to take the interface down")
     subprocess.run(["ip", "link", "set", "vcan0", "down"], check=True)
     try:
+        live.wait_for("Trying again until it is back")
+        live.process.terminate()
         ended = live.end(20.0)
     finally:
         subprocess.run(["ip", "link", "set", "vcan0", "up"], check=True)
-    assert ended.code == 1
-    assert ended.err.splitlines()[-1].startswith("error: socketcan vcan0: ")
-    assert "down" in ended.err.splitlines()[-1]
+    assert ended.code == 0
+    assert ended.json["bus_losses"] == 1
     # What was recorded until then is there.
     recorded = estimate_capture(record, load_vehicle("generic"), leaf_model())
     assert recorded.table.soc_pct.size == 200

@@ -59,6 +59,10 @@ _DRIVER_ERRORS: Final = (
 logging.getLogger("can").addHandler(logging.NullHandler())
 
 
+class DriverMissingError(InputError):
+    """What a bus needs is not installed: no waiting will bring it."""
+
+
 @dataclass(frozen=True)
 class BusAddress:
     """Which bus.
@@ -142,8 +146,9 @@ def open_bus(address: BusAddress, filters: Sequence[CanFilter] | None = None) ->
     Raises
     ------
     InputError
-        If there is no such bus, the driver or a library that it needs is missing, an option is
-        wrong, or rights are missing.
+        If there is no such bus or it is down, an option is wrong, or rights are missing.
+    DriverMissingError
+        If the driver or a library that it needs is.
     """
     arguments: dict[str, Any] = dict(address.options)
     if filters is not None:
@@ -159,6 +164,8 @@ def open_bus(address: BusAddress, filters: Sequence[CanFilter] | None = None) ->
         raise _refusal(address, error) from error
     if address.interface in _ON_SOCKETS:
         _widen_receive_buffer(bus)
+    if address.interface == "socketcan":
+        _check_up(bus, address)
     return bus
 
 
@@ -172,6 +179,11 @@ def has_socketcan(channel: str) -> bool:
             return True
     except OSError:
         return False
+
+
+def is_interface_name(channel: str | None) -> bool:
+    """Return whether a channel is a network interface's name, and no multicast address."""
+    return channel is not None and not _is_multicast(channel)
 
 
 def parse_bus_options(given: Sequence[str]) -> dict[str, BusOption]:
@@ -239,6 +251,24 @@ def _widen_receive_buffer(bus: can.BusABC) -> None:
         own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
 
 
+def _check_up(bus: can.BusABC, address: BusAddress) -> None:
+    # SocketCAN opens an interface that is down, and leaves the error to the first call after.
+    with socket.socket(fileno=os.dup(bus.fileno())) as own:
+        code = own.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+    if not code:
+        return
+    bus.shutdown()
+    if code != errno.ENETDOWN:
+        error = OSError(code, os.strerror(code))
+        raise _refusal(address, error) from error
+    raise InputError(
+        "this bus is down",
+        field="--channel",
+        value=address.channel,
+        cure=f"bring it up: sudo ip link set {address.channel} up",
+    )
+
+
 def _refusal(address: BusAddress, error: BaseException) -> InputError:
     """Return what the driver's error means, in one line with a cure."""
     cause = error
@@ -275,7 +305,7 @@ def _refusal(address: BusAddress, error: BaseException) -> InputError:
     missing = isinstance(error, can.CanInterfaceNotImplementedError | ImportError | NameError)
     said = " ".join(str(cause).split()) or type(cause).__name__
     if missing or "library" in said or "module" in said or "install" in said:
-        return InputError(
+        return DriverMissingError(
             f"a library for this interface is missing ({said})",
             field="--interface",
             value=interface,

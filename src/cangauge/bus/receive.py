@@ -1,25 +1,32 @@
 """Receiving and sending on an open bus, with the errors of drivers sorted out.
 
 What is only one bad packet is counted and passed over; what means that the bus is gone becomes a
-`BusError`. No threads: whoever calls owns the loop.
+`BusError`. No threads: whoever calls owns the loop. (A bus that comes back: `lasting`.)
 """
 
 from __future__ import annotations
 
 import errno
 import time
+from collections import Counter, deque
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Final, Self
 
 import can
 from can.typechecking import CanFilter
 
+from cangauge.bus.error_frames import BUS_OFF, RESTARTED, UNSPECIFIED, error_kinds
+from cangauge.bus.interface_facts import UNKNOWN_INTERFACE, InterfaceFacts
+from cangauge.bus.queue_drops import queue_drops
 from cangauge.errors import CangaugeError
 
 SEND_WITHIN_S: Final = 1.0
 """How long sending may wait for room in the transmit queue [s]."""
 
 _RETRY_S: Final = 0.0005
+_POSTED_RETRY_S: Final = 0.005
+"""So soon posted frames that found the transmit queue full are tried again [s]."""
 _QUEUE_FULL: Final = {errno.ENOBUFS, errno.EAGAIN}
 
 
@@ -32,10 +39,12 @@ class BusPort:
 
     Parameters
     ----------
-    bus : can.BusABC
-        Closed by `close`, or at the end of a `with` block.
+    bus : can.BusABC, optional
+        Closed by `close`, or at the end of a `with` block; None: there is none at present.
     name : str
         For messages.
+    facts : InterfaceFacts, optional
+        What its interface does.
 
     Attributes
     ----------
@@ -43,16 +52,28 @@ class BusPort:
         Packets that were no CAN frames (on `udp_multicast`, where anybody may send).
     error_frames : int
         Error frames that the controller reported.
+    error_kinds : Counter of str
+        What they told; one frame may tell several kinds.
+    is_off : bool
+        The controller has told that it is bus-off, and nothing came since.
     unsent : int
-        Frames given up because the transmit queue stayed full: nobody else on the bus?
+        Frames given up because the transmit queue stayed full (nobody else on the bus?), or
+        because there was no bus.
     """
 
-    def __init__(self, bus: can.BusABC, name: str) -> None:
+    def __init__(
+        self, bus: can.BusABC | None, name: str, facts: InterfaceFacts = UNKNOWN_INTERFACE
+    ) -> None:
         self._bus = bus
         self.name = name
+        self.facts = facts
         self.garbled = 0
         self.error_frames = 0
+        self.error_kinds: Counter[str] = Counter()
+        self.is_off = False
         self.unsent = 0
+        self._posted: deque[tuple[float, can.Message]] = deque()
+        self._dropped_before: int | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -66,8 +87,10 @@ class BusPort:
         self.close()
 
     def close(self) -> None:
-        """Close the bus."""
-        self._bus.shutdown()
+        """Close the bus; what was counted stays."""
+        bus = self._take_bus()
+        if bus is not None:
+            bus.shutdown()
 
     def receive(self, timeout_s: float) -> can.Message | None:
         """Return the next frame that passes the filters; None if none came in time.
@@ -77,19 +100,26 @@ class BusPort:
         BusError
             If the bus is gone.
         """
+        if self._posted:
+            self._send_posted()
+            timeout_s = min(timeout_s, _POSTED_RETRY_S)
         try:
-            message = self._bus.recv(timeout_s)
-        except can.CanOperationError as error:
-            if _is_lost(error):
-                raise self._lost(error, "receiving") from error
-            self.garbled += 1
-            return None
-        except (OSError, can.CanError, ValueError) as error:
-            # ValueError: select on a socket that was closed.
+            message = self._open_bus().recv(timeout_s)
+        except BusError:
+            raise
+        except Exception as error:
+            # Drivers raise what they like, asserts and errors of libraries included. One bad
+            # packet is none of the bus's; whatever else it was, this bus is of no more use.
+            if _is_one_packets(error):
+                self.garbled += 1
+                return None
             raise self._lost(error, "receiving") from error
-        if message is not None and message.is_error_frame:
-            self.error_frames += 1
+        if message is None:
             return None
+        if message.is_error_frame:
+            self._count_error(message)
+            return None
+        self.is_off = False
         return message
 
     def send(self, message: can.Message, within_s: float = SEND_WITHIN_S) -> bool:
@@ -101,44 +131,121 @@ class BusPort:
             If the bus is gone.
         """
         give_up_s = 0.0
-        while True:
-            try:
-                self._bus.send(message)
-            except (OSError, can.CanError, ValueError) as error:
-                if not _is_full(error):
-                    raise self._lost(error, "sending") from error
-            else:
-                return True
+        while not self._try_to_send(message):
             now_s = time.monotonic()
             give_up_s = give_up_s or now_s + within_s
             if now_s >= give_up_s:
                 self.unsent += 1
                 return False
             time.sleep(_RETRY_S)
+        return True
 
-    def set_filters(self, filters: list[CanFilter]) -> None:
-        """Receive only what passes these filters from now on."""
-        self._bus.set_filters(filters)
+    def post(self, message: can.Message, within_s: float = SEND_WITHIN_S) -> None:
+        """Send a frame without ever waiting.
+
+        While the transmit queue is full it is tried again whenever something is received or
+        looked for, in order, and given up after `within_s` [s].
+
+        Raises
+        ------
+        BusError
+            If the bus is gone.
+        """
+        self._posted.append((time.monotonic() + within_s, message))
+        self._send_posted()
+
+    @property
+    def queue_drops(self) -> int | None:
+        """Frames that the kernel dropped because the receive queue was full; None: not told."""
+        now = None if self._bus is None else queue_drops(self._bus)
+        if now is None or self._dropped_before is None:
+            return self._dropped_before if now is None else now
+        return self._dropped_before + now
+
+    def set_filters(self, filters: Sequence[CanFilter]) -> None:
+        """Receive only what passes these filters from now on.
+
+        Raises
+        ------
+        BusError
+            If the bus is gone.
+        """
+        try:
+            self._open_bus().set_filters(filters)
+        except BusError:
+            raise
+        except Exception as error:  # as when receiving
+            raise self._lost(error, "setting filters") from error
 
     @property
     def carries_fd(self) -> bool:
         """Whether the bus is open for CAN FD frames."""
-        return self._bus.protocol is not can.CanProtocol.CAN_20
+        return self._bus is not None and self._bus.protocol is not can.CanProtocol.CAN_20
+
+    def _open_bus(self) -> can.BusABC:
+        if self._bus is None:
+            raise BusError(f"{self.name}: not open")
+        return self._bus
+
+    def _take_bus(self) -> can.BusABC | None:
+        """Give up the bus, if there is one, without closing it."""
+        self._dropped_before = self.queue_drops
+        bus, self._bus = self._bus, None
+        self.unsent += len(self._posted)
+        self._posted.clear()
+        self.is_off = False
+        return bus
+
+    def _try_to_send(self, message: can.Message) -> bool:
+        """Return whether the transmit queue had room."""
+        try:
+            self._open_bus().send(message)
+        except BusError:
+            raise
+        except Exception as error:  # as when receiving
+            if _is_full(error):
+                return False
+            raise self._lost(error, "sending") from error
+        return True
+
+    def _send_posted(self) -> None:
+        now_s = time.monotonic()
+        while self._posted:
+            until_s, message = self._posted[0]
+            if not self._try_to_send(message):
+                if now_s < until_s:
+                    return
+                self.unsent += 1
+            self._posted.popleft()
+
+    def _count_error(self, message: can.Message) -> None:
+        self.error_frames += 1
+        kinds = error_kinds(message) if self.facts.has_error_classes else [UNSPECIFIED]
+        self.error_kinds.update(kinds)
+        if BUS_OFF in kinds:
+            self.is_off = True
+        elif RESTARTED in kinds:
+            self.is_off = False
 
     def _lost(self, error: BaseException, doing: str) -> BusError:
         said = " ".join(str(error.__cause__ or error).split()) or type(error).__name__
         return BusError(f"{self.name}: {doing} failed: {said}; is the bus up?")
 
 
-def _is_lost(error: can.CanOperationError) -> bool:
-    """Return whether receiving failed for good, and not only for one packet's content.
+def _is_one_packets(error: BaseException) -> bool:
+    """Return whether receiving failed for one packet's content only, and not for good.
 
-    Only the latter is told by an error of Python's own (the driver could not unpack it).
+    That is told by an error of Python's own (the driver could not unpack it).
     """
-    return error.__cause__ is None or isinstance(error.__cause__, OSError | can.CanError)
+    cause = error.__cause__
+    if not isinstance(error, can.CanOperationError) or cause is None:
+        return False
+    return not isinstance(cause, OSError | can.CanError)
 
 
 def _is_full(error: BaseException) -> bool:
+    if isinstance(error, can.CanTimeoutError):
+        return True
     code = getattr(error, "error_code", None)
     if code is None:
         cause = error.__cause__ or error

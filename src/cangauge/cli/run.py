@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import gc
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from cangauge.bus.open import open_bus, parse_bus_options
-from cangauge.bus.receive import BusPort
+from cangauge.bus.lasting import LastingPort
+from cangauge.bus.open import parse_bus_options
 from cangauge.cli.bus_options import (
     BusDbcOption,
     BusMapOption,
@@ -32,7 +34,8 @@ from cangauge.service.display import LiveLine
 from cangauge.service.gauge import Gauge
 from cangauge.service.loop import Outputs, RunSummary, serve
 from cangauge.service.record import Recorder
-from cangauge.service.signals import stop_on_signals
+from cangauge.service.reload import Reloader
+from cangauge.service.signals import note_hangups, stop_on_signals
 from cangauge.service.table import EstimateWriter
 
 
@@ -52,6 +55,14 @@ def run_command(  # noqa: PLR0917 - typer passes options by name
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
     bus_option: BusOptionOption = None,
+    wait_for_bus: Annotated[
+        bool | None,
+        typer.Option(
+            "--wait-for-bus/--need-bus",
+            help="Start even if the bus is not there yet, or refuse to (default). A bus that goes"
+            " later is waited for in any case.",
+        ),
+    ] = None,
     vehicle: BusVehicleOption = None,
     dbc: BusDbcOption = None,
     map_file: BusMapOption = None,
@@ -135,6 +146,9 @@ def run_command(  # noqa: PLR0917 - typer passes options by name
     `dbc/soc_estimate.dbc` says: SoC and its standard deviation [%], status, reasons. Ends at
     Ctrl-C or SIGTERM with a summary. Positive current discharges.
 
+    SIGHUP reads configuration, model and car again: SoC goes on, and what is broken is refused.
+    The bus, the time source and the files to write need a restart.
+
     For example:
 
     `cangauge run -m leaf.json --vehicle leaf_aze0 --interface socketcan --channel can0`
@@ -149,6 +163,7 @@ def run_command(  # noqa: PLR0917 - typer passes options by name
         "interface": interface,
         "channel": channel,
         "bus_options": parse_bus_options(bus_option or []),
+        "wait_for_bus": wait_for_bus,
         "vehicle": vehicle,
         "dbc": _text(dbc),
         "map": _text(map_file),
@@ -168,20 +183,28 @@ def run_command(  # noqa: PLR0917 - typer passes options by name
         "duration_s": duration_s,
         "until_idle_s": until_idle_s,
     }
-    result = _run(load_config(config, options))
+    result = _run(lambda: load_config(config, options))
     if json_output:
         emit_json(result)
 
 
-def _run(config: RunConfig) -> dict[str, Any]:
+def _run(read: Callable[[], RunConfig]) -> dict[str, Any]:
+    config = read()
     written = [Path(name) for name in (config.record, config.output) if name is not None]
     check_outputs(written, [Path(config.model)])
-    gauge = Gauge(config.load_vehicle(), load_model(config.model), config.gauge_settings())
+    vehicle = config.load_vehicle()
+    gauge = Gauge(vehicle, load_model(config.model), config.gauge_settings())
+    reloader = Reloader(read, config, vehicle, gauge, note)
     address = config.address()
+    # All that is loaded by now stays until the end. Left out of garbage collection, it costs no
+    # pauses meanwhile, and at the end not the second or so of taking it apart.
+    gc.freeze()
     with ExitStack() as stack:
         # Signals first: whoever starts the service may end it at any moment after.
         stop = stack.enter_context(stop_on_signals())
-        port = stack.enter_context(BusPort(open_bus(address, gauge.filters), str(address)))
+        hangup = stack.enter_context(note_hangups())
+        port = stack.enter_context(LastingPort(address, gauge.filters, note))
+        port.open(wait=config.wait_for_bus)
         recorder = table = line = None
         if config.record is not None:
             recorder = stack.enter_context(Recorder(config.record))
@@ -189,15 +212,16 @@ def _run(config: RunConfig) -> dict[str, Any]:
             table = stack.enter_context(EstimateWriter(config.output))
         note(f"listening on {address}; time source: {config.time_source}; Ctrl-C ends")
         if console.is_terminal:
-            line = stack.enter_context(LiveLine(console, gauge))
+            line = stack.enter_context(LiveLine(console, gauge, lambda: port.trouble))
         outputs = Outputs(
             record=recorder,
             table=None if table is None else table.add,
             show=None if line is None else line.show,
             warn=note,
+            reload=lambda: reloader.reload() if hangup() else None,
         )
         summary = serve(port, gauge, config.loop_settings(), outputs, stop)
-    note(_summary_line(gauge, summary))
+    note(_summary_line(gauge, port, summary))
     if not gauge.counts.frames:
         note(
             f"warning: {port.name}: no wanted frame arrived; check channel, bit rate and the car"
@@ -208,18 +232,33 @@ def _run(config: RunConfig) -> dict[str, Any]:
     return _as_json(gauge, port, summary, config)
 
 
-def _summary_line(gauge: Gauge, summary: RunSummary) -> str:
+def _summary_line(gauge: Gauge, port: LastingPort, summary: RunSummary) -> str:
     counts, latest = gauge.counts, gauge.latest
     soc = f"{number(latest.soc_pct, 2)} ± {number(latest.soc_std_pct, 2, '%')}"
     step = number(summary.step_p50_us, 0, "µs")
     return (
         f"{summary.seconds:.1f} s, {counts.frames} frames, {counts.samples} samples,"
-        f" {counts.lost} lost, {counts.crc_errors} CRC errors;"
+        f" {counts.lost} lost, {counts.crc_errors} CRC errors{_troubles(port, summary)};"
         f" last SoC {soc} ({latest.status.name.lower()}); step {step} (median)"
     )
 
 
-def _as_json(gauge: Gauge, port: BusPort, summary: RunSummary, config: RunConfig) -> dict[str, Any]:
+def _troubles(port: LastingPort, summary: RunSummary) -> str:
+    """Return what went wrong on the bus, as a part of the summary."""
+    kinds = ", ".join(f"{kind} {count}" for kind, count in port.error_kinds.most_common())
+    found = {
+        "dropped in the receive queue": port.queue_drops,
+        f"error frames ({kinds})": port.error_frames,
+        "not sent": port.unsent,
+        "of another service with these ids": summary.rival_frames,
+        f"times without the bus ({port.away_s:.1f} s)": port.losses,
+    }
+    return "".join(f", {count} {what}" for what, count in found.items() if count)
+
+
+def _as_json(
+    gauge: Gauge, port: LastingPort, summary: RunSummary, config: RunConfig
+) -> dict[str, Any]:
     counts, latest = gauge.counts, gauge.latest
     return {
         "bus": port.name,
@@ -242,7 +281,13 @@ def _as_json(gauge: Gauge, port: BusPort, summary: RunSummary, config: RunConfig
         "restarts": counts.beginnings,
         "garbled": port.garbled,
         "error_frames": port.error_frames,
+        "error_kinds": dict(port.error_kinds),
+        "queue_drops": port.queue_drops,
         "unsent": port.unsent,
+        "bus_losses": port.losses,
+        "bus_away_s": port.away_s,
+        "rival_frames": summary.rival_frames,
+        "stamps": port.facts.stamps,
         "step_p50_us": summary.step_p50_us,
         "estimate": {
             "time_s": latest.time_s,

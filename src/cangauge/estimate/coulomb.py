@@ -55,6 +55,15 @@ class CoulombCounter:
         self.moved_pct = 0.0
         """Charge moved either way since the first sample [%]."""
 
+    def take_over(self, before: CoulombCounter) -> None:
+        """Go on counting from the last sample of another counter."""
+        self._last, self._mean_square_a2 = before.memory
+
+    @property
+    def memory(self) -> tuple[tuple[float, float] | None, float]:
+        """Time [s] and current [A] of the last sample, and the recent mean square current [A²]."""
+        return self._last, self._mean_square_a2
+
     def step(self, time_s: float, current_a: float) -> ChargeStep:
         """Take one sample, later than the one before (positive current discharges)."""
         last, self._last = self._last, (time_s, current_a)

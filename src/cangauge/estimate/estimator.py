@@ -139,6 +139,29 @@ class Estimator:
         """Estimated offset of the current sensor [A]; 0 without fusion."""
         return self._fusion.offset_a if self._fused else 0.0
 
+    def take_over(self, before: Estimator) -> None:
+        """Go on where another estimator stands, of another model or other settings.
+
+        SoC and standard deviation are carried over, and so are the delay line, the last sample,
+        from which charge is counted on, and the marks of gaps. What was learned of the current's
+        offset and the model's bias belongs to the other model, and is learned anew; so are the
+        inner states of effects. Where the other one knows no SoC yet, neither does this one.
+        """
+        self._samples = before._samples
+        self._first_s = before._first_s
+        self._last_s = before._last_s
+        self._temperature_c = before._temperature_c
+        self._gap_until_s = before._gap_until_s
+        self._rest_since_s = before._rest_since_s
+        self._line.take_over(before._line)
+        self._counter.take_over(before._counter)
+        self._last_estimate = latest = before._last_estimate
+        if math.isfinite(latest.soc_pct) and math.isfinite(latest.soc_std_pct):
+            self._begin(latest.soc_pct, latest.soc_std_pct)
+        elif math.isfinite(latest.soc_coulomb_pct):
+            # The inverse without a voltage knows nothing; counting still does.
+            self._begin(latest.soc_coulomb_pct, UNKNOWN_SOC_STD_PCT)
+
     def step(self, sample: Sample) -> Estimate:
         """Take one sample and return the estimate after it.
 

@@ -94,6 +94,24 @@ class DelayLine:
             del times[:stale]
             del currents[:stale]
 
+    def take_over(self, before: DelayLine) -> None:
+        """Take the samples of another line, as far as it keeps them."""
+        self._times, self._currents = before.kept()
+        if self._times:
+            self._since = self._times[-1] - before.filled_s
+            if self._longest > before.longest_s:
+                # The other one has forgotten what this one would need.
+                self._since = max(self._since, self._times[0])
+
+    def kept(self) -> tuple[list[float], list[float]]:
+        """Return times [s] and currents [A] of the samples kept, oldest first."""
+        return list(self._times), list(self._currents)
+
+    @property
+    def longest_s(self) -> float:
+        """The longest delay [s]."""
+        return self._longest
+
     @property
     def filled_s(self) -> float:
         """How long a gap-free stretch the line has seen [s]."""

@@ -9,6 +9,7 @@ Keys are the options' names, with underscores::
     method = "ekf"                  # ekf, newton, coulomb
     initial_soc = "auto"            # or a number [%]
     time_source = "receive"         # or "replay-clock"
+    wait_for_bus = true             # start even if it is not there yet
 
     [bus_options]
     bitrate = 500000
@@ -42,7 +43,7 @@ from pydantic import (
 )
 
 from cangauge.bus.mapping import CheckMap, MessageMap, RuleMap
-from cangauge.bus.open import BusAddress, bus_address
+from cangauge.bus.open import BusAddress, bus_address, is_interface_name
 from cangauge.bus.overrides import Overrides
 from cangauge.bus.publish import FrameIds
 from cangauge.bus.time_source import TimeSourceName
@@ -108,6 +109,8 @@ class RunConfig(_Strict):
         By default SocketCAN's vcan0 where there is one, else `udp_multicast`.
     bus_options : mapping
         Further arguments of the bus's driver.
+    wait_for_bus : bool
+        Start even if the bus is not there yet.
     vehicle, dbc, map : str, optional
         Preset, or DBC and map file; by default what `replay` sends.
     temperature : float, optional
@@ -145,6 +148,7 @@ class RunConfig(_Strict):
     interface: str | None = None
     channel: str | None = None
     bus_options: dict[str, StrictBool | int | float | str] = Field(default_factory=dict)
+    wait_for_bus: StrictBool = False
     vehicle: str | None = None
     dbc: str | None = None
     map: str | None = None
@@ -175,7 +179,10 @@ class RunConfig(_Strict):
 
     def address(self) -> BusAddress:
         """Return which bus; may raise InputError."""
-        return bus_address(self.interface, self.channel, self.bus_options)
+        interface = self.interface
+        if interface is None and self.wait_for_bus and is_interface_name(self.channel):
+            interface = "socketcan"  # which cannot be seen from what is there now
+        return bus_address(interface, self.channel, self.bus_options)
 
     def load_vehicle(self) -> Vehicle:
         """Return the vehicle; may raise InputError."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import TracebackType
 from typing import Final, Self
 
@@ -30,10 +31,15 @@ class LiveLine:
     ----------
     console : rich.console.Console
     gauge : Gauge
+    trouble : callable, optional
+        Returns what is wrong with the bus, in words; empty if nothing is.
     """
 
-    def __init__(self, console: Console, gauge: Gauge) -> None:
+    def __init__(
+        self, console: Console, gauge: Gauge, trouble: Callable[[], str] | None = None
+    ) -> None:
         self._gauge = gauge
+        self._trouble = trouble
         # Without a thread of its own: it is drawn when it is told to.
         self._live = Live(console=console, auto_refresh=False, transient=True)
         self._due_s = 0.0
@@ -61,7 +67,10 @@ class LiveLine:
         if self._last is not None and now_s > self._last[0]:
             self._rate = (samples - self._last[1]) / (now_s - self._last[0])
         self._last = (now_s, samples)
-        self._live.update(live_text(self._gauge, self._rate), refresh=True)
+        text = live_text(self._gauge, self._rate)
+        if self._trouble is not None and (trouble := self._trouble()):
+            text.append(f"  {trouble}", style="bold red")
+        self._live.update(text, refresh=True)
 
 
 def live_text(gauge: Gauge, samples_per_s: float) -> Text:

@@ -68,6 +68,31 @@ class Gauge:
         self._publisher = SocPublisher(ids, ACKNOWLEDGE_EVERY if self._is_replay else None)
         self._beginnings = 0
 
+    def reconfigure(
+        self, vehicle: Vehicle | None, model: ModelFile, settings: GaugeSettings
+    ) -> None:
+        """Go on with another configuration, from the SoC that is known.
+
+        Parameters
+        ----------
+        vehicle : Vehicle, optional
+            None: the same.
+        model : ModelFile
+        settings : GaugeSettings
+            Of the estimator's, initial SoC and standard deviation stay what they were; time source
+            and REPLAY_CLOCK's id must be what they were.
+
+        Raises
+        ------
+        InputError
+            As when made; the old configuration then stays.
+        """
+        _check_ids(vehicle or self._vehicle, settings.ids)
+        self._vehicle = vehicle or self._vehicle
+        self._stream.reconfigure(vehicle, model, settings.estimator)
+        self.settings = settings
+        self._publisher.ids = settings.ids
+
     @property
     def filters(self) -> list[CanFilter]:
         """What to receive: the vehicle's frames, and REPLAY_CLOCK where that is the clock."""

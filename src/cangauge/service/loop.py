@@ -20,6 +20,8 @@ from cangauge.bus.receive import BusPort
 from cangauge.bus.time_source import is_clock
 from cangauge.estimate.types import Estimate
 from cangauge.service.gauge import Gauge
+from cangauge.service.rivals import Rivals
+from cangauge.service.upkeep import Upkeep
 
 LATE_S: Final = 0.01
 """So much later than due a beat may come, so that it tells of a sample that is about to [s]."""
@@ -27,9 +29,9 @@ LATE_S: Final = 0.01
 LOOK_EVERY_S: Final = 0.1
 """How long receiving may block before signals and heartbeats are looked at again [s]."""
 
-SEND_WITHIN_S: Final = 0.02
-"""How long sending may wait for room [s]: a full queue (nobody else on the bus) costs frames, never
-the estimate."""
+SEND_WITHIN_S: Final = 0.1
+"""How long a frame may wait for room in the transmit queue [s]: by then the next one is due.
+Nothing waits for it: a full queue (nobody else on the bus) costs frames, never the estimate."""
 
 STEPS_KEPT: Final = 4096
 """Over so many of the latest steps is the median of their times taken."""
@@ -52,11 +54,14 @@ class LoopSettings:
         Without a sample for so long, the estimate is published as stale [s].
     duration_s, until_idle_s : float, optional
         End after this time; end when samples came and then none for so long [s].
+    checkpoint_every_s : float
+        How often the state is saved [s].
     """
 
     timeout_s: float = 2.0
     duration_s: float | None = None
     until_idle_s: float | None = None
+    checkpoint_every_s: float = 30.0
 
 
 @dataclass(frozen=True)
@@ -73,12 +78,20 @@ class Outputs:
         Called with the monotonic time [s] after every frame and at every heartbeat.
     warn : callable, optional
         Takes a line of text.
+    checkpoint : callable, optional
+        Saves the state: called every `checkpoint_every_s`, and at the end after the last estimate.
+        What it raises as OSError or CangaugeError is a warning.
+    reload : callable, optional
+        Asked like `stop`; if the gauge has been given another configuration, it returns the
+        loop's.
     """
 
     record: FrameSink | None = None
     table: Callable[[float, Estimate], None] | None = None
     show: Callable[[float], None] | None = None
     warn: Callable[[str], None] | None = None
+    checkpoint: Callable[[], None] | None = None
+    reload: Callable[[], LoopSettings | None] | None = None
 
 
 @dataclass(frozen=True)
@@ -89,6 +102,8 @@ class RunSummary:
     cpu_seconds: float
     step_p50_us: float | None
     """Median time from a frame that completes a sample to its estimate [µs]."""
+    rival_frames: int = 0
+    """Frames with this service's ids that somebody else sent."""
 
 
 def serve(
@@ -116,17 +131,21 @@ def serve(
     Raises
     ------
     BusError
-        If the bus is gone.
+        If the bus is gone (never with a `LastingPort`, which waits until it is back).
     """
     loop = _Loop(port, gauge, settings, outputs)
     cpu = time.process_time()
-    while not (stop() or loop.is_over()):
-        loop.turn()
-    loop.finish()
+    try:
+        while not (stop() or loop.is_over()):
+            loop.turn()
+        loop.finish()
+    finally:
+        loop.save()
     return RunSummary(
         seconds=time.monotonic() - loop.began_s,
         cpu_seconds=time.process_time() - cpu,
         step_p50_us=statistics.median(loop.step_ns) / 1e3 if loop.step_ns else None,
+        rival_frames=loop.rivals.frames,
     )
 
 
@@ -138,10 +157,10 @@ class _Loop:
         self._gauge = gauge
         self._settings = settings
         self._outputs = outputs
+        self.rivals = Rivals(gauge.settings.ids, echoes=port.facts.echoes, warn=outputs.warn)
+        self._upkeep = Upkeep(port, outputs.checkpoint, settings.checkpoint_every_s, outputs.warn)
         self._ignores_clock = gauge.settings.time_source == "receive"
-        if self._ignores_clock:
-            # Listened for, to warn, until the first one.
-            port.set_filters([*gauge.filters, standard_filter(gauge.settings.ids.replay_clock)])
+        self._set_filters()
         self.began_s = time.monotonic()
         self.step_ns: deque[int] = deque(maxlen=STEPS_KEPT)
         self._now_s = self.began_s
@@ -168,6 +187,11 @@ class _Loop:
         late_s = 0.0 if self._gauge.samples != before else LATE_S
         if self._now_s >= self._beat_s + late_s:
             self._beat()
+        self._upkeep.look(self._now_s)
+        if self._outputs.reload is not None and (settings := self._outputs.reload()) is not None:
+            self._settings = settings
+            self.rivals.use(self._gauge.settings.ids)
+            self._set_filters()
         if self._outputs.show is not None:
             self._outputs.show(self._now_s)
 
@@ -186,8 +210,13 @@ class _Loop:
             self._tell()
             self._send(frames)
 
+    def save(self) -> None:
+        self._upkeep.finish()
+
     def _take(self, message: can.Message) -> None:
         gauge = self._gauge
+        if self.rivals.takes(message, self._now_s):
+            return
         if self._ignores_clock and is_clock(message, gauge.settings.ids.replay_clock):
             self._warn_of_clock()
             return
@@ -212,11 +241,19 @@ class _Loop:
 
     def _send(self, frames: list[can.Message]) -> None:
         for frame in frames:
-            self._port.send(frame, SEND_WITHIN_S)
+            self.rivals.sent(frame)
+            self._port.post(frame, SEND_WITHIN_S)
+
+    def _set_filters(self) -> None:
+        wanted = [*self._gauge.filters, *self.rivals.filters]
+        if self._ignores_clock:
+            # Listened for, to warn, until the first one.
+            wanted.append(standard_filter(self._gauge.settings.ids.replay_clock))
+        self._port.set_filters(wanted)
 
     def _warn_of_clock(self) -> None:
         self._ignores_clock = False
-        self._port.set_filters(self._gauge.filters)
+        self._set_filters()
         if self._outputs.warn is not None:
             self._outputs.warn(
                 "warning: a replay tells its own time on this bus (REPLAY_CLOCK), but frames are"

@@ -93,9 +93,7 @@ class EstimateStream:
         time_source: TimeSourceName = "receive",
         clock_id: int = REPLAY_CLOCK_ID,
     ) -> None:
-        settings = settings or EstimatorSettings()
-        if settings.temperature_source == "unknown":
-            settings = replace(settings, temperature_source=vehicle.temperature_source)
+        settings = _filled(settings or EstimatorSettings(), vehicle)
         self._vehicle = vehicle
         self._model = model
         self._settings = settings
@@ -135,6 +133,34 @@ class EstimateStream:
     def finish(self) -> Estimate | None:
         """Return the estimate after a last current that still waits for a voltage, if any."""
         return self._step(self._assembler.flush())
+
+    def reconfigure(
+        self, vehicle: Vehicle | None, model: ModelFile, settings: EstimatorSettings
+    ) -> None:
+        """Go on with another vehicle (None: the same), model and settings.
+
+        What does not change is not touched: the numbers then go on bit for bit. Else the
+        estimator is made anew and takes SoC and delay line over; the initial SoC stays what it
+        was.
+        """
+        old = self._settings
+        settings = replace(
+            _filled(settings, vehicle or self._vehicle),
+            initial_soc_pct=old.initial_soc_pct,
+            initial_soc_std_pct=old.initial_soc_std_pct,
+        )
+        pack = pack_of(model, settings.capacity_ah)
+        if vehicle is not None or pack != self._pack:
+            # What a signal may be follows from both.
+            self._past, self._untimed = self.counts, 0
+            self._vehicle, self._pack = vehicle or self._vehicle, pack
+            self._assembler = SampleAssembler(self._vehicle, pack)
+        if (model, settings) == (self._model, old):
+            return
+        before = self._estimator
+        self._model, self._settings = model, settings
+        self._estimator = Estimator(model, settings)
+        self._estimator.take_over(before)
 
     @property
     def counts(self) -> FrameCounts:
@@ -226,3 +252,9 @@ def pack_of(model: ModelFile, capacity_ah: float | None = None) -> Pack:
         capacity_ah=model.capacity_ah if capacity_ah is None else capacity_ah,
         usual_v=voltage.pseudo_ocv_at(50.0)[0],
     )
+
+
+def _filled(settings: EstimatorSettings, vehicle: Vehicle) -> EstimatorSettings:
+    if settings.temperature_source != "unknown":
+        return settings
+    return replace(settings, temperature_source=vehicle.temperature_source)

@@ -1,0 +1,92 @@
+"""The kernel's count of frames that found the receive queue full, on real sockets."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+import time
+from pathlib import Path
+
+import can
+import pytest
+
+from cangauge.bus.interface_facts import interface_facts
+from cangauge.bus.open import BusAddress, bus_address, open_bus
+from cangauge.bus.queue_drops import queue_drops
+from cangauge.bus.receive import BusPort
+
+linux_only = pytest.mark.skipif(sys.platform != "linux", reason="the count is Linux's")
+
+
+def multicast() -> BusAddress:
+    return bus_address("udp_multicast", options={"port": 20_000 + os.getpid() % 20_000})
+
+
+@linux_only
+def test_every_frame_is_received_or_counted() -> None:
+    address, sent = multicast(), 4000
+    with BusPort(open_bus(address), "receiver") as port, BusPort(open_bus(address), "sender") as tx:
+        with socket.socket(fileno=os.dup(port._bus.fileno())) as own:  # type: ignore[union-attr] # open
+            own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
+        assert port.queue_drops == 0
+        for number in range(sent):
+            tx.send(can.Message(arbitration_id=number % 0x700, is_extended_id=False, data=bytes(8)))
+        dropped = port.queue_drops
+        received = 0
+        while port.receive(0.1) is not None:
+            received += 1
+    assert dropped
+    assert received + dropped == sent
+    assert port.queue_drops == dropped  # also when it is closed
+
+
+def test_where_nobody_counts_it_says_so() -> None:
+    with BusPort(open_bus(BusAddress("virtual", "drops")), "virtual") as port:
+        assert port.queue_drops is None
+    assert port.queue_drops is None
+
+
+@linux_only
+def test_a_descriptor_that_is_no_socket() -> None:
+    class DeviceBus:
+        def fileno(self) -> int:
+            return descriptor
+
+    descriptor = os.open(os.devnull, os.O_RDONLY)
+    try:
+        before = descriptors()
+        assert queue_drops(DeviceBus()) is None  # type: ignore[arg-type] # all that is asked for
+        assert descriptors() == before
+    finally:
+        os.close(descriptor)
+
+
+def descriptors() -> int:
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+@linux_only
+def test_the_kernel_stamps_multicast_when_it_comes_in() -> None:
+    address = multicast()
+    assert interface_facts(address).stamps == "kernel"
+    with BusPort(open_bus(address), "receiver") as port, BusPort(open_bus(address), "sender") as tx:
+        before_s = time.time()
+        tx.send(can.Message(arbitration_id=1, is_extended_id=False))
+        sent_s = time.time()
+        time.sleep(0.3)
+        message = port.receive(1.0)
+    assert message is not None
+    assert before_s - 0.001 <= message.timestamp <= sent_s + 0.1
+
+
+def test_what_interfaces_do() -> None:
+    virtual = interface_facts(BusAddress("virtual", "x"))
+    assert (virtual.stamps, virtual.echoes) == ("sender", False)
+    pcan = interface_facts(BusAddress("pcan", "PCAN_USBBUS1", {"receive_own_messages": True}))
+    assert (pcan.stamps, pcan.echoes, pcan.has_error_classes) == ("driver", True, False)
+    socketcan = interface_facts(BusAddress("socketcan", "can0"))
+    assert (socketcan.stamps, socketcan.echoes, socketcan.has_error_classes) == (
+        "kernel", False, True,
+    )  # fmt: skip
+    assert interface_facts(multicast()).echoes

@@ -1,0 +1,100 @@
+"""An estimator that goes on where one of another model or other settings stands."""
+
+from __future__ import annotations
+
+import pytest
+
+from cangauge.estimate.estimator import Estimator, EstimatorSettings
+from cangauge.estimate.offline import samples_of
+from cangauge.estimate.types import Estimate, Reason, Sample
+from cangauge.model.model_file import ModelFile
+from live import leaf_model, short_log
+
+
+def drive() -> list[Sample]:
+    return list(samples_of(short_log(200.0)))
+
+
+def stepped(estimator: Estimator, samples: list[Sample]) -> Estimate:
+    for sample in samples:
+        estimate = estimator.step(sample)
+    return estimate
+
+
+def other_model() -> ModelFile:
+    model = leaf_model()
+    k0 = model.coefficients["k0"]
+    shifted = {**model.coefficients, "k0": k0.model_copy(update={"value": k0.value + 2.0})}
+    return model.model_copy(update={"coefficients": shifted})
+
+
+@pytest.mark.parametrize("method", ["ekf", "coulomb"])
+def test_soc_and_its_deviation_go_on_and_the_line_stays_full(method: str) -> None:
+    samples = drive()
+    settings = EstimatorSettings(method=method, initial_soc_pct=80.0)  # type: ignore[arg-type] # one of them
+    before = Estimator(leaf_model(), settings)
+    last = stepped(before, samples[:1500])
+    after = Estimator(other_model(), settings)
+    after.take_over(before)
+    first = after.step(samples[1500])
+    # One step of 0.1 s moves it, and one voltage, weighed against what was known.
+    assert first.soc_pct == pytest.approx(last.soc_pct, abs=0.25 * last.soc_std_pct)
+    assert first.soc_std_pct == pytest.approx(last.soc_std_pct, rel=0.05)
+    assert not first.reasons & (Reason.DELAY_LINE_FILLING | Reason.NO_INITIAL_SOC)
+    assert first.samples == 1501
+    # The model that it has now is the other one: it predicts other voltages.
+    assert first.voltage_model_v == pytest.approx(last.voltage_model_v + 2.0, abs=1.0)
+
+
+def test_no_charge_is_lost_in_between() -> None:
+    samples = [each._replace(current_a=100.0) for each in drive()]
+    settings = EstimatorSettings(method="coulomb", initial_soc_pct=80.0)
+    whole = stepped(Estimator(leaf_model(), settings), samples)
+    part = Estimator(leaf_model(), settings)
+    for cut in range(100, 2000, 100):
+        stepped(part, samples[cut - 100 : cut])
+        following = Estimator(leaf_model(), settings)
+        following.take_over(part)
+        part = following
+    # 20 estimators, each from the last sample of the one before: 100 A × 0.1 s lost each time
+    # would be 0.1 %.
+    assert stepped(part, samples[1900:]).soc_pct == pytest.approx(whole.soc_pct, abs=1e-9)
+
+
+def test_a_shorter_memory_does_not_feign_a_longer_one() -> None:
+    samples = drive()
+    short = leaf_model()
+    short = short.model_copy(update={"delays_s": [0.0, 1.0, 2.0, 3.0]})
+    settings = EstimatorSettings(initial_soc_pct=80.0)
+    before = Estimator(short, settings)
+    stepped(before, samples[:1900])
+    after = Estimator(leaf_model(), settings)
+    after.take_over(before)
+    assert after.step(samples[1900]).reasons & Reason.DELAY_LINE_FILLING
+
+
+def test_what_is_not_known_stays_unknown_and_a_sample_before_the_last_is_refused() -> None:
+    samples = drive()
+    before = Estimator(leaf_model())
+    after = Estimator(leaf_model())
+    after.take_over(before)
+    assert after.step(samples[0]._replace(voltage_v=float("nan"))).reasons & Reason.NO_INITIAL_SOC
+    before = Estimator(leaf_model(), EstimatorSettings(initial_soc_pct=80.0))
+    stepped(before, samples[:100])
+    after = Estimator(leaf_model(), EstimatorSettings(initial_soc_pct=80.0))
+    after.take_over(before)
+    assert after.step(samples[50]).reasons & Reason.IMPLAUSIBLE_INPUT
+
+
+def test_the_inverse_without_a_voltage_goes_on_from_counting() -> None:
+    samples = drive()
+    settings = EstimatorSettings(method="newton", initial_soc_pct=80.0)
+    before = Estimator(leaf_model(), settings)
+    stepped(before, samples[:1000])
+    silent = [each._replace(voltage_v=float("nan")) for each in samples[1000:1020]]
+    last = stepped(before, silent)
+    after = Estimator(leaf_model(), EstimatorSettings(initial_soc_pct=80.0))
+    after.take_over(before)
+    assert after.step(samples[1020]._replace(voltage_v=float("nan"))).soc_pct == pytest.approx(
+        last.soc_coulomb_pct, abs=0.05
+    )

@@ -1,0 +1,213 @@
+"""Another configuration while running: what takes effect, what does not, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import can
+import pytest
+
+from cangauge.bus.database import load_dbc
+from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.vehicle import load_vehicle
+from cangauge.estimate.offline import samples_of
+from cangauge.estimate.types import Reason
+from cangauge.model.model_file import load_model
+from cangauge.service.config import load_config
+from cangauge.service.gauge import Gauge
+from cangauge.service.loop import LoopSettings
+from cangauge.service.reload import Reloader
+from cangauge.share import shared_file
+from live import leaf_model_path, short_log
+
+MAP = """
+dbc = ["pack.dbc"]
+name = "car"
+temperature_source = "pack"
+[current]
+message = "PACK_CURRENT"
+signal = "current_a"
+[voltage]
+message = "PACK_VOLTAGE"
+signal = "voltage_v"
+[temperature]
+message = "PACK_TEMPERATURE"
+signal = "temperature_c"
+"""
+
+
+class Car:
+    """A gauge with its configuration file, its frames, and what was said."""
+
+    def __init__(self, folder: Path, text: str = "") -> None:
+        self.path = folder / "car.toml"
+        self.model = folder / "model.json"
+        shutil.copy(leaf_model_path(), self.model)
+        self.write(text)
+        config = load_config(self.path)
+        vehicle = config.load_vehicle()
+        self.gauge = Gauge(vehicle, load_model(config.model), config.gauge_settings())
+        self.said: list[str] = []
+        self.reloader = Reloader(
+            lambda: load_config(self.path), config, vehicle, self.gauge, self.said.append
+        )
+        encoder = FrameEncoder(load_vehicle("generic"))
+        self.frames = [encoder.encode(each) for each in samples_of(short_log(200.0))]
+
+    def write(self, text: str) -> None:
+        self.path.write_text(f'model = "model.json"\ninitial_soc = 80\n{text}')
+
+    def drive(self, first: int, last: int) -> list[can.Message]:
+        sent: list[can.Message] = []
+        for frames in self.frames[first:last]:
+            for frame in frames:
+                sent += self.gauge.handle(can.Message.__copy__(frame))
+            sent += self.gauge.heartbeat(is_stale=False)
+        return sent
+
+    def reload(self, text: str) -> LoopSettings | None:
+        self.write(text)
+        return self.reloader.reload()
+
+
+@pytest.fixture
+def car(tmp_path: Path) -> Car:
+    car = Car(tmp_path)
+    car.drive(0, 1000)
+    return car
+
+
+def test_thresholds_and_time_outs_change_and_the_estimate_goes_on_bit_for_bit(
+    car: Car, tmp_path: Path
+) -> None:
+    settings = car.reload("timeout_s = 0.5\nuntil_idle_s = 9\n")
+    assert settings == LoopSettings(timeout_s=0.5, until_idle_s=9.0)
+    assert car.said == ["configuration read again; changed: timeout_s, until_idle_s"]
+    car.drive(1000, 1200)
+    (tmp_path / "undisturbed").mkdir()
+    undisturbed = Car(tmp_path / "undisturbed")
+    undisturbed.drive(0, 1200)
+    assert car.gauge.latest == undisturbed.gauge.latest
+
+
+def test_another_model_in_the_same_file_takes_soc_over(car: Car) -> None:
+    before = car.gauge.latest
+    text = json.loads(car.model.read_text())
+    text["capacity_ah"] *= 0.9
+    text["coefficients"]["k0"]["value"] += 1.0
+    car.model.write_text(json.dumps(text))
+    assert car.reload("") is not None
+    car.drive(1000, 1001)
+    after = car.gauge.latest
+    assert after.soc_pct == pytest.approx(before.soc_pct, abs=0.25 * before.soc_std_pct)
+    assert after.soc_std_pct == pytest.approx(before.soc_std_pct, rel=0.05)
+    assert not after.reasons & Reason.DELAY_LINE_FILLING
+    assert after.voltage_model_v != pytest.approx(before.voltage_model_v, abs=0.2)
+    assert car.gauge.samples == 1001
+
+
+def test_initial_soc_is_of_the_past(car: Car) -> None:
+    before = car.gauge.latest
+    assert car.reload("initial_soc_std = 20\n") is not None
+    car.path.write_text('model = "model.json"\ninitial_soc = 20\n')
+    assert car.reloader.reload() is not None
+    car.drive(1000, 1001)
+    assert car.gauge.latest.soc_pct == pytest.approx(before.soc_pct, abs=0.05)
+
+
+def test_published_ids_change_and_their_counters_go_on(car: Car) -> None:
+    assert {each.arbitration_id for each in car.drive(1000, 1020)} == {0x5A0, 0x5A1}
+    last = estimate_counter(car.drive(1020, 1021)[0])
+    assert car.reload("[ids]\nsoc_estimate = 0x100\n") is not None
+    sent = car.drive(1021, 1042)
+    assert {each.arbitration_id for each in sent} == {0x100, 0x5A1}
+    first = next(each for each in sent if each.arbitration_id == 0x100)
+    assert estimate_counter(first) == (last + 1) % 16
+
+
+def estimate_counter(frame: can.Message) -> int:
+    layout = load_dbc(shared_file("dbc", "soc_estimate.dbc")).get_message_by_name("SOC_ESTIMATE")
+    values = layout.decode(frame.data, decode_choices=False)
+    return int(next(values[name] for name in values if name.startswith("counter")))  # type: ignore[union-attr,call-overload] # a dict of numbers
+
+
+def test_another_car_is_taken_and_frames_stay_counted(car: Car) -> None:
+    frames = car.gauge.counts.frames
+    assert car.reload('vehicle = "leaf_aze0"\n') is not None
+    car.drive(1000, 1100)  # the frames of the other car: not wanted now
+    assert car.gauge.samples == 1000
+    assert car.gauge.counts.frames > frames
+    assert 0x1DB in [each["can_id"] for each in car.gauge.filters]
+    assert car.reload("") is not None
+    car.drive(1100, 1110)
+    assert car.gauge.samples >= 1009
+
+
+def test_a_dbc_or_map_that_changed_is_noticed(tmp_path: Path) -> None:
+    shutil.copy(shared_file("dbc", "generic_pack.dbc"), tmp_path / "pack.dbc")
+    (tmp_path / "map.toml").write_text(MAP)
+    car = Car(tmp_path, 'map = "map.toml"\n')
+    car.drive(0, 100)
+    temperature_c = car.gauge.latest_sample.temperature_c  # type: ignore[union-attr] # there is one
+    (tmp_path / "map.toml").write_text(MAP + "offset = 5\n")
+    assert car.reloader.reload() is not None
+    car.drive(100, 200)
+    assert car.gauge.latest_sample.temperature_c == pytest.approx(  # type: ignore[union-attr] # as above
+        temperature_c + 5.0, abs=1.0
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "say"),
+    [
+        ("timeout_s = [", "car.toml: not TOML"),
+        ("timeout_s = -1", "timeout_s"),
+        ("timeuot_s = 1", "did you mean timeout_s"),
+        ('vehicle = "moped"', "moped"),
+        ('map = "nowhere.toml"', "nowhere.toml"),
+        ("[ids]\nsoc_estimate = 0x5A1", "soc_detail"),
+        ("[ids]\nsoc_estimate = 0x100\nsoc_detail = 0x900", "soc_detail"),
+    ],
+)
+def test_what_is_broken_is_refused_whole_and_the_old_one_goes_on(
+    car: Car, text: str, say: str
+) -> None:
+    settings, filters, latest = car.gauge.settings, car.gauge.filters, car.gauge.latest
+    assert car.reload(text) is None
+    assert len(car.said) == 1
+    assert car.said[0].startswith("warning: new configuration refused, the old one goes on: ")
+    assert say in car.said[0]
+    assert "\n" not in car.said[0]
+    assert (car.gauge.settings, car.gauge.filters, car.gauge.latest) == (settings, filters, latest)
+    car.drive(1000, 1001)
+    assert car.gauge.samples == 1001
+
+
+def test_an_id_that_the_new_car_uses_is_refused_before_anything_changes(car: Car) -> None:
+    filters = car.gauge.filters
+    assert car.reload('vehicle = "leaf_aze0"\n[ids]\nsoc_estimate = 0x1DB\n') is None
+    assert "0x1DB" in car.said[0]
+    assert car.gauge.filters == filters
+
+
+@pytest.mark.parametrize("content", [b"", b'{"format": "cangauge-model"', b"\xff\xfe\x00"])
+def test_a_broken_model_is_refused(car: Car, content: bytes) -> None:
+    car.model.write_bytes(content)
+    assert car.reload("timeout_s = 0.5\n") is None
+    assert "model.json" in car.said[0]
+    car.model.unlink()
+    assert car.reloader.reload() is None
+    assert len(car.said) == 2
+
+
+def test_what_needs_a_restart_is_said_and_left(car: Car) -> None:
+    text = 'channel = "can5"\ntime_source = "replay-clock"\n[ids]\nreplay_clock = 0x111\n'
+    assert car.reload(text) is not None
+    assert car.gauge.settings.time_source == "receive"
+    assert car.gauge.settings.ids.replay_clock == 0x5AF
+    assert car.said[1] == (
+        "warning: channel, time_source, ids.replay_clock: takes effect when the service starts"
+        " again"
+    )

@@ -1,0 +1,98 @@
+"""Two services with the same ids on one bus, and one that hears itself."""
+
+from __future__ import annotations
+
+import os
+import time
+
+import can
+import pytest
+
+from cangauge.bus.interface_facts import interface_facts
+from cangauge.bus.open import bus_address, open_bus
+from cangauge.bus.publish import FrameIds
+from cangauge.bus.receive import BusPort
+from cangauge.bus.vehicle import load_vehicle
+from cangauge.service.gauge import Gauge, GaugeSettings
+from cangauge.service.rivals import AGAIN_S, Rivals
+from live import Service, leaf_model, virtual_service, waits
+
+OTHER_IDS = GaugeSettings(ids=FrameIds(soc_estimate=0x5B0, soc_detail=0x5B1))
+
+
+def frame(frame_id: int = 0x5A0, data: bytes = b"12345678") -> can.Message:
+    return can.Message(arbitration_id=frame_id, is_extended_id=False, data=data)
+
+
+def test_two_services_on_one_bus_notice_each_other_once() -> None:
+    with virtual_service("rivals") as one, virtual_service("rivals") as two:
+        assert waits(lambda: bool(one.warnings) and bool(two.warnings))
+        time.sleep(0.5)
+    for service in (one, two):
+        assert len(service.warnings) == 1
+        assert "0x5A" in service.warnings[0]
+        assert "--soc-estimate-id" in service.warnings[0]
+        assert service.summary is not None
+        assert service.summary.rival_frames >= 3
+        assert service.gauge.counts.frames == 0  # they are no input
+
+
+def test_other_ids_are_no_rivals() -> None:
+    with virtual_service("peers") as one, virtual_service("peers", OTHER_IDS) as two:
+        time.sleep(0.8)
+    assert one.warnings == two.warnings == []
+    assert one.summary is not None
+    assert one.summary.rival_frames == 0
+
+
+def multicast_service(port: int) -> Service:
+    gauge = Gauge(load_vehicle("generic"), leaf_model())
+    address = bus_address("udp_multicast", options={"port": port})
+    bus = open_bus(address, gauge.filters)
+    return Service(BusPort(bus, str(address), interface_facts(address)), gauge)
+
+
+def test_where_ones_own_frames_come_back_they_are_known() -> None:
+    port = 20_000 + (os.getpid() + 7919) % 20_000
+    with multicast_service(port) as alone:
+        time.sleep(1.0)
+        assert alone.warnings == []
+        with multicast_service(port) as second:
+            assert waits(lambda: bool(alone.warnings) and bool(second.warnings))
+    assert "somebody else sends 0x5A" in alone.warnings[0]
+
+
+@pytest.mark.parametrize("echoes", [False, True])
+def test_even_the_very_same_frames_of_another_are_noticed(echoes: bool) -> None:
+    warnings = list[str]()
+    rivals = Rivals(FrameIds(), echoes=echoes, warn=warnings.append)
+    for number in range(4):
+        mine = frame(data=bytes([number] * 8))
+        rivals.sent(mine)
+        if echoes:
+            assert rivals.takes(mine, 1.0 + number)
+        assert rivals.takes(frame(data=bytes([number] * 8)), 1.0 + number)
+    assert rivals.frames == 4
+    assert len(warnings) == 1
+
+
+def test_a_single_frame_is_no_service_and_one_that_stays_is_mentioned_again() -> None:
+    warnings = list[str]()
+    rivals = Rivals(FrameIds(), echoes=False, warn=warnings.append)
+    for time_s in (0.0, 10.0, 20.0):
+        assert rivals.takes(frame(), time_s)
+    assert warnings == []
+    assert not rivals.takes(frame(0x1DB), 20.0)
+    assert not rivals.takes(can.Message(arbitration_id=0x5A0, is_extended_id=True), 20.0)
+    for number in range(20_000):
+        rivals.takes(frame(0x5A1), 30.0 + 0.1 * number)
+    assert len(warnings) == 1 + 2000.0 // AGAIN_S
+
+
+def test_an_echo_that_is_lost_does_not_make_the_next_one_a_rival() -> None:
+    rivals = Rivals(FrameIds(), echoes=True)
+    for number in range(200):
+        rivals.sent(frame(data=bytes([number] * 8)))
+        if number % 3:
+            rivals.takes(frame(data=bytes([number] * 8)), 0.1 * number)
+    assert rivals.frames == 0

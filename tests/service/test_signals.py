@@ -1,0 +1,66 @@
+"""SIGHUP: a request to read again, and the end where it means that the terminal is gone."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from cangauge.service.signals import note_hangups, stop_on_signals
+
+pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no SIGHUP on this system")
+
+
+def test_a_hangup_is_told_once() -> None:
+    before = signal.getsignal(signal.SIGHUP)
+    with stop_on_signals() as stop, note_hangups() as take:
+        assert not take()
+        signal.raise_signal(signal.SIGHUP)
+        signal.raise_signal(signal.SIGHUP)
+        assert take()
+        assert not take()
+        assert not stop()
+    assert signal.getsignal(signal.SIGHUP) == before
+
+
+LOOP = """
+import sys, time
+from cangauge.service.signals import note_hangups, stop_on_signals
+with stop_on_signals() as stop, note_hangups() as take:
+    print("ready", flush=True)
+    until = time.monotonic() + 20.0
+    while not stop() and time.monotonic() < until:
+        if take():
+            print("again", flush=True)
+        time.sleep(0.01)
+open(sys.argv[1], "w").write("stopped" if stop() else "went on")
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no terminals of that kind")
+def test_a_terminal_that_is_closed_ends_it(tmp_path: Path) -> None:
+    import pty  # noqa: PLC0415 - not on every system
+
+    said = tmp_path / "said"
+    child, terminal = pty.fork()
+    if child == 0:
+        os.execv(sys.executable, [sys.executable, "-c", LOOP, str(said)])  # noqa: S606 - no shell wanted
+    assert _reads(terminal, b"ready")
+    os.kill(child, signal.SIGHUP)
+    assert _reads(terminal, b"again")
+    os.close(terminal)
+    began_s = time.monotonic()
+    os.waitpid(child, 0)
+    assert time.monotonic() - began_s < 5.0
+    assert said.read_text() == "stopped"
+
+
+def _reads(terminal: int, text: bytes) -> bool:
+    found = b""
+    while text not in found:
+        found += os.read(terminal, 1024)
+    return True

@@ -1,0 +1,354 @@
+"""What befalls a real SocketCAN interface, and the service on it: down, removed, overrun, told of
+errors, shared with a second service; and the signals meanwhile."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import signal
+import socket
+import struct
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Self
+
+import can
+import pytest
+
+from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.lasting import LONGEST_PAUSE_S, LastingPort
+from cangauge.bus.open import BusAddress, has_socketcan, open_bus
+from cangauge.bus.publish import SocEstimate, SocReader, standard_filter
+from cangauge.bus.receive import BusPort
+from cangauge.bus.vehicle import load_vehicle
+from cangauge.errors import InputError
+from cangauge.estimate.estimator import EstimatorSettings
+from cangauge.estimate.offline import samples_of
+from cangauge.estimate.types import Reason, Status
+from cangauge.service.gauge import Gauge, GaugeSettings
+from cangauge.service.loop import LoopSettings
+from live import Command, Service, leaf_model, leaf_model_path, short_log, waits
+
+pytestmark = pytest.mark.socketcan
+
+VCAN = BusAddress("socketcan", "vcan0")
+STALE_S = 0.3
+
+
+def ip(*arguments: str) -> None:
+    subprocess.run(["ip", "link", *arguments], check=True)
+
+
+def add(name: str) -> None:
+    ip("add", name, "type", "vcan")
+    ip("set", name, "up")
+
+
+@pytest.fixture(autouse=True)
+def _vcan0() -> Iterator[None]:
+    if not has_socketcan("vcan0"):
+        pytest.skip("no SocketCAN interface vcan0 on this machine")
+    if shutil.which("ip") is None:
+        pytest.skip("no `ip` command to take the interface down")
+    yield
+    names = [name for _, name in socket.if_nameindex()]
+    if "vcan0" in names:
+        ip("set", "vcan0", "up")
+    else:
+        add("vcan0")
+    if "vcan7" in names:
+        ip("del", "vcan7")
+
+
+class Lasting(Service):
+    """The service on a port that lasts; what the port says is kept."""
+
+    def __init__(self, address: BusAddress = VCAN, *, wait: bool = False) -> None:
+        known = GaugeSettings(EstimatorSettings(initial_soc_pct=80.0))
+        gauge = Gauge(load_vehicle("generic"), leaf_model(), known)
+        self.lines: list[str] = []
+        port = LastingPort(address, gauge.filters, self.lines.append)
+        port.open(wait=wait)
+        super().__init__(port, gauge, LoopSettings(timeout_s=STALE_S))
+
+    @property
+    def lasting(self) -> LastingPort:
+        assert isinstance(self.port, LastingPort)
+        return self.port
+
+
+class Pack:
+    """Sends a drive in real time, 50 samples a second, whenever there is a bus."""
+
+    def __init__(self, address: BusAddress = VCAN) -> None:
+        self._address = address
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self.sent = 0
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join(10.0)
+
+    def _run(self) -> None:
+        encoder = FrameEncoder(load_vehicle("generic"))
+        port = LastingPort(self._address, [], lambda _line: None)
+        port.open(wait=True)
+        with port:
+            for sample in samples_of(short_log(600.0)):
+                if self._stop.is_set():
+                    return
+                for frame in encoder.encode(sample):
+                    port.post(frame)
+                    self.sent += 1
+                port.receive(0.0 if port.is_away else 0.001)
+                time.sleep(0.02)
+
+
+class Listener:
+    """Reads what is published, on a bus opened when it is asked."""
+
+    def __init__(self) -> None:
+        self._bus = open_bus(VCAN, [standard_filter(0x5A0)])
+        self._reader = SocReader()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bus.shutdown()
+
+    def next(self) -> SocEstimate:
+        message = self._bus.recv(2.0)
+        assert message is not None, "nothing is published"
+        content = self._reader.read(message)
+        assert isinstance(content, SocEstimate)
+        return content
+
+
+def is_stale(told: SocEstimate) -> bool:
+    return told.status is Status.INVALID and bool(told.reasons & Reason.INPUT_STALE)
+
+
+@pytest.mark.parametrize("kind", ["down", "removed"])
+def test_an_interface_that_goes_and_comes_back(kind: str) -> None:
+    with Lasting() as live:
+        with Pack():
+            assert waits(lambda: live.gauge.samples >= 50)
+        before = live.gauge.latest.soc_pct
+        if kind == "down":
+            ip("set", "vcan0", "down")
+        else:
+            ip("del", "vcan0")
+        assert waits(lambda: live.lasting.is_away)
+        cpu_s = time.process_time()
+        time.sleep(2.0)
+        # The whole program's, this test's included; a loop that spins takes two seconds.
+        assert time.process_time() - cpu_s < 0.5
+        assert live.error is None
+        assert live.lasting.is_away
+        if kind == "down":
+            ip("set", "vcan0", "up")
+        else:
+            add("vcan0")
+        assert waits(lambda: not live.lasting.is_away, LONGEST_PAUSE_S + 0.5)
+        with Listener() as listener:
+            told = listener.next()
+            assert is_stale(told)  # it goes on publishing, and says how old that is
+            assert told.soc_pct == pytest.approx(before, abs=0.01)
+            samples = live.gauge.samples
+            with Pack():
+                assert waits(lambda: live.gauge.samples >= samples + 20)
+                told = [listener.next() for _ in range(30)][-1]
+            assert not is_stale(told)
+            assert told.soc_pct == pytest.approx(before, abs=0.5)
+    assert live.error is None
+    assert live.lasting.losses == 1
+    assert live.lasting.away_s >= 2.0
+    assert 1 <= len(live.lines) <= 3
+    assert live.lines[0].startswith("warning: socketcan vcan0: ")
+
+
+def test_an_interface_that_comes_and_goes() -> None:
+    with Lasting() as live, Pack():
+        for _ in range(5):
+            ip("set", "vcan0", "down")
+            time.sleep(0.05)
+            ip("set", "vcan0", "up")
+            time.sleep(0.25)
+        assert waits(lambda: not live.lasting.is_away)
+        samples = live.gauge.samples
+        assert waits(lambda: live.gauge.samples >= samples + 20)
+    assert live.error is None
+    assert live.summary is not None
+    assert 1 <= live.lasting.losses <= 5
+    assert len(live.lines) <= live.summary.seconds + 1.0
+
+
+def test_a_bus_that_does_not_exist_yet() -> None:
+    address = BusAddress("socketcan", "vcan7")
+    with pytest.raises(InputError, match="vcan7"):
+        Lasting(address)
+    with Lasting(address, wait=True) as live, Pack(address):
+        time.sleep(0.5)
+        assert live.lasting.is_away
+        add("vcan7")
+        assert waits(lambda: live.gauge.samples >= 20)
+    assert live.error is None
+    assert live.lasting.losses == 0
+    assert "waiting for it" in live.lines[0]
+
+
+def test_an_interface_that_is_down_is_told_when_it_is_opened() -> None:
+    ip("set", "vcan0", "down")
+    with pytest.raises(InputError, match="is down") as caught:
+        open_bus(VCAN)
+    assert "ip link set vcan0 up" in str(caught.value)
+
+
+def test_trying_in_vain_leaks_no_descriptor(caplog: pytest.LogCaptureFixture) -> None:
+    # What the driver logs holds its errors, and they the sockets; only pytest keeps it.
+    caplog.set_level(logging.CRITICAL + 1, "can")
+
+    def descriptors() -> int:
+        return len(list(Path("/proc/self/fd").iterdir()))
+
+    ip("set", "vcan0", "down")
+    before = descriptors()
+    for address in [VCAN] * 100 + [BusAddress("socketcan", "nosuch0")] * 100:
+        try:
+            open_bus(address)
+        except InputError:
+            continue
+        pytest.fail("opened")
+    assert descriptors() <= before + 1
+
+
+def send_error(classes: int, data: bytes = bytes(8)) -> None:
+    with socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw:
+        raw.bind(("vcan0",))
+        raw.send(struct.pack("=IB3x8s", socket.CAN_ERR_FLAG | classes, 8, data))
+
+
+def test_error_frames_are_counted_by_kind_and_bus_off_is_told() -> None:
+    with Lasting() as live, Pack():
+        assert waits(lambda: live.gauge.samples >= 10)
+        for _ in range(5):
+            send_error(0x088)
+        send_error(0x004, b"\x00\x01" + bytes(6))
+        assert waits(lambda: live.port.error_frames == 6)
+        assert live.port.error_kinds == {
+            "protocol": 5, "bus_error": 5, "controller_receive_overflow": 1,
+        }  # fmt: skip
+        assert live.lines == []
+        send_error(0x040)
+        assert waits(lambda: live.port.error_kinds["bus_off"] == 1)
+        assert waits(lambda: bool(live.lines))
+        assert "bus-off" in live.lines[0]
+        send_error(0x100)
+        frames = live.gauge.counts.frames
+        assert waits(lambda: live.gauge.counts.frames > frames + 20)
+        assert not live.port.is_off
+    assert live.error is None
+    assert live.lasting.losses == 0
+
+
+def test_two_thousand_error_frames_keep_nothing_from_the_estimate() -> None:
+    with Lasting() as live, Pack() as pack:
+        assert waits(lambda: live.gauge.samples >= 10)
+        with socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw:
+            raw.bind(("vcan0",))
+            frame = struct.pack("=IB3x8s", socket.CAN_ERR_FLAG | 0x080, 8, bytes(8))
+            for _ in range(100):
+                for _ in range(20):
+                    raw.send(frame)
+                time.sleep(0.01)
+        assert waits(lambda: live.port.error_frames == 2000)
+        samples = live.gauge.samples
+        assert waits(lambda: live.gauge.samples >= samples + 20)
+        assert pack.sent > 0
+    assert live.gauge.counts.lost == live.port.queue_drops == 0
+
+
+def test_the_kernel_stamps_when_a_frame_comes_in_and_not_when_it_is_read() -> None:
+    with BusPort(open_bus(VCAN), "receiver") as port, BusPort(open_bus(VCAN), "sender") as sender:
+        before_s = time.time()
+        sender.send(can.Message(arbitration_id=0x123, is_extended_id=False))
+        sent_s = time.time()
+        time.sleep(0.5)
+        message = port.receive(1.0)
+    assert message is not None
+    # Stamps have nanoseconds, this clock too; half a second would be the reading.
+    assert before_s - 0.001 <= message.timestamp <= sent_s + 0.05
+
+
+def test_two_services_notice_each_other() -> None:
+    with Lasting() as one:
+        time.sleep(0.5)
+        assert one.warnings == []
+        with Lasting() as two:
+            assert waits(lambda: bool(one.warnings) and bool(two.warnings))
+    assert "somebody else sends 0x5A" in one.warnings[0]
+
+
+def test_one_service_through_overflow_signals_and_a_bus_that_is_down(tmp_path: Path) -> None:
+    """Processes start slowly in a guest, so one is led through all of it."""
+    config, burst = tmp_path / "car.toml", 4000
+    config.write_text(f'model = "{leaf_model_path()}"\nchannel = "vcan0"\n')
+    ip("set", "vcan0", "down")
+    live = Command("run", "--config", config, "--wait-for-bus", "--json")
+    live.wait_for("waiting for it")
+    ip("set", "vcan0", "up")
+    live.wait_for("there after")
+    # A pause of the process: what does not fit the queue is lost, and counted.
+    live.process.send_signal(signal.SIGSTOP)
+    with BusPort(open_bus(VCAN, []), "sender") as sender:
+        for frame in _frames(burst):
+            sender.send(frame)
+    live.process.send_signal(signal.SIGCONT)
+    live.wait_for("the receive queue overflowed")
+    config.write_text("timeout_s = [")
+    live.process.send_signal(signal.SIGHUP)
+    live.wait_for("new configuration refused")
+    config.write_text(
+        f'model = "{leaf_model_path()}"\nchannel = "vcan0"\n[ids]\nsoc_estimate = 0x111\n'
+    )
+    live.process.send_signal(signal.SIGHUP)
+    live.wait_for("configuration read again; changed: ids")
+    listener = open_bus(VCAN, [standard_filter(0x111)])
+    assert listener.recv(2.0) is not None
+    listener.shutdown()
+    ip("set", "vcan0", "down")
+    live.wait_for("Trying again")
+    time.sleep(0.5)
+    began_s = time.monotonic()
+    live.process.send_signal(signal.SIGTERM)
+    ended = live.end(10.0)
+    assert time.monotonic() - began_s < 1.0
+    assert ended.code == 0, ended.err
+    result = ended.json
+    assert result["queue_drops"] > 0
+    assert result["frames"] + result["queue_drops"] == burst
+    assert result["stamps"] == "kernel"
+    assert result["bus_losses"] == 1
+    assert result["bus_away_s"] > 0.5
+    assert f"{result['queue_drops']} dropped in the receive queue" in ended.err
+
+
+def _frames(count: int) -> Iterator[can.Message]:
+    encoder = FrameEncoder(load_vehicle("generic"))
+    made = 0
+    for sample in samples_of(short_log(200.0)):
+        for frame in encoder.encode(sample):
+            yield frame
+            made += 1
+            if made == count:
+                return
+    raise AssertionError("the log is too short")
