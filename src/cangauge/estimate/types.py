@@ -58,6 +58,8 @@ class Reason(enum.IntFlag):
     """No wanted frame within the time-out."""
     IMPLAUSIBLE_INPUT = 1 << 12
     """A sample was refused: not finite, or outside physical limits."""
+    FILTER_RESET = 1 << 13
+    """The filter was lost (every voltage an outlier for minutes) and was started anew."""
 
 
 class Estimate(NamedTuple):

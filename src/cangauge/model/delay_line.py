@@ -121,3 +121,13 @@ class DelayLine:
                 c0, c1 = currents[right - 1], currents[right]
                 result.append(c0 + (c1 - c0) * (at - t0) / (t1 - t0))
         return result
+
+    @property
+    def contents(self) -> tuple[list[float], list[float], float]:
+        """Times [s] and currents [A] kept, and when the gap-free stretch began [s]: copies."""
+        return list(self._times), list(self._currents), self._since
+
+    def fill(self, time_s: Sequence[float], current_a: Sequence[float], since_s: float) -> None:
+        """Take over the contents of another line: times [s], increasing, currents [A]."""
+        self._times, self._currents = list(time_s), list(current_a)
+        self._since = since_s
