@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
@@ -33,6 +34,7 @@ from cangauge.service.gauge import Gauge
 from cangauge.service.loop import Outputs, RunSummary, serve
 from cangauge.service.record import Recorder
 from cangauge.service.signals import stop_on_signals
+from cangauge.service.state_keeper import StateKeeper
 from cangauge.service.table import EstimateWriter
 
 
@@ -124,6 +126,25 @@ def run_command(  # noqa: PLR0917 - typer passes options by name
             "--until-idle", metavar="S", help="End when samples came and then none for so long [s]."
         ),
     ] = None,
+    state: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Keep SoC, its uncertainty and the delay line here over restarts: written every"
+            " 30 s and at the end. A folder stands for a file in it. Default: systemd's"
+            " StateDirectory, if there is one.",
+        ),
+    ] = None,
+    state_max_age_s: Annotated[
+        float | None,
+        typer.Option(
+            "--state-max-age", metavar="S", help="An older state is refused [s]. Default: 7 days."
+        ),
+    ] = None,
+    state_every_s: Annotated[
+        float | None,
+        typer.Option("--state-every", metavar="S", help="Write it so often [s]. Default: 30."),
+    ] = None,
     soc_estimate_id: EstimateIdOption = None,
     soc_detail_id: DetailIdOption = None,
     replay_clock_id: ClockIdOption = None,
@@ -143,6 +164,8 @@ def run_command(  # noqa: PLR0917 - typer passes options by name
     `cangauge replay trip.parquet --speed max`)
 
     `cangauge run --config car.toml --record drive.log -o soc.parquet`
+
+    `cangauge run --config car.toml --state /var/lib/cangauge`
     """
     options: dict[str, Any] = {
         "model": _text(model),
@@ -167,6 +190,9 @@ def run_command(  # noqa: PLR0917 - typer passes options by name
         "output": _text(output),
         "duration_s": duration_s,
         "until_idle_s": until_idle_s,
+        "state": _text(state),
+        "state_max_age_s": state_max_age_s,
+        "state_every_s": state_every_s,
     }
     result = _run(load_config(config, options))
     if json_output:
@@ -176,13 +202,17 @@ def run_command(  # noqa: PLR0917 - typer passes options by name
 def _run(config: RunConfig) -> dict[str, Any]:
     written = [Path(name) for name in (config.record, config.output) if name is not None]
     check_outputs(written, [Path(config.model)])
-    gauge = Gauge(config.load_vehicle(), load_model(config.model), config.gauge_settings())
+    kept = config.state_settings(os.environ)
+    model = load_model(config.model)
+    gauge = Gauge(config.load_vehicle(), model, config.gauge_settings())
     address = config.address()
     with ExitStack() as stack:
         # Signals first: whoever starts the service may end it at any moment after.
         stop = stack.enter_context(stop_on_signals())
         port = stack.enter_context(BusPort(open_bus(address, gauge.filters), str(address)))
-        recorder = table = line = None
+        recorder = table = line = keeper = None
+        if kept is not None:
+            keeper = stack.enter_context(StateKeeper(kept, gauge, model, note))
         if config.record is not None:
             recorder = stack.enter_context(Recorder(config.record))
         if config.output is not None:
@@ -195,6 +225,8 @@ def _run(config: RunConfig) -> dict[str, Any]:
             table=None if table is None else table.add,
             show=None if line is None else line.show,
             warn=note,
+            checkpoint=None if keeper is None else keeper.checkpoint,
+            checkpoint_every_s=config.state_every_s,
         )
         summary = serve(port, gauge, config.loop_settings(), outputs, stop)
     note(_summary_line(gauge, summary))
@@ -248,6 +280,7 @@ def _as_json(gauge: Gauge, port: BusPort, summary: RunSummary, config: RunConfig
         "soc_reference_pct": gauge.reference_soc_pct,
         "record": config.record,
         "output": config.output,
+        "state": config.state,
     }
 
 

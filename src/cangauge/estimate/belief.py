@@ -143,11 +143,10 @@ class Belief:
         change = moved.log_likelihood - parked.log_likelihood
         self._log_odds = min(max(self._log_odds + change, -50.0), 50.0)
         self._open_s += since.counted_s
-        likelier = int(self._log_odds > 0.0)
-        if abs(self._log_odds) > CLEAR_LOG_ODDS or any(contradicted):
-            self._filters = [self._filters[likelier]]
-            self.verdict = "moved" if likelier else "parked"
-            return contradicted[likelier]
+        if contradicted[0] != contradicted[1]:
+            return self._settle(contradicted.index(False))
+        if contradicted[0] or abs(self._log_odds) > CLEAR_LOG_ODDS:
+            return self._settle(int(self._log_odds > 0.0), is_doubted=contradicted[0])
         if self._open_s > OPEN_AT_MOST_S:
             self._merge("unclear")
         return False
@@ -240,6 +239,12 @@ class Belief:
     def _mean(self, values: Sequence[float]) -> float:
         moved = 1.0 / (1.0 + math.exp(-self._log_odds))
         return (1.0 - moved) * values[0] + moved * values[1]
+
+    def _settle(self, story: int, *, is_doubted: bool = False) -> bool:
+        """Keep one of two stories; return whether it is contradicted as well."""
+        self._filters = [self._filters[story]]
+        self.verdict = "moved" if story else "parked"
+        return is_doubted
 
     def _merge(self, verdict: Verdict) -> None:
         """Replace two filters by one with their mean and spread, weighed by the odds."""

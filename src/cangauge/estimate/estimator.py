@@ -283,6 +283,7 @@ class Estimator:
                 self._fusion.rested()
         if not math.isfinite(sample.voltage_v):
             self._newton = Inverse(math.nan, inside=True)
+            self._newton_std_pct = math.nan
         else:
             self._weigh_voltage(sample, since)
         for anchor in self._anchors.see(

@@ -281,6 +281,10 @@ class Fusion:
     def _watch(self, measurement: Measurement, seconds: float) -> bool:
         """Whether the mean innovation, before any bias, contradicts state and model."""
         ekf = self._ekf
+        if seconds > PERSISTENT_S:
+            # One voltage after a pause is no mean, and those before it tell nothing any more.
+            self._forget_innovations()
+            return False
         plain = float(self._predicted(ekf.x, measurement)[0, 0]) - self.bias_v
         weight = math.exp(-seconds / PERSISTENT_S)
         self._mean_innovation_v *= weight

@@ -72,12 +72,16 @@ class Outputs:
         Called with the monotonic time [s] after every frame and at every heartbeat.
     warn : callable, optional
         Takes a line of text.
+    checkpoint : callable, optional
+        Called every `checkpoint_every_s`, to keep the state; must return at once.
     """
 
     record: FrameSink | None = None
     table: Callable[[float, Estimate], None] | None = None
     show: Callable[[float], None] | None = None
     warn: Callable[[str], None] | None = None
+    checkpoint: Callable[[], None] | None = None
+    checkpoint_every_s: float = 30.0
 
 
 @dataclass(frozen=True)
@@ -146,6 +150,7 @@ class _Loop:
         self._now_s = self.began_s
         self._beat_s = self.began_s
         self._sample_s = self.began_s
+        self._checkpoint_s = self.began_s + outputs.checkpoint_every_s
 
     def is_over(self) -> bool:
         settings = self._settings
@@ -168,6 +173,9 @@ class _Loop:
             self._beat_s = self._now_s + ESTIMATE_EVERY_S
         if self._outputs.show is not None:
             self._outputs.show(self._now_s)
+        if self._outputs.checkpoint is not None and self._now_s >= self._checkpoint_s:
+            self._outputs.checkpoint()
+            self._checkpoint_s = self._now_s + self._outputs.checkpoint_every_s
 
     def finish(self) -> None:
         before = self._gauge.samples
