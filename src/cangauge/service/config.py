@@ -191,6 +191,7 @@ class RunConfig(_Strict):
 
     def gauge_settings(self) -> GaugeSettings:
         """Return what the gauge needs; may raise InputError."""
+        full, rest = self.full_charge, self.long_rest
         return GaugeSettings(
             estimator=EstimatorSettings(
                 method=self.method,
@@ -199,8 +200,8 @@ class RunConfig(_Strict):
                 capacity_ah=self.capacity_ah,
                 gap_s=self.max_gap_s,
                 temperature_source=self.temperature_source or "unknown",
-                full_charge=self.full_charge and FullCharge(**self.full_charge.model_dump()),
-                long_rest=self.long_rest and LongRest(**self.long_rest.model_dump()),
+                full_charge=None if full is None else FullCharge(**full.model_dump()),
+                long_rest=None if rest is None else LongRest(**rest.model_dump()),
             ),
             time_source=self.time_source,
             ids=FrameIds(**self.ids.model_dump()),

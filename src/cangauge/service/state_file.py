@@ -54,9 +54,9 @@ def model_fingerprint(model: ModelFile) -> str:
 
 def state_text(content: StateContent) -> str:
     """Return the file's text."""
-    data = content.model_dump(mode="json")
-    head = {"format": STATE_FORMAT, "version": STATE_VERSION, "sha256": _hash(data)}
-    return json.dumps({**head, "content": data}, allow_nan=False) + "\n"
+    text = _canonical(content.model_dump(mode="json"))
+    head = {"format": STATE_FORMAT, "version": STATE_VERSION, "sha256": _hash(text)}
+    return f'{json.dumps(head)[:-1]}, "content": {text}}}\n'
 
 
 def read_state(path: Path) -> StateContent:
@@ -80,7 +80,7 @@ def read_state(path: Path) -> StateContent:
             value=_shown(data.get("version")),
         )
     content = data.get("content")
-    if not isinstance(content, dict) or data.get("sha256") != _hash(content):
+    if not isinstance(content, dict) or data.get("sha256") != _content_hash(content):
         raise InputError("damaged: its content is not what was written", source=path,
                          field="sha256")  # fmt: skip
     try:
@@ -126,12 +126,19 @@ def _parsed(raw: bytes, path: Path) -> object:
         raise InputError(f"is no JSON: {reason}", source=path) from error
 
 
-def _hash(content: dict[str, Any]) -> str:
+def _canonical(content: dict[str, Any]) -> str:
+    return json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _content_hash(content: dict[str, Any]) -> str:
     try:
-        text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+        return _hash(_canonical(content))
     except (ValueError, RecursionError):  # 1e999 is read as infinity, which no hash is made of
         return ""
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _no_constant(name: str) -> float:

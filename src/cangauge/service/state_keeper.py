@@ -117,7 +117,6 @@ class StateKeeper:
         self._writer: BackgroundWriter[StateContent] = BackgroundWriter(self._write)
         self._samples_kept = 0
         self._warned_s = -math.inf
-        self._kept_back = 0
         self._restored_pct: float | None = None
         self.restored = False
         """Whether the gauge went on from the file."""
@@ -258,7 +257,6 @@ class StateKeeper:
         if now_s - self._warned_s < WARN_EVERY_S and not at_once:
             return
         self._warned_s = now_s
-        text = (
-            str(error) if isinstance(error, CangaugeError) else f"{type(error).__name__}: {error}"
-        )
+        is_told = isinstance(error, CangaugeError)
+        text = str(error) if is_told else f"{self.settings.path}: {error!r}"
         self._tell(f"warning: state not written: {text}")
