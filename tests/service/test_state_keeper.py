@@ -195,9 +195,10 @@ def test_a_long_pause_in_a_restart_draws_toward_the_voltage_and_does_not_jump(
     found = service.drive(later)
     truth_pct = 80.0 - 0.01 * (found[-1].time_s - DRIVE[0].time_s - 8 * 3600.0)
     wrong_pct = [truth_pct - each.soc_newton_pct for each in found[800:]]
-    assert sum(wrong_pct) / len(wrong_pct) > 3.5
-    assert abs(found[-1].soc_pct - truth_pct) < 2.0
-    assert abs(found[-1].soc_pct - truth_pct) < found[-1].soc_std_pct
+    by_voltage_pct = sum(wrong_pct) / len(wrong_pct)
+    assert by_voltage_pct > 3.5
+    assert abs(found[-1].soc_pct - truth_pct) < 0.6 * by_voltage_pct
+    assert abs(found[-1].soc_pct - truth_pct) < 1.5 * found[-1].soc_std_pct
     steps = [b.soc_pct - a.soc_pct for a, b in itertools.pairwise([last, *found])]
     assert max(map(abs, steps)) < 0.5
 

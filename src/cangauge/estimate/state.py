@@ -72,6 +72,7 @@ class CounterState(_Strict):
     """Time of the last sample [s]; NaN before the first."""
     current_a: Finite
     mean_square_a2: NotNegative
+    mean_a: Finite
     discharged_pct: Finite
     moved_pct: NotNegative
     counted_s: NotNegative

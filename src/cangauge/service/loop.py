@@ -30,6 +30,10 @@ SEND_WITHIN_S: Final = 0.02
 """How long sending may wait for room [s]: a full queue (nobody else on the bus) costs frames, never
 the estimate."""
 
+FIRST_CHECKPOINT_S: Final = 1.0
+"""The first checkpoint comes so soon, lest a service that is killed again and again keeps nothing
+[s]."""
+
 STEPS_KEPT: Final = 4096
 """Over so many of the latest steps is the median of their times taken."""
 
@@ -150,7 +154,7 @@ class _Loop:
         self._now_s = self.began_s
         self._beat_s = self.began_s
         self._sample_s = self.began_s
-        self._checkpoint_s = self.began_s + outputs.checkpoint_every_s
+        self._checkpoint_s = self.began_s + min(FIRST_CHECKPOINT_S, outputs.checkpoint_every_s)
 
     def is_over(self) -> bool:
         settings = self._settings
