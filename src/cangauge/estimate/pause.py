@@ -13,9 +13,9 @@ import math
 USE_S = 120.0
 """The current before a pause may have gone on for so long into it [s]."""
 
-DRAIN_PCT_PER_HOUR = 0.1
+DRAIN_PCT_PER_HOUR = 0.05
 DRAIN_AT_MOST_PCT = 5.0
-"""What consumers of a parked car and self-discharge may take [% per hour; %]."""
+"""What consumers of a parked car and self-discharge may take [% per hour; %]: 1.2 % a day."""
 
 MOVED_AT_MOST = 0.3
 """Probability that somebody charged or drove in a long pause: a guess, of which the voltage takes
