@@ -70,6 +70,8 @@ class Restart:
     """From the last writing to the first frame after [s]."""
     flowed_pct: float
     """Charge that flowed in that time, either way [% of capacity]."""
+    net_pct: float
+    """The same, charging subtracted: what would be lost if nothing were counted across it."""
     lost_pct: float
     """Charge that is counted wrongly for good [% of capacity]."""
     soc_pct: float
@@ -87,7 +89,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     console = Console(stderr=True)
-    minutes = (options.kills * 0.06 + options.real * 5.0) / 60.0
+    minutes = (options.kills * 0.25 + options.real * 7.0) / 60.0
     console.print(f"about {minutes:.0f} minutes on a machine that is otherwise idle")
     results: Result = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -170,7 +172,7 @@ def in_process(kills: int, seed: int, folder: Path, console: Console) -> Result:
     lives = np.ceil((rng.exponential(MEAN_BETWEEN_KILLS_S, kills + 1) + 1.0) * RATE_HZ).astype(int)
     away = np.ceil(rng.uniform(0.2, 3.0, kills + 1) * RATE_HZ).astype(int)
     samples = drive(float(lives.sum() + away.sum()) / RATE_HZ, model, seed)
-    flowed = flowed_pct(samples, model.capacity_ah)
+    flowed, net = flowed_pct(samples, model.capacity_ah)
     encoder, other = (FrameEncoder(load_vehicle("generic")) for _ in range(2))
     whole, life = Life(model, None), Life(model, path)
     life.begin(EPOCH_S)
@@ -185,7 +187,7 @@ def in_process(kills: int, seed: int, folder: Path, console: Console) -> Result:
                 counted_pct = found.soc_coulomb_pct - truth.soc_coulomb_pct
                 begun = (
                     (at - saved) / RATE_HZ, float(flowed[at] - flowed[saved]),
-                    counted_pct - was_pct, found.soc_pct - truth.soc_pct,
+                    float(net[at] - net[saved]), counted_pct - was_pct, found.soc_pct - truth.soc_pct,
                 )  # fmt: skip
                 was_pct = counted_pct
             if at >= due:
@@ -210,11 +212,12 @@ def in_process(kills: int, seed: int, folder: Path, console: Console) -> Result:
     }
 
 
-def flowed_pct(samples: list[Sample], capacity_ah: float) -> np.ndarray:
-    """Return the charge that flowed either way since the first sample [%], shape (n,)."""
+def flowed_pct(samples: list[Sample], capacity_ah: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the charge since the first sample [%], either way and net, shape (n,) each."""
     current_a = np.array([sample.current_a for sample in samples])
-    each = np.abs(current_a[1:] + current_a[:-1]) / 2.0 / RATE_HZ
-    return np.concatenate(([0.0], np.cumsum(each))) * 100.0 / (3600.0 * capacity_ah)
+    each = (current_a[1:] + current_a[:-1]) / 2.0 / RATE_HZ * 100.0 / (3600.0 * capacity_ah)
+    either = np.concatenate(([0.0], np.cumsum(np.abs(each))))
+    return either, np.concatenate(([0.0], np.cumsum(each)))
 
 
 def rms_30s_pct(samples: list[Sample], capacity_ah: float) -> float:
@@ -227,7 +230,7 @@ def summary(restarts: list[Restart], rms_30s_pct: float) -> Result:
     """Return what the restarts amount to."""
     columns = {
         name: np.abs([getattr(each, name) for each in restarts])
-        for name in ("unsaved_s", "flowed_pct", "lost_pct", "soc_pct", "later_pct")
+        for name in ("unsaved_s", "flowed_pct", "net_pct", "lost_pct", "soc_pct", "later_pct")
     }
     result: Result = {"restarts": len(restarts)}
     for name, values in columns.items():
@@ -255,7 +258,7 @@ def real_process(kills: int, seed: int, folder: Path, console: Console) -> Resul
     model = load_model(model_path)
     lives = rng.uniform(1.5, 6.0, kills)
     samples = drive(kills * 30.0 + 300.0, model, seed)
-    flowed = flowed_pct(samples, model.capacity_ah)
+    flowed, net = flowed_pct(samples, model.capacity_ah)
     restarts = []
     with Player(samples) as player:
         service = [player.service(model_path, KILLED_ID, folder / "real.json")]
@@ -277,7 +280,7 @@ def real_process(kills: int, seed: int, folder: Path, console: Console) -> Resul
                 restarts.append(
                     Restart(
                         (back - saved) / RATE_HZ, float(flowed[back] - flowed[saved]),
-                        after_pct - before_pct, after_pct, player.apart_pct(),
+                        float(net[back] - net[saved]), after_pct - before_pct, after_pct, player.apart_pct(),
                     )
                 )  # fmt: skip
                 console.print(f"{number + 1} real kills", end="\r")
@@ -372,6 +375,7 @@ def table_of(results: Result) -> Table:
     rows = {
         "unsaved_s": "time not saved, until the first frame after [s]",
         "flowed_pct": "charge that flowed in it, either way [%]",
+        "net_pct": "net: lost if nothing were counted across the gap [%]",
         "lost_pct": "charge (process: SoC) lost [%]",
         "soc_pct": "SoC off at the first frame after [%]",
         "later_pct": "SoC off at the end of that life [%]",
