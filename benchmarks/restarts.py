@@ -187,7 +187,8 @@ def in_process(kills: int, seed: int, folder: Path, console: Console) -> Result:
                 counted_pct = found.soc_coulomb_pct - truth.soc_coulomb_pct
                 begun = (
                     (at - saved) / RATE_HZ, float(flowed[at] - flowed[saved]),
-                    float(net[at] - net[saved]), counted_pct - was_pct, found.soc_pct - truth.soc_pct,
+                    float(net[at] - net[saved]),
+                    counted_pct - was_pct, found.soc_pct - truth.soc_pct,
                 )  # fmt: skip
                 was_pct = counted_pct
             if at >= due:
@@ -280,7 +281,8 @@ def real_process(kills: int, seed: int, folder: Path, console: Console) -> Resul
                 restarts.append(
                     Restart(
                         (back - saved) / RATE_HZ, float(flowed[back] - flowed[saved]),
-                        float(net[back] - net[saved]), after_pct - before_pct, after_pct, player.apart_pct(),
+                        float(net[back] - net[saved]),
+                        after_pct - before_pct, after_pct, player.apart_pct(),
                     )
                 )  # fmt: skip
                 console.print(f"{number + 1} real kills", end="\r")

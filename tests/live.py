@@ -62,7 +62,6 @@ class Service:
     settings: LoopSettings = field(default_factory=LoopSettings)
     record: Any = None
     checkpoint: Callable[[], None] | None = None
-    checkpoint_every_s: float = 30.0
     rows: list[tuple[float, Estimate]] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     summary: RunSummary | None = None
@@ -93,7 +92,6 @@ class Service:
             table=lambda time_s, estimate: self.rows.append((time_s, estimate)),
             warn=self.warnings.append,
             checkpoint=self.checkpoint,
-            checkpoint_every_s=self.checkpoint_every_s,
         )
         try:
             self.summary = serve(self.port, self.gauge, self.settings, outputs, self._stop.is_set)

@@ -16,7 +16,7 @@ from cangauge.estimate.anchors import FullCharge, LongRest
 from cangauge.estimate.estimator import Estimator, EstimatorSettings
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.state import EstimatorState
-from cangauge.estimate.types import Estimate, Sample
+from cangauge.estimate.types import Estimate, Reason, Sample
 from cangauge.model.effects.effect import Pack
 from cangauge.model.effects.library import LIBRARY, effect_entries
 from cangauge.model.model_file import ModelFile
@@ -147,6 +147,22 @@ def test_with_other_settings_the_soc_stays(change: dict[str, Any]) -> None:
     found = after.step(EVENTFUL[300])
     assert found.soc_pct == pytest.approx(last.soc_pct, abs=0.05)
     assert found.soc_std_pct == pytest.approx(last.soc_std_pct, abs=0.2)
+
+
+def test_another_model_takes_the_soc_over() -> None:
+    before = Estimator(PLAIN, EstimatorSettings(initial_soc_pct=80.0))
+    for sample in EVENTFUL[:300]:
+        last = before.step(sample)
+    after = Estimator(extended_by(["hysteresis", "time_skew"]))
+    after.take_over(before)
+    found = [after.step(each) for each in EVENTFUL[300:304]]
+    assert found[0].samples == last.samples + 1
+    assert found[-1].soc_pct == pytest.approx(last.soc_pct, abs=0.1)
+    assert found[-1].soc_std_pct == pytest.approx(last.soc_std_pct, abs=0.2)
+    assert not found[-1].reasons & Reason.DELAY_LINE_FILLING
+    nothing = Estimator(PLAIN)
+    nothing.take_over(Estimator(PLAIN))
+    assert nothing.step(Sample(0.0, 10.0, math.nan, 23.0)).reasons & Reason.NO_INITIAL_SOC
 
 
 def test_a_state_of_another_model_is_refused() -> None:

@@ -96,10 +96,9 @@ def test_stopped_killed_and_started_again(tmp_path: Path) -> None:
 
 def test_the_loop_asks_for_the_state_soon_and_then_every_so_often() -> None:
     asked: list[float] = []
-    service = virtual_service("state", loop=LoopSettings(duration_s=2.6))
+    service = virtual_service("state", loop=LoopSettings(duration_s=2.6, checkpoint_every_s=1.2))
     began = time.monotonic()
     service.checkpoint = lambda: asked.append(time.monotonic() - began)
-    service.checkpoint_every_s = 1.2
     with service:
         service.join(5.0)
     assert [round(each, 1) for each in asked] == pytest.approx([1.0, 2.2], abs=0.25)

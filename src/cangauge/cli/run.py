@@ -226,7 +226,6 @@ def _run(config: RunConfig) -> dict[str, Any]:
             show=None if line is None else line.show,
             warn=note,
             checkpoint=None if keeper is None else keeper.checkpoint,
-            checkpoint_every_s=config.state_every_s,
         )
         summary = serve(port, gauge, config.loop_settings(), outputs, stop)
     note(_summary_line(gauge, summary))

@@ -45,10 +45,7 @@ USUAL_CURRENT_C_RATE = 1.0 / 3.0
 """What a current that was not seen may have been [1/h]: 20 A at 60 Ah."""
 
 CONTRADICTED_S = 300.0
-"""For how long after a lasting contradiction the estimate is marked [s]."""
-
-RESET_S = 300.0
-"""For how long after the filter was started anew the estimate is marked [s]."""
+"""For how long after a lasting contradiction, or the filter's loss, the estimate is marked [s]."""
 
 TEMPERATURE_STD_K = 10.0
 """Uncertainty of a temperature that is not measured [K]."""
@@ -110,7 +107,6 @@ _SCALARS = (
     "coulomb_moved_pct",
     "gap_until_s",
     "contradicted_until_s",
-    "reset_until_s",
     "rest_since_s",
 )
 """What the estimator itself remembers, by its attributes' names."""
@@ -163,7 +159,8 @@ class Estimator:
         # NaN: never.
         self._gap_until_s = math.nan
         self._contradicted_until_s = math.nan
-        self._reset_until_s = math.nan
+        self.resets = 0
+        """How often the filter was lost and started anew."""
         self._rest_since_s = math.nan
         self._last_estimate = _nothing_yet()
         if self.settings.initial_soc_pct is not None:
@@ -315,7 +312,8 @@ class Estimator:
         known = (self._newton.soc_pct, self._last_estimate.soc_pct, 50.0)
         soc_pct = next(soc for soc in known if math.isfinite(soc))
         self._fusion.start(soc_pct, UNKNOWN_SOC_STD_PCT)
-        self._reset_until_s = time_s + RESET_S
+        self._contradicted_until_s = time_s + CONTRADICTED_S
+        self.resets += 1
 
     def _error_std_v(self) -> float:
         """Return the fast error of this voltage [V], larger where the model is out of its depth."""
@@ -405,8 +403,6 @@ class Estimator:
             reasons |= Reason.VOLTAGE_OUTSIDE_MODEL
         if sample.time_s < self._contradicted_until_s:
             reasons |= Reason.INNOVATION_LARGE
-        if sample.time_s < self._reset_until_s:
-            reasons |= Reason.FILTER_RESET
         return reasons | outside_model(self._model, soc_pct, sample)
 
     def _refuse(self) -> Estimate:
@@ -438,6 +434,7 @@ class Estimator:
             newton_inside=self._newton.inside,
             estimate=list(self._last_estimate[:7]),
             reasons=int(self._last_estimate.reasons),
+            resets=self.resets,
             **{name: getattr(self, f"_{name}") for name in _SCALARS},
         )
 
@@ -464,11 +461,36 @@ class Estimator:
         InputError
             If the state does not fit the model; the estimator must then not be used.
         """
+        self._resume(state, age_s)
+        self._online.remember(state.effects)
+        self._anchors.restore(state.anchors)
+        self.resets = state.resets
+        is_same = (state.method, state.capacity_ah) == (self.settings.method, self.capacity_ah)
+        if not is_same:
+            self._begin_from(state)
+        elif self.settings.method == "ekf" and math.isfinite(self._coulomb_start_pct):
+            self._fusion.restore(state.belief)
+            self._fused = True
+        return self._last_estimate
+
+    def take_over(self, before: Estimator) -> None:
+        """Go on where another estimator stands, of another model or other settings.
+
+        SoC and standard deviation are carried over, and so are the delay line, the last sample,
+        from which charge is counted on, and the marks of gaps. What was learned of the current's
+        offset and the model's bias belongs to the other model, and is learned anew; so are the
+        inner states of effects. Where the other one knows no SoC yet, neither does this one.
+        """
+        state = before.snapshot()
+        self._resume(state, 0.0)
+        self._tick = -1
+        self._begin_from(state)
+
+    def _resume(self, state: EstimatorState, age_s: float) -> None:
+        """Take over what does not depend on model and settings."""
         self._clock.restore(state.clock, age_s)
         self._counter.restore(state.counter)
         self._line.fill(state.line.time_s, state.line.current_a, state.line.since_s)
-        self._online.remember(state.effects)
-        self._anchors.restore(state.anchors)
         self._since = Since.of(state.since)
         self._newton = Inverse(state.newton_pct, state.newton_inside)
         for name in _SCALARS:
@@ -477,17 +499,18 @@ class Estimator:
         self._last_estimate = Estimate._make(
             [*state.estimate, status_of(reasons), reasons, state.samples]
         )
-        soc_pct, std_pct = state.soc_pct, state.soc_std_pct
         self._fused = False
-        if state.method == self.settings.method and state.capacity_ah == self.capacity_ah:
-            if self.settings.method == "ekf" and math.isfinite(self._coulomb_start_pct):
-                self._fusion.restore(state.belief)
-                self._fused = True
-        elif math.isfinite(soc_pct) and math.isfinite(std_pct):
-            self._begin(_clip(soc_pct), min(std_pct, UNKNOWN_SOC_STD_PCT))
+
+    def _begin_from(self, state: EstimatorState) -> None:
+        """Begin from the SoC that another estimator knew, if it knew any."""
+        coulomb_pct = state.estimate[4]
+        if math.isfinite(state.soc_pct) and math.isfinite(state.soc_std_pct):
+            self._begin(state.soc_pct, min(state.soc_std_pct, UNKNOWN_SOC_STD_PCT))
+        elif math.isfinite(coulomb_pct):
+            # The inverse without a voltage knows nothing; counting still does.
+            self._begin(coulomb_pct, UNKNOWN_SOC_STD_PCT)
         else:
             self._coulomb_start_pct = math.nan
-        return self._last_estimate
 
 
 def _clip(soc_pct: float) -> float:

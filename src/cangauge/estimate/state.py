@@ -157,6 +157,7 @@ class EstimatorState(_Strict):
     since: SinceState
     anchors: AnchorState
     samples: Count
+    resets: Count
     first_s: Finite
     tick: Annotated[int, Field(ge=-1, le=1 << 62)]
     temperature_c: MaybeNan
@@ -169,7 +170,6 @@ class EstimatorState(_Strict):
     coulomb_moved_pct: NotNegative
     gap_until_s: MaybeNan
     contradicted_until_s: MaybeNan
-    reset_until_s: MaybeNan
     rest_since_s: MaybeNan
     estimate: Annotated[list[MaybeNan], Field(min_length=7, max_length=7)]
     """Numbers of the last `Estimate`, in its order, from `time_s` to `residual_v`."""

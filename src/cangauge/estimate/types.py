@@ -51,15 +51,14 @@ class Reason(enum.IntFlag):
     TEMPERATURE_SOURCE_MISMATCH = 1 << 8
     """The bus's temperature is not measured where the model's was."""
     INNOVATION_LARGE = 1 << 9
-    """Voltage and prediction disagree persistently: the uncertainty was inflated."""
+    """Voltage and prediction disagree persistently: the uncertainty was inflated, or the filter,
+    to which every voltage was an outlier for minutes, was started anew."""
     NO_INITIAL_SOC = 1 << 10
     """No initial SoC is known yet."""
     INPUT_STALE = 1 << 11
     """No wanted frame within the time-out."""
     IMPLAUSIBLE_INPUT = 1 << 12
     """A sample was refused: not finite, or outside physical limits."""
-    FILTER_RESET = 1 << 13
-    """The filter was lost (every voltage an outlier for minutes) and was started anew."""
 
 
 class Estimate(NamedTuple):

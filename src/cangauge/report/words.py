@@ -26,7 +26,6 @@ REASON_WORDS: Final = {
     Reason.NO_INITIAL_SOC: "no SoC is known yet",
     Reason.INPUT_STALE: "no wanted frame within the time-out",
     Reason.IMPLAUSIBLE_INPUT: "a sample was refused: not finite or physically impossible",
-    Reason.FILTER_RESET: "the filter was lost (all voltages outliers) and was started anew",
 }
 
 

@@ -223,6 +223,7 @@ class RunConfig(_Strict):
             timeout_s=self.timeout_s,
             duration_s=self.duration_s,
             until_idle_s=self.until_idle_s,
+            checkpoint_every_s=self.state_every_s,
         )
 
 

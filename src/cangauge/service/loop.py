@@ -55,11 +55,14 @@ class LoopSettings:
         Without a sample for so long, the estimate is published as stale [s].
     duration_s, until_idle_s : float, optional
         End after this time; end when samples came and then none for so long [s].
+    checkpoint_every_s : float
+        How often the state is saved [s].
     """
 
     timeout_s: float = 2.0
     duration_s: float | None = None
     until_idle_s: float | None = None
+    checkpoint_every_s: float = 30.0
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,6 @@ class Outputs:
     show: Callable[[float], None] | None = None
     warn: Callable[[str], None] | None = None
     checkpoint: Callable[[], None] | None = None
-    checkpoint_every_s: float = 30.0
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,7 @@ class _Loop:
         self._now_s = self.began_s
         self._beat_s = self.began_s
         self._sample_s = self.began_s
-        self._checkpoint_s = self.began_s + min(FIRST_CHECKPOINT_S, outputs.checkpoint_every_s)
+        self._checkpoint_s = self.began_s + min(FIRST_CHECKPOINT_S, settings.checkpoint_every_s)
 
     def is_over(self) -> bool:
         settings = self._settings
@@ -179,7 +181,7 @@ class _Loop:
             self._outputs.show(self._now_s)
         if self._outputs.checkpoint is not None and self._now_s >= self._checkpoint_s:
             self._outputs.checkpoint()
-            self._checkpoint_s = self._now_s + self._outputs.checkpoint_every_s
+            self._checkpoint_s = self._now_s + self._settings.checkpoint_every_s
 
     def finish(self) -> None:
         before = self._gauge.samples
