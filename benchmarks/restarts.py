@@ -261,7 +261,7 @@ def real_process(kills: int, seed: int, folder: Path, console: Console) -> Resul
     samples = drive(kills * 30.0 + 300.0, model, seed)
     flowed, net = flowed_pct(samples, model.capacity_ah)
     restarts = []
-    with Player(samples) as player:
+    with Player(samples, folder / "said.txt") as player:
         service = [player.service(model_path, KILLED_ID, folder / "real.json")]
         other = player.service(model_path, WHOLE_ID, None)
         try:
@@ -290,15 +290,17 @@ def real_process(kills: int, seed: int, folder: Path, console: Console) -> Resul
             for process in (*service, other):
                 process.kill()
                 process.wait()
-    return summary(restarts, rms_30s_pct(samples, model.capacity_ah))
+    found = summary(restarts, rms_30s_pct(samples, model.capacity_ah))
+    return found | {"refused": kills - player.restored()}
 
 
 class Player(threading.Thread):
     """Plays a drive on a bus in real time, and hears what two services make of it."""
 
-    def __init__(self, samples: list[Sample]) -> None:
+    def __init__(self, samples: list[Sample], said: Path) -> None:
         super().__init__(daemon=True)
         self._samples = samples
+        self._said = said
         self._bus = open_bus(BusAddress("udp_multicast", CHANNEL, {"port": PORT}))
         self._over = threading.Event()
         self._latest: dict[int, float] = {}
@@ -362,11 +364,16 @@ class Player(threading.Thread):
             "--soc-estimate-id", f"0x{frame_id:X}", "--soc-detail-id", f"0x{frame_id + 1:X}",
             "--replay-clock-id", f"0x{frame_id + 15:X}", *kept,
         ]  # fmt: skip
-        return subprocess.Popen(
-            [sys.executable, "-c", COMMAND, *map(str, arguments)],
-            stderr=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-        )
+        with self._said.open("ab") as said:
+            return subprocess.Popen(
+                [sys.executable, "-c", COMMAND, *map(str, arguments)],
+                stderr=said,
+                stdout=subprocess.DEVNULL,
+            )
+
+    def restored(self) -> int:
+        """Return how many starts went on from a state, as the services said."""
+        return self._said.read_text(encoding="utf-8").count("going on from")
 
 
 def table_of(results: Result) -> Table:
