@@ -62,6 +62,7 @@ class Service:
     gauge: Gauge
     settings: LoopSettings = field(default_factory=LoopSettings)
     record: Any = None
+    checkpoint: Callable[[], None] | None = None
     rows: list[tuple[float, Estimate]] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     summary: RunSummary | None = None
@@ -91,6 +92,7 @@ class Service:
             record=self.record,
             table=lambda time_s, estimate: self.rows.append((time_s, estimate)),
             warn=self.warnings.append,
+            checkpoint=self.checkpoint,
         )
         try:
             self.summary = serve(self.port, self.gauge, self.settings, outputs, self._stop.is_set)

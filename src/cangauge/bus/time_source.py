@@ -101,6 +101,10 @@ class ReplayClock:
             return None
         return None if self._now_us is None else self._now_us / 1e6
 
+    def resume(self, time_s: float) -> None:
+        """Go on after an interruption from a log time [s]: an earlier one is that of a new log."""
+        self._now_us = whole_us(time_s)
+
     def _take(self, message: can.Message) -> None:
         data = message.data
         if len(data) != 8 or CRC_ONLY_RULE.crc(data) != data[CRC_ONLY_RULE.crc_byte]:

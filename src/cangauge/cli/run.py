@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -36,6 +37,7 @@ from cangauge.service.loop import Outputs, RunSummary, serve
 from cangauge.service.record import Recorder
 from cangauge.service.reload import Reloader
 from cangauge.service.signals import note_hangups, stop_on_signals
+from cangauge.service.state_keeper import StateKeeper
 from cangauge.service.table import EstimateWriter
 
 
@@ -135,6 +137,25 @@ def run_command(  # noqa: PLR0917 - typer passes options by name
             "--until-idle", metavar="S", help="End when samples came and then none for so long [s]."
         ),
     ] = None,
+    state: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Keep SoC, its uncertainty and the delay line here over restarts: written every"
+            " 30 s and at the end. A folder stands for a file in it. Default: systemd's"
+            " StateDirectory, if there is one.",
+        ),
+    ] = None,
+    state_max_age_s: Annotated[
+        float | None,
+        typer.Option(
+            "--state-max-age", metavar="S", help="An older state is refused [s]. Default: 7 days."
+        ),
+    ] = None,
+    state_every_s: Annotated[
+        float | None,
+        typer.Option("--state-every", metavar="S", help="Write it so often [s]. Default: 30."),
+    ] = None,
     soc_estimate_id: EstimateIdOption = None,
     soc_detail_id: DetailIdOption = None,
     replay_clock_id: ClockIdOption = None,
@@ -157,6 +178,8 @@ def run_command(  # noqa: PLR0917 - typer passes options by name
     `cangauge replay trip.parquet --speed max`)
 
     `cangauge run --config car.toml --record drive.log -o soc.parquet`
+
+    `cangauge run --config car.toml --state /var/lib/cangauge`
     """
     options: dict[str, Any] = {
         "model": _text(model),
@@ -182,6 +205,9 @@ def run_command(  # noqa: PLR0917 - typer passes options by name
         "output": _text(output),
         "duration_s": duration_s,
         "until_idle_s": until_idle_s,
+        "state": _text(state),
+        "state_max_age_s": state_max_age_s,
+        "state_every_s": state_every_s,
     }
     result = _run(lambda: load_config(config, options))
     if json_output:
@@ -192,6 +218,7 @@ def _run(read: Callable[[], RunConfig]) -> dict[str, Any]:
     config = read()
     written = [Path(name) for name in (config.record, config.output) if name is not None]
     check_outputs(written, [Path(config.model)])
+    kept = config.state_settings(os.environ)
     vehicle = config.load_vehicle()
     gauge = Gauge(vehicle, load_model(config.model), config.gauge_settings())
     reloader = Reloader(read, config, vehicle, gauge, note)
@@ -205,7 +232,9 @@ def _run(read: Callable[[], RunConfig]) -> dict[str, Any]:
         hangup = stack.enter_context(note_hangups())
         port = stack.enter_context(LastingPort(address, gauge.filters, note))
         port.open(wait=config.wait_for_bus)
-        recorder = table = line = None
+        recorder = table = line = keeper = None
+        if kept is not None:
+            keeper = stack.enter_context(StateKeeper(kept, gauge, note))
         if config.record is not None:
             recorder = stack.enter_context(Recorder(config.record))
         if config.output is not None:
@@ -219,6 +248,7 @@ def _run(read: Callable[[], RunConfig]) -> dict[str, Any]:
             show=None if line is None else line.show,
             warn=note,
             reload=lambda: reloader.reload() if hangup() else None,
+            checkpoint=None if keeper is None else keeper.checkpoint,
         )
         summary = serve(port, gauge, config.loop_settings(), outputs, stop)
     note(_summary_line(gauge, port, summary))
@@ -302,6 +332,7 @@ def _as_json(
         "soc_reference_pct": gauge.reference_soc_pct,
         "record": config.record,
         "output": config.output,
+        "state": config.state,
     }
 
 

@@ -12,8 +12,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 from cangauge.errors import InputError
+from cangauge.estimate.anchors import Anchor, AnchorWatch, FullCharge, LongRest
+from cangauge.estimate.belief import Belief, Since, Verdict
+from cangauge.estimate.clock import EstimatorClock
 from cangauge.estimate.coulomb import ChargeStep, CoulombCounter
 from cangauge.estimate.fusion import UNKNOWN_SOC_STD_PCT, Fusion, Measurement
+from cangauge.estimate.state import DelayLineState, EstimatorState
 from cangauge.estimate.types import Estimate, Reason, Sample, Status
 from cangauge.estimate.validity import (
     acceptable,
@@ -41,7 +45,7 @@ USUAL_CURRENT_C_RATE = 1.0 / 3.0
 """What a current that was not seen may have been [1/h]: 20 A at 60 Ah."""
 
 CONTRADICTED_S = 300.0
-"""For how long after a lasting contradiction the estimate is marked [s]."""
+"""For how long after a lasting contradiction, or the filter's loss, the estimate is marked [s]."""
 
 TEMPERATURE_STD_K = 10.0
 """Uncertainty of a temperature that is not measured [K]."""
@@ -65,6 +69,9 @@ class EstimatorSettings:
         A longer step between current samples is a gap [s].
     temperature_source : str
         What the input's temperature is measured on.
+    full_charge : FullCharge, optional
+    long_rest : LongRest, optional
+        Rules that say what the SoC is at some moments; None is off.
     """
 
     method: Method = "ekf"
@@ -73,6 +80,8 @@ class EstimatorSettings:
     capacity_ah: float | None = None
     gap_s: float = GAP_S
     temperature_source: TemperatureSource = "unknown"
+    full_charge: FullCharge | None = None
+    long_rest: LongRest | None = None
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -84,6 +93,23 @@ class EstimatorSettings:
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
                 raise InputError(f"must lie within {low:g} … {high:g}", field=name, value=value)
+
+
+_SCALARS = (
+    "samples",
+    "first_s",
+    "tick",
+    "temperature_c",
+    "newton_std_pct",
+    "coulomb_start_pct",
+    "coulomb_var_pct2",
+    "coulomb_counted_s",
+    "coulomb_moved_pct",
+    "gap_until_s",
+    "contradicted_until_s",
+    "rest_since_s",
+)
+"""What the estimator itself remembers, by its attributes' names."""
 
 
 class Estimator:
@@ -105,7 +131,8 @@ class Estimator:
         self._counter = CoulombCounter(self.capacity_ah, self.settings.gap_s)
         self._line = DelayLine(self._model.delay_s, gap_s=self.settings.gap_s)
         noise = model.noise
-        self._fusion = Fusion(self._online, self.capacity_ah, noise)
+        self._fusion = Belief(lambda: Fusion(self._online, self.capacity_ah, noise))
+        self._anchors = AnchorWatch(self.settings.full_charge, self.settings.long_rest)
         self._bias_std_v = math.hypot(noise.slow_std_v, noise.lasting_std_v)
         self._fast_std_v = effective_error_std_v(noise, 1.0 / model.rate_hz)
         self._standing = temperature_mismatch(
@@ -115,7 +142,7 @@ class Estimator:
         self._implausible = Reason.NONE
         self._samples = 0
         self._first_s = 0.0
-        self._last_s = -math.inf
+        self._clock = EstimatorClock()
         self._tick = -1
         self._temperature_c = math.nan
         # SoC by each method: NaN until it is known. The counter's is the SoC that it began from.
@@ -123,11 +150,17 @@ class Estimator:
         self._newton_std_pct = math.nan
         self._coulomb_start_pct = math.nan
         self._coulomb_var_pct2 = math.nan
+        # What was counted when the counter's SoC was last known to that variance.
+        self._coulomb_counted_s = 0.0
+        self._coulomb_moved_pct = 0.0
         self._fused = False
         # Since the last voltage that was used: what the filter must be carried over.
-        self._since = _Since()
-        self._gap_until_s = -math.inf
-        self._contradicted_until_s = -math.inf
+        self._since = Since()
+        # NaN: never.
+        self._gap_until_s = math.nan
+        self._contradicted_until_s = math.nan
+        self.resets = 0
+        """How often the filter was lost and started anew."""
         self._rest_since_s = math.nan
         self._last_estimate = _nothing_yet()
         if self.settings.initial_soc_pct is not None:
@@ -139,55 +172,34 @@ class Estimator:
         """Estimated offset of the current sensor [A]; 0 without fusion."""
         return self._fusion.offset_a if self._fused else 0.0
 
-    def take_over(self, before: Estimator) -> None:
-        """Go on where another estimator stands, of another model or other settings.
-
-        SoC and standard deviation are carried over, and so are the delay line, the last sample,
-        from which charge is counted on, and the marks of gaps. What was learned of the current's
-        offset and the model's bias belongs to the other model, and is learned anew; so are the
-        inner states of effects. Where the other one knows no SoC yet, neither does this one.
-        """
-        self._samples = before._samples
-        self._first_s = before._first_s
-        self._last_s = before._last_s
-        self._temperature_c = before._temperature_c
-        self._gap_until_s = before._gap_until_s
-        self._rest_since_s = before._rest_since_s
-        self._line.take_over(before._line)
-        self._counter.take_over(before._counter)
-        self._last_estimate = latest = before._last_estimate
-        if math.isfinite(latest.soc_pct) and math.isfinite(latest.soc_std_pct):
-            self._begin(latest.soc_pct, latest.soc_std_pct)
-        elif math.isfinite(latest.soc_coulomb_pct):
-            # The inverse without a voltage knows nothing; counting still does.
-            self._begin(latest.soc_coulomb_pct, UNKNOWN_SOC_STD_PCT)
-
     def step(self, sample: Sample) -> Estimate:
         """Take one sample and return the estimate after it.
 
         A sample without a believable current, or not later than the one before, is refused: the
-        last estimate comes back, marked `IMPLAUSIBLE_INPUT`. A voltage or temperature that cannot
-        be true counts as missing, and charge is still counted.
+        last estimate comes back, marked `IMPLAUSIBLE_INPUT`; a clock that was set back is noticed
+        after a few and followed. A voltage or temperature that cannot be true counts as missing,
+        and charge is still counted.
 
         With effects in the model the sample is corrected first. An effect may hold a sample back
         until it knows the current that belongs to it (`time_skew`); the estimate then is the one
         after the last sample that was given out.
         """
-        if not acceptable(sample) or sample.time_s <= self._last_s:
+        time_s = self._clock.at(sample.time_s) if acceptable(sample) else None
+        if time_s is None:
             return self._refuse()
-        sample, self._implausible = cleaned(sample, self._usual_v)
+        stamp_s = sample.time_s
+        sample, self._implausible = cleaned(sample._replace(time_s=time_s), self._usual_v)
         if self._samples == 0:
-            self._first_s = sample.time_s
+            self._first_s = time_s
         self._samples += 1
-        self._last_s = sample.time_s
         corrected = self._corrected(sample)
         for item in corrected:
             self._take(item)
         if corrected:
-            self._last_estimate = self._estimate(corrected[-1], sample.time_s)
+            self._last_estimate = self._estimate(corrected[-1], stamp_s)
         else:
             self._last_estimate = self._last_estimate._replace(
-                time_s=sample.time_s, samples=self._samples
+                time_s=stamp_s, samples=self._samples
             )
         return self._last_estimate
 
@@ -234,26 +246,51 @@ class Estimator:
             self._rest_since_s = time_s - charge.seconds
 
     def _begin(self, soc_pct: float, std_pct: float) -> None:
-        self._coulomb_start_pct = soc_pct + self._counter.discharged_pct
-        self._coulomb_var_pct2 = std_pct**2
+        self._begin_count(soc_pct, std_pct**2)
         if self.settings.method == "ekf":
             self._fusion.start(soc_pct, std_pct)
             self._fused = True
-            self._since = _Since()
+            self._since = Since()
+
+    def _begin_count(self, soc_pct: float, var_pct2: float) -> None:
+        self._coulomb_start_pct = soc_pct + self._counter.discharged_pct
+        self._coulomb_var_pct2 = var_pct2
+        self._coulomb_counted_s = self._counter.counted_s
+        self._coulomb_moved_pct = self._counter.moved_pct
+
+    def _anchor(self, anchor: Anchor) -> None:
+        """Take a SoC in that is known otherwise, as far as the two uncertainties say."""
+        if math.isnan(self._coulomb_start_pct):
+            self._begin(anchor.soc_pct, anchor.soc_std_pct)
+            return
+        soc_pct = _clip(self._coulomb_start_pct - self._counter.discharged_pct)
+        before, of_anchor = self._coulomb_std_pct() ** 2, anchor.soc_std_pct**2
+        gain = before / (before + of_anchor)
+        self._begin_count(soc_pct + gain * (anchor.soc_pct - soc_pct), (1.0 - gain) * before)
+        if self._fused:
+            self._fusion.anchor(anchor.soc_pct, anchor.soc_std_pct)
 
     # --- voltage --------------------------------------------------------------------------
 
     def _use_voltage(self, sample: Sample) -> None:
-        since, self._since = self._since, _Since()
+        since, self._since = self._since, Since()
         if self._fused:
-            self._fusion.predict(
-                since.seconds, since.discharged_pct, since.moved_pct, since.gap_var_pct2
-            )
+            self._fusion.predict(since)
             if sample.time_s - self._rest_since_s > REST_S:
                 self._fusion.rested()
         if not math.isfinite(sample.voltage_v):
             self._newton = Inverse(math.nan, inside=True)
-            return
+            self._newton_std_pct = math.nan
+        else:
+            self._weigh_voltage(sample, since)
+        for anchor in self._anchors.see(
+            sample, sample.time_s - self._rest_since_s, self._newton.soc_pct
+        ):
+            self._anchor(anchor)
+        if self._fused and self._fusion.is_lost:
+            self._reset(sample.time_s)
+
+    def _weigh_voltage(self, sample: Sample, since: Since) -> None:
         beside_v = self._model.offset_at(self._known_temperature_c(), self._line.currents())
         guess = self._newton.soc_pct if math.isfinite(self._newton.soc_pct) else 50.0
         self._newton = soc_from_ocv(self._online, sample.voltage_v - beside_v, guess)
@@ -266,9 +303,17 @@ class Estimator:
             self._begin(self._newton.soc_pct, UNKNOWN_SOC_STD_PCT)
             self._coulomb_var_pct2 = self._newton_std_pct**2
         if self._fused and self._fusion.update(
-            Measurement(sample.voltage_v, beside_v, std_v), since.seconds
+            Measurement(sample.voltage_v, beside_v, std_v), since
         ):
             self._contradicted_until_s = sample.time_s + CONTRADICTED_S
+
+    def _reset(self, time_s: float) -> None:
+        """Start the filter anew, from the voltage if there is one, and forget its offset."""
+        known = (self._newton.soc_pct, self._last_estimate.soc_pct, 50.0)
+        soc_pct = next(soc for soc in known if math.isfinite(soc))
+        self._fusion.start(soc_pct, UNKNOWN_SOC_STD_PCT)
+        self._contradicted_until_s = time_s + CONTRADICTED_S
+        self.resets += 1
 
     def _error_std_v(self) -> float:
         """Return the fast error of this voltage [V], larger where the model is out of its depth."""
@@ -330,14 +375,17 @@ class Estimator:
         if math.isnan(self._coulomb_start_pct):
             return math.nan, math.nan
         if method == "coulomb":
-            hours = (self._last_s - self._first_s) / 3600.0
-            std = self._fusion.count_std_pct(self._coulomb_var_pct2, hours, self._counter.moved_pct)
-            return _clip(coulomb_pct), std
+            return _clip(coulomb_pct), self._coulomb_std_pct()
         # Between voltages the filter's SoC moves by the charge counted since.
-        moved = self._since.discharged_pct - self._fusion.offset_pct(self._since.seconds)
+        moved = self._since.discharged_pct - self._fusion.offset_pct(self._since.counted_s)
         return _clip(self._fusion.soc_pct - moved), math.sqrt(
-            self._fusion.soc_std_pct**2 + self._since.gap_var_pct2
+            self._fusion.soc_std_pct**2 + self._since.spread_pct2()
         )
+
+    def _coulomb_std_pct(self) -> float:
+        hours = (self._counter.counted_s - self._coulomb_counted_s) / 3600.0
+        moved_pct = self._counter.moved_pct - self._coulomb_moved_pct
+        return self._fusion.count_std_pct(self._coulomb_var_pct2, hours, moved_pct)
 
     def _reasons(self, sample: Sample, soc_pct: float) -> Reason:
         reasons = self._standing | self._implausible
@@ -362,21 +410,111 @@ class Estimator:
         reasons = last.reasons | Reason.IMPLAUSIBLE_INPUT
         return last._replace(reasons=reasons, status=status_of(reasons))
 
+    # --- interruptions --------------------------------------------------------------------
 
-@dataclass
-class _Since:
-    """Charge since the last voltage that was used."""
+    @property
+    def pause_verdict(self) -> Verdict:
+        """How the SoC over the last long pause was judged by the voltage after it."""
+        return self._fusion.verdict
 
-    seconds: float = 0.0
-    discharged_pct: float = 0.0
-    moved_pct: float = 0.0
-    gap_var_pct2: float = 0.0
+    def snapshot(self) -> EstimatorState:
+        """Return all that must be remembered to go on as if not interrupted: copies."""
+        times, currents, since_s = self._line.contents
+        return EstimatorState.model_construct(
+            method=self.settings.method,
+            capacity_ah=self.capacity_ah,
+            clock=self._clock.state(),
+            counter=self._counter.state(),
+            line=DelayLineState.model_construct(time_s=times, current_a=currents, since_s=since_s),
+            effects=self._online.memory(),
+            belief=self._fusion.state(),
+            since=self._since.state(),
+            anchors=self._anchors.state(),
+            newton_pct=self._newton.soc_pct,
+            newton_inside=self._newton.inside,
+            estimate=list(self._last_estimate[:7]),
+            reasons=int(self._last_estimate.reasons),
+            resets=self.resets,
+            **{name: getattr(self, f"_{name}") for name in _SCALARS},
+        )
 
-    def add(self, charge: ChargeStep) -> None:
-        self.seconds += charge.seconds
-        self.discharged_pct += charge.discharged_pct
-        self.moved_pct += abs(charge.discharged_pct)
-        self.gap_var_pct2 += charge.gap_std_pct**2
+    def restore(self, state: EstimatorState, age_s: float = 0.0) -> Estimate:
+        """Go on from a state; return its last estimate.
+
+        With the state's own method and capacity everything is taken over, and the next sample
+        goes on bit for bit. With another method or capacity the SoC is, with its uncertainty.
+
+        Parameters
+        ----------
+        state : EstimatorState
+            Of the same model.
+        age_s : float
+            How old the state is at least, by a clock that the samples' stamps do not come from
+            [s]; NaN if none knows. If the stamps show less, the age is believed.
+
+        Returns
+        -------
+        Estimate
+
+        Raises
+        ------
+        InputError
+            If the state does not fit the model; the estimator must then not be used.
+        """
+        self._resume(state, age_s)
+        self._online.remember(state.effects)
+        self._anchors.restore(state.anchors)
+        self.resets = state.resets
+        is_same = (state.method, state.capacity_ah) == (self.settings.method, self.capacity_ah)
+        if not is_same:
+            self._begin_from(state)
+        elif self.settings.method == "ekf" and math.isfinite(self._coulomb_start_pct):
+            self._fusion.restore(state.belief)
+            self._fused = True
+        return self._last_estimate
+
+    def take_over(self, before: Estimator) -> None:
+        """Go on where another estimator stands, of another model or other settings.
+
+        SoC and standard deviation are carried over, and so are the delay line, the last sample,
+        from which charge is counted on, and the marks of gaps. What was learned of the current's
+        offset and the model's bias belongs to the other model, and is learned anew; so are the
+        inner states of effects. Where the other one knows no SoC yet, neither does this one.
+        """
+        state = before.snapshot()
+        self._resume(state, before._clock.age_s)
+        line = state.line
+        if line.time_s and self._line.longest_s > before._line.longest_s:
+            # The other one has forgotten what this one would need.
+            self._line.fill(line.time_s, line.current_a, max(line.since_s, line.time_s[0]))
+        self._tick = -1
+        self._begin_from(state)
+
+    def _resume(self, state: EstimatorState, age_s: float | None) -> None:
+        """Take over what does not depend on model and settings."""
+        self._clock.restore(state.clock, age_s)
+        self._counter.restore(state.counter)
+        self._line.fill(state.line.time_s, state.line.current_a, state.line.since_s)
+        self._since = Since.of(state.since)
+        self._newton = Inverse(state.newton_pct, state.newton_inside)
+        for name in _SCALARS:
+            setattr(self, f"_{name}", getattr(state, name))
+        reasons = Reason(state.reasons)
+        self._last_estimate = Estimate._make(
+            [*state.estimate, status_of(reasons), reasons, state.samples]
+        )
+        self._fused = False
+
+    def _begin_from(self, state: EstimatorState) -> None:
+        """Begin from the SoC that another estimator knew, if it knew any."""
+        coulomb_pct = state.estimate[4]
+        if math.isfinite(state.soc_pct) and math.isfinite(state.soc_std_pct):
+            self._begin(state.soc_pct, min(state.soc_std_pct, UNKNOWN_SOC_STD_PCT))
+        elif math.isfinite(coulomb_pct):
+            # The inverse without a voltage knows nothing; counting still does.
+            self._begin(coulomb_pct, UNKNOWN_SOC_STD_PCT)
+        else:
+            self._coulomb_start_pct = math.nan
 
 
 def _clip(soc_pct: float) -> float:

@@ -19,6 +19,8 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
 
+from cangauge.errors import InputError
+from cangauge.estimate.state import FilterState
 from cangauge.model.extended import OnlineExtendedModel
 from cangauge.model.model_file import ModelNoise
 from cangauge.model.voltage_model import VoltageModel
@@ -95,6 +97,10 @@ class Fusion:
         self._offset_std_a = OFFSET_STD_PER_AH * capacity_ah
         self._mean_innovation_v = 0.0
         self._mean_seconds = 0.0
+        self.log_likelihood = 0.0
+        """Of the last voltage, given all before it."""
+        self.was_outlier = False
+        """Whether the last voltage was weighed as an outlier."""
         self._ekf = ExtendedKalmanFilter(dim_x=4, dim_z=1, dim_u=1)
         self._ekf.B = np.array([[1.0], [0.0], [0.0], [0.0]])
 
@@ -107,7 +113,12 @@ class Fusion:
         self._forget_innovations()
 
     def predict(
-        self, seconds: float, discharged_pct: float, moved_pct: float, gap_var_pct2: float
+        self,
+        seconds: float,
+        discharged_pct: float,
+        moved_pct: float,
+        gap_var_pct2: float,
+        away_s: float = 0.0,
     ) -> None:
         """Carry the state over the charge counted since the last call.
 
@@ -119,13 +130,15 @@ class Fusion:
             Charge taken out, and moved either way [% of capacity].
         gap_var_pct2 : float
             Variance of the charge lost in gaps [%²].
+        away_s : float
+            Part of the time in which no charge was counted [s], and so no offset either.
         """
         slow_stays = math.exp(-seconds / self._slow_time_s - moved_pct / SLOW_SPAN_PCT)
         lasting_stays = math.exp(-seconds / LASTING_TIME_S - moved_pct / LASTING_SPAN_PCT)
         offset_walk = OFFSET_WALK_PER_SQRT_H * self._offset_std_a
         ekf = self._ekf
         ekf.F = np.diag([1.0, 1.0, slow_stays, lasting_stays])
-        ekf.F[0, 1] = self._pct_per_as * seconds
+        ekf.F[0, 1] = self._pct_per_as * (seconds - away_s)
         ekf.Q = np.diag(
             [
                 CAPACITY_STD**2 * CAPACITY_SPAN_PCT * moved_pct + gap_var_pct2,
@@ -154,8 +167,11 @@ class Fusion:
         jacobian = self._jacobian(ekf.x)
         spread = float((jacobian @ ekf.P @ jacobian.T)[0, 0])
         variance = measurement.std_v**2
-        if innovation**2 > OUTLIER_SIGMAS**2 * (spread + variance):
+        self.was_outlier = innovation**2 > OUTLIER_SIGMAS**2 * (spread + variance)
+        if self.was_outlier:
             variance = max(variance, innovation**2 - spread)
+        total = spread + variance
+        self.log_likelihood = -0.5 * (innovation**2 / total + math.log(total))
         ekf.update(
             np.array([[measurement.voltage_v]]),
             self._jacobian,
@@ -174,6 +190,45 @@ class Fusion:
         ekf.x[2, 0] *= shrink
         ekf.P[2, :] *= shrink
         ekf.P[:, 2] *= shrink
+
+    def anchor(self, soc_pct: float, std_pct: float) -> None:
+        """Take a SoC in that is known otherwise, with its standard deviation [%]."""
+        ekf = self._ekf
+        along = np.zeros((1, ekf.dim_x))
+        along[0, 0] = 1.0
+        ekf.update(np.array([[soc_pct]]), lambda _: along, lambda x: x[:1], R=std_pct**2)
+        self._keep_in_range()
+
+    def state(self) -> FilterState:
+        """Return what is to be remembered."""
+        return FilterState.model_construct(
+            x=self._ekf.x[:, 0].tolist(),
+            p=self._ekf.P.tolist(),
+            mean_innovation_v=self._mean_innovation_v,
+            mean_seconds=self._mean_seconds,
+        )
+
+    def restore(self, state: FilterState) -> None:
+        """Go on from a state.
+
+        Raises
+        ------
+        InputError
+            If it has another number of states.
+        """
+        ekf = self._ekf
+        size = ekf.dim_x
+        if [len(state.x), *map(len, state.p)] != [size] * (size + 1) or len(state.p) != size:
+            raise InputError(f"is not that of a filter of {size} states", field="belief.filters")
+        ekf.x = np.array(state.x).reshape(size, 1)
+        ekf.P = np.array(state.p)
+        self._mean_innovation_v = state.mean_innovation_v
+        self._mean_seconds = state.mean_seconds
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether state and covariance are still such: finite, and no variance negative."""
+        return is_covariance(self._ekf.P) and bool(np.all(np.isfinite(self._ekf.x)))
 
     @property
     def soc_pct(self) -> float:
@@ -226,6 +281,10 @@ class Fusion:
     def _watch(self, measurement: Measurement, seconds: float) -> bool:
         """Whether the mean innovation, before any bias, contradicts state and model."""
         ekf = self._ekf
+        if seconds > PERSISTENT_S:
+            # One voltage after a pause is no mean, and those before it tell nothing any more.
+            self._forget_innovations()
+            return False
         plain = float(self._predicted(ekf.x, measurement)[0, 0]) - self.bias_v
         weight = math.exp(-seconds / PERSISTENT_S)
         self._mean_innovation_v *= weight
@@ -254,3 +313,17 @@ class Fusion:
 
     def _keep_in_range(self) -> None:
         self._ekf.x[0, 0] = min(max(float(self._ekf.x[0, 0]), 0.0), 100.0)
+
+
+def is_covariance(matrix: FloatArray) -> bool:
+    """Whether a matrix is finite, symmetric and positive semi-definite, to rounding."""
+    if not np.all(np.isfinite(matrix)):
+        return False
+    variance = np.diag(matrix)
+    if np.any(variance < 0.0):
+        return False
+    scale = np.sqrt(np.where(variance > 0.0, variance, 1.0))
+    correlation = matrix / np.outer(scale, scale)
+    if not np.allclose(correlation, correlation.T, rtol=0.0, atol=1e-6):
+        return False
+    return bool(np.linalg.eigvalsh(correlation)[0] > -1e-6)

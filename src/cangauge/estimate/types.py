@@ -51,7 +51,8 @@ class Reason(enum.IntFlag):
     TEMPERATURE_SOURCE_MISMATCH = 1 << 8
     """The bus's temperature is not measured where the model's was."""
     INNOVATION_LARGE = 1 << 9
-    """Voltage and prediction disagree persistently: the uncertainty was inflated."""
+    """Voltage and prediction disagree persistently: the uncertainty was inflated, or the filter,
+    to which every voltage was an outlier for minutes, was started anew."""
     NO_INITIAL_SOC = 1 << 10
     """No initial SoC is known yet."""
     INPUT_STALE = 1 << 11

@@ -94,19 +94,6 @@ class DelayLine:
             del times[:stale]
             del currents[:stale]
 
-    def take_over(self, before: DelayLine) -> None:
-        """Take the samples of another line, as far as it keeps them."""
-        self._times, self._currents = before.kept()
-        if self._times:
-            self._since = self._times[-1] - before.filled_s
-            if self._longest > before.longest_s:
-                # The other one has forgotten what this one would need.
-                self._since = max(self._since, self._times[0])
-
-    def kept(self) -> tuple[list[float], list[float]]:
-        """Return times [s] and currents [A] of the samples kept, oldest first."""
-        return list(self._times), list(self._currents)
-
     @property
     def longest_s(self) -> float:
         """The longest delay [s]."""
@@ -139,3 +126,13 @@ class DelayLine:
                 c0, c1 = currents[right - 1], currents[right]
                 result.append(c0 + (c1 - c0) * (at - t0) / (t1 - t0))
         return result
+
+    @property
+    def contents(self) -> tuple[list[float], list[float], float]:
+        """Times [s] and currents [A] kept, and when the gap-free stretch began [s]: copies."""
+        return list(self._times), list(self._currents), self._since
+
+    def fill(self, time_s: Sequence[float], current_a: Sequence[float], since_s: float) -> None:
+        """Take over the contents of another line: times [s], increasing, currents [A]."""
+        self._times, self._currents = list(time_s), list(current_a)
+        self._since = since_s

@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from cangauge.errors import InputError
 from cangauge.model.charge import discharged_ah
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.effects.effect import (
@@ -250,6 +251,26 @@ class OnlineExtendedModel:
         for effect in self._effects:
             effect.advance(time_s, current_a, temperature_c, drop_v)
         self._beside_soc_v = sum((item.extra_voltage(0.0) for item in self._beside_soc), 0.0)
+
+    def memory(self) -> list[list[float]]:
+        """Return what the effects are to remember, one list each."""
+        return [effect.memory() for effect in self._effects]
+
+    def remember(self, memory: Sequence[Sequence[float]]) -> None:
+        """Go on from a memory of the same effects.
+
+        Raises
+        ------
+        InputError
+            If it is none.
+        """
+        if len(memory) != len(self._effects):
+            raise InputError(f"the model has {len(self._effects)} effects", field="effects")
+        for number, (effect, of_effect) in enumerate(zip(self._effects, memory, strict=True)):
+            try:
+                effect.remember(of_effect)
+            except ValueError as error:
+                raise InputError(str(error), field=f"effects.{number}") from error
 
     def pseudo_ocv_at(self, soc_pct: float) -> tuple[float, float]:
         """Return voltage without the model's drop and kt [V], and its slope [V per %], at one SoC.

@@ -23,10 +23,20 @@ Keys are the options' names, with underscores::
     [checks.voltage]                # likewise: range, rate, how many failures, time-out
     lowest = 240
     highest = 410
+
+    [full_charge]                   # optional: what the SoC is at some moments
+    voltage_v = 402.0               # at least this …
+    current_a = 3.0                 # … at no more than this, either way
+    hold_s = 60
+
+    [long_rest]
+    after_s = 7200
+    soc_std_pct = 2.0
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
@@ -50,16 +60,18 @@ from cangauge.bus.time_source import TimeSourceName
 from cangauge.bus.validation import read_toml, validated
 from cangauge.bus.vehicle import Vehicle, load_vehicle
 from cangauge.errors import InputError
+from cangauge.estimate.anchors import FullCharge, LongRest
 from cangauge.estimate.estimator import EstimatorSettings, Method
 from cangauge.logs.log import TemperatureSource
 from cangauge.model.delay_line import GAP_S
 from cangauge.service.gauge import GaugeSettings
 from cangauge.service.loop import LoopSettings
+from cangauge.service.state_keeper import StateSettings, state_path
 
 DEFAULT_VEHICLE: Final = "generic"
 """What `replay` sends by default, so that both commands find each other without options."""
 
-_PATHS: Final = ("model", "dbc", "map", "record", "output")
+_PATHS: Final = ("model", "dbc", "map", "record", "output", "state")
 
 Percent = Annotated[FiniteFloat, Field(ge=0.0, le=100.0)]
 Seconds = Annotated[FiniteFloat, Field(gt=0.0, le=1e9)]
@@ -96,6 +108,23 @@ class ChecksConfig(_Strict):
     voltage: CheckMap = CheckMap()
     temperature: CheckMap = CheckMap()
     soc_reference: CheckMap = CheckMap()
+
+
+class FullChargeConfig(_Strict):
+    """When the pack is full; see `FullCharge`."""
+
+    voltage_v: Annotated[FiniteFloat, Field(gt=0.0, le=1e4)]
+    current_a: Annotated[FiniteFloat, Field(ge=0.0, le=5e3)]
+    hold_s: Annotated[FiniteFloat, Field(ge=0.0, le=86400.0)] = 60.0
+    soc_pct: Percent = 100.0
+    soc_std_pct: Annotated[FiniteFloat, Field(ge=0.01, le=100.0)] = 0.5
+
+
+class LongRestConfig(_Strict):
+    """When the voltage is the open-circuit voltage; see `LongRest`."""
+
+    after_s: Annotated[FiniteFloat, Field(ge=60.0, le=30.0 * 86400.0)] = 7200.0
+    soc_std_pct: Annotated[FiniteFloat, Field(ge=0.01, le=100.0)] = 2.0
 
 
 class RunConfig(_Strict):
@@ -142,6 +171,12 @@ class RunConfig(_Strict):
         Files to write: the frames received, the estimates.
     duration_s, until_idle_s : float, optional
         When to end by itself [s].
+    state : str, optional
+        File, or folder of one, that the state is kept in over restarts.
+    state_max_age_s, state_every_s : float
+        An older state is refused; how often it is written [s].
+    full_charge, long_rest : optional
+        Rules that say what the SoC is at some moments.
     """
 
     model: str
@@ -170,6 +205,11 @@ class RunConfig(_Strict):
     output: str | None = None
     duration_s: Seconds | None = None
     until_idle_s: Seconds | None = None
+    state: str | None = None
+    state_max_age_s: Seconds = 7.0 * 86400.0
+    state_every_s: Annotated[FiniteFloat, Field(ge=0.1, le=86400.0)] = 30.0
+    full_charge: FullChargeConfig | None = None
+    long_rest: LongRestConfig | None = None
     _file: str = PrivateAttr("the configuration")
 
     def named(self, file: str | PathLike[str]) -> Self:
@@ -200,6 +240,7 @@ class RunConfig(_Strict):
 
     def gauge_settings(self) -> GaugeSettings:
         """Return what the gauge needs; may raise InputError."""
+        full, rest = self.full_charge, self.long_rest
         return GaugeSettings(
             estimator=EstimatorSettings(
                 method=self.method,
@@ -208,10 +249,22 @@ class RunConfig(_Strict):
                 capacity_ah=self.capacity_ah,
                 gap_s=self.max_gap_s,
                 temperature_source=self.temperature_source or "unknown",
+                full_charge=None if full is None else FullCharge(**full.model_dump()),
+                long_rest=None if rest is None else LongRest(**rest.model_dump()),
             ),
             time_source=self.time_source,
             ids=FrameIds(**self.ids.model_dump()),
         )
+
+    def state_settings(self, environment: Mapping[str, str]) -> StateSettings | None:
+        """Return where the state is kept, if anywhere; may raise InputError."""
+        path = state_path(self.state, environment)
+        if path is None:
+            return None
+        for other in (self.model, self.record, self.output, self.dbc, self.map):
+            if other is not None and os.path.realpath(other) == os.path.realpath(path):
+                raise InputError("is another file of this service", field="--state", value=other)
+        return StateSettings(path, self.state_max_age_s, self.state_every_s)
 
     def loop_settings(self) -> LoopSettings:
         """Return when the service calls its input stale, and when it ends."""
@@ -219,6 +272,7 @@ class RunConfig(_Strict):
             timeout_s=self.timeout_s,
             duration_s=self.duration_s,
             until_idle_s=self.until_idle_s,
+            checkpoint_every_s=self.state_every_s,
         )
 
 

@@ -13,7 +13,9 @@ from cangauge.bus.publish import FrameIds, SocPublisher, standard_filter
 from cangauge.bus.time_source import TimeSourceName
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
+from cangauge.estimate.belief import Verdict
 from cangauge.estimate.estimator import EstimatorSettings
+from cangauge.estimate.state import EstimatorState
 from cangauge.estimate.types import Estimate, Reason, Sample
 from cangauge.estimate.validity import status_of
 from cangauge.model.model_file import ModelFile
@@ -169,6 +171,24 @@ class Gauge:
     def reference_soc_pct(self) -> float:
         """The car's own state of charge [%]; NaN while there is none."""
         return self._stream.reference_soc_pct
+
+    @property
+    def model(self) -> ModelFile:
+        """The model in use."""
+        return self._stream.model
+
+    @property
+    def pause_verdict(self) -> Verdict:
+        """How the SoC over the last long pause was judged by the voltage after it."""
+        return self._stream.pause_verdict
+
+    def snapshot(self) -> EstimatorState | None:
+        """Return what must be remembered over a restart; None while no SoC is known."""
+        return self._stream.snapshot()
+
+    def restore(self, state: EstimatorState, age_s: float = 0.0) -> Estimate:
+        """Go on from a state; see `EstimateStream.restore`."""
+        return self._stream.restore(state, age_s)
 
     def _publish(self, estimate: Estimate) -> list[can.Message]:
         if not self._is_replay:

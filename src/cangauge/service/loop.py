@@ -190,6 +190,7 @@ class _Loop:
         self._upkeep.look(self._now_s)
         if self._outputs.reload is not None and (settings := self._outputs.reload()) is not None:
             self._settings = settings
+            self._upkeep.every_s = settings.checkpoint_every_s
             self.rivals.use(self._gauge.settings.ids)
             self._set_filters()
         if self._outputs.show is not None:

@@ -29,6 +29,8 @@ NEEDS_RESTART: Final = (
     "time_source",
     "record",
     "output",
+    "state",
+    "state_max_age_s",
 )
 """What stays as it was at the start."""
 

@@ -22,7 +22,9 @@ from cangauge.bus.time_source import (
     is_clock,
 )
 from cangauge.bus.vehicle import Vehicle
+from cangauge.estimate.belief import Verdict
 from cangauge.estimate.estimator import Estimator, EstimatorSettings
+from cangauge.estimate.state import EstimatorState
 from cangauge.estimate.types import Estimate, Reason, Sample, Status
 from cangauge.estimate.validity import status_of
 from cangauge.model.model_file import ModelFile, effective_error_std_v
@@ -184,6 +186,37 @@ class EstimateStream:
     def reference_soc_pct(self) -> float:
         """The car's own state of charge [%]; NaN while there is none."""
         return self._assembler.reference_soc_pct
+
+    @property
+    def model(self) -> ModelFile:
+        """The model in use."""
+        return self._model
+
+    @property
+    def pause_verdict(self) -> Verdict:
+        """How the SoC over the last long pause was judged by the voltage after it."""
+        return self._estimator.pause_verdict
+
+    def snapshot(self) -> EstimatorState | None:
+        """Return what must be remembered over a restart; None while no SoC is known."""
+        return self._estimator.snapshot() if math.isfinite(self.latest.soc_pct) else None
+
+    def restore(self, state: EstimatorState, age_s: float = 0.0) -> Estimate:
+        """Go on from a state (see `Estimator.restore`); until a sample comes, it is stale.
+
+        Raises
+        ------
+        InputError
+            If the state does not fit the model; nothing is changed then.
+        """
+        estimator = Estimator(self._model, self._settings)
+        latest = estimator.restore(state, age_s)
+        self._estimator = estimator
+        if isinstance(self._time, ReplayClock):
+            self._time.resume(latest.time_s)
+        reasons = latest.reasons | Reason.INPUT_STALE
+        self.latest = latest._replace(status=Status.INVALID, reasons=reasons)
+        return self.latest
 
     def _step(self, sample: Sample | None) -> Estimate | None:
         if sample is None:

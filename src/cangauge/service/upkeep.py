@@ -11,6 +11,10 @@ from cangauge.errors import CangaugeError
 
 LOOK_EVERY_S: Final = 0.1
 
+FIRST_CHECKPOINT_S: Final = 1.0
+"""The first checkpoint comes so soon, lest a service that is killed again and again keeps nothing
+[s]."""
+
 
 class Upkeep:
     """Looks after what needs no more than a glance every `LOOK_EVERY_S`.
@@ -20,7 +24,7 @@ class Upkeep:
     port : BusPort
         Whose receive queue is watched.
     checkpoint : callable, optional
-        Saves the state; called every `every_s` and at the end.
+        Saves the state; called after `FIRST_CHECKPOINT_S`, every `every_s`, and at the end.
     every_s : float
     warn : callable, optional
         Takes a line of text.
@@ -35,7 +39,7 @@ class Upkeep:
     ) -> None:
         self._port = port
         self._checkpoint = checkpoint
-        self._every_s = every_s
+        self.every_s = every_s
         self._voice = Voice(warn) if warn is not None else None
         self._look_s = 0.0
         self._save_s: float | None = None
@@ -50,9 +54,9 @@ class Upkeep:
         if self._voice is not None:
             self._voice.look()
         if self._save_s is None:
-            self._save_s = now_s + self._every_s
+            self._save_s = now_s + min(FIRST_CHECKPOINT_S, self.every_s)
         elif now_s >= self._save_s:
-            self._save_s = now_s + self._every_s
+            self._save_s = now_s + self.every_s
             self._save()
 
     def finish(self) -> None:

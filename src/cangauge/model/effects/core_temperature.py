@@ -64,3 +64,9 @@ class _Online(OnlineEffect):
         time_s, current_a, voltage_v, temperature_c = reading
         above = self._above.step(time_s, (current_a / self._capacity_ah) ** 2)
         return (Reading(time_s, current_a, voltage_v, temperature_c + self._rise_k * above),)
+
+    def memory(self) -> list[float]:
+        return self._above.memory()
+
+    def remember(self, memory: Sequence[float]) -> None:
+        self._above.remember(memory)

@@ -204,6 +204,21 @@ class OnlineEffect:
         del soc_pct
         return 0.0
 
+    def memory(self) -> list[float]:
+        """Return what is to be remembered of earlier samples; NaN where nothing is known yet."""
+        return []
+
+    def remember(self, memory: Sequence[float]) -> None:
+        """Go on from a memory of the same effect.
+
+        Raises
+        ------
+        ValueError
+            If it is none.
+        """
+        if memory:
+            raise ValueError("this effect remembers nothing")
+
 
 class Effect(ABC):
     """A mechanism that the baseline model lacks."""

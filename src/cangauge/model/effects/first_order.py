@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,3 +110,17 @@ class LowPass:
                 self.value += (1.0 - a) * value + b * (self._last[1] - value)
         self._last = (time_s, value)
         return self.value
+
+    def memory(self) -> list[float]:
+        """Return time [s], input and lagged value of the last sample; nothing before the first."""
+        return [] if self._last is None else [*self._last, self.value]
+
+    def remember(self, memory: Sequence[float]) -> None:
+        """Go on from a memory; may raise ValueError."""
+        if not memory:
+            self._last, self.value = None, 0.0
+            return
+        time_s, last, self.value = memory
+        self._last = (time_s, last)
+        if not all(map(math.isfinite, memory)):
+            raise ValueError("not finite")

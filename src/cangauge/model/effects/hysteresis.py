@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -77,3 +78,14 @@ class _Online(OnlineEffect):
     def extra_voltage(self, soc_pct: float) -> float:
         del soc_pct
         return self._half_width_v * self._state
+
+    def memory(self) -> list[float]:
+        return [] if self._last is None else [*self._last, self._state]
+
+    def remember(self, memory: Sequence[float]) -> None:
+        self._last = None
+        if memory:
+            time_s, current_a, self._state = memory
+            self._last = (time_s, current_a)
+            if not (all(map(math.isfinite, memory)) and abs(self._state) <= 1.0):
+                raise ValueError("the state lies within ±1")

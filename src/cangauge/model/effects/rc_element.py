@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from cangauge.model.charge import BRIDGE_S
@@ -39,3 +41,11 @@ class OnlineRc(OnlineEffect):
         """Return the element's voltage [V]."""
         del soc_pct
         return -self._ohm * self._lagged.value
+
+    def memory(self) -> list[float]:
+        """Return the last sample's time, current and lagged current."""
+        return self._lagged.memory()
+
+    def remember(self, memory: Sequence[float]) -> None:
+        """Go on from a memory; may raise ValueError."""
+        self._lagged.remember(memory)

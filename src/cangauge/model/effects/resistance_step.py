@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from cangauge.model.effects.effect import (
@@ -78,3 +80,11 @@ class _Online(OnlineEffect):
     def extra_voltage(self, soc_pct: float) -> float:
         del soc_pct
         return self._volts
+
+    def memory(self) -> list[float]:
+        return [] if self._first_s is None else [self._first_s]
+
+    def remember(self, memory: Sequence[float]) -> None:
+        self._first_s = None
+        if memory:
+            (self._first_s,) = memory

@@ -62,3 +62,9 @@ class _Online(OnlineEffect):
         return (
             Reading(time_s, current_a, voltage_v, measured + self._ahead * (measured - smooth)),
         )
+
+    def memory(self) -> list[float]:
+        return self._smooth.memory()
+
+    def remember(self, memory: Sequence[float]) -> None:
+        self._smooth.remember(memory)

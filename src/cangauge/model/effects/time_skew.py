@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Sequence
@@ -100,3 +102,22 @@ class _Online(OnlineEffect):
         if stale > 64:
             del self._times[:stale]
             del self._currents[:stale]
+
+    def memory(self) -> list[float]:
+        flat = [value for reading in self._waiting for value in reading]
+        return [float(len(self._waiting)), *flat, *self._times, *self._currents]
+
+    def remember(self, memory: Sequence[float]) -> None:
+        waiting = int(memory[0]) if memory else -1
+        first = 1 + 4 * waiting
+        kept, odd = divmod(len(memory) - first, 2)
+        if waiting < 0 or kept < 0 or odd:
+            raise ValueError("not the readings that wait, and as many currents as times")
+        readings = [Reading(*memory[k : k + 4]) for k in range(1, first, 4)]
+        times, currents = list(memory[first : first + kept]), list(memory[first + kept :])
+        stamps = [reading.time_s for reading in readings]
+        if not all(map(math.isfinite, [*times, *currents, *stamps])):
+            raise ValueError("not finite")
+        if any(b <= a for a, b in itertools.pairwise(times)):
+            raise ValueError("times must increase")
+        self._waiting, self._times, self._currents = deque(readings), times, currents

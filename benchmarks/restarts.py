@@ -1,0 +1,412 @@
+"""What a restart costs: the service killed at random moments, and what it then knows.
+
+    python benchmarks/restarts.py [--kills 1000] [--real 20] [--seed 1] [--json]
+
+in-process  A drive of 10 Hz is estimated without a break, and beside it by a service that is killed
+            again and again. A kill throws the gauge and the state keeper away; the next service has
+            the state file as it was written by then, and nothing else. The file is written a second
+            after the start and then every 30 s of the drive, as by the service's loop; one in ten
+            kills falls into the writing and leaves half a temporary file. Between kill and first
+            frame 0.2 to 3 s of the drive are lost.
+process     `cangauge run` in a process of its own on a bus (udp_multicast), SIGKILLed at random
+            moments of the wall clock and started again, beside one that nobody kills; the state is
+            written every second there, so that kills are worth something in a minute. How long the
+            start takes is the machine's.
+
+For each restart: the charge that is counted wrongly for good (process: the step of the SoC, since
+the bus tells the count to 0.025 % only), beside the charge that flowed either way between the last
+writing and the first frame after; and the SoC less that of the undisturbed service.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import can
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.open import BusAddress, open_bus
+from cangauge.bus.publish import FrameIds, SocEstimate, SocReader
+from cangauge.bus.vehicle import load_vehicle
+from cangauge.estimate.estimator import EstimatorSettings
+from cangauge.estimate.types import Estimate, Reason, Sample
+from cangauge.model.model_file import ModelFile, load_model
+from cangauge.service.gauge import Gauge, GaugeSettings
+from cangauge.service.state_keeper import StateKeeper, StateSettings
+from cangauge.service.upkeep import FIRST_CHECKPOINT_S
+from cangauge.share import shared_file
+
+EVERY_S = 30.0
+RATE_HZ = 10
+START_PCT = 90.0
+MEAN_BETWEEN_KILLS_S = 60.0
+EPOCH_S = 1_700_000_000.0
+PORT = 43_777
+CHANNEL = "239.74.163.2"
+REAL_EVERY_S = 1.0
+COMMAND = "import sys; from cangauge.cli.app import main; main()"
+
+Result = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Restart:
+    """One kill, and what came of it."""
+
+    unsaved_s: float
+    """From the last writing to the first frame after [s]."""
+    flowed_pct: float
+    """Charge that flowed in that time, either way [% of capacity]."""
+    net_pct: float
+    """The same, charging subtracted: what would be lost if nothing were counted across it."""
+    lost_pct: float
+    """Charge that is counted wrongly for good [% of capacity]."""
+    soc_pct: float
+    """SoC at the first frame after, less the undisturbed [%]."""
+    later_pct: float
+    """The same at the end of that life, mostly a minute later [%]."""
+
+
+def main() -> None:
+    """Run, and print a table or JSON."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n", maxsplit=1)[0])
+    parser.add_argument("--kills", type=int, default=1000)
+    parser.add_argument("--real", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    console = Console(stderr=True)
+    minutes = (options.kills * 0.25 + options.real * 7.0) / 60.0
+    console.print(f"about {minutes:.0f} minutes on a machine that is otherwise idle")
+    results: Result = {}
+    with tempfile.TemporaryDirectory() as folder:
+        if options.kills:
+            results["in-process"] = in_process(options.kills, options.seed, Path(folder), console)
+        if options.real:
+            results["process"] = real_process(options.real, options.seed, Path(folder), console)
+    if options.json:
+        print(json.dumps(results))
+    else:
+        Console().print(table_of(results))
+
+
+# --- in this process --------------------------------------------------------------------------
+
+
+def drive(seconds: float, model: ModelFile, seed: int) -> list[Sample]:
+    """Return a drive with pulses and regeneration, down and up by turns; the model's voltage."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(0.0, seconds, 1.0 / RATE_HZ)
+    edges = np.cumsum(rng.uniform(2.0, 15.0, int(seconds / 5.0) + 10))
+    levels = rng.normal(0.0, 30.0, edges.size + 1)
+    # Down for an hour, up for an hour, about 25 % each.
+    mean_a = 0.25 * model.capacity_ah * np.sign(np.sin(np.pi * time_s / 3600.0) + 1e-12)
+    current_a = levels[np.searchsorted(edges, time_s)] + mean_a
+    out_pct = np.concatenate(([0.0], np.cumsum((current_a[1:] + current_a[:-1]) / 2.0)))
+    soc_pct = START_PCT - 15.0 - out_pct * 100.0 / (3600.0 * RATE_HZ * model.capacity_ah)
+    voltage_model = model.voltage_model()
+    delayed = np.column_stack(
+        [np.interp(time_s - delay, time_s, current_a) for delay in voltage_model.delay_s]
+    )
+    temperature_c = 23.0 + 2.0 * np.sin(time_s / 2000.0)
+    voltage_v = voltage_model.voltage(np.clip(soc_pct, 5.0, 98.0), temperature_c, delayed)
+    voltage_v += rng.normal(0.0, 0.5, time_s.size)
+    columns = (time_s + EPOCH_S, current_a, voltage_v, temperature_c)
+    return [Sample(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
+
+
+class Life:
+    """A service from its start to its kill, driven by samples; the wall clock is theirs."""
+
+    def __init__(self, model: ModelFile, path: Path | None) -> None:
+        self.now_s = EPOCH_S
+        settings = GaugeSettings(EstimatorSettings(initial_soc_pct=START_PCT - 15.0))
+        self.gauge = Gauge(load_vehicle("generic"), model, settings)
+        self.keeper: StateKeeper | None = None
+        if path is not None:
+            self.keeper = StateKeeper(
+                StateSettings(path, every_s=EVERY_S), self.gauge, lambda _: None,
+                wall_s=lambda: self.now_s,
+            )  # fmt: skip
+
+    def begin(self, now_s: float) -> None:
+        """Start at a moment [s]."""
+        self.now_s = now_s
+        if self.keeper is not None:
+            self.keeper.__enter__()
+
+    def take(self, sample: Sample, encoder: FrameEncoder) -> Estimate:
+        """Let the frames of a sample arrive."""
+        self.now_s = sample.time_s
+        for frame in encoder.encode(sample):
+            self.gauge.handle(frame)
+        return self.gauge.latest
+
+    def keep(self) -> None:
+        """Have the state written, and wait: what is written later is lost with the service."""
+        if self.keeper is None:
+            return
+        self.keeper.checkpoint()
+        if not self.keeper.flush(30.0):
+            raise TimeoutError("the state was not written within 30 s")
+
+
+def in_process(kills: int, seed: int, folder: Path, console: Console) -> Result:
+    """Kill so many services at random moments of one drive."""
+    rng = np.random.default_rng(seed)
+    model = load_model(shared_file("replay", "leaf2012_published_model.json"))
+    path = folder / "state.json"
+    lives = np.ceil((rng.exponential(MEAN_BETWEEN_KILLS_S, kills + 1) + 1.0) * RATE_HZ).astype(int)
+    away = np.ceil(rng.uniform(0.2, 3.0, kills + 1) * RATE_HZ).astype(int)
+    samples = drive(float(lives.sum() + away.sum()) / RATE_HZ, model, seed)
+    flowed, net = flowed_pct(samples, model.capacity_ah)
+    encoder, other = (FrameEncoder(load_vehicle("generic")) for _ in range(2))
+    whole, life = Life(model, None), Life(model, path)
+    life.begin(EPOCH_S)
+    restarts, begun = [], None
+    first = saved = refused = 0
+    was_pct = 0.0
+    for number, (alive, gone) in enumerate(zip(lives.tolist(), away.tolist(), strict=True)):
+        due = first + int(FIRST_CHECKPOINT_S * RATE_HZ)
+        for at in range(first, first + alive):
+            truth, found = whole.take(samples[at], other), life.take(samples[at], encoder)
+            if at == first and number:
+                counted_pct = found.soc_coulomb_pct - truth.soc_coulomb_pct
+                begun = (
+                    (at - saved) / RATE_HZ, float(flowed[at] - flowed[saved]),
+                    float(net[at] - net[saved]),
+                    counted_pct - was_pct, found.soc_pct - truth.soc_pct,
+                )  # fmt: skip
+                was_pct = counted_pct
+            if at >= due:
+                life.keep()
+                due, saved = at + int(EVERY_S * RATE_HZ), at
+        if begun is not None:
+            restarts.append(Restart(*begun, found.soc_pct - truth.soc_pct))
+        # Killed: nothing of it is used again but the file, as it is now.
+        if rng.random() < 0.1:
+            (folder / f".state.{number:08x}.json").write_bytes(b'{"format": "cangauge-st')
+        first += alive + gone
+        for at in range(first - gone, min(first, len(samples))):
+            whole.take(samples[at], other)
+        life = Life(model, path)
+        life.begin(EPOCH_S + first / RATE_HZ)
+        refused += not (life.keeper is not None and life.keeper.restored)
+        console.print(f"{number} kills", end="\r")
+    left = len(list(folder.glob(".state.*")))
+    return summary(restarts, rms_30s_pct(samples, model.capacity_ah)) | {
+        "refused": refused,
+        "left_over": left,
+    }
+
+
+def flowed_pct(samples: list[Sample], capacity_ah: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the charge since the first sample [%], either way and net, shape (n,) each."""
+    current_a = np.array([sample.current_a for sample in samples])
+    each = (current_a[1:] + current_a[:-1]) / 2.0 / RATE_HZ * 100.0 / (3600.0 * capacity_ah)
+    either = np.concatenate(([0.0], np.cumsum(np.abs(each))))
+    return either, np.concatenate(([0.0], np.cumsum(each)))
+
+
+def rms_30s_pct(samples: list[Sample], capacity_ah: float) -> float:
+    """Return the charge of 30 s at the drive's mean (root of squares) current [%]."""
+    rms_a = float(np.sqrt(np.mean([sample.current_a**2 for sample in samples])))
+    return 100.0 * rms_a * 30.0 / (3600.0 * capacity_ah)
+
+
+def summary(restarts: list[Restart], rms_30s_pct: float) -> Result:
+    """Return what the restarts amount to."""
+    columns = {
+        name: np.abs([getattr(each, name) for each in restarts])
+        for name in ("unsaved_s", "flowed_pct", "net_pct", "lost_pct", "soc_pct", "later_pct")
+    }
+    result: Result = {"restarts": len(restarts)}
+    for name, values in columns.items():
+        result[name] = {
+            "median": float(np.median(values)),
+            "p99": float(np.quantile(values, 0.99)),
+            "most": float(values.max()),
+        }
+    beyond = columns["lost_pct"] > columns["flowed_pct"] + 1e-9
+    result["lost_more_than_flowed"] = int(beyond.sum())
+    result["rms_30s_pct"] = rms_30s_pct
+    result["lost_more_than_30s"] = int((columns["lost_pct"] > rms_30s_pct).sum())
+    return result
+
+
+# --- in processes of their own ----------------------------------------------------------------
+
+KILLED_ID, WHOLE_ID = 0x5A0, 0x5B0
+
+
+def real_process(kills: int, seed: int, folder: Path, console: Console) -> Result:
+    """Kill `cangauge run` so often with SIGKILL, beside one that nobody kills."""
+    rng = np.random.default_rng(seed)
+    model_path = shared_file("replay", "leaf2012_published_model.json")
+    model = load_model(model_path)
+    lives = rng.uniform(1.5, 6.0, kills)
+    samples = drive(kills * 30.0 + 300.0, model, seed)
+    flowed, net = flowed_pct(samples, model.capacity_ah)
+    restarts = []
+    with Player(samples, folder / "said.txt") as player:
+        service = [player.service(model_path, KILLED_ID, folder / "real.json")]
+        other = player.service(model_path, WHOLE_ID, None)
+        try:
+            player.wait_for_both()
+            for number, seconds in enumerate(lives.tolist()):
+                time.sleep(seconds)
+                before_pct, saved = player.apart_pct(), player.sent
+                service[0].send_signal(signal.SIGKILL)
+                service[0].wait()
+                player.forget()
+                service[0] = player.service(model_path, KILLED_ID, folder / "real.json")
+                player.wait_for_both()
+                back = player.sent
+                after_pct = player.apart_pct()
+                saved = max(saved - int((REAL_EVERY_S + 0.5) * RATE_HZ), 0)
+                time.sleep(1.0)
+                restarts.append(
+                    Restart(
+                        (back - saved) / RATE_HZ, float(flowed[back] - flowed[saved]),
+                        float(net[back] - net[saved]),
+                        after_pct - before_pct, after_pct, player.apart_pct(),
+                    )
+                )  # fmt: skip
+                console.print(f"{number + 1} real kills", end="\r")
+        finally:
+            for process in (*service, other):
+                process.kill()
+                process.wait()
+    found = summary(restarts, rms_30s_pct(samples, model.capacity_ah))
+    return found | {"refused": kills - player.restored()}
+
+
+class Player(threading.Thread):
+    """Plays a drive on a bus in real time, and hears what two services make of it."""
+
+    def __init__(self, samples: list[Sample], said: Path) -> None:
+        super().__init__(daemon=True)
+        self._samples = samples
+        self._said = said
+        self._bus = open_bus(BusAddress("udp_multicast", CHANNEL, {"port": PORT}))
+        self._over = threading.Event()
+        self._latest: dict[int, float] = {}
+        self._readers = [SocReader(FrameIds(each, each + 1, each + 15)) for each in
+                         (KILLED_ID, WHOLE_ID)]  # fmt: skip
+        self.sent = 0
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self.join()
+        self._bus.shutdown()
+
+    def run(self) -> None:
+        """Send, and listen in between."""
+        encoder = FrameEncoder(load_vehicle("generic"))
+        began_s = time.monotonic()
+        for number, sample in enumerate(self._samples):
+            for frame in encoder.encode(sample):
+                self._bus.send(frame)
+            self.sent = number
+            while (left_s := began_s + (number + 1) / RATE_HZ - time.monotonic()) > 0.0:
+                message = self._bus.recv(left_s)
+                if message is not None:
+                    self._hear(message)
+            if self._over.is_set():
+                return
+
+    def _hear(self, message: can.Message) -> None:
+        for frame_id, reader in zip((KILLED_ID, WHOLE_ID), self._readers, strict=True):
+            content = reader.read(message)
+            if isinstance(content, SocEstimate) and not content.reasons & Reason.INPUT_STALE:
+                self._latest[frame_id] = content.soc_pct
+
+    def forget(self) -> None:
+        """Forget what the killed one said."""
+        time.sleep(0.2)
+        self._latest.pop(KILLED_ID, None)
+
+    def wait_for_both(self) -> None:
+        """Wait until both tell a SoC of samples that they had."""
+        until_s = time.monotonic() + 60.0
+        while not {KILLED_ID, WHOLE_ID} <= self._latest.keys():
+            if time.monotonic() > until_s:
+                raise TimeoutError("no estimate within 60 s")
+            time.sleep(0.02)
+
+    def apart_pct(self) -> float:
+        """Return the killed one's SoC less the other's [%]."""
+        return self._latest[KILLED_ID] - self._latest[WHOLE_ID]
+
+    def service(self, model: Path, frame_id: int, state: Path | None) -> subprocess.Popen[bytes]:
+        """Start `cangauge run`."""
+        kept = [] if state is None else ["--state", state, "--state-every", REAL_EVERY_S]
+        arguments = [
+            "run", "-m", model, "--interface", "udp_multicast", "--channel", CHANNEL,
+            "--bus-option", f"port={PORT}", "--initial-soc", START_PCT - 15.0,
+            "--soc-estimate-id", f"0x{frame_id:X}", "--soc-detail-id", f"0x{frame_id + 1:X}",
+            "--replay-clock-id", f"0x{frame_id + 15:X}", *kept,
+        ]  # fmt: skip
+        with self._said.open("ab") as said:
+            return subprocess.Popen(
+                [sys.executable, "-c", COMMAND, *map(str, arguments)],
+                stderr=said,
+                stdout=subprocess.DEVNULL,
+            )
+
+    def restored(self) -> int:
+        """Return how many starts went on from a state, as the services said."""
+        return self._said.read_text(encoding="utf-8").count("going on from")
+
+
+def table_of(results: Result) -> Table:
+    """Return the results as a table."""
+    table = Table(title="killed and started again", title_justify="left")
+    for name in ("", *results):
+        table.add_column(name, justify="right" if name else "left")
+    rows = {
+        "unsaved_s": "time not saved, until the first frame after [s]",
+        "flowed_pct": "charge that flowed in it, either way [%]",
+        "net_pct": "net: lost if nothing were counted across the gap [%]",
+        "lost_pct": "charge (process: SoC) lost [%]",
+        "soc_pct": "SoC off at the first frame after [%]",
+        "later_pct": "SoC off at the end of that life [%]",
+    }
+    table.add_row("restarts", *(str(each["restarts"]) for each in results.values()))
+    for name, words in rows.items():
+        cells = [
+            " / ".join(f"{each[name][part]:.3f}" for part in ("median", "p99", "most"))
+            for each in results.values()
+        ]
+        table.add_row(f"{words}: median / p99 / most", *cells)
+    carried = (f"{each['rms_30s_pct']:.3f}" for each in results.values())
+    table.add_row("30 s at the drive's rms current carry [%]", *carried)
+    for name, words in (
+        ("lost_more_than_30s", "lost more than 30 s at the drive's rms current carry"),
+        ("lost_more_than_flowed", "lost more than flowed (a guess of the wrong sign)"),
+        ("refused", "state refused or absent at the start"),
+        ("left_over", "temporary files left over"),
+    ):
+        table.add_row(words, *(str(each.get(name, "–")) for each in results.values()))
+    return table
+
+
+if __name__ == "__main__":
+    main()

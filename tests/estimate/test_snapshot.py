@@ -1,0 +1,237 @@
+"""An estimator that is interrupted and restored goes on as if it had not been."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cangauge.errors import InputError
+from cangauge.estimate.anchors import FullCharge, LongRest
+from cangauge.estimate.estimator import Estimator, EstimatorSettings
+from cangauge.estimate.offline import samples_of
+from cangauge.estimate.state import EstimatorState
+from cangauge.estimate.types import Estimate, Reason, Sample
+from cangauge.model.effects.effect import Pack
+from cangauge.model.effects.library import LIBRARY, effect_entries
+from cangauge.model.model_file import ModelFile
+from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
+from synthetic import synthetic_log
+
+PACK = Pack.of(leaf_2012_model(), CAPACITY_AH)
+PLAIN = leaf_2012_model_file()
+ANCHORS = {"full_charge": FullCharge(400.0, 5.0), "long_rest": LongRest(600.0)}
+
+
+def extended_by(ids: list[str]) -> ModelFile:
+    """The published model with effects, half way to their bounds."""
+    chosen = []
+    for effect_id in ids:
+        effect = LIBRARY[effect_id]
+        values = effect.neutral(PACK)
+        for parameter in effect.amplitudes:
+            low, high = parameter.bounds(PACK)
+            far = high if high > values[parameter.name] else low
+            values[parameter.name] = 0.5 * (values[parameter.name] + far)
+        chosen.append((effect, values | ({"skew_s": 0.7} if effect_id == "time_skew" else {})))
+    return ModelFile.model_validate(PLAIN.model_dump() | {"effects": effect_entries(chosen)})
+
+
+def eventful_samples() -> list[Sample]:
+    """A drive with a short gap, a long pause, missing signals, a late sample and a clock set
+    back."""
+    samples = list(samples_of(synthetic_log(hours=0.15, rate_hz=2.0, start_pct=80.0, end_pct=70.0,
+                                            noise_v=0.3, seed=5)))  # fmt: skip
+    out = []
+    for number, sample in enumerate(samples):
+        time_s = sample.time_s
+        time_s += 8.0 if number > 300 else 0.0
+        time_s += 7200.0 if number > 450 else 0.0
+        time_s -= 5000.0 if number > 900 else 0.0
+        if number % 97 == 5:
+            sample = sample._replace(voltage_v=math.nan)  # noqa: PLW2901 - a sample goes through
+        if number % 4:
+            sample = sample._replace(temperature_c=math.nan)  # noqa: PLW2901
+        out.append(sample._replace(time_s=time_s))
+    out.insert(200, out[190])
+    return out
+
+
+EVENTFUL = eventful_samples()
+
+
+def through_json(state: EstimatorState) -> EstimatorState:
+    text = json.dumps(state.model_dump(mode="json"), allow_nan=False)
+    return EstimatorState.model_validate(json.loads(text))
+
+
+def same(first: list[Estimate], again: list[Estimate]) -> bool:
+    return np.array_equal(np.array(first, float), np.array(again, float), equal_nan=True)
+
+
+def remembered(thing: Any, depth: int = 0) -> Any:
+    """All values in an object, down to the bottom, NaN as a word."""
+    if isinstance(thing, float) and math.isnan(thing):
+        return "nan"
+    if isinstance(thing, np.ndarray):
+        return thing.tolist()
+    if isinstance(thing, list | tuple) or type(thing).__name__ == "deque":
+        return [remembered(each, depth + 1) for each in thing]
+    if hasattr(thing, "__dict__") and not callable(thing) and depth < 8:
+        # What an EKF keeps for its reader only is not needed to go on.
+        names = {"x", "P"} if type(thing).__name__ == "ExtendedKalmanFilter" else vars(thing)
+        return {name: remembered(vars(thing)[name], depth + 1) for name in sorted(names)}
+    return thing if isinstance(thing, int | float | str | bool | None) else type(thing).__name__
+
+
+def check_goes_on(model: ModelFile, chosen: EstimatorSettings, at: int) -> None:
+    whole = Estimator(model, chosen)
+    for sample in EVENTFUL[:at]:
+        whole.step(sample)
+    state = through_json(whole.snapshot())
+    after = Estimator(model, chosen)
+    after.restore(state)
+    rest = EVENTFUL[at:]
+    # The next voltage is used within a second; after it nothing may differ inside either.
+    assert same([after.step(each) for each in rest[:8]], [whole.step(each) for each in rest[:8]])
+    assert remembered(after) == remembered(whole)
+    assert same([after.step(each) for each in rest[8:]], [whole.step(each) for each in rest[8:]])
+
+
+MOMENTS = [0, 1, 3, 201, 310, 455, 850, 910]
+
+
+@pytest.mark.parametrize("at", MOMENTS)
+@pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
+def test_goes_on_bit_for_bit(method: Any, at: int) -> None:
+    check_goes_on(PLAIN, EstimatorSettings(method=method, **ANCHORS), at)
+
+
+@pytest.mark.parametrize("effect_id", LIBRARY)
+def test_goes_on_bit_for_bit_with_each_effect(effect_id: str) -> None:
+    check_goes_on(extended_by([effect_id]), EstimatorSettings(initial_soc_pct=80.0), 465)
+
+
+@pytest.mark.parametrize("at", MOMENTS)
+def test_goes_on_bit_for_bit_with_many_effects(at: int) -> None:
+    ids = ["time_skew", "temperature_lag", "core_temperature", "fast_polarization",
+           "slow_diffusion", "hysteresis", "resistance_step", "entropic_coefficient"]  # fmt: skip
+    check_goes_on(extended_by(ids), EstimatorSettings(), at)
+
+
+def test_a_snapshot_is_not_changed_by_what_comes_after() -> None:
+    estimator = Estimator(extended_by(["time_skew", "hysteresis"]))
+    for sample in EVENTFUL[:475]:
+        estimator.step(sample)
+    state = estimator.snapshot()
+    before = state.model_dump_json()
+    for sample in EVENTFUL[475:600]:
+        estimator.step(sample)
+    assert state.model_dump_json() == before
+
+
+@pytest.mark.parametrize(
+    "change", [{"method": "coulomb"}, {"capacity_ah": 45.0}, {"method": "ekf", "capacity_ah": 60.0}]
+)
+def test_with_other_settings_the_soc_stays(change: dict[str, Any]) -> None:
+    before = Estimator(PLAIN, EstimatorSettings(initial_soc_pct=80.0))
+    for sample in EVENTFUL[:300]:
+        last = before.step(sample)
+    after = Estimator(PLAIN, EstimatorSettings(**change))
+    after.restore(through_json(before.snapshot()))
+    found = after.step(EVENTFUL[300])
+    assert found.soc_pct == pytest.approx(last.soc_pct, abs=0.05)
+    assert found.soc_std_pct == pytest.approx(last.soc_std_pct, abs=0.2)
+
+
+def test_another_model_takes_the_soc_over() -> None:
+    before = Estimator(PLAIN, EstimatorSettings(initial_soc_pct=80.0))
+    for sample in EVENTFUL[:300]:
+        last = before.step(sample)
+    after = Estimator(extended_by(["hysteresis", "time_skew"]))
+    after.take_over(before)
+    found = [after.step(each) for each in EVENTFUL[300:304]]
+    assert found[0].samples == last.samples + 1
+    assert found[-1].soc_pct == pytest.approx(last.soc_pct, abs=0.1)
+    assert found[-1].soc_std_pct == pytest.approx(last.soc_std_pct, abs=0.2)
+    assert not found[-1].reasons & Reason.DELAY_LINE_FILLING
+    nothing = Estimator(PLAIN)
+    nothing.take_over(Estimator(PLAIN))
+    assert nothing.step(Sample(0.0, 10.0, math.nan, 23.0)).reasons & Reason.NO_INITIAL_SOC
+
+
+def test_a_state_of_another_model_is_refused() -> None:
+    estimator = Estimator(extended_by(["hysteresis", "fast_polarization"]))
+    for sample in EVENTFUL[:100]:
+        estimator.step(sample)
+    state = estimator.snapshot()
+    with pytest.raises(InputError, match="effects"):
+        Estimator(PLAIN).restore(state)
+    with pytest.raises(InputError, match=r"effects\.0"):
+        Estimator(extended_by(["current_offset", "fast_polarization"])).restore(state)
+
+
+_STATE = None
+
+
+def state_of_a_drive() -> dict[str, Any]:
+    global _STATE  # noqa: PLW0603 - made once, it takes half a second
+    if _STATE is None:
+        estimator = Estimator(extended_by(["time_skew", "hysteresis", "slow_diffusion"]))
+        for sample in EVENTFUL[:465]:
+            estimator.step(sample)
+        _STATE = estimator.snapshot().model_dump(mode="json")
+    return json.loads(json.dumps(_STATE))
+
+
+def places(data: Any, here: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Where the numbers are."""
+    items = (
+        data.items()
+        if isinstance(data, dict)
+        else enumerate(data)
+        if isinstance(data, list)
+        else ()
+    )
+    found = [place for key, value in items for place in places(value, (*here, key))]
+    return found or [here]
+
+
+PLACES = [place for place in places(state_of_a_drive()) if "line" not in place]
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(PLACES),
+            st.one_of(st.none(), st.booleans(), st.integers(), st.text(max_size=3),
+                      st.floats(allow_nan=False, allow_infinity=False), st.just([]),
+                      st.floats(-1e12, 1e12)),
+        ),
+        min_size=1,
+        max_size=6,
+    )
+)  # fmt: skip
+def test_a_damaged_state_is_refused_or_does_no_harm(changes: list[tuple[Any, Any]]) -> None:
+    data = state_of_a_drive()
+    for place, value in changes:
+        at = data
+        for key in place[:-1]:
+            at = at[key]
+        at[place[-1]] = value
+    estimator = Estimator(extended_by(["time_skew", "hysteresis", "slow_diffusion"]))
+    try:
+        estimator.restore(EstimatorState.model_validate(data))
+    except (InputError, ValueError):  # pydantic's is one
+        return
+    for sample in EVENTFUL[465:495]:
+        found = estimator.step(sample)
+        assert 0.0 <= found.soc_pct <= 100.0 or math.isnan(found.soc_pct)
+        assert found.soc_std_pct >= 0.0 or math.isnan(found.soc_std_pct)
+        assert math.isnan(found.soc_pct) == math.isnan(found.soc_std_pct)

@@ -1,0 +1,121 @@
+"""`cangauge run --state` as a process: stopped, killed, started again."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.open import BusAddress, open_bus
+from cangauge.bus.publish import SocEstimate, SocReader, standard_filter
+from cangauge.bus.receive import BusPort
+from cangauge.bus.vehicle import load_vehicle
+from cangauge.estimate.offline import samples_of
+from cangauge.estimate.types import Reason, Status
+from cangauge.service.loop import LoopSettings
+from cangauge.service.state_file import read_state
+from live import (
+    Command,
+    collect,
+    in_process,
+    leaf_model_path,
+    short_log,
+    virtual_service,
+    waits,
+)
+
+MODEL = ("-m", leaf_model_path())
+ADDRESS = "239.74.163.2"
+PORT = 43_821
+BUS = ("--interface", "udp_multicast", "--channel", ADDRESS, "--bus-option", f"port={PORT}")
+
+
+def drive(port: BusPort, first: int, after: int) -> None:
+    encoder = FrameEncoder(load_vehicle("generic"))
+    for sample in list(samples_of(short_log(100.0)))[first:after]:
+        for frame in encoder.encode(sample):
+            port.send(frame)
+        time.sleep(0.01)
+
+
+def run(path: Path) -> Command:
+    service = Command("run", *BUS, *MODEL, "--state", path, "--state-every", "0.2", "--json",
+                      "--initial-soc", "80")  # fmt: skip
+    service.wait_for("listening")
+    return service
+
+
+def samples_kept(path: Path) -> int:
+    return read_state(path).estimator.samples if path.exists() else 0
+
+
+@pytest.mark.slow
+def test_stopped_killed_and_started_again(tmp_path: Path) -> None:
+    path = tmp_path / "state.json"
+    wanted = [standard_filter(0x5A0)]
+    address = BusAddress("udp_multicast", ADDRESS, {"port": PORT})
+    with BusPort(open_bus(address, wanted), "bus") as port:
+        service = run(path)
+        drive(port, 0, 100)
+        service.process.send_signal(signal.SIGTERM)
+        ended = service.end()
+        assert ended.code == 0
+        assert ended.json["samples"] == 100
+        assert samples_kept(path) == 100
+        # Killed: what was written by then is there.
+        service = run(path)
+        drive(port, 100, 200)
+        assert waits(lambda: samples_kept(path) == 200)
+        drive(port, 200, 202)
+        service.process.send_signal(signal.SIGKILL)
+        service.process.wait()
+        assert 200 <= samples_kept(path) <= 202
+        kept_pct = read_state(path).estimator.soc_pct
+        service = run(path)
+        while port.receive(0.0) is not None:
+            pass
+        contents = [SocReader().read(frame) for frame in collect(port, 0.5)]
+        told = [each for each in contents if isinstance(each, SocEstimate)]
+        assert told
+        assert told[-1].soc_pct == pytest.approx(kept_pct, abs=0.002)
+        assert told[-1].status is Status.INVALID
+        assert told[-1].reasons & Reason.INPUT_STALE
+        drive(port, 202, 210)
+        service.process.send_signal(signal.SIGTERM)
+        ended = service.end()
+    assert "going on from" in ended.err
+    # The seconds that starting took are counted by the mean current before: 10 s at 60 A are 0.3 %.
+    assert ended.json["estimate"]["soc_pct"] == pytest.approx(kept_pct, abs=1.0)
+    assert ended.json["estimate"]["soc_pct"] != pytest.approx(80.0, abs=0.1)
+    assert [each.name for each in tmp_path.iterdir()] == ["state.json"]
+
+
+def test_the_loop_asks_for_the_state_soon_then_every_so_often_and_at_the_end() -> None:
+    asked: list[float] = []
+    service = virtual_service("state", loop=LoopSettings(duration_s=2.6, checkpoint_every_s=1.2))
+    began = time.monotonic()
+    service.checkpoint = lambda: asked.append(time.monotonic() - began)
+    with service:
+        service.join(5.0)
+    assert [round(each, 1) for each in asked] == pytest.approx([1.0, 2.2, 2.6], abs=0.25)
+
+
+def test_the_state_is_no_other_file_of_the_service(tmp_path: Path) -> None:
+    model = tmp_path / "model.json"
+    model.write_bytes(leaf_model_path().read_bytes())
+    ended = in_process("run", "-m", model, "--state", model)
+    assert ended.code == 2
+    assert "--state: is another file of this service" in ended.err
+    assert json.loads(model.read_text())["format"] == "cangauge-model"
+
+
+def test_options_of_the_config(tmp_path: Path) -> None:
+    config = tmp_path / "run.toml"
+    config.write_text('model = "m"\n[full_charge]\nvoltage_v = 390\n')
+    ended = in_process("run", "--config", config)
+    assert ended.code == 2
+    assert f"{config}: full_charge.current_a: is missing" in ended.err
