@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,16 +26,33 @@ from cangauge.cli.bus_options import (
     frame_ids,
 )
 from cangauge.cli.inputs import JsonOption, TemperatureSourceOption, check_outputs
-from cangauge.cli.output import console, emit_json, note
+from cangauge.cli.ops_options import (
+    HttpOption,
+    HttpTokenFileOption,
+    LogFormatOption,
+    LogLevelOption,
+    RecordKeepMbOption,
+    RecordOption,
+    RecordPartMbOption,
+    RecordPartSOption,
+    StatusSocketOption,
+)
+from cangauge.cli.output import console, emit_json
+from cangauge.errors import CangaugeError
+from cangauge.events import LogFormat, emit, logging_to
 from cangauge.model.model_file import load_model
 from cangauge.report.words import number, reason_names
 from cangauge.service.config import RunConfig, load_config
 from cangauge.service.display import LiveLine
 from cangauge.service.gauge import Gauge
 from cangauge.service.loop import Outputs, RunSummary, serve
+from cangauge.service.monitor import Monitor
+from cangauge.service.operate import operated
 from cangauge.service.record import Recorder
 from cangauge.service.signals import stop_on_signals
 from cangauge.service.table import EstimateWriter
+
+_LOG = logging.getLogger(__name__)
 
 
 def run_command(  # noqa: PLR0917 - typer passes options by name
@@ -101,14 +120,10 @@ def run_command(  # noqa: PLR0917 - typer passes options by name
         float | None,
         typer.Option(metavar="S", help="Without a sample for so long: stale [s]. Default: 2."),
     ] = None,
-    record: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Record the frames received (.log or .csv): `cangauge estimate` on them"
-            " gives the live numbers, bit for bit.",
-        ),
-    ] = None,
+    record: RecordOption = None,
+    record_part_mb: RecordPartMbOption = None,
+    record_part_s: RecordPartSOption = None,
+    record_keep_mb: RecordKeepMbOption = None,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -127,6 +142,11 @@ def run_command(  # noqa: PLR0917 - typer passes options by name
     soc_estimate_id: EstimateIdOption = None,
     soc_detail_id: DetailIdOption = None,
     replay_clock_id: ClockIdOption = None,
+    http: HttpOption = None,
+    http_token_file: HttpTokenFileOption = None,
+    status_socket: StatusSocketOption = None,
+    log_format: LogFormatOption = None,
+    log_level: LogLevelOption = None,
     json_output: JsonOption = False,
 ) -> None:
     """Estimate the state of charge from a bus, and publish it there.
@@ -164,19 +184,41 @@ def run_command(  # noqa: PLR0917 - typer passes options by name
         "timeout_s": timeout_s,
         "ids": frame_ids(soc_estimate_id, soc_detail_id, replay_clock_id),
         "record": _text(record),
+        "record_part_mb": record_part_mb,
+        "record_part_s": record_part_s,
+        "record_keep_mb": record_keep_mb,
         "output": _text(output),
         "duration_s": duration_s,
         "until_idle_s": until_idle_s,
+        "http": http,
+        "http_token_file": _text(http_token_file),
+        "status_socket": status_socket,
+        "log_format": log_format,
+        "log_level": log_level,
     }
-    result = _run(load_config(config, options))
+    loaded = load_config(config, options)
+    with logging_to(loaded.log_format, loaded.log_level), _failures_logged(loaded.log_format):
+        result = _run(loaded)
     if json_output:
         emit_json(result)
 
 
+@contextmanager
+def _failures_logged(log_format: LogFormat) -> Iterator[None]:
+    """Tell of a failure as an event where stderr is JSON, so that every line of it is."""
+    try:
+        yield
+    except CangaugeError as error:
+        if log_format != "json":
+            raise
+        emit(_LOG, logging.ERROR, "service.failed", str(error), exit_code=error.exit_code)
+        raise typer.Exit(error.exit_code) from error
+
+
 def _run(config: RunConfig) -> dict[str, Any]:
-    written = [Path(name) for name in (config.record, config.output) if name is not None]
-    check_outputs(written, [Path(config.model)])
-    gauge = Gauge(config.load_vehicle(), load_model(config.model), config.gauge_settings())
+    check_outputs([None if config.output is None else Path(config.output)], [Path(config.model)])
+    vehicle = config.load_vehicle()
+    gauge = Gauge(vehicle, load_model(config.model), config.gauge_settings())
     address = config.address()
     with ExitStack() as stack:
         # Signals first: whoever starts the service may end it at any moment after.
@@ -184,28 +226,49 @@ def _run(config: RunConfig) -> dict[str, Any]:
         port = stack.enter_context(BusPort(open_bus(address, gauge.filters), str(address)))
         recorder = table = line = None
         if config.record is not None:
-            recorder = stack.enter_context(Recorder(config.record))
+            recorder = stack.enter_context(Recorder(config.record, config.record_limits()))
         if config.output is not None:
             table = stack.enter_context(EstimateWriter(config.output))
-        note(f"listening on {address}; time source: {config.time_source}; Ctrl-C ends")
+        monitor = stack.enter_context(operated(config, vehicle.name, gauge, port, recorder))
         if console.is_terminal:
             line = stack.enter_context(LiveLine(console, gauge))
         outputs = Outputs(
             record=recorder,
             table=None if table is None else table.add,
-            show=None if line is None else line.show,
-            warn=note,
+            show=_each_turn(monitor, recorder, line),
+            warn=_warn,
+            stepped=monitor.stepped,
         )
         summary = serve(port, gauge, config.loop_settings(), outputs, stop)
-    note(_summary_line(gauge, summary))
+    emit(_LOG, logging.INFO, "service.stopped", _summary_line(gauge, summary))
     if not gauge.counts.frames:
-        note(
-            f"warning: {port.name}: no wanted frame arrived; check channel, bit rate and the car"
-            " (--vehicle, or --dbc and --map)"
+        _warn(
+            f"{port.name}: no wanted frame arrived; check channel, bit rate and the car"
+            " (--vehicle, or --dbc and --map)",
+            event="bus.nothing_wanted",
         )
-    for path in written:
-        note(f"written: {path}")
-    return _as_json(gauge, port, summary, config)
+    recorded = None if recorder is None else recorder.path
+    for path in (recorded, config.output):
+        if path is not None:
+            emit(_LOG, logging.INFO, "file.written", f"written: {path}", path=str(path))
+    return _as_json(gauge, port, summary, config) | {"record": _text(recorded)}
+
+
+def _each_turn(
+    monitor: Monitor, recorder: Recorder | None, line: LiveLine | None
+) -> Callable[[float], None]:
+    wanted = (monitor.turn, recorder and recorder.tick, line and line.show)
+    calls = [each for each in wanted if each]
+
+    def turn(now_s: float) -> None:
+        for call in calls:
+            call(now_s)
+
+    return turn
+
+
+def _warn(text: str, event: str = "service.warning") -> None:
+    emit(_LOG, logging.WARNING, event, text.removeprefix("warning: "))
 
 
 def _summary_line(gauge: Gauge, summary: RunSummary) -> str:
@@ -246,7 +309,6 @@ def _as_json(gauge: Gauge, port: BusPort, summary: RunSummary, config: RunConfig
             "reasons": reason_names(int(latest.reasons)),
         },
         "soc_reference_pct": gauge.reference_soc_pct,
-        "record": config.record,
         "output": config.output,
     }
 

@@ -15,6 +15,8 @@ Keys are the options' names, with underscores::
 
     [ids]
     soc_estimate = 0x5A0
+
+How the service is watched and what it records: see `ops_config`.
 """
 
 from __future__ import annotations
@@ -37,11 +39,12 @@ from cangauge.logs.log import TemperatureSource
 from cangauge.model.delay_line import GAP_S
 from cangauge.service.gauge import GaugeSettings
 from cangauge.service.loop import LoopSettings
+from cangauge.service.ops_config import OPS_PATHS, OpsConfig
 
 DEFAULT_VEHICLE: Final = "generic"
 """What `replay` sends by default, so that both commands find each other without options."""
 
-_PATHS: Final = ("model", "dbc", "map", "record", "output")
+_PATHS: Final = ("model", "dbc", "map", "output", *OPS_PATHS)
 
 Percent = Annotated[FiniteFloat, Field(ge=0.0, le=100.0)]
 Seconds = Annotated[FiniteFloat, Field(gt=0.0, le=1e9)]
@@ -71,8 +74,10 @@ class IdsConfig(_Strict):
     replay_clock: StandardId = 0x5AF
 
 
-class RunConfig(_Strict):
+class RunConfig(OpsConfig):
     """All that `cangauge run` can be told; defaults are those of the command line.
+
+    The keys for operators are those of `OpsConfig`.
 
     Parameters
     ----------
@@ -103,8 +108,8 @@ class RunConfig(_Strict):
     timeout_s : float
         Without a sample for so long the estimate is published as stale [s].
     ids : IdsConfig
-    record, output : str, optional
-        Files to write: the frames received, the estimates.
+    output : str, optional
+        File to write the estimates to.
     duration_s, until_idle_s : float, optional
         When to end by itself [s].
     """
@@ -127,7 +132,6 @@ class RunConfig(_Strict):
     time_source: TimeSourceName = "receive"
     timeout_s: Seconds = 2.0
     ids: IdsConfig = IdsConfig()
-    record: str | None = None
     output: str | None = None
     duration_s: Seconds | None = None
     until_idle_s: Seconds | None = None

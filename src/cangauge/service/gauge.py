@@ -8,6 +8,7 @@ from typing import Final
 import can
 from can.typechecking import CanFilter
 
+from cangauge.bus.counters import Counters
 from cangauge.bus.publish import FrameIds, SocPublisher, standard_filter
 from cangauge.bus.time_source import TimeSourceName
 from cangauge.bus.vehicle import Vehicle
@@ -15,7 +16,7 @@ from cangauge.errors import InputError
 from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.types import Estimate, Reason, Sample, Status
 from cangauge.model.model_file import ModelFile
-from cangauge.service.stream import EstimateStream, FrameCounts
+from cangauge.service.stream import NOTHING_YET, EstimateStream, FrameCounts
 
 ACKNOWLEDGE_EVERY: Final = 4
 """Samples between two SOC_DETAIL at most, under the replay clock: `replay` waits for them."""
@@ -69,6 +70,8 @@ class Gauge:
         self._publisher = SocPublisher(ids, ACKNOWLEDGE_EVERY if is_replay else None)
         self._beginnings = 0
         self._beats = 0
+        self.published = NOTHING_YET
+        """The estimate as last put on the bus, stale where it was told to be."""
 
     @property
     def filters(self) -> list[CanFilter]:
@@ -108,6 +111,7 @@ class Gauge:
             estimate = estimate._replace(
                 status=Status.INVALID, reasons=estimate.reasons | Reason.INPUT_STALE
             )
+        self.published = estimate
         frames = [self._publisher.estimate_frame(estimate)]
         self._beats += 1
         if self.samples != self._publisher.samples_told or self._beats % DETAIL_EVERY_BEATS == 1:
@@ -135,6 +139,11 @@ class Gauge:
         return self._stream.counts
 
     @property
+    def counters(self) -> Counters:
+        """The same in detail, of the log that is running."""
+        return self._stream.counters
+
+    @property
     def reference_soc_pct(self) -> float:
         """The car's own state of charge [%]; NaN while there is none."""
         return self._stream.reference_soc_pct
@@ -143,6 +152,7 @@ class Gauge:
         if self._stream.beginnings != self._beginnings:
             self._beginnings = self._stream.beginnings
             self._publisher.restart()
+        self.published = estimate
         return self._publisher.publish(estimate, self.samples)
 
 

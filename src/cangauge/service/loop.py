@@ -72,12 +72,16 @@ class Outputs:
         Called with the monotonic time [s] after every frame and at every heartbeat.
     warn : callable, optional
         Takes a line of text.
+    stepped : callable, optional
+        Takes, after every sample, the receive stamp [s] of the frame that completed it, the time
+        that the estimate took [ns], and whether it was sent.
     """
 
     record: FrameSink | None = None
     table: Callable[[float, Estimate], None] | None = None
     show: Callable[[float], None] | None = None
     warn: Callable[[str], None] | None = None
+    stepped: Callable[[float, int, bool], None] | None = None
 
 
 @dataclass(frozen=True)
@@ -183,17 +187,20 @@ class _Loop:
             return
         if self._outputs.record is not None:
             self._outputs.record.write(message)
-        before = gauge.samples
+        before, stamp_s = gauge.samples, message.timestamp
         began_ns = time.perf_counter_ns()
         frames = gauge.handle(message)
         if gauge.samples == before:
             return
-        self.step_ns.append(time.perf_counter_ns() - began_ns)
+        step_ns = time.perf_counter_ns() - began_ns
+        self.step_ns.append(step_ns)
         self._sample_s = time.monotonic()
         self._tell()
         if frames:
             self._send(frames)
             self._beat_s = self._sample_s + ESTIMATE_EVERY_S + LATE_S
+        if self._outputs.stepped is not None:
+            self._outputs.stepped(stamp_s, step_ns, bool(frames))
 
     def _tell(self) -> None:
         sample = self._gauge.latest_sample

@@ -11,6 +11,7 @@ from typing import Final
 
 import can
 
+from cangauge.bus.counters import Counters
 from cangauge.bus.decode import SampleAssembler
 from cangauge.bus.time_source import (
     REPLAY_CLOCK_ID,
@@ -129,6 +130,11 @@ class EstimateStream:
             crc_errors=now.crc_errors,
             untimed=self._untimed,
         )
+
+    @property
+    def counters(self) -> Counters:
+        """The same in detail, of the log that is running."""
+        return self._assembler.counters
 
     @property
     def reference_soc_pct(self) -> float:

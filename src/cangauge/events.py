@@ -1,0 +1,200 @@
+"""Events of a running service, one a line on stderr: for people, or as JSON for machines.
+
+Anything that has something to say takes a logger of the standard library and names its event::
+
+    _LOG = logging.getLogger(__name__)
+    emit(_LOG, logging.WARNING, "bus.lost", "socketcan can0 is down", retry_s=1.0)
+
+Event names are stable (`area.what_happened`), so that they can be searched and counted; the text
+may change. An event that repeats is told at growing intervals, with how often it was left out.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any, Final, Literal, TextIO
+
+LogFormat = Literal["text", "json"]
+LogLevel = Literal["debug", "info", "warning", "error"]
+
+FIRST_REPEAT_S: Final = 1.0
+"""An event is told again so long after it was told first [s] …"""
+LONGEST_REPEAT_S: Final = 60.0
+"""… then after twice as long each time, up to this [s]. Quiet for longer, it is new again."""
+EVENTS_KEPT: Final = 256
+"""Of so many different events it is known when they were told."""
+
+_UNNAMED: Final = "log"
+"""The event of a record that has none: what a library logs."""
+
+
+def emit(logger: logging.Logger, level: int, event: str, text: str, **fields: object) -> None:
+    """Log one event.
+
+    Parameters
+    ----------
+    logger : logging.Logger
+    level : int
+        `logging.INFO`, `logging.WARNING`, …
+    event : str
+        Its stable name, such as "bus.lost".
+    text : str
+        One line for people.
+    **fields
+        Further values, with units in their names. JSON has them as keys.
+    """
+    logger.log(level, "%s", text, extra={"event": event, "fields": fields})
+
+
+@contextmanager
+def logging_to(
+    log_format: LogFormat, level: LogLevel = "info", stream: TextIO | None = None
+) -> Iterator[None]:
+    """Write what is logged to a stream while the block runs, then restore what was before.
+
+    Parameters
+    ----------
+    log_format : {"text", "json"}
+    level : {"debug", "info", "warning", "error"}
+        What is less is left out; of other libraries everything below a warning.
+    stream : file, optional
+        stderr by default.
+    """
+    handler = _Handler(stream or sys.stderr)
+    handler.setFormatter(JsonFormatter() if log_format == "json" else TextFormatter())
+    handler.addFilter(RepeatFilter())
+    root, own = logging.getLogger(), logging.getLogger("cangauge")
+    before = root.handlers[:], root.level, own.level
+    root.handlers[:] = [handler]
+    root.setLevel(max(logging.WARNING, _number(level)))
+    own.setLevel(_number(level))
+    try:
+        yield
+    finally:
+        root.handlers[:] = before[0]
+        root.setLevel(before[1])
+        own.setLevel(before[2])
+
+
+def _number(level: LogLevel) -> int:
+    return logging.getLevelNamesMapping()[level.upper()]
+
+
+class _Handler(logging.StreamHandler[TextIO]):
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
+        """Do nothing: a stderr that is gone must not end the service, and cannot be told of."""
+
+
+class TextFormatter(logging.Formatter):
+    """`2026-10-17T08:30:00.123Z WARNING bus.lost: socketcan can0 is down (retry_s=1.0)`."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        pairs = " ".join(f"{name}={_short(value)}" for name, value in _fields(record).items())
+        line = f"{_time(record)} {record.levelname} {_event(record)}: {_message(record)}"
+        return " ".join((f"{line} ({pairs})" if pairs else line).splitlines())
+
+
+class JsonFormatter(logging.Formatter):
+    """One JSON object a line: `time`, `level`, `event`, `message`, `logger` and the fields."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        content = {name: _plain(value) for name, value in _fields(record).items()} | {
+            "time": _time(record),
+            "level": record.levelname.lower(),
+            "event": _event(record),
+            "message": _message(record),
+            "logger": record.name,
+        }
+        return json.dumps(content, ensure_ascii=False)
+
+
+@dataclass
+class _Told:
+    last_s: float
+    next_s: float
+    wait_s: float = FIRST_REPEAT_S
+    left_out: int = 0
+
+
+class RepeatFilter(logging.Filter):
+    """Lets an event pass that is new, and one that repeats at growing intervals.
+
+    Parameters
+    ----------
+    clock : callable
+        Monotonic time [s].
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
+        self._clock = clock
+        self._told: dict[tuple[str, str], _Told] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether the record is told; one that is carries what was left out before it."""
+        now_s = self._clock()
+        event = _event(record)
+        key = (record.name, event if event != _UNNAMED else str(record.msg))
+        told = self._told.pop(key, None)
+        if told is None or now_s - told.last_s > LONGEST_REPEAT_S:
+            left_out = 0 if told is None else told.left_out
+            told = _Told(now_s, now_s + FIRST_REPEAT_S)
+        elif now_s < told.next_s:
+            told.left_out += 1
+            told.last_s = now_s
+            self._told[key] = told
+            return False
+        else:
+            left_out, told.left_out = told.left_out, 0
+            told.last_s = now_s
+            told.wait_s = min(2.0 * told.wait_s, LONGEST_REPEAT_S)
+            told.next_s = now_s + told.wait_s
+        self._told[key] = told
+        if len(self._told) > EVENTS_KEPT:
+            del self._told[next(iter(self._told))]  # the one not seen for longest
+        if left_out:
+            record.left_out = left_out
+        return True
+
+
+def _time(record: logging.LogRecord) -> str:
+    stamp = datetime.fromtimestamp(record.created, UTC)
+    return stamp.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def _event(record: logging.LogRecord) -> str:
+    return str(getattr(record, "event", _UNNAMED))
+
+
+def _message(record: logging.LogRecord) -> str:
+    text = record.getMessage()
+    return text if record.exc_info is None else f"{text}: {record.exc_info[1]!r}"
+
+
+def _fields(record: logging.LogRecord) -> dict[str, Any]:
+    fields = dict(getattr(record, "fields", {}))
+    if hasattr(record, "left_out"):
+        fields["repeats_left_out"] = record.left_out
+    return fields
+
+
+def _short(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value if isinstance(value, str | int | bool) or value is None else str(value)

@@ -1,0 +1,205 @@
+"""The loop's side of watching: counts durations, shows snapshots, tells systemd, logs changes."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Final, Protocol
+
+from cangauge.bus.counters import Counters, MessageCounters
+from cangauge.bus.receive import BusPort
+from cangauge.estimate.types import Status
+from cangauge.events import emit
+from cangauge.report.words import number, reason_names
+from cangauge.service.gauge import Gauge
+from cangauge.service.histogram import Histogram
+from cangauge.service.notify import Notifier
+from cangauge.service.snapshot import Identity, RecordState, Snapshot, reason_ids
+
+SHOW_EVERY_S: Final = 0.25
+"""How often a snapshot is made [s]."""
+TELL_EVERY_S: Final = 1.0
+"""How often systemd is told the status line [s]."""
+RATE_OVER_S: Final = 2.0
+"""Over so long the rate of samples is taken [s]."""
+CLOCKS_APART_S: Final = 60.0
+"""A receive stamp further than this from the wall clock is of another clock: no latency [s]."""
+
+BUS_COUNTS: Final = (
+    "garbled",
+    "error_frames",
+    "unsent",
+    "kernel_drops",
+    "reconnects",
+)
+"""Counts of a port that are shown, where the port has them."""
+
+_NO_REJECTS: Final = frozenset({"wanted", "counter_jumps", "frames_lost"})
+_VALUE_REJECTS: Final = frozenset({"not_available"})
+"""Rejects that refuse a value of a frame, not the frame."""
+_FRAME_REJECTS: Final = tuple(
+    each.name
+    for each in fields(MessageCounters)
+    if each.name not in _NO_REJECTS and each.name not in _VALUE_REJECTS
+)
+
+_LOG = logging.getLogger(__name__)
+
+
+class Recording(Protocol):
+    """A recording that can say how it fares."""
+
+    @property
+    def state(self) -> RecordState:
+        """How it fares."""
+
+
+class Monitor:
+    """Watches the loop from within; its methods are for the loop's thread.
+
+    Parameters
+    ----------
+    gauge : Gauge
+    port : BusPort
+    identity : Identity
+    notifier : Notifier
+    record : Recording, optional
+    clock : callable
+        Monotonic time [s].
+
+    Attributes
+    ----------
+    latest : Snapshot
+        For any thread: it is replaced, never changed.
+    """
+
+    def __init__(
+        self,
+        gauge: Gauge,
+        port: BusPort,
+        *,
+        identity: Identity,
+        notifier: Notifier,
+        record: Recording | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._gauge = gauge
+        self._port = port
+        self._identity = identity
+        self._notifier = notifier
+        self._record = record
+        self._clock = clock
+        self._began_s = now_s = clock()
+        self._latency = Histogram()
+        self._step = Histogram()
+        self._due_s = self._tell_s = now_s
+        self._ping_s = now_s
+        self._sample_s = -math.inf
+        self._rate = 0.0
+        self._rate_from = (now_s, 0)
+        self._status: Status | None = None
+        self.latest = self._snapshot(now_s)
+
+    def stepped(self, stamp_s: float, step_ns: int, sent: bool) -> None:
+        """Count a step of the estimator.
+
+        Parameters
+        ----------
+        stamp_s : float
+            Receive stamp of the frame that completed the sample, seconds since 1970.
+        step_ns : int
+            From that frame to the estimate [ns].
+        sent : bool
+            Whether the estimate has just been sent, so that the latency is known.
+        """
+        self._sample_s = self._clock()
+        self._step.add(1e-9 * step_ns)
+        if sent:
+            latency_s = time.time() - stamp_s
+            # Stamps of another clock, and a clock that was set in between, tell nothing.
+            if 0.0 <= latency_s < CLOCKS_APART_S:
+                self._latency.add(latency_s)
+
+    def turn(self, now_s: float) -> None:
+        """Take notice that the loop has turned (monotonic clock [s])."""
+        if now_s < self._due_s:
+            return
+        self._due_s = now_s + SHOW_EVERY_S
+        self.latest = snapshot = self._snapshot(now_s)
+        self._log_status(snapshot)
+        ping_every_s = self._notifier.ping_every_s
+        if ping_every_s is not None and now_s >= self._ping_s:
+            self._ping_s = now_s + ping_every_s - SHOW_EVERY_S
+            self._notifier.ping()
+        if self._notifier.active and now_s >= self._tell_s:
+            self._tell_s = now_s + TELL_EVERY_S
+            self._notifier.status(status_line(snapshot))
+
+    def _snapshot(self, now_s: float) -> Snapshot:
+        gauge = self._gauge
+        samples = gauge.samples
+        since_s, before = self._rate_from
+        if now_s - since_s >= RATE_OVER_S:
+            self._rate = (samples - before) / (now_s - since_s)
+            self._rate_from = (now_s, samples)
+        counters = gauge.counters
+        rejects = _rejects(counters)
+        return Snapshot(
+            identity=self._identity,
+            made_s=now_s,
+            uptime_s=now_s - self._began_s,
+            estimate=gauge.published,
+            sample=gauge.latest_sample,
+            sample_age_s=now_s - self._sample_s,
+            samples=samples,
+            samples_per_s=self._rate,
+            frames=counters.frames,
+            wanted=counters.wanted,
+            rejected=sum(rejects[name] for name in _FRAME_REJECTS),
+            lost=counters.frames_lost,
+            rejects=rejects,
+            bus={name: int(getattr(self._port, name)) for name in BUS_COUNTS if self._has(name)},
+            latency=self._latency.copy(),
+            step=self._step.copy(),
+            record=None if self._record is None else self._record.state,
+        )
+
+    def _has(self, name: str) -> bool:
+        return hasattr(self._port, name)
+
+    def _log_status(self, snapshot: Snapshot) -> None:
+        estimate = snapshot.estimate
+        if estimate.status is self._status:
+            return
+        before, self._status = self._status, estimate.status
+        is_worse = estimate.status is Status.INVALID
+        emit(
+            _LOG,
+            logging.WARNING if is_worse else logging.INFO,
+            "status.changed",
+            status_line(snapshot),
+            status=estimate.status.name.lower(),
+            before=None if before is None else before.name.lower(),
+            reasons=reason_ids(estimate.reasons),
+            soc_pct=estimate.soc_pct,
+            soc_std_pct=estimate.soc_std_pct,
+        )
+
+
+def status_line(snapshot: Snapshot) -> str:
+    """Return the state in one line, such as "SoC 71.2 ± 0.8 %, valid, 10.0 samples/s"."""
+    estimate = snapshot.estimate
+    soc = f"SoC {number(estimate.soc_pct, 1)} ± {number(estimate.soc_std_pct, 1, '%')}"
+    why = reason_names(int(estimate.reasons))
+    status = estimate.status.name.lower() + (f" ({why})" if why else "")
+    return f"{soc}, {status}, {snapshot.samples_per_s:.1f} samples/s"
+
+
+def _rejects(counters: Counters) -> dict[str, int]:
+    names = (*_FRAME_REJECTS, *sorted(_VALUE_REJECTS))
+    return {
+        name: sum(int(getattr(each, name)) for each in counters.messages.values()) for name in names
+    }
