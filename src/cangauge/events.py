@@ -18,7 +18,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Final, Literal, TextIO
 
@@ -36,7 +35,15 @@ _UNNAMED: Final = "log"
 """The event of a record that has none: what a library logs."""
 
 
-def emit(logger: logging.Logger, level: int, event: str, text: str, **fields: object) -> None:
+def emit(
+    logger: logging.Logger,
+    level: int,
+    event: str,
+    text: str,
+    *,
+    always: bool = False,
+    **fields: object,
+) -> None:
     """Log one event.
 
     Parameters
@@ -48,10 +55,12 @@ def emit(logger: logging.Logger, level: int, event: str, text: str, **fields: ob
         Its stable name, such as "bus.lost".
     text : str
         One line for people.
+    always : bool
+        Tell it however often it repeats.
     **fields
         Further values, with units in their names. JSON has them as keys.
     """
-    logger.log(level, "%s", text, extra={"event": event, "fields": fields})
+    logger.log(level, "%s", text, extra={"event": event, "always": always, "fields": fields})
 
 
 @contextmanager
@@ -64,7 +73,7 @@ def logging_to(
     ----------
     log_format : {"text", "json"}
     level : {"debug", "info", "warning", "error"}
-        What is less is left out; of other libraries everything below a warning.
+        What is less is left out; of other libraries all but errors, unless it is "debug".
     stream : file, optional
         stderr by default.
     """
@@ -74,7 +83,7 @@ def logging_to(
     root, own = logging.getLogger(), logging.getLogger("cangauge")
     before = root.handlers[:], root.level, own.level
     root.handlers[:] = [handler]
-    root.setLevel(max(logging.WARNING, _number(level)))
+    root.setLevel(logging.DEBUG if level == "debug" else logging.ERROR)
     own.setLevel(_number(level))
     try:
         yield
@@ -118,12 +127,33 @@ class JsonFormatter(logging.Formatter):
         return json.dumps(content, ensure_ascii=False)
 
 
-@dataclass
-class _Told:
-    last_s: float
-    next_s: float
-    wait_s: float = FIRST_REPEAT_S
-    left_out: int = 0
+class Pace:
+    """How often something may be told: at once, then at growing intervals while it goes on.
+
+    Attributes
+    ----------
+    left_out : int
+        How often it was not told since it was told last.
+    """
+
+    def __init__(self) -> None:
+        self.left_out = 0
+        self._asked_s = self._next_s = -math.inf
+        self._wait_s = FIRST_REPEAT_S
+
+    def allows(self, now_s: float) -> bool:
+        """Return whether it may be told now (monotonic clock [s]); if so, it counts as told."""
+        is_new = now_s - self._asked_s > LONGEST_REPEAT_S
+        self._asked_s = now_s
+        if is_new:
+            self._wait_s = FIRST_REPEAT_S
+        elif now_s < self._next_s:
+            self.left_out += 1
+            return False
+        else:
+            self._wait_s = min(2.0 * self._wait_s, LONGEST_REPEAT_S)
+        self._next_s = now_s + self._wait_s
+        return True
 
 
 class RepeatFilter(logging.Filter):
@@ -138,32 +168,20 @@ class RepeatFilter(logging.Filter):
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
         self._clock = clock
-        self._told: dict[tuple[str, str], _Told] = {}
+        self._paces: dict[tuple[str, str], Pace] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether the record is told; one that is carries what was left out before it."""
-        now_s = self._clock()
         event = _event(record)
         key = (record.name, event if event != _UNNAMED else str(record.msg))
-        told = self._told.pop(key, None)
-        if told is None or now_s - told.last_s > LONGEST_REPEAT_S:
-            left_out = 0 if told is None else told.left_out
-            told = _Told(now_s, now_s + FIRST_REPEAT_S)
-        elif now_s < told.next_s:
-            told.left_out += 1
-            told.last_s = now_s
-            self._told[key] = told
+        pace = self._paces.pop(key, None) or Pace()
+        self._paces[key] = pace
+        if len(self._paces) > EVENTS_KEPT:
+            del self._paces[next(iter(self._paces))]  # the one not seen for longest
+        if not (getattr(record, "always", False) or pace.allows(self._clock())):
             return False
-        else:
-            left_out, told.left_out = told.left_out, 0
-            told.last_s = now_s
-            told.wait_s = min(2.0 * told.wait_s, LONGEST_REPEAT_S)
-            told.next_s = now_s + told.wait_s
-        self._told[key] = told
-        if len(self._told) > EVENTS_KEPT:
-            del self._told[next(iter(self._told))]  # the one not seen for longest
-        if left_out:
-            record.left_out = left_out
+        if pace.left_out:
+            record.left_out, pace.left_out = pace.left_out, 0
         return True
 
 

@@ -20,7 +20,7 @@ RecordPartMbOption = Annotated[
     float | None,
     typer.Option(
         metavar="MB",
-        help="Begin a new file after so much [MB]: NAME-<run>-<part>. The name NAME-<run> stands"
+        help="Begin a new file after so much [MB]: NAME-RUN-PART. The name NAME-RUN stands"
         " for all parts.",
     ),
 ]

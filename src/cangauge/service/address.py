@@ -67,7 +67,7 @@ def http_address(
         loopback and there is no token.
     """
     host, port = _host_and_port(text)
-    token = _token(token_file, os.environ if environment is None else environment)
+    token = read_token(token_file, os.environ if environment is None else environment)
     if token is None and not is_loopback_name(host):
         raise InputError(
             "this address is open to the network, and there is no token",
@@ -111,7 +111,14 @@ def _host_and_port(text: str) -> tuple[str, int]:
     return host, number
 
 
-def _token(path: str | PathLike[str] | None, environment: Mapping[str, str]) -> str | None:
+def read_token(path: str | PathLike[str] | None, environment: Mapping[str, str]) -> str | None:
+    """Return the token in a file, or in the environment; None if there is neither.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or is too short or no printable text.
+    """
     if path is None:
         given = environment.get(TOKEN_VARIABLE)
         return None if given is None else _checked(given, TOKEN_VARIABLE)

@@ -12,7 +12,7 @@ from typing import Final, Protocol
 from cangauge.bus.counters import Counters, MessageCounters
 from cangauge.bus.receive import BusPort
 from cangauge.estimate.types import Status
-from cangauge.events import emit
+from cangauge.events import Pace, emit
 from cangauge.report.words import number, reason_names
 from cangauge.service.gauge import Gauge
 from cangauge.service.histogram import Histogram
@@ -101,6 +101,7 @@ class Monitor:
         self._rate = 0.0
         self._rate_from = (now_s, 0)
         self._status: Status | None = None
+        self._pace = Pace()
         self.latest = self._snapshot(now_s)
 
     def stepped(self, stamp_s: float, step_ns: int, sent: bool) -> None:
@@ -172,7 +173,8 @@ class Monitor:
 
     def _log_status(self, snapshot: Snapshot) -> None:
         estimate = snapshot.estimate
-        if estimate.status is self._status:
+        # A change that may not be told yet is told later, if it has not gone by then.
+        if estimate.status is self._status or not self._pace.allows(snapshot.made_s):
             return
         before, self._status = self._status, estimate.status
         is_worse = estimate.status is Status.INVALID
@@ -181,6 +183,7 @@ class Monitor:
             logging.WARNING if is_worse else logging.INFO,
             "status.changed",
             status_line(snapshot),
+            always=True,
             status=estimate.status.name.lower(),
             before=None if before is None else before.name.lower(),
             reasons=reason_ids(estimate.reasons),
