@@ -238,6 +238,7 @@ def _run(config: RunConfig) -> dict[str, Any]:
             show=_each_turn(monitor, recorder, line),
             warn=_warn,
             stepped=monitor.stepped,
+            sent=monitor.sent,
         )
         summary = serve(port, gauge, config.loop_settings(), outputs, stop)
     emit(_LOG, logging.INFO, "service.stopped", _summary_line(gauge, summary))

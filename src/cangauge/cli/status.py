@@ -85,7 +85,16 @@ def _rows(status: dict[str, Any]) -> list[tuple[str, str]]:
             f"{frames['received']} received, {frames['used']} used, {frames['lost']} lost",
         ),
         ("refused", refused or "none"),
-        ("bus", f"{status['bus']}; {_counts(status['bus_counts']) or 'no errors'}"),
+        (
+            "bus",
+            "; ".join(
+                (
+                    status["bus"],
+                    *filter(None, [status["bus_trouble"]]),
+                    _counts(status["bus_counts"]) or "no errors",
+                )
+            ),
+        ),
         ("receive to sent", _delay(status["latency"])),
         ("estimate takes", _delay(status["step"])),
     ]

@@ -73,15 +73,18 @@ class Outputs:
     warn : callable, optional
         Takes a line of text.
     stepped : callable, optional
-        Takes, after every sample, the receive stamp [s] of the frame that completed it, the time
-        that the estimate took [ns], and whether it was sent.
+        Takes, after every sample, the receive stamp [s] of the frame that completed it, and the
+        time that the estimate took [ns].
+    sent : callable, optional
+        Called after frames were sent.
     """
 
     record: FrameSink | None = None
     table: Callable[[float, Estimate], None] | None = None
     show: Callable[[float], None] | None = None
     warn: Callable[[str], None] | None = None
-    stepped: Callable[[float, int, bool], None] | None = None
+    stepped: Callable[[float, int], None] | None = None
+    sent: Callable[[], None] | None = None
 
 
 @dataclass(frozen=True)
@@ -194,13 +197,13 @@ class _Loop:
             return
         step_ns = time.perf_counter_ns() - began_ns
         self.step_ns.append(step_ns)
+        if self._outputs.stepped is not None:
+            self._outputs.stepped(stamp_s, step_ns)
         self._sample_s = time.monotonic()
         self._tell()
         if frames:
             self._send(frames)
             self._beat_s = self._sample_s + ESTIMATE_EVERY_S + LATE_S
-        if self._outputs.stepped is not None:
-            self._outputs.stepped(stamp_s, step_ns, bool(frames))
 
     def _tell(self) -> None:
         sample = self._gauge.latest_sample
@@ -210,6 +213,8 @@ class _Loop:
     def _send(self, frames: list[can.Message]) -> None:
         for frame in frames:
             self._port.send(frame, SEND_WITHIN_S)
+        if frames and self._outputs.sent is not None:
+            self._outputs.sent()
 
     def _warn_of_clock(self) -> None:
         self._ignores_clock = False

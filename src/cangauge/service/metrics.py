@@ -35,8 +35,8 @@ _BUS_HELP: Final = {
     "garbled": "Packets that were no CAN frames.",
     "error_frames": "Error frames that the controller reported.",
     "unsent": "Frames given up because the transmit queue stayed full.",
-    "kernel_drops": "Frames that the kernel dropped because its receive queue was full.",
-    "reconnects": "How often the bus was opened again after it was lost.",
+    "queue_drops": "Frames that the kernel dropped because the receive queue was full.",
+    "losses": "How often the bus was lost; it is opened again until it is back.",
 }
 
 
@@ -160,6 +160,9 @@ def _frames(snapshot: Snapshot) -> Iterator[Metric]:
     for name, value in snapshot.bus.items():
         text = _BUS_HELP.get(name, name.replace("_", " "))
         yield CounterMetricFamily(f"cangauge_bus_{name}", text, value)
+    yield GaugeMetricFamily(
+        "cangauge_bus_up", "0 while the bus is away or its controller off.", snapshot.bus_up
+    )
 
 
 def _record(snapshot: Snapshot) -> Iterator[Metric]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from typing import Final, Protocol
 
@@ -28,14 +29,8 @@ RATE_OVER_S: Final = 2.0
 CLOCKS_APART_S: Final = 60.0
 """A receive stamp further than this from the wall clock is of another clock: no latency [s]."""
 
-BUS_COUNTS: Final = (
-    "garbled",
-    "error_frames",
-    "unsent",
-    "kernel_drops",
-    "reconnects",
-)
-"""Counts of a port that are shown, where the port has them."""
+BUS_COUNTS: Final = ("garbled", "error_frames", "unsent", "queue_drops", "losses")
+"""Counts of a port that are shown, as far as the port has them."""
 
 _NO_REJECTS: Final = frozenset({"wanted", "counter_jumps", "frames_lost"})
 _VALUE_REJECTS: Final = frozenset({"not_available"})
@@ -98,13 +93,14 @@ class Monitor:
         self._due_s = self._tell_s = now_s
         self._ping_s = now_s
         self._sample_s = -math.inf
+        self._untold_stamp_s: float | None = None
         self._rate = 0.0
         self._rate_from = (now_s, 0)
         self._status: Status | None = None
         self._pace = Pace()
         self.latest = self._snapshot(now_s)
 
-    def stepped(self, stamp_s: float, step_ns: int, sent: bool) -> None:
+    def stepped(self, stamp_s: float, step_ns: int) -> None:
         """Count a step of the estimator.
 
         Parameters
@@ -113,16 +109,29 @@ class Monitor:
             Receive stamp of the frame that completed the sample, seconds since 1970.
         step_ns : int
             From that frame to the estimate [ns].
-        sent : bool
-            Whether the estimate has just been sent, so that the latency is known.
         """
         self._sample_s = self._clock()
+        self._untold_stamp_s = stamp_s
         self._step.add(1e-9 * step_ns)
-        if sent:
-            latency_s = time.time() - stamp_s
-            # Stamps of another clock, and a clock that was set in between, tell nothing.
-            if 0.0 <= latency_s < CLOCKS_APART_S:
-                self._latency.add(latency_s)
+
+    def sent(self) -> None:
+        """Count the latency of the latest sample: an estimate that knows it was just sent."""
+        stamp_s, self._untold_stamp_s = self._untold_stamp_s, None
+        if stamp_s is None:
+            return
+        latency_s = time.time() - stamp_s
+        # Stamps of another clock, and a clock that was set in between, tell nothing.
+        if 0.0 <= latency_s < CLOCKS_APART_S:
+            self._latency.add(latency_s)
+
+    @contextmanager
+    def reloading(self) -> Iterator[None]:
+        """Tell systemd that the configuration is read again while the block runs."""
+        self._notifier.reloading()
+        try:
+            yield
+        finally:
+            self._notifier.ready(status_line(self.latest))
 
     def turn(self, now_s: float) -> None:
         """Take notice that the loop has turned (monotonic clock [s])."""
@@ -162,14 +171,13 @@ class Monitor:
             rejected=sum(rejects[name] for name in _FRAME_REJECTS),
             lost=counters.frames_lost,
             rejects=rejects,
-            bus={name: int(getattr(self._port, name)) for name in BUS_COUNTS if self._has(name)},
+            bus=_bus_counts(self._port),
+            bus_up=not (getattr(self._port, "is_away", False) or getattr(self._port, "is_off", False)),
+            bus_trouble=str(getattr(self._port, "trouble", "")),
             latency=self._latency.copy(),
             step=self._step.copy(),
             record=None if self._record is None else self._record.state,
         )
-
-    def _has(self, name: str) -> bool:
-        return hasattr(self._port, name)
 
     def _log_status(self, snapshot: Snapshot) -> None:
         estimate = snapshot.estimate
@@ -206,3 +214,8 @@ def _rejects(counters: Counters) -> dict[str, int]:
     return {
         name: sum(int(getattr(each, name)) for each in counters.messages.values()) for name in names
     }
+
+
+def _bus_counts(port: BusPort) -> dict[str, int]:
+    found = {name: getattr(port, name, None) for name in BUS_COUNTS}
+    return {name: int(value) for name, value in found.items() if value is not None}

@@ -40,7 +40,6 @@ def operated(
         model=config.model,
         method=config.method,
         time_source=config.time_source,
-        timeout_s=config.timeout_s,
         began_s=time.time(),
     )
     with ExitStack() as stack:

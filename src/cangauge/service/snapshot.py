@@ -17,8 +17,8 @@ from cangauge.report.words import reason_name
 from cangauge.service.histogram import HistogramCounts
 
 SCHEMA: Final = 1
-STUCK_S: Final = 5.0
-"""A loop that shows nothing for so long [s] is taken to be stuck."""
+STUCK_S: Final = 2.0
+"""A loop that shows nothing for so long [s] is taken to be stuck, and its SoC to be old."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,8 +28,6 @@ class Identity:
     Parameters
     ----------
     bus, vehicle, model, method, time_source : str
-    timeout_s : float
-        Without a sample for so long, the estimate is invalid [s].
     began_s : float
         Start, seconds since 1970.
     """
@@ -39,7 +37,6 @@ class Identity:
     model: str
     method: str
     time_source: str
-    timeout_s: float
     began_s: float
 
 
@@ -88,6 +85,10 @@ class Snapshot:
         Refused frames and values by reason.
     bus : mapping
         What the bus counts: error frames, frames unsent, …
+    bus_up : bool
+        False while the bus is away or its controller off.
+    bus_trouble : str
+        What is or went wrong with the bus, in words; empty if nothing is known to.
     latency, step : HistogramCounts
         From receive stamp to SoC sent; from the frame that completes a sample to its estimate.
     record : RecordState or None
@@ -107,6 +108,8 @@ class Snapshot:
     lost: int
     rejects: Mapping[str, int]
     bus: Mapping[str, int]
+    bus_up: bool
+    bus_trouble: str
     latency: HistogramCounts
     step: HistogramCounts
     record: RecordState | None
@@ -122,12 +125,11 @@ class Snapshot:
     def estimate_at(self, now_s: float) -> Estimate:
         """Return the estimate as it may be believed at a monotonic time [s].
 
-        What has grown old since the loop showed it, or a loop that shows nothing any more, makes
-        it invalid: old numbers are never called valid.
+        The loop judges whether its input is stale. Where the loop itself shows nothing any more,
+        nobody does, and the estimate is invalid.
         """
         estimate = self.estimate
-        is_old = self.samples > 0 and self.age_s(now_s) > self.identity.timeout_s
-        if not (is_old or self.is_stuck(now_s)):
+        if not self.is_stuck(now_s):
             return estimate
         return estimate._replace(
             status=Status.INVALID, reasons=estimate.reasons | Reason.INPUT_STALE
@@ -194,7 +196,9 @@ def as_json(snapshot: Snapshot, now_s: float) -> dict[str, Any]:
             "lost": snapshot.lost,
         },
         "rejects": dict(snapshot.rejects),
+        "bus_up": snapshot.bus_up,
         "bus_counts": dict(snapshot.bus),
+        "bus_trouble": snapshot.bus_trouble or None,
         "latency": _durations(snapshot.latency),
         "step": _durations(snapshot.step),
         "record": None
