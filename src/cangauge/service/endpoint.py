@@ -23,6 +23,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from tornado.httpserver import HTTPServer
+from tornado.iostream import IOStream
 from tornado.netutil import bind_sockets
 from tornado.web import Application, RequestHandler
 
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
 
 MAX_HEADER_BYTES: Final = 8192
 MAX_BODY_BYTES: Final = 1024
+MAX_CLIENTS: Final = 32
+"""So many are answered at once; more are turned away."""
 REQUEST_WITHIN_S: Final = 3.0
 """A request must have arrived within this time [s]."""
 CLOSE_WITHIN_S: Final = 0.3
@@ -71,7 +74,7 @@ class Endpoint:
     ) -> None:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._done: asyncio.Event | None = None
-        self._servers: list[tuple[HTTPServer, list[socket.socket]]] = []
+        self._servers: list[tuple[_Server, list[socket.socket]]] = []
         self._unix_path: Path | None = None
         self.port: int | None = None
         """The TCP port that is served, where HTTP is."""
@@ -95,7 +98,7 @@ class Endpoint:
         self._add(_application(latest, Exposition(latest), http), sockets)
 
     def _add(self, application: Application, sockets: list[socket.socket]) -> None:
-        server = HTTPServer(
+        server = _Server(
             application,
             no_keep_alive=True,
             max_header_size=MAX_HEADER_BYTES,
@@ -156,6 +159,25 @@ class Endpoint:
         await self._done.wait()
         for server, _ in self._servers:
             server.stop()
+
+
+class _Server(HTTPServer):
+    """Answers so many at once: the files that the service itself needs to open stay free."""
+
+    def initialize(self, *args: Any, **kwargs: Any) -> None:
+        self._clients = 0
+        super().initialize(*args, **kwargs)
+
+    def handle_stream(self, stream: IOStream, address: Any) -> None:
+        if self._clients >= MAX_CLIENTS:
+            stream.close()
+            return
+        self._clients += 1
+        super().handle_stream(stream, address)
+
+    def on_close(self, server_conn: object) -> None:
+        self._clients -= 1
+        super().on_close(server_conn)
 
 
 def _open_tcp(http: HttpAddress) -> list[socket.socket]:

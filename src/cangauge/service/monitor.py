@@ -172,7 +172,7 @@ class Monitor:
             lost=counters.frames_lost,
             rejects=rejects,
             bus=_bus_counts(self._port),
-            bus_up=not (getattr(self._port, "is_away", False) or getattr(self._port, "is_off", False)),
+            bus_up=not any(getattr(self._port, name, False) for name in ("is_away", "is_off")),
             bus_trouble=str(getattr(self._port, "trouble", "")),
             latency=self._latency.copy(),
             step=self._step.copy(),
