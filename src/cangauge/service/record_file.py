@@ -57,6 +57,7 @@ class DiskWriter:
         self._work: deque[_Piece | Callable[[], None]] = deque()
         self._wake = threading.Event()
         self._closing = threading.Event()
+        self._done = threading.Event()
         self._handed_bytes = 0
         self._file: io.FileIO | None = None
         self._end = 0
@@ -102,10 +103,11 @@ class DiskWriter:
         """Write what waits and end; return whether all was written in time [s]."""
         self._closing.set()
         self._wake.set()
-        self._thread.join(within_s)
-        left = sum(item.frames for item in list(self._work) if isinstance(item, _Piece))
-        self.lost_frames += left
-        return not (left or self._thread.is_alive())
+        is_done = self._done.wait(within_s)
+        self.lost_frames += sum(
+            item.frames for item in list(self._work) if isinstance(item, _Piece)
+        )
+        return is_done and not self._work
 
     def _run(self) -> None:
         while True:
@@ -114,13 +116,16 @@ class DiskWriter:
             is_last = self._closing.is_set()
             try:
                 self._do_all()
-                self._sync()
                 if is_last and not self._work:
+                    # Written is enough for the end of the process; the rest is against power cuts.
+                    self._done.set()
                     self._close_file()
                     return
+                self._sync()
             except OSError as error:
                 self._failed(error)
                 if is_last:
+                    self._done.set()
                     return
                 self._closing.wait(RETRY_S)
                 self._wake.set()
@@ -175,7 +180,8 @@ class DiskWriter:
         if self._file is not None:
             file, self._file = self._file, None
             with file:
-                _to_disk(file)
+                if self._done.is_set() or not self._closing.is_set():
+                    _to_disk(file)
 
     def _failed(self, error: OSError) -> None:
         self.problem = error.strerror or str(error)

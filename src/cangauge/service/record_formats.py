@@ -15,6 +15,8 @@ from cangauge.service.record_file import RecordFile
 
 EXACT_FORMATS: Final = (".log", ".csv", ".blf", ".mf4")
 PACKED: Final = ".gz"
+_EARLIEST_S: Final = 631_152_000.0
+"""1990: python-can writes no earlier start into a BLF header [s since 1970]."""
 IN_PARTS_ONLY: Final = (".blf", ".mf4")
 """Formats whose stamps count from the file's start, so that a clock set back needs a new file."""
 
@@ -107,8 +109,10 @@ class _Blf(can.BLFWriter):
 
     def __init__(self, file: RecordFile, start_s: float) -> None:
         super().__init__(cast("BinaryIO", file))
-        # As the writer itself takes it from the first frame.
-        self.start_timestamp = self.stop_timestamp = int(start_s * 1000.0) / 1000.0
+        # As the writer itself takes it from the first frame; a start that its header cannot tell
+        # (of a clock that was never set) counts from 1970.
+        whole_s = int(start_s * 1000.0) / 1000.0
+        self.start_timestamp = self.stop_timestamp = 0.0 if whole_s < _EARLIEST_S else whole_s
         self._update_header()
 
     def write(self, message: can.Message) -> None:
