@@ -248,7 +248,8 @@ def _run(config: RunConfig) -> dict[str, Any]:
             " (--vehicle, or --dbc and --map)",
             event="bus.nothing_wanted",
         )
-    recorded = None if recorder is None else recorder.path
+    # BLF and MF4 begin with the first frame, and without one there is no file.
+    recorded = recorder.path if recorder and (recorder.frames or recorder.path.exists()) else None
     for path in (recorded, config.output):
         if path is not None:
             emit(_LOG, logging.INFO, "file.written", f"written: {path}", path=str(path))
