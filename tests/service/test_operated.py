@@ -44,6 +44,7 @@ def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
     )  # fmt: skip
     service.wait_for("http.listening")
     http_port = json.loads(service._said[-1])["port"]
+    service.wait_for("service.ready")
     assert run_to_end("replay", log, *bus, "--speed", "max").code == 0
     found = in_process("status", "--endpoint", sock, "--json")
     assert found.json["samples"] == 1200
@@ -56,9 +57,7 @@ def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
     assert ended.code == 0
     assert not sock.exists()
     events = [json.loads(line)["event"] for line in ended.err.splitlines()]
-    assert events[:2] == ["http.listening", "service.ready"]
-    assert "status.changed" in events
-    assert "service.stopped" in events
+    assert {"http.listening", "service.ready", "status.changed", "service.stopped"} <= {*events}
     assert ended.json["record"] == str(tmp_path / "seen-0001.blf")
     assert len(list(tmp_path.glob("seen-0001-*.blf"))) > 1
     recorded = estimate_capture(ended.json["record"], load_vehicle("generic"), leaf_model())

@@ -80,9 +80,13 @@ class _Text:
     """candump or CSV, perhaps gzipped: whole lines, each readable as soon as it is there."""
 
     def __init__(self, kind: str, file: RecordFile) -> None:
-        self._packed = gzip.GzipFile(fileobj=file, mode="wb") if kind.endswith(PACKED) else None
+        self._packed = (
+            gzip.GzipFile(fileobj=file, mode="wb", compresslevel=6)
+            if kind.endswith(PACKED)
+            else None
+        )
         below = cast("BinaryIO", self._packed or file)
-        text = io.TextIOWrapper(below, "utf-8", newline="\n", write_through=True)
+        text = io.TextIOWrapper(below, "utf-8", newline="\n")
         self._text = text
         self._writer: can.CanutilsLogWriter | can.CSVWriter
         if kind.startswith(".log"):
