@@ -63,6 +63,25 @@ def emit(
     logger.log(level, "%s", text, extra={"event": event, "always": always, "fields": fields})
 
 
+def speaker(logger: logging.Logger, event: str, *, always: bool = False) -> Callable[[str], None]:
+    """Return a function that logs lines of text as one event; "warning: …" is a warning.
+
+    Parameters
+    ----------
+    logger : logging.Logger
+    event : str
+    always : bool
+        Where who speaks keeps a measure of their own.
+    """
+
+    def say(text: str) -> None:
+        words = text.removeprefix("warning: ")
+        level = logging.INFO if words == text else logging.WARNING
+        emit(logger, level, event, words, always=always)
+
+    return say
+
+
 @contextmanager
 def logging_to(
     log_format: LogFormat, level: LogLevel = "info", stream: TextIO | None = None

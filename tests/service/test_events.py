@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from cangauge.events import LogFormat, Pace, RepeatFilter, emit, logging_to
+from cangauge.events import LogFormat, Pace, RepeatFilter, emit, logging_to, speaker
 
 LOG = logging.getLogger("cangauge.test")
 
@@ -43,6 +43,17 @@ def test_text_is_one_line_an_event() -> None:
     assert len(lines) == 3
     assert lines[0].endswith("INFO bus.lost: can0 is down (retry_s=0.25 why=nan)")
     assert lines[1].endswith("WARNING bus.said: 100 % busy")
+
+
+def test_a_speaker_takes_lines_as_they_were() -> None:
+    stream = io.StringIO()
+    with logging_to("text", stream=stream):
+        say = speaker(LOG, "bus.told", always=True)
+        say("warning: can0 is down")
+        say("can0: back")
+    lines = stream.getvalue().splitlines()
+    assert lines[0].endswith("WARNING bus.told: can0 is down")
+    assert lines[1].endswith("INFO bus.told: can0: back")
 
 
 def test_levels_and_what_was_before_is_restored() -> None:

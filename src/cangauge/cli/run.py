@@ -39,7 +39,7 @@ from cangauge.cli.ops_options import (
 )
 from cangauge.cli.output import console, emit_json
 from cangauge.errors import CangaugeError
-from cangauge.events import LogFormat, emit, logging_to
+from cangauge.events import LogFormat, emit, logging_to, speaker
 from cangauge.model.model_file import load_model
 from cangauge.report.words import number, reason_names
 from cangauge.service.config import RunConfig, load_config
@@ -236,17 +236,19 @@ def _run(config: RunConfig) -> dict[str, Any]:
             record=recorder,
             table=None if table is None else table.add,
             show=_each_turn(monitor, recorder, line),
-            warn=_warn,
+            warn=speaker(_LOG, "service.warning"),
             stepped=monitor.stepped,
             sent=monitor.sent,
         )
         summary = serve(port, gauge, config.loop_settings(), outputs, stop)
     emit(_LOG, logging.INFO, "service.stopped", _summary_line(gauge, summary))
     if not gauge.counts.frames:
-        _warn(
+        emit(
+            _LOG,
+            logging.WARNING,
+            "bus.nothing_wanted",
             f"{port.name}: no wanted frame arrived; check channel, bit rate and the car"
             " (--vehicle, or --dbc and --map)",
-            event="bus.nothing_wanted",
         )
     # BLF and MF4 begin with the first frame, and without one there is no file.
     recorded = recorder.path if recorder and (recorder.frames or recorder.path.exists()) else None
@@ -267,10 +269,6 @@ def _each_turn(
             call(now_s)
 
     return turn
-
-
-def _warn(text: str, event: str = "service.warning") -> None:
-    emit(_LOG, logging.WARNING, event, text.removeprefix("warning: "))
 
 
 def _summary_line(gauge: Gauge, summary: RunSummary) -> str:

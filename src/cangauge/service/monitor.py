@@ -33,12 +33,10 @@ BUS_COUNTS: Final = ("garbled", "error_frames", "unsent", "queue_drops", "losses
 """Counts of a port that are shown, as far as the port has them."""
 
 _NO_REJECTS: Final = frozenset({"wanted", "counter_jumps", "frames_lost"})
-_VALUE_REJECTS: Final = frozenset({"not_available"})
-"""Rejects that refuse a value of a frame, not the frame."""
-_FRAME_REJECTS: Final = tuple(
-    each.name
-    for each in fields(MessageCounters)
-    if each.name not in _NO_REJECTS and each.name not in _VALUE_REJECTS
+_OF_VALUES: Final = frozenset({"not_available", "implausible", "stuck", "held_back"})
+"""Counters of values that were refused, while their frame was not."""
+_REJECTS: Final = tuple(
+    each.name for each in fields(MessageCounters) if each.name not in _NO_REJECTS
 )
 
 _LOG = logging.getLogger(__name__)
@@ -168,7 +166,7 @@ class Monitor:
             samples_per_s=self._rate,
             frames=counters.frames,
             wanted=counters.wanted,
-            rejected=sum(rejects[name] for name in _FRAME_REJECTS),
+            rejected=sum(count for name, count in rejects.items() if name not in _OF_VALUES),
             lost=counters.frames_lost,
             rejects=rejects,
             bus=_bus_counts(self._port),
@@ -210,9 +208,9 @@ def status_line(snapshot: Snapshot) -> str:
 
 
 def _rejects(counters: Counters) -> dict[str, int]:
-    names = (*_FRAME_REJECTS, *sorted(_VALUE_REJECTS))
     return {
-        name: sum(int(getattr(each, name)) for each in counters.messages.values()) for name in names
+        name: sum(int(getattr(each, name)) for each in counters.messages.values())
+        for name in _REJECTS
     }
 
 
