@@ -12,7 +12,8 @@ from pathlib import Path
 
 from cangauge.errors import CangaugeError, InputError
 
-_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
+FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
+"""Errors of a disk that is full or fails, which pass."""
 _CURES: dict[int, tuple[str, str]] = {
     errno.ENOENT: ("the folder of this file does not exist", "create it or name another one"),
     errno.ENOTDIR: ("a part of this path is a file, not a folder", "name another path"),
@@ -63,7 +64,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             part.chmod(stat.S_IMODE(mode))
         part.replace(target)
     except OSError as error:
-        if error.errno not in _FULL:
+        if error.errno not in FULL:
             raise
         problem = f"{path}: writing failed: {error.strerror}; free some space"
         raise CangaugeError(problem) from error

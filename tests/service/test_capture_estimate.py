@@ -24,8 +24,8 @@ NUMBERS = ("soc_pct", "soc_std_pct", "soc_newton_pct", "voltage_model_v", "resid
 
 def live_and_recorded(
     frames: list[can.Message], settings: GaugeSettings, path: Path, preset: str
-) -> list[Estimate]:
-    """Handle frames as the loop does, recording them, and return the estimates."""
+) -> tuple[list[Estimate], Path]:
+    """Handle frames as the loop does, recording them; return the estimates and the recording."""
     gauge = Gauge(load_vehicle(preset), leaf_model(), settings)
     found = []
     with Recorder(path) as recorder:
@@ -39,7 +39,7 @@ def live_and_recorded(
         gauge.finish()
         if gauge.samples != before:
             found.append(gauge.latest)
-    return found
+    return found, recorder.path
 
 
 def assert_same(live: list[Estimate], path: Path, preset: str) -> None:
@@ -50,7 +50,7 @@ def assert_same(live: list[Estimate], path: Path, preset: str) -> None:
         assert np.array_equal(getattr(recorded.table, name), expected, equal_nan=True), name
 
 
-@pytest.mark.parametrize("suffix", [".log", ".csv", ".log.gz"])
+@pytest.mark.parametrize("suffix", [".log", ".csv", ".log.gz", ".blf"])
 @pytest.mark.parametrize("preset", ["generic", "leaf_aze0"])
 def test_recorded_stamps_are_the_live_ones(tmp_path: Path, suffix: str, preset: str) -> None:
     rng = np.random.default_rng(5)
@@ -64,7 +64,7 @@ def test_recorded_stamps_are_the_live_ones(tmp_path: Path, suffix: str, preset: 
     for frame, late_s in zip(frames, np.sort(rng.uniform(0.0, 1.0, len(frames))), strict=True):
         frame.timestamp += float(late_s) - (4000.0 if late_s > 0.5 else 0.0)
     path = tmp_path / f"drive{suffix}"
-    live = live_and_recorded(frames, GaugeSettings(), path, preset)
+    live, path = live_and_recorded(frames, GaugeSettings(), path, preset)
     assert_same(live, path, preset)
 
 
@@ -78,7 +78,8 @@ def test_of_a_recorded_replay_time_is_the_logs(tmp_path: Path) -> None:
     for number, frame in enumerate(frames):
         frame.timestamp = 1.7e9 + 1e-4 * number
     path = tmp_path / "replayed.log"
-    live = live_and_recorded(frames, GaugeSettings(time_source="replay-clock"), path, "generic")
+    settings = GaugeSettings(time_source="replay-clock")
+    live, _ = live_and_recorded(frames, settings, path, "generic")
     assert_same(live, path, "generic")
     recorded = estimate_capture(path, load_vehicle("generic"), leaf_model())
     assert recorded.time_source == "replay-clock"
@@ -94,7 +95,7 @@ def test_samples_without_voltage_are_estimated_too(tmp_path: Path) -> None:
             if frame.arbitration_id != 0x401 or row % 3:  # every third voltage is missing
                 frames.append(frame)  # noqa: PERF401 - two loops and a condition read better so
     path = tmp_path / "gappy.log"
-    live = live_and_recorded(frames, GaugeSettings(), path, "generic")
+    live, _ = live_and_recorded(frames, GaugeSettings(), path, "generic")
     assert_same(live, path, "generic")
     recorded = estimate_capture(path, load_vehicle("generic"), leaf_model())
     assert np.count_nonzero(np.isnan(recorded.voltage_v)) == 100
@@ -109,7 +110,7 @@ def test_another_buses_capture_is_refused(tmp_path: Path) -> None:
 
 
 def test_formats_that_round_stamps_are_refused(tmp_path: Path) -> None:
-    for name in ("a.asc", "a.trc", "a.blf", "a"):
+    for name in ("a.asc", "a.trc", "a.blf.gz", "a"):
         with pytest.raises(InputError, match="microsecond"):
             Recorder(tmp_path / name)
         assert not (tmp_path / name).exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import math
 from pathlib import Path
@@ -104,3 +105,22 @@ def test_what_is_wrong_with_the_bus_is_on_the_line() -> None:
     with LiveLine(console, gauge, lambda: "bus away for 12 s") as line:
         line.show(50.0)
     assert "bus away for 12 s" in out.getvalue()
+
+
+def test_a_table_whose_disk_is_full_is_given_up_and_the_service_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    path = tmp_path / "soc.parquet"
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with EstimateWriter(path, said.append) as table:
+        monkeypatch.setattr(table, "_write", full)
+        for number in range(10_000):
+            table.add(0.1 * number, ROW)
+    assert table.failed
+    assert len(said) == 1
+    assert "soc.parquet: cannot be written" in said[0]
+    assert list(tmp_path.iterdir()) == []

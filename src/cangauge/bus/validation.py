@@ -13,6 +13,9 @@ from cangauge.bus.database import closest
 from cangauge.errors import InputError
 
 MAX_TOML_BYTES: Final = 256 * 1024
+MAX_DOTS: Final = 200
+"""More dots in a line are refused: time and memory that tomllib takes for a key of n parts grow
+with n²; 100,000 of them, well below `MAX_TOML_BYTES`, take all the memory there is."""
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -36,9 +39,12 @@ def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
         raise InputError(f"cannot be read: {reason}", source=path) from error
     if len(data) > MAX_TOML_BYTES:
         raise InputError(f"larger than {MAX_TOML_BYTES // 1024} kB", source=path)
+    for number, line in enumerate(data.splitlines(), start=1):
+        if line.count(b".") > MAX_DOTS:
+            raise InputError(f"not TOML: line {number} has more than {MAX_DOTS} dots", source=path)
     try:
         return tomllib.loads(data.decode("utf-8-sig"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except ValueError as error:  # TOMLDecodeError, UnicodeDecodeError, an integer of 5,000 digits
         raise InputError(f"not TOML: {error}", source=path) from error
     except RecursionError as error:
         raise InputError("not TOML: nested too deeply", source=path) from error

@@ -18,6 +18,7 @@ from cangauge.cli.inspect import inspect_command
 from cangauge.cli.output import note
 from cangauge.cli.replay import replay_command
 from cangauge.cli.run import run_command
+from cangauge.cli.status import status_command
 from cangauge.cli.twin import twin_command
 from cangauge.errors import CangaugeError
 
@@ -52,6 +53,7 @@ app.command("fit")(fit_command)
 app.command("estimate")(estimate_command)
 app.command("gap")(gap_command)
 app.command("run")(run_command)
+app.command("status")(status_command)
 app.command("replay")(replay_command)
 app.command("inspect")(inspect_command)
 app.command("twin")(twin_command)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import gc
+import logging
 import os
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,18 +29,35 @@ from cangauge.cli.bus_options import (
     frame_ids,
 )
 from cangauge.cli.inputs import JsonOption, TemperatureSourceOption, check_outputs
-from cangauge.cli.output import console, emit_json, note
+from cangauge.cli.ops_options import (
+    HttpOption,
+    HttpTokenFileOption,
+    LogFormatOption,
+    LogLevelOption,
+    RecordKeepMbOption,
+    RecordOption,
+    RecordPartMbOption,
+    RecordPartSOption,
+    StatusSocketOption,
+)
+from cangauge.cli.output import console, emit_json
+from cangauge.errors import CangaugeError
+from cangauge.events import LogFormat, emit, logging_to, speaker
 from cangauge.model.model_file import load_model
 from cangauge.report.words import number, reason_names
 from cangauge.service.config import RunConfig, load_config
 from cangauge.service.display import LiveLine
 from cangauge.service.gauge import Gauge
-from cangauge.service.loop import Outputs, RunSummary, serve
+from cangauge.service.loop import LoopSettings, Outputs, RunSummary, serve
+from cangauge.service.monitor import Monitor
+from cangauge.service.operate import operated
 from cangauge.service.record import Recorder
 from cangauge.service.reload import Reloader
 from cangauge.service.signals import note_hangups, stop_on_signals
 from cangauge.service.state_keeper import StateKeeper
 from cangauge.service.table import EstimateWriter
+
+_LOG = logging.getLogger(__name__)
 
 
 def run_command(  # noqa: PLR0917 - typer passes options by name
@@ -114,14 +133,10 @@ def run_command(  # noqa: PLR0917 - typer passes options by name
         float | None,
         typer.Option(metavar="S", help="Without a sample for so long: stale [s]. Default: 2."),
     ] = None,
-    record: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Record the frames received (.log or .csv): `cangauge estimate` on them"
-            " gives the live numbers, bit for bit.",
-        ),
-    ] = None,
+    record: RecordOption = None,
+    record_part_mb: RecordPartMbOption = None,
+    record_part_s: RecordPartSOption = None,
+    record_keep_mb: RecordKeepMbOption = None,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -159,6 +174,11 @@ def run_command(  # noqa: PLR0917 - typer passes options by name
     soc_estimate_id: EstimateIdOption = None,
     soc_detail_id: DetailIdOption = None,
     replay_clock_id: ClockIdOption = None,
+    http: HttpOption = None,
+    http_token_file: HttpTokenFileOption = None,
+    status_socket: StatusSocketOption = None,
+    log_format: LogFormatOption = None,
+    log_level: LogLevelOption = None,
     json_output: JsonOption = False,
 ) -> None:
     """Estimate the state of charge from a bus, and publish it there.
@@ -202,26 +222,50 @@ def run_command(  # noqa: PLR0917 - typer passes options by name
         "timeout_s": timeout_s,
         "ids": frame_ids(soc_estimate_id, soc_detail_id, replay_clock_id),
         "record": _text(record),
+        "record_part_mb": record_part_mb,
+        "record_part_s": record_part_s,
+        "record_keep_mb": record_keep_mb,
         "output": _text(output),
         "duration_s": duration_s,
         "until_idle_s": until_idle_s,
         "state": _text(state),
         "state_max_age_s": state_max_age_s,
         "state_every_s": state_every_s,
+        "http": http,
+        "http_token_file": _text(http_token_file),
+        "status_socket": status_socket,
+        "log_format": log_format,
+        "log_level": log_level,
     }
-    result = _run(lambda: load_config(config, options))
+
+    def read() -> RunConfig:
+        return load_config(config, options)
+
+    loaded = read()
+    with logging_to(loaded.log_format, loaded.log_level), _failures_logged(loaded.log_format):
+        result = _run(loaded, read)
     if json_output:
         emit_json(result)
 
 
-def _run(read: Callable[[], RunConfig]) -> dict[str, Any]:
-    config = read()
-    written = [Path(name) for name in (config.record, config.output) if name is not None]
-    check_outputs(written, [Path(config.model)])
+@contextmanager
+def _failures_logged(log_format: LogFormat) -> Iterator[None]:
+    """Tell of a failure as an event where stderr is JSON, so that every line of it is."""
+    try:
+        yield
+    except CangaugeError as error:
+        if log_format != "json":
+            raise
+        emit(_LOG, logging.ERROR, "service.failed", str(error), exit_code=error.exit_code)
+        raise typer.Exit(error.exit_code) from error
+
+
+def _run(config: RunConfig, read: Callable[[], RunConfig]) -> dict[str, Any]:
+    check_outputs([None if config.output is None else Path(config.output)], [Path(config.model)])
     kept = config.state_settings(os.environ)
     vehicle = config.load_vehicle()
     gauge = Gauge(vehicle, load_model(config.model), config.gauge_settings())
-    reloader = Reloader(read, config, vehicle, gauge, note)
+    reloader = Reloader(read, config, vehicle, gauge, _voice("config.reload"))
     address = config.address()
     # All that is loaded by now stays until the end. Left out of garbage collection, it costs no
     # pauses meanwhile, and at the end not the second or so of taking it apart.
@@ -230,36 +274,75 @@ def _run(read: Callable[[], RunConfig]) -> dict[str, Any]:
         # Signals first: whoever starts the service may end it at any moment after.
         stop = stack.enter_context(stop_on_signals())
         hangup = stack.enter_context(note_hangups())
-        port = stack.enter_context(LastingPort(address, gauge.filters, note))
+        port = stack.enter_context(LastingPort(address, gauge.filters, _voice("bus.notice")))
         port.open(wait=config.wait_for_bus)
         recorder = table = line = keeper = None
         if kept is not None:
-            keeper = stack.enter_context(StateKeeper(kept, gauge, note))
+            keeper = stack.enter_context(StateKeeper(kept, gauge, _voice("state.notice")))
         if config.record is not None:
-            recorder = stack.enter_context(Recorder(config.record))
+            recorder = stack.enter_context(Recorder(config.record, config.record_limits()))
         if config.output is not None:
-            table = stack.enter_context(EstimateWriter(config.output))
-        note(f"listening on {address}; time source: {config.time_source}; Ctrl-C ends")
+            table = stack.enter_context(EstimateWriter(config.output, _voice("file.failed")))
+        monitor = stack.enter_context(operated(config, vehicle.name, gauge, port, recorder))
         if console.is_terminal:
             line = stack.enter_context(LiveLine(console, gauge, lambda: port.trouble))
         outputs = Outputs(
             record=recorder,
             table=None if table is None else table.add,
-            show=None if line is None else line.show,
-            warn=note,
-            reload=lambda: reloader.reload() if hangup() else None,
+            show=_each_turn(monitor, recorder, line),
+            warn=_voice("service.warning"),
             checkpoint=None if keeper is None else keeper.checkpoint,
+            reload=lambda: _reload(reloader, monitor, gauge) if hangup() else None,
+            stepped=monitor.stepped,
+            sent=monitor.sent,
         )
         summary = serve(port, gauge, config.loop_settings(), outputs, stop)
-    note(_summary_line(gauge, port, summary))
+    emit(_LOG, logging.INFO, "service.stopped", _summary_line(gauge, port, summary))
     if not gauge.counts.frames:
-        note(
-            f"warning: {port.name}: no wanted frame arrived; check channel, bit rate and the car"
-            " (--vehicle, or --dbc and --map)"
+        emit(
+            _LOG,
+            logging.WARNING,
+            "bus.nothing_wanted",
+            f"{port.name}: no wanted frame arrived; check channel, bit rate and the car"
+            " (--vehicle, or --dbc and --map)",
         )
-    for path in written:
-        note(f"written: {path}")
-    return _as_json(gauge, port, summary, config)
+    # BLF and MF4 begin with the first frame, and without one there is no file.
+    recorded = recorder.path if recorder and (recorder.frames or recorder.path.exists()) else None
+    output = None if table is None or table.failed else config.output
+    for path in (recorded, output):
+        if path is not None:
+            emit(_LOG, logging.INFO, "file.written", f"written: {path}", path=str(path))
+    return _as_json(gauge, port, summary, config) | {"record": _text(recorded), "output": output}
+
+
+def _voice(event: str) -> Callable[[str], None]:
+    """Return what logs the lines of those who keep a measure of their own."""
+    return speaker(_LOG, event, always=True)
+
+
+def _reload(reloader: Reloader, monitor: Monitor, gauge: Gauge) -> LoopSettings | None:
+    with monitor.reloading():
+        settings = reloader.reload()
+        monitor.identity = replace(
+            monitor.identity,
+            vehicle=gauge.vehicle.name,
+            model=reloader.config.model,
+            method=gauge.settings.estimator.method,
+        )
+    return settings
+
+
+def _each_turn(
+    monitor: Monitor, recorder: Recorder | None, line: LiveLine | None
+) -> Callable[[float], None]:
+    wanted = (monitor.turn, recorder and recorder.tick, line and line.show)
+    calls = [each for each in wanted if each]
+
+    def turn(now_s: float) -> None:
+        for call in calls:
+            call(now_s)
+
+    return turn
 
 
 def _summary_line(gauge: Gauge, port: LastingPort, summary: RunSummary) -> str:
@@ -330,8 +413,6 @@ def _as_json(
             "reasons": reason_names(int(latest.reasons)),
         },
         "soc_reference_pct": gauge.reference_soc_pct,
-        "record": config.record,
-        "output": config.output,
         "state": config.state,
     }
 

@@ -61,6 +61,8 @@ def read_log(
             value=temperature_source,
             cure=f"use one of: {', '.join(TEMPERATURE_SOURCES)}",
         )
+    if not Path(path).exists() and _is_capture(Path(path)):  # a recording in parts
+        raise _capture_given(Path(path))
     content = read_content(path)
     draft = _read(content)
     log = draft.to_log(temperature_c)
@@ -87,11 +89,7 @@ def _read(content: Content) -> Draft:
 
 def _unknown(content: Content, line: str) -> InputError:
     if _is_capture(content.path):
-        return CaptureGivenError(
-            "this is a CAN capture, not a log",
-            source=content.path,
-            cure="give --vehicle, or --dbc and --map",
-        )
+        return _capture_given(content.path)
     shown = line.strip()
     if not shown or not shown.isprintable():
         return InputError("the file is not a known kind of log", source=content.path, cure=_KNOWN)
@@ -101,6 +99,14 @@ def _unknown(content: Content, line: str) -> InputError:
         field="first line",
         value=shown[:80],
         cure=_KNOWN,
+    )
+
+
+def _capture_given(path: Path) -> CaptureGivenError:
+    return CaptureGivenError(
+        "this is a CAN capture, not a log",
+        source=path,
+        cure="give --vehicle, or --dbc and --map",
     )
 
 

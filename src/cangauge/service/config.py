@@ -32,6 +32,8 @@ Keys are the options' names, with underscores::
     [long_rest]
     after_s = 7200
     soc_std_pct = 2.0
+
+How the service is watched and what it records: see `ops_config`.
 """
 
 from __future__ import annotations
@@ -66,12 +68,13 @@ from cangauge.logs.log import TemperatureSource
 from cangauge.model.delay_line import GAP_S
 from cangauge.service.gauge import GaugeSettings
 from cangauge.service.loop import LoopSettings
+from cangauge.service.ops_config import OPS_PATHS, OpsConfig
 from cangauge.service.state_keeper import StateSettings, state_path
 
 DEFAULT_VEHICLE: Final = "generic"
 """What `replay` sends by default, so that both commands find each other without options."""
 
-_PATHS: Final = ("model", "dbc", "map", "record", "output", "state")
+_PATHS: Final = ("model", "dbc", "map", "output", "state", *OPS_PATHS)
 
 Percent = Annotated[FiniteFloat, Field(ge=0.0, le=100.0)]
 Seconds = Annotated[FiniteFloat, Field(gt=0.0, le=1e9)]
@@ -127,8 +130,10 @@ class LongRestConfig(_Strict):
     soc_std_pct: Annotated[FiniteFloat, Field(ge=0.01, le=100.0)] = 2.0
 
 
-class RunConfig(_Strict):
+class RunConfig(OpsConfig):
     """All that `cangauge run` can be told; defaults are those of the command line.
+
+    The keys for operators are those of `OpsConfig`.
 
     Parameters
     ----------
@@ -167,8 +172,8 @@ class RunConfig(_Strict):
         Protection rules of one's own.
     checks : ChecksConfig
         When values are believed, before what the vehicle's mapping states.
-    record, output : str, optional
-        Files to write: the frames received, the estimates.
+    output : str, optional
+        File to write the estimates to.
     duration_s, until_idle_s : float, optional
         When to end by itself [s].
     state : str, optional
@@ -201,7 +206,6 @@ class RunConfig(_Strict):
     messages: dict[str, MessageMap] = Field(default_factory=dict)
     rules: dict[str, RuleMap] = Field(default_factory=dict)
     checks: ChecksConfig = ChecksConfig()
-    record: str | None = None
     output: str | None = None
     duration_s: Seconds | None = None
     until_idle_s: Seconds | None = None

@@ -9,6 +9,7 @@ from typing import Final
 import can
 from can.typechecking import CanFilter
 
+from cangauge.bus.counters import Counters
 from cangauge.bus.publish import FrameIds, SocPublisher, standard_filter
 from cangauge.bus.time_source import TimeSourceName
 from cangauge.bus.vehicle import Vehicle
@@ -19,7 +20,7 @@ from cangauge.estimate.state import EstimatorState
 from cangauge.estimate.types import Estimate, Reason, Sample
 from cangauge.estimate.validity import status_of
 from cangauge.model.model_file import ModelFile
-from cangauge.service.stream import EstimateStream, FrameCounts
+from cangauge.service.stream import NOTHING_YET, EstimateStream, FrameCounts
 
 ACKNOWLEDGE_EVERY: Final = 4
 """Samples between two SOC_DETAIL at most, under the replay clock: `replay` waits for them."""
@@ -69,6 +70,8 @@ class Gauge:
         self._is_replay = self.settings.time_source == "replay-clock"
         self._publisher = SocPublisher(ids, ACKNOWLEDGE_EVERY if self._is_replay else None)
         self._beginnings = 0
+        self.published = NOTHING_YET
+        """The estimate as last put on the bus, stale where it was told to be."""
 
     def reconfigure(
         self, vehicle: Vehicle | None, model: ModelFile, settings: GaugeSettings
@@ -118,7 +121,10 @@ class Gauge:
     def finish(self) -> list[can.Message]:
         """Return the last frames to send, at the end."""
         estimate = self._stream.finish()
-        return [] if estimate is None else self._publisher.beat(estimate, self.samples, 0.0)
+        if estimate is None:
+            return []
+        self.published = estimate
+        return self._publisher.beat(estimate, self.samples, 0.0)
 
     def heartbeat(self, *, is_stale: bool, silent_s: float = 0.0) -> list[can.Message]:
         """Return what to send now: every `publish.ESTIMATE_EVERY_S`, or so long after `handle`.
@@ -136,6 +142,7 @@ class Gauge:
         if is_stale and self.samples:
             reasons = estimate.reasons | Reason.INPUT_STALE
             estimate = estimate._replace(status=status_of(reasons), reasons=reasons)
+        self.published = estimate
         age_s = silent_s if self.samples else math.nan
         return self._publisher.beat(estimate, self.samples, age_s)
 
@@ -168,9 +175,19 @@ class Gauge:
         return self._stream.counts
 
     @property
+    def counters(self) -> Counters:
+        """The same in detail, of the log that is running."""
+        return self._stream.counters
+
+    @property
     def reference_soc_pct(self) -> float:
         """The car's own state of charge [%]; NaN while there is none."""
         return self._stream.reference_soc_pct
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """The vehicle in use."""
+        return self._vehicle
 
     @property
     def model(self) -> ModelFile:
@@ -196,6 +213,7 @@ class Gauge:
         if self._stream.beginnings != self._beginnings:
             self._beginnings = self._stream.beginnings
             self._publisher.restart()
+        self.published = estimate
         return self._publisher.publish(estimate, self.samples)
 
 

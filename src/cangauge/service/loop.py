@@ -84,6 +84,11 @@ class Outputs:
     reload : callable, optional
         Asked like `stop`; if the gauge has been given another configuration, it returns the
         loop's.
+    stepped : callable, optional
+        Takes, after every sample, the receive stamp [s] of the frame that completed it, and the
+        time that the estimate took [ns].
+    sent : callable, optional
+        Called after frames were sent.
     """
 
     record: FrameSink | None = None
@@ -92,6 +97,8 @@ class Outputs:
     warn: Callable[[str], None] | None = None
     checkpoint: Callable[[], None] | None = None
     reload: Callable[[], LoopSettings | None] | None = None
+    stepped: Callable[[float, int], None] | None = None
+    sent: Callable[[], None] | None = None
 
 
 @dataclass(frozen=True)
@@ -223,12 +230,15 @@ class _Loop:
             return
         if self._outputs.record is not None:
             self._outputs.record.write(message)
-        before = gauge.samples
+        before, stamp_s = gauge.samples, message.timestamp
         began_ns = time.perf_counter_ns()
         frames = gauge.handle(message)
         if gauge.samples == before:
             return
-        self.step_ns.append(time.perf_counter_ns() - began_ns)
+        step_ns = time.perf_counter_ns() - began_ns
+        self.step_ns.append(step_ns)
+        if self._outputs.stepped is not None:
+            self._outputs.stepped(stamp_s, step_ns)
         self._sample_s = time.monotonic()
         self._tell()
         if frames:
@@ -244,6 +254,8 @@ class _Loop:
         for frame in frames:
             self.rivals.sent(frame)
             self._port.post(frame, SEND_WITHIN_S)
+        if frames and self._outputs.sent is not None:
+            self._outputs.sent()
 
     def _set_filters(self) -> None:
         wanted = [*self._gauge.filters, *self.rivals.filters]

@@ -31,6 +31,14 @@ NEEDS_RESTART: Final = (
     "output",
     "state",
     "state_max_age_s",
+    "record_part_mb",
+    "record_part_s",
+    "record_keep_mb",
+    "http",
+    "http_token_file",
+    "status_socket",
+    "log_format",
+    "log_level",
 )
 """What stays as it was at the start."""
 
@@ -49,6 +57,11 @@ class Reloader:
     gauge : Gauge
     say : callable
         Takes a line of text.
+
+    Attributes
+    ----------
+    config : RunConfig
+        The configuration in use, but for what needs a restart.
     """
 
     def __init__(
@@ -60,7 +73,7 @@ class Reloader:
         say: Callable[[str], None],
     ) -> None:
         self._read = read
-        self._config = config
+        self.config = config
         self._gauge = gauge
         self._say = say
         self._vehicle_key = _vehicle_key(config, vehicle)
@@ -87,15 +100,15 @@ class Reloader:
             return None
         self._vehicle_key = key
         self._tell(config)
-        self._config = config
+        self.config = config
         return config.loop_settings()
 
     def _tell(self, config: RunConfig) -> None:
-        old, new = self._config.model_dump(), config.model_dump()
+        old, new = self.config.model_dump(), config.model_dump()
         changed = [name for name in new if new[name] != old[name]]
         self._say(f"configuration read again; changed: {', '.join(changed) or 'no option'}")
         late = [name for name in changed if name in NEEDS_RESTART]
-        if self._config.ids.replay_clock != config.ids.replay_clock:
+        if self.config.ids.replay_clock != config.ids.replay_clock:
             late.append("ids.replay_clock")
         if late:
             self._say(f"warning: {', '.join(late)}: takes effect when the service starts again")

@@ -11,6 +11,7 @@ from typing import Final
 
 import can
 
+from cangauge.bus.counters import Counters
 from cangauge.bus.decode import SampleAssembler
 from cangauge.bus.signal_health import MISSED_AT_LEAST
 from cangauge.bus.stuck import Pack
@@ -181,6 +182,11 @@ class EstimateStream:
             held_back=now.held_back,
             untimed=self._untimed,
         )
+
+    @property
+    def counters(self) -> Counters:
+        """The same in detail, of the log that is running."""
+        return self._assembler.counters
 
     @property
     def reference_soc_pct(self) -> float:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
@@ -13,7 +14,7 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 
 from cangauge.atomic import atomic_path
-from cangauge.errors import InputError
+from cangauge.errors import CangaugeError, InputError
 from cangauge.estimate.types import Estimate
 from cangauge.report.words import reason_names
 
@@ -44,6 +45,9 @@ class EstimateWriter:
     ----------
     path : path-like
         `.parquet` or `.csv`.
+    warn : callable, optional
+        Takes a line of text when the disk is full or fails: the table is then given up, and
+        whoever adds to it goes on. Without it, the OSError is raised.
 
     Raises
     ------
@@ -51,7 +55,9 @@ class EstimateWriter:
         If the suffix is another one, or the folder is absent or not writable.
     """
 
-    def __init__(self, path: str | PathLike[str]) -> None:
+    def __init__(
+        self, path: str | PathLike[str], warn: Callable[[str], None] | None = None
+    ) -> None:
         self._path = Path(path)
         if self._path.suffix.lower() not in {".parquet", ".csv"}:
             raise InputError(
@@ -65,7 +71,14 @@ class EstimateWriter:
         self._names: dict[int, str] = {}
         self._stack = ExitStack()
         self._sink: Any = None
+        self._warn = warn
+        self._error: OSError | None = None
         self.rows = 0
+
+    @property
+    def failed(self) -> bool:
+        """Whether the table was given up; there is then no file."""
+        return self._error is not None
 
     def __enter__(self) -> Self:
         part = self._stack.enter_context(atomic_path(self._path))
@@ -85,6 +98,13 @@ class EstimateWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        if self._error is not None:
+            # The temporary file goes, and nothing is put in place.
+            with suppress(OSError):
+                self._sink.close()
+            with suppress(OSError, CangaugeError):
+                self._stack.__exit__(OSError, self._error, None)
+            return
         if kind is None:
             self._write()
         self._sink.close()
@@ -92,6 +112,8 @@ class EstimateWriter:
 
     def add(self, time_s: float, estimate: Estimate) -> None:
         """Add the row of a sample: its time [s] and the estimate after it."""
+        if self._error is not None:
+            return
         reasons = int(estimate.reasons)
         words = self._names.get(reasons)
         if words is None:
@@ -101,7 +123,17 @@ class EstimateWriter:
         self._rows.append((time_s, *numbers, estimate.status.name.lower(), words))
         self.rows += 1
         if len(self._rows) >= _ROWS_AT_ONCE:
+            self._write_or_give_up()
+
+    def _write_or_give_up(self) -> None:
+        try:
             self._write()
+        except OSError as error:
+            if self._warn is None:
+                raise
+            self._error = error
+            self._rows.clear()
+            self._warn(f"warning: {self._path}: cannot be written ({error}); given up")
 
     def _write(self) -> None:
         if not self._rows:

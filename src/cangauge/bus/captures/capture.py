@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import chain
 from os import PathLike
 from pathlib import Path
 from typing import Final
@@ -16,6 +17,7 @@ from cangauge.bus.captures.library import (
     LibraryFormat,
     library_messages,
 )
+from cangauge.bus.captures.parts import parts_of_run
 from cangauge.bus.captures.stream import LineStream, read_head
 from cangauge.bus.captures.text_formats import TEXT_FORMATS, Parser, TextFormat
 from cangauge.errors import InputError
@@ -49,12 +51,19 @@ class Capture:
     kind : TextFormat or LibraryFormat
     clock : tuple of int and float
         Id of the frames that count time where there are no stamps, and their period [s].
+    parts : sequence of Path
+        The files that `path` stands for; by default itself.
     """
 
     def __init__(
-        self, path: Path, kind: TextFormat | LibraryFormat, clock: tuple[int, float]
+        self,
+        path: Path,
+        kind: TextFormat | LibraryFormat,
+        clock: tuple[int, float],
+        parts: Sequence[Path] = (),
     ) -> None:
         self.path = path
+        self._parts = parts or (path,)
         self._kind = kind
         self._clock = clock
         self._reset()
@@ -106,22 +115,26 @@ class Capture:
         """
         self._reset()
         if isinstance(self._kind, TextFormat):
-            messages = self._text(self._kind)
-            if self._kind.stamps == "none":
+            kind = self._kind
+            messages: Iterator[can.Message] = chain.from_iterable(
+                self._text(kind, part) for part in self._parts
+            )
+            if kind.stamps == "none":
                 messages = self._count_time(messages)
         else:
-            messages = self._library(self._kind)
+            library = self._kind
+            messages = chain.from_iterable(self._library(library, part) for part in self._parts)
         yield from messages
         self._finish()
 
-    def _text(self, kind: TextFormat) -> Iterator[can.Message]:
-        lines = LineStream(self.path)
+    def _text(self, kind: TextFormat, path: Path) -> Iterator[can.Message]:
+        lines = LineStream(path)
         parse: Parser | None = None
         for line in lines:
             if parse is None:
                 parse = kind.parser(line)
                 if parse is None:
-                    raise _unknown(self.path)
+                    raise _unknown(path)
             if not line.endswith("\n") and not kind.states_length and line.strip():
                 # The last line: it could have lost bytes without showing it.
                 self._cut_off = True
@@ -138,9 +151,9 @@ class Capture:
         if lines.cut_off:
             self._cut_off = True
 
-    def _library(self, kind: LibraryFormat) -> Iterator[can.Message]:
+    def _library(self, kind: LibraryFormat, path: Path) -> Iterator[can.Message]:
         try:
-            for message in library_messages(kind, self.path):
+            for message in library_messages(kind, path):
                 if not (message.is_fd or message.is_remote_frame or message.is_error_frame) and (
                     len(message.data) != message.dlc
                 ):
@@ -150,10 +163,11 @@ class Capture:
                 yield message
         except DAMAGE as error:
             self._cut_off = True
-            if not self._frames:
+            # A part without a frame, begun just before the power went, costs only itself.
+            if not self._frames and path == self._parts[-1]:
                 raise InputError(
                     f"the {kind.name} file is damaged ({type(error).__name__}: {error})",
-                    source=self.path,
+                    source=path,
                     cure="record or fetch it again",
                 ) from error
 
@@ -203,7 +217,7 @@ class Capture:
 def open_capture(
     path: str | PathLike[str], *, clock: tuple[int, float] = (CLOCK_ID, CLOCK_PERIOD_S)
 ) -> Capture:
-    """Find out what kind of capture a file is.
+    """Find out what kind of capture a file is, or the parts of a recording are (see `parts`).
 
     Parameters
     ----------
@@ -217,10 +231,12 @@ def open_capture(
         If it cannot be read, or is no known kind of capture.
     """
     path = Path(path)
-    kind = _recognise(read_head(path))
+    parts = parts_of_run(path)
+    kinds = (_recognise(read_head(part)) for part in parts or [path])
+    kind = next((each for each in kinds if each is not None), None)
     if kind is None:
         raise _unknown(path)
-    return Capture(path, kind, clock)
+    return Capture(path, kind, clock, parts)
 
 
 def read_capture(path: str | PathLike[str]) -> Iterator[can.Message]:
@@ -230,8 +246,9 @@ def read_capture(path: str | PathLike[str]) -> Iterator[can.Message]:
 
 def is_capture(path: str | PathLike[str]) -> bool:
     """Return whether a file is a capture of a known kind; False also where it cannot be read."""
+    path = Path(path)
     try:
-        return _recognise(read_head(Path(path))) is not None
+        return any(_recognise(read_head(part)) for part in parts_of_run(path) or [path])
     except InputError:
         return False
 

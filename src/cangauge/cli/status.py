@@ -1,0 +1,133 @@
+"""`cangauge status`: how a running service fares."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import typer
+
+from cangauge.cli.inputs import JsonOption
+from cangauge.cli.output import emit_json
+from cangauge.cli.tables import print_table
+from cangauge.errors import CangaugeError
+from cangauge.report.words import NONE_KNOWN, duration, number
+from cangauge.service.status_client import NotRunningError, fetch_status, find_socket
+
+TRUSTED: Final = frozenset({"valid", "degraded"})
+
+
+def status_command(
+    endpoint: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PATH|URL",
+            help="Unix socket, or http://HOST:PORT, of the service. Default: the one that runs"
+            " on this machine.",
+        ),
+    ] = None,
+    token_file: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="File with the bearer token of an HTTP endpoint; or in CANGAUGE_HTTP_TOKEN.",
+        ),
+    ] = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Show how a running service fares: SoC ± standard deviation [%], status, frames, delays.
+
+    Exit code 0: the SoC is valid or degraded. 1: it is invalid or not known yet, or no service
+    runs. 2: bad usage. With `--json` the object is printed in the first two cases alike.
+
+    For example:
+
+    `cangauge status`
+
+    `cangauge status --endpoint /run/cangauge/can0/status.sock --json`
+
+    `cangauge status --endpoint http://127.0.0.1:9464`
+    """
+    try:
+        place = endpoint or str(find_socket())
+        status = fetch_status(place, token_file)
+    except NotRunningError as error:
+        if json_output:
+            emit_json({"running": False, "status": None, "problem": str(error)})
+            raise typer.Exit(1) from error
+        raise CangaugeError(str(error)) from error
+    if json_output:
+        emit_json(status)
+    else:
+        print_table(f"cangauge at {place}", ("", "<"), _rows(status))
+    if status.get("status") not in TRUSTED:
+        raise typer.Exit(1)
+
+
+def _rows(status: dict[str, Any]) -> list[tuple[str, str]]:
+    estimate, sample = status["estimate"], status["sample"] or {}
+    frames, record = status["frames"], status["record"]
+    reasons = "; ".join(each.replace("_", " ") for each in status["reasons"])
+    refused = _counts(status["rejects"])
+    rows = [
+        ("SoC", f"{number(estimate['soc_pct'], 2)} ± {number(estimate['soc_std_pct'], 2, '%')}"),
+        ("status", status["status"] + (f": {reasons}" if reasons else "")),
+        ("by voltage alone", number(estimate["soc_newton_pct"], 2, "%")),
+        ("by charge alone", number(estimate["soc_coulomb_pct"], 2, "%")),
+        ("current", number(sample.get("current_a"), 2, "A (positive = discharge)")),
+        ("voltage", number(sample.get("voltage_v"), 2, "V")),
+        ("residual", number(_times(estimate["residual_v"], 1e3), 0, "mV")),
+        ("temperature", number(sample.get("temperature_c"), 1, "°C")),
+        ("latest sample", f"{number(sample.get('age_s'), 2, 's')} ago"),
+        ("samples", f"{status['samples']} ({number(status['samples_per_s'], 1, '/s')})"),
+        (
+            "frames",
+            f"{frames['received']} received, {frames['used']} used, {frames['lost']} lost",
+        ),
+        ("refused", refused or "none"),
+        (
+            "bus",
+            "; ".join(
+                (
+                    status["bus"],
+                    *filter(None, [status["bus_trouble"]]),
+                    _counts(status["bus_counts"]) or "no errors",
+                )
+            ),
+        ),
+        ("receive to sent", _delay(status["latency"])),
+        ("estimate takes", _delay(status["step"])),
+    ]
+    if record is not None:
+        problem = f"; FAILING: {record['problem']}" if record["problem"] else ""
+        rows.append(
+            (
+                "recording",
+                f"{record['path']}: {record['frames']} frames,"
+                f" {number(1e-6 * record['written_bytes'], 1, 'MB')},"
+                f" {record['lost_frames']} frames lost{problem}",
+            )
+        )
+    if status["loop_stuck"]:
+        rows.insert(0, ("LOOP STUCK", "the receive loop does not turn; restart the service"))
+    return [
+        *rows,
+        ("vehicle", status["vehicle"]),
+        ("model", f"{status['model']} ({status['method']}, time: {status['time_source']})"),
+        ("running for", f"{duration(status['uptime_s'])}, cangauge {status['version']}"),
+    ]
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in counts.items() if value)
+
+
+def _delay(durations: dict[str, Any]) -> str:
+    if not durations["count"]:
+        return NONE_KNOWN
+    p50, p99 = (_times(durations[f"{name}_at_most_s"], 1e3) for name in ("p50", "p99"))
+    return f"half within {number(p50, 3, 'ms')}, 99 % within {number(p99, 3, 'ms')}"
+
+
+def _times(value: float | None, factor: float) -> float | None:
+    return None if value is None else factor * value

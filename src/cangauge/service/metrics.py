@@ -1,0 +1,197 @@
+"""Prometheus metrics of a snapshot, by prometheus-client (extra `metrics`)."""
+
+from __future__ import annotations
+
+import math
+import platform
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import Final
+
+from cangauge import __version__
+from cangauge.errors import InputError
+from cangauge.estimate.types import Reason, Status
+from cangauge.service.histogram import BOUNDS_S, HistogramCounts
+from cangauge.service.snapshot import Snapshot, reason_ids
+
+try:
+    from prometheus_client import CollectorRegistry, ProcessCollector
+    from prometheus_client.core import (
+        CounterMetricFamily,
+        GaugeMetricFamily,
+        HistogramMetricFamily,
+        Metric,
+    )
+    from prometheus_client.exposition import choose_encoder
+    from prometheus_client.registry import Collector
+except ImportError as error:
+    raise InputError(
+        "the metrics need the package prometheus-client, which is not installed",
+        field="http",
+        cure="pip install 'cangauge[metrics]'; `cangauge status` works without",
+    ) from error
+
+_BUS_HELP: Final = {
+    "garbled": "Packets that were no CAN frames.",
+    "error_frames": "Error frames that the controller reported.",
+    "unsent": "Frames given up because the transmit queue stayed full.",
+    "queue_drops": "Frames that the kernel dropped because the receive queue was full.",
+    "losses": "How often the bus was lost; it is opened again until it is back.",
+}
+
+
+class Exposition:
+    """Renders the latest snapshot, for any thread but the loop's.
+
+    Parameters
+    ----------
+    latest : callable
+        Returns the latest snapshot.
+    clock : callable
+        Monotonic time [s].
+    """
+
+    def __init__(
+        self, latest: Callable[[], Snapshot], clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._registry = CollectorRegistry()
+        self._registry.register(_SnapshotCollector(latest, clock))
+        ProcessCollector(registry=self._registry)
+
+    def render(self, accept: str) -> tuple[bytes, str]:
+        """Return the text and its content type, as the Accept header asks for."""
+        encode, content_type = choose_encoder(accept)
+        return encode(self._registry), content_type
+
+
+class _SnapshotCollector(Collector):
+    def __init__(self, latest: Callable[[], Snapshot], clock: Callable[[], float]) -> None:
+        self._latest = latest
+        self._clock = clock
+
+    def collect(self) -> Iterator[Metric]:
+        snapshot, now_s = self._latest(), self._clock()
+        yield from _about(snapshot, now_s)
+        yield from _estimate(snapshot, now_s)
+        yield from _frames(snapshot)
+        yield _histogram(
+            "cangauge_latency_seconds",
+            "From the receive stamp of the frame that completes a sample to its SoC being sent.",
+            snapshot.latency,
+        )
+        yield _histogram(
+            "cangauge_step_seconds",
+            "From the frame that completes a sample to its estimate.",
+            snapshot.step,
+        )
+        yield from _record(snapshot)
+
+
+def _about(snapshot: Snapshot, now_s: float) -> Iterator[Metric]:
+    identity = snapshot.identity
+    labels = {
+        "version": __version__,
+        "python": platform.python_version(),
+        "bus": identity.bus,
+        "vehicle": identity.vehicle,
+        "model": identity.model,
+        "method": identity.method,
+        "time_source": identity.time_source,
+    }
+    build = GaugeMetricFamily("cangauge_build_info", "What runs here; always 1.", labels=[*labels])
+    build.add_metric([*labels.values()], 1.0)
+    yield build
+    yield GaugeMetricFamily(
+        "cangauge_start_time_seconds", "Start, seconds since 1970.", identity.began_s
+    )
+    yield GaugeMetricFamily(
+        "cangauge_loop_age_seconds",
+        "Since the receive loop last showed that it turns.",
+        now_s - snapshot.made_s,
+    )
+
+
+def _estimate(snapshot: Snapshot, now_s: float) -> Iterator[Metric]:
+    estimate, sample = snapshot.estimate_at(now_s), snapshot.sample
+    nan = math.nan
+    for name, text, value in (
+        ("soc_percent", "State of charge [%].", estimate.soc_pct),
+        ("soc_std_percent", "Its standard deviation [%].", estimate.soc_std_pct),
+        ("soc_newton_percent", "By the voltage model's inverse alone.", estimate.soc_newton_pct),
+        ("soc_coulomb_percent", "By Coulomb counting alone [%].", estimate.soc_coulomb_pct),
+        ("residual_volts", "Measured minus predicted voltage.", estimate.residual_v),
+        (
+            "current_amperes",
+            "Positive current discharges.",
+            nan if sample is None else sample.current_a,
+        ),
+        ("voltage_volts", "Pack voltage.", nan if sample is None else sample.voltage_v),
+        ("temperature_celsius", "Temperature.", nan if sample is None else sample.temperature_c),
+        (
+            "sample_age_seconds",
+            "Since the latest sample; infinite before the first.",
+            snapshot.age_s(now_s),
+        ),
+    ):
+        yield GaugeMetricFamily(f"cangauge_{name}", text, value)
+    status = GaugeMetricFamily("cangauge_status", "1 for the status that holds.", labels=["status"])
+    for each in Status:
+        status.add_metric([each.name.lower()], float(each is estimate.status))
+    yield status
+    reasons = GaugeMetricFamily("cangauge_reason", "1 for reasons that hold.", labels=["reason"])
+    held = set(reason_ids(estimate.reasons))
+    for name in reason_ids(~Reason.NONE):
+        reasons.add_metric([name], float(name in held))
+    yield reasons
+
+
+def _frames(snapshot: Snapshot) -> Iterator[Metric]:
+    for name, text, value in (
+        ("frames_received", "Frames that passed the filters.", snapshot.frames),
+        ("frames_wanted", "Frames with a wanted id.", snapshot.wanted),
+        ("frames_used", "Wanted frames not refused.", snapshot.wanted - snapshot.rejected),
+        ("frames_lost", "Wanted frames that their counters say are missing.", snapshot.lost),
+        ("samples", "Samples made of the frames.", snapshot.samples),
+    ):
+        yield CounterMetricFamily(f"cangauge_{name}", text, value)
+    yield _by_label(
+        "cangauge_rejects", "Frames and values refused, by reason.", "reason", snapshot.rejects
+    )
+    for name, value in snapshot.bus.items():
+        text = _BUS_HELP.get(name, name.replace("_", " "))
+        yield CounterMetricFamily(f"cangauge_bus_{name}", text, value)
+    yield GaugeMetricFamily(
+        "cangauge_bus_up", "0 while the bus is away or its controller off.", snapshot.bus_up
+    )
+
+
+def _record(snapshot: Snapshot) -> Iterator[Metric]:
+    record = snapshot.record
+    if record is None:
+        return
+    yield CounterMetricFamily("cangauge_record_frames", "Frames recorded.", record.frames)
+    yield CounterMetricFamily(
+        "cangauge_record_lost_frames", "Frames that the disk did not take.", record.lost_frames
+    )
+    yield CounterMetricFamily(
+        "cangauge_record_written_bytes", "Written to the disk.", record.written_bytes
+    )
+    yield GaugeMetricFamily(
+        "cangauge_record_failing", "1 while nothing can be written.", record.problem is not None
+    )
+
+
+def _by_label(name: str, text: str, label: str, values: Mapping[str, int]) -> Metric:
+    family = CounterMetricFamily(name, text, labels=[label])
+    for key, value in values.items():
+        family.add_metric([key], value)
+    return family
+
+
+def _histogram(name: str, text: str, histogram: HistogramCounts) -> Metric:
+    total = 0
+    buckets: list[tuple[str, float]] = []
+    for bound, count in zip((*BOUNDS_S, math.inf), histogram.counts, strict=True):
+        total += count
+        buckets.append(("+Inf" if math.isinf(bound) else repr(bound), float(total)))
+    return HistogramMetricFamily(name, text, buckets=buckets, sum_value=histogram.total_s)

@@ -1,0 +1,123 @@
+"""Asking a running service how it fares, by its unix socket or by HTTP."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import socket
+from pathlib import Path
+from typing import Any, Final, cast
+from urllib.parse import urlsplit
+
+from cangauge.errors import CangaugeError, InputError
+from cangauge.service.address import read_token
+from cangauge.service.snapshot import SCHEMA
+from cangauge.service.status_socket import served_sockets
+
+ANSWER_WITHIN_S: Final = 3.0
+LARGEST_ANSWER: Final = 1 << 20
+
+
+class NotRunningError(CangaugeError):
+    """No service answers."""
+
+
+def find_socket() -> Path:
+    """Return the unix socket of the one service that runs.
+
+    Raises
+    ------
+    NotRunningError
+        If none does.
+    InputError
+        If several do.
+    """
+    found = served_sockets()
+    if not found:
+        raise NotRunningError(
+            "no running service found: start `cangauge run`, or name it by --endpoint"
+            " (that of another user may need more rights)"
+        )
+    if len(found) > 1:
+        raise InputError(
+            "several services run",
+            field="--endpoint",
+            cure=f"name one of {', '.join(str(path) for path in found)}",
+        )
+    return found[0]
+
+
+def fetch_status(endpoint: str, token_file: Path | None = None) -> dict[str, Any]:
+    """Return what a service tells of itself.
+
+    Parameters
+    ----------
+    endpoint : str
+        Path of a unix socket, or "http://host:port".
+    token_file : Path, optional
+        File with the token; by default the environment's.
+
+    Raises
+    ------
+    InputError
+        If the endpoint is neither.
+    NotRunningError
+        If nobody answers there.
+    CangaugeError
+        If what answers refuses, or is no such service.
+    """
+    token = read_token(token_file, os.environ)
+    connection = _http(endpoint) if "://" in endpoint else _UnixConnection(endpoint)
+    try:
+        headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+        connection.request("GET", "/status", headers=headers)
+        response = connection.getresponse()
+        body = response.read(LARGEST_ANSWER)
+    except (OSError, http.client.HTTPException) as error:
+        reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        raise NotRunningError(f"{endpoint}: no service answers: {reason}") from error
+    finally:
+        connection.close()
+    if response.status != http.client.OK:
+        said = " ".join(body[:200].decode("utf-8", "replace").split())
+        raise CangaugeError(f"{endpoint}: refused ({response.status}): {said}")
+    return _content(body, endpoint)
+
+
+def _http(endpoint: str) -> http.client.HTTPConnection:
+    try:
+        parts = urlsplit(endpoint)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host = port = None
+    if host is None or parts.scheme not in {"http", "https"}:
+        raise InputError(
+            "neither the path of a unix socket nor a URL",
+            field="--endpoint",
+            value=endpoint,
+            cure="write it as http://127.0.0.1:9464",
+        )
+    kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
+    return kind(host, port, timeout=ANSWER_WITHIN_S)
+
+
+class _UnixConnection(http.client.HTTPConnection):
+    def __init__(self, path: str) -> None:
+        super().__init__("localhost", timeout=ANSWER_WITHIN_S)
+        self._path = path
+
+    def connect(self) -> None:
+        self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self.sock.settimeout(ANSWER_WITHIN_S)
+        self.sock.connect(self._path)
+
+
+def _content(body: bytes, endpoint: str) -> dict[str, Any]:
+    try:
+        content = json.loads(body)
+    except (ValueError, RecursionError) as error:
+        raise CangaugeError(f"{endpoint}: the answer is not a status of cangauge") from error
+    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
+        raise CangaugeError(f"{endpoint}: the answer is not a status of this release of cangauge")
+    return cast("dict[str, Any]", content)

@@ -1,0 +1,138 @@
+"""What systemd hears, from the class and from the real service."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from cangauge.service.notify import Notifier
+from live import COMMAND, Command, leaf_model_path
+
+
+class FakeSystemd:
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.socket.bind(str(path))
+        self.socket.settimeout(20.0)
+
+    def next(self) -> dict[str, str]:
+        lines = self.socket.recv(4096).decode().splitlines()
+        return dict(line.split("=", 1) for line in lines)
+
+    def drain(self) -> int:
+        """Take what is there; return how much it was."""
+        self.socket.settimeout(0.0)
+        taken = 0
+        with contextlib.suppress(BlockingIOError):
+            while self.socket.recv(4096):
+                taken += 1
+        self.socket.settimeout(20.0)
+        return taken
+
+    def until(self, key: str) -> list[dict[str, str]]:
+        heard = [self.next()]
+        while key not in heard[-1]:
+            heard.append(self.next())
+        return heard
+
+
+@pytest.fixture
+def systemd(tmp_path: Path) -> Iterator[FakeSystemd]:
+    fake = FakeSystemd(tmp_path / "notify")
+    yield fake
+    fake.socket.close()
+
+
+def test_every_message(systemd: FakeSystemd) -> None:
+    notifier = Notifier.from_environment({"NOTIFY_SOCKET": str(systemd.path)})
+    assert notifier.active
+    assert notifier.ping_every_s is None
+    notifier.ready("on\ncan0")
+    assert systemd.next() == {"READY": "1", "STATUS": "on can0"}
+    notifier.ping()
+    assert systemd.next() == {"WATCHDOG": "1"}
+    notifier.reloading()
+    told = systemd.next()
+    assert told["RELOADING"] == "1"
+    assert abs(int(told["MONOTONIC_USEC"]) / 1e6 - time.monotonic()) < 5.0
+    notifier.stopping()
+    assert systemd.next()["STOPPING"] == "1"
+    notifier.close()
+    notifier.ping()  # nothing happens
+    assert not notifier.active
+
+
+def test_the_abstract_name_space() -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as fake:
+        name = f"cangauge-test-{os.getpid()}"
+        fake.bind("\0" + name)
+        fake.settimeout(5.0)
+        Notifier.from_environment({"NOTIFY_SOCKET": "@" + name}).ping()
+        assert fake.recv(100) == b"WATCHDOG=1"
+
+
+@pytest.mark.parametrize(
+    ("environment", "active", "every_s"),
+    [
+        ({}, False, None),
+        ({"NOTIFY_SOCKET": "vsock:2:1"}, False, None),
+        ({"NOTIFY_SOCKET": "/x", "WATCHDOG_USEC": "10000000"}, True, 2.5),
+        ({"NOTIFY_SOCKET": "/x", "WATCHDOG_USEC": "10000000", "WATCHDOG_PID": "1"}, True, None),
+        ({"NOTIFY_SOCKET": "/x", "WATCHDOG_USEC": "soon"}, True, None),
+    ],
+)
+def test_what_the_environment_asks_for(
+    environment: dict[str, str], active: bool, every_s: float | None
+) -> None:
+    notifier = Notifier.from_environment(environment)
+    assert (notifier.active, notifier.ping_every_s) == (active, every_s)
+    notifier.ping()  # where nobody listens, nothing happens
+    notifier.close()
+
+
+def test_a_full_queue_does_not_block(systemd: FakeSystemd) -> None:
+    notifier = Notifier(str(systemd.path))
+    began = time.monotonic()
+    for _ in range(10_000):
+        notifier.ping()
+    assert time.monotonic() - began < 5.0
+
+
+@pytest.mark.slow
+def test_the_service_is_ready_lives_while_its_loop_turns_and_says_when_it_stops(
+    systemd: FakeSystemd, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "main" in COMMAND
+    monkeypatch.setenv("NOTIFY_SOCKET", str(systemd.path))
+    monkeypatch.setenv("WATCHDOG_USEC", "2000000")
+    service = Command(
+        "run", "-m", leaf_model_path(), "--interface", "udp_multicast", "--bus-option",
+        "port=23123", "--status-socket", "off", "--json",
+    )  # fmt: skip
+    heard = systemd.until("READY")
+    assert "listening" in heard[-1]["STATUS"]
+    began = time.monotonic()
+    heard = [systemd.next() for _ in range(12)]
+    pings = [each for each in heard if "WATCHDOG" in each]
+    status = [each["STATUS"] for each in heard if "STATUS" in each]
+    assert len(pings) > 5
+    assert time.monotonic() - began < 10.0
+    assert "initialising" in status[-1]
+    # Stopped in its loop, it gives no sign of life, so that systemd would act.
+    os.kill(service.process.pid, 19)
+    time.sleep(0.3)
+    systemd.drain()
+    time.sleep(1.0)
+    assert systemd.drain() == 0
+    os.kill(service.process.pid, 18)
+    systemd.until("WATCHDOG")
+    service.process.terminate()
+    systemd.until("STOPPING")
+    assert service.end().code == 0

@@ -1,0 +1,119 @@
+"""The service with all that operators want, in a process of its own, over udp_multicast."""
+
+from __future__ import annotations
+
+import json
+import urllib.request
+import zlib
+from pathlib import Path
+
+import pytest
+
+from cangauge.bus.vehicle import load_vehicle
+from cangauge.logs.canonical import write_log
+from cangauge.service.capture_estimate import estimate_capture
+from live import Command, in_process, leaf_model, leaf_model_path, run_to_end, short_log
+
+pytestmark = pytest.mark.slow
+
+MODEL = ("-m", leaf_model_path())
+
+
+@pytest.fixture
+def bus(request: pytest.FixtureRequest) -> list[str]:
+    """Options of a bus that no other test uses."""
+    port = 40_000 + zlib.crc32(request.node.nodeid.encode()) % 20_000
+    channel = ["--interface", "udp_multicast", "--channel", "239.74.163.2"]
+    return [*channel, "--bus-option", f"port={port}"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder, which relative paths are in."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
+    log, sock = tmp_path / "drive.parquet", tmp_path / "status.sock"
+    write_log(short_log(120.0), log)
+    service = Command(
+        "run", *bus, *MODEL, "--time-source", "replay-clock", "--json", "--log-format", "json",
+        "--http", "127.0.0.1:0", "--status-socket", sock,
+        "--record", tmp_path / "seen.blf", "--record-part-mb", "0.02",
+    )  # fmt: skip
+    service.wait_for("http.listening")
+    http_port = json.loads(service._said[-1])["port"]
+    service.wait_for("service.ready")
+    assert run_to_end("replay", log, *bus, "--speed", "max").code == 0
+    found = in_process("status", "--endpoint", sock, "--json")
+    assert found.json["samples"] == 1200
+    assert found.json["latency"]["count"] > 0
+    assert found.json["record"]["lost_frames"] == 0
+    with urllib.request.urlopen(f"http://127.0.0.1:{http_port}/metrics") as answer:
+        assert b"cangauge_samples_total 1200.0" in answer.read()
+    service.process.terminate()
+    ended = service.end(20.0)
+    assert ended.code == 0
+    assert not sock.exists()
+    events = [json.loads(line)["event"] for line in ended.err.splitlines()]
+    assert {"http.listening", "service.ready", "status.changed", "service.stopped"} <= {*events}
+    assert ended.json["record"] == str(tmp_path / "seen-0001.blf")
+    assert len(list(tmp_path.glob("seen-0001-*.blf"))) > 1
+    recorded = estimate_capture(ended.json["record"], load_vehicle("generic"), leaf_model())
+    assert recorded.table.soc_pct[-1] == ended.json["estimate"]["soc_pct"]
+    assert recorded.table.soc_pct.size == 1200
+
+
+def test_a_disk_that_is_full_does_not_stop_the_service(bus: list[str], tmp_path: Path) -> None:
+    log, sock = tmp_path / "drive.parquet", tmp_path / "status.sock"
+    write_log(short_log(60.0), log)
+    (tmp_path / "seen.log").symlink_to("/dev/full")
+    service = Command(
+        "run", *bus, *MODEL, "--time-source", "replay-clock", "--json",
+        "--status-socket", sock, "--record", tmp_path / "seen.log",
+    )  # fmt: skip
+    service.wait_for("service.ready")
+    assert run_to_end("replay", log, *bus, "--speed", "max").code == 0
+    service.wait_for("record.failed")
+    record = in_process("status", "--endpoint", sock, "--json").json["record"]
+    assert record["problem"] == "No space left on device"
+    assert "FAILING" in in_process("status", "--endpoint", sock).out
+    service.process.terminate()
+    ended = service.end(10.0)
+    assert ended.code == 0
+    assert ended.json["samples"] == 600
+    assert "record.incomplete" in ended.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "say"),
+    [
+        (["--http", "0.0.0.0:9464"], "open to the network"),
+        (["--http", "here"], "HOST:PORT"),
+        (["--http", "127.0.0.1:0", "--http-token-file", "/nowhere/token"], "/nowhere/token"),
+        (["--status-socket", "/nowhere/x.sock"], "/nowhere/x.sock"),
+        (["--record-keep-mb", "5", "--record", "x.log"], "record_part_mb"),
+        (["--record", "x.asc"], "microsecond"),
+        (["--record-part-s", "0.1"], "--record-part-s"),
+        (["--log-format", "xml"], "--log-format"),
+        (["--log-level", "loud"], "--log-level"),
+    ],
+)
+@pytest.mark.parametrize("log_format", ["text", "json"])
+def test_what_cannot_be_served_is_one_line_and_exit_2(
+    bus: list[str],
+    folder: Path,
+    log_format: str,
+    arguments: list[str],
+    say: str,
+) -> None:
+    if "--log-format" in arguments and log_format == "json":
+        pytest.skip("the format itself is what is wrong")
+    ended = in_process("run", *bus, *MODEL, "--log-format", log_format, *arguments)
+    assert ended.code == 2
+    assert ended.out == ""
+    lines = ended.err.splitlines()
+    assert len(lines) == 1, ended.err
+    assert say in lines[0]
+    assert not list(folder.iterdir())

@@ -1,0 +1,116 @@
+"""The files for operators: systemd's units, the example configuration, bounds of hostile files."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+from cangauge.errors import InputError
+from cangauge.service.config import load_config
+
+NAME = "cangauge@.service"
+
+
+@pytest.fixture
+def units(project: Path, tmp_path: Path) -> Path:
+    """The units as an operator installs them, with a command that is there."""
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("no systemd-analyze on this machine")
+    source = project / "contrib" / "systemd"
+    text = (source / NAME).read_text().replace("/usr/local/bin/cangauge", "/bin/true")
+    (tmp_path / NAME).write_text(text)
+    (tmp_path / "cangauge@can0.service").write_text(text)
+    (tmp_path / f"{NAME}.d").mkdir()
+    shutil.copy(source / "hardening.conf", tmp_path / f"{NAME}.d")
+    return tmp_path
+
+
+def analyze(units: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["systemd-analyze", *arguments],
+        env={"SYSTEMD_UNIT_PATH": f"{units}:", "PATH": "/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        timeout=60.0,
+        check=False,
+    )
+
+
+def test_the_units_are_what_systemd_reads(units: Path) -> None:
+    verified = analyze(units, "verify", str(units / "cangauge@can0.service"))
+    assert verified.returncode == 0, verified.stderr
+    # It only warns of keys that it does not know.
+    assert "cangauge" not in verified.stderr
+    broken = units / f"{NAME}.d" / "broken.conf"
+    broken.write_text("[Service]\nProtectSystm=strict\n")
+    assert "ProtectSystm" in analyze(units, "verify", str(units / "cangauge@can0.service")).stderr
+
+
+def test_the_hardened_service_is_exposed_little(units: Path) -> None:
+    rated = analyze(units, "security", "--offline=true", "cangauge@can0.service")
+    if "offline" in rated.stderr:
+        pytest.skip("this systemd cannot rate units offline")
+    found = re.search(r"exposure level for .*: ([\d.]+)", rated.stdout)
+    assert found is not None, rated.stdout + rated.stderr
+    assert float(found[1]) <= 2.0
+
+
+def test_the_unit_names_options_that_there_are(project: Path) -> None:
+    text = (project / "contrib" / "systemd" / NAME).read_text()
+    command = re.search(r"^ExecStart=\S+ run (.*)$", text, re.MULTILINE)
+    assert command is not None
+    from typer.main import get_command  # noqa: PLC0415
+
+    from cangauge.cli.app import app  # noqa: PLC0415
+
+    known = {
+        option
+        for parameter in get_command(app).commands["run"].params  # type: ignore[attr-defined] # a group
+        for option in parameter.opts
+    }
+    assert set(re.findall(r"--[\w-]+", command[1])) <= known
+
+
+def test_the_example_configuration_is_one(project: Path) -> None:
+    config = load_config(project / "contrib" / "systemd" / "example.toml")
+    assert config.record == "/var/lib/cangauge/can0/drive.log.gz"
+    limits = config.record_limits()
+    assert (limits.part_bytes, limits.part_s, limits.keep_bytes) == (
+        64_000_000,
+        3600,
+        2_000_000_000,
+    )
+    address = config.http_address()
+    assert address is not None
+    assert address.host == "127.0.0.1"
+
+
+@pytest.mark.parametrize(
+    ("text", "say"),
+    [
+        (".".join("a" * 100_000) + " = 1", "dots"),
+        ("a = " + "[" * 120_000, "nested too deeply"),
+        ("a = " + "{a=" * 80_000, "nested too deeply"),
+        ("a = " + "9" * 250_000, "not TOML"),
+        ("a = \0", "not TOML"),
+        ("[[a]]\n" * 40_000, "unknown key|valid|missing"),
+        ("[" + ".".join("a" * 150) + ".b]\n" + "x = 1\n", "unknown key|missing"),
+        ("".join(f"a{number} = 1\n" for number in range(20_000)), "unknown key"),
+        ("#" * 300_000, "larger than 256 kB"),
+        (b"\xff\xfe\x00", "not TOML"),
+    ],
+)
+def test_a_hostile_configuration_is_refused_in_no_time(
+    tmp_path: Path, text: str | bytes, say: str
+) -> None:
+    path = tmp_path / "car.toml"
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    began = time.perf_counter()
+    with pytest.raises(InputError, match=say):
+        load_config(path)
+    assert time.perf_counter() - began < 5.0

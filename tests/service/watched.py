@@ -1,0 +1,69 @@
+"""A gauge, a port and a monitor over it, without a bus."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.vehicle import load_vehicle
+from cangauge.estimate.offline import samples_of
+from cangauge.service.gauge import Gauge
+from cangauge.service.monitor import Monitor
+from cangauge.service.notify import Notifier
+from cangauge.service.snapshot import Identity
+from live import leaf_model, short_log
+
+IDENTITY = Identity(
+    bus="virtual x",
+    vehicle="generic",
+    model="leaf.json",
+    method="ekf",
+    time_source="receive",
+    began_s=1.7e9,
+)
+
+
+@dataclass
+class StandInPort:
+    """The counts of a port."""
+
+    garbled: int = 1
+    error_frames: int = 2
+    unsent: int = 3
+    queue_drops: int | None = 4
+    is_off: bool = False
+
+
+@dataclass
+class Watched:
+    now_s: float = 100.0
+    port: Any = field(default_factory=StandInPort)
+    notifier: Notifier = field(default_factory=Notifier)
+    record: Any = None
+
+    def __post_init__(self) -> None:
+        self.gauge = Gauge(load_vehicle("generic"), leaf_model())
+        self.monitor = Monitor(
+            self.gauge,
+            self.port,
+            identity=IDENTITY,
+            notifier=self.notifier,
+            record=self.record,
+            clock=lambda: self.now_s,
+        )
+
+    def drive(self, seconds: float) -> None:
+        """Handle the frames of a drive, publishing as the loop does."""
+        encoder = FrameEncoder(load_vehicle("generic"))
+        for sample in samples_of(short_log(seconds)):
+            for frame in encoder.encode(sample):
+                before = self.gauge.samples
+                self.gauge.handle(frame)
+                if self.gauge.samples != before:
+                    self.monitor.stepped(frame.timestamp, 30_000)
+        self.gauge.heartbeat(is_stale=False)
+
+    def turn(self, later_s: float = 1.0) -> None:
+        self.now_s += later_s
+        self.monitor.turn(self.now_s)

@@ -1,0 +1,95 @@
+"""Watching and recording on a real SocketCAN interface: kernel stamps, and no frame the worse."""
+
+from __future__ import annotations
+
+import threading
+import time
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.open import BusAddress, has_socketcan, open_bus
+from cangauge.bus.receive import BusPort
+from cangauge.bus.vehicle import load_vehicle
+from cangauge.estimate.offline import samples_of
+from cangauge.service.address import http_address
+from cangauge.service.capture_estimate import estimate_capture
+from cangauge.service.endpoint import Endpoint
+from cangauge.service.gauge import Gauge
+from cangauge.service.loop import LoopSettings, Outputs, serve
+from cangauge.service.monitor import Monitor
+from cangauge.service.notify import Notifier
+from cangauge.service.record import Recorder, RecordLimits
+from cangauge.service.snapshot import Identity
+from live import leaf_model, short_log, waits
+
+pytestmark = pytest.mark.socketcan
+
+VCAN = BusAddress("socketcan", "vcan0")
+IDENTITY = Identity("vcan0", "generic", "leaf.json", "ekf", "receive", 0.0)
+
+
+@pytest.fixture(autouse=True)
+def _vcan0() -> None:
+    if not has_socketcan("vcan0"):
+        pytest.skip("no SocketCAN interface vcan0 on this machine (see tests/socketcan)")
+
+
+def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
+    gauge = Gauge(load_vehicle("generic"), leaf_model())
+    rows = []
+    stop = threading.Event()
+    encoder = FrameEncoder(load_vehicle("generic"))
+    frames = [encoder.encode(sample) for sample in samples_of(short_log(50.0))]
+    with (
+        BusPort(open_bus(VCAN, gauge.filters), "vcan0") as port,
+        BusPort(open_bus(VCAN, []), "sender") as sender,
+        Recorder(tmp_path / "seen.blf", RecordLimits(part_bytes=5_000)) as recorder,
+    ):
+        monitor = Monitor(gauge, port, identity=IDENTITY, notifier=Notifier(), record=recorder)
+
+        def turn(now_s: float) -> None:
+            monitor.turn(now_s)
+            recorder.tick(now_s)
+
+        outputs = Outputs(
+            record=recorder,
+            table=lambda _, estimate: rows.append(estimate),
+            show=turn,
+            stepped=monitor.stepped,
+            sent=monitor.sent,
+        )
+        loop = threading.Thread(
+            target=serve, args=(port, gauge, LoopSettings(), outputs, stop.is_set)
+        )
+        loop.start()
+        with Endpoint(lambda: monitor.latest, http=http_address("127.0.0.1:0")) as endpoint:
+            scrapes = 0
+            for number, group in enumerate(frames, start=1):
+                for frame in group:
+                    sender.send(frame)
+                time.sleep(0.002)
+                if number % 50 == 0:
+                    # No faster than this machine: what it can carry is not what is tested here.
+                    assert waits(lambda done=number: gauge.samples >= done, 20.0), gauge.counters
+                    url = f"http://127.0.0.1:{endpoint.port}/metrics"
+                    with urllib.request.urlopen(url, timeout=10.0) as answer:
+                        scrapes += b"cangauge_samples_total" in answer.read()
+        time.sleep(0.6)
+        stop.set()
+        loop.join(5.0)
+    snapshot = monitor.latest
+    assert scrapes == len(frames) // 50
+    assert snapshot.samples == len(frames) == 500
+    assert snapshot.lost == snapshot.rejected == 0
+    # By the kernel's stamps, so from the moment that the frame was there.
+    assert snapshot.latency.count >= 10
+    assert 0.0 < snapshot.latency.total_s / snapshot.latency.count < 1.0
+    recorded = estimate_capture(recorder.path, load_vehicle("generic"), leaf_model())
+    assert len(list(tmp_path.iterdir())) > 1
+    assert recorded.table.soc_pct.tolist() == [each.soc_pct for each in rows]
+    residual = np.array([each.residual_v for each in rows])
+    assert np.array_equal(recorded.table.residual_v, residual, equal_nan=True)
