@@ -50,7 +50,21 @@ class InputError(CangaugeError):
         where = ": ".join(part for part in (self.source, self.field) if part)
         text = f"{where}: {self.problem}" if where else self.problem
         if self.value is not None:
-            text += f" (got {self.value!r})"
+            text += f" (got {_shown(self.value)})"
         if self.cure:
             text += f"; {self.cure}"
-        return text
+        # What a file or its name holds must neither break the line nor control a terminal.
+        return "".join(
+            char if char.isprintable() else char.encode("unicode_escape").decode() for char in text
+        )
+
+
+_LONGEST_VALUE = 160
+
+
+def _shown(value: object) -> str:
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # a number of more than 4300 digits; lists in lists in …
+        return f"a huge {type(value).__name__}"
+    return text if len(text) <= _LONGEST_VALUE else text[:_LONGEST_VALUE] + "…"

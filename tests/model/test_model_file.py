@@ -63,5 +63,5 @@ def test_refuses_what_is_no_model(tmp_path: Path, text: str) -> None:
 
 
 def test_says_where_a_missing_file_was_looked_for(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"nowhere\.json.*cannot be read"):
+    with pytest.raises(InputError, match=r"nowhere\.json.*no such file"):
         load_model(tmp_path / "nowhere.json")

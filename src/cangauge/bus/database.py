@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import difflib
 import logging
 import re
-from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
 from typing import Final
@@ -14,9 +12,10 @@ import cantools.database
 from cantools.database.can import Database, Message, Signal
 
 from cangauge.errors import InputError
+from cangauge.files import read_bounded
+from cangauge.limits import MAX_DBC_BYTES
+from cangauge.nearest import closest
 
-MAX_BYTES: Final = 4 * 1024 * 1024
-"""Reading takes 1–6 s a megabyte; the largest files in use are smaller than this."""
 MAX_MESSAGES: Final = 20_000
 MAX_MESSAGE_BYTES: Final = 1785
 """The longest that J1939 can transport. cantools lays out every bit of a message in memory."""
@@ -148,28 +147,8 @@ def find_signal(
     )
 
 
-def closest(word: str, names: Iterable[str]) -> str:
-    """Return the names most like a word, joined by commas; "" if none is."""
-    by_lower = {name.lower(): name for name in names}
-    hits = difflib.get_close_matches(word.lower(), by_lower, n=3, cutoff=0.5)
-    return ", ".join(by_lower[hit] for hit in hits)
-
-
 def _read_text(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except FileNotFoundError as error:
-        raise InputError("no such file", source=path, cure="check the path") from error
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"cannot be read: {reason}", source=path) from error
-    if len(data) > MAX_BYTES:
-        raise InputError(
-            f"the DBC is larger than {MAX_BYTES // 1024 // 1024} MB",
-            source=path,
-            cure="cut it down to the messages that you need",
-        )
+    data = read_bounded(path, MAX_DBC_BYTES, "a DBC")
     if not data.strip():
         raise InputError("the DBC is empty", source=path)
     try:

@@ -10,20 +10,25 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from cangauge.errors import InputError
+from cangauge.files import read_bounded
+from cangauge.limits import MAX_MODEL_BYTES, MAX_MODEL_COLUMNS, MAX_MODEL_ITEMS
 from cangauge.logs.log import TemperatureSource
 from cangauge.model.effects.effect import Pack
 from cangauge.model.effects.library import parse_effects
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.voltage_model import BASIS_NAMES, VoltageModel
+from cangauge.schema import schema_error
 
 MODEL_FORMAT = "cangauge-model"
 MODEL_VERSION = 1
-LARGEST_FILE_BYTES = 16 << 20
+_CURE = "make the file again with `cangauge fit`"
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Span = tuple[Finite, Finite]
+Columns = Field(max_length=MAX_MODEL_COLUMNS)
+Items = Field(max_length=MAX_MODEL_ITEMS)
 
 
 class _Strict(BaseModel):
@@ -67,10 +72,10 @@ class Information(_Strict):
     another log can be stacked below: joint identification without the old logs.
     """
 
-    columns: list[str]
-    scale: list[Positive]
-    root: list[list[Finite]]
-    projected: list[Finite]
+    columns: Annotated[list[str], Columns]
+    scale: Annotated[list[Positive], Columns]
+    root: Annotated[list[Annotated[list[Finite], Columns]], Columns]
+    projected: Annotated[list[Finite], Columns]
     rows: Annotated[int, Field(gt=0)]
     residual_sum_v2: NotNegative
 
@@ -95,8 +100,8 @@ class Made(_Strict):
     """How the model was made."""
 
     by: str
-    options: dict[str, str | float | int | bool | list[float] | None]
-    logs: list[SourceLog]
+    options: Annotated[dict[str, str | float | int | bool | list[float] | None], Items]
+    logs: Annotated[list[SourceLog], Items]
     fingerprint: str
 
 
@@ -106,13 +111,13 @@ class ModelFile(_Strict):
     format: Literal["cangauge-model"] = "cangauge-model"
     version: Literal[1] = 1
     name: str
-    coefficients: dict[str, Coefficient]
+    coefficients: Annotated[dict[str, Coefficient], Items]
     epsilon: Annotated[float, Field(gt=0, lt=0.5)]
     t_ref_c: Finite
     delays_s: Annotated[list[NotNegative], Field(min_length=1, max_length=64)]
     rate_hz: Positive
     capacity_ah: Positive
-    effects: list[dict[str, object]] = []
+    effects: Annotated[list[dict[str, object]], Items] = []
     temperature_source: TemperatureSource
     range: Ranges
     noise: ModelNoise
@@ -186,14 +191,9 @@ def load_model(path: Path | str) -> ModelFile:
         If it cannot be read or does not describe a usable model; names the field.
     """
     path = Path(path)
+    data = read_bounded(path, MAX_MODEL_BYTES, "a model file")
     try:
-        if path.stat().st_size > LARGEST_FILE_BYTES:
-            raise InputError("too large for a model file", source=path, value=path.stat().st_size)
-        raw = json.loads(path.read_bytes(), parse_constant=_no_constant)
-    except OSError as error:
-        raise InputError(
-            f"cannot be read ({error.strerror})", source=path, cure="check the path after -m"
-        ) from error
+        raw = json.loads(data, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
         raise InputError(
             f"is no JSON ({error})", source=path, cure="a model file is made by `cangauge fit`"
@@ -218,25 +218,12 @@ def load_model(path: Path | str) -> ModelFile:
         model = ModelFile.model_validate(raw)
         model.extended_model()
     except ValidationError as error:
-        raise _as_input_error(error, path) from error
+        raise schema_error(error, ModelFile, path, _CURE) from error
     except InputError as error:
         raise InputError(
             error.problem, source=path, field=error.field, value=error.value, cure=error.cure
         ) from error
     return model
-
-
-def _as_input_error(error: ValidationError, path: Path) -> InputError:
-    first = error.errors()[0]
-    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-    value = first["input"]
-    return InputError(
-        first["msg"].removeprefix("Value error, ") + more,
-        source=path,
-        field=".".join(str(part) for part in first["loc"]) or None,
-        value=value if isinstance(value, str | int | float) else None,
-        cure="make the file again with `cangauge fit`",
-    )
 
 
 def _no_constant(name: str) -> float:
