@@ -62,9 +62,10 @@ def read_parquet(content: Content) -> Draft:
         _refuse_large(file.metadata, path)
         for field, index in places.items():
             _check_type(field, schema.field(index), path)
-        if _SOURCE in places:
-            # A long word, repeated in millions of rows, takes no room in the file.
-            file = _open_parquet(content, schema.names[places[_SOURCE]])
+        texts = [schema.names[i] for i in places.values() if _is_text(schema.field(i).type)]
+        if texts:
+            # A long text, repeated in millions of rows, takes no room in the file.
+            file = _open_parquet(content, *texts)
         table = file.read(columns=[schema.names[i] for i in places.values()])
     except (pa.ArrowException, OSError, ValueError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
@@ -262,15 +263,11 @@ def _refuse_large(metadata: Any, path: object) -> None:
 
 def _check_type(field: str, column: Any, path: object) -> None:
     kind, types = column.type, pa.types
-    if field == _SOURCE:
-        kind = kind.value_type if types.is_dictionary(kind) else kind
-        good = types.is_string(kind) or types.is_large_string(kind) or types.is_null(kind)
-        what, cure = "words", f"store it as one of: {', '.join(TEMPERATURE_SOURCES)}"
-    else:
-        good = any(
-            is_kind(kind)
-            for is_kind in (types.is_integer, types.is_floating, types.is_decimal, types.is_null)
-        )
+    good = _is_text(kind) or types.is_null(kind)
+    what, cure = "words", f"store it as one of: {', '.join(TEMPERATURE_SOURCES)}"
+    if field != _SOURCE:
+        numbers = (types.is_integer, types.is_floating, types.is_decimal)
+        good = good or any(is_kind(kind) for is_kind in numbers)
         what, cure = "numbers", "store it as floating point"
     if not good:
         raise InputError(
@@ -280,6 +277,11 @@ def _check_type(field: str, column: Any, path: object) -> None:
             value=str(kind)[:60],
             cure=cure,
         )
+
+
+def _is_text(kind: Any) -> bool:
+    kind = kind.value_type if pa.types.is_dictionary(kind) else kind
+    return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind))
 
 
 def _as_numbers(column: Any, label: str, path: object) -> FloatArray:
