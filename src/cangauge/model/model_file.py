@@ -26,7 +26,18 @@ _CURE = "make the file again with `cangauge fit`"
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Span = tuple[Finite, Finite]
+
+# Wider than any pack needs, and narrow enough that nothing overflows on the way to a voltage.
+_Value = Annotated[float, Field(ge=-1e12, le=1e12)]
+_Soc = Annotated[float, Field(ge=-10, le=110)]
+_Celsius = Annotated[float, Field(ge=-273.15, le=1000)]
+_Ampere = Annotated[float, Field(ge=-1e6, le=1e6)]
+_Volts = Annotated[float, Field(ge=0, le=1e6)]
+_Delay = Annotated[float, Field(ge=0, le=3600)]
+_Seconds = Annotated[float, Field(ge=0, le=1e9)]
+SocSpan = tuple[_Soc, _Soc]
+TemperatureSpan = tuple[_Celsius, _Celsius]
+CurrentSpan = tuple[_Ampere, _Ampere]
 Columns = Field(max_length=MAX_MODEL_COLUMNS)
 Items = Field(max_length=MAX_MODEL_ITEMS)
 
@@ -38,7 +49,7 @@ class _Strict(BaseModel):
 class Coefficient(_Strict):
     """One coefficient of the voltage model."""
 
-    value: Finite
+    value: _Value
     std_error: NotNegative | None = None
     unit: Literal["V", "V/K", "ohm"]
 
@@ -46,21 +57,21 @@ class Coefficient(_Strict):
 class Ranges(_Strict):
     """What the model was identified on; beyond it, it is flagged and bounded."""
 
-    soc_pct: Span
-    temperature_c: Span
-    current_a: Span
+    soc_pct: SocSpan
+    temperature_c: TemperatureSpan
+    current_a: CurrentSpan
 
 
 class ModelNoise(_Strict):
     """The model's voltage error on data that its fit did not see."""
 
-    fast_std_v: NotNegative
-    fast_time_s: NotNegative
-    slow_std_v: NotNegative
-    slow_time_s: Positive
-    lasting_std_v: NotNegative
+    fast_std_v: _Volts
+    fast_time_s: _Seconds
+    slow_std_v: _Volts
+    slow_time_s: Annotated[float, Field(gt=0, le=1e9)]
+    lasting_std_v: _Volts
     voltage_mae_pct: NotNegative
-    voltage_rmse_v: NotNegative
+    voltage_rmse_v: _Volts
     judged_on: str
 
 
@@ -112,11 +123,11 @@ class ModelFile(_Strict):
     version: Literal[1] = 1
     name: str
     coefficients: Annotated[dict[str, Coefficient], Items]
-    epsilon: Annotated[float, Field(gt=0, lt=0.5)]
-    t_ref_c: Finite
-    delays_s: Annotated[list[NotNegative], Field(min_length=1, max_length=64)]
-    rate_hz: Positive
-    capacity_ah: Positive
+    epsilon: Annotated[float, Field(ge=1e-4, lt=0.5)]
+    t_ref_c: _Celsius
+    delays_s: Annotated[list[_Delay], Field(min_length=1, max_length=64)]
+    rate_hz: Annotated[float, Field(ge=1e-3, le=1e4)]
+    capacity_ah: Annotated[float, Field(ge=1e-3, le=1e5)]
     effects: Annotated[list[dict[str, object]], Items] = []
     temperature_source: TemperatureSource
     range: Ranges
