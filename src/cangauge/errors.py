@@ -48,7 +48,8 @@ class InputError(CangaugeError):
 
     def _line(self) -> str:
         field = None if self.field is None else _short(self.field)
-        where = ": ".join(part for part in (self.source, field) if part)
+        source = None if self.source is None else _short(self.source, _LONGEST_PATH)
+        where = ": ".join(part for part in (source, field) if part)
         problem = _short(self.problem, _LONGEST_PROBLEM)
         text = f"{where}: {problem}" if where else problem
         if self.value is not None:
@@ -64,6 +65,7 @@ class InputError(CangaugeError):
 # What is quoted from a file may be of any length; a message is to be read.
 _LONGEST_VALUE = 160
 _LONGEST_PROBLEM = 600
+_LONGEST_PATH = 1000
 
 
 def _short(text: str, longest: int = _LONGEST_VALUE) -> str:

@@ -22,6 +22,10 @@ MAX_LOG_BYTES: Final = 1024 * MIB
 MAX_LOG_ROWS: Final = 20_000_000
 """Rows of a log, samples of a capture: 23 days at 10 Hz, 0.8 GB of numbers."""
 MAX_LOG_COLUMNS: Final = 10_000
+MAX_LOG_SPAN_S: Final = 366 * 86400.0
+"""From the first row to the last [s]: where a clock was set within a log, decades seem to pass."""
+MAX_HEADING: Final = 200
+"""A column's heading that is longer is none that is known [characters]."""
 MAX_ODD_ROWS: Final = 100
 """Rows with a wrong number of cells that are kept for the message."""
 MAX_PARQUET_NAMES: Final = 16 * MIB
@@ -37,7 +41,7 @@ MAX_BLF_OBJECT: Final = 16 * MIB
 MAX_BUSES: Final = 64
 """Buses in one capture: each is decoded for itself."""
 MAX_STAMP_S: Final = 1e11
-"""Largest time stamp of a frame [s]: the year 5138, if it counts from 1970."""
+"""Largest time stamp of a frame or a row [s]: the year 5138, if it counts from 1970."""
 
 # --- DBC ----------------------------------------------------------------------------------------
 MAX_DBC_BYTES: Final = 4 * MIB

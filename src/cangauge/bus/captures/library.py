@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -17,6 +18,9 @@ from cangauge.bus.captures.blf import CheckedBlf
 from cangauge.bus.captures.stream import open_bytes
 from cangauge.errors import InputError
 from cangauge.limits import MAX_LINE
+
+# Its readers log a line for every object that they do not know: a hostile file has millions.
+logging.getLogger("can").addHandler(logging.NullHandler())
 
 # What python-can's readers raise on damaged files.
 DAMAGE: Final = (
