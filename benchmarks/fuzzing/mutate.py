@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from random import Random
 from typing import Any
 
-MAX_BYTES = 200_000
+MAX_BYTES = 20_000
 """Mutants are kept below this size: what is large is tested apart, by name."""
 
 NUMBERS = (

@@ -7,6 +7,7 @@ left of its share is given to another one.
 from __future__ import annotations
 
 import contextlib
+import math
 import multiprocessing as mp
 import resource
 import time
@@ -15,11 +16,12 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from multiprocessing.connection import Connection, wait
 from random import Random
 from typing import Any
 
-from fuzzing.targets import Target, attempt, targets
+from fuzzing.targets import Target, attempt
 
 SLOW_S = 2.0
 """More CPU time than this for one input (or 200 frames) is a finding [s]."""
@@ -116,6 +118,9 @@ def fuzz(
     seed: int,
     workers: int,
     progress: Callable[[str, int], None],
+    *,
+    module: str = "fuzzing.targets",
+    hang_s: float = HANG_S,
 ) -> dict[str, Tally]:
     """Run all shares; return a tally for each target.
 
@@ -127,11 +132,15 @@ def fuzz(
         Processes at a time.
     progress : callable
         Called with a target and the inputs done, for every share that is done.
+    module : str
+        Whose `targets()` are run.
+    hang_s : float
+        A worker that is so long at one input is killed [s].
     """
-    weights = {target.name: target.weight for target in targets()}
+    weights = {target.name: target.weight for target in import_module(module).targets()}
     tallies = {share.target: Tally() for share in shares}
     open_ = deque(shares)
-    team = [_Worker(seed) for _ in range(workers)]
+    team = [_Worker(seed, module) for _ in range(workers)]
     try:
         while open_ or any(worker.share for worker in team):
             for worker in team:
@@ -151,7 +160,7 @@ def fuzz(
                         tallies[share.target].add(done)
                         progress(share.target, done.inputs)
                         continue
-                elif worker.stuck():
+                elif worker.stuck(hang_s):
                     what = "hung"
                 else:
                     continue
@@ -167,7 +176,7 @@ def fuzz(
                     if part.start < part.stop
                 )
                 worker.end()
-                team[place] = _Worker(seed)
+                team[place] = _Worker(seed, module)
     finally:
         for worker in team:
             worker.end()
@@ -177,19 +186,22 @@ def fuzz(
 class _Worker:
     """A process that tries one share at a time."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, module: str) -> None:
         context = mp.get_context("spawn")
         self.connection, theirs = context.Pipe()
         # Number of the input at work, and when it began.
         self._at = context.RawArray("d", 2)
         self.share: Share | None = None
-        self._process = context.Process(target=_work, args=(theirs, self._at, seed), daemon=True)
+        self._process = context.Process(
+            target=_work, args=(theirs, self._at, seed, module), daemon=True
+        )
         self._process.start()
         theirs.close()
 
     def give(self, share: Share) -> None:
         self.share = share
-        self._at[0], self._at[1] = share.start, time.monotonic()
+        # Its time begins when it does: a process takes a while to start.
+        self._at[0], self._at[1] = share.start, math.inf
         self.connection.send(share)
 
     def take(self) -> Tally | None:
@@ -205,8 +217,8 @@ class _Worker:
     def number(self) -> int:
         return int(self._at[0])
 
-    def stuck(self) -> bool:
-        return time.monotonic() - self._at[1] > HANG_S
+    def stuck(self, hang_s: float) -> bool:
+        return time.monotonic() - self._at[1] > hang_s
 
     def exit_code(self) -> int | None:
         self._process.join(5.0)
@@ -221,20 +233,23 @@ class _Worker:
         self._process.join()
 
 
-def _work(connection: Connection, at: Any, seed: int) -> None:
+def _work(connection: Connection, at: Any, seed: int, module: str) -> None:
     warnings.simplefilter("error", RuntimeWarning)  # numpy's, which a user would see on stderr
     with contextlib.suppress(ValueError, OSError):
         resource.setrlimit(resource.RLIMIT_DATA, (DATA_LIMIT, DATA_LIMIT))
-    by_name = {target.name: target for target in targets()}
-    for target in by_name.values():  # what is built once belongs to no input
-        with contextlib.suppress(Exception):
-            attempt(target, input_of(target, seed, 0))
+    by_name: dict[str, Target] = {each.name: each for each in import_module(module).targets()}
+    warm: set[str] = set()
     while True:
         try:
             share: Share = connection.recv()
         except (EOFError, OSError):
             return
         target, tally = by_name[share.target], Tally()
+        if share.target not in warm:  # what is built once belongs to no input
+            warm.add(share.target)
+            at[1] = time.monotonic()
+            with contextlib.suppress(Exception):
+                attempt(target, input_of(target, seed, share.start))
         for number in range(share.start, share.stop):
             at[0], at[1] = number, time.monotonic()
             try_one(target, input_of(target, seed, number), number, tally)

@@ -34,6 +34,16 @@ def load(folder: Path, content: bytes) -> None:
         ("BO_ 1 X: " + "9" * 5000 + " Y\n", "a message of so many bytes"),
         ('BO_ 1 X: 8 Y\n SG_ a : 0|800000000@1+ (1,0) [0|1] "" Y\n', "of so many bits"),
         ('BO_ 1 X: 8 Y\n SG_ a m3 : 100000000|8@0+ (1,0) [0|1] "" Y\n', "starts at such a bit"),
+        ('BO_ 1 X: 8 Y\n SG_ a : -2147483649|8@1+ (1,0) [0|1] "" Y\n', "starts at such a bit"),
+        ('BO_ 1 X: 8 Y\n SG_ a : 0|-100000000@0+ (1,0) [0|1] "" Y\n', "of so many bits"),
+        ("BO_ 1 X: -8 Y\n", "a message of so many bytes"),
+        ("BO_ 1 X: +100000000 Y\n", "a message of so many bytes"),
+        ("BO_ 1 X: // here:\n 100000000 Y\n", "a message of so many bytes"),
+        (
+            'BO_ 1 X: 8 Y\n SG_ a m0 : 0|8@1+ (1,0) [0|1] "" Y\n SG_ M M : 8|8@1+ (1,0) [0|1] "" Y'
+            '\n SG_ x y : 16|8@1+ (1,0) [0|1] "" Y\n',
+            "not a DBC",
+        ),
         (GOOD + "SG_MUL_VAL_ 256 s s 0-4000000000;\n", "too many multiplexer values"),
         (GOOD + "SG_MUL_VAL_ 256 s s " + "0-60000, " * 9 + "0-1;\n", "too many multiplexer"),
         ("BO_ 1 X: 8 Y\n" * 30_000, "more than 20000 messages"),

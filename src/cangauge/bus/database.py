@@ -23,10 +23,23 @@ MAX_MULTIPLEXER_VALUE: Final = (1 << 32) - 1
 MAX_MULTIPLEXER_VALUES: Final = 65_536
 """cantools makes a list of every value in a range of multiplexer values."""
 
+_WHAT_CANTOOLS_RAISES: Final = (
+    cantools.Error,
+    LookupError,
+    ValueError,
+    TypeError,
+    ArithmeticError,
+    AttributeError,
+    AssertionError,  # it asserts that a multiplexed signal says by what
+)
+
 # What cantools reads as these statements, and with possessive quantifiers, so that no text takes
 # more than linear time.
-_MESSAGE = re.compile(r"(?<![A-Za-z_])BO_\s++\d++\s*+\w++\s*+:\s*+(\d++)")
-_SIGNAL = re.compile(r"(?<![A-Za-z_])SG_\s++\w++\s*+(?:\w++\s*+)?:\s*+(\d++)\s*+\|\s*+(\d++)\s*+@")
+_STRING_OR_COMMENT = re.compile(r'"(\\"|[^"])*?"|//[^\n]*+\n')
+_MESSAGE = re.compile(r"(?<![A-Za-z_])BO_\s++[-+]?\d++\s*+\w++\s*+:\s*+([-+]?\d++)")
+_SIGNAL = re.compile(
+    r"(?<![A-Za-z_])SG_\s++\w++\s*+(?:\w++\s*+)?:\s*+([-+]?\d++)\s*+\|\s*+([-+]?\d++)\s*+@"
+)
 _MULTIPLEXER_VALUES = re.compile(r"(?<![A-Za-z_])SG_MUL_VAL_\s[^;]*+")
 _RANGE = re.compile(r"(?<!\d)(\d++)\s*+-\s*+(\d++)")
 
@@ -53,7 +66,7 @@ def load_dbc(path: str | PathLike[str]) -> Database:
         database = cantools.database.load_string(text, "dbc", strict=False)
     except RecursionError as error:
         raise InputError("signals are multiplexed in a circle", source=path) from error
-    except (cantools.Error, LookupError, ValueError, TypeError, ArithmeticError) as error:
+    except _WHAT_CANTOOLS_RAISES as error:
         raise InputError(
             f"not a DBC file that can be read: {_first_line(error)}",
             source=path,
@@ -159,6 +172,8 @@ def _read_text(path: Path) -> str:
 
 def _refuse_hostile(text: str, path: Path) -> None:
     """Refuse figures that would make cantools fill the memory."""
+    # A comment may stand between any two words, and a string may look like anything.
+    text = _STRING_OR_COMMENT.sub(lambda match: '""' if match[0][0] == '"' else " ", text)
     messages = 0
     for match in _MESSAGE.finditer(text):
         messages += 1
@@ -183,7 +198,7 @@ def _refuse_hostile(text: str, path: Path) -> None:
 
 
 def _bounded(figure: str, limit: int, what: str, path: Path) -> None:
-    if len(figure) > 12 or int(figure) > limit:
+    if figure.startswith("-") or len(figure) > 13 or int(figure) > limit:
         raise InputError(f"the DBC defines {what}", source=path, value=figure[:20])
 
 

@@ -67,6 +67,7 @@ def read_parquet(content: Content) -> Draft:
             # A long text, repeated in millions of rows, takes no room in the file.
             file = _open_parquet(content, *texts)
         table = file.read(columns=[schema.names[i] for i in places.values()])
+        table.validate(full=True)  # damage can point outside of a dictionary
     except (pa.ArrowException, OSError, ValueError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise InputError(

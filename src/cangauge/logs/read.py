@@ -12,11 +12,14 @@ from cangauge.logs.assemble import Draft
 from cangauge.logs.content import Content, cells, delimiter_of, read_content
 from cangauge.logs.log import TEMPERATURE_SOURCES, Log, TemperatureSource
 from cangauge.logs.signs import settle_sign
+from cangauge.logs.units import COLDEST_C, HOTTEST_C
 
 _KNOWN = (
     "known are: canonical Parquet and CSV (time_s, current_a, voltage_v, temperature_c, soc_pct),"
-    " ANL D3 tests, BMW i3 trips, Arbin, Bitrode and VisuaLCN exports"
+    " ANL D3 tests, BMW i3 trips, Arbin, Bitrode and VisuaLCN exports; and, with --vehicle or"
+    " --dbc and --map, CAN captures: candump, CRTD, ASC, BLF, TRC, MF4, CSV"
 )
+_NEITHER = "not a known kind of log, nor of capture"
 
 
 class CaptureGivenError(InputError):
@@ -61,6 +64,12 @@ def read_log(
             value=temperature_source,
             cure=f"use one of: {', '.join(TEMPERATURE_SOURCES)}",
         )
+    if temperature_c is not None and not COLDEST_C <= temperature_c <= HOTTEST_C:
+        raise InputError(
+            f"must lie within {COLDEST_C:g} … {HOTTEST_C:g} °C",
+            field="--temperature",
+            value=temperature_c,
+        )
     content = read_content(path)
     draft = _read(content)
     log = draft.to_log(temperature_c)
@@ -94,9 +103,9 @@ def _unknown(content: Content, line: str) -> InputError:
         )
     shown = line.strip()
     if not shown or not shown.isprintable():
-        return InputError("the file is not a known kind of log", source=content.path, cure=_KNOWN)
+        return InputError(_NEITHER, source=content.path, cure=_KNOWN)
     return InputError(
-        "the file is not a known kind of log",
+        _NEITHER,
         source=content.path,
         field="first line",
         value=shown[:80],

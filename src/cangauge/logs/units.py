@@ -200,8 +200,8 @@ def _check_voltage(voltage: FloatArray, refuse: _Refuse) -> None:
         )
     if middle < 1.0:
         raise refuse("voltage_v", "voltage looks like kilovolts", middle, "give it in volts")
-    row = int(np.argmax(voltage))
-    if voltage[row] > MAX_VOLTAGE_V:
+    row = int(np.argmax(np.abs(voltage)))
+    if abs(voltage[row]) > MAX_VOLTAGE_V:
         raise refuse(
             "voltage_v",
             f"row {row + 1} is not a battery's voltage",

@@ -4,10 +4,18 @@ from __future__ import annotations
 
 import json
 import math
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from cangauge.errors import InputError
 from cangauge.files import read_bounded
@@ -134,6 +142,13 @@ class ModelFile(_Strict):
     noise: ModelNoise
     information: Information | None = None
     made: Made
+
+    @field_validator("delays_s")
+    @classmethod
+    def _increasing(cls, delays_s: list[float]) -> list[float]:
+        if any(high <= low for low, high in pairwise(delays_s)):
+            raise ValueError(f"must increase, with R1 … R{len(delays_s)} in the same order")
+        return delays_s
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
