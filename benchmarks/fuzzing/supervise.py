@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from multiprocessing.connection import Connection, wait
+from pathlib import Path
 from random import Random
 from typing import Any
 
@@ -32,6 +33,7 @@ GROWTH_MB = 128.0
 DATA_LIMIT = 4 << 30
 """No worker gets more memory than this [bytes]."""
 CHUNK = 250
+_STATUS = Path("/proc/self/status")
 
 
 @dataclass
@@ -264,4 +266,10 @@ def _where(error: BaseException) -> tuple[str, str]:
 
 
 def _memory_mb() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    """Return the most memory that this process ever had [MB]."""
+    try:
+        with _STATUS.open() as status:
+            return next(float(line.split()[1]) for line in status if line[:6] == "VmHWM:") / 1024.0
+    except (OSError, StopIteration):
+        # Elsewhere than on Linux, where this begins with the parent's.
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
