@@ -177,7 +177,7 @@ def mutate_json(rng: Random, tree: Any) -> Any:
             donors = list(_nodes(tree))
             owner[key] = copy.deepcopy(rng.choice(donors))
         else:
-            owner[key] = rng.choice(_VALUES)
+            owner[key] = copy.deepcopy(rng.choice(_VALUES))
     return tree
 
 
