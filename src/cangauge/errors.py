@@ -47,10 +47,34 @@ class InputError(CangaugeError):
         super().__init__(self._line())
 
     def _line(self) -> str:
-        where = ": ".join(part for part in (self.source, self.field) if part)
-        text = f"{where}: {self.problem}" if where else self.problem
+        field = None if self.field is None else _short(self.field)
+        source = None if self.source is None else _short(self.source, _LONGEST_PATH)
+        where = ": ".join(part for part in (source, field) if part)
+        problem = _short(self.problem, _LONGEST_PROBLEM)
+        text = f"{where}: {problem}" if where else problem
         if self.value is not None:
-            text += f" (got {self.value!r})"
+            text += f" (got {_shown(self.value)})"
         if self.cure:
-            text += f"; {self.cure}"
-        return text
+            text += f"; {_short(self.cure, _LONGEST_PROBLEM)}"
+        # What a file or its name holds must neither break the line nor control a terminal.
+        return "".join(
+            char if char.isprintable() else char.encode("unicode_escape").decode() for char in text
+        )
+
+
+# What is quoted from a file may be of any length; a message is to be read.
+_LONGEST_VALUE = 160
+_LONGEST_PROBLEM = 600
+_LONGEST_PATH = 1000
+
+
+def _short(text: str, longest: int = _LONGEST_VALUE) -> str:
+    return text if len(text) <= longest else text[:longest] + "…"
+
+
+def _shown(value: object) -> str:
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # a number of more than 4300 digits; lists in lists in …
+        return f"a huge {type(value).__name__}"
+    return _short(text)

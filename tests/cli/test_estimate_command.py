@@ -199,7 +199,7 @@ def test_a_slow_log_has_no_gaps_by_default(run: Run, made: Path, tmp_path: Path)
         (["--max-gap-s", "nan"], ["--max-gap-s"]),
         (["-o", "soc.txt"], ["soc.txt", ".csv or .parquet"]),
         (["-o", "no/such/soc.csv"], ["no/such/soc.csv"]),
-        (["-m", "none.json"], ["none.json", "-m"]),
+        (["-m", "none.json"], ["none.json", "no such file"]),
         (["--report", "soc.csv"], ["two outputs"]),
     ],
 )

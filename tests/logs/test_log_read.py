@@ -89,8 +89,11 @@ def test_damaged_bytes_never_break_out(
         (b"", "the file is empty"),
         (b"\r\n \n", "the file is empty"),
         (gzip.compress(b""), "the file is empty"),
-        (b"\x00\x01\x02" * 100, "not a known kind of log; known are: canonical Parquet"),
-        (b"%PDF-1.4\n", r"first line: .*not a known kind of log \(got '%PDF-1.4'\)"),
+        (
+            b"\x00\x01\x02" * 100,
+            "not a known kind of log, nor of capture; known are: canonical Parquet",
+        ),
+        (b"%PDF-1.4\n", r"first line: .*not a known kind of log.* \(got '%PDF-1.4'\)"),
         (b"a,b,c\n1,2,3\n", r"\(got 'a,b,c'\)"),
         (b"\x1f\x8bnot gzip", "gzip file is cut off or damaged"),
         (b"PK\x03\x04not zip", "zip file is cut off or damaged"),

@@ -36,7 +36,7 @@ def test_round_trip(model: ModelFile, tmp_path: Path) -> None:
         (lambda raw: raw.update(capacity_ah=-1.0), "capacity_ah"),
         (lambda raw: raw["coefficients"]["k3"].update(value="many"), "coefficients.k3.value"),
         (lambda raw: raw["coefficients"].pop("R2"), None),
-        (lambda raw: raw.update(delays_s=[0.0, 30.0, 10.0, 70.0]), "delays"),
+        (lambda raw: raw.update(delays_s=[0.0, 30.0, 10.0, 70.0]), "delays_s"),
         (lambda raw: raw["coefficients"]["k5"].update(value=-1e5), "coefficients"),
         (lambda raw: raw.update(effects=[{"id": "hysteresis"}]), "effects.0"),
         (lambda raw: raw.update(surprise=1), "surprise"),
@@ -63,5 +63,5 @@ def test_refuses_what_is_no_model(tmp_path: Path, text: str) -> None:
 
 
 def test_says_where_a_missing_file_was_looked_for(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"nowhere\.json.*cannot be read"):
+    with pytest.raises(InputError, match=r"nowhere\.json.*no such file"):
         load_model(tmp_path / "nowhere.json")

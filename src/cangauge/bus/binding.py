@@ -26,6 +26,7 @@ _LOG_FIELD: Final = {
     "temperature": "temperature_c",
     "soc_reference": "soc_pct",
 }
+LONGEST_CYCLE_MS: Final = 1e9
 
 
 def bind_vehicle(
@@ -84,6 +85,14 @@ def bind_vehicle(
     )
 
 
+def _cycle_s(message: Message) -> float | None:
+    """Return the period that the DBC states [s]; None where that is no time."""
+    stated: object = message.cycle_time
+    if not isinstance(stated, int | float) or not 0.0 < stated <= LONGEST_CYCLE_MS:
+        return None
+    return stated / 1000.0
+
+
 class _Binder:
     """Finds the signals of one mapping and remembers the messages that they are in."""
 
@@ -135,8 +144,8 @@ class _Binder:
         for key, message in self._found.items():
             each, source = stated.get(key, (None, self._source))
             period = None if each is None else each.period_s
-            if period is None and message.cycle_time:
-                period = message.cycle_time / 1000.0
+            if period is None:
+                period = _cycle_s(message)
             rule = None if each is None else choose_rule(message, each, own, source=source)
             rules[key] = MessageRule(rule, period)
         return rules

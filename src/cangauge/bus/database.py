@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import difflib
 import logging
 import re
-from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
 from typing import Final
@@ -14,9 +12,10 @@ import cantools.database
 from cantools.database.can import Database, Message, Signal
 
 from cangauge.errors import InputError
+from cangauge.files import read_bounded
+from cangauge.limits import MAX_DBC_BYTES
+from cangauge.nearest import closest
 
-MAX_BYTES: Final = 4 * 1024 * 1024
-"""Reading takes 1–6 s a megabyte; the largest files in use are smaller than this."""
 MAX_MESSAGES: Final = 20_000
 MAX_MESSAGE_BYTES: Final = 1785
 """The longest that J1939 can transport. cantools lays out every bit of a message in memory."""
@@ -24,10 +23,23 @@ MAX_MULTIPLEXER_VALUE: Final = (1 << 32) - 1
 MAX_MULTIPLEXER_VALUES: Final = 65_536
 """cantools makes a list of every value in a range of multiplexer values."""
 
+_WHAT_CANTOOLS_RAISES: Final = (
+    cantools.Error,
+    LookupError,
+    ValueError,
+    TypeError,
+    ArithmeticError,
+    AttributeError,
+    AssertionError,  # it asserts that a multiplexed signal says by what
+)
+
 # What cantools reads as these statements, and with possessive quantifiers, so that no text takes
 # more than linear time.
-_MESSAGE = re.compile(r"(?<![A-Za-z_])BO_\s++\d++\s*+\w++\s*+:\s*+(\d++)")
-_SIGNAL = re.compile(r"(?<![A-Za-z_])SG_\s++\w++\s*+(?:\w++\s*+)?:\s*+(\d++)\s*+\|\s*+(\d++)\s*+@")
+_STRING_OR_COMMENT = re.compile(r'"(\\"|[^"])*?"|//[^\n]*+\n')
+_MESSAGE = re.compile(r"(?<![A-Za-z_])BO_\s++[-+]?\d++\s*+\w++\s*+:\s*+([-+]?\d++)")
+_SIGNAL = re.compile(
+    r"(?<![A-Za-z_])SG_\s++\w++\s*+(?:\w++\s*+)?:\s*+([-+]?\d++)\s*+\|\s*+([-+]?\d++)\s*+@"
+)
 _MULTIPLEXER_VALUES = re.compile(r"(?<![A-Za-z_])SG_MUL_VAL_\s[^;]*+")
 _RANGE = re.compile(r"(?<!\d)(\d++)\s*+-\s*+(\d++)")
 
@@ -54,7 +66,7 @@ def load_dbc(path: str | PathLike[str]) -> Database:
         database = cantools.database.load_string(text, "dbc", strict=False)
     except RecursionError as error:
         raise InputError("signals are multiplexed in a circle", source=path) from error
-    except (cantools.Error, LookupError, ValueError, TypeError, ArithmeticError) as error:
+    except _WHAT_CANTOOLS_RAISES as error:
         raise InputError(
             f"not a DBC file that can be read: {_first_line(error)}",
             source=path,
@@ -148,28 +160,8 @@ def find_signal(
     )
 
 
-def closest(word: str, names: Iterable[str]) -> str:
-    """Return the names most like a word, joined by commas; "" if none is."""
-    by_lower = {name.lower(): name for name in names}
-    hits = difflib.get_close_matches(word.lower(), by_lower, n=3, cutoff=0.5)
-    return ", ".join(by_lower[hit] for hit in hits)
-
-
 def _read_text(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except FileNotFoundError as error:
-        raise InputError("no such file", source=path, cure="check the path") from error
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"cannot be read: {reason}", source=path) from error
-    if len(data) > MAX_BYTES:
-        raise InputError(
-            f"the DBC is larger than {MAX_BYTES // 1024 // 1024} MB",
-            source=path,
-            cure="cut it down to the messages that you need",
-        )
+    data = read_bounded(path, MAX_DBC_BYTES, "a DBC")
     if not data.strip():
         raise InputError("the DBC is empty", source=path)
     try:
@@ -180,6 +172,8 @@ def _read_text(path: Path) -> str:
 
 def _refuse_hostile(text: str, path: Path) -> None:
     """Refuse figures that would make cantools fill the memory."""
+    # A comment may stand between any two words, and a string may look like anything.
+    text = _STRING_OR_COMMENT.sub(lambda match: '""' if match[0][0] == '"' else " ", text)
     messages = 0
     for match in _MESSAGE.finditer(text):
         messages += 1
@@ -204,7 +198,7 @@ def _refuse_hostile(text: str, path: Path) -> None:
 
 
 def _bounded(figure: str, limit: int, what: str, path: Path) -> None:
-    if len(figure) > 12 or int(figure) > limit:
+    if figure.startswith("-") or len(figure) > 13 or int(figure) > limit:
         raise InputError(f"the DBC defines {what}", source=path, value=figure[:20])
 
 

@@ -300,7 +300,16 @@ def _check_layout(message: Message, signal: Signal, source: object, field: str) 
 def _multiplexers(message: Message, signal: Signal, source: object, field: str) -> list[Condition]:
     conditions: list[Condition] = []
     while signal.multiplexer_signal is not None:
-        selector = message.get_signal_by_name(signal.multiplexer_signal)
+        name = signal.multiplexer_signal
+        selector = next((each for each in message.signals if each.name == name), None)
+        if selector is None:
+            raise InputError(
+                f"{signal.name} is multiplexed by a signal that {message.name} does not have",
+                source=str(source),
+                field=field,
+                value=name,
+                cure="correct the DBC",
+            )
         if len(conditions) > len(message.signals):
             raise InputError("signals are multiplexed in a circle", source=str(source), field=field)
         _check_layout(message, selector, source, field)

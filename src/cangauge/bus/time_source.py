@@ -10,6 +10,7 @@ and its own recording see the same numbers, to the last bit.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Final, Literal, Protocol, get_args
 
 import can
@@ -154,6 +155,7 @@ class ClockFrames:
         )
 
 
+@lru_cache(maxsize=1)
 def _clock_codec() -> SignalCodec:
     path = shared_file("dbc", "soc_estimate.dbc")
     message = load_dbc(path).get_message_by_name("REPLAY_CLOCK")

@@ -8,12 +8,12 @@ from pathlib import Path
 
 from cangauge.bus.binding import bind_vehicle
 from cangauge.bus.bound import EXTENDED, BoundSignal, MessageRule, Role, Vehicle
-from cangauge.bus.database import closest
 from cangauge.bus.mapping import VehicleMap
 from cangauge.bus.overrides import NO_OVERRIDES, Overrides
 from cangauge.bus.presets import PRESETS, Preset
 from cangauge.bus.validation import read_toml, validated
 from cangauge.errors import InputError
+from cangauge.nearest import closest
 from cangauge.share import shared_file
 
 __all__ = [

@@ -20,6 +20,7 @@ from cangauge.cli.replay import replay_command
 from cangauge.cli.run import run_command
 from cangauge.cli.status import status_command
 from cangauge.cli.twin import twin_command
+from cangauge.cli.usage import UsageError, usage_line
 from cangauge.errors import CangaugeError
 
 app = typer.Typer(
@@ -62,10 +63,14 @@ app.command("twin")(twin_command)
 def main() -> None:
     """Run the command line and exit with its code."""
     try:
-        app()
+        code = app(standalone_mode=False)
     except CangaugeError as error:
         note(f"error: {error}")
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
+    except UsageError as error:
+        if told := usage_line(error):
+            note(told)
+        sys.exit(2)
+    if code == 130:  # what typer makes of Ctrl-C
         note("stopped")
-        sys.exit(130)
+    sys.exit(code or 0)

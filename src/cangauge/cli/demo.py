@@ -13,12 +13,12 @@ import pyarrow.parquet as pq
 import typer
 from rich.table import Table
 
-from cangauge.atomic import write_text_atomic
+from cangauge.atomic import check_writable, write_text_atomic
 from cangauge.bus.open import has_socketcan
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.cli.inputs import JsonOption
 from cangauge.cli.output import console, emit_json, note
-from cangauge.errors import CangaugeError
+from cangauge.errors import CangaugeError, InputError
 from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import EstimateTable, Scores, estimate_log, score
 from cangauge.estimate.types import Reason, Status
@@ -55,7 +55,16 @@ def demo_command(
     `cangauge demo --folder /tmp/demo --json`
     """
     began = time.monotonic()
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"this folder cannot be made: {error.strerror}",
+            source=folder,
+            field="--folder",
+            cure="name another one",
+        ) from error
+    check_writable(folder / "model.json")
     model_path, live_path = folder / "model.json", folder / "live.parquet"
     fit_page, soc_page = folder / "fit.html", folder / "soc.html"
     note("1/4  fitting the voltage model on 2.6 h of the reconstructed Leaf test …")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import numpy as np
 from rich.progress import Progress
 
-from cangauge.cli.inputs import refuse_turned_current
+from cangauge.cli.inputs import refuse_single_row, refuse_turned_current
 from cangauge.cli.output import console, note
 from cangauge.errors import InputError
 from cangauge.estimate.estimator import EstimatorSettings
@@ -134,6 +134,7 @@ def from_capture(
         temperature_source=settings.temperature_source,
         remarks=found.remarks,
     )
+    refuse_single_row(recording)
     for remark in recording.remarks:
         note(f"{path}: {remark}")
     check_same_pack(recording, model)

@@ -19,6 +19,7 @@ from cangauge.cli.inputs import (
     VehicleOption,
     check_outputs,
     load_log,
+    within,
 )
 from cangauge.cli.output import console, emit_json, note
 from cangauge.errors import InputError
@@ -73,6 +74,8 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     given = list(reference or [])
     check_outputs([report, extended], [*logs, *given, model])
     model_file = load_model(model)
+    if initial_soc is not None:
+        within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
     if capacity_ah is not None:
         model_file = _with_capacity(model_file, capacity_ah)
 
@@ -109,10 +112,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
 
 
 def _with_capacity(model: ModelFile, capacity_ah: float) -> ModelFile:
-    if not 1e-3 <= capacity_ah <= 1e5:
-        raise InputError(
-            "must lie within 0.001 … 100000 Ah", field="--capacity-ah", value=capacity_ah
-        )
+    within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
     return model.model_copy(update={"capacity_ah": capacity_ah})
 
 

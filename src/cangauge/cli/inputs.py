@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sized
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, cast
@@ -119,6 +119,7 @@ def load_log(
         if source is not None:
             log = replace(log, temperature_source=source)
     if refuse_turned:
+        refuse_single_row(log)
         refuse_turned_current(log, is_capture=is_capture)
     for remark in log.remarks:
         note(f"{log.source or log.name}: {remark}")
@@ -164,6 +165,16 @@ def within(value: float, low: float, high: float, *, option: str, unit: str) -> 
             f"must lie within {low:g} … {high:g} {unit}".rstrip(), field=option, value=value
         )
     return value
+
+
+def refuse_single_row(recorded: Sized) -> None:
+    """Raise InputError for a log of one row: no charge can be counted over it."""
+    if len(recorded) < 2:
+        raise InputError(
+            "a single row: charge is counted from one row to the next",
+            source=getattr(recorded, "source", None),
+            cure="give a log of minutes or hours",
+        )
 
 
 def refuse_turned_current(log: Log, *, is_capture: bool) -> None:

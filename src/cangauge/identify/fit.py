@@ -108,6 +108,13 @@ def fit(
     say = progress or _silent
     if not logs:
         raise InputError("no log given", cure="name at least one recorded log")
+    for log in logs:
+        if len(log) < 2:
+            raise InputError(
+                "a single row identifies nothing",
+                source=log.source or log.name,
+                cure="give a log of minutes or hours",
+            )
     _check_temperature_sources(logs)
     capacity = options.capacity_ah
     if capacity is None:

@@ -9,7 +9,7 @@ from typing import Final, Literal
 import numpy as np
 
 from cangauge.inspect.charge import Charge, Resistance, Soc
-from cangauge.inspect.sign import SignFinding, charge_ah, correlation
+from cangauge.inspect.sign import SignFinding, charge_ah, correlation, spaced_rows
 from cangauge.inspect.timing import Timing
 from cangauge.logs.log import Log
 
@@ -133,12 +133,14 @@ def _delays(log: Log, timing: Timing) -> Iterator[Ability]:
 
 def _alikeness(log: Log) -> float | None:
     """Return the correlation of current with itself ten seconds before."""
-    grid = np.arange(log.time_s[0], log.time_s[-1], 1.0)
-    current = np.interp(grid, log.time_s, log.current_a)
-    lag = int(DELAYS_S[0])
-    if current.size <= lag + 2 or np.ptp(current[lag:]) == 0.0 or np.ptp(current[:-lag]) == 0.0:
+    # At rows about a second apart, not on a grid: a gap may last months.
+    rows = spaced_rows(log.time_s, 1.0)
+    rows = rows[log.time_s[rows] >= log.time_s[0] + DELAYS_S[0]]
+    now = log.current_a[rows]
+    before = np.interp(log.time_s[rows] - DELAYS_S[0], log.time_s, log.current_a)
+    if now.size <= 2 or np.ptp(now) == 0.0 or np.ptp(before) == 0.0:
         return None
-    return correlation(current[lag:], current[:-lag])
+    return correlation(now, before)
 
 
 def _temperature(log: Log) -> Ability:

@@ -96,6 +96,11 @@ class SignFinding:
     evidence: tuple[Evidence, ...]
 
     @property
+    def strongest(self) -> Evidence:
+        """The evidence that speaks most for the finding."""
+        return max(self.evidence, key=lambda item: item.weight * (self.sign or 1))
+
+    @property
     def sentence(self) -> str:
         """Say the finding and its grounds in one line."""
         what = {
@@ -150,11 +155,15 @@ def require_discharge_positive(log: Log) -> None:
     """
     finding = sign_of_current(log)
     if finding.sign < 0:
+        ground = finding.strongest
+        cure = "multiply the column by -1: positive current discharges"
+        if ground.kind == "soc":
+            cure += "; or, if the current is right, correct soc_pct or leave it out"
         raise InputError(
-            f"the sign of current is turned: {finding.evidence[0].text}",
+            f"the sign of current is turned: {ground.text}",
             source=log.source or log.name,
             field="current_a",
-            cure="multiply the column by -1: positive current discharges",
+            cure=cure,
         )
 
 
@@ -222,7 +231,8 @@ def _from_soc(log: Log) -> Evidence:
     if span < 1.0 or np.ptp(taken) <= 0.0:
         return Evidence("soc", 0.0, f"reference SoC moves by only {span:.1f} %")
     alike = correlation(taken, soc)
-    text = f"reference SoC against charge taken out: correlation {alike:+.3f}"
+    way = "rises" if alike > 0.0 else "falls"
+    text = f"reference SoC {way} as charge is taken out (correlation {alike:+.3f})"
     weight = 4.0 if abs(alike) >= 0.95 else 1.0 if abs(alike) >= 0.8 else 0.0
     return Evidence("soc", -float(np.sign(alike)) * weight, text)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from typing import Final
 
+from cangauge.limits import MAX_HEADING
 from cangauge.logs.assemble import Draft
 from cangauge.logs.columns import read_columns
 from cangauge.logs.content import Content, cells
@@ -42,7 +43,7 @@ def read_bmw_i3(content: Content) -> Draft:
     header = cells(content.head[0], ";")
     wanted, units = {}, {}
     for index, heading in enumerate(header):
-        match = _HEADING.match(heading)
+        match = _HEADING.match(heading) if len(heading) <= MAX_HEADING else None
         field = _COLUMNS.get(match["name"].strip().lower()) if match else None
         if match and field and field not in wanted:
             wanted[field], units[field] = index, match["unit"] or ""

@@ -21,6 +21,7 @@ import pyarrow.parquet as pq
 
 from cangauge.atomic import atomic_path
 from cangauge.errors import InputError
+from cangauge.limits import MAX_LOG_COLUMNS, MAX_LOG_ROWS, MAX_PARQUET_NAMES
 from cangauge.logs.assemble import REQUIRED, Draft
 from cangauge.logs.columns import read_columns
 from cangauge.logs.content import Content, cells, delimiter_of
@@ -55,18 +56,24 @@ def read_parquet(content: Content) -> Draft:
     """
     path = content.path
     try:
-        # Checksums are there in files that we wrote; others are read without.
-        file = pq.ParquetFile(pa.BufferReader(content.data), page_checksum_verification=True)
-        places = _places(file.schema_arrow.names, path)
-        table = file.read(columns=[file.schema_arrow.names[i] for i in places.values()])
+        file = _open_parquet(content)
+        schema = file.schema_arrow
+        places = _places(schema.names, path)
+        _refuse_large(file.metadata, path)
+        for field, index in places.items():
+            _check_type(field, schema.field(index), path)
+        texts = [schema.names[i] for i in places.values() if _is_text(schema.field(i).type)]
+        if texts:
+            # A long text, repeated in millions of rows, takes no room in the file.
+            file = _open_parquet(content, *texts)
+        table = file.read(columns=[schema.names[i] for i in places.values()])
+        table.validate(full=True)  # damage can point outside of a dictionary
     except (pa.ArrowException, OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        reason = str(error).splitlines()[0]
+        reason = (str(error) or type(error).__name__).splitlines()[0]
         raise InputError(
             f"the Parquet file is cut off or damaged ({reason})", source=path, cure="export again"
         ) from error
-    names = file.schema_arrow.names
+    names = schema.names
     if not table.num_rows:
         raise InputError("the log holds no rows", source=path, cure="check the export")
     values = {
@@ -74,7 +81,7 @@ def read_parquet(content: Content) -> Draft:
         for field, index in places.items()
         if field != _SOURCE
     }
-    metadata = file.schema_arrow.metadata or {}
+    metadata = schema.metadata or {}
     word = metadata.get(_METADATA_KEY, b"unknown").decode("utf-8", errors="replace")
     if _SOURCE in places:
         word = _one_word(table.column(names[places[_SOURCE]]), path)
@@ -227,6 +234,55 @@ def _draft(
             cure=f"use one of: {', '.join(TEMPERATURE_SOURCES)}",
         )
     return Draft(content, values, labels, cast("TemperatureSource", word), remarks=remarks)
+
+
+def _open_parquet(content: Content, *words: str) -> Any:
+    return pq.ParquetFile(
+        pa.BufferReader(content.data),
+        # Checksums are there in files that we wrote; others are read without.
+        page_checksum_verification=True,
+        thrift_string_size_limit=MAX_PARQUET_NAMES,
+        thrift_container_size_limit=MAX_PARQUET_NAMES,
+        read_dictionary=words or None,
+    )
+
+
+def _refuse_large(metadata: Any, path: object) -> None:
+    """Refuse what a small file can unpack to: runs of one value take no room in it."""
+    for what, count, limit in (
+        ("rows", metadata.num_rows, MAX_LOG_ROWS),
+        ("columns", metadata.num_columns, MAX_LOG_COLUMNS),
+    ):
+        if count > limit:
+            raise InputError(
+                f"more than the {limit} {what} that a log may have",
+                source=str(path),
+                value=count,
+                cure="cut it into parts",
+            )
+
+
+def _check_type(field: str, column: Any, path: object) -> None:
+    kind, types = column.type, pa.types
+    good = _is_text(kind) or types.is_null(kind)
+    what, cure = "words", f"store it as one of: {', '.join(TEMPERATURE_SOURCES)}"
+    if field != _SOURCE:
+        numbers = (types.is_integer, types.is_floating, types.is_decimal)
+        good = good or any(is_kind(kind) for is_kind in numbers)
+        what, cure = "numbers", "store it as floating point"
+    if not good:
+        raise InputError(
+            f"the column does not hold {what}",
+            source=str(path),
+            field=column.name,
+            value=str(kind)[:60],
+            cure=cure,
+        )
+
+
+def _is_text(kind: Any) -> bool:
+    kind = kind.value_type if pa.types.is_dictionary(kind) else kind
+    return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind))
 
 
 def _as_numbers(column: Any, label: str, path: object) -> FloatArray:

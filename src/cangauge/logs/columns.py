@@ -12,6 +12,7 @@ import pyarrow.compute as pc
 import pyarrow.csv as pacsv
 
 from cangauge.errors import InputError
+from cangauge.limits import MAX_LOG_COLUMNS, MAX_LOG_ROWS, MAX_ODD_ROWS
 from cangauge.logs.content import Content, cells
 from cangauge.logs.log import FloatArray
 
@@ -106,7 +107,7 @@ def read_columns(
 
     def keep_aside(row: Any) -> str:
         odd.append(row)
-        return "skip"
+        return "skip" if len(odd) < MAX_ODD_ROWS else "error"
 
     names = [f"c{index}" for index in range(width)]
     include = [names[index] for index in wanted.values()]
@@ -125,8 +126,17 @@ def read_columns(
             ),
         )
     except (pa.ArrowException, OSError) as error:
+        if len(odd) >= MAX_ODD_ROWS:
+            raise _odd_row(odd[0], skip_lines, content) from error
         reason = str(error).splitlines()[0]
         raise InputError(f"the table cannot be read: {reason}", source=content.path) from error
+    if table.num_rows > MAX_LOG_ROWS:
+        raise InputError(
+            f"more than the {MAX_LOG_ROWS} rows that a log may have",
+            source=content.path,
+            value=table.num_rows,
+            cure="cut it into parts",
+        )
     if not table.num_rows:
         raise InputError(
             "there are no rows below the header", source=content.path, cure="check the export"
@@ -155,6 +165,13 @@ def _width(content: Content, header: list[str], delimiter: str, skip_lines: int)
             "there are no rows below the header", source=content.path, cure="check the export"
         )
     width = len(cells(first, delimiter))
+    if width > MAX_LOG_COLUMNS:
+        raise InputError(
+            f"more than the {MAX_LOG_COLUMNS} columns that a log may have",
+            source=content.path,
+            value=width,
+            cure="export only the columns that are needed",
+        )
     named = max((i + 1 for i, name in enumerate(header) if name), default=0)
     if width < named:
         raise InputError(
@@ -184,13 +201,17 @@ def _judge_odd_rows(
             cut_off += 1
             remarks.append("the last line is cut off and was left out: the file may be incomplete")
         else:
-            raise InputError(
-                f"row {row.number - skip_lines} has {row.actual_columns} cells where the others"
-                f" have {row.expected_columns}",
-                source=content.path,
-                cure="export the file again",
-            )
+            raise _odd_row(row, skip_lines, content)
     return tuple(remarks)
+
+
+def _odd_row(row: Any, skip_lines: int, content: Content) -> InputError:
+    return InputError(
+        f"row {row.number - skip_lines} has {row.actual_columns} cells where the others"
+        f" have {row.expected_columns}",
+        source=content.path,
+        cure="export the file again",
+    )
 
 
 def _unended(content: Content) -> tuple[str, ...]:

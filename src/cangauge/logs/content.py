@@ -5,22 +5,27 @@ from __future__ import annotations
 import csv
 import gzip
 import io
+import struct
 import zipfile
 import zlib
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Final
+from typing import Final, cast
 
 from cangauge.errors import InputError
+from cangauge.files import GZIP, Bounded, read_bounded, unpacks_to
+from cangauge.limits import MAX_LOG_BYTES
 
-_GZIP: Final = b"\x1f\x8b"
 _ZIP: Final = b"PK\x03\x04"
 _PARQUET: Final = b"PAR1"
 _DELIMITERS: Final = ("\t", ";", ",")
 _HEAD_BYTES: Final = 64 * 1024
 _HEAD_LINES: Final = 60
 _D3_MEMBER: Final = "test data.txt"
+_WHAT: Final = "a log"
+# LZMA in a zip says itself how much memory it wants; no exporter uses it.
+_ZIP_METHODS: Final = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,8 +84,8 @@ def read_content(path: str | PathLike[str]) -> Content:
         which of its files is meant.
     """
     path = Path(path)
-    data, stem, remarks = _read_bytes(path), _stem(path.name), ()
-    if data.startswith(_GZIP):
+    data, stem, remarks = read_bounded(path, MAX_LOG_BYTES, _WHAT), _stem(path.name), ()
+    if data.startswith(GZIP):
         data = _gunzip(data, path)
     if data.startswith(_ZIP):
         data, stem = _unzip(data, path)
@@ -92,33 +97,29 @@ def read_content(path: str | PathLike[str]) -> Content:
     return Content(path, data, stem, _head(data), remarks)
 
 
-def _read_bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except FileNotFoundError as error:
-        raise InputError("no such file", source=path, cure="check the path") from error
-    except IsADirectoryError as error:
-        raise InputError("this is a folder", source=path, cure="name a file in it") from error
-    except (OSError, ValueError) as error:  # ValueError: a null byte in the path
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"cannot be read: {reason}", source=path) from error
-
-
 def _gunzip(data: bytes, path: Path) -> bytes:
     try:
-        return gzip.decompress(data)
+        with gzip.GzipFile(fileobj=io.BytesIO(data)) as packed:
+            return _read_all(packed, path, len(data))
     except (EOFError, OSError, zlib.error) as error:
         raise InputError(
             f"the gzip file is cut off or damaged ({error})", source=path, cure="fetch it again"
         ) from error
 
 
+def _read_all(packed: io.BufferedIOBase, path: Path, packed_bytes: int) -> bytes:
+    limit = min(MAX_LOG_BYTES, unpacks_to(packed_bytes))
+    return io.BufferedReader(Bounded(packed, path, limit)).read()
+
+
 def _unzip(data: bytes, path: Path) -> tuple[bytes, str]:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             member = _member(archive, path)
-            return archive.read(member), _stem(Path(member.filename).name)
-    except (zipfile.BadZipFile, EOFError, OSError, zlib.error, ValueError) as error:
+            with archive.open(member) as packed:
+                content = _read_all(cast("io.BufferedIOBase", packed), path, len(data))
+            return content, _stem(Path(member.filename).name)
+    except (zipfile.BadZipFile, EOFError, OSError, zlib.error, ValueError, struct.error) as error:
         raise InputError(
             f"the zip file is cut off or damaged ({error})", source=path, cure="fetch it again"
         ) from error
@@ -136,8 +137,15 @@ def _member(archive: zipfile.ZipFile, path: Path) -> zipfile.ZipInfo:
     # A vehicle's zip of the ANL D3 data base holds documents beside the test data.
     tests = [info for info in files if info.filename.lower().endswith(_D3_MEMBER)]
     chosen = tests or files
-    if len(chosen) == 1:
+    if len(chosen) == 1 and chosen[0].compress_type in _ZIP_METHODS:
         return chosen[0]
+    if len(chosen) == 1:
+        raise InputError(
+            "the zip packs in another way than deflate",
+            source=path,
+            value=chosen[0].compress_type,
+            cure="unpack it yourself",
+        )
     names = ", ".join(info.filename for info in chosen[:4]) + (", …" if len(chosen) > 4 else "")
     raise InputError(
         f"the zip holds {len(chosen)} files ({names})" if chosen else "the zip is empty",

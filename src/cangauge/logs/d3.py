@@ -19,6 +19,7 @@ from typing import Final
 import numpy as np
 
 from cangauge.errors import InputError
+from cangauge.limits import MAX_HEADING
 from cangauge.logs.assemble import Draft
 from cangauge.logs.columns import Columns, read_columns
 from cangauge.logs.content import Content, cells
@@ -181,7 +182,7 @@ def _drop_wait(draft: Draft) -> None:
 def _headings(line: str) -> list[_Heading]:
     found = []
     for index, text in enumerate(cells(line, "\t")):
-        match = _UNIT.match(text)
+        match = _UNIT.match(text) if len(text) <= MAX_HEADING else None
         name = match["name"] if match else text
         unit = (match["square"] or match["tail"] or "") if match else ""
         simple = re.sub(r"[\s_]", "", name).lower()

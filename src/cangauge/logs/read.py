@@ -12,11 +12,14 @@ from cangauge.logs.assemble import Draft
 from cangauge.logs.content import Content, cells, delimiter_of, read_content
 from cangauge.logs.log import TEMPERATURE_SOURCES, Log, TemperatureSource
 from cangauge.logs.signs import settle_sign
+from cangauge.logs.units import COLDEST_C, HOTTEST_C
 
 _KNOWN = (
     "known are: canonical Parquet and CSV (time_s, current_a, voltage_v, temperature_c, soc_pct),"
-    " ANL D3 tests, BMW i3 trips, Arbin, Bitrode and VisuaLCN exports"
+    " ANL D3 tests, BMW i3 trips, Arbin, Bitrode and VisuaLCN exports; and, with --vehicle or"
+    " --dbc and --map, CAN captures: candump, CRTD, ASC, BLF, TRC, MF4, CSV"
 )
+_NEITHER = "not a known kind of log, nor of capture"
 
 
 class CaptureGivenError(InputError):
@@ -61,8 +64,14 @@ def read_log(
             value=temperature_source,
             cure=f"use one of: {', '.join(TEMPERATURE_SOURCES)}",
         )
-    if not Path(path).exists() and _is_capture(Path(path)):  # a recording in parts
+    if _is_recording_in_parts(Path(path)):
         raise _capture_given(Path(path))
+    if temperature_c is not None and not COLDEST_C <= temperature_c <= HOTTEST_C:
+        raise InputError(
+            f"must lie within {COLDEST_C:g} … {HOTTEST_C:g} °C",
+            field="--temperature",
+            value=temperature_c,
+        )
     content = read_content(path)
     draft = _read(content)
     log = draft.to_log(temperature_c)
@@ -92,9 +101,9 @@ def _unknown(content: Content, line: str) -> InputError:
         return _capture_given(content.path)
     shown = line.strip()
     if not shown or not shown.isprintable():
-        return InputError("the file is not a known kind of log", source=content.path, cure=_KNOWN)
+        return InputError(_NEITHER, source=content.path, cure=_KNOWN)
     return InputError(
-        "the file is not a known kind of log",
+        _NEITHER,
         source=content.path,
         field="first line",
         value=shown[:80],
@@ -108,6 +117,18 @@ def _capture_given(path: Path) -> CaptureGivenError:
         source=path,
         cure="give --vehicle, or --dbc and --map",
     )
+
+
+def _is_recording_in_parts(path: Path) -> bool:
+    try:
+        if path.exists():
+            return False
+    except OSError:  # a name that is too long
+        return False
+    # Imported here: as below.
+    from cangauge.bus.captures.parts import parts_of_run  # noqa: PLC0415
+
+    return bool(parts_of_run(path)) and _is_capture(path)
 
 
 def _is_capture(path: Path) -> bool:

@@ -24,7 +24,7 @@ def settle_sign(log: Log, *, stored_sign_unknown: bool) -> Log:
     """
     finding = sign_of_current(log)
     if stored_sign_unknown and finding.sign < 0:
-        text = f"current negated, sign found from the data: {finding.evidence[0].text}"
+        text = f"current negated, sign found from the data: {finding.strongest.text}"
         return replace(log, current_a=0.0 - log.current_a, remarks=(*log.remarks, text))
     if stored_sign_unknown and finding.sign == 0:
         text = "sign of current unknown and not to be told from the data: kept as stored"

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from cangauge.errors import InputError
+from cangauge.limits import MAX_LOG_SPAN_S, MAX_STAMP_S
 from cangauge.logs.log import FloatArray
 
 # Spelling (lower case, without blanks) -> (factor, offset) to the unit of the canonical log.
@@ -139,6 +140,7 @@ def _check_time(values: dict[str, FloatArray], refuse: _Refuse) -> None:
         raise refuse(
             "time_s", "time looks like milliseconds since 1970", float(time[0]), "divide it by 1000"
         )
+    _check_span(time, refuse)
     if interval > MAX_INTERVAL_S:
         raise refuse(
             "time_s",
@@ -170,6 +172,24 @@ def _check_time(values: dict[str, FloatArray], refuse: _Refuse) -> None:
             )
 
 
+def _check_span(time: FloatArray, refuse: _Refuse) -> None:
+    far = np.flatnonzero(np.abs(time) > MAX_STAMP_S)
+    if far.size:
+        raise refuse(
+            "time_s", f"row {far[0] + 1} is no time in seconds", float(time[far[0]]), "correct it"
+        )
+    if time[-1] - time[0] <= MAX_LOG_SPAN_S:
+        return
+    row = int(np.argmax(np.diff(time))) + 1
+    raise refuse(
+        "time_s",
+        f"the log lasts {(time[-1] - time[0]) / 86400.0:.0f} days; its longest step ends at row"
+        f" {row + 1}",
+        float(time[row]),
+        "if the clock was set there, cut the log there",
+    )
+
+
 def _check_voltage(voltage: FloatArray, refuse: _Refuse) -> None:
     middle = float(np.median(voltage))
     if middle > MAX_VOLTAGE_V:
@@ -180,8 +200,8 @@ def _check_voltage(voltage: FloatArray, refuse: _Refuse) -> None:
         )
     if middle < 1.0:
         raise refuse("voltage_v", "voltage looks like kilovolts", middle, "give it in volts")
-    row = int(np.argmax(voltage))
-    if voltage[row] > MAX_VOLTAGE_V:
+    row = int(np.argmax(np.abs(voltage)))
+    if abs(voltage[row]) > MAX_VOLTAGE_V:
         raise refuse(
             "voltage_v",
             f"row {row + 1} is not a battery's voltage",

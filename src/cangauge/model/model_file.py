@@ -4,26 +4,50 @@ from __future__ import annotations
 
 import json
 import math
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from cangauge.errors import InputError
+from cangauge.files import read_bounded
+from cangauge.limits import MAX_MODEL_BYTES, MAX_MODEL_COLUMNS, MAX_MODEL_ITEMS
 from cangauge.logs.log import TemperatureSource
 from cangauge.model.effects.effect import Pack
 from cangauge.model.effects.library import parse_effects
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.voltage_model import BASIS_NAMES, VoltageModel
+from cangauge.schema import schema_error
 
 MODEL_FORMAT = "cangauge-model"
 MODEL_VERSION = 1
-LARGEST_FILE_BYTES = 16 << 20
+_CURE = "make the file again with `cangauge fit`"
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Span = tuple[Finite, Finite]
+
+# Wider than any pack needs, and narrow enough that nothing overflows on the way to a voltage.
+_Value = Annotated[float, Field(ge=-1e12, le=1e12)]
+_Soc = Annotated[float, Field(ge=-10, le=110)]
+_Celsius = Annotated[float, Field(ge=-273.15, le=1000)]
+_Ampere = Annotated[float, Field(ge=-1e6, le=1e6)]
+_Volts = Annotated[float, Field(ge=0, le=1e6)]
+_Delay = Annotated[float, Field(ge=0, le=3600)]
+_Seconds = Annotated[float, Field(ge=0, le=1e9)]
+SocSpan = tuple[_Soc, _Soc]
+TemperatureSpan = tuple[_Celsius, _Celsius]
+CurrentSpan = tuple[_Ampere, _Ampere]
+Columns = Field(max_length=MAX_MODEL_COLUMNS)
+Items = Field(max_length=MAX_MODEL_ITEMS)
 
 
 class _Strict(BaseModel):
@@ -33,7 +57,7 @@ class _Strict(BaseModel):
 class Coefficient(_Strict):
     """One coefficient of the voltage model."""
 
-    value: Finite
+    value: _Value
     std_error: NotNegative | None = None
     unit: Literal["V", "V/K", "ohm"]
 
@@ -41,21 +65,21 @@ class Coefficient(_Strict):
 class Ranges(_Strict):
     """What the model was identified on; beyond it, it is flagged and bounded."""
 
-    soc_pct: Span
-    temperature_c: Span
-    current_a: Span
+    soc_pct: SocSpan
+    temperature_c: TemperatureSpan
+    current_a: CurrentSpan
 
 
 class ModelNoise(_Strict):
     """The model's voltage error on data that its fit did not see."""
 
-    fast_std_v: NotNegative
-    fast_time_s: NotNegative
-    slow_std_v: NotNegative
-    slow_time_s: Positive
-    lasting_std_v: NotNegative
+    fast_std_v: _Volts
+    fast_time_s: _Seconds
+    slow_std_v: _Volts
+    slow_time_s: Annotated[float, Field(gt=0, le=1e9)]
+    lasting_std_v: _Volts
     voltage_mae_pct: NotNegative
-    voltage_rmse_v: NotNegative
+    voltage_rmse_v: _Volts
     judged_on: str
 
 
@@ -67,10 +91,10 @@ class Information(_Strict):
     another log can be stacked below: joint identification without the old logs.
     """
 
-    columns: list[str]
-    scale: list[Positive]
-    root: list[list[Finite]]
-    projected: list[Finite]
+    columns: Annotated[list[str], Columns]
+    scale: Annotated[list[Positive], Columns]
+    root: Annotated[list[Annotated[list[Finite], Columns]], Columns]
+    projected: Annotated[list[Finite], Columns]
     rows: Annotated[int, Field(gt=0)]
     residual_sum_v2: NotNegative
 
@@ -95,8 +119,8 @@ class Made(_Strict):
     """How the model was made."""
 
     by: str
-    options: dict[str, str | float | int | bool | list[float] | None]
-    logs: list[SourceLog]
+    options: Annotated[dict[str, str | float | int | bool | list[float] | None], Items]
+    logs: Annotated[list[SourceLog], Items]
     fingerprint: str
 
 
@@ -106,18 +130,25 @@ class ModelFile(_Strict):
     format: Literal["cangauge-model"] = "cangauge-model"
     version: Literal[1] = 1
     name: str
-    coefficients: dict[str, Coefficient]
-    epsilon: Annotated[float, Field(gt=0, lt=0.5)]
-    t_ref_c: Finite
-    delays_s: Annotated[list[NotNegative], Field(min_length=1, max_length=64)]
-    rate_hz: Positive
-    capacity_ah: Positive
-    effects: list[dict[str, object]] = []
+    coefficients: Annotated[dict[str, Coefficient], Items]
+    epsilon: Annotated[float, Field(ge=1e-4, lt=0.5)]
+    t_ref_c: _Celsius
+    delays_s: Annotated[list[_Delay], Field(min_length=1, max_length=64)]
+    rate_hz: Annotated[float, Field(ge=1e-3, le=1e4)]
+    capacity_ah: Annotated[float, Field(ge=1e-3, le=1e5)]
+    effects: Annotated[list[dict[str, object]], Items] = []
     temperature_source: TemperatureSource
     range: Ranges
     noise: ModelNoise
     information: Information | None = None
     made: Made
+
+    @field_validator("delays_s")
+    @classmethod
+    def _increasing(cls, delays_s: list[float]) -> list[float]:
+        if any(high <= low for low, high in pairwise(delays_s)):
+            raise ValueError(f"must increase, with R1 … R{len(delays_s)} in the same order")
+        return delays_s
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -186,14 +217,9 @@ def load_model(path: Path | str) -> ModelFile:
         If it cannot be read or does not describe a usable model; names the field.
     """
     path = Path(path)
+    data = read_bounded(path, MAX_MODEL_BYTES, "a model file")
     try:
-        if path.stat().st_size > LARGEST_FILE_BYTES:
-            raise InputError("too large for a model file", source=path, value=path.stat().st_size)
-        raw = json.loads(path.read_bytes(), parse_constant=_no_constant)
-    except OSError as error:
-        raise InputError(
-            f"cannot be read ({error.strerror})", source=path, cure="check the path after -m"
-        ) from error
+        raw = json.loads(data, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
         raise InputError(
             f"is no JSON ({error})", source=path, cure="a model file is made by `cangauge fit`"
@@ -218,25 +244,12 @@ def load_model(path: Path | str) -> ModelFile:
         model = ModelFile.model_validate(raw)
         model.extended_model()
     except ValidationError as error:
-        raise _as_input_error(error, path) from error
+        raise schema_error(error, ModelFile, path, _CURE) from error
     except InputError as error:
         raise InputError(
             error.problem, source=path, field=error.field, value=error.value, cure=error.cure
         ) from error
     return model
-
-
-def _as_input_error(error: ValidationError, path: Path) -> InputError:
-    first = error.errors()[0]
-    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-    value = first["input"]
-    return InputError(
-        first["msg"].removeprefix("Value error, ") + more,
-        source=path,
-        field=".".join(str(part) for part in first["loc"]) or None,
-        value=value if isinstance(value, str | int | float) else None,
-        cure="make the file again with `cangauge fit`",
-    )
 
 
 def _no_constant(name: str) -> float:

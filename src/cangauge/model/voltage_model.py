@@ -246,5 +246,18 @@ def _check_shape(model: VoltageModel) -> None:
         raise InputError("a coefficient is not finite", field="coefficients", value=numbers)
     for name in ("soc_range_pct", "temperature_range_c", "current_range_a"):
         lo, hi = getattr(model, name)
+        if name == "soc_range_pct" and not _defined(lo, hi, model.epsilon):
+            raise InputError(
+                "the pseudo-OCV's logarithms end within this range",
+                field=name,
+                value=(lo, hi),
+                cure="identify the model with a larger epsilon",
+            )
         if not lo <= hi or (name == "soc_range_pct" and not lo < hi):
             raise InputError("the range is empty", field=name, value=(lo, hi))
+
+
+def _defined(low_pct: float, high_pct: float, epsilon: float) -> bool:
+    """Return whether ln s and ln(1 − s) exist from one SoC to another."""
+    ends = scaled_soc([low_pct, high_pct], epsilon)
+    return bool(np.all((ends > 0.0) & (ends < 1.0)))

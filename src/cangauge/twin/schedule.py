@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from os import PathLike
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -12,12 +11,15 @@ import pyarrow.csv as pacsv
 from numpy.typing import NDArray
 
 from cangauge.errors import InputError
+from cangauge.files import read_bounded
+from cangauge.limits import MAX_SPEED_TRACE_BYTES
 
 FloatArray = NDArray[np.float64]
 
 # Unit in the heading (or none) → factor to m/s.
 _UNITS: Final = {"kmh": 1.0 / 3.6, "kph": 1.0 / 3.6, "km/h": 1.0 / 3.6, "mph": 0.44704}
 _FASTEST_MS: Final = 85.0
+_LONGEST_S: Final = 1e6
 _CURE: Final = "give two columns with a heading: time [s] and speed [m/s], or speed_kmh, speed_mph"
 
 
@@ -36,16 +38,16 @@ def read_speed(path: str | PathLike[str]) -> FloatArray:
     InputError
         If it cannot be read, time does not increase, or a speed is negative or out of this world.
     """
-    if not Path(path).is_file():
-        raise InputError("there is no such file", source=path, cure="check the path")
+    data = read_bounded(path, MAX_SPEED_TRACE_BYTES, "a speed trace")
     try:
-        table = pacsv.read_csv(path)
+        data.decode("utf-8")
+        table = pacsv.read_csv(pa.BufferReader(data))
         if table.num_columns < 2 or table.num_rows < 2:
             raise InputError("this is no speed trace", source=path, cure=_CURE)
         time_s = np.asarray(table.column(0).cast(pa.float64()).to_numpy())
         speed = np.asarray(table.column(1).cast(pa.float64()).to_numpy())
-    except pa.ArrowException as error:
-        reason = str(error).splitlines()[0]
+    except (pa.ArrowException, ValueError) as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0]
         raise InputError(f"this is no speed trace ({reason})", source=path, cure=_CURE) from error
     heading = table.column_names[1]
     compact = heading.lower().replace("_", "").replace(" ", "")
@@ -54,6 +56,14 @@ def read_speed(path: str | PathLike[str]) -> FloatArray:
     if not (np.all(np.isfinite(time_s)) and np.all(np.diff(time_s) > 0.0)):
         raise InputError(
             "time does not increase", source=path, field=table.column_names[0], cure=_CURE
+        )
+    if time_s[-1] - time_s[0] > _LONGEST_S:
+        raise InputError(
+            f"it lasts longer than {_LONGEST_S:g} s",
+            source=path,
+            field=table.column_names[0],
+            value=float(time_s[-1]),
+            cure=_CURE,
         )
     bad = np.flatnonzero(~((speed >= 0.0) & (speed < _FASTEST_MS)))
     if bad.size:

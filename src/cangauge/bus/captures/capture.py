@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 import can
+from can.typechecking import Channel
 
 from cangauge.bus.captures.info import CaptureInfo, Stamps
 from cangauge.bus.captures.library import (
@@ -21,6 +22,7 @@ from cangauge.bus.captures.parts import parts_of_run
 from cangauge.bus.captures.stream import LineStream, read_head
 from cangauge.bus.captures.text_formats import TEXT_FORMATS, Parser, TextFormat
 from cangauge.errors import InputError
+from cangauge.limits import MAX_BUSES, MAX_STAMP_S
 
 CLOCK_ID: Final = 0x1DB
 """Without time stamps, time is counted in frames of this id (Nissan Leaf) …"""
@@ -124,7 +126,15 @@ class Capture:
         else:
             library = self._kind
             messages = chain.from_iterable(self._library(library, part) for part in self._parts)
-        yield from messages
+        channels: set[Channel | None] = set()
+        for message in messages:
+            if message.channel not in channels:
+                channels.add(message.channel)
+                if len(channels) > MAX_BUSES:
+                    raise InputError(
+                        f"frames of more than {MAX_BUSES} buses", source=self.path, cure=_KNOWN
+                    )
+            yield message
         self._finish()
 
     def _text(self, kind: TextFormat, path: Path) -> Iterator[can.Message]:
@@ -142,12 +152,16 @@ class Capture:
                 continue
             try:
                 message = parse(line)
-            except ValueError:
+            except (ValueError, OverflowError):
                 self._skip(lines.number)
                 continue
-            if message is not None:
-                self._frames += 1
-                yield message
+            if message is None:
+                continue
+            if not abs(message.timestamp) <= MAX_STAMP_S:
+                self._skip(lines.number)
+                continue
+            self._frames += 1
+            yield message
         if lines.cut_off:
             self._cut_off = True
 
@@ -157,6 +171,9 @@ class Capture:
                 if not (message.is_fd or message.is_remote_frame or message.is_error_frame) and (
                     len(message.data) != message.dlc
                 ):
+                    self._skip(None)
+                    continue
+                if not abs(message.timestamp) <= MAX_STAMP_S:
                     self._skip(None)
                     continue
                 self._frames += 1
@@ -274,7 +291,7 @@ def _score(kind: TextFormat, lines: list[str]) -> int:
     for line in lines:
         try:
             frames += parse(line) is not None
-        except ValueError:
+        except (ValueError, OverflowError):
             malformed += 1
     return frames if frames > malformed else 0
 

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import io
+import logging
 import struct
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import can
 from can.io.blf import BLFParseError
 
+from cangauge.bus.captures.blf import CheckedBlf
 from cangauge.bus.captures.stream import open_bytes
 from cangauge.errors import InputError
+from cangauge.limits import MAX_LINE
+
+# Its readers log a line for every object that they do not know: a hostile file has millions.
+logging.getLogger("can").addHandler(logging.NullHandler())
 
 # What python-can's readers raise on damaged files.
 DAMAGE: Final = (
@@ -84,6 +90,27 @@ LIBRARY_FORMATS: Final = (
 )
 
 
+class _Lines:
+    """The lines of a text, as python-can iterates over them, of bounded length."""
+
+    def __init__(self, raw: io.BufferedReader) -> None:
+        self._text = io.TextIOWrapper(raw, "utf-8", errors="replace")
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> str:
+        line = self._text.readline(MAX_LINE)
+        if not line:
+            raise StopIteration
+        if len(line) >= MAX_LINE:
+            raise ValueError(f"a line of more than {MAX_LINE} characters")
+        return line
+
+    def close(self) -> None:
+        self._text.close()
+
+
 def library_messages(kind: LibraryFormat, path: Path) -> Iterator[can.Message]:
     """Yield the frames of a file; raises one of `DAMAGE` where it breaks off.
 
@@ -93,7 +120,9 @@ def library_messages(kind: LibraryFormat, path: Path) -> Iterator[can.Message]:
         If the reader is not installed (MF4 without asammdf).
     """
     with open_bytes(path) as raw:
-        file: Any = io.TextIOWrapper(raw, "utf-8", errors="replace") if kind.is_text else raw
+        file: Any = _Lines(raw) if kind.is_text else raw
+        if kind.reader is can.BLFReader:
+            file = CheckedBlf(raw)
         try:
             reader = kind.reader(file)
         except NotImplementedError as error:

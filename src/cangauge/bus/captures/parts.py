@@ -40,7 +40,7 @@ def all_parts(path: Path) -> list[Part]:
     pattern = re.compile(f"{re.escape(stem)}-{_RUN}-{_PART}{re.escape(suffix)}")
     try:
         names = list(path.parent.iterdir())
-    except OSError:
+    except (OSError, ValueError):  # ValueError: a null byte in the path
         return []
     found = []
     for name in names:
@@ -57,7 +57,11 @@ def parts_of_run(path: Path) -> list[Path]:
     """
     stem, suffix = _split(path)
     match = re.fullmatch(f"(?P<stem>.*)-{_RUN}", stem)
-    if match is None or path.exists():
+    try:
+        is_run = match is not None and not path.exists()
+    except OSError:  # a name that is too long
+        return []
+    if match is None or not is_run:
         return []
     base = path.with_name(match["stem"] + suffix)
     return [each.path for each in all_parts(base) if each.run == int(match["run"])]

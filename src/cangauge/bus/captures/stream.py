@@ -2,43 +2,36 @@
 
 from __future__ import annotations
 
-import gzip
 import io
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, cast
 
-from cangauge.errors import InputError
+from cangauge.files import GZIP, gunzip_bounded, open_regular
+from cangauge.limits import MAX_CAPTURE_BYTES, MAX_LINE
 
 if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
 
-MAX_LINE: Final = 16 * 1024
-"""No capture has longer lines; what is longer is not text, or hostile [characters]."""
 HEAD_BYTES: Final = 64 * 1024
-_GZIP: Final = b"\x1f\x8b"
 
 
-def open_bytes(path: Path) -> io.BufferedIOBase:
+def open_bytes(path: Path) -> io.BufferedReader:
     """Open a file, unpacking gzip whatever its name.
 
     Raises
     ------
     InputError
-        If it is absent or cannot be read.
+        If it is absent, not a regular file or cannot be read; while reading, if it unpacks
+        without bounds (see `cangauge.limits`).
     """
-    try:
-        with path.open("rb") as file:
-            packed = file.read(2) == _GZIP
-        return gzip.GzipFile(path, "rb") if packed else path.open("rb")
-    except FileNotFoundError as error:
-        raise InputError("no such file", source=path, cure="check the path") from error
-    except IsADirectoryError as error:
-        raise InputError("this is a folder", source=path, cure="name a file in it") from error
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"cannot be read: {reason}", source=path) from error
+    file = open_regular(path)
+    packed = file.read(2) == GZIP
+    file.seek(0)
+    if packed:
+        return gunzip_bounded(file, path, MAX_CAPTURE_BYTES)
+    return cast("io.BufferedReader", file)
 
 
 def read_head(path: Path) -> bytes:

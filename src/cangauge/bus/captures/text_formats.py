@@ -132,9 +132,11 @@ def _crtd(_first: str) -> Parser:
 
 
 #  (1436509052.249713)  can0  1DB   [8]  00 04 C2 62 00 00 03 B6
+# Possessive (++): a line of 16,000 blanks must not be tried in every way to part them.
 _CANDUMP = re.compile(
-    r"\s*(?:\((\d+\.\d+)\))?\s*(\S+)\s+(?:[RT]X\b\s*[-BE ]*\s+)?([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
-    r"\s+\[(\d+)\]\s+(remote request|(?:[0-9A-Fa-f]{2}\b ?)*)"
+    r"\s*+(?:\((\d++\.\d++)\)\s*+)?(\S++)\s++(?:[RT]X(?:\s++[-BE](?=\s))*+\s++)?"
+    r"([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
+    r"\s++\[(\d++)\]\s++(remote request|(?:[0-9A-Fa-f]{2}\b ?)*)"
 )
 
 

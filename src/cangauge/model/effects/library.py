@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 from cangauge.errors import InputError
@@ -54,6 +53,9 @@ _EFFECTS: tuple[Effect, ...] = (
 
 LIBRARY: Mapping[str, Effect] = {effect.id: effect for effect in _EFFECTS}
 """Effect id → effect, in the order in which effects are applied."""
+
+LARGEST = 1e30
+"""No parameter is larger, in any unit."""
 
 LEEWAY = 2.0
 """Bounds that are relative to the pack are this much wider when a file is read: the pack's sizes
@@ -142,7 +144,12 @@ def _values(effect: Effect, given: object, pack: Pack, field: str) -> Values:
 
 
 def _value(parameter: Parameter, given: object, pack: Pack, field: str) -> float:
-    if isinstance(given, bool) or not isinstance(given, int | float) or not math.isfinite(given):
+    # Whole numbers of JSON have any length, and only those of up to 308 digits become a float.
+    if (
+        isinstance(given, bool)
+        or not isinstance(given, int | float)
+        or not -LARGEST <= given <= LARGEST
+    ):
         raise InputError("must be a finite number", field=field, value=given)
     low, high = parameter.bounds(pack)
     if parameter.scale != "one":

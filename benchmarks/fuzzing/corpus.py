@@ -1,0 +1,339 @@
+"""Small valid files of every format that cangauge reads, as their makers write them."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import tempfile
+import zipfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import can
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.vehicle import load_vehicle
+from cangauge.estimate.types import Sample
+from cangauge.model.effects.effect import Pack, Parameter
+from cangauge.model.effects.library import LIBRARY, effect_entries
+from cangauge.model.model_file import load_model
+from cangauge.share import shared_file
+
+ROWS = 12
+
+DBC = """VERSION "1"
+NS_ :
+BS_:
+BU_: BMS VCU
+BO_ 256 BMS_Status: 8 BMS
+ SG_ PackCurrent : 7|16@0- (0.1,0) [-1000|1000] "A" VCU
+ SG_ PackVoltage : 23|16@0+ (0.1,0) [0|1000] "V" VCU
+ SG_ Counter : 48|4@1+ (1,0) [0|15] "" VCU
+BO_ 2566844926 BMS_Temp: 8 BMS
+ SG_ Selector M : 0|8@1+ (1,0) [0|255] "" VCU
+ SG_ PackTemperature m2 : 8|8@1- (0.5,-40) [-40|80] "degC" VCU
+ SG_ DisplaySoc m1 : 8|16@1+ (0.1,0) [0|100] "%" VCU
+CM_ SG_ 256 PackCurrent "positive charges";
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
+BA_DEF_DEF_ "GenMsgCycleTime" 0;
+BA_ "GenMsgCycleTime" BO_ 256 10;
+VAL_ 256 PackVoltage 65535 "not available" ;
+SIG_VALTYPE_ 256 PackCurrent : 0;
+SG_MUL_VAL_ 2566844926 PackTemperature Selector 2-2;
+"""
+
+MAP = """name = "my car"
+dbc = "car.dbc"
+temperature_source = "pack"
+pair_within_s = 0.02
+[current]
+message = "BMS_Status"
+signal = "PackCurrent"
+sign = -1
+scale = 1.0
+timeout_s = 2.0
+[voltage]
+signal = "PackVoltage"
+not_available = [65534]
+[temperature]
+message = 0x18FEF1FE
+signal = "PackTemperature"
+when = { Selector = 2 }
+[soc_reference]
+signal = "DisplaySoc"
+offset = 0.0
+[messages.BMS_Status]
+protection = "mine"
+period_s = 0.01
+[rules.mine]
+polynomial = 0x2F
+initial = 0xFF
+crc_byte = 7
+counter_byte = 6
+counter_bits = 4
+"""
+
+CONFIG = """model = "model.json"
+interface = "udp_multicast"
+channel = "239.74.163.2"
+vehicle = "leaf_aze0"
+temperature = 21.5
+temperature_source = "pack"
+method = "ekf"
+initial_soc = "auto"
+initial_soc_std = 1
+capacity_ah = 51.5
+max_gap_s = 2.0
+pair_within_s = 0.02
+time_source = "receive"
+timeout_s = 2.0
+record = "drive.log"
+output = "soc.parquet"
+duration_s = 60
+until_idle_s = 3
+[bus_options]
+bitrate = 500000
+fd = false
+[ids]
+soc_estimate = 0x5A0
+soc_detail = 1441
+"""
+
+OWN_CAR = 'model = "model.json"\ndbc = "car.dbc"\nmap = "car.toml"\ninitial_soc = 80\n'
+
+SPEED = "time_s,speed_kmh\n" + "".join(f"{k},{k % 7}.5\n" for k in range(ROWS))
+
+
+def current_a(row: int) -> float:
+    """Return a current that steps, positive = discharge [A]."""
+    return 40.0 if row % 2 else -10.0
+
+
+def log_rows() -> list[tuple[float, ...]]:
+    """Return time [s], current [A], voltage [V], temperature [°C], SoC [%] of some rows."""
+    return [
+        (k / 10, current_a(k), 380.0 - 0.1 * current_a(k), 21.0, 80.0 - k / 100)
+        for k in range(ROWS)
+    ]
+
+
+def csv_log() -> bytes:
+    """Return a canonical log as CSV."""
+    head = "time_s,current_a,voltage_v,temperature_c,soc_pct,temperature_source\n"
+    return (
+        head + "".join(",".join(f"{v:g}" for v in row) + ",pack\n" for row in log_rows())
+    ).encode()
+
+
+def parquet_log(*, checked: bool = False, compression: str = "none") -> bytes:
+    """Return a canonical log as Parquet; without checksums, damage reaches the decoder."""
+    names = ("time_s", "current_a", "voltage_v", "temperature_c", "soc_pct")
+    columns = dict(zip(names, map(list, zip(*log_rows(), strict=True)), strict=True))
+    table = pa.table({**columns, "temperature_source": ["pack"] * ROWS})
+    out = io.BytesIO()
+    pq.write_table(table, out, write_page_checksum=checked, compression=compression)
+    return out.getvalue()
+
+
+def _table(head: str, row: str, mark: str = "\n") -> bytes:
+    lines = [
+        row.format(t=t, i=i, n=-i, u=u, T=temp, s=soc, k=round(10 * t) + 1)
+        for t, i, u, temp, soc in log_rows()
+    ]
+    return (head + mark + "".join(line + mark for line in lines)).encode("latin-1")
+
+
+@cache
+def log_files() -> dict[str, bytes]:
+    """Return a small file of every format of logs, by file name."""
+    d3 = {
+        "2012": (
+            "Timestamp [sec]\tDyno Speed [mph]\tCell Temp [C]\tPhase #"
+            "\tHV Battery Voltage w/500A max clamp [V]\tHV Battery Current w/500A max clamp [A]",
+            "{t}\t0\t{T}\t1\t{u}\t{i}",
+        ),
+        "2013": (
+            "Time[sec]\tDyno_Speed[mph]\tTest_Cell_Temp[C]\tHV_Battery_SOC[%]"
+            "\tHV_Battery_Current[A]\tHV_Battery_Voltage[V]",
+            "{t}\t0\t{T}\t{s}\t{i}\t{u}",
+        ),
+        "later": (
+            "DAQ_Time[s]\tDyno_Spd[mph]\tCell_Temp[C]\tHVBatt_voltage_CAN5__V"
+            "\tHVBatt_current_wide_CAN5__A\tHVBatt_SOC_CAN5__per",
+            "{t}\t0\t{T}\t{u}\t{n}\t{s}",
+        ),
+    }
+    files = {
+        "log.csv": csv_log(),
+        "log;.csv": csv_log().replace(b",", b";").replace(b".", b","),
+        "utf16.csv": csv_log().decode().encode("utf-16"),
+        "log.parquet": parquet_log(),
+        "checked.parquet": parquet_log(checked=True, compression="snappy"),
+        "TripA01.csv": _table(
+            "Time [s];Velocity [km/h];Battery Voltage [V];Battery Current [A];"
+            "Battery Temperature [°C];SoC [%];max. SoC [%)",
+            "{t};0;{u};{n};{T};{s};90",
+            "\r\n",
+        ),
+        "A123_OCV_P25_S1.csv": _table(
+            "Data_Point,Test_Time(s),Date_Time,Step_Index,Current(A),Voltage(V)",
+            "{k},{t},09/23/2013 16:21:09,1,{n},{u}",
+        ),
+        "A123_DYN_50_P25_s1.csv": _table(
+            "time, step, current, voltage, chgAh, disAh", "{t}, 1.0, {i}, {u}, 0.0, 0.0"
+        ),
+        "Cell-HPPC-10C.csv": _table(
+            "No,0.0,1,1,1,1,1,0.0,1.00,381.0,0.0,0.00,0.00,DCHG, ,",
+            "No,{k}.0,1,1,1,1,1,{t},{n},{u},0.0,0.00,0.00,DCHG, ,",
+            "\r\n",
+        ),
+        "module.csv": _table(
+            "Test Name,170410\nNotes, 5.25b\n\n"
+            "Total Time,Cycle,Current,Voltage,Amp-Hours,Temperature A1,Temperature A2,Mode,",
+            "{k}.0,1,{n},{u},0,22,23,DCHG,",
+        )
+        + b"Total Number of Data Lines in the Database: 0000000012\n",
+    }
+    for spelling, (head, row) in d3.items():
+        files[f"{spelling} Test Data.txt"] = _table(head, row, "\r\n")
+    files["log.csv.gz"] = gzip.compress(files["log.csv"], mtime=0)
+    files["leaf.zip"] = zipped("61201019 Test Data.txt", files["2012 Test Data.txt"])
+    return files
+
+
+def zipped(name: str, data: bytes) -> bytes:
+    """Return a zip of one test and a document beside it."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(zipfile.ZipInfo(name), data)
+        archive.writestr(zipfile.ZipInfo("readme.pdf"), b"%PDF")
+    return out.getvalue()
+
+
+@cache
+def leaf_frames() -> tuple[can.Message, ...]:
+    """Return the frames that a Leaf with these rows would send."""
+    encoder = FrameEncoder(load_vehicle("leaf_aze0"))
+    frames: list[can.Message] = []
+    for t, i, u, temp, soc in log_rows():
+        for frame in encoder.encode(Sample(1000.0 + t, i, u, temp), soc):
+            frame.channel = "can0"
+            frames.append(frame)
+    return tuple(frames)
+
+
+def _hex(frame: can.Message, separator: str = " ") -> str:
+    return frame.data.hex(" ").upper().replace(" ", separator)
+
+
+_TEXTS: dict[str, tuple[str, Callable[[can.Message], str]]] = {
+    "spaced.txt": (
+        "", lambda f: f"{f.timestamp:.6f} {f.arbitration_id:08X} {f.dlc} {_hex(f)}\r\n"
+    ),
+    "table.csv": (
+        "ParserFlags\tCh\tCounter\tT/R\tTime\tFlags\tCAN ID\tLen\tData\tParser\n",
+        lambda f: f"1\t0\t1\tRX\t{1000 * f.timestamp:.0f}\t\t0x{f.arbitration_id:08x}\t{f.dlc}"
+        f"\t0x{_hex(f)} \tDefault\n",
+    ),
+    "ovms.crtd": (
+        "1000.000000 CXX OVMS CRTD\n",
+        lambda f: f"{f.timestamp:.6f} 1R11 {f.arbitration_id:03x} {_hex(f)}\n",
+    ),
+    "screen.txt": (
+        "", lambda f: f"  can0  {f.arbitration_id:03X}   [{f.dlc}]  {_hex(f)}\n"
+    ),
+    "stamped.txt": (
+        "", lambda f: f" ({f.timestamp:.6f})  can0  RX - -  {f.arbitration_id:03X}   [{f.dlc}]"
+        f"  {_hex(f)}\n",
+    ),
+    "candump.log": (
+        "", lambda f: f"({f.timestamp:.6f}) can0 {f.arbitration_id:03X}#{_hex(f, '')}\n",
+    ),
+}  # fmt: skip
+_WRITERS: dict[str, Callable[..., can.io.generic.MessageWriter]] = {
+    "x.asc": can.ASCWriter,
+    "x.blf": can.BLFWriter,
+    "x.csv": can.CSVWriter,
+    "x.trc": can.TRCWriter,
+}
+
+
+@cache
+def capture_files() -> dict[str, bytes]:
+    """Return a small file of every format of captures, by file name (MF4 where it is there)."""
+    files = {}
+    for name, (head, line) in _TEXTS.items():
+        files[name] = (head + "".join(map(line, leaf_frames()))).encode()
+    for name in _WRITERS:
+        files[name] = _written(name)
+    # Not packed, so that what is changed inside a container arrives inside it.
+    files["plain.blf"] = _written("x.blf", compression_level=0)
+    files["candump.log.gz"] = gzip.compress(files["candump.log"], mtime=0)
+    mf4 = _mf4()
+    return files if mf4 is None else files | {"x.mf4": mf4}
+
+
+def _written(name: str, **options: int) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        with _WRITERS[name](path, **options) as writer:
+            for frame in leaf_frames():
+                writer.on_message_received(_on_channel_0(frame))
+        return path.read_bytes()
+
+
+def _on_channel_0(frame: can.Message) -> can.Message:
+    return can.Message(
+        timestamp=frame.timestamp,
+        arbitration_id=frame.arbitration_id,
+        is_extended_id=frame.is_extended_id,
+        data=frame.data,
+        channel=0,
+    )
+
+
+def _mf4() -> bytes | None:
+    try:
+        import asammdf  # noqa: F401, PLC0415 - an extra
+    except ModuleNotFoundError:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "x.mf4"
+        with can.MF4Writer(path) as writer:
+            for frame in leaf_frames():
+                writer.on_message_received(_on_channel_0(frame))
+        return path.read_bytes()
+
+
+@cache
+def model_tree() -> dict[str, Any]:
+    """Return a model file's content, with every effect and with information."""
+    path = shared_file("replay", "leaf2012_published_model.json")
+    tree: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    file = load_model(path)
+    pack = Pack.of(file.voltage_model(), file.capacity_ah)
+    tree["effects"] = effect_entries(
+        [(effect, {p.name: _somewhere(p, pack) for p in effect.parameters})
+         for effect in LIBRARY.values()]
+    )  # fmt: skip
+    names = list(tree["coefficients"])
+    n = len(names)
+    tree["information"] = {
+        "columns": names,
+        "scale": [1.0 + k for k in range(n)],
+        "root": [[float(i == k) for k in range(n)] for i in range(n)],
+        "projected": [0.5] * n,
+        "rows": 9000,
+        "residual_sum_v2": 12.5,
+    }
+    return tree
+
+
+def _somewhere(parameter: Parameter, pack: Pack) -> float:
+    low, high = parameter.bounds(pack)
+    return low + 0.3 * (high - low)

@@ -1,0 +1,480 @@
+"""What is fuzzed: how an input is made, and all that cangauge does with it.
+
+A target's `run` returns whether the input was accepted. `InputError` (any `CangaugeError`) is how
+it may be refused; whatever else comes out is a finding.
+"""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+import math
+import os
+import tempfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import can
+
+from cangauge.bus.capture_inspect import inspect_capture
+from cangauge.bus.capture_log import capture_to_log
+from cangauge.bus.captures import is_capture, open_capture
+from cangauge.bus.database import load_dbc
+from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.protection import GENERIC_RULE
+from cangauge.bus.publish import SocPublisher, SocReader
+from cangauge.bus.time_source import ClockFrames
+from cangauge.bus.vehicle import Vehicle, load_vehicle
+from cangauge.errors import CangaugeError
+from cangauge.estimate.estimator import Estimator, EstimatorSettings
+from cangauge.estimate.offline import estimate_log
+from cangauge.estimate.types import Estimate, Sample
+from cangauge.inspect.analysis import inspect_log
+from cangauge.logs.log import Log
+from cangauge.logs.read import read_log
+from cangauge.model.model_file import ModelFile, load_model
+from cangauge.service.config import load_config
+from cangauge.service.stream import EstimateStream
+from cangauge.share import shared_file
+from cangauge.twin.schedule import read_speed
+from fuzzing import corpus
+from fuzzing.mutate import json_bytes, mutate, mutate_json
+
+FRAMES_AT_ONCE = 200
+"""Frames of one stream: each is an input."""
+LONGEST_MESSAGE = 2000
+ESTIMATED_ROWS = 200
+"""Longer logs are read and inspected, but not estimated."""
+
+
+class FindingError(Exception):
+    """An input was accepted, and what came of it is wrong."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """One kind of input.
+
+    Parameters
+    ----------
+    name : str
+    make : callable
+        Draws an input from a generator of random numbers; `bytes`, or what `run` takes.
+    run : callable
+        Takes it; returns whether it was accepted.
+    weight : int
+        How many inputs one call counts for.
+    share : float
+        Share of all inputs in a whole run.
+    seeds : callable, optional
+        Valid files; None for what is no file.
+    """
+
+    name: str
+    make: Callable[[Random], bytes]
+    run: Callable[[bytes], bool]
+    share: float
+    weight: int = 1
+    seeds: Callable[[], dict[str, bytes]] | None = None
+
+
+def attempt(target: Target, data: bytes) -> bool:
+    """Run a target; return whether the input was accepted; anything else is raised."""
+    with refusable():
+        return target.run(data)
+    return False
+
+
+@contextmanager
+def refusable() -> Iterator[None]:
+    """Let the inside end by a `CangaugeError` whose message is one readable line."""
+    try:
+        yield
+    except CangaugeError as error:
+        line = str(error)
+        if not line or not line.isprintable() or len(line) > LONGEST_MESSAGE:
+            raise FindingError(f"a message of {len(line)} characters: {line[:100]!r}") from error
+
+
+# --- a place for files ---------------------------------------------------------------------------
+
+
+@cache
+def _folder() -> Path:
+    """Return this process's own folder, in memory where the machine has such a file system."""
+    memory = Path("/dev/shm")  # noqa: S108 - only where to put a folder of our own
+    where = memory if memory.is_dir() and os.access(memory, os.W_OK) else None
+    holder = tempfile.TemporaryDirectory(prefix="cangauge-fuzz-", dir=where)
+    _HOLDERS.append(holder)
+    folder = Path(holder.name)
+    (folder / "car.dbc").write_text(corpus.DBC)
+    (folder / "car.toml").write_text(corpus.MAP)
+    (folder / "model.json").write_bytes(json_bytes(corpus.model_tree()))
+    return folder
+
+
+_HOLDERS: list[tempfile.TemporaryDirectory[str]] = []
+
+
+@contextmanager
+def _file(data: bytes, name: str = "input") -> Iterator[Path]:
+    path = _folder() / name
+    path.write_bytes(data)
+    yield path
+
+
+# --- logs ----------------------------------------------------------------------------------------
+
+
+@cache
+def _model() -> ModelFile:
+    return load_model(shared_file("replay", "leaf2012_published_model.json"))
+
+
+def _packed(rng: Random, data: bytes) -> bytes:
+    return gzip.compress(data, 1, mtime=0) if rng.randrange(8) == 0 else data
+
+
+def _make_log(rng: Random) -> bytes:
+    files = corpus.log_files()
+    name = rng.choice(list(files))
+    data = files[name]
+    if name.endswith((".parquet", ".gz", ".zip", "utf16.csv")):
+        return mutate(rng, data, list(files.values()))
+    mutant = mutate(rng, data, [files["log.csv"], files["TripA01.csv"]], text=True)
+    if name.startswith("2012") and rng.randrange(8) == 0:
+        return corpus.zipped("1 Test Data.txt", mutant)
+    return _packed(rng, mutant)
+
+
+# Some formats take the temperature from the file's name.
+_LOG_NAMES = ("input", "A_P25_x.csv", "Cell-HPPC-10C.csv", "_N05_.csv")
+
+
+def _run_log(data: bytes) -> bool:
+    with _file(data, _LOG_NAMES[zlib.crc32(data) % len(_LOG_NAMES)]) as path:
+        log = read_log(path, temperature_c=20.0 if zlib.crc32(data) % 3 else None)
+        is_capture(path)
+    inspect_log(log).to_dict()
+    if len(log) <= ESTIMATED_ROWS:
+        _estimate(log)
+    return True
+
+
+def _estimate(log: Log) -> None:
+    table, _ = estimate_log(log, _model(), EstimatorSettings())
+    for row in range(len(log)):
+        _check_soc(float(table.soc_pct[row]))
+
+
+def _check_soc(soc_pct: float) -> None:
+    if not (math.isnan(soc_pct) or 0.0 <= soc_pct <= 100.0):
+        raise FindingError(f"a SoC of {soc_pct} %")
+
+
+def _check_estimate(estimate: Estimate) -> None:
+    _check_soc(estimate.soc_pct)
+    if estimate.soc_std_pct < 0.0:
+        raise FindingError(f"a standard deviation of {estimate.soc_std_pct} %")
+
+
+def _run_speed(data: bytes) -> bool:
+    with _file(data) as path:
+        return bool(read_speed(path).size)
+
+
+# --- captures and frames -------------------------------------------------------------------------
+
+
+@cache
+def _vehicles() -> tuple[Vehicle, ...]:
+    folder = _folder()
+    return (
+        load_vehicle("leaf_aze0"),
+        load_vehicle("generic"),
+        load_vehicle("leaf_ze1", temperature_c=20.0),
+        load_vehicle(map_file=folder / "car.toml"),
+    )
+
+
+def _make_capture(rng: Random) -> bytes:
+    files = corpus.capture_files()
+    name = rng.choice(list(files))
+    is_text = not name.endswith((".blf", ".gz", ".mf4"))
+    mutant = mutate(rng, files[name], list(files.values()), text=is_text)
+    return _packed(rng, mutant) if is_text else mutant
+
+
+def _run_capture(data: bytes) -> bool:
+    with _file(data, "capture") as path:
+        capture = open_capture(path)
+        for _ in capture:
+            pass
+        capture.info.to_dict()
+        with refusable():
+            _use_capture(path, zlib.crc32(data) % 40)
+    return True
+
+
+def _use_capture(path: Path, what: int) -> None:
+    if what == 0:
+        inspect_capture(path).to_dict()
+    elif what == 1:
+        inspect_capture(path, _vehicles()[0]).to_dict()
+    elif what == 2:
+        capture_to_log(path, _vehicles()[0], source="replay-clock")
+    elif what <= 20:
+        log = capture_to_log(path, _vehicles()[0])
+        if len(log) <= ESTIMATED_ROWS:
+            _estimate(log)
+
+
+def _make_frames(rng: Random) -> bytes:
+    """Return a stream's seed: the frames are drawn while it runs."""
+    return rng.randrange(1 << 62).to_bytes(8, "big")
+
+
+def _run_frames(data: bytes) -> bool:
+    rng = Random(data)  # noqa: S311 - no secret
+    which = rng.randrange(len(_vehicles()))
+    vehicle = _vehicles()[which]
+    settings = EstimatorSettings(
+        method=rng.choice(("ekf", "ekf", "newton", "coulomb")),
+        initial_soc_pct=rng.choice((None, 0.0, 50.0, 100.0)),
+    )
+    source = rng.choice(("receive", "receive", "replay-clock"))
+    stream = EstimateStream(vehicle, _model(), settings, source)
+    reader, publisher = SocReader(), SocPublisher()
+    good = _good_frames(which)
+    now_s = rng.choice((0.0, 1000.0, 1.7e9))
+    for number in range(FRAMES_AT_ONCE):
+        frame = _mutant_frame(rng, good[number % len(good)], vehicle)
+        now_s += rng.choice((0.01, 0.01, 0.01, 0.0, 1.0, 5.0, -0.5, 1e5, -1e6, 1e-9))
+        frame.timestamp = now_s
+        estimate = stream.handle(frame)
+        reader.read(frame)
+        if estimate is not None:
+            _check_estimate(estimate)
+            for message in publisher.publish(estimate, stream.samples):
+                _read_back(rng, reader, message)
+    last = stream.finish()
+    if last is not None:
+        _check_estimate(last)
+    return bool(stream.samples)
+
+
+def _read_back(rng: Random, reader: SocReader, message: can.Message) -> None:
+    if reader.read(message) is None:
+        raise FindingError("a frame that was published cannot be read")
+    damaged = bytearray(message.data)
+    damaged[rng.randrange(6)] ^= 1 << rng.randrange(8)
+    message.data = bytearray(GENERIC_RULE.protect(damaged, rng.randrange(16)))
+    reader.read(message)
+
+
+@cache
+def _good_frames(which: int) -> tuple[can.Message, ...]:
+    encoder, clock = FrameEncoder(_vehicles()[which]), ClockFrames()
+    frames: list[can.Message] = []
+    for t, i, u, temp, soc in corpus.log_rows():
+        frames.append(clock.at(round(t * 1e6)))
+        frames += encoder.encode(Sample(t, i, u, temp), soc)
+    return tuple(frames)
+
+
+def _mutant_frame(rng: Random, frame: can.Message, vehicle: Vehicle) -> can.Message:
+    data = bytearray(frame.data)
+    number, extended = frame.arbitration_id, frame.is_extended_id
+    kinds: dict[str, bool] = {}
+    for _ in range(rng.choice((0, 1, 1, 2))):
+        what = rng.randrange(7)
+        if what <= 2 and data:
+            data[rng.randrange(len(data))] = rng.choice((0, 255, 127, 128, rng.randrange(256)))
+        elif what == 3:
+            data = data[: rng.randrange(9)]
+        elif what == 4:
+            data += bytes(rng.randrange(57))
+        elif what == 5:
+            number, extended = rng.choice(
+                ((0, False), (number, True), (0x5A0, False), (0x5A1, False))
+            )
+        else:
+            kinds = rng.choice(
+                ({"is_error_frame": True}, {"is_remote_frame": True}, {"is_fd": True})
+            )
+    rule = next((m.rule for key, m in vehicle.messages.items() if key == number), None)
+    if rule is not None and rng.randrange(3) and rule.fits(len(data)):
+        # With a right CRC and a counter that goes on, the damage gets through.
+        data = bytearray(rule.protect(data, rng.randrange(16)))
+    return can.Message(arbitration_id=number, is_extended_id=extended, data=data, **kinds)
+
+
+# --- DBC, map, configuration ---------------------------------------------------------------------
+
+
+def _make_dbc(rng: Random) -> bytes:
+    seeds = _dbc_seeds()
+    data = rng.choice(list(seeds.values()))
+    return mutate(rng, data, list(seeds.values()), text=True)
+
+
+@cache
+def _dbc_seeds() -> dict[str, bytes]:
+    shipped = {
+        name: shared_file("dbc", name).read_bytes()
+        for name in ("soc_estimate.dbc", "generic_pack.dbc")
+    }
+    # The small one more often: reading takes time with the size.
+    return {"car.dbc": corpus.DBC.encode(), "again.dbc": corpus.DBC.encode()} | shipped
+
+
+def _run_dbc(data: bytes) -> bool:
+    with _file(data, "mutant.dbc") as path:
+        load_dbc(path)
+        if b"PackCurrent" in data:
+            car = load_vehicle(dbc=path, map_file=_own_map())
+            stream = EstimateStream(car, _model())
+            for key in car.messages:
+                for length in (0, 8, 64):
+                    stream.handle(
+                        can.Message(
+                            arbitration_id=key & 0x1FFFFFFF,
+                            is_extended_id=key > 0x1FFFFFFF,
+                            data=data[-length:] if length else b"",
+                            timestamp=1.0,
+                            is_fd=True,
+                        )
+                    )
+    return True
+
+
+@cache
+def _own_map() -> Path:
+    path = _folder() / "without_dbc.toml"
+    path.write_text(corpus.MAP.replace('dbc = "car.dbc"\n', ""))
+    return path
+
+
+def _make_map(rng: Random) -> bytes:
+    return mutate(rng, corpus.MAP.encode(), [corpus.CONFIG.encode()], text=True)
+
+
+def _run_map(data: bytes) -> bool:
+    with _file(data, "map.toml") as path:
+        load_vehicle(map_file=path)
+    return True
+
+
+def _make_config(rng: Random) -> bytes:
+    data = rng.choice((corpus.CONFIG, corpus.CONFIG, corpus.OWN_CAR)).encode()
+    return mutate(rng, data, [corpus.MAP.encode()], text=True)
+
+
+def _run_config(data: bytes) -> bool:
+    with _file(data, "config.toml") as path:
+        config = load_config(path, {"timeout_s": 3.0} if data[:1] == b"m" else None)
+        config.address()
+        config.gauge_settings()
+        config.loop_settings()
+        config.load_vehicle()
+    return True
+
+
+# --- model files, state files --------------------------------------------------------------------
+
+
+def _make_model(rng: Random) -> bytes:
+    tree = corpus.model_tree()
+    if rng.randrange(4) == 0:
+        return mutate(rng, json_bytes(tree), text=True)
+    if rng.randrange(2):
+        tree = {**tree, "effects": rng.sample(tree["effects"], 2)}
+    return json_bytes(mutate_json(rng, tree))
+
+
+def _run_model(data: bytes) -> bool:
+    with _file(data, "mutant.json") as path:
+        model = load_model(path)
+    volts = model.voltage_model().pseudo_ocv([-5.0, 0.0, 50.0, 100.0, 105.0])
+    if not all(map(math.isfinite, volts.tolist())):
+        raise FindingError(f"a pseudo-OCV of {volts} V")
+    estimator = Estimator(model, EstimatorSettings())
+    for t, i, u, temp, _ in corpus.log_rows():
+        _check_estimate(estimator.step(Sample(t, i, u, temp)))
+    return True
+
+
+def _state_target() -> Target | None:
+    """Return the target of state files, where this release keeps any."""
+    try:
+        from cangauge.service import state_file  # noqa: PLC0415
+    except ImportError:
+        return None
+    return Target("state", lambda rng: _make_state(rng, state_file), _runs_state(state_file), 0.05)
+
+
+def _make_state(rng: Random, state_file: Any) -> bytes:
+    tree = json.loads(_state_text(state_file))
+    if rng.randrange(4) == 0:
+        return mutate(rng, json_bytes(tree), text=True)
+    tree["content"] = mutate_json(rng, tree["content"])
+    if rng.randrange(8):
+        # Signed anew, or the hash refuses it at once.
+        with suppress(TypeError, ValueError):
+            text = json.dumps(tree["content"], sort_keys=True, separators=(",", ":"))
+            tree["sha256"] = hashlib.sha256(text.encode()).hexdigest()
+    return json_bytes(tree)
+
+
+@cache
+def _state_text(state_file: Any) -> str:
+    estimator = Estimator(_model(), EstimatorSettings())
+    for t, i, u, temp, _ in corpus.log_rows():
+        estimator.step(Sample(t, i, u, temp))
+    return state_file.state_text(
+        state_file.StateContent(
+            saved_s=1.7e9, boot_id="x", model=state_file.model_fingerprint(_model()),
+            model_name="x", time_source="receive", estimator=estimator.snapshot(),
+        )
+    )  # fmt: skip
+
+
+def _runs_state(state_file: Any) -> Callable[[bytes], bool]:
+    def run(data: bytes) -> bool:
+        with _file(data, "state.json") as path:
+            content = state_file.read_state(path)
+        estimator = Estimator(_model(), EstimatorSettings())
+        _check_estimate(estimator.restore(content.estimator))
+        for t, i, u, temp, _ in corpus.log_rows():
+            _check_estimate(estimator.step(Sample(2e9 + t, i, u, temp)))
+        return True
+
+    return run
+
+
+# --- all -----------------------------------------------------------------------------------------
+
+
+def targets() -> tuple[Target, ...]:
+    """Return all targets; shares are of a whole run's inputs."""
+    found = [
+        Target("frames", _make_frames, _run_frames, 0.44, weight=FRAMES_AT_ONCE),
+        Target("captures", _make_capture, _run_capture, 0.16, seeds=corpus.capture_files),
+        Target("logs", _make_log, _run_log, 0.10, seeds=corpus.log_files),
+        Target("model", _make_model, _run_model, 0.08),
+        Target("config", _make_config, _run_config, 0.07),
+        Target("map", _make_map, _run_map, 0.06),
+        Target("dbc", _make_dbc, _run_dbc, 0.05, seeds=_dbc_seeds),
+        Target(
+            "speed", lambda rng: mutate(rng, corpus.SPEED.encode(), text=True), _run_speed, 0.04
+        ),
+    ]
+    state = _state_target()
+    return tuple(found if state is None else [*found, state])

@@ -1,0 +1,58 @@
+"""The fuzzer itself: it must notice what it is there for, or a clean table means nothing."""
+
+from __future__ import annotations
+
+import naughty_targets as naughty
+import pytest
+
+from cangauge.errors import InputError
+from fuzzing.supervise import Share, Tally, fuzz, input_of, try_one
+from fuzzing.targets import FindingError, Target, attempt, targets
+
+
+@pytest.mark.slow
+def test_what_hangs_dies_raises_and_grows_is_found_and_all_the_rest_is_tried() -> None:
+    done: list[int] = []
+    tallies = fuzz(
+        [Share("naughty", 0, 30), Share("naughty", 30, 60)],
+        seed=1,
+        workers=2,
+        progress=lambda _, inputs: done.append(inputs),
+        module="naughty_targets",
+        hang_s=3.0,
+    )
+    tally = tallies["naughty"]
+    found = {example.number: what for (what, _), example in tally.findings.items()}
+    assert found == {
+        naughty.HANGS: "hung",
+        naughty.DIES: "died with exit code -9",
+        naughty.RAISES: "KeyError",
+        naughty.GROWS: "too much memory",
+    }
+    assert (tally.inputs, tally.accepted, tally.refused) == (60, 30, 27)
+    assert sum(done) == 58
+
+
+def test_a_message_that_is_no_line_is_a_finding() -> None:
+    def run(_: bytes) -> bool:
+        error = InputError("fine")
+        error.args = ("two\nlines",)
+        raise error
+
+    target = Target("x", lambda _: b"", run, 1.0)
+    with pytest.raises(FindingError):
+        attempt(target, b"")
+
+
+def test_slow_ones_are_findings(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fuzzing.supervise.SLOW_S", 0.02)
+    tally = Tally()
+    try_one(Target("x", lambda _: b"", lambda _: sum(range(3_000_000)) > 0, 1.0), b"", 5, tally)
+    assert ("too slow", "x") in tally.findings
+
+
+@pytest.mark.parametrize("target", targets(), ids=lambda target: target.name)
+def test_the_same_seed_and_number_are_the_same_input(target: Target) -> None:
+    assert [input_of(target, 3, n) for n in range(5)] == [input_of(target, 3, n) for n in range(5)]
+    assert len({input_of(target, 3, n) for n in range(20)}) > 10
+    assert input_of(target, 3, 1) != input_of(target, 4, 1)
