@@ -10,13 +10,15 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
 
 from cangauge.atomic import write_text_atomic
 from cangauge.errors import InputError
-from cangauge.gapcheck.draw import Label, draw_group
+from cangauge.gapcheck.draw import MODEL, Label, draw_group
+from cangauge.gapcheck.later import judge_later, later_figures, write_model
 from cangauge.gapcheck.outcome import Outcome, outcome_of
 from cangauge.gapcheck.plan import EFFECTS, Group
 from cangauge.gapcheck.seal import seal, unseal
@@ -104,7 +106,10 @@ def _tasks(labels: Sequence[Label], open_set: int, rng: np.random.Generator) -> 
     there = sorted(
         (label for label in labels if "failed" not in label), key=lambda label: label["name"]
     )
-    asked = [Task("", label["name"], label["protocol"]) for label in there]
+    asked = [
+        Task("", label["name"], label["protocol"], wants_model="judged_on" in label)
+        for label in there
+    ]
     again: list[Task] = []
     for effect in EFFECTS:
         with_it = [
@@ -226,6 +231,37 @@ def outcomes_of(
             task = Task(f"undrawn_{name}", name, label["protocol"])
             outcomes.append(outcome_of(task, label, {"error": label["failed"]}))
     return outcomes
+
+
+def some_of(tasks: Sequence[Task], at_most: int | None) -> list[Task]:
+    """Return so many tasks at random, always the same ones; all without a number."""
+    if at_most is None or at_most >= len(tasks):
+        return list(tasks)
+    chosen = np.random.default_rng(0).permutation(len(tasks))[:at_most]
+    return [tasks[k] for k in sorted(chosen.tolist())]
+
+
+def later_of(
+    drawn: Drawn, tasks: Sequence[Task], answers: dict[str, dict[str, Any]], progress: Progress
+) -> dict[str, Any]:
+    """Return the figures of extended models on logs that were kept back (see `later`).
+
+    A case without an extended model keeps the plain one.
+    """
+    labels = unseal(drawn.folder / SEALED, drawn.sha256)
+    judged = []
+    with TemporaryDirectory(prefix="models-") as folder:
+        for task in tasks:
+            if not task.wants_model or task.id not in answers:
+                continue
+            plain = drawn.folder / OPEN / task.case / MODEL
+            model = answers[task.id].get("extended_model")
+            better = (
+                plain if model is None else write_model(model, Path(folder) / f"{task.id}.json")
+            )
+            judged.append(judge_later(labels[task.case], plain, better, drawn.folder / SEALED))
+            progress(1)
+    return later_figures(judged)
 
 
 @contextmanager

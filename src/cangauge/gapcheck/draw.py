@@ -18,11 +18,14 @@ import numpy as np
 
 from cangauge.atomic import write_text_atomic
 from cangauge.gapcheck.floors import identify, missed_v
+from cangauge.gapcheck.outcome import LEAST_GAP
+from cangauge.gapcheck.physical import CAUSES, label_of, physical_case
 from cangauge.gapcheck.plan import Group, Planned
 from cangauge.gapcheck.recorded import recorded_set
+from cangauge.logs.canonical import write_log
 from cangauge.model.model_file import model_json
 from cangauge.twin.case import CaseOptions, draw_case, write_case
-from cangauge.twin.case_files import Case
+from cangauge.twin.case_files import Case, write_case_files
 from cangauge.twin.real_case import make_real_case
 from cangauge.twin.world import World, record_day
 
@@ -38,6 +41,9 @@ OPTIONS: Final[Mapping[str, CaseOptions]] = {
 
 REAL_LOGS: Final = 4
 _CLEAN_DAYS: Final = 3
+_TRIES: Final = 4
+_OTHER_SEED: Final = 2**40
+"""Even, so that another try of a case for development stays one for development."""
 
 Label = dict[str, Any]
 
@@ -63,6 +69,8 @@ def draw_group(group: Group, folder: Path, sealed: Path, data: Path | None) -> l
     try:
         if group.protocol in OPTIONS:
             return _simulated(group, folder, sealed)
+        if group.protocol in CAUSES:
+            return [_physical(group.protocol, case, folder, sealed, data) for case in group.cases]
         return _real(group, folder, sealed, data)
     except Exception as error:  # noqa: BLE001 - what cannot be drawn is listed, never dropped
         reason = f"{type(error).__name__}: {error}"
@@ -84,7 +92,11 @@ def _simulated(group: Group, folder: Path, sealed: Path) -> list[Label]:
     labels: list[Label] = []
     first: Path | None = None
     for case in group.cases:
-        drawn = draw_case(case.seed, case.effects or None, options=options, world=world)
+        for attempt in range(_TRIES):
+            seed = case.seed + attempt * _OTHER_SEED
+            drawn = draw_case(seed, case.effects or None, options=options, world=world)
+            if not case.effects or drawn.gap_v >= LEAST_GAP * floor_v:
+                break  # else physics allows too little on these days: draw others
         written = write_case(drawn, folder, sealed, case.name)
         write_text_atomic(folder / case.name / MODEL, model)
         healthy = [record_day(world.plant, day, ()).log for day in drawn.days]
@@ -107,22 +119,47 @@ def _real(group: Group, folder: Path, sealed: Path, data: Path | None) -> list[L
     labels: list[Label] = []
     first: Path | None = None
     for case in group.cases:
-        written = make_real_case(
-            case.seed,
-            case.effects or None,
-            recorded,
-            folder,
-            sealed,
-            floor_v=floor_v,
-            n_logs=REAL_LOGS,
-            name=case.name,
-        )
+        for attempt in range(_TRIES):
+            written = make_real_case(
+                case.seed + attempt * _OTHER_SEED,
+                case.effects or None,
+                recorded,
+                folder,
+                sealed,
+                floor_v=floor_v,
+                n_logs=REAL_LOGS,
+                name=case.name,
+            )
+            if not case.effects or _truth(written)["gap_v"] >= LEAST_GAP * floor_v:
+                break
         write_text_atomic(folder / case.name / MODEL, model)
         chosen = {about["name"] for about in _truth(written)["logs"]}
         healthy = [log for log in recorded.held_out if log.name in chosen]
         labels.append(_label(group.protocol, case, written, missed_v(known, healthy)))
         first = _share(folder / case.name, first)
     return labels
+
+
+def _physical(protocol: str, case: Planned, folder: Path, sealed: Path, data: Path | None) -> Label:
+    found = physical_case(protocol, case.seed, data)
+    hidden = [{"time_s": log.time_s} for log in found.shown.logs]
+    written = write_case_files(
+        found.shown,
+        label_of(found, protocol, case.seed),
+        hidden,
+        folder=folder,
+        sealed=sealed,
+        name=case.name,
+    )
+    write_text_atomic(folder / case.name / MODEL, found.model)
+    label = _label(protocol, case, written, found.floor_v)
+    judged_on: dict[str, list[dict[str, str]]] = {}
+    for group, logs in found.judged_on.items():
+        for log in logs:
+            name = f"{case.name}_{log.name}.parquet"
+            write_log(log, sealed / name)
+            judged_on.setdefault(group, []).append({"log": log.name, "file": name})
+    return label | ({"judged_on": judged_on} if judged_on else {})
 
 
 def _label(protocol: str, case: Planned, written: Case, clean_v: float) -> Label:
@@ -132,14 +169,13 @@ def _label(protocol: str, case: Planned, written: Case, clean_v: float) -> Label
     logs = [{k: v for k, v in about.items() if k not in {"file", "sha256"}}
             for about in truth.pop("logs")]  # fmt: skip
     written.truth.unlink()
-    real = protocol.startswith("real-")
     return {
         **truth,
         "protocol": protocol,
         "logs": logs,
         "floor_v": truth["gap_counted_in_v"],
         "floor_clean_v": clean_v,
-        "floor_sensor_v": None if real else truth["floor_sensor_v"],
+        "floor_sensor_v": truth["floor_sensor_v"] if protocol in OPTIONS else None,
     }
 
 

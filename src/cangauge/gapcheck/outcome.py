@@ -88,6 +88,11 @@ class Outcome:
         return self.truth[0]
 
     @property
+    def is_decoy(self) -> bool:
+        """Whether an effect was left out of the library that is not the cause."""
+        return bool(self.leave_out) and not set(self.truth) & set(self.leave_out)
+
+    @property
     def strict(self) -> bool:
         """Whether the verdict is right (of several causes: one of them)."""
         if len(self.truth) > 1 and not self.leave_out:

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
-from cangauge.twin.case import OUTSIDE
+from cangauge.gapcheck.physical import CAUSES
 from cangauge.twin.faults import fault_kinds
 
-Protocol = Literal["simulated", "two-effects", "pybamm", "real-bmw_i3", "real-lg_hg2"]
 EFFECTS: Final = tuple(kind.id for kind in fault_kinds())
 OUTSIDE_EFFECTS: Final = tuple(kind.id for kind in fault_kinds(outside=True))
 
@@ -71,6 +70,8 @@ class Sizes:
         Cases of two named effects at once.
     effects : int
         How many of the named effects, drawn at random; all without a smaller number.
+    physical : int
+        Cases of recorded logs with a physical effect, which are always the same.
     """
 
     per_effect: int = 0
@@ -78,22 +79,29 @@ class Sizes:
     per_outside: int = 0
     pairs: int = 0
     effects: int = len(EFFECTS)
+    physical: int = 0
+
+    @property
+    def cases(self) -> int:
+        """How many in all."""
+        named = min(self.effects, len(EFFECTS)) * self.per_effect
+        outside = len(OUTSIDE_EFFECTS) * self.per_outside
+        return named + outside + self.healthy + self.pairs + self.physical
 
 
 FULL: Final[dict[str, Sizes]] = {
     "simulated": Sizes(per_effect=20, healthy=300),
     "outside": Sizes(per_outside=6),
     "two-effects": Sizes(pairs=40),
-    "pybamm": Sizes(per_effect=5, healthy=20),
+    "pybamm": Sizes(per_effect=2, healthy=10),
     "real-bmw_i3": Sizes(per_effect=5, healthy=40),
     "real-lg_hg2": Sizes(per_effect=5, healthy=20),
+    **{name: Sizes(physical=number) for name, (_, number) in CAUSES.items()},
 }
 
 SMALL: Final[dict[str, Sizes]] = {
     "simulated": Sizes(per_effect=1, healthy=2, effects=5),
-    "outside": Sizes(),
     "two-effects": Sizes(pairs=1),
-    "pybamm": Sizes(),
     "real-bmw_i3": Sizes(per_effect=1, healthy=1, effects=2),
     "real-lg_hg2": Sizes(per_effect=1, healthy=1, effects=1),
 }
@@ -135,6 +143,9 @@ _Cases = list[tuple[int, tuple[str, ...]]]
 
 def _groups(protocol: str, sizes: Sizes, *, seed: int, final: bool) -> list[tuple[int, _Cases]]:
     rng = _rng(protocol, seed, final=final)
+    if sizes.physical:
+        cause = CAUSES[protocol][0]
+        return [(number, [(number, (cause,))]) for number in range(sizes.physical)]
     causes = list(_causes(sizes, rng))
     seeds = _seeds(rng, len(causes), final=final)
     order = rng.permutation(len(causes))
@@ -173,4 +184,36 @@ def _seeds(rng: np.random.Generator, number: int, *, final: bool) -> list[int]:
 
 def is_outside(effects: Sequence[str]) -> bool:
     """Whether a cause is one that no diagnosis is expected to know."""
-    return any(effect in OUTSIDE_EFFECTS or effect == OUTSIDE for effect in effects)
+    return any(effect in OUTSIDE_EFFECTS for effect in effects)
+
+
+ROUGH_S: Final = {
+    "simulated": 6.0,
+    "outside": 6.0,
+    "two-effects": 6.0,
+    "pybamm": 75.0,
+    "real-bmw_i3": 12.0,
+    "real-lg_hg2": 25.0,
+    "cold-bmw_i3": 60.0,
+    "cold-lg_hg2": 30.0,
+    "hysteresis-a123_lfp": 12.0,
+}
+"""Seconds that drawing and diagnosing a case take, roughly."""
+
+OPEN_SET_S: Final = 2.0
+OPEN_SET_OF: Final = {"full": 10, "small": 1}
+"""So many cases of each simulated effect are diagnosed again with it out of the library."""
+
+NEEDS_DATA: Final = tuple(name for name in FULL if name.startswith("real-") or name in CAUSES)
+
+
+def open_set_of(part: str, per_effect: int | None) -> int:
+    """Return how many cases of each effect the open set has."""
+    usual = OPEN_SET_OF[part]
+    return usual if per_effect is None else min(usual, per_effect)
+
+
+def seconds_of(sizes: dict[str, Sizes], open_set: int) -> float:
+    """Return roughly how long a plan takes on one core [s]."""
+    again = open_set * sizes["simulated"].effects if "simulated" in sizes else 0
+    return sum(ROUGH_S[name] * item.cases for name, item in sizes.items()) + OPEN_SET_S * again

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Final
@@ -51,15 +50,14 @@ def recorded_set(name: str, data: Path | None, seed: int) -> RecordedSet:
     folder = folder_of(name, data)
     rng = np.random.default_rng([seed, 7])
     if name == "bmw_i3":
-        training = read_i3(folder, _I3_TRAINING)
+        training = summer_training(folder)
         long = [log for log in training if log.duration_s > _AT_LEAST_S]
         chosen = np.sort(rng.permutation(len(long))[:_REFERENCES])
-        held_out = [log for log in read_i3(folder, _I3_HELD_OUT) if log.duration_s > _AT_LEAST_S]
         return RecordedSet(
             name,
             training,
             [long[k] for k in chosen],
-            held_out,
+            summer_held_out(folder),
             capacity_from_reference(training),
             _I3_CELLS,
         )
@@ -99,9 +97,15 @@ def _read(path: Path) -> Log:
     return read_log(path)
 
 
-def read_i3(folder: Path, names: Sequence[str]) -> list[Log]:
-    """Read trips of the car."""
-    return [_read(folder / name) for name in names]
+def summer_training(folder: Path) -> list[Log]:
+    """Return the summer trips of the car that its model is identified on."""
+    return [_read(folder / name) for name in _I3_TRAINING]
+
+
+def summer_held_out(folder: Path) -> list[Log]:
+    """Return the other summer trips, as far as they are long enough to show anything."""
+    trips = [_read(folder / name) for name in _I3_HELD_OUT]
+    return [trip for trip in trips if trip.duration_s > _AT_LEAST_S]
 
 
 @cache

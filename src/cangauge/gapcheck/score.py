@@ -17,6 +17,9 @@ CONFIDENT: Final = 0.5
 GAP_EDGES: Final = (0.0, 0.5, 1.0, 2.0, 5.5)
 _BINS: Final = 10
 
+REAL: Final = "real-"
+"""Protocols of faults put into recorded logs; they are scored each and all together."""
+
 Figures = dict[str, Any]
 
 
@@ -30,6 +33,9 @@ def score(outcomes: Sequence[Outcome]) -> Figures:
     by_protocol: dict[str, list[Outcome]] = defaultdict(list)
     for item in outcomes:
         by_protocol[item.protocol].append(item)
+    recorded = [item for item in outcomes if item.protocol.startswith(REAL)]
+    if recorded:
+        by_protocol["real"] = recorded
     return {
         "protocols": {name: _protocol(items) for name, items in sorted(by_protocol.items())},
         "reliability": reliability(outcomes),
@@ -38,19 +44,20 @@ def score(outcomes: Sequence[Outcome]) -> Figures:
     }
 
 
-def _protocol(items: Sequence[Outcome]) -> Figures:
+def _protocol(everything: Sequence[Outcome]) -> Figures:
+    decoys = [i for i in everything if i.is_decoy]
+    items = [i for i in everything if not i.is_decoy]
     single = [i for i in items if len(i.truth) == 1 and not is_outside(i.truth)]
     closed_set = [i for i in single if i.right in EFFECTS and i.in_range]
     healthy = [i for i in items if not i.truth]
     unnamed = [i for i in items if i.right == UNKNOWN and i.in_range]
     pairs = [i for i in items if len(i.truth) == 2]
-    result: Figures = {"cases": len(items)}
+    result: Figures = {"cases": len(items), "below_range": sum(not i.in_range for i in items)}
     if closed_set:
         result["effects"] = _accuracy(closed_set)
         result["by_gap"] = _by_gap([i for i in single if i.right in EFFECTS])
         result["by_effect"] = _by_effect(closed_set)
         result["coverage"] = _coverage(closed_set)
-        result["below_range"] = sum(not i.in_range for i in single)
     if healthy:
         result["healthy"] = {
             "false_alarms": share([i.verdict != NONE for i in healthy]).to_dict(),
@@ -66,7 +73,11 @@ def _protocol(items: Sequence[Outcome]) -> Figures:
                 [i.names_effect and set(i.truth) <= set(i.ranked[:3]) for i in pairs]
             ).to_dict(),
         }
+    if decoys:
+        # The cause is still in the library, so these say whether leaving another out does harm.
+        result["decoys"] = share([i.strict for i in decoys]).to_dict()
     result["confusion"] = confusion(items)
+    result["cost"] = _cost(items)
     return result
 
 
