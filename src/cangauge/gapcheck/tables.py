@@ -53,8 +53,10 @@ def entries_of(items: Mapping[str, Any]) -> Iterator[Entry]:
         for key, label in ACCURACY:
             yield label, effects[key]
         for key, label in FLOORS:
-            yield f"closed where found, median ({label})", effects["closed"][key]["detected"]
-        yield "intervals that hold the true parameter", items["coverage"]["all"]
+            if effects["closed"][key]["detected"]["of"]:
+                yield f"closed where found, median ({label})", effects["closed"][key]["detected"]
+        if items["coverage"]["all"]["of"]:
+            yield "intervals that hold the true parameter", items["coverage"]["all"]
     if "healthy" in items:
         yield "healthy: false alarms", items["healthy"]["false_alarms"]
         yield "healthy: an effect named", items["healthy"]["named_an_effect"]

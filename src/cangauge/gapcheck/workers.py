@@ -160,11 +160,13 @@ def diagnose_all(
             worker = free.get()
             home = Path(tempfile.mkdtemp(dir=top))
             try:
-                request = request_of(task, cases / task.case, home)
-                found = worker.ask(request)
+                found = worker.ask(request_of(task, cases / task.case, home))
                 if task.wants_model and "error" not in found:
                     text = (home / "extended.json").read_text(encoding="utf-8")
                     found["extended_model"] = json.loads(text)
+            except OSError as error:  # a kept case whose files are gone, a full disk
+                return {"error": f"{type(error).__name__}: {error}"}
+            else:
                 return found
             finally:
                 shutil.rmtree(home, ignore_errors=True)
