@@ -154,7 +154,7 @@ def test_closed_is_by_the_truths_floors_and_zero_without_a_cause() -> None:
     }
     missed = outcome(label("capacity"), answer("none", rmse=(3.0, 3.0)))
     assert missed.closed is not None
-    assert missed.closed["sensor"] == 0.0
+    assert missed.closed == {"reported": 0.0, "clean": 0.0, "sensor": 0.0}
     no_gap = outcome(label("capacity"), answer("capacity", rmse=(0.9, 0.4)))
     assert no_gap.closed is not None
     assert "clean" not in no_gap.closed

@@ -205,8 +205,9 @@ def _closed(gap: Mapping[str, Any], label: Mapping[str, Any], verdict: str) -> d
     closed.
     """
     result: dict[str, float] = {}
-    if gap.get("closed_fraction") is not None:
-        result["reported"] = float(gap["closed_fraction"])
+    has_cause = verdict not in {NONE, UNKNOWN}
+    if not has_cause or gap.get("closed_fraction") is not None:
+        result["reported"] = float(gap["closed_fraction"]) if has_cause else 0.0
     for name in ("clean", "sensor"):
         floor = label.get(f"floor_{name}_v")
         if floor is None:
@@ -215,7 +216,7 @@ def _closed(gap: Mapping[str, Any], label: Mapping[str, Any], verdict: str) -> d
         if there <= 0.0:
             continue  # the model as given has no gap above this floor
         shrunk = float(gap["baseline_rmse_v"]) ** 2 - float(gap["extended_rmse_v"]) ** 2
-        result[name] = min(shrunk / there, 1.0) if verdict not in {NONE, UNKNOWN} else 0.0
+        result[name] = min(shrunk / there, 1.0) if has_cause else 0.0
     return result
 
 
