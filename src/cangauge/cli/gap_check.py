@@ -150,6 +150,8 @@ def gap_check_command(  # noqa: PLR0917 - typer passes options by name
         began = time.perf_counter()
         if score_only:
             answers = answers_before(drawn)
+            tasks = [task for task in tasks if task.id in answers]
+            note(f"{len(tasks)} of {len(drawn.tasks)} diagnoses were kept")
         else:
             bar = progress.add_task("diagnosing", total=len(tasks))
             answers = diagnose_tasks(drawn, tasks, jobs, lambda n: progress.advance(bar, n))
@@ -197,7 +199,7 @@ def _draw(
     groups = plan(sizes, seed=chosen, final=final)
     total = sum(len(group.cases) for group in groups)
     rough = duration(planned_seconds(sizes, open_set) / jobs)
-    note(f"{total} cases of {', '.join(sizes)}: about {rough} with {jobs} processes")
+    note(f"{total} cases of {', '.join(sizes)}: about {rough}, {jobs} at a time")
     bar = progress.add_task("drawing", total=total)
     return draw_all(
         groups,

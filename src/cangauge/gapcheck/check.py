@@ -180,11 +180,13 @@ def diagnose_tasks(
         Called with the number of answers that came.
     """
     answers = {}
-    for task, answer in diagnose_all(tasks, drawn.folder / OPEN, jobs):
-        answers[task.id] = answer
-        progress(1)
-    lines = [json.dumps({"task": key, **answer}) for key, answer in sorted(answers.items())]
-    write_text_atomic(drawn.folder / ANSWERS, "\n".join(lines) + "\n")
+    # Line by line, so that a long check that is stopped can be scored as far as it came.
+    with (drawn.folder / ANSWERS).open("w", encoding="utf-8") as file:
+        for task, answer in diagnose_all(tasks, drawn.folder / OPEN, jobs):
+            answers[task.id] = answer
+            file.write(json.dumps({"task": task.id, **answer}) + "\n")
+            file.flush()
+            progress(1)
     return answers
 
 

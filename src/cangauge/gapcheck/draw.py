@@ -113,8 +113,10 @@ def _clean_days(world: World, options: CaseOptions) -> list[Any]:
 
 def _real(group: Group, folder: Path, sealed: Path, data: Path | None) -> list[Label]:
     recorded = recorded_set(group.protocol.removeprefix("real-"), data, group.world_seed)
-    known = identify(recorded.training, recorded.capacity_ah)
-    model = model_json(known.model)
+    model = model_json(identify(recorded.training, recorded.capacity_ah).model)
+    own = {log.name for log in recorded.training}
+    further = [log for log in recorded.references if log.name not in own]
+    known = identify([*recorded.training, *further], recorded.capacity_ah)
     floor_v = missed_v(known, recorded.held_out)
     labels: list[Label] = []
     first: Path | None = None
