@@ -96,6 +96,27 @@ def test_kept_answers_score_the_same(kept: Path, ran: dict[str, Any]) -> None:
         assert json.loads(again.stdout)[key] == ran["json"][key]
 
 
+def test_a_check_that_was_stopped_is_scored_as_far_as_it_came(
+    kept: Path, ran: dict[str, Any], capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    path = kept / "answers.jsonl"
+    before = path.read_text()
+    path.write_text("".join(before.splitlines(keepends=True)[:3]))
+    monkeypatch.setattr(
+        sys, "argv", ["cangauge", "gap-check", "--cases", str(kept), "--score-only", "--json"]
+    )
+    try:
+        with pytest.raises(SystemExit) as left:
+            main()
+    finally:
+        path.write_text(before)
+    assert left.value.code == 0
+    said = capsys.readouterr()
+    assert len(json.loads(said.out)["cases"]) == 3
+    assert "3 of 4" in said.err
+
+
 def test_a_changed_label_is_refused(kept: Path, ran: dict[str, Any]) -> None:
     path = kept / "sealed" / "labels.json"
     before = path.read_text()
