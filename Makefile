@@ -3,13 +3,14 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: help demo test lint coverage trips clean
+.PHONY: help demo test lint coverage check trips clean
 
 help:
 	@echo "make demo      the whole job on the shipped log: fit, bus, service, report"
 	@echo "make test      the whole test suite"
 	@echo "make lint      ruff and mypy"
 	@echo "make coverage  the test suite with coverage"
+	@echo "make check     a small part of the withheld check of the diagnosis"
 	@echo "make trips     the table on the real BMW i3 trips (see README for the data)"
 
 $(VENV)/installed: pyproject.toml
@@ -35,6 +36,9 @@ lint: $(VENV)/installed-dev
 
 coverage: $(VENV)/installed-dev
 	$(BIN)/python -m pytest --cov --cov-report=term-missing:skip-covered
+
+check: $(VENV)/installed
+	$(BIN)/cangauge gap-check --part small
 
 trips: $(VENV)/installed
 	$(BIN)/python benchmarks/real_trips.py

@@ -14,6 +14,7 @@ from cangauge.cli.demo import demo_command
 from cangauge.cli.estimate import estimate_command
 from cangauge.cli.fit import fit_command
 from cangauge.cli.gap import gap_command
+from cangauge.cli.gap_check import gap_check_command
 from cangauge.cli.inspect import inspect_command
 from cangauge.cli.output import note
 from cangauge.cli.replay import replay_command
@@ -53,6 +54,7 @@ app.command("demo")(demo_command)
 app.command("fit")(fit_command)
 app.command("estimate")(estimate_command)
 app.command("gap")(gap_command)
+app.command("gap-check")(gap_check_command)
 app.command("run")(run_command)
 app.command("status")(status_command)
 app.command("replay")(replay_command)

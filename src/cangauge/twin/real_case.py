@@ -120,8 +120,8 @@ def make_real_case(
         )
         reached = min((item.reached_v / item.wanted_v for item in scaled), default=1.0)
         attempts.append((reached, logs, scaled))
-        if reached >= _GOOD_ENOUGH:
-            break
+        if reached >= _GOOD_ENOUGH or n_logs == len(recorded.held_out):
+            break  # good, or there are no other logs to draw
     _, logs, scaled = max(attempts, key=lambda attempt: attempt[0])
     faults = [item.fault for item in scaled]
     changed = [inject(log, faults, pack, seed=seed) for log in logs]

@@ -1,0 +1,1 @@
+"""The withheld check: causes are drawn and sealed, diagnosed from the logs alone, then scored."""
