@@ -1,0 +1,140 @@
+"""Which faults run beside which, how long that takes, and in what order."""
+
+from __future__ import annotations
+
+import math
+import queue
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Final
+
+from faults.catalogue import undisturbed
+from faults.fault import Fault
+from faults.judge import Reference, Seen, Verdict, judge
+from faults.line import Line
+from faults.process import Target, cangauge
+from faults.run import run_fault
+
+AROUND_S: Final = 4.0
+"""What a run takes besides its frames: starting, last words, ending [s]."""
+SERVER_S: Final = 10.0
+"""What it takes to import the service once [s]."""
+
+
+@dataclass(frozen=True)
+class Jobs:
+    """How many faults run at once.
+
+    Parameters
+    ----------
+    fast, real : int
+        Of those by the replay clock (they take a quarter of a core each), of those in real time
+        (they take little).
+    """
+
+    fast: int = 3
+    real: int = 24
+
+
+@dataclass(frozen=True)
+class Done:
+    """A fault that was run."""
+
+    fault: Fault
+    verdict: Verdict
+
+
+def seconds(faults: list[Fault], jobs: Jobs) -> float:
+    """Return how long `run_all` will take, about [s]."""
+    runs = _with_undisturbed(faults)
+    alone = [fault for fault in runs if "alone" in fault.needs]
+    beside = [fault for fault in runs if "alone" not in fault.needs]
+    total = SERVER_S + sum(fault.profile.seconds + AROUND_S for fault in alone)
+    pools = []
+    for is_real, width in ((True, jobs.real), (False, jobs.fast)):
+        lengths = [
+            fault.profile.seconds + AROUND_S
+            for fault in beside
+            if fault.profile.is_real_time == is_real
+        ]
+        rounds = math.ceil(len(lengths) / width)
+        pools.append(rounds * max(lengths, default=0.0))
+    return total + max(pools)
+
+
+def run_all(
+    faults: list[Fault],
+    lines: Callable[[int], Line],
+    jobs: Jobs,
+    seed: int,
+    *,
+    target: Target = cangauge,
+    progress: Callable[[str], None] = lambda _name: None,
+) -> list[Done]:
+    """Run faults and their undisturbed runs, and judge them.
+
+    Parameters
+    ----------
+    faults : list of Fault
+    lines : callable
+        Gives a bus by number.
+    jobs : Jobs
+    seed : int
+    target : callable
+        The service.
+    progress : callable
+        Told the name of each run that is over.
+
+    Returns
+    -------
+    list of Done
+        In the order of `faults`, the undisturbed runs first.
+
+    Raises
+    ------
+    ValueError
+        If an undisturbed run is no reference.
+    """
+    runs = _with_undisturbed(faults)
+    free: queue.SimpleQueue[Line] = queue.SimpleQueue()
+    for number in range(jobs.fast + jobs.real):
+        free.put(lines(number))
+
+    def one(fault: Fault) -> Seen:
+        line = free.get()
+        try:
+            return run_fault(fault, line, seed, target)
+        finally:
+            free.put(line)
+            progress(fault.name)
+
+    seen: dict[int, Seen] = {}
+    futures: dict[int, Future[Seen]] = {}
+    with ThreadPoolExecutor(jobs.fast) as fast, ThreadPoolExecutor(jobs.real) as real:
+        for number, fault in enumerate(runs):
+            if "alone" not in fault.needs:
+                pool = real if fault.profile.is_real_time else fast
+                futures[number] = pool.submit(one, fault)
+                # Not all at the same moment: a dozen starts at once would delay each other.
+                time.sleep(0.05)
+        for number, future in futures.items():
+            seen[number] = future.result()
+    for number, fault in enumerate(runs):
+        if "alone" in fault.needs:
+            seen[number] = one(fault)
+    references = {
+        fault.alike: Reference(seen[number])
+        for number, fault in enumerate(runs)
+        if fault.plan is None and fault.frames is None and fault.values is None
+    }
+    return [
+        Done(fault, judge(seen[number], references[fault.alike]))
+        for number, fault in enumerate(runs)
+    ]
+
+
+def _with_undisturbed(faults: list[Fault]) -> list[Fault]:
+    needed = {fault.alike: undisturbed(fault) for fault in faults}
+    return [*needed.values(), *faults]
