@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from dataclasses import replace
+from random import Random
 
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
@@ -82,6 +83,11 @@ def faster_current() -> FrameChange:
     return whole
 
 
+def _either(rng: Random, low: float, high: float) -> float:
+    """Return a number of that size, of either sign."""
+    return rng.choice((-1.0, 1.0)) * rng.uniform(low, high)
+
+
 def _floats(current_a: float, voltage_v: float) -> bytes:
     return struct.pack("<ff", current_a, voltage_v)
 
@@ -139,7 +145,7 @@ PROTECTION = [
 
 VALUES = [
     *[
-        Fault(f"{role} not available", "its code for that, CRC valid", frames=alter.not_available(role))
+        Fault(f"{role} not available", "its code, CRC valid", frames=alter.not_available(role))
         for role in ROLES
     ],
     Fault("current not available, real time", "its code for that, CRC valid", REAL,
@@ -154,10 +160,10 @@ VALUES = [
           values=value("voltage_v", lambda _v, _r: 4e3)),
     Fault("temperature out of range", "200 °C, CRC valid", REAL, untrue=TEMPERATURE,
           values=value("temperature_c", lambda _t, _r: 200.0)),
-    Fault("current implausibly quick", "100–300 A more or less at every sample", untrue=CURRENT,
-          values=value("current_a", lambda a, rng: a + rng.choice((-1, 1)) * rng.uniform(100, 300))),
-    Fault("voltage implausibly quick", "30–60 V more or less at every sample", untrue=VOLTAGE,
-          values=value("voltage_v", lambda v, rng: v + rng.choice((-1, 1)) * rng.uniform(30, 60))),
+    Fault("current implausibly quick", "100–300 A off at every sample", untrue=CURRENT,
+          values=value("current_a", lambda a, rng: a + _either(rng, 100, 300))),
+    Fault("voltage implausibly quick", "30–60 V off at every sample", untrue=VOLTAGE,
+          values=value("voltage_v", lambda v, rng: v + _either(rng, 30, 60))),
     Fault("temperature implausibly quick", "40 K up and down", untrue=TEMPERATURE,
           values=value("temperature_c", lambda t, rng: t + rng.choice((-40.0, 40.0)))),
     Fault("current stuck", "held at its value, counter and CRC go on", values=stuck("current_a")),

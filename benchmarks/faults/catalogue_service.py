@@ -86,9 +86,9 @@ def garbage(stage: Stage) -> None:
 
 
 RESTARTS = [
-    Fault("SIGTERM, restart", "ended politely and started again", REAL, plan=at(BEGIN, Stage.restart),
+    Fault("SIGTERM, restart", "ended and started again", REAL, plan=at(BEGIN, Stage.restart),
           needs=frozenset({"state"})),
-    Fault("SIGKILL, restart", "killed at a random moment and started again, fresh interpreter", REAL,
+    Fault("SIGKILL, restart", "killed at a random moment, a fresh interpreter started", REAL,
           plan=kills(1), needs=frozenset({"state"}), cold=True),
     Fault("SIGKILL three times", "killed at random moments and started again", REAL, plan=kills(3),
           needs=frozenset({"state"})),

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -230,7 +231,7 @@ def _silent(seen: Seen) -> float:
     times = [each.time_s for each in seen.told if each.time_s <= seen.ended_s]
     times = [seen.began_s, *times, seen.ended_s]
     worst = 0.0
-    for one, two in zip(times, times[1:], strict=False):
+    for one, two in pairwise(times):
         # Of the whole silence what was excused does not count.
         excused = sum(
             max(min(two, last) - max(one, first), 0.0) for first, last in _joined(seen.excused)
@@ -250,8 +251,4 @@ def _joined(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
 
 
 def _not_valid(told: list[Told]) -> float:
-    return sum(
-        two.time_s - one.time_s
-        for one, two in zip(told, told[1:], strict=False)
-        if one.status != VALID
-    )
+    return sum(two.time_s - one.time_s for one, two in pairwise(told) if one.status != VALID)

@@ -174,6 +174,7 @@ class Listener(threading.Thread):
         self.start()
 
     def run(self) -> None:
+        """Listen until told to stop."""
         while not self._stopped.is_set():
             frame = self._wire.receive(0.1)
             if frame is not None and frame.arbitration_id == self._message.frame_id:

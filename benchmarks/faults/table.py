@@ -68,14 +68,15 @@ def show(rows: list[Row], console: Console) -> None:
     table = Table(title="faults on a live bus", caption=CAPTION)
     for name in ("fault", "what was done", "bus, time"):
         table.add_column(name, overflow="fold")
-    for name in (
+    numbers = (
         "SoC error %",
         "worst %",
         "status: worst, last",
         "not valid s",
         "stale s",
         "silent s",
-    ):
+    )
+    for name in numbers:
         table.add_column(name, justify="right")
     table.add_column("", overflow="fold")
     for row in rows:
@@ -99,10 +100,10 @@ def show(rows: list[Row], console: Console) -> None:
 
 
 CAPTION = (
-    "SoC error: largest against the undisturbed run that was called valid after recovery (–: nothing"
-    " was called valid there); worst: in the whole run. Not valid: for so long from the fault on. Stale: called"
-    " valid for so much longer than its time-out. Times by the clock on the wall; a replay clock's"
-    " second is 24 of its log's."
+    "SoC error: largest against the undisturbed run, called valid after recovery (–: nothing"
+    " was called valid there); worst: in the whole run. Not valid: for so long from the fault on."
+    " Stale: called valid for so much longer than its time-out. Times by the clock on the wall; a"
+    " second of it is 24 of the log's with the replay clock."
 )
 
 
