@@ -125,7 +125,7 @@ def _run(bus: str, faults: list[Fault], options: argparse.Namespace) -> list[Row
 
         lines = udp if bus == "udp" else vcan
         done = run_all(able, lines, jobs, options.seed, progress=over)
-    return [Row.of(each.fault, bus, each.verdict) for each in done] + rows
+    return [Row.of(each.fault, bus, each.verdict, each.why_not) for each in done] + rows
 
 
 def _able(bus: str, faults: list[Fault]) -> tuple[list[Fault], list[Row]]:

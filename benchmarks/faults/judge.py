@@ -30,6 +30,8 @@ STALE_SLACK_S: Final = 0.6
 """Besides the time-out: a publishing period, and what a busy machine takes [s]."""
 TRANSPORT_S: Final = 0.5
 """A published frame may be so much older than when it was seen [s]."""
+JUST_BEFORE_S: Final = 0.3
+"""So shortly before the fault the undisturbed run must be valid [s]."""
 RECOVERED_SHARE: Final = 0.9
 """The SoC is judged in what follows this share of the run."""
 
@@ -75,6 +77,8 @@ class Seen:
         Ends of the process and the like.
     stop_s : float
         Longest time from SIGTERM to the end [s].
+    late_s : float
+        By so much at most was the harness itself late with a frame [s].
     """
 
     told: list[Told] = field(default_factory=list)
@@ -88,6 +92,7 @@ class Seen:
     excused: list[tuple[float, float]] = field(default_factory=list)
     troubles: list[str] = field(default_factory=list)
     stop_s: float = math.nan
+    late_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -129,12 +134,16 @@ class Reference:
             raise ValueError(f"the undisturbed run failed: {'; '.join(seen.troubles)}")
         valid = [each for each in seen.told if each.status == VALID]
         begin, last = seen.fault_s[0], seen.judged_from_s
-        for name, low, high in (("fault's begin", begin - 1.0, begin), ("end", last, math.inf)):
+        for name, low, high in (
+            ("fault's begin", begin - JUST_BEFORE_S, begin),
+            ("end", last, math.inf),
+        ):
             there = [each for each in seen.told if low <= each.time_s <= high]
             # The very last ones may already be told of as stale: nothing more is sent.
             there = [each for each in there if each.time_s <= seen.ended_s + TRANSPORT_S]
-            if not there or any(each.status != VALID for each in there):
-                raise ValueError(f"the undisturbed run is not valid at the {name}: {there[-1:]}")
+            bad = [each for each in there if each.status != VALID]
+            if bad or not there:
+                raise ValueError(f"the undisturbed run is not valid at the {name}: {bad[:1]}")
         self._bus_s = bus_time([each.time_s for each in valid], seen)
         self._soc_pct = np.array([each.soc_pct for each in valid])
 

@@ -113,6 +113,7 @@ class _Player:
     def __init__(self, sender: Wire, seen: Seen, speed: float) -> None:
         self._sender = sender
         self._seen = seen
+        self._speed = speed
         self._clock = None if speed == 1.0 else ClockFrames()
         self._pacer = Pacer(speed, lambda: False)
         seen.good_s = {role: [] for role in ROLES}
@@ -133,6 +134,8 @@ class _Player:
                 last_s = event.at_s
                 seen.sent_s.append(time.monotonic())
                 seen.bus_s.append(event.at_s)
+                due_s = seen.began_s + event.at_s / self._speed
+                seen.late_s = max(seen.late_s, seen.sent_s[-1] - due_s)
             if send(event.frame) and event.is_good:
                 for role in event.roles:
                     seen.good_s[role].append(seen.sent_s[-1])

@@ -19,6 +19,8 @@ from cangauge.bus.publish import FrameIds, SocPublisher
 from cangauge.estimate.types import Estimate, Reason, Status
 
 NAN = float("nan")
+AGE_S = 2.0
+"""Older input is missed [s]; the last words of a run are shorter."""
 
 
 def _serve(
@@ -50,7 +52,7 @@ def _serve(
 
 def honest(arguments: list[str]) -> None:
     """A constant SoC, invalid as soon as no current comes: nothing to object to."""
-    _serve(arguments, lambda age_s, _n: (70.0, Status.INVALID if age_s > 1.0 else Status.VALID))
+    _serve(arguments, lambda age_s, _n: (70.0, Status.INVALID if age_s > AGE_S else Status.VALID))
 
 
 def always_valid(arguments: list[str]) -> None:
@@ -63,7 +65,7 @@ def silent_after_a_fault(arguments: list[str]) -> None:
     lost: list[bool] = []
 
     def answer(age_s: float, _n: int) -> tuple[float, Status] | None:
-        if age_s > 1.0:
+        if age_s > AGE_S:
             lost.append(True)
         return None if lost else (70.0, Status.VALID)
 
@@ -75,7 +77,7 @@ def drifts_after_a_fault(arguments: list[str]) -> None:
     lost: list[bool] = []
 
     def answer(age_s: float, _n: int) -> tuple[float, Status] | None:
-        if age_s > 1.0:
+        if age_s > AGE_S:
             lost.append(True)
             return 70.0, Status.INVALID
         return (68.0 if lost else 70.0), Status.VALID
@@ -87,7 +89,7 @@ def dies_of_a_fault(arguments: list[str]) -> None:
     """Ends with an exception when its input is missing."""
 
     def answer(age_s: float, _n: int) -> tuple[float, Status] | None:
-        if age_s > 1.0:
+        if age_s > AGE_S:
             raise RuntimeError("no input")
         return 70.0, Status.VALID
 
