@@ -38,13 +38,15 @@ from rich.table import Table
 
 from cangauge.bus.encode import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, open_bus
-from cangauge.bus.publish import SAMPLES_MODULO, FrameIds, SocDetail, SocReader
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.estimate.types import Sample
 from cangauge.replay.pace import Pacer
 from cangauge.share import shared_file
 
+SOC_DETAIL_ID: Final = 0x5A1
+SAMPLES_MODULO: Final = 1 << 16
+"""SOC_DETAIL counts samples modulo this."""
 SAMPLE_HZ: Final = 500
 """Two wanted frames each."""
 BARE_EVERY: Final = 4
@@ -113,7 +115,7 @@ def _latencies(address: BusAddress, seconds: float) -> list[float]:
     listener = open_bus(address)
     sender = CONTEXT.Process(target=_send_samples, args=(address, seconds))
     sender.start()
-    reader = SocReader(FrameIds())
+    layout = _messages()[SOC_DETAIL_ID]
     done_s: list[float] = []
     found: list[tuple[int, float]] = []
     first: float | None = None
@@ -122,11 +124,11 @@ def _latencies(address: BusAddress, seconds: float) -> list[float]:
             done_s.append(message.timestamp)
             first = first or message.timestamp
             continue
-        told = reader.read(message)
-        if not isinstance(told, SocDetail) or not done_s or first is None:
+        if message.arbitration_id != SOC_DETAIL_ID or first is None:
             continue
+        told = int(layout.decode(message.data)["samples"])
         # What was told is modulo 65536; it lies near what was sent.
-        number = len(done_s) - (len(done_s) - told.samples) % SAMPLES_MODULO
+        number = len(done_s) - (len(done_s) - told) % SAMPLES_MODULO
         is_new = 0 < number <= len(done_s) and len(done_s) - number < SAMPLE_HZ
         if is_new and done_s[number - 1] > first + WARM_S:
             found.append((number, message.timestamp - done_s[number - 1]))
@@ -168,14 +170,12 @@ def _bare(address: BusAddress, loop: Any) -> Iterator[Connection]:
 
 def _echo(pipe: Connection, address: BusAddress) -> None:
     """Receive, decode, send: what any service must do, and no more."""
-    messages = {}
-    for name in ("generic_pack.dbc", "soc_estimate.dbc"):
-        database = cantools.database.load_file(shared_file("dbc", name))
-        messages |= {each.frame_id: each for each in database.messages}
+    messages = _messages()
     wanted = [0x400, 0x401, 0x402, 0x403, 0x5AF]
     filters = [{"can_id": each, "can_mask": 0x7FF, "extended": False} for each in wanted]
     bus, samples = open_bus(address, filters), 0
-    detail = messages[0x5A1]
+    detail = messages[SOC_DETAIL_ID]
+    nothing = {signal.name: 0.0 for signal in detail.signals}
     pipe.send("ready")
     while True:
         message = bus.recv(1.0)
@@ -186,17 +186,18 @@ def _echo(pipe: Connection, address: BusAddress) -> None:
             continue
         samples += 1
         if samples % BARE_EVERY == 0:
-            bus.send(_detail(detail, samples))
+            values = {**nothing, "samples": samples % SAMPLES_MODULO}
+            data = detail.encode(values, strict=False)
+            bus.send(can.Message(arbitration_id=SOC_DETAIL_ID, is_extended_id=False, data=data))
 
 
-def _detail(message: cantools.database.can.Message, samples: int) -> can.Message:
-    """Return a SOC_DETAIL; its CRC by table, as a service would."""
-    from cangauge.bus.protection import GENERIC_RULE  # noqa: PLC0415
-
-    values = {signal.name: 0.0 for signal in message.signals}
-    data = message.encode({**values, "samples": samples % SAMPLES_MODULO}, strict=False)
-    data = GENERIC_RULE.protect(bytearray(data), samples // BARE_EVERY)
-    return can.Message(arbitration_id=message.frame_id, is_extended_id=False, data=data)
+def _messages() -> dict[int, cantools.database.can.Message]:
+    """Return what the DBC files hold, by id."""
+    found = {}
+    for name in ("generic_pack.dbc", "soc_estimate.dbc"):
+        database = cantools.database.load_file(shared_file("dbc", name))
+        found |= {each.frame_id: each for each in database.messages}
+    return found
 
 
 # --- loss ---------------------------------------------------------------------------------------

@@ -78,7 +78,7 @@ class Seen:
     stop_s : float
         Longest time from SIGTERM to the end [s].
     late_s : float
-        By so much at most was the harness itself late with a frame [s].
+        By so much at most were two frames further apart than meant: the harness was held up [s].
     """
 
     told: list[Told] = field(default_factory=list)

@@ -25,6 +25,7 @@ Target = Callable[[list[str]], None]
 CONTEXT: Final = multiprocessing.get_context("forkserver")
 PRELOAD: Final = [
     "faults.process",
+    "cangauge.cli.app",
     "cangauge.cli.run",
     "cangauge.estimate.fusion",
     "can.interfaces.udp_multicast",

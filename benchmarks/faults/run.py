@@ -22,7 +22,7 @@ from faults.fault import Action, Fault
 from faults.judge import RECOVERED_SHARE, Seen, Told
 from faults.line import Line, Wire
 from faults.process import Target, cangauge
-from faults.stage import START_S, Setting, Stage, remove, vehicle_config
+from faults.stage import FIRST_START_S, Setting, Stage, remove, vehicle_config
 
 LAST_WORDS_S: Final = 1.0
 """How long to listen after the last frame; less than the time-out of the input [s]."""
@@ -72,7 +72,7 @@ def _played(fault: Fault, stage: Stage, sender: Wire, listener: Listener, rng: R
         found = fault.frames(found, profile, vehicle, rng)
     actions = [] if fault.plan is None else fault.plan(profile, rng)
     stage.service.start()
-    if not listener.wait(START_S, stage.service.check):
+    if not listener.wait(FIRST_START_S, stage.service.check):
         stage.troubles.append("does not start: " + " ".join(stage.service.said().split())[-200:])
         # Nothing to play to; what is missing is judged all the same.
         found, actions = found[:1], []
@@ -134,8 +134,9 @@ class _Player:
                 last_s = event.at_s
                 seen.sent_s.append(time.monotonic())
                 seen.bus_s.append(event.at_s)
-                due_s = seen.began_s + event.at_s / self._speed
-                seen.late_s = max(seen.late_s, seen.sent_s[-1] - due_s)
+                took_s = seen.sent_s[-1] - seen.sent_s[-2]
+                meant_s = (seen.bus_s[-1] - seen.bus_s[-2]) / self._speed
+                seen.late_s = max(seen.late_s, took_s - meant_s)
             if send(event.frame) and event.is_good:
                 for role in event.roles:
                     seen.good_s[role].append(seen.sent_s[-1])

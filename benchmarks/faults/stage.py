@@ -23,6 +23,8 @@ MODEL: Final = "leaf2012_published_model.json"
 START_S: Final = 15.0
 """How long a service may take until it publishes; a guest's or a busy machine's interpreter takes
 long to start [s]."""
+FIRST_START_S: Final = 60.0
+"""How long the first start may take, on a machine that does other things too [s]."""
 RECONNECT_S: Final = 5.0
 """How long it may take until it uses a bus that is back [s]."""
 

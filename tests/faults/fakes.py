@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import can
+import cantools
 
-from cangauge.bus.publish import FrameIds, SocPublisher
-from cangauge.estimate.types import Estimate, Reason, Status
+from cangauge.estimate.types import Status
+from cangauge.share import shared_file
 
-NAN = float("nan")
 AGE_S = 2.0
 """Older input is missed [s]; the last words of a run are shorter."""
 
@@ -33,7 +33,8 @@ def _serve(
         interface=config["interface"], channel=config["channel"], ignore_config=True,
         **config["bus_options"],
     )  # fmt: skip
-    publisher, currents = SocPublisher(FrameIds()), 0
+    database = cantools.database.load_file(shared_file("dbc", "soc_estimate.dbc"))
+    layout, currents = database.get_message_by_name("SOC_ESTIMATE"), 0
     last_s = due_s = time.monotonic()
     while True:
         message = bus.recv(0.05)
@@ -46,8 +47,9 @@ def _serve(
         told = answer(now_s - last_s, currents)
         if told is not None:
             soc_pct, status = told
-            estimate = Estimate(now_s, soc_pct, 1.0, NAN, NAN, NAN, NAN, status, Reason.NONE, 0)
-            bus.send(publisher.estimate_frame(estimate))
+            values = dict.fromkeys((signal.name for signal in layout.signals), 0)
+            data = layout.encode({**values, "soc_pct": soc_pct, "status": int(status)})
+            bus.send(can.Message(arbitration_id=layout.frame_id, is_extended_id=False, data=data))
 
 
 def honest(arguments: list[str]) -> None:
