@@ -3,13 +3,17 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: help demo test lint coverage trips clean
+# Where SocketCAN is not to be had directly, a command that provides it (as in .ci/run).
+SOCKETCAN ?= $(wildcard ../shared/tools/with-socketcan)
+
+.PHONY: help demo test lint coverage trips faults clean
 
 help:
 	@echo "make demo      the whole job on the shipped log: fit, bus, service, report"
 	@echo "make test      the whole test suite"
 	@echo "make lint      ruff and mypy"
 	@echo "make coverage  the test suite with coverage"
+	@echo "make faults    the table of faults on a live bus; says how long it takes before it starts"
 	@echo "make trips     the table on the real BMW i3 trips (see README for the data)"
 
 $(VENV)/installed: pyproject.toml
@@ -38,6 +42,9 @@ coverage: $(VENV)/installed-dev
 
 trips: $(VENV)/installed
 	$(BIN)/python benchmarks/real_trips.py
+
+faults: $(VENV)/installed
+	PYTHONPATH=benchmarks $(BIN)/python -m faults $(if $(SOCKETCAN),--socketcan "$(SOCKETCAN) -t 3600 -m 2G")
 
 clean:
 	rm -rf $(VENV) out

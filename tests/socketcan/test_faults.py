@@ -23,9 +23,10 @@ BRIEF = Profile("replay clock, brief", 55.0, 200.0, (90.0, 130.0), 12.0)
 
 ALWAYS = ("interface down, long", "adapter unplugged")
 DRAWN_FROM = (
-    "error frames",     "drop 5 %", "drop 20 %", "duplicate", "swap", "jitter", "CRC wrong, some", "counter jumps",
-    "DLC short", "DLC 0", "remote frames", "extended id", "wrong id", "current spikes",
-    "voltage missing", "temperature not available", "NaN at times", "clock damaged",
+    "error frames", "drop 5 %", "drop 20 %", "duplicate", "swap", "jitter", "CRC wrong, some",
+    "counter jumps", "DLC short", "DLC 0", "remote frames", "extended id", "wrong id",
+    "current spikes", "voltage missing", "temperature not available", "NaN at times",
+    "clock damaged",
 )  # fmt: skip
 
 
