@@ -45,7 +45,7 @@ def main() -> int:
     rows: list[Row] = []
     if options.bus in {"udp", "both"}:
         faults = [fault for fault in ON_UDP if fault.name in chosen]
-        there = _guest(options, chosen) if options.bus == "both" and options.socketcan else None
+        there = _Elsewhere(options, chosen) if options.bus == "both" and options.socketcan else None
         rows += _run("udp", faults, options)
         if there is not None:
             rows += there.rows()
@@ -167,7 +167,7 @@ def _can_make_vcan() -> bool:
     return has_socketcan(line.channel)
 
 
-class _guest:  # noqa: N801 - reads as what it is where it is used
+class _Elsewhere:
     """The vcan part of this very program under another command, at the same time."""
 
     def __init__(self, options: argparse.Namespace, chosen: set[str]) -> None:

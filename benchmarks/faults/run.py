@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from random import Random
 from typing import Final
@@ -200,11 +201,11 @@ class Listener(threading.Thread):
         )
         self._first.set()
 
-    def wait(self, seconds: float, still: object) -> bool:
-        """Wait for the first estimate."""
+    def wait(self, seconds: float, still: Callable[[], bool]) -> bool:
+        """Wait for the first estimate, as long as `still()` holds."""
         until = time.monotonic() + seconds
         while not self._first.is_set():
-            if time.monotonic() > until or (callable(still) and not still()):
+            if time.monotonic() > until or not still():
                 return False
             time.sleep(0.01)
         return True

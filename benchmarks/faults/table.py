@@ -19,7 +19,8 @@ class Row:
 
     Parameters
     ----------
-    fault : Fault
+    name, done, profile : str
+        Of the fault.
     bus : str
         "udp" or "vcan".
     verdict : Verdict, optional
