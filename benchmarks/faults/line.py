@@ -5,10 +5,12 @@ Sender and listener of the harness outlive an interface that goes and comes back
 
 from __future__ import annotations
 
+import socket
 import subprocess
 import threading
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,7 +20,10 @@ from cangauge.bus.open import BusAddress, open_bus
 from cangauge.errors import CangaugeError
 
 UDP_GROUP: Final = "239.74.163.2"
-UDP_PORT: Final = 44_000
+UDP_PORT: Final = 20_000
+PORTS: Final = 100
+"""So many lines each process may have; ports alone keep multicast buses apart."""
+BLOCKS: Final = 120
 PUBLISHED: Final = [
     {"can_id": frame_id, "can_mask": 0x7FF, "extended": False} for frame_id in (0x5A0, 0x5A1)
 ]
@@ -67,8 +72,29 @@ class Line:
 
 
 def udp(number: int) -> Line:
-    """Return a bus on this machine that no other number shares."""
-    return Line("udp_multicast", UDP_GROUP, {"port": UDP_PORT + number, "hop_limit": 0})
+    """Return a bus on this machine that no other number and no other process shares."""
+    if not 0 <= number < PORTS:
+        raise ValueError(f"no line {number}: there are {PORTS}")
+    port = UDP_PORT + PORTS * _own_block()[0] + number
+    return Line("udp_multicast", UDP_GROUP, {"port": port, "hop_limit": 0})
+
+
+@cache
+def _own_block() -> tuple[int, socket.socket]:
+    """Claim ports that no other process of this kind uses, until this one ends.
+
+    Multicast ports can be shared by design, so that nothing would tell of a clash: a name that
+    only one process can have is held instead.
+    """
+    for block in range(BLOCKS):
+        claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            claim.bind(f"\0cangauge-faults-{block}")
+        except OSError:
+            claim.close()
+        else:
+            return block, claim
+    raise CangaugeError("no ports are left for buses of their own")
 
 
 def vcan(number: int) -> Line:

@@ -49,7 +49,7 @@ def results() -> dict[Target, list[Done]]:
 
     def one(number: int) -> list[Done]:
         return run_all(
-            [GONE], lambda line: udp(500 + 5 * number + line), Jobs(2, 1), 1, target=FAKES[number]
+            [GONE], lambda line: udp(5 * number + line), Jobs(2, 1), 1, target=FAKES[number]
         )
 
     with ThreadPoolExecutor(len(FAKES)) as pool:
@@ -86,7 +86,7 @@ def test_the_service_survives_a_few_faults() -> None:
     # What is left after a short time is not asked here: that is `make faults`.
     done = run_all(
         [shortened(EVERYTHING[name]) for name in names],
-        lambda number: udp(600 + number), Jobs(3, 1), seed=1,
+        lambda number: udp(60 + number), Jobs(3, 1), seed=1,
     )  # fmt: skip
     for each in done:
         assert each.verdict is not None, each.why_not
