@@ -43,6 +43,7 @@ from cangauge.bus.vehicle import load_vehicle
 from cangauge.estimate.types import Sample
 from cangauge.replay.pace import Pacer
 from cangauge.share import shared_file
+from faults.line import udp
 
 SOC_DETAIL_ID: Final = 0x5A1
 SAMPLES_MODULO: Final = 1 << 16
@@ -345,7 +346,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=1.0, help="of the loss part (wanted: 10)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
-    more = {"port": 43_777} if options.interface == "udp_multicast" else {}
+    more = udp(0).options if options.interface == "udp_multicast" else {}
     address = bus_address(options.interface, options.channel, more)
     parts = options.only or ["latency", "loss"]
     result: Result = {"bus": str(address)}
