@@ -52,6 +52,7 @@ class Told:
     """NaN: not available."""
     status: int
     reason: int
+    soc_std_pct: float = math.nan
 
 
 @dataclass
@@ -101,8 +102,10 @@ class Verdict:
 
     soc_error_pct: float
     """Largest error called valid after recovery; NaN: nothing was called valid."""
+    std_pct: float
+    """The standard deviation that was published with it."""
     worst_error_pct: float
-    """The same over the whole run."""
+    """The largest error called valid in the whole run."""
     last_status: str
     worst_status: str
     """From the fault's begin on."""
@@ -165,15 +168,17 @@ def judge(seen: Seen, reference: Reference) -> Verdict:
     """Judge a run."""
     errors = _errors(seen, reference)
     recovered = [
-        error
+        (error, each.soc_std_pct)
         for each, error in zip(seen.told, errors, strict=True)
         if each.time_s >= seen.judged_from_s and each.status == VALID
     ]
-    after = [each for each in seen.told if each.time_s >= seen.judged_from_s]
-    hit = [each for each in seen.told if each.time_s >= seen.fault_s[0]]
+    # What is told when nothing more was sent says nothing of the fault.
+    played = [each for each in seen.told if each.time_s <= seen.ended_s + TRANSPORT_S]
+    after = [each for each in played if each.time_s >= seen.judged_from_s]
+    hit = [each for each in played if each.time_s >= seen.fault_s[0]]
     stale_s, stale = _stale(seen)
     silent_s = _silent(seen)
-    error_pct = max(recovered, default=math.nan)
+    error_pct, std_pct = max(recovered, default=(math.nan, math.nan))
     failures = list(seen.troubles)
     if not after:
         failures.append("nothing published after the fault")
@@ -185,6 +190,7 @@ def judge(seen: Seen, reference: Reference) -> Verdict:
         failures.append(f"silent for {silent_s:.1f} s")
     return Verdict(
         soc_error_pct=error_pct,
+        std_pct=std_pct,
         worst_error_pct=max(
             (error for each, error in zip(seen.told, errors, strict=True) if each.status == VALID),
             default=math.nan,

@@ -197,6 +197,7 @@ class Listener(threading.Thread):
                 soc_pct if soc_pct <= 100.0 else float("nan"),
                 int(values["status"]),
                 int(values["reason"]),
+                float(values["soc_std_pct"]),
             )
         )
         self._first.set()
