@@ -12,7 +12,7 @@ from faults.fault import UNDISTURBED, Fault
 ON_ANY_BUS: Final = [*catalogue_frames.ALL, *catalogue_service.ALL, *catalogue_state.ALL]
 ON_UDP: Final = [*ON_ANY_BUS, *catalogue_service.UDP_ONLY]
 
-ON_KERNEL: Final = ("error frames", "remote frames", "burst of others", "paused in a burst")
+ON_KERNEL: Final = ("error frames", "remote frames")
 """Faults that a kernel's bus treats in its own way: run there too."""
 
 ON_VCAN: Final = [

@@ -92,8 +92,6 @@ RESTARTS = [
           plan=kills(1), needs=frozenset({"state"}), cold=True),
     Fault("SIGKILL three times", "killed at random moments and started again", REAL, plan=kills(3),
           needs=frozenset({"state"})),
-    Fault("SIGKILL under way", "killed twice at random moments of the replay clock",
-          plan=kills(2), needs=frozenset({"state"})),
 ]  # fmt: skip
 
 CONFIG = [

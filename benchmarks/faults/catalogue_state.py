@@ -9,7 +9,7 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from faults.drive import FAST
+from faults.drive import REAL
 from faults.fault import Fault, at
 from faults.stage import Stage
 
@@ -107,8 +107,9 @@ WAYS: list[tuple[str, str, Callable[[Stage], None]]] = [
     ("gone", "removed", instead(lambda _path: None)),
 ]  # fmt: skip
 
+# In real time: by the replay clock a start would take half a minute of the log.
 ALL = [
-    Fault(f"state: {name}", f"state file: {done}; restarted", FAST, plan=at(0.0, do),
+    Fault(f"state: {name}", f"state file: {done}; restarted", REAL, plan=at(0.0, do),
           needs=frozenset({"state"}))
     for name, done, do in WAYS
 ]  # fmt: skip

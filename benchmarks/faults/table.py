@@ -71,6 +71,7 @@ def show(rows: list[Row], console: Console) -> None:
         table.add_column(name, overflow="fold")
     numbers = (
         "SoC error %",
+        "σ %",
         "worst %",
         "status: worst, last",
         "not valid s",
@@ -84,12 +85,13 @@ def show(rows: list[Row], console: Console) -> None:
         found = row.verdict
         head = (row.name, row.done, f"{row.bus}, {row.profile}")
         if found is None:
-            table.add_row(*head, *[""] * 6, f"[yellow]left out: {row.why_not}")
+            table.add_row(*head, *[""] * 7, f"[yellow]left out: {row.why_not}")
             continue
         told = "[green]pass" if found.passed else f"[red]FAIL: {'; '.join(found.failures)}"
         table.add_row(
             *head,
             _number(found.soc_error_pct, 2),
+            _number(found.std_pct, 2),
             _number(found.worst_error_pct, 2),
             f"{found.worst_status}, {found.last_status}",
             _number(found.not_valid_s, 1),
@@ -101,8 +103,8 @@ def show(rows: list[Row], console: Console) -> None:
 
 
 CAPTION = (
-    "SoC error: largest against the undisturbed run, called valid after recovery (–: nothing"
-    " was called valid there); worst: in the whole run. Not valid: for so long from the fault on."
+    "SoC error: largest against the undisturbed run, called valid after recovery (–: nothing was),"
+    " and σ published with it; worst: in the whole run. Not valid: for so long from the fault on."
     " Stale: called valid for so much longer than its time-out. Times by the clock on the wall; a"
     " second of it is 24 of the log's with the replay clock."
 )
