@@ -3,7 +3,7 @@
     make faults
     PYTHONPATH=benchmarks python -m faults [--only NAME]… [--bus udp|vcan|both] [--json]
 
-Says how long it will take before it begins. Exit status 1 if a fault was not survived.
+Says how long it will take before it begins. Exit status 1 if a fault was not survived, or nothing could be judged.
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ def main() -> int:
         faults = list({fault.name: fault for fault in usual if fault.name in chosen}.values())
         rows += _run("vcan", faults, options)
     failed = [row for row in rows if row.verdict is not None and not row.verdict.passed]
+    judged = any(row.verdict is not None for row in rows)
     if options.json:
         found = {
             "seed": options.seed,
@@ -73,7 +74,7 @@ def main() -> int:
             f"{len(rows)} runs: {len(rows) - len(failed) - left_out} passed, {len(failed)} failed,"
             f" {left_out} left out; seed {options.seed}"
         )
-    return 1 if failed else 0
+    return 1 if failed or not judged else 0
 
 
 def _options() -> argparse.Namespace:

@@ -30,8 +30,6 @@ STALE_SLACK_S: Final = 0.6
 """Besides the time-out: a publishing period, and what a busy machine takes [s]."""
 TRANSPORT_S: Final = 0.5
 """A published frame may be so much older than when it was seen [s]."""
-JUST_BEFORE_S: Final = 0.3
-"""So shortly before the fault the undisturbed run must be valid [s]."""
 RECOVERED_SHARE: Final = 0.9
 """The SoC is judged in what follows this share of the run."""
 
@@ -136,14 +134,14 @@ class Reference:
         if seen.troubles:
             raise ValueError(f"the undisturbed run failed: {'; '.join(seen.troubles)}")
         valid = [each for each in seen.told if each.status == VALID]
-        begin, last = seen.fault_s[0], seen.judged_from_s
-        for name, low, high in (
-            ("fault's begin", begin - JUST_BEFORE_S, begin),
-            ("end", last, math.inf),
-        ):
-            there = [each for each in seen.told if low <= each.time_s <= high]
-            # The very last ones may already be told of as stale: nothing more is sent.
-            there = [each for each in there if each.time_s <= seen.ended_s + TRANSPORT_S]
+        before = [each for each in seen.told if each.time_s <= seen.fault_s[0]][-1:]
+        # The very last ones may already be told of as stale: nothing more is sent.
+        ending = [
+            each
+            for each in seen.told
+            if seen.judged_from_s <= each.time_s <= seen.ended_s + TRANSPORT_S
+        ]
+        for name, there in (("fault's begin", before), ("end", ending)):
             bad = [each for each in there if each.status != VALID]
             if bad or not there:
                 raise ValueError(f"the undisturbed run is not valid at the {name}: {bad[:1]}")
