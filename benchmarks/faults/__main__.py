@@ -3,7 +3,8 @@
     make faults
     PYTHONPATH=benchmarks python -m faults [--only NAME]… [--bus udp|vcan|both] [--json]
 
-Says how long it will take before it begins. Exit status 1 if a fault was not survived, or nothing could be judged.
+Says how long it will take before it begins. Exit status 1 if a fault was not survived, or nothing
+could be judged.
 """
 
 from __future__ import annotations
