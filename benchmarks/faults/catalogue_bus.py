@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 from typing import Final, Literal
 
+from faults.catalogue_state import WITHOUT_SOC
 from faults.drive import REAL
 from faults.fault import Fault, Need, Plan, at
 from faults.line import run
@@ -109,9 +110,9 @@ INTERFACE = [
 
 DISK = [
     Fault("disk full", "state on a full file system, then killed and started again", REAL,
-          plan=small_disk("full"), needs=STATE),
+          plan=small_disk("full"), needs=STATE, config=WITHOUT_SOC),
     Fault("state read-only", "state on a read-only file system, then killed and started again",
-          REAL, plan=small_disk("read-only"), needs=STATE),
+          REAL, plan=small_disk("read-only"), needs=STATE, config=WITHOUT_SOC),
 ]  # fmt: skip
 
 CLOCK = [
