@@ -3,7 +3,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: help demo test lint coverage check trips clean
+# Where SocketCAN is not to be had directly, a command that provides it (as in .ci/run).
+SOCKETCAN ?= $(wildcard ../shared/tools/with-socketcan)
+
+.PHONY: help demo test lint coverage check faults trips clean
 
 help:
 	@echo "make demo      the whole job on the shipped log: fit, bus, service, report"
@@ -11,6 +14,7 @@ help:
 	@echo "make lint      ruff and mypy"
 	@echo "make coverage  the test suite with coverage"
 	@echo "make check     a small part of the withheld check of the diagnosis"
+	@echo "make faults    the table of faults on a live bus; says how long it takes before it starts"
 	@echo "make trips     the table on the real BMW i3 trips (see README for the data)"
 
 $(VENV)/installed: pyproject.toml
@@ -42,6 +46,9 @@ check: $(VENV)/installed
 
 trips: $(VENV)/installed
 	$(BIN)/python benchmarks/real_trips.py
+
+faults: $(VENV)/installed
+	PYTHONPATH=benchmarks $(BIN)/python -m faults $(if $(SOCKETCAN),--socketcan "$(SOCKETCAN) -t 3600 -m 2G")
 
 clean:
 	rm -rf $(VENV) out

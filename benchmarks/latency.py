@@ -1,0 +1,387 @@
+"""Latency from a frame to the SoC made of it, and frames lost at high rates, beside a bare loop.
+
+    python benchmarks/latency.py [--only latency|loss]… [--interface I --channel C]
+                                 [--seconds 20] [--rounds 3] [--minutes 10] [--json]
+
+latency  1,000 wanted frames/s (current and voltage at 500 Hz each, and REPLAY_CLOCK). SOC_DETAIL
+         tells how many samples it was made of, so the time from the frame that completed the last
+         of them to it is known exactly; both are the kernel's stamps at one listener. Beside it, in
+         turn: a bare python-can loop that receives, decodes by cantools and sends as often.
+loss     the highest rate that a bare python-can receive loop carries without loss is searched for;
+         then the service sees that rate, for --minutes. Twice: 5 % of the frames wanted, as on a
+         car's bus, and all of them.
+
+Both on UDP multicast on this machine, or on SocketCAN (`--interface socketcan --channel vcan0`).
+Start-up is not counted: the service listens before the first frame.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import multiprocessing
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any, Final
+
+import can
+import cantools
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.open import BusAddress, bus_address, open_bus
+from cangauge.bus.time_source import ClockFrames
+from cangauge.bus.vehicle import load_vehicle
+from cangauge.estimate.types import Sample
+from cangauge.replay.pace import Pacer
+from cangauge.share import shared_file
+from faults.line import udp
+
+SOC_DETAIL_ID: Final = 0x5A1
+SAMPLES_MODULO: Final = 1 << 16
+"""SOC_DETAIL counts samples modulo this."""
+SAMPLE_HZ: Final = 500
+"""Two wanted frames each."""
+BARE_EVERY: Final = 4
+"""The bare loop sends after so many samples, as the service acknowledges."""
+WARM_S: Final = 1.0
+"""Not counted at the begin of each round [s]."""
+WANTED_SHARE: Final = 0.05
+"""Of the frames on a car's bus: 200 of 4,000."""
+TRY_S: Final = 4.0
+"""How long a rate is tried [s]: longer than what the socket's buffer bridges at rates found."""
+HIGHEST_HZ: Final = 64_000.0
+
+CONTEXT: Final = multiprocessing.get_context("spawn")
+COMMAND: Final = "from cangauge.cli.app import main; main()"
+Result = dict[str, Any]
+
+
+@contextmanager
+def service(address: BusAddress, *more: str) -> Iterator[subprocess.Popen[str]]:
+    """Run `cangauge run` until the block ends; wait until it listens."""
+    on = ["--interface", address.interface, "--channel", address.channel]
+    for key, value in address.options.items():
+        on += ["--bus-option", f"{key}={value}"]
+    model = str(shared_file("replay", "leaf2012_published_model.json"))
+    process = subprocess.Popen(
+        [sys.executable, "-c", COMMAND, "run", "-m", model, *on, *more, "--json"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        for line in process.stderr or ():
+            if "listening" in line:
+                break
+        else:
+            raise SystemExit("cangauge run does not start")
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+# --- latency ------------------------------------------------------------------------------------
+
+
+def latency(address: BusAddress, seconds: float, rounds: int) -> Result:
+    """Measure service and bare loop in turn."""
+    found: dict[str, list[float]] = {"service": [], "bare": []}
+    for number in range(rounds):
+        sys.stderr.write(f"latency: round {number + 1} of {rounds} …\n")
+        with service(address, "--time-source", "replay-clock"):
+            found["service"] += _latencies(address, seconds)
+        with _bare(address, _echo):
+            found["bare"] += _latencies(address, seconds)
+    result: Result = {}
+    for name, values in found.items():
+        if not values:
+            raise SystemExit(f"{name}: nothing was sent")
+        p50, p99 = np.percentile(values, [50, 99]).tolist()
+        result[name] = {"count": len(values), "p50_us": 1e6 * p50, "p99_us": 1e6 * p99}
+    for key in ("p50_us", "p99_us"):
+        result[f"{key[:3]}_ratio"] = result["service"][key] / result["bare"][key]
+    return result
+
+
+def _latencies(address: BusAddress, seconds: float) -> list[float]:
+    """Play, and return the times from the n-th sample's last frame to its SOC_DETAIL [s]."""
+    listener = open_bus(address)
+    sender = CONTEXT.Process(target=_send_samples, args=(address, seconds))
+    sender.start()
+    layout = _messages()[SOC_DETAIL_ID]
+    done_s: list[float] = []
+    found: list[tuple[int, float]] = []
+    first: float | None = None
+    while (message := listener.recv(1.5 if done_s else 30.0)) is not None:
+        if message.arbitration_id == 0x401:
+            done_s.append(message.timestamp)
+            first = first or message.timestamp
+            continue
+        if message.arbitration_id != SOC_DETAIL_ID or first is None:
+            continue
+        told = int(layout.decode(message.data)["samples"])
+        # What was told is modulo 65536; it lies near what was sent.
+        number = len(done_s) - (len(done_s) - told) % SAMPLES_MODULO
+        is_new = 0 < number <= len(done_s) and len(done_s) - number < SAMPLE_HZ
+        if is_new and done_s[number - 1] > first + WARM_S:
+            found.append((number, message.timestamp - done_s[number - 1]))
+        if message.timestamp - done_s[-1] > 1.0:
+            break  # the service repeats itself; the bare loop falls silent
+    sender.join()
+    listener.shutdown()
+    # A count that is told again (by the heartbeat) tells of no new sample: the first one counts.
+    return list(dict(reversed(found)).values())
+
+
+def _send_samples(address: BusAddress, seconds: float) -> None:
+    encoder, clock = FrameEncoder(load_vehicle("generic")), ClockFrames()
+    bus, pacer = open_bus(address), Pacer(1.0, lambda: False)
+    for number in range(int(seconds * SAMPLE_HZ)):
+        time_us = number * 1_000_000 // SAMPLE_HZ
+        time_s = time_us / 1e6
+        frames = encoder.encode(Sample(time_s, 20.0 + 10.0 * math.sin(time_s), 380.0, 25.0))
+        pacer.wait(time_us)
+        bus.send(clock.at(time_us))
+        for frame in frames:
+            bus.send(frame)
+    time.sleep(0.2)
+    bus.shutdown()
+
+
+@contextmanager
+def _bare(address: BusAddress, loop: Any) -> Iterator[Connection]:
+    ours, theirs = CONTEXT.Pipe()
+    process = CONTEXT.Process(target=loop, args=(theirs, address), daemon=True)
+    process.start()
+    ours.recv()
+    try:
+        yield ours
+    finally:
+        process.kill()
+        process.join()
+
+
+def _echo(pipe: Connection, address: BusAddress) -> None:
+    """Receive, decode, send: what any service must do, and no more."""
+    messages = _messages()
+    wanted = [0x400, 0x401, 0x402, 0x403, 0x5AF]
+    filters = [{"can_id": each, "can_mask": 0x7FF, "extended": False} for each in wanted]
+    bus, samples = open_bus(address, filters), 0
+    detail = messages[SOC_DETAIL_ID]
+    nothing = {signal.name: 0.0 for signal in detail.signals}
+    pipe.send("ready")
+    while True:
+        message = bus.recv(1.0)
+        if message is None:
+            continue
+        messages[message.arbitration_id].decode(message.data)
+        if message.arbitration_id != 0x401:
+            continue
+        samples += 1
+        if samples % BARE_EVERY == 0:
+            values = {**nothing, "samples": samples % SAMPLES_MODULO}
+            data = detail.encode(values, strict=False)
+            bus.send(can.Message(arbitration_id=SOC_DETAIL_ID, is_extended_id=False, data=data))
+
+
+def _messages() -> dict[int, cantools.database.can.Message]:
+    """Return what the DBC files hold, by id."""
+    found = {}
+    for name in ("generic_pack.dbc", "soc_estimate.dbc"):
+        database = cantools.database.load_file(shared_file("dbc", name))
+        found |= {each.frame_id: each for each in database.messages}
+    return found
+
+
+# --- loss ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Sent:
+    """What a sender got out."""
+
+    frames: int
+    wanted: int
+    seconds: float
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames a second."""
+        return self.frames / self.seconds
+
+
+def loss(address: BusAddress, seconds: float) -> Result:
+    """Search the bare loop's highest rate, then let the service see it."""
+    result: Result = {}
+    for name, share in (("5 % wanted", WANTED_SHARE), ("all wanted", 1.0)):
+        rate_hz = highest_rate(address, share)
+        sys.stderr.write(f"loss, {name}: {rate_hz:.0f} frames/s for {seconds:.0f} s …\n")
+        with service(address, "--until-idle", "5") as process:
+            sent = _send(address, rate_hz, seconds, share)
+            out, _ = process.communicate(timeout=seconds + 120.0)
+        run = json.loads(out)
+        # The same bare loop once more, as long: a rate that it carried for a moment is no measure.
+        bare = _bare_count(address, rate_hz, seconds, share)
+        result[name] = {
+            "rate_hz": sent.rate_hz,
+            "seconds": sent.seconds,
+            "frames": sent.frames,
+            "wanted": sent.wanted,
+            "wanted_lost": sent.wanted - run["frames"],
+            "bare_lost": bare[0].wanted - bare[1],
+            "cpu_share": run["cpu_seconds"] / sent.seconds,
+        }
+    return result
+
+
+def highest_rate(address: BusAddress, share: float) -> float:
+    """Return the highest rate [frames/s], to 10 %, that the bare loop carries without loss."""
+    good, rate_hz, bad = 0.0, 2000.0, HIGHEST_HZ
+    while rate_hz < 1.1 * HIGHEST_HZ and bad > 1.1 * max(good, 1.0):
+        sent, got = _bare_count(address, rate_hz, TRY_S, share)
+        is_carried = got == sent.wanted and sent.rate_hz > 0.95 * rate_hz
+        sys.stderr.write(
+            f"  bare loop at {rate_hz:.0f}/s: sent {sent.rate_hz:.0f}/s,"
+            f" {sent.wanted - got} of {sent.wanted} lost\n"
+        )
+        if is_carried:
+            good = rate_hz
+            rate_hz = min(2.0 * rate_hz, 0.5 * (good + bad))
+        else:
+            bad = rate_hz
+            rate_hz = 0.5 * (good + bad)
+    return good
+
+
+def _bare_count(
+    address: BusAddress, rate_hz: float, seconds: float, share: float
+) -> tuple[Sent, int]:
+    with _bare(address, _count) as pipe:
+        sent = _send(address, rate_hz, seconds, share)
+        got: int = pipe.recv()
+    return sent, got
+
+
+def _count(pipe: Connection, address: BusAddress) -> None:
+    """Receive wanted frames and count them, until none comes for two seconds."""
+    filters = [{"can_id": 0x400, "can_mask": 0x7FE, "extended": False}]
+    bus, frames = open_bus(address, filters), 0
+    pipe.send("ready")
+    while bus.recv(2.0 if frames else 60.0) is not None:
+        frames += 1
+    pipe.send(frames)
+
+
+def _send(address: BusAddress, rate_hz: float, seconds: float, share: float) -> Sent:
+    ours, theirs = CONTEXT.Pipe()
+    process = CONTEXT.Process(target=_flood, args=(theirs, address, rate_hz, seconds, share))
+    process.start()
+    sent: Sent = ours.recv()
+    process.join()
+    return sent
+
+
+def _flood(
+    pipe: Connection, address: BusAddress, rate_hz: float, seconds: float, share: float
+) -> None:
+    """Send current and voltage in turn among foreign frames, evenly."""
+    encoder, bus = FrameEncoder(load_vehicle("generic")), open_bus(address, [])
+    every = round(1.0 / share)
+    # Made before: counters go round after 16 samples, so the frames repeat.
+    ready = [
+        frame
+        for number in range(16)
+        for frame in encoder.encode(Sample(float(number), 20.0, 380.0, math.nan))
+    ]
+    other = can.Message(arbitration_id=0x123, is_extended_id=False, data=bytes(8))
+    pacer, began, wanted = Pacer(1.0, lambda: False), time.monotonic(), 0
+    total = int(rate_hz * seconds)
+    burst = max(round(rate_hz / 1000.0), 1)
+    pacer.wait(0)
+    for number in range(total):
+        if number % every == 0:
+            _put(bus, ready[wanted % len(ready)])
+            wanted += 1
+        else:
+            _put(bus, other)
+        if number % burst == 0:
+            pacer.wait(round(number * 1e6 / rate_hz))
+    pipe.send(Sent(total, wanted, time.monotonic() - began))
+    bus.shutdown()
+
+
+def _put(bus: can.BusABC, frame: can.Message) -> None:
+    while True:
+        try:
+            bus.send(frame)
+        except can.CanOperationError as error:
+            if "buffer" not in str(error).lower():
+                raise
+            time.sleep(0.0005)
+        else:
+            return
+
+
+# --- main ---------------------------------------------------------------------------------------
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--only", action="append", choices=("latency", "loss"))
+    parser.add_argument("--interface", default="udp_multicast")
+    parser.add_argument("--channel")
+    parser.add_argument("--seconds", type=float, default=20.0, help="of a round of latency")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--minutes", type=float, default=1.0, help="of the loss part (wanted: 10)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args()
+    more = udp(0).options if options.interface == "udp_multicast" else {}
+    address = bus_address(options.interface, options.channel, more)
+    parts = options.only or ["latency", "loss"]
+    result: Result = {"bus": str(address)}
+    if "latency" in parts:
+        result["latency"] = latency(address, options.seconds, options.rounds)
+    if "loss" in parts:
+        result["loss"] = loss(address, 60.0 * options.minutes)
+    if options.json:
+        sys.stdout.write(json.dumps(result) + "\n")
+    else:
+        _show(result, Console())
+    return 0
+
+
+def _show(result: Result, console: Console) -> None:
+    table = Table("", "service", "bare loop", "wanted", title=result["bus"])
+    if "latency" in result:
+        found = result["latency"]
+        for key in ("p50", "p99"):
+            wanted = "≤ 3×" if key == "p99" else ""
+            table.add_row(
+                f"latency at 1,000 frames/s, {key}",
+                f"{found['service'][f'{key}_us']:.0f} µs ({found[f'{key}_ratio']:.2f}×)",
+                f"{found['bare'][f'{key}_us']:.0f} µs",
+                wanted,
+            )
+    for name, found in result.get("loss", {}).items():
+        table.add_row(
+            f"lost at {found['rate_hz']:.0f} frames/s for {found['seconds']:.0f} s, {name}",
+            f"{found['wanted_lost']} of {found['wanted']} ({100 * found['cpu_share']:.0f} % CPU)",
+            str(found["bare_lost"]),
+            "0",
+        )
+    console.print(table)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
