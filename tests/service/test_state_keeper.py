@@ -61,7 +61,6 @@ class Machine:
         keeper = StateKeeper(
             StateSettings(self.path, self.max_age_s),
             gauge,
-            self.model,
             self.said.append,
             wall_s=lambda: self.clock.wall_s,
             monotonic_s=lambda: self.clock.monotonic_s,

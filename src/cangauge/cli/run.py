@@ -203,8 +203,7 @@ def _run(config: RunConfig) -> dict[str, Any]:
     written = [Path(name) for name in (config.record, config.output) if name is not None]
     check_outputs(written, [Path(config.model)])
     kept = config.state_settings(os.environ)
-    model = load_model(config.model)
-    gauge = Gauge(config.load_vehicle(), model, config.gauge_settings())
+    gauge = Gauge(config.load_vehicle(), load_model(config.model), config.gauge_settings())
     address = config.address()
     with ExitStack() as stack:
         # Signals first: whoever starts the service may end it at any moment after.
@@ -212,7 +211,7 @@ def _run(config: RunConfig) -> dict[str, Any]:
         port = stack.enter_context(BusPort(open_bus(address, gauge.filters), str(address)))
         recorder = table = line = keeper = None
         if kept is not None:
-            keeper = stack.enter_context(StateKeeper(kept, gauge, model, note))
+            keeper = stack.enter_context(StateKeeper(kept, gauge, note))
         if config.record is not None:
             recorder = stack.enter_context(Recorder(config.record))
         if config.output is not None:

@@ -142,6 +142,11 @@ class Gauge:
         return self._stream.reference_soc_pct
 
     @property
+    def model(self) -> ModelFile:
+        """The model in use."""
+        return self._stream.model
+
+    @property
     def pause_verdict(self) -> Verdict:
         """How the SoC over the last long pause was judged by the voltage after it."""
         return self._stream.pause_verdict

@@ -19,7 +19,6 @@ from typing import Final, Self
 
 from cangauge.atomic import write_text_atomic
 from cangauge.errors import CangaugeError, InputError
-from cangauge.model.model_file import ModelFile
 from cangauge.report.words import duration, number
 from cangauge.service.background import BackgroundWriter
 from cangauge.service.gauge import Gauge
@@ -88,8 +87,6 @@ class StateKeeper:
     ----------
     settings : StateSettings
     gauge : Gauge
-    model : ModelFile
-        The gauge's model.
     tell : callable
         Takes a line of text for the user.
     wall_s, monotonic_s : callable
@@ -100,7 +97,6 @@ class StateKeeper:
         self,
         settings: StateSettings,
         gauge: Gauge,
-        model: ModelFile,
         tell: Callable[[str], None],
         *,
         wall_s: Callable[[], float] = time.time,
@@ -108,8 +104,8 @@ class StateKeeper:
     ) -> None:
         self.settings = settings
         self._gauge = gauge
-        self._model = model_fingerprint(model)
-        self._model_name = model.name[:200]
+        self._model = gauge.model
+        self._fingerprint = model_fingerprint(gauge.model)
         self._tell = tell
         self._wall_s = wall_s
         self._monotonic_s = monotonic_s
@@ -147,12 +143,16 @@ class StateKeeper:
         if state is None:
             return
         self._samples_kept = self._gauge.samples
+        if self._gauge.model is not self._model:
+            # The configuration was read again.
+            self._model = self._gauge.model
+            self._fingerprint = model_fingerprint(self._model)
         self._writer.submit(
             StateContent.model_construct(
                 saved_s=self._wall_s(),
                 boot_id=self._boot_id,
-                model=self._model,
-                model_name=self._model_name,
+                model=self._fingerprint,
+                model_name=self._model.name[:200],
                 time_source=self._gauge.settings.time_source,
                 estimator=state,
             )
@@ -185,7 +185,7 @@ class StateKeeper:
     def _checked_age(self, content: StateContent) -> float:
         """Return how old the state is at least [s]; NaN if no clock knows."""
         path = self.settings.path
-        if content.model != self._model:
+        if content.model != self._fingerprint:
             raise InputError(
                 f"of another model ({content.model_name})", source=path, field="content.model"
             )

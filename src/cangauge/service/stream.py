@@ -138,6 +138,11 @@ class EstimateStream:
         return self._assembler.reference_soc_pct
 
     @property
+    def model(self) -> ModelFile:
+        """The model in use."""
+        return self._model
+
+    @property
     def pause_verdict(self) -> Verdict:
         """How the SoC over the last long pause was judged by the voltage after it."""
         return self._estimator.pause_verdict
