@@ -35,6 +35,7 @@ from typing import Any, Self
 import can
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from cangauge.bus.encode import FrameEncoder
@@ -395,7 +396,7 @@ def table_of(results: Result) -> Table:
             " / ".join(f"{each[name][part]:.3f}" for part in ("median", "p99", "most"))
             for each in results.values()
         ]
-        table.add_row(f"{words}: median / p99 / most", *cells)
+        table.add_row(escape(f"{words}: median / p99 / most"), *cells)
     carried = (f"{each['rms_30s_pct']:.3f}" for each in results.values())
     table.add_row("30 s at the drive's rms current carry [%]", *carried)
     for name, words in (

@@ -131,7 +131,7 @@ def test_a_hangup_reads_the_configuration_again_and_soc_goes_on(
     service.wait_for("listening")
     path.write_text("timeout_s = [")
     service.process.send_signal(signal.SIGHUP)
-    service.wait_for("warning: new configuration refused, the old one goes on: ")
+    service.wait_for("new configuration refused, the old one goes on: ")
     path.write_text("timeout_s = 0.5\n")
     service.process.send_signal(signal.SIGHUP)
     service.wait_for("configuration read again; changed: timeout_s")

@@ -19,7 +19,6 @@ from typing import Final, Self
 
 from cangauge.atomic import write_text_atomic
 from cangauge.errors import CangaugeError, InputError
-from cangauge.model.model_file import ModelFile
 from cangauge.report.words import duration, number
 from cangauge.service.background import BackgroundWriter
 from cangauge.service.gauge import Gauge
@@ -105,7 +104,8 @@ class StateKeeper:
     ) -> None:
         self.settings = settings
         self._gauge = gauge
-        self._take_model(gauge.model)
+        self._model = gauge.model
+        self._fingerprint = model_fingerprint(gauge.model)
         self._tell = tell
         self._wall_s = wall_s
         self._monotonic_s = monotonic_s
@@ -144,20 +144,19 @@ class StateKeeper:
             return
         self._samples_kept = self._gauge.samples
         if self._gauge.model is not self._model:
-            self._take_model(self._gauge.model)  # the configuration was read again
+            # The configuration was read again.
+            self._model = self._gauge.model
+            self._fingerprint = model_fingerprint(self._model)
         self._writer.submit(
             StateContent.model_construct(
                 saved_s=self._wall_s(),
                 boot_id=self._boot_id,
-                model=self._model_hash,
+                model=self._fingerprint,
                 model_name=self._model.name[:200],
                 time_source=self._gauge.settings.time_source,
                 estimator=state,
             )
         )
-
-    def _take_model(self, model: ModelFile) -> None:
-        self._model, self._model_hash = model, model_fingerprint(model)
 
     def flush(self, seconds: float) -> bool:
         """Wait until what was asked for is written; False if that takes longer [s]."""
@@ -186,7 +185,7 @@ class StateKeeper:
     def _checked_age(self, content: StateContent) -> float:
         """Return how old the state is at least [s]; NaN if no clock knows."""
         path = self.settings.path
-        if content.model != self._model_hash:
+        if content.model != self._fingerprint:
             raise InputError(
                 f"of another model ({content.model_name})", source=path, field="content.model"
             )
