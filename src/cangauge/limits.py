@@ -40,6 +40,11 @@ MAX_IDLE_LINES: Final = 1_000_000
 """So many lines in a row without a frame are no capture."""
 MAX_BLF_OBJECT: Final = 16 * MIB
 """Of one object of a BLF file, packed or unpacked (its writers fill 128 KiB)."""
+MAX_MF4_MEMORY: Final = 4096 * MIB
+"""Of the process that reads an MF4 file."""
+MF4_SILENCE_S: Final = 60.0
+MF4_SILENCE_S_PER_MIB: Final = 0.5
+"""It may give no frame for so long [s], longer with the file's size."""
 MAX_BUSES: Final = 64
 """Buses in one capture: each is decoded for itself."""
 MAX_STAMP_S: Final = 1e11
