@@ -13,8 +13,8 @@ MIB: Final = 1 << 20
 # --- all packed files (gzip, zip) ---------------------------------------------------------------
 UNPACK_FREE_BYTES: Final = 16 * MIB
 """Whatever unpacks to no more than this may do so at any ratio."""
-UNPACK_RATIO: Final = 100
-"""Beyond it, a file may unpack to so many times its size (real recordings: up to 20 times)."""
+UNPACK_RATIO: Final = 250
+"""Beyond it, a file may unpack to so many times its size (real recordings: up to 43 times)."""
 
 # --- logs ---------------------------------------------------------------------------------------
 MAX_LOG_BYTES: Final = 1024 * MIB
@@ -36,8 +36,15 @@ MAX_CAPTURE_BYTES: Final = 64 * 1024 * MIB
 """Of a capture, unpacked: it is read as a stream."""
 MAX_LINE: Final = 16 * 1024
 """No capture has longer lines; what is longer is not text, or hostile [characters]."""
+MAX_IDLE_LINES: Final = 1_000_000
+"""So many lines in a row without a frame are no capture."""
 MAX_BLF_OBJECT: Final = 16 * MIB
 """Of one object of a BLF file, packed or unpacked (its writers fill 128 KiB)."""
+MAX_MF4_MEMORY: Final = 4096 * MIB
+"""Of the process that reads an MF4 file."""
+MF4_SILENCE_S: Final = 60.0
+MF4_SILENCE_S_PER_MIB: Final = 0.5
+"""It may give no frame for so long [s], longer with the file's size."""
 MAX_BUSES: Final = 64
 """Buses in one capture: each is decoded for itself."""
 MAX_STAMP_S: Final = 1e11
@@ -48,7 +55,9 @@ MAX_DBC_BYTES: Final = 4 * MIB
 """Reading takes 1–6 s a megabyte; the largest files in use are smaller than this."""
 
 # --- configurations, maps, model files ----------------------------------------------------------
-MAX_TOML_BYTES: Final = 256 * 1024
+MAX_TOML_BYTES: Final = 64 * 1024
+MAX_TOML_KEY: Final = 32
+"""Parts of a dotted key: reading takes time and memory with their square."""
 MAX_MODEL_BYTES: Final = 4 * MIB
 """A model of 64 delays has 0.2 MB."""
 MAX_MODEL_COLUMNS: Final = 256

@@ -22,7 +22,7 @@ from cangauge.bus.captures.parts import parts_of_run
 from cangauge.bus.captures.stream import LineStream, read_head
 from cangauge.bus.captures.text_formats import TEXT_FORMATS, Parser, TextFormat
 from cangauge.errors import InputError
-from cangauge.limits import MAX_BUSES, MAX_STAMP_S
+from cangauge.limits import MAX_BUSES, MAX_IDLE_LINES, MAX_STAMP_S
 
 CLOCK_ID: Final = 0x1DB
 """Without time stamps, time is counted in frames of this id (Nissan Leaf) …"""
@@ -140,6 +140,7 @@ class Capture:
     def _text(self, kind: TextFormat, path: Path) -> Iterator[can.Message]:
         lines = LineStream(path)
         parse: Parser | None = None
+        idle = 0
         for line in lines:
             if parse is None:
                 parse = kind.parser(line)
@@ -156,7 +157,16 @@ class Capture:
                 self._skip(lines.number)
                 continue
             if message is None:
+                idle += 1
+                if idle > MAX_IDLE_LINES:
+                    raise InputError(
+                        f"{MAX_IDLE_LINES} lines in a row hold no frame",
+                        source=self.path,
+                        value=f"up to line {lines.number}",
+                        cure="cut them out",
+                    )
                 continue
+            idle = 0
             if not abs(message.timestamp) <= MAX_STAMP_S:
                 self._skip(lines.number)
                 continue

@@ -15,8 +15,8 @@ import can
 from can.io.blf import BLFParseError
 
 from cangauge.bus.captures.blf import CheckedBlf
+from cangauge.bus.captures.mf4 import mf4_messages
 from cangauge.bus.captures.stream import open_bytes
-from cangauge.errors import InputError
 from cangauge.limits import MAX_LINE
 
 # Its readers log a line for every object that they do not know: a hostile file has millions.
@@ -119,16 +119,9 @@ def library_messages(kind: LibraryFormat, path: Path) -> Iterator[can.Message]:
     InputError
         If the reader is not installed (MF4 without asammdf).
     """
+    if kind.reader is can.MF4Reader:
+        yield from mf4_messages(path)
+        return
     with open_bytes(path) as raw:
-        file: Any = _Lines(raw) if kind.is_text else raw
-        if kind.reader is can.BLFReader:
-            file = CheckedBlf(raw)
-        try:
-            reader = kind.reader(file)
-        except NotImplementedError as error:
-            raise InputError(
-                f"reading {kind.name} needs another package: {error}",
-                source=path,
-                cure="pip install 'cangauge[mf4]'",
-            ) from error
-        yield from reader
+        file: Any = _Lines(raw) if kind.is_text else CheckedBlf(raw)
+        yield from kind.reader(file)
