@@ -93,7 +93,7 @@ def test_the_example_configuration_is_one(project: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "say"),
     [
-        (".".join("a" * 100_000) + " = 1", "dots"),
+        (".".join("a" * 100_000) + " = 1", "parts"),
         ("a = " + "[" * 120_000, "nested too deeply"),
         ("a = " + "{a=" * 80_000, "nested too deeply"),
         ("a = " + "9" * 250_000, "not TOML"),
