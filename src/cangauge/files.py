@@ -16,6 +16,7 @@ from cangauge.limits import UNPACK_FREE_BYTES, UNPACK_RATIO
 if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
 
+_PIECE: Final = 1 << 20
 GZIP: Final = b"\x1f\x8b"
 
 # Reading these would wait for ever, never end, or do something to a machine.
@@ -50,6 +51,14 @@ def open_regular(path: str | PathLike[str]) -> BinaryIO:
     return file
 
 
+def _read_at_most(file: BinaryIO, size: int) -> bytes:
+    """Read in pieces: reading at once takes memory for all that there might be."""
+    data = bytearray()
+    while len(data) < size and (piece := file.read(min(_PIECE, size - len(data)))):
+        data += piece
+    return bytes(data)
+
+
 def read_bounded(path: str | PathLike[str], limit: int, what: str) -> bytes:
     """Return the content of a regular file of at most `limit` bytes.
 
@@ -68,7 +77,7 @@ def read_bounded(path: str | PathLike[str], limit: int, what: str) -> bytes:
     """
     try:
         with open_regular(path) as file:
-            data = file.read(limit + 1)
+            data = _read_at_most(file, limit + 1)
     except OSError as error:
         raise _unreadable(error, path) from error
     if len(data) > limit:
