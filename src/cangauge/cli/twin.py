@@ -143,7 +143,7 @@ def twin_command(  # noqa: PLR0917 - typer passes options by name
             np.random.default_rng([seed, 4, day]),
             stand_in.pack,
             hours=2.5 if hours is None and discharge else _hours(hours),
-            ambient_c=ambient_c,
+            ambient_c=_ambient(ambient_c),
             start_soc=_start(start_soc, discharge=discharge),
             end_soc=0.02 if end_soc is None and discharge else _share(end_soc, "--end-soc"),
             speed_ms=None if speed is None else read_speed(speed),
@@ -167,6 +167,10 @@ def twin_command(  # noqa: PLR0917 - typer passes options by name
 
 def _hours(given: float | None) -> float | None:
     return given if given is None else within(given, 0.05, 12.0, option="--hours", unit="h")
+
+
+def _ambient(given: float | None) -> float | None:
+    return given if given is None else within(given, -30.0, 50.0, option="--ambient-c", unit="°C")
 
 
 def _start(given: float | None, *, discharge: bool) -> float | None:

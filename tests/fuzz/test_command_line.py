@@ -1,0 +1,273 @@
+"""Every command of `cangauge --help` with wrong options: exit 2, one clear line, nothing written."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import typer
+
+from cangauge.cli.app import app, main
+from fuzzing import corpus
+
+COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+VALID = {
+    # Complete but for a file that is not there, so that none of them ever begins to work.
+    "demo": ["--folder", "file.txt"],
+    "fit": ["absent.csv", "-o", "out.json"],
+    "estimate": ["absent.csv", "-m", "model.json", "-o", "out.csv"],
+    "gap": ["absent.csv", "-m", "model.json"],
+    "run": ["-m", "absent.json"],
+    "replay": ["absent.csv"],
+    "inspect": ["absent.csv"],
+    "twin": ["-o", "absent/out.csv"],
+}
+
+
+class Ran(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+
+Run = Callable[..., Ran]
+
+
+@pytest.fixture(scope="module")
+def model_text() -> str:
+    return json.dumps(corpus.model_tree())
+
+
+@pytest.fixture
+def run(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    model_text: str,
+) -> Run:
+    """Run `cangauge ARG…` in a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+    Path("model.json").write_text(model_text)
+    Path("file.txt").write_text("x\n")
+    Path("one.csv").write_text("time_s,current_a,voltage_v,temperature_c\n0,1,380,20\n")
+    Path("log.csv").write_bytes(corpus.csv_log())
+
+    def call(*args: str) -> Ran:
+        monkeypatch.setattr(sys, "argv", ["cangauge", *args])
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as left:
+            main()
+        return Ran(int(left.value.code or 0), *capfd.readouterr())
+
+    return call
+
+
+@pytest.fixture
+def refused(run: Run) -> Callable[..., str]:
+    """Run it; return the one line that it is refused with. Nothing may be left in the folder."""
+
+    def call(*args: str) -> str:
+        before = {name: Path(name).stat().st_mtime_ns for name in os.listdir()}
+        ran = run(*args)
+        assert ran.code == 2, ran
+        assert ran.out == ""
+        lines = ran.err.splitlines()
+        assert len(lines) == 1, ran.err
+        assert lines[0].startswith("error: ")
+        assert {name: Path(name).stat().st_mtime_ns for name in os.listdir()} == before
+        return lines[0]
+
+    return call
+
+
+def test_all_commands_are_here() -> None:
+    assert set(VALID) == set(COMMANDS)
+
+
+@pytest.mark.parametrize("command", list(VALID))
+def test_what_is_valid_ends_at_the_missing_file(command: str, refused: Callable[..., str]) -> None:
+    line = refused(command, *VALID[command])
+    assert re.search("no such file|does not exist|cannot be made", line)
+
+
+@pytest.mark.parametrize("command", ["", *VALID])
+def test_unknown_options_and_too_many_arguments(command: str, refused: Callable[..., str]) -> None:
+    given = [command, *VALID[command]] if command else []
+    assert "--bogus" in refused(*given, "--bogus")
+    if command not in {"fit", "gap"}:  # which take any number of logs
+        assert "unexpected extra argument" in refused(*given, "x") or not command
+    assert f"see `cangauge{' ' * bool(command)}{command} --help`" in refused(*given, "--bogus")
+
+
+def test_no_such_command(refused: Callable[..., str]) -> None:
+    assert "no such command 'bogus'" in refused("bogus")
+
+
+@pytest.mark.parametrize("command", [name for name, given in VALID.items() if len(given) > 2])
+def test_every_required_option_is_missed_by_name(command: str, refused: Callable[..., str]) -> None:
+    needed = [p for p in COMMANDS[command].params if p.required]
+    for parameter in needed:
+        given = VALID[command]
+        if parameter.param_type_name == "argument":
+            args, name = given[1:], (parameter.metavar or parameter.name).upper()
+        else:
+            at = given.index(parameter.opts[0])
+            args, name = given[:at] + given[at + 2 :], parameter.opts[0]
+        assert name in refused(command, *args)
+
+
+def options() -> Iterator[tuple[str, Any]]:
+    for name, command in COMMANDS.items():
+        for parameter in command.params:
+            if parameter.param_type_name == "option" and not getattr(parameter, "is_flag", False):
+                yield name, parameter
+
+
+def _without(args: list[str], parameter: Any) -> list[str]:
+    for spelling in parameter.opts:
+        if spelling in args:
+            at = args.index(spelling)
+            return args[:at] + args[at + 2 :]
+    return args
+
+
+@pytest.mark.parametrize(
+    ("command", "parameter"), [pytest.param(c, p, id=f"{c} {p.opts[0]}") for c, p in options()]
+)
+def test_every_option_with_every_kind_of_wrong_value(
+    command: str, parameter: Any, refused: Callable[..., str]
+) -> None:
+    """Valid ones among them end at the missing file; none may end in a traceback or a file."""
+    for value in (
+        "",
+        "nan",
+        "inf",
+        "-inf",
+        "-1",
+        "1e999",
+        "x",
+        ".",
+        "/dev/zero",
+        "a" * 5000,
+        "é=ä",
+    ):
+        if command == "demo":
+            continue
+        refused(command, *_without(VALID[command], parameter), f"{parameter.opts[-1]}={value}")
+    refused(command, *_without(VALID[command], parameter), parameter.opts[-1])
+
+
+NUMBERS = {
+    "fit": ("--capacity-ah", "--initial-soc", "--rate-hz", "--epsilon", "--t-ref", "--temperature"),
+    "estimate": ("--initial-soc", "--initial-soc-std", "--capacity-ah", "--max-gap-s",
+                 "--temperature"),
+    "gap": ("--initial-soc", "--capacity-ah", "--temperature"),
+    "run": ("--temperature", "--initial-soc", "--initial-soc-std", "--capacity-ah", "--max-gap-s",
+            "--pair-within-s", "--timeout-s", "--duration", "--until-idle"),
+    "replay": ("--speed", "--wait", "--acknowledge-within", "--temperature"),
+    "inspect": ("--temperature",),
+    "twin": ("--hours", "--ambient-c", "--start-soc", "--end-soc"),
+}  # fmt: skip
+PRESENT = {
+    "fit": ["log.csv", "-o", "out.json"],
+    "estimate": ["log.csv", "-m", "model.json", "-o", "out.csv"],
+    "gap": ["log.csv", "-m", "model.json"],
+    "run": ["-m", "model.json"],
+    "replay": ["log.csv", "--vehicle", "generic"],
+    "inspect": ["log.csv"],
+    "twin": ["-o", "out.csv"],
+}
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-1e9"])
+@pytest.mark.parametrize(
+    ("command", "option"), [(name, option) for name, all_ in NUMBERS.items() for option in all_]
+)
+def test_no_number_of_an_option_is_out_of_its_range(
+    command: str, option: str, value: str, refused: Callable[..., str]
+) -> None:
+    line = refused(command, *PRESENT[command], option, value)
+    assert option in line
+    assert not re.search(r"[Ii]nput should|less than or equal|greater than or equal", line)
+
+
+@pytest.mark.parametrize("option", ["--initial-soc", "--initial-soc-std"])
+def test_a_soc_beyond_100_is_told_in_our_words(option: str, refused: Callable[..., str]) -> None:
+    for command in ("run", "estimate"):
+        line = refused(command, *PRESENT[command], option, "150")
+        assert f"{option}: must lie within 0 … 100" in line
+        assert "(got 150.0)" in line
+
+
+def test_single_rows(refused: Callable[..., str]) -> None:
+    for args in (
+        ("fit", "one.csv", "-o", "out.json"),
+        ("fit", "one.csv", "-o", "out.json", "--capacity-ah", "from-soc"),
+        ("estimate", "one.csv", "-m", "model.json", "-o", "out.csv"),
+        ("gap", "one.csv", "-m", "model.json"),
+    ):
+        assert refused(*args).startswith("error: one.csv: a single row: charge is counted")
+
+
+def test_a_reference_that_rises_while_discharging(refused: Callable[..., str]) -> None:
+    rows = (f"{t},20,{380 - 0.001 * t},20,{50 + 0.005 * t}" for t in range(2000))
+    head = "time_s,current_a,voltage_v,temperature_c,soc_pct\n"
+    Path("log.csv").write_text(head + "\n".join(rows) + "\n")
+    line = refused("fit", "log.csv", "-o", "out.json", "--capacity-ah", "from-soc")
+    assert "sign of current is turned: reference SoC rises as charge is taken out" in line
+    assert "correct soc_pct or leave it out" in line
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"capacity_a": 50.0}, "capacity_a: unknown key; did you mean capacity_ah?"),
+        ({"range": {"soc_pc": [0, 100]}}, "range.soc_pc: unknown key; did you mean soc_pct?"),
+        ({"coefficients": {"k0": {"valu": 1.0}}}, "coefficients.k0.valu: unknown key; did you"),
+        ({"delays_s": [70.0, 30.0, 10.0, 0.0]}, "delays_s: must increase, with R1 … R4 in"),
+        ({"delays_s": [0.0, 10.0]}, "2 delays_s need R1 … R2"),
+        ({"capacity_ah": -1}, "capacity_ah: must lie within 0.001 … 100000 (got -1"),
+        ({"name": 3}, "name: must be a text (got 3)"),
+        ({"made": None}, "made: must be a table"),
+    ],
+)
+def test_mistakes_in_a_model_file(
+    change: dict[str, Any], told: str, refused: Callable[..., str], model_text: str
+) -> None:
+    tree = json.loads(model_text)
+    for key, value in change.items():
+        tree[key] = {**tree[key], **value} if isinstance(value, dict) else value
+    Path("model.json").write_text(json.dumps(tree))
+    assert told in refused("estimate", "log.csv", "-m", "model.json", "-o", "out.csv")
+
+
+@pytest.mark.parametrize("name", ["x.log", "x.blf", "x.csv", "x.asc"])
+def test_junk_is_told_to_be_neither_log_nor_capture(name: str, refused: Callable[..., str]) -> None:
+    Path(name).write_bytes(bytes(range(256)) * 40)
+    for args in (("inspect", name), ("replay", name), ("fit", name, "-o", "out.json"),
+                 ("inspect", name, "--vehicle", "leaf_ze0")):  # fmt: skip
+        line = refused(*args)
+        assert f"{name}: not a known kind of log, nor of capture" in line
+        assert "candump" in line
+
+
+@pytest.mark.parametrize("command", ["fit", "estimate", "gap", "inspect", "replay", "run"])
+def test_what_is_no_file(command: str, refused: Callable[..., str]) -> None:
+    os.mkfifo("pipe")
+    Path("folder").mkdir()
+    Path("empty").touch()
+    for name, told in (
+        ("pipe", "a pipe"), ("folder", "a folder"), ("empty", "empty|is no JSON"),
+        ("/dev/zero", "a device"), ("absent", "no such file"),
+    ):  # fmt: skip
+        args = ["-m", name] if command == "run" else [name, *VALID[command][1:]]
+        assert re.search(told, refused(command, *args))
+    for option in ("--dbc", "--map"):
+        line = refused(command, *PRESENT[command], "--dbc", "pipe", "--map", "pipe")
+        assert "a pipe" in line or command in {"fit", "estimate", "gap", "inspect"}, option
