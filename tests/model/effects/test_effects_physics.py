@@ -153,7 +153,7 @@ def test_a_capacity_that_the_user_insists_on_is_left_alone() -> None:
 
 
 def test_resistance_follows_arrhenius_from_the_middle_of_the_models_range() -> None:
-    values = {"activation_k": 4000.0}
+    values = {"activation_k": 4000.0, "delayed": 1.0}
     at_23 = extra("resistance_temperature", steady(10.0, 50.0, temperature_c=23.0), values)
     np.testing.assert_allclose(at_23, 0.0, atol=1e-12)
     cold = steady(10.0, 50.0, temperature_c=0.0)
@@ -164,7 +164,7 @@ def test_resistance_follows_arrhenius_from_the_middle_of_the_models_range() -> N
 
 
 def test_resistance_rises_toward_empty_and_full() -> None:
-    values = {"at_empty": 2.0, "at_full": 0.5, "width_pct": 10.0}
+    values = {"at_empty": 2.0, "at_full": 0.5, "width_pct": 10.0, "delayed": 1.0}
     for soc, share in ((0.0, 2.0), (100.0, 0.5), (10.0, 2.0 / math.e), (50.0, 0.0168)):
         state = steady(3.0, 50.0, soc_pct=soc)
         np.testing.assert_allclose(
@@ -263,7 +263,11 @@ def test_entropy_bounds_are_tenths_of_a_millivolt_per_kelvin_and_cell() -> None:
         assert -low == high
         assert 1e-4 < high / PACK.cells < 5e-4
     warm = steady(3.0, 0.0, soc_pct=100.0, temperature_c=MODEL.t_ref_c + 10.0)
-    found = extra("entropic_coefficient", warm, {"slope_v_per_k": 0.01, "curve_v_per_k": 0.02})
+    found = extra(
+        "entropic_coefficient",
+        warm,
+        {"level_v_per_k": 0.0, "slope_v_per_k": 0.01, "curve_v_per_k": 0.02},
+    )
     np.testing.assert_allclose(found, 10.0 * 0.03)
 
 

@@ -22,7 +22,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -167,6 +167,15 @@ class PackState:
     drop_v: FloatArray
     """Σ Rj·I(t − dj) of the voltage model [V]; negative while discharging."""
 
+    def scaled_drop_v(self, delayed: float, pack: Pack) -> FloatArray:
+        """Return the drop that an effect scales [V] (`DELAYED`)."""
+        return self.drop_v if delayed else -pack.resistance_ohm * self.current_a
+
+
+DELAYED: Final = Parameter("delayed", "1", 0.0, 1.0, neutral=None, grid=(1.0, 0.0))
+"""Whether an effect scales the whole drop of the voltage model (1), or only that of the current
+now, over the sum of the resistances (0): contacts and electrolyte answer at once, diffusion not."""
+
 
 class Reading(NamedTuple):
     """One sample on its way through the corrections.
@@ -217,6 +226,9 @@ class Effect(ABC):
     source: ClassVar[str]
     separated_by: ClassVar[str]
     """What test would tell it from its look-alikes."""
+    bends_at: ClassVar[tuple[float, ...]] = ()
+    """Parts of the widest bound of its only amplitude at which the diagnosis takes the voltage's
+    change, beside a small one: for effects that are far from linear in their amplitude."""
 
     @property
     def amplitudes(self) -> tuple[Parameter, ...]:
