@@ -168,13 +168,20 @@ class PackState:
     """Σ Rj·I(t − dj) of the voltage model [V]; negative while discharging."""
 
     def scaled_drop_v(self, delayed: float, pack: Pack) -> FloatArray:
-        """Return the drop that an effect scales [V] (`DELAYED`)."""
-        return self.drop_v if delayed else -pack.resistance_ohm * self.current_a
+        """Return the drop that an effect scales [V], shape (n,) (`DELAYED`)."""
+        now_v = -pack.resistance_ohm * self.current_a
+        return delayed * self.drop_v + (1.0 - delayed) * now_v
+
+
+def scaled_drop_at(drop_v: float, current_a: float, delayed: float, resistance_ohm: float) -> float:
+    """Return the same of one sample, the pack's resistance being `resistance_ohm`."""
+    return delayed * drop_v + (1.0 - delayed) * (-resistance_ohm * current_a)
 
 
 DELAYED: Final = Parameter("delayed", "1", 0.0, 1.0, neutral=None, grid=(1.0, 0.0))
 """Whether an effect scales the whole drop of the voltage model (1), or only that of the current
-now, over the sum of the resistances (0): contacts and electrolyte answer at once, diffusion not."""
+now, over the sum of the resistances (0): contacts and electrolyte answer at once, diffusion not.
+In between it scales a mixture of both."""
 
 
 class Reading(NamedTuple):

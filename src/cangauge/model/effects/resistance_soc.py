@@ -15,12 +15,13 @@ from cangauge.model.effects.effect import (
     PackState,
     Parameter,
     Values,
+    scaled_drop_at,
 )
 from cangauge.model.voltage_model import VoltageModel
 
 
 class ResistanceSoc(Effect):
-    """Relative change of the whole drop that falls off from empty and from full."""
+    """Relative change of the drop that falls off from empty and from full."""
 
     id = "resistance_soc"
     family = "resistance"
@@ -51,25 +52,23 @@ class ResistanceSoc(Effect):
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
         """Return the change of the drop at one sample at a time."""
         del model
-        now_ohm = None if values["delayed"] else pack.resistance_ohm
-        return _Online(values["at_empty"], values["at_full"], values["width_pct"], now_ohm)
+        return _Online(values, pack.resistance_ohm)
 
 
 class _Online(OnlineEffect):
     uses_soc = True
 
-    def __init__(
-        self, at_empty: float, at_full: float, width_pct: float, now_ohm: float | None
-    ) -> None:
-        self._at_empty = at_empty
-        self._at_full = at_full
-        self._width_pct = width_pct
-        self._now_ohm = now_ohm
+    def __init__(self, values: Values, resistance_ohm: float) -> None:
+        self._at_empty = values["at_empty"]
+        self._at_full = values["at_full"]
+        self._width_pct = values["width_pct"]
+        self._delayed = values["delayed"]
+        self._resistance_ohm = resistance_ohm
         self._drop_v = 0.0
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         del time_s, temperature_c
-        self._drop_v = drop_v if self._now_ohm is None else -self._now_ohm * current_a
+        self._drop_v = scaled_drop_at(drop_v, current_a, self._delayed, self._resistance_ohm)
 
     def extra_voltage(self, soc_pct: float) -> float:
         soc = min(max(soc_pct, 0.0), 100.0)

@@ -16,6 +16,7 @@ from cangauge.model.effects.effect import (
     PackState,
     Parameter,
     Values,
+    scaled_drop_at,
 )
 from cangauge.model.voltage_model import VoltageModel
 
@@ -54,8 +55,7 @@ class ResistanceTemperature(Effect):
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
         """Return the change of the drop at one sample at a time."""
-        now_ohm = None if values["delayed"] else pack.resistance_ohm
-        return _Online(values["share"], values["activation_k"], _usual_per_k(model), now_ohm)
+        return _Online(values, _usual_per_k(model), pack.resistance_ohm)
 
 
 def _usual_per_k(model: VoltageModel) -> float:
@@ -64,21 +64,19 @@ def _usual_per_k(model: VoltageModel) -> float:
 
 
 class _Online(OnlineEffect):
-    def __init__(
-        self, share: float, activation_k: float, usual_per_k: float, now_ohm: float | None
-    ) -> None:
-        self._share = share
-        self._activation_k = activation_k
+    def __init__(self, values: Values, usual_per_k: float, resistance_ohm: float) -> None:
+        self._share = values["share"]
+        self._activation_k = values["activation_k"]
+        self._delayed = values["delayed"]
         self._usual_per_k = usual_per_k
-        self._now_ohm = now_ohm
+        self._resistance_ohm = resistance_ohm
         self._volts = 0.0
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         del time_s
-        if self._now_ohm is not None:
-            drop_v = -self._now_ohm * current_a
+        scaled_v = scaled_drop_at(drop_v, current_a, self._delayed, self._resistance_ohm)
         colder = inverse_k_at(temperature_c) - self._usual_per_k
-        self._volts = self._share * drop_v * math.expm1(self._activation_k * colder)
+        self._volts = self._share * scaled_v * math.expm1(self._activation_k * colder)
 
     def extra_voltage(self, soc_pct: float) -> float:
         del soc_pct
