@@ -44,7 +44,7 @@ def test_a_constant_is_slow_and_a_flutter_is_fast(rows: int, level: float) -> No
     constant = by_scale(np.full((rows, 1), level))
     for part in constant[:-1]:
         np.testing.assert_allclose(part, 0.0, atol=1e-9)
-    assert float(np.sum(constant[-1] ** 2)) == pytest.approx(rows * level**2, abs=1e-9)
+    assert float(np.sum(constant[-1] ** 2)) == pytest.approx(rows * level**2, rel=1e-9, abs=1e-9)
     flutter = by_scale(np.where(np.arange(rows) % 2, 1.0, -1.0)[:, None])
     assert float(np.sum(flutter[0] ** 2)) > 0.6 * rows
 

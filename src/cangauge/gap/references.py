@@ -36,6 +36,9 @@ KNOWN_LOGS = 0.5
 KNOWN_COEFFICIENTS = 2.0
 """So many coefficients are taken to agree with the model file, beside those that are looked at."""
 
+TRUSTS: tuple[float, ...] = tuple(np.logspace(-7.0, 0.0, 29).tolist())
+"""Weights of the model file's information to choose from."""
+
 FEW = 2.0
 """Chance on few references: a mean of n squares is taken to be low by this over n."""
 
@@ -73,7 +76,9 @@ def error_from_references(frame: Frame, grams: Sequence[Gram], stated: ErrorMode
         Of the references, two at least.
     stated : ErrorModel
     """
-    error = stated
+    # What all references share comes first, or it is taken for what differs from log to log: under
+    # information that is too sure the differences grow until they explain it, and it stays so.
+    error = replace(stated, trust=_trust(frame, grams, stated))
     known_v2, known_own = np.array(stated.scale_v2), np.array(stated.own_std)
     counts = np.sum([gram.counts for gram in grams], axis=0)
     known = KNOWN_LOGS * counts / len(grams) + 1e-9
@@ -143,17 +148,30 @@ def with_strays(frame: Frame, grams: Sequence[Gram], error: ErrorModel) -> Error
 def _trust(frame: Frame, grams: Sequence[Gram], error: ErrorModel) -> float:
     """Return how far the references bear out the model file's information (`ErrorModel.trust`).
 
-    It says where the coefficients are, and how surely. If they lie as far from there as it says
-    they may, it is trusted; if they lie ten times further, it counts for a hundredth.
+    It says where the coefficients are, and how surely. If the references put them ten times further
+    away than it says they may lie, it counts for about a hundredth: the weight under which the
+    references are most probable, everything else integrated out.
     """
     p = frame.scale.size
     if frame.prior_root is None:
         return 1.0
     found = gather(frame, grams, [], error)
-    away = found.mean[:p] - (0.0 if frame.centre is None else frame.centre)
+    right = found.precision @ found.mean
     whole = information_of(frame, replace(error, trust=1.0))
-    seen = float(away @ whole @ away + np.sum(whole * _inverse(found.precision)[:p, :p]))
-    return min((p + KNOWN_COEFFICIENTS) / (seen + KNOWN_COEFFICIENTS), 1.0)
+    centre = np.zeros(p) if frame.centre is None else frame.centre
+
+    def log_probability(trust: float) -> float:
+        precision, toward = found.precision.copy(), right.copy()
+        precision[:p, :p] += (trust - error.trust) * whole
+        toward[:p] += (trust - error.trust) * whole @ centre
+        balance = 1.0 / np.sqrt(np.diag(precision))
+        balanced, toward = precision * balance * balance[:, None], toward * balance
+        gained = toward @ np.linalg.solve(balanced, toward) - trust * centre @ whole @ centre
+        volume = np.linalg.slogdet(balanced)[1] - 2.0 * np.sum(np.log(balance))
+        agreed = KNOWN_COEFFICIENTS * (np.log(trust) - trust)
+        return float(0.5 * (gained - volume + p * np.log(trust) + agreed))
+
+    return max(TRUSTS, key=log_probability)
 
 
 @dataclass(frozen=True, eq=False)
