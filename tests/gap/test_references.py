@@ -88,8 +88,8 @@ def test_where_references_differ_logs_are_taken_to_differ(
     ohms = learn(apart(more_resistance, references, 0.03))
     # A constant offset looks like a wrong gain too: between them they hold it.
     assert own_std(volts, "voltage_gain") > 2.0 * own_std(alike, "voltage_gain")
-    assert own_std(amperes, "current_offset") > 4.0 * own_std(alike, "current_offset")
-    assert level_std(ohms) > 4.0 * level_std(alike)
+    assert own_std(amperes, "current_offset") > 3.0 * own_std(alike, "current_offset")
+    assert level_std(ohms) > 3.0 * level_std(alike)
     # And nothing is learned of what they do not differ in.
     for settled in (volts, ohms):
         assert own_std(settled, "current_offset") < 1.2 * own_std(alike, "current_offset")
@@ -116,9 +116,9 @@ def test_an_effect_that_strays_on_references_is_believed_less(
     strange = learn([*references[:2], more_amperes(references[2], 4.0)])
     before, after = alike.error.strays, strange.error.strays
     assert after["current_offset"] > 1.5 * before["current_offset"]
-    assert after["time_skew"] < 1.5 * before["time_skew"]
-    # What strays is never less worth than the mean of all.
-    assert min(after.values()) >= 1.0
+    assert after["current_offset"] > after["time_skew"]
+    # A model that strays in one way is believed less in all: none is worth more than the mean.
+    assert min(after.values()) > min(before.values())
 
 
 def test_an_effect_that_references_stray_in_is_no_cause(
