@@ -60,6 +60,8 @@ class ErrorModel:
     strays: Mapping[str, float] = field(default_factory=dict)
     """By how much the squared evidence for each effect exceeds, on references left out, what
     chance alone would give; 1 where it is not listed."""
+    clean_v2: float = 0.0
+    """Mean square of what references left out keep, their own terms not taken off [V²]."""
     clean_excess: float = 0.0
     """The largest `excess` of a reference left out."""
     trust: float = 1.0
@@ -358,6 +360,37 @@ def left_over(
         weights[-1] = 1.0
         total += (log.products @ weights) @ weights
     return total
+
+
+def kept_v2(
+    frame: Frame,
+    log: Gram,
+    solution: FloatArray,
+    chosen: Sequence[int] = (),
+    amplitude: FloatArray | None = None,
+) -> float:
+    """Return a log's mean square error with what is shared and some effects alone [V²].
+
+    What is the log's own is not taken off: it could hide a gap that no effect explains.
+
+    Parameters
+    ----------
+    frame : Frame
+    log : Gram
+        With the columns of all of the frame's candidates.
+    solution : array
+        Coefficients and repairs, as `Evidence.mean`.
+    chosen, amplitude : optional
+        Candidates and all their amplitudes.
+    """
+    p, repairs = frame.scale.size, frame.amplitudes_of(frame.repairs)
+    weights = np.zeros(log.products.shape[1])
+    weights[:p] = -solution[:p]
+    weights[p + repairs] -= solution[p:]
+    if amplitude is not None:
+        weights[p + frame.amplitudes_of(chosen)] -= amplitude
+    weights[-1] = 1.0
+    return float(np.sum((log.products @ weights) @ weights) / np.sum(log.counts))
 
 
 def excess(

@@ -21,6 +21,7 @@ from cangauge.gap.evidence import (
     excess,
     gather,
     information_of,
+    kept_v2,
     prior_precision,
 )
 from cangauge.gap.scales import SCALES, scale_variances
@@ -28,7 +29,7 @@ from cangauge.model.model_file import ModelNoise
 
 FloatArray = NDArray[np.float64]
 
-ROUNDS = 6
+ROUNDS = 5
 
 KNOWN_LOGS = 0.5
 """What the model file says counts like so much of a reference log."""
@@ -36,11 +37,15 @@ KNOWN_LOGS = 0.5
 KNOWN_COEFFICIENTS = 2.0
 """So many coefficients are taken to agree with the model file, beside those that are looked at."""
 
-TRUSTS: tuple[float, ...] = tuple(np.logspace(-7.0, 0.0, 29).tolist())
-"""Weights of the model file's information to choose from."""
+TRUSTS: tuple[float, ...] = tuple(np.logspace(-1.0, 0.0, 9).tolist())
+"""Weights of the model file's information to choose from. It is never quite let go: at temperatures
+that no reference has, it is all that there is."""
 
 FEW = 2.0
 """Chance on few references: a mean of n squares is taken to be low by this over n."""
+
+OWN_AT_MOST = 4.0
+"""Nor by more than this many times it: effects that cancel each other could grow without end."""
 
 OWN_AT_LEAST = 0.25
 """Few references cannot show that logs differ by less than this part of what is usual."""
@@ -90,9 +95,10 @@ def error_from_references(frame: Frame, grams: Sequence[Gram], stated: ErrorMode
         error = ErrorModel(
             scale_v2=_positive(variance),
             own_std=tuple(
-                np.maximum(
+                np.clip(
                     np.sqrt((own + KNOWN_LOGS * known_own**2) / (len(grams) + KNOWN_LOGS)),
                     OWN_AT_LEAST * known_own,
+                    OWN_AT_MOST * known_own,
                 ).tolist()
             ),
             rmse_v=float(np.sqrt(np.sum(counts * variance) / np.sum(counts))),
@@ -125,11 +131,13 @@ def with_strays(frame: Frame, grams: Sequence[Gram], error: ErrorModel) -> Error
         own=tuple(range(len(frame.repairs), len(shown))),
     )
     squares: dict[str, list[float]] = {}
-    excesses = []
+    excesses, kept = [], []
     for number, gram in enumerate(grams):
         others = [item for k, item in enumerate(grams) if k != number]
         evidence = gather(few, others, [gram], error)
-        excesses.append(excess(evidence, [gram], gather(few, others, [], error).squares))
+        without = gather(few, others, [], error)
+        excesses.append(excess(evidence, [gram], without.squares))
+        kept.append(kept_v2(few, gram, without.mean))
         for k, choice in enumerate(few.choices):
             at = evidence.of(k)
             prior = prior_precision(choice.bounds)
@@ -142,7 +150,7 @@ def with_strays(frame: Frame, grams: Sequence[Gram], error: ErrorModel) -> Error
     # A model that strays in some ways will stray in others too, on a day that nobody has seen.
     usual = float(np.mean([*worth.values()]))
     worth = {key: max(value, usual) for key, value in worth.items()}
-    return replace(error, strays=worth, clean_excess=max(excesses))
+    return replace(error, strays=worth, clean_v2=float(np.mean(kept)), clean_excess=max(excesses))
 
 
 def _trust(frame: Frame, grams: Sequence[Gram], error: ErrorModel) -> float:

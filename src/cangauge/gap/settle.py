@@ -43,6 +43,7 @@ CLEAN_STRUCTURE: tuple[tuple[str, dict[str, float]], ...] = (
     ("resistance_temperature", {"activation_k": 2500.0, "delayed": 1.0}),
     ("resistance_soc", {"width_pct": 40.0, "delayed": 1.0}),
     ("charge_transfer", {"exchange_a": 0.12}),
+    ("hysteresis", {"travel_pct": 4.0}),
 )
 """Structure that a clean pack may well have and the 13 coefficients lack: all logs share it, so it
 is learned from the references and is no cause."""
@@ -56,6 +57,9 @@ the pack's resistance."""
 
 OWN_PART = 0.01
 """How much every other effect does, in parts of its physical range."""
+
+ALWAYS_OF_TEMPERATURE = frozenset({"charge_transfer"})
+"""Structure that follows the temperature whatever its shape."""
 
 COVERED_K = 3.0
 """References cover temperatures up to this far outside their own [K]."""
@@ -159,6 +163,8 @@ def settle(
         grams = [gram_of(terms, frame.scale) for terms in reference_terms]
         if len(grams) > 1:
             error = with_strays(frame, grams, error_from_references(frame, grams, error))
+            if not _temperatures_covered(of_references, of_logs):
+                error = _beyond_the_references(error)
         solution, _ = within_bounds(gather(frame, grams, [], error), model.model, [])
         change = solution[: frame.scale.size]
         learned = moved(model.model, change)
@@ -211,7 +217,11 @@ def _frame(
     known = [item for item in CLEAN_STRUCTURE if references]
     if references and not _temperatures_covered(references, diagnosed):
         # References that were never so cold cannot have shown what resistance does there.
-        known = [item for item in known if not item[1].get("activation_k")]
+        known = [
+            (effect_id, shape)
+            for effect_id, shape in known
+            if not shape.get("activation_k") and effect_id not in ALWAYS_OF_TEMPERATURE
+        ]
     found = [_first_like(choices, effect_id, shape, pack) for effect_id, shape in known]
     repairs = tuple(k for k in found if k is not None)
     own, own_prior = _own(choices, model_file)
@@ -275,6 +285,15 @@ def _over_all_temperatures(model: ExtendedModel, logs: Sequence[Log]) -> Extende
         model.model, temperature_range_c=(low, high), current_range_a=(least, most)
     )
     return replace(model, model=voltage_model)
+
+
+def _beyond_the_references(error: ErrorModel) -> ErrorModel:
+    """Return the error to expect at temperatures that no reference has.
+
+    How well the model follows from row to row there, and how far it strays, nobody has seen: all
+    scales are given the variance of the slowest.
+    """
+    return replace(error, scale_v2=(error.lasting_v2,) * len(error.scale_v2), strays={})
 
 
 def _temperatures_covered(references: Sequence[Prepared], diagnosed: Sequence[Prepared]) -> bool:

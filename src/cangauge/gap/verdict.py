@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cangauge.gap.evidence import Evidence, Score, condition_on, excess, gather, scores
+from cangauge.gap.evidence import Evidence, Score, condition_on, excess, gather, kept_v2, scores
 from cangauge.gap.settle import Settled
 
 FloatArray = NDArray[np.float64]
@@ -30,11 +30,14 @@ FURTHER_LOG_BAYES = 12.0
 
 FURTHER_AT_MOST = 2
 
-EXPLAINED_AT_LEAST = 0.3
+EXPLAINED_AT_LEAST = 0.4
 """The best effect must explain this part of the excess, or the verdict is `unknown`."""
 
-HALF_KNOWN = 0.45
+HALF_KNOWN = 0.5
 """An effect that explains this part of the excess is as likely to be right as not."""
+
+VISIBLE = 0.25
+"""A gap of this part of the clean mean square is seen in volts."""
 
 UNKNOWN_BEYOND = 3.0
 """A gap that no effect explains must be so many times what the worst reference shows."""
@@ -71,13 +74,9 @@ def decide(settled: Settled) -> Verdict:
     )
     ranked = scores(evidence)
     best = ranked[0]
-    clean = 0.0
-    if settled.reference_grams:
-        clean = gather(settled.frame, settled.reference_grams, [], settled.error).squares
-    grams = settled.diagnosed_grams
-    before = excess(evidence, grams, clean)
-    after = excess(evidence, grams, clean, best)
-    explained = float(np.clip(1.0 - after / before, 0.0, 1.0)) if before > 0.0 else 1.0
+    alone = gather(settled.frame, settled.reference_grams, [], settled.error)
+    before = excess(evidence, settled.diagnosed_grams, alone.squares)
+    explained = _explained(settled, evidence, alone, best)
     chances = _chances(ranked, explained)
     beyond = before / max(settled.error.clean_excess, 1.0)
     if best.log_bayes_factor < ACCEPT_LOG_BAYES:
@@ -114,6 +113,30 @@ def _accepted(evidence: Evidence, best: Score, alike: Sequence[str]) -> tuple[Sc
             break
         accepted.append(rest[0])
     return tuple(accepted)
+
+
+def _explained(settled: Settled, evidence: Evidence, alone: Evidence, score: Score) -> float:
+    """Return the part of the mean square gap beyond that of clean logs that an effect takes away.
+
+    From the model as the references alone know it, to that model with the effect; what is each
+    log's own is not taken off in either.
+    """
+    frame, grams = settled.frame, settled.diagnosed_grams
+    amplitude = score.amplitude
+    at = evidence.of(score.candidate)
+    with_it = evidence.mean - evidence.per_amplitude[:, at] @ amplitude
+    before = sum(kept_v2(frame, gram, alone.mean) for gram in grams) / len(grams)
+    after = sum(
+        kept_v2(frame, gram, with_it, [score.candidate], amplitude) for gram in grams
+    ) / len(grams)
+    clean = settled.error.clean_v2 or settled.error.rmse_v**2
+    gap = before - clean
+    if gap > VISIBLE * clean:
+        return float(np.clip((before - max(after, clean)) / gap, 0.0, 1.0))
+    # Too small to be seen in volts, yet perhaps certain: then in units of what chance leaves.
+    chance = excess(evidence, grams, alone.squares)
+    left = excess(evidence, grams, alone.squares, score)
+    return float(np.clip(1.0 - left / chance, 0.0, 1.0)) if chance > 0.0 else 0.0
 
 
 def _chances(ranked: Sequence[Score], explained: float) -> dict[str, float]:
