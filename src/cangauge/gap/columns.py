@@ -19,16 +19,15 @@ from cangauge.identify.rows import FitRows
 from cangauge.identify.voltage_fit import columns_of, prepare
 from cangauge.logs.log import Log
 from cangauge.model.charge import BRIDGE_S, discharged_ah
-from cangauge.model.effects.effect import Effect, Pack, Signals, Values
+from cangauge.model.effects.effect import Effect, Pack, Signals
 from cangauge.model.effects.first_order import low_passed
 from cangauge.model.extended import ExtendedModel
 
 FloatArray = NDArray[np.float64]
 
-OWN = ("constant voltage [V]", "assumed initial SoC [%]", "slow polarisation", "resistance level")
-"""What differs from log to log without a cause; the last two in parts of the pack's resistance.
-Trips of one pack differ in the state that they begin from, in how hard they are, in how warm the
-cells inside are."""
+LEVELS = ("slow polarisation", "resistance level")
+"""What differs from log to log beside the effects, in parts of the pack's resistance: trips of one
+pack differ in the state that they begin from, and in how warm the cells inside are."""
 
 OWN_SLOW_S = 150.0
 """Time constant of a log's own slow polarisation [s]."""
@@ -66,6 +65,8 @@ class Candidate:
     """Amplitudes at which the effect does nothing, shape (k,)."""
     bounds: FloatArray
     """Physical bounds of the amplitudes, less the neutral values, shape (k, 2)."""
+    steps: FloatArray
+    """Change of each amplitude over which the voltage's change is taken, shape (k,)."""
 
     def values(self, amplitude: FloatArray) -> dict[str, float]:
         """Return the effect's parameters for amplitudes beside the neutral ones."""
@@ -83,9 +84,9 @@ class LogTerms:
     baseline: FloatArray
     """Columns of the voltage model's coefficients, shape (m, 9 + delays)."""
     own: FloatArray
-    """Columns of what differs from log to log without a cause (`OWN`), shape (m, 4)."""
+    """Columns of `LEVELS`, shape (m, 2)."""
     effects: tuple[FloatArray, ...]
-    """Columns of each candidate, shape (m, k) each."""
+    """Columns of each candidate (of a reference: of those in `Frame.shown`), shape (m, k) each."""
 
     def at(self, keep: NDArray[np.bool_]) -> LogTerms:
         """Return the terms on some of the rows."""
@@ -132,20 +133,31 @@ def candidates(effects: Sequence[Effect], pack: Pack, time_s: FloatArray) -> lis
     result = []
     for effect in effects:
         neutral = effect.neutral(pack)
-        if not effect.amplitudes:  # time_skew's only parameter is both shape and amplitude
-            only = effect.parameters[0]
-            result.append(
-                Candidate(effect, {}, (only.name,), np.zeros(1), np.array([only.bounds(pack)]))
-            )
-            continue
-        names = tuple(parameter.name for parameter in effect.amplitudes)
+        amplitudes = effect.amplitudes or effect.parameters[:1]  # time_skew's is a shape as well
+        names = tuple(parameter.name for parameter in amplitudes)
         centre = np.array([neutral[name] for name in names])
-        bounds = np.array([parameter.bounds(pack) for parameter in effect.amplitudes])
-        grids = [effect.trials(parameter, pack, time_s) for parameter in effect.shapes]
+        bounds = np.array([parameter.bounds(pack) for parameter in amplitudes]) - centre[:, None]
+        shapes = effect.shapes if effect.amplitudes else ()
+        grids = [effect.trials(parameter, pack, time_s) for parameter in shapes]
         for choice in itertools.product(*grids):
-            shape = dict(zip((p.name for p in effect.shapes), choice, strict=True))
-            result.append(Candidate(effect, shape, names, centre, bounds - centre[:, None]))
+            shape = dict(zip((p.name for p in shapes), choice, strict=True))
+            result += [
+                Candidate(effect, shape, names, centre, bounds, steps)
+                for steps in _steps(effect, bounds)
+            ]
     return result
+
+
+def _steps(effect: Effect, bounds: FloatArray) -> list[FloatArray]:
+    """Return over which changes of the amplitudes the voltage's change is taken."""
+    widest = float(np.abs(bounds).max()) if effect.bends_at else 0.0
+    return [_tangent_steps(bounds), *(np.array([part * widest]) for part in effect.bends_at)]
+
+
+def _tangent_steps(bounds: FloatArray) -> FloatArray:
+    """Return small changes of the amplitudes, within their bounds, shape (k,)."""
+    small = STEP * (bounds[:, 1] - bounds[:, 0])
+    return np.where(small > bounds[:, 1], -small, small)
 
 
 def residual(prepared: Prepared, model: ExtendedModel) -> FloatArray:
@@ -155,62 +167,56 @@ def residual(prepared: Prepared, model: ExtendedModel) -> FloatArray:
 
 
 def effect_columns(
-    prepared: Prepared,
-    model: ExtendedModel,
-    candidate: Candidate,
-    around: FloatArray | None = None,
-) -> tuple[FloatArray, FloatArray]:
-    """Return the residual and minus its derivative by each amplitude, shapes (m,) and (m, k).
+    prepared: Prepared, model: ExtendedModel, candidate: Candidate, here: FloatArray
+) -> FloatArray:
+    """Return minus the residual's change per unit of each amplitude, shape (m, k).
 
     Parameters
     ----------
     prepared : Prepared
+        With the model's voltage in place of the measured one: an effect in proportion to the
+        voltage would else follow its noise.
     model : ExtendedModel
         Without the candidate.
     candidate : Candidate
-    around : array of shape (k,), optional
-        Amplitudes beside the neutral ones to take the derivative at; zero by default.
+    here : array of shape (m,)
+        Residual without it [V].
     """
-    zero = np.zeros(len(candidate.amplitudes))
-    centre = zero if around is None else around
-    effect = candidate.effect
-    here = residual(prepared, _with(model, effect, candidate.values(centre), around is None))
-    columns = np.empty((here.size, zero.size))
-    for k in range(zero.size):
-        low, high = candidate.bounds[k]
-        step = STEP * (high - low)
-        if centre[k] + step > high:
-            step = -step
-        moved = centre.copy()
-        moved[k] += step
-        there = residual(prepared, model.with_effect(effect, candidate.values(moved)))
-        columns[:, k] = (here - there) / step
-    return here, columns
+    columns = np.empty((here.size, len(candidate.amplitudes)))
+    for k, step in enumerate(candidate.steps):
+        moved = np.zeros(len(candidate.amplitudes))
+        moved[k] = step
+        with_it = model.with_effect(candidate.effect, candidate.values(moved))
+        columns[:, k] = (here - residual(prepared, with_it)) / step
+    return columns
 
 
 def log_terms(prepared: Prepared, model: ExtendedModel, choices: Sequence[Candidate]) -> LogTerms:
-    """Return all terms of one log."""
+    """Return the terms of one log, with the columns of some candidates."""
     voltage_model = model.model
-    plain = residual(prepared, model)
     rows = prepared.rows
     current = prepared.log.current_a
     slow = low_passed(prepared.log.time_s, current, OWN_SLOW_S, 0.0, rest_s=BRIDGE_S)
     own = np.column_stack(
         [
-            np.ones(len(rows)),
-            voltage_model.pseudo_ocv_slope(rows.soc_pct),
             -model.pack.resistance_ohm * slow[prepared.at],
             -model.pack.resistance_ohm * current[prepared.at],
         ]
     )
+    smooth = _as_modelled(prepared, model)
+    here = residual(smooth, model)
     return LogTerms(
         prepared=prepared,
-        residual_v=plain,
+        residual_v=residual(prepared, model),
         baseline=columns_of(rows, voltage_model.epsilon, voltage_model.t_ref_c),
         own=own,
-        effects=tuple(effect_columns(prepared, model, choice)[1] for choice in choices),
+        effects=tuple(effect_columns(smooth, model, choice, here) for choice in choices),
     )
 
 
-def _with(model: ExtendedModel, effect: Effect, values: Values, is_neutral: bool) -> ExtendedModel:
-    return model if is_neutral else model.with_effect(effect, values)
+def _as_modelled(prepared: Prepared, model: ExtendedModel) -> Prepared:
+    """Return the log with the model's voltage in place of the measured one."""
+    everywhere = np.arange(len(prepared.log))
+    prediction = model.predict(prepared.signals, prepared.initial_soc_pct, everywhere)
+    volts = prepared.log.voltage_v - prediction.residual_v
+    return replace(prepared, log=replace(prepared.log, voltage_v=volts))

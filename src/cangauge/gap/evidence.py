@@ -9,28 +9,38 @@ All but a are integrated out. What is left is a quadratic form in a, for all can
 
     ln evidence(a) = g·a − ½ a·S·a,    and with a ~ N(0, τ²) the Bayes factor against no effect.
 
-The error is correlated in time, so n rows count as n/κ independent ones, with κ from the
-references. How alike two effects look to these logs is the correlation in S.
+The error is correlated in time, so rows are weighed scale by scale (`scales`), each scale by the
+error that the references show there. How alike two effects look to these logs is the correlation
+in S.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
+from scipy.special import log_ndtr
 
-from cangauge.gap.columns import OWN, Candidate, LogTerms
+from cangauge.gap.columns import LEVELS, Candidate, LogTerms
+from cangauge.gap.scales import SCALES, by_scale
 
 FloatArray = NDArray[np.float64]
 
 PRIOR_SIGMAS = 2.0
 """Half the width of an amplitude's bounds is this many prior standard deviations."""
 
-PIN = 0.01
+PRIOR_PARTS = (1.0, 0.3, 0.1, 0.03)
+"""An effect may be as large as its bounds, or much smaller: the prior's width in parts of that of
+the bounds, each as probable as the others."""
+
+NOISIER = 0.2
+"""Errors' variance differs from log to log by this part without a cause."""
+
+PIN = 0.1
 """How far the structure of clean logs may move with the diagnosed ones, in parts of its bounds."""
 
 JITTER = 1e-10
@@ -41,12 +51,27 @@ JITTER = 1e-10
 class ErrorModel:
     """How far residuals stray without a cause."""
 
-    rmse_v: float
-    """Of a reference log under a model that did not see it [V]."""
-    rows_alike: float
-    """κ: so many rows in a row tell as much as one."""
+    scale_v2: tuple[float, ...]
+    """Variance of the coefficients of each scale (`scales.by_scale`) [V²]."""
     own_std: tuple[float, ...]
-    """Standard deviation, from log to log, of each of `columns.OWN`."""
+    """Standard deviation, from log to log, of what is each log's own (`Frame.own_prior`)."""
+    rmse_v: float
+    """Root mean square error of a row, what is each log's own apart [V]."""
+    strays: Mapping[str, float] = field(default_factory=dict)
+    """By how much the squared evidence for each effect exceeds, on references left out, what
+    chance alone would give; 1 where it is not listed."""
+    clean_v2: float = 0.0
+    """Mean square of what references left out keep, their own terms not taken off [V²]."""
+    clean_excess: float = 0.0
+    """The largest `excess` of a reference left out."""
+    trust: float = 1.0
+    """Weight of the information that the model file brings: less than 1 where the references
+    contradict it."""
+
+    @property
+    def lasting_v2(self) -> float:
+        """Variance per row of an error that does not average out [V²]."""
+        return self.scale_v2[-1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +79,7 @@ class Evidence:
     """The quadratic form of all candidates' amplitudes."""
 
     frame: Frame
+    error: ErrorModel
     gradient: FloatArray
     """g, shape (all amplitudes,)."""
     curvature: FloatArray
@@ -61,7 +87,7 @@ class Evidence:
     squares: float
     """Weighted sum of squares that is left without any effect."""
     mean: FloatArray
-    """Solution without any effect: δθ (scaled), repairs, then what is each log's own."""
+    """Solution without any effect: δθ (scaled), repairs."""
     per_amplitude: FloatArray
     """How that solution falls as an amplitude rises, shape (…, all amplitudes)."""
     precision: FloatArray
@@ -93,23 +119,22 @@ class Score:
 class Gram:
     """Products of a log's columns with each other: all that linear models need of its rows.
 
-    Columns: baseline (p), all candidates' amplitudes, own (`columns.OWN`), residual.
+    Columns: baseline (p), amplitudes (of all candidates; of a reference: of the repairs, then of
+    what is each log's own), `columns.LEVELS`, residual.
     """
 
     products: FloatArray
-    rows: int
-
-    def __add__(self, other: Gram) -> Gram:
-        """Return the products over the rows of both."""
-        return Gram(self.products + other.products, self.rows + other.rows)
+    """One matrix a scale, shape (SCALES, columns, columns)."""
+    counts: FloatArray
+    """Coefficients of each scale, shape (SCALES,)."""
 
     def weakened(self, factor: float) -> Gram:
         """Return the products as if the errors' variance were `factor` times larger."""
-        return Gram(self.products / factor, self.rows)
+        return Gram(self.products / factor, self.counts)
 
-    def __sub__(self, other: Gram) -> Gram:
-        """Return the products over the rows that the other has not."""
-        return Gram(self.products - other.products, self.rows - other.rows)
+    def weighed(self, error: ErrorModel) -> FloatArray:
+        """Return the products, each scale by the inverse of its variance, summed [-]."""
+        return np.asarray(np.tensordot(1.0 / np.array(error.scale_v2), self.products, axes=1))
 
 
 def gram_of(terms: LogTerms, scale: FloatArray, keep: NDArray[np.bool_] | None = None) -> Gram:
@@ -117,7 +142,10 @@ def gram_of(terms: LogTerms, scale: FloatArray, keep: NDArray[np.bool_] | None =
     columns = np.column_stack([terms.baseline / scale, *terms.effects, terms.own, terms.residual_v])
     if keep is not None:
         columns = columns[keep]
-    return Gram(columns.T @ columns, columns.shape[0])
+    parts = by_scale(columns)
+    return Gram(
+        np.stack([part.T @ part for part in parts]), np.array([float(len(part)) for part in parts])
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,12 +159,24 @@ class Frame:
     """Scale of the baseline's columns, shape (p,)."""
     repairs: tuple[int, ...] = ()
     """Candidates that clean logs show too; all logs share their amplitudes."""
+    own: tuple[int, ...] = ()
+    """Candidates by which logs may differ without a cause: every effect, a little."""
+    own_prior: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """How much so before references were seen, as standard deviations: of the amplitudes of `own`,
+    then of `columns.LEVELS`."""
+    centre: FloatArray | None = None
+    """Where the information holds the coefficients, in scaled columns, shape (p,); 0 if None."""
 
     @cached_property
     def first(self) -> NDArray[np.intp]:
         """Index of each candidate's first amplitude, one more than candidates."""
         widths = [len(choice.amplitudes) for choice in self.choices]
         return np.concatenate(([0], np.cumsum(widths))).astype(np.intp)
+
+    @property
+    def shown(self) -> tuple[int, ...]:
+        """Candidates whose columns are wanted of references too: repairs, then own."""
+        return (*self.repairs, *self.own)
 
     def amplitudes_of(self, chosen: Sequence[int]) -> NDArray[np.intp]:
         """Return the indices of some candidates' amplitudes."""
@@ -160,37 +200,34 @@ def gather(
         Logs without and with the effect in question.
     error : ErrorModel
     """
-    weight = 1.0 / (error.rmse_v**2 * error.rows_alike)
     p, amplitudes = frame.scale.size, int(frame.first[-1])
-    own = p + amplitudes + np.arange(len(OWN))
-    residual = int(own[-1]) + 1
-    effects = p + np.arange(amplitudes)
-    shared = np.concatenate((np.arange(p), p + frame.amplitudes_of(frame.repairs)))
-    logs = [*references, *diagnosed]
-    size = shared.size + own.size * len(logs)
-    precision, right = np.zeros((size, size)), np.zeros(size)
-    cross = np.zeros((size, amplitudes))
+    shared = p + frame.amplitudes_of(frame.repairs).size
+    effects = shared + np.arange(amplitudes)
+    precision, right = np.zeros((shared, shared)), np.zeros(shared)
+    cross = np.zeros((shared, amplitudes))
     curvature, gradient, squares = np.zeros((amplitudes, amplitudes)), np.zeros(amplitudes), 0.0
-    for number, log in enumerate(logs):
-        products = weight * log.products
-        columns = np.concatenate((shared, own))
-        used = np.concatenate(
-            (np.arange(shared.size), shared.size + own.size * number + np.arange(own.size))
-        )
-        precision[np.ix_(used, used)] += products[np.ix_(columns, columns)]
-        right[used] += products[columns, residual]
-        squares += float(products[residual, residual])
-        if number >= len(references):
-            cross[used] += products[np.ix_(columns, effects)]
-            curvature += products[np.ix_(effects, effects)]
-            gradient += products[effects, residual]
-    _add_priors(precision, frame, error, weight)
+    for log in references:
+        products, _ = _without_own(log, frame, error, is_reference=True)
+        precision += products[:shared, :shared]
+        right += products[:shared, -1]
+        squares += float(products[-1, -1])
+    for log in diagnosed:
+        products, _ = _without_own(log, frame, error, is_reference=False)
+        precision += products[:shared, :shared]
+        right += products[:shared, -1]
+        squares += float(products[-1, -1])
+        cross += products[np.ix_(np.arange(shared), effects)]
+        curvature += products[np.ix_(effects, effects)]
+        gradient += products[effects, -1]
+    squares += _add_priors(precision, right, frame, error)
     if references and diagnosed and frame.repairs:
-        _pin_repairs(precision, right, frame, gather(frame, references, [], error).mean)
+        clean = gather(frame, references, [], error).mean
+        squares += _pin_repairs(precision, right, frame, clean)
     solve = _solver(precision)
     mean, per_amplitude = solve(right), solve(cross)
     return Evidence(
         frame=frame,
+        error=error,
         gradient=gradient - cross.T @ mean,
         curvature=curvature - cross.T @ per_amplitude,
         squares=squares - float(right @ mean),
@@ -200,25 +237,70 @@ def gather(
     )
 
 
-def _add_priors(precision: FloatArray, frame: Frame, error: ErrorModel, weight: float) -> None:
+def _without_own(
+    log: Gram, frame: Frame, error: ErrorModel, *, is_reference: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Integrate out what is a log's own.
+
+    Returns
+    -------
+    products : array
+        Weighed products of the shared columns, all amplitudes' (not of a reference), residual.
+    own : array
+        By how much the log's own amplitudes follow each of these, shape (own, …).
+    """
+    p = frame.scale.size
+    repairs, varying = frame.amplitudes_of(frame.repairs), frame.amplitudes_of(frame.own)
+    weighed = log.weighed(error)
+    levels = weighed.shape[0] - 1 - len(LEVELS) + np.arange(len(LEVELS))
+    last = [weighed.shape[0] - 1]
+    if is_reference:
+        shared = np.arange(p + repairs.size)
+        kept = np.concatenate((shared, last))
+        own = np.concatenate((shared.size + np.arange(varying.size), levels))
+    else:
+        every = p + np.arange(int(frame.first[-1]))
+        kept = np.concatenate((np.arange(p), p + repairs, every, last))
+        own = np.concatenate((p + varying, levels))
+    block = weighed[np.ix_(own, own)]
+    block[np.diag_indices(own.size)] += np.array(error.own_std) ** -2.0
+    toward = weighed[np.ix_(own, kept)]
+    follows = _solver(block)(toward)
+    return weighed[np.ix_(kept, kept)] - toward.T @ follows, follows
+
+
+def _add_priors(precision: FloatArray, right: FloatArray, frame: Frame, error: ErrorModel) -> float:
+    """Add the priors (in place); return the square of what they are centred at."""
+    squares = 0.0
     p = frame.scale.size
     block = precision[:p, :p]
     if frame.prior_root is not None:
-        block += weight * frame.prior_root.T @ frame.prior_root
+        information = information_of(frame, error)
+        block += information
+        if frame.centre is not None:
+            right[:p] += information @ frame.centre
+            squares = float(frame.centre @ information @ frame.centre)
     block[np.diag_indices(p)] += JITTER * np.trace(block) / p
     repairs = prior_precision(frame.bounds_of(frame.repairs))
     at = p + np.arange(repairs.shape[0])
     precision[np.ix_(at, at)] += repairs
-    own = np.arange(p + at.size, precision.shape[0])
-    logs = own.size // len(OWN)
-    precision[own, own] += np.tile(np.array(error.own_std) ** -2.0, logs)
+    return squares
 
 
-def _pin_repairs(precision: FloatArray, right: FloatArray, frame: Frame, clean: FloatArray) -> None:
+def information_of(frame: Frame, error: ErrorModel) -> FloatArray:
+    """Return the precision with which the model file holds the scaled coefficients, (p, p)."""
+    if frame.prior_root is None:
+        return np.zeros((frame.scale.size, frame.scale.size))
+    return np.asarray(error.trust * frame.prior_root.T @ frame.prior_root / error.lasting_v2)
+
+
+def _pin_repairs(
+    precision: FloatArray, right: FloatArray, frame: Frame, clean: FloatArray
+) -> float:
     """Hold the structure of clean logs near what the references say of it.
 
     Else it would take up a cause of its own kind: cold logs would only teach what resistance does
-    in the cold, and nothing would be left to attribute.
+    in the cold, and nothing would be left to attribute. Returns the square of the pins' centre.
     """
     p = frame.scale.size
     bounds = frame.bounds_of(frame.repairs)
@@ -226,6 +308,7 @@ def _pin_repairs(precision: FloatArray, right: FloatArray, frame: Frame, clean: 
     pin = (PIN * (bounds[:, 1] - bounds[:, 0])) ** -2.0
     precision[at, at] += pin
     right[at] += pin * clean[at]
+    return float(np.sum(pin * clean[at] ** 2))
 
 
 def _solver(precision: FloatArray) -> Callable[[FloatArray], FloatArray]:
@@ -238,6 +321,105 @@ def _solver(precision: FloatArray) -> Callable[[FloatArray], FloatArray]:
         return np.asarray(balance * cho_solve(factor, balance * right))
 
     return solve
+
+
+def left_over(
+    evidence: Evidence, diagnosed: Sequence[Gram], chosen: Sequence[int], amplitude: FloatArray
+) -> FloatArray:
+    """Return the diagnosed logs' squares once some candidates explain them, shape (SCALES,) [V²].
+
+    Parameters
+    ----------
+    evidence : Evidence
+    diagnosed : sequence of Gram
+        Of the diagnosed logs, the last ones of the evidence.
+    chosen : sequence of int
+        Candidates.
+    amplitude : array
+        Of all of them, in order.
+    """
+    frame = evidence.frame
+    p, repairs = frame.scale.size, frame.amplitudes_of(frame.repairs)
+    varying, at = frame.amplitudes_of(frame.own), frame.amplitudes_of(chosen)
+    solution = evidence.mean - evidence.per_amplitude[:, at] @ amplitude
+    known = np.zeros(solution.size + int(frame.first[-1]) + 1)
+    known[: solution.size] = -solution
+    known[solution.size + at] = -amplitude
+    known[-1] = 1.0
+    total = np.zeros(SCALES)
+    for log in diagnosed:
+        _, follows = _without_own(log, frame, evidence.error, is_reference=False)
+        mine = follows @ known
+        weights = np.zeros(log.products.shape[1])
+        weights[:p] = -solution[:p]
+        # A candidate may be a repair, a log's own and the cause at once.
+        weights[p + repairs] -= solution[p:]
+        weights[p + varying] -= mine[: varying.size]
+        weights[p + at] -= amplitude
+        weights[-1 - len(LEVELS) : -1] = -mine[varying.size :]
+        weights[-1] = 1.0
+        total += (log.products @ weights) @ weights
+    return total
+
+
+def kept_v2(
+    frame: Frame,
+    log: Gram,
+    solution: FloatArray,
+    chosen: Sequence[int] = (),
+    amplitude: FloatArray | None = None,
+) -> float:
+    """Return a log's mean square error with what is shared and some effects alone [V²].
+
+    What is the log's own is not taken off: it could hide a gap that no effect explains.
+
+    Parameters
+    ----------
+    frame : Frame
+    log : Gram
+        With the columns of all of the frame's candidates.
+    solution : array
+        Coefficients and repairs, as `Evidence.mean`.
+    chosen, amplitude : optional
+        Candidates and all their amplitudes.
+    """
+    p, repairs = frame.scale.size, frame.amplitudes_of(frame.repairs)
+    weights = np.zeros(log.products.shape[1])
+    weights[:p] = -solution[:p]
+    weights[p + repairs] -= solution[p:]
+    if amplitude is not None:
+        weights[p + frame.amplitudes_of(chosen)] -= amplitude
+    weights[-1] = 1.0
+    return float(np.sum((log.products @ weights) @ weights) / np.sum(log.counts))
+
+
+def excess(
+    evidence: Evidence, diagnosed: Sequence[Gram], clean: float, score: Score | None = None
+) -> float:
+    """Return by how much the weighted squares of some logs exceed what chance leaves.
+
+    These are the squares of their errors, of what their own terms and the coefficients had to
+    give, and of what the references lost by it. Errors count only scale by scale and beyond what
+    varies from log to log: a sensor that is a little noisier is no gap.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    diagnosed : sequence of Gram
+        The last logs of the evidence.
+    clean : float
+        Squares of the references alone.
+    score : Score, optional
+        An effect to add.
+    """
+    chosen = [] if score is None else [score.candidate]
+    amplitude = np.zeros(0) if score is None else score.amplitude
+    total = evidence.squares - clean - (0.0 if score is None else score.explained)
+    counts = np.sum([gram.counts for gram in diagnosed], axis=0)
+    errors = left_over(evidence, diagnosed, chosen, amplitude) / np.array(evidence.error.scale_v2)
+    usual = (1.0 + NOISIER) * counts + 2.0 * np.sqrt(2.0 * counts)
+    given = max(total - float(errors.sum()), 0.0)
+    return given + float(np.sum(np.maximum(errors - usual, 0.0)))
 
 
 def condition_on(evidence: Evidence, given: Sequence[int]) -> Evidence:
@@ -270,31 +452,52 @@ def scores(evidence: Evidence, leave_out: Sequence[str] = ()) -> list[Score]:
             by_effect.setdefault(choice.effect.id, []).append(_score(evidence, k))
     best = []
     for shapes in by_effect.values():
-        factors = np.array([score.log_bayes_factor for score in shapes])
-        top = shapes[int(np.argmax(factors))]
-        mean = float(np.log(np.mean(np.exp(factors - factors.max()))) + factors.max())
-        best.append(
-            Score(top.effect_id, mean, top.candidate, top.amplitude, top.covariance, top.explained)
-        )
+        top = max(shapes, key=lambda score: score.log_bayes_factor)
+        mean = _log_mean([score.log_bayes_factor for score in shapes])
+        best.append(replace(top, log_bayes_factor=mean))
     return sorted(best, key=lambda score: -score.log_bayes_factor)
 
 
 def _score(evidence: Evidence, k: int) -> Score:
     at, choice = evidence.of(k), evidence.frame.choices[k]
-    gradient, curvature = evidence.gradient[at], evidence.curvature[at, at]
+    # What references left out bring up as well is worth so much less.
+    strays = evidence.error.strays.get(choice.effect.id, 1.0)
+    gradient, curvature = evidence.gradient[at] / strays, evidence.curvature[at, at] / strays
     prior = prior_precision(choice.bounds)
     total = curvature + prior
     amplitude = np.clip(np.linalg.solve(total, gradient), choice.bounds[:, 0], choice.bounds[:, 1])
-    occam = 0.5 * float(np.linalg.slogdet(np.linalg.solve(prior, total))[1])
-    factor = float(gradient @ amplitude - 0.5 * amplitude @ total @ amplitude) - occam
+    factors = [
+        _log_bayes_factor(gradient, curvature, prior / part**2, choice.bounds)
+        for part in PRIOR_PARTS
+    ]
     return Score(
         effect_id=choice.effect.id,
-        log_bayes_factor=factor,
+        log_bayes_factor=_log_mean(factors),
         candidate=k,
         amplitude=amplitude,
         covariance=np.asarray(np.linalg.inv(total), dtype=np.float64),
-        explained=float(2.0 * gradient @ amplitude - amplitude @ curvature @ amplitude),
+        explained=strays * float(2.0 * gradient @ amplitude - amplitude @ curvature @ amplitude),
     )
+
+
+def _log_bayes_factor(
+    gradient: FloatArray, curvature: FloatArray, prior: FloatArray, bounds: FloatArray
+) -> float:
+    """Return ln of the Bayes factor of amplitudes with this prior against none."""
+    total = curvature + prior
+    occam = 0.5 * float(np.linalg.slogdet(np.linalg.solve(prior, total))[1])
+    if gradient.size == 1 and np.any(bounds == 0.0):  # one sign only: a half-normal prior
+        sign = 1.0 if bounds[0, 0] == 0.0 else -1.0
+        root = float(np.sqrt(total[0, 0]))
+        at = sign * float(gradient[0]) / root
+        return 0.5 * at**2 - occam + float(np.log(2.0) + log_ndtr(at))
+    best = np.clip(np.linalg.solve(total, gradient), bounds[:, 0], bounds[:, 1])
+    return float(gradient @ best - 0.5 * best @ total @ best) - occam
+
+
+def _log_mean(values: Sequence[float]) -> float:
+    array = np.array(values)
+    return float(np.log(np.mean(np.exp(array - array.max()))) + array.max())
 
 
 def prior_precision(bounds: FloatArray) -> FloatArray:

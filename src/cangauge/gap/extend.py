@@ -10,22 +10,14 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from cangauge import __version__
-from cangauge.errors import InputError
+from cangauge.gap.bounded import moved, within_bounds
 from cangauge.gap.columns import residual
-from cangauge.gap.evidence import Evidence, Score, gather, prior_precision
+from cangauge.gap.evidence import Score, gather
 from cangauge.gap.settle import Settled
-from cangauge.identify.least_squares import nearest_rising
-from cangauge.identify.voltage_fit import SLOPE_CHECKS
 from cangauge.model.effects.effect import Effect, Pack, Values
 from cangauge.model.effects.library import LIBRARY, effect_entries
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Made, ModelFile, Ranges
-from cangauge.model.voltage_model import (
-    BASIS_NAMES,
-    SLOPE_AT_LEAST,
-    VoltageModel,
-    ocv_basis_slope,
-)
 
 FloatArray = NDArray[np.float64]
 
@@ -57,7 +49,9 @@ def extend(settled: Settled, accepted: Sequence[Score]) -> Extension:
     evidence = gather(
         settled.frame, settled.reference_grams, settled.diagnosed_grams, settled.error
     )
-    solution, amplitudes = _within_bounds(settled, evidence, accepted)
+    solution, amplitudes = within_bounds(
+        evidence, settled.model.model, [score.candidate for score in accepted]
+    )
     base, remarks = _base(settled, solution)
     frame = settled.frame
     cause: dict[str, dict[str, float]] = {}
@@ -69,73 +63,12 @@ def extend(settled: Settled, accepted: Sequence[Score]) -> Extension:
     return Extension(model, cause, tuple(remarks))
 
 
-def _within_bounds(
-    settled: Settled, evidence: Evidence, accepted: Sequence[Score]
-) -> tuple[FloatArray, list[FloatArray]]:
-    """Return the most probable coefficients, structure and amplitudes that physics allows.
-
-    One convex problem for all of them, so that what a bound takes from one goes to the others:
-    the pseudo-OCV rises over the identified SoC, and structure and effects keep their bounds.
-
-    Returns
-    -------
-    solution : array
-        δθ [V, V/K, Ω], then the amplitudes of `frame.repairs`.
-    amplitudes : list of arrays
-        Of each accepted effect, beside the neutral values.
-    """
-    frame, model = settled.frame, settled.model.model
-    p, n = frame.scale.size, len(BASIS_NAMES)
-    chosen = [score.candidate for score in accepted]
-    at = frame.amplitudes_of(chosen)
-    limits = np.vstack([frame.bounds_of(frame.repairs), frame.bounds_of(chosen)])
-    first, size = evidence.precision.shape[0], evidence.precision.shape[0] + at.size
-    curvature = evidence.curvature[np.ix_(at, at)] + prior_precision(frame.bounds_of(chosen))
-    upper = _root(evidence.precision)
-    root, target = np.zeros((size, size)), np.zeros(size)
-    root[:first, :first] = upper
-    root[:first, first:] = upper @ evidence.per_amplitude[:, at]
-    target[:first] = upper @ evidence.mean
-    if at.size:
-        lower = _root(curvature)
-        root[first:, first:] = lower
-        target[first:] = lower @ np.linalg.solve(curvature, evidence.gradient[at])
-    slopes = ocv_basis_slope(np.linspace(*model.soc_range_pct, SLOPE_CHECKS), model.epsilon)
-    rising = np.zeros((SLOPE_CHECKS, size))
-    rising[:, :n] = slopes / frame.scale[:n]
-    needed = SLOPE_AT_LEAST * model.pseudo_ocv_at(50.0)[0] - slopes @ np.array(model.ocv_v)
-    repairs = p + np.arange(limits.shape[0] - at.size)
-    bounded = np.concatenate((repairs, first + np.arange(at.size)))
-    kept = np.zeros((bounded.size, size))
-    kept[np.arange(bounded.size), bounded] = 1.0
-    found = nearest_rising(
-        root,
-        target,
-        np.vstack([rising, kept, -kept]),
-        np.concatenate((needed, limits[:, 0], -limits[:, 1])),
-    )
-    solution = found[: p + repairs.size].copy()
-    solution[:p] /= frame.scale
-    amplitudes, begin = [], first
-    for k in chosen:
-        end = begin + len(frame.choices[k].amplitudes)
-        amplitudes.append(found[begin:end])
-        begin = end
-    return solution, amplitudes
-
-
-def _root(matrix: FloatArray) -> FloatArray:
-    """Return the upper root R of a positive matrix, RᵀR, balanced by its diagonal."""
-    scale = np.sqrt(np.diag(matrix))
-    return np.asarray(np.linalg.cholesky(matrix / scale / scale[:, None]).T * scale)
-
-
 def _base(settled: Settled, solution: FloatArray) -> tuple[ExtendedModel, list[str]]:
     """Return the given model with coefficients and structure that the references add."""
     given, frame = settled.model, settled.frame
     p = frame.scale.size
     remarks: list[str] = []
-    voltage_model = _moved(given.model, solution[:p])
+    voltage_model = moved(given.model, solution[:p])
     if voltage_model is None:
         voltage_model = given.model
         remarks.append("the coefficients stay: moved, the pseudo-OCV would not rise everywhere")
@@ -151,22 +84,6 @@ def _base(settled: Settled, solution: FloatArray) -> tuple[ExtendedModel, list[s
     return base, remarks
 
 
-def _moved(model: VoltageModel, change: FloatArray) -> VoltageModel | None:
-    n = len(BASIS_NAMES)
-    moved = change.tolist()
-    try:
-        return replace(
-            model,
-            ocv_v=tuple(a + b for a, b in zip(model.ocv_v, moved[:n], strict=True)),
-            kt_v_per_k=model.kt_v_per_k + moved[n],
-            resistance_ohm=tuple(
-                a + b for a, b in zip(model.resistance_ohm, moved[n + 1 :], strict=True)
-            ),
-        )
-    except InputError:
-        return None
-
-
 def _refined(
     settled: Settled, model: ExtendedModel, score: Score, start: FloatArray
 ) -> tuple[ExtendedModel, dict[str, float]]:
@@ -174,7 +91,7 @@ def _refined(
     choice = settled.frame.choices[score.candidate]
     low, high = choice.bounds[:, 0], choice.bounds[:, 1]
     scale = high - low
-    prior = 4.0 * settled.error.rmse_v * np.sqrt(settled.error.rows_alike)
+    prior = 4.0 * np.sqrt(settled.error.lasting_v2)
 
     def errors(unit: FloatArray) -> FloatArray:
         trial = model.with_effect(choice.effect, choice.values(unit * scale))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,49 +11,58 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cangauge.errors import InputError
+from cangauge.gap.bounded import moved, within_bounds
 from cangauge.gap.columns import (
     Candidate,
     LogTerms,
+    Prepared,
     candidates,
     log_terms,
     prepare_log,
     residual,
 )
-from cangauge.gap.evidence import ErrorModel, Frame, Gram, gram_of
-from cangauge.gap.references import (
-    error_from_noise,
-    error_from_references,
-    left_out_errors,
-    own_from_references,
-)
+from cangauge.gap.evidence import ErrorModel, Frame, Gram, gather, gram_of
+from cangauge.gap.references import error_from_noise, error_from_references, with_strays
 from cangauge.identify.options import FitOptions
 from cangauge.logs.log import Log
-from cangauge.model.effects.effect import Effect
+from cangauge.model.effects.effect import Effect, Pack
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import ModelFile
 
 FloatArray = NDArray[np.float64]
 
 CLEAN_STRUCTURE: tuple[tuple[str, dict[str, float]], ...] = (
-    ("fast_polarization", {"tau_s": 3.5}),
-    ("fast_polarization", {"tau_s": 9.0}),
-    ("slow_diffusion", {"tau_s": 200.0}),
-    ("slow_diffusion", {"tau_s": 800.0}),
-    ("resistance_temperature", {}),
-    ("resistance_soc", {"width_pct": 40.0}),
+    ("fast_polarization", {"tau_s": 3.5, "activation_k": 0.0}),
+    ("fast_polarization", {"tau_s": 3.5, "activation_k": 3000.0}),
+    ("fast_polarization", {"tau_s": 9.0, "activation_k": 3000.0}),
+    ("slow_diffusion", {"tau_s": 220.0, "activation_k": 0.0}),
+    ("slow_diffusion", {"tau_s": 220.0, "activation_k": 3000.0}),
+    ("slow_diffusion", {"tau_s": 750.0, "activation_k": 3000.0}),
+    ("resistance_temperature", {"activation_k": 1000.0, "delayed": 0.0}),
+    ("resistance_temperature", {"activation_k": 4500.0, "delayed": 0.0}),
+    ("resistance_temperature", {"activation_k": 2500.0, "delayed": 1.0}),
+    ("resistance_soc", {"width_pct": 40.0, "delayed": 1.0}),
+    ("charge_transfer", {"exchange_a": 0.12}),
+    ("hysteresis", {"travel_pct": 4.0}),
 )
 """Structure that a clean pack may well have and the 13 coefficients lack: all logs share it, so it
 is learned from the references and is no cause."""
 
+SOC_STD_PCT = 0.5
+"""How well a log's assumed initial SoC is known without a cause [%]."""
+
+SLOW_STD, LEVEL_STD = 0.08, 0.03
+"""How much slow polarisation and resistance differ from log to log without a cause, in parts of
+the pack's resistance."""
+
+OWN_PART = 0.01
+"""How much every other effect does, in parts of its physical range."""
+
+ALWAYS_OF_TEMPERATURE = frozenset({"charge_transfer"})
+"""Structure that follows the temperature whatever its shape."""
+
 COVERED_K = 3.0
 """References cover temperatures up to this far outside their own [K]."""
-
-INFORMATION_WEIGHT = 0.1
-"""How far the model's own information is trusted where the structure above joins it: it was
-gathered without that structure."""
-
-STATED_LOGS = 2.0
-"""The error that the model file states counts like this many references."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,64 +153,118 @@ def settle(
         _check_pack(log, model)
     choices = candidates(effects, model.pack, logs[0].time_s)
     say = progress or _silent
-
-    def terms_of(group: Sequence[Log], clean: bool) -> tuple[LogTerms, ...]:
-        result = []
-        for log in group:
-            say(f"weighing {'reference ' if clean else ''}{log.name} against every effect")
-            own = options if not clean else replace(options, initial_soc_pct=None)
-            result.append(_terms(log, model, own, effects, choices))
-        return tuple(result)
-
-    reference_terms, diagnosed_terms = terms_of(references, clean=True), terms_of(logs, clean=False)
-    frame = _frame(model_file, choices, reference_terms, diagnosed_terms)
-    stated = error_from_noise(model_file.noise, model_file.rate_hz)
-    error = stated
-    if len(reference_terms) >= 2:
+    of_logs = [prepare_log(log, options) for log in logs]
+    of_references = [prepare_log(log, replace(options, initial_soc_pct=None)) for log in references]
+    frame = _frame(model_file, choices, of_references, of_logs, model.pack)
+    error = error_from_noise(model_file.noise, model_file.rate_hz, frame)
+    if of_references:
+        say("learning from the references")
+        reference_terms = _reference_terms(of_references, model, frame)
         grams = [gram_of(terms, frame.scale) for terms in reference_terms]
-        seen = error_from_references(
-            left_out_errors(frame, reference_terms, grams, stated), stated, model_file.rate_hz
-        )
-        stated_part = STATED_LOGS / (STATED_LOGS + len(reference_terms))
-        mixed = (1.0 - stated_part) * seen.rmse_v**2 + stated_part * stated.rmse_v**2
-        error = own_from_references(frame, grams, replace(seen, rmse_v=math.sqrt(mixed)))
-    return Settled(model, options, frame, error, reference_terms, diagnosed_terms, given)
+        if len(grams) > 1:
+            error = with_strays(frame, grams, error_from_references(frame, grams, error))
+            if not _temperatures_covered(of_references, of_logs):
+                error = _beyond_the_references(error)
+        solution, _ = within_bounds(gather(frame, grams, [], error), model.model, [])
+        change = solution[: frame.scale.size]
+        learned = moved(model.model, change)
+        if learned is not None:
+            # Columns follow the model: resistances, slope and kt as the references know them.
+            model = replace(model, model=learned)
+            frame = replace(frame, centre=-change * frame.scale)
+    diagnosed = []
+    for item in of_logs:
+        say(f"weighing {item.log.name} against every effect")
+        diagnosed.append(_terms(item, model, effects, choices))
+    return Settled(
+        model,
+        options,
+        frame,
+        error,
+        _reference_terms(of_references, model, frame),
+        tuple(diagnosed),
+        given,
+    )
+
+
+def _reference_terms(
+    references: Sequence[Prepared], model: ExtendedModel, frame: Frame
+) -> tuple[LogTerms, ...]:
+    shown = [frame.choices[k] for k in frame.shown]
+    return tuple(log_terms(item, model, shown) for item in references)
 
 
 def _terms(
-    log: Log,
+    prepared: Prepared,
     model: ExtendedModel,
-    options: FitOptions,
     effects: Sequence[Effect],
     choices: Sequence[Candidate],
 ) -> LogTerms:
     # A shape may depend on the log (a moment as a part of its length), so each has its own list.
-    own = candidates(effects, model.pack, log.time_s)
+    own = candidates(effects, model.pack, prepared.log.time_s)
     if len(own) != len(choices):
-        raise InputError("the effects' shapes differ between logs", source=log.source or log.name)
-    return log_terms(prepare_log(log, options), model, own)
+        raise InputError("the effects' shapes differ between logs", source=prepared.log.source)
+    return log_terms(prepared, model, own)
 
 
 def _frame(
     model_file: ModelFile,
     choices: Sequence[Candidate],
-    references: Sequence[LogTerms],
-    diagnosed: Sequence[LogTerms],
+    references: Sequence[Prepared],
+    diagnosed: Sequence[Prepared],
+    pack: Pack,
 ) -> Frame:
     known = [item for item in CLEAN_STRUCTURE if references]
     if references and not _temperatures_covered(references, diagnosed):
         # References that were never so cold cannot have shown what resistance does there.
-        known = [item for item in known if item[0] != "resistance_temperature"]
-    repairs = tuple(
-        k for k, choice in enumerate(choices) if (choice.effect.id, dict(choice.shape)) in known
-    )
+        known = [
+            (effect_id, shape)
+            for effect_id, shape in known
+            if not shape.get("activation_k") and effect_id not in ALWAYS_OF_TEMPERATURE
+        ]
+    found = [_first_like(choices, effect_id, shape, pack) for effect_id, shape in known]
+    repairs = tuple(k for k in found if k is not None)
+    own, own_prior = _own(choices, model_file)
     information = model_file.information
-    number = 9 + len(model_file.delays_s)
-    if information is None:
-        return Frame(tuple(choices), None, np.ones(number), repairs)
-    weight = INFORMATION_WEIGHT if repairs else 1.0
-    root = math.sqrt(weight) * np.array(information.root)
-    return Frame(tuple(choices), root, np.array(information.scale), repairs)
+    root, scale = None, np.ones(9 + len(model_file.delays_s))
+    if information is not None:
+        root, scale = np.array(information.root), np.array(information.scale)
+    return Frame(tuple(choices), root, scale, repairs, own, own_prior)
+
+
+def _first_like(
+    choices: Sequence[Candidate], effect_id: str, shape: Mapping[str, float], pack: Pack
+) -> int | None:
+    """Return the effect's first candidate of a shape; None where the library lacks it."""
+    for k, choice in enumerate(choices):
+        effect = choice.effect
+        if effect.id != effect_id:
+            continue
+        wanted = {p.name: shape[p.name] * p.factor(pack) for p in effect.shapes}
+        if all(math.isclose(choice.shape[name], value) for name, value in wanted.items()):
+            return k
+    return None
+
+
+def _own(choices: Sequence[Candidate], model_file: ModelFile) -> tuple[tuple[int, ...], FloatArray]:
+    """Return by which candidates logs may differ, all of them, and how much at first."""
+    by_effect: dict[str, list[int]] = {}
+    for k, choice in enumerate(choices):
+        by_effect.setdefault(choice.effect.id, []).append(k)
+    noise = model_file.noise
+    constant_v = max(noise.lasting_std_v, 0.25 * math.hypot(noise.fast_std_v, noise.slow_std_v))
+    own: list[int] = []
+    stds: list[float] = []
+    for effect_id, of_one in by_effect.items():
+        for k in of_one:
+            widths = choices[k].bounds[:, 1] - choices[k].bounds[:, 0]
+            usual = {"voltage_offset": [constant_v], "initial_soc": [SOC_STD_PCT]}.get(
+                effect_id, (OWN_PART * widths).tolist()
+            )
+            # All shapes together make up what the effect may differ by.
+            stds.extend(std / math.sqrt(len(of_one)) for std in usual)
+            own.append(k)
+    return tuple(own), np.array([*stds, SLOW_STD, LEVEL_STD])
 
 
 def _over_all_temperatures(model: ExtendedModel, logs: Sequence[Log]) -> ExtendedModel:
@@ -224,9 +287,18 @@ def _over_all_temperatures(model: ExtendedModel, logs: Sequence[Log]) -> Extende
     return replace(model, model=voltage_model)
 
 
-def _temperatures_covered(references: Sequence[LogTerms], diagnosed: Sequence[LogTerms]) -> bool:
-    seen = np.concatenate([terms.prepared.rows.temperature_c for terms in references])
-    asked = np.concatenate([terms.prepared.rows.temperature_c for terms in diagnosed])
+def _beyond_the_references(error: ErrorModel) -> ErrorModel:
+    """Return the error to expect at temperatures that no reference has.
+
+    How well the model follows from row to row there, and how far it strays, nobody has seen: all
+    scales are given the variance of the slowest.
+    """
+    return replace(error, scale_v2=(error.lasting_v2,) * len(error.scale_v2), strays={})
+
+
+def _temperatures_covered(references: Sequence[Prepared], diagnosed: Sequence[Prepared]) -> bool:
+    seen = np.concatenate([item.rows.temperature_c for item in references])
+    asked = np.concatenate([item.rows.temperature_c for item in diagnosed])
     low, high = seen.min() - COVERED_K, seen.max() + COVERED_K
     return bool(np.mean((asked >= low) & (asked <= high)) > 0.5)
 

@@ -12,13 +12,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cangauge.gap.evidence import Evidence, Score, condition_on, gather, scores
+from cangauge.gap.evidence import Evidence, Score, condition_on, excess, gather, kept_v2, scores
 from cangauge.gap.settle import Settled
+
+FloatArray = NDArray[np.float64]
 
 NONE, UNKNOWN = "none", "unknown"
 
-ACCEPT_LOG_BAYES = 6.0
+ACCEPT_LOG_BAYES = 5.0
 """An effect is accepted above this log Bayes factor against no effect. On clean groups of real
 trips it was rarely reached; see the README for the false alarms measured."""
 
@@ -27,8 +30,17 @@ FURTHER_LOG_BAYES = 12.0
 
 FURTHER_AT_MOST = 2
 
-EXPLAINED_AT_LEAST = 0.45
+EXPLAINED_AT_LEAST = 0.4
 """The best effect must explain this part of the excess, or the verdict is `unknown`."""
+
+HALF_KNOWN = 0.5
+"""An effect that explains this part of the excess is as likely to be right as not."""
+
+VISIBLE = 0.25
+"""A gap of this part of the clean mean square is seen in volts."""
+
+UNKNOWN_BEYOND = 3.0
+"""A gap that no effect explains must be so many times what the worst reference shows."""
 
 ALIKE_WITHIN = 3.0
 """Effects with a log Bayes factor this close to the best are not told from it."""
@@ -51,6 +63,8 @@ class Verdict:
     """Probability of each effect, of `none` and of `unknown`."""
     explained: float
     """Part of the excess that the best effect explains."""
+    excess: float
+    """What clean logs do not show, over the most that a reference left out shows."""
 
 
 def decide(settled: Settled) -> Verdict:
@@ -60,12 +74,16 @@ def decide(settled: Settled) -> Verdict:
     )
     ranked = scores(evidence)
     best = ranked[0]
-    explained = min(best.explained / max(_excess(settled, evidence), best.explained, 1e-9), 1.0)
+    alone = gather(settled.frame, settled.reference_grams, [], settled.error)
+    before = excess(evidence, settled.diagnosed_grams, alone.squares)
+    explained = _explained(settled, evidence, alone, best)
     chances = _chances(ranked, explained)
+    beyond = before / max(settled.error.clean_excess, 1.0)
     if best.log_bayes_factor < ACCEPT_LOG_BAYES:
-        return Verdict(NONE, chances[NONE], (), (), tuple(ranked), chances, explained)
+        return Verdict(NONE, chances[NONE], (), (), tuple(ranked), chances, explained, beyond)
     if explained < EXPLAINED_AT_LEAST:
-        return Verdict(UNKNOWN, chances[UNKNOWN], (), (), tuple(ranked), chances, explained)
+        cause = UNKNOWN if beyond > UNKNOWN_BEYOND else NONE
+        return Verdict(cause, chances[cause], (), (), tuple(ranked), chances, explained, beyond)
     alike = tuple(
         score.effect_id
         for score in ranked[1:]
@@ -80,6 +98,7 @@ def decide(settled: Settled) -> Verdict:
         tuple(ranked),
         chances,
         explained,
+        beyond,
     )
 
 
@@ -96,20 +115,33 @@ def _accepted(evidence: Evidence, best: Score, alike: Sequence[str]) -> tuple[Sc
     return tuple(accepted)
 
 
-def _excess(settled: Settled, evidence: Evidence) -> float:
-    """Return the weighted sum of squares beyond what clean logs show."""
-    clean = 0.0
-    if settled.reference_grams:
-        alone = gather(settled.frame, settled.reference_grams, [], settled.error)
-        clean = alone.squares
-    error = settled.error
-    rows = sum(gram.rows / error.rows_alike for gram in settled.diagnosed_grams)
-    return evidence.squares - clean - rows
+def _explained(settled: Settled, evidence: Evidence, alone: Evidence, score: Score) -> float:
+    """Return the part of the mean square gap beyond that of clean logs that an effect takes away.
+
+    From the model as the references alone know it, to that model with the effect; what is each
+    log's own is not taken off in either.
+    """
+    frame, grams = settled.frame, settled.diagnosed_grams
+    amplitude = score.amplitude
+    at = evidence.of(score.candidate)
+    with_it = evidence.mean - evidence.per_amplitude[:, at] @ amplitude
+    before = sum(kept_v2(frame, gram, alone.mean) for gram in grams) / len(grams)
+    after = sum(
+        kept_v2(frame, gram, with_it, [score.candidate], amplitude) for gram in grams
+    ) / len(grams)
+    clean = settled.error.clean_v2 or settled.error.rmse_v**2
+    gap = before - clean
+    if gap > VISIBLE * clean:
+        return float(np.clip((before - max(after, clean)) / gap, 0.0, 1.0))
+    # Too small to be seen in volts, yet perhaps certain: then in units of what chance leaves.
+    chance = excess(evidence, grams, alone.squares)
+    left = excess(evidence, grams, alone.squares, score)
+    return float(np.clip(1.0 - left / chance, 0.0, 1.0)) if chance > 0.0 else 0.0
 
 
 def _chances(ranked: Sequence[Score], explained: float) -> dict[str, float]:
     """Return tempered probabilities of every effect, of `none` and of `unknown`."""
-    known = 1.0 / (1.0 + math.exp(-10.0 * (explained - EXPLAINED_AT_LEAST)))
+    known = 1.0 / (1.0 + math.exp(-10.0 * (explained - HALF_KNOWN)))
     factors = np.array([score.log_bayes_factor for score in ranked])
     weights = np.exp(TEMPERING * (factors - max(factors.max(), ACCEPT_LOG_BAYES)))
     none = math.exp(TEMPERING * (ACCEPT_LOG_BAYES - max(factors.max(), ACCEPT_LOG_BAYES)))

@@ -222,8 +222,9 @@ def _method(diagnosis: Diagnosis, names: str) -> list[str]:
     rows = int(np.sum([terms.residual_v.size for terms in settled.diagnosed]))
     return [
         f"Diagnosed: {names} ({rows} rows); references: {len(settled.references)}.",
-        f"Error expected without a cause: {error.rmse_v:.2f} V, of which {error.rows_alike:.0f}"
-        " rows in a row tell as much as one.",
+        f"Error expected without a cause: {error.rmse_v:.2f} V, weighed by time scale:"
+        f" {error.scale_v2[0] ** 0.5:.2f} V from row to row,"
+        f" {error.lasting_v2**0.5:.2f} V·√row over many minutes.",
         "Coefficients, structure that clean logs share, and what differs from log to log without a"
         " cause are integrated out; then every effect is weighed against none.",
         *settled_remarks(diagnosis),

@@ -42,7 +42,10 @@ def test_far_out_of_bounds_is_refused_naming_the_parameter(effect: Effect) -> No
 
 def test_a_bound_of_zero_stays_zero() -> None:
     """The leeway of bounds that are relative to the pack must not let a resistance turn sign."""
-    entry = {"id": "slow_diffusion", "parameters": {"ohm": -0.001, "tau_s": 500.0}}
+    entry = {
+        "id": "slow_diffusion",
+        "parameters": {"ohm": -0.001, "tau_s": 500.0, "activation_k": 0.0},
+    }
     with pytest.raises(InputError, match="must lie within 0 "):
         parse_effects([entry], PACK)
 

@@ -62,6 +62,15 @@ def test_describes_itself(effect: Effect) -> None:
         for value in parameter.grid or ():
             assert parameter.low <= value <= parameter.high
     assert set(effect.parameters) == {*effect.amplitudes, *effect.shapes}
+    if effect.bends_at:
+        # Taken as parts of the widest bound of the one parameter that the effect has.
+        (only,) = effect.parameters
+        low, high = only.bounds(PACK)
+        neutral = effect.neutral(PACK)[only.name]
+        widest = max(high - neutral, neutral - low)
+        for part in effect.bends_at:
+            assert part != 0.0
+            assert low <= neutral + part * widest <= high
 
 
 @each_effect
@@ -107,6 +116,24 @@ def test_offline_equals_online_on_irregular_samples_with_gaps(effect: Effect, pa
         np.testing.assert_allclose(found[:, k], expected, rtol=0.0, atol=1e-7)
     np.testing.assert_allclose(online.soc_pct, batch.soc_pct[:n], rtol=0.0, atol=1e-8)
     np.testing.assert_allclose(online.voltage_v, batch.voltage_v[:n], rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("delayed", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("effect_id", ["resistance_temperature", "resistance_soc"])
+def test_offline_equals_online_whichever_drop_is_scaled(effect_id: str, delayed: float) -> None:
+    signals = irregular_signals(1500, seed=8)
+    effect = LIBRARY[effect_id]
+    rows = np.arange(signals.time_s.size)
+    plain = ExtendedModel(MODEL, CAPACITY_AH)
+    extended = plain.with_effect(effect, middle(effect) | {"delayed": delayed})
+    batch = extended.predict(signals, 80.0, rows)
+    online = step_through(extended, signals, 80.0, batch.soc_pct)
+    np.testing.assert_allclose(online.voltage_v, batch.voltage_v, rtol=0.0, atol=1e-9)
+    # Each differs from the others, so that none can stand in for another.
+    for other in {0.0, 0.5, 1.0} - {delayed}:
+        values = middle(effect) | {"delayed": other}
+        beside = plain.with_effect(effect, values).predict(signals, 80.0, rows)
+        assert np.abs(beside.voltage_v - batch.voltage_v).max() > 0.1
 
 
 @each_effect
@@ -174,6 +201,8 @@ def test_a_pack_of_cells_is_the_cell_times_their_number(effect: Effect) -> None:
     np.testing.assert_allclose(many * found[0], found[1], rtol=0.0, atol=1e-6)
 
 
+MOST = max(len(effect.parameters) for effect in EFFECTS)
+
 signal_rows = st.lists(
     st.tuples(
         st.floats(1e-3, 1e5), st.floats(-5000.0, 5000.0), st.floats(0.0, 1000.0),
@@ -187,7 +216,7 @@ signal_rows = st.lists(
 @settings(max_examples=300, deadline=None)
 @given(
     st.sampled_from(EFFECTS),
-    st.lists(st.floats(0.0, 1.0), min_size=3, max_size=3),
+    st.lists(st.floats(0.0, 1.0), min_size=MOST, max_size=MOST),
     signal_rows,
     st.floats(0.0, 100.0),
     st.booleans(),

@@ -152,19 +152,45 @@ def test_a_capacity_that_the_user_insists_on_is_left_alone() -> None:
 # --- resistance ---------------------------------------------------------------------------
 
 
-def test_resistance_follows_arrhenius_from_the_middle_of_the_models_range() -> None:
-    values = {"activation_k": 4000.0}
+def at_onset(current_a: float, **state: float) -> PackState:
+    """The current has just begun: only the undelayed resistance drops, 0.4 of all of them."""
+    just = steady(5.0, current_a, **state)
+    return replace(just, drop_v=0.4 * just.drop_v)
+
+
+def test_a_share_of_the_drop_follows_arrhenius_from_the_middle_of_the_models_range() -> None:
+    values = {"share": 0.7, "activation_k": 4000.0, "delayed": 1.0}
     at_23 = extra("resistance_temperature", steady(10.0, 50.0, temperature_c=23.0), values)
     np.testing.assert_allclose(at_23, 0.0, atol=1e-12)
     cold = steady(10.0, 50.0, temperature_c=0.0)
     factor = math.exp(4000.0 * (1.0 / 273.15 - 1.0 / 296.15))
     assert 2.5 < factor < 3.5
     found = extra("resistance_temperature", cold, values)
-    np.testing.assert_allclose(found, cold.drop_v * (factor - 1.0), rtol=1e-12)
+    np.testing.assert_allclose(found, 0.7 * cold.drop_v * (factor - 1.0), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("effect_id", "values", "rise"),
+    [
+        ("resistance_temperature", {"share": 0.5, "activation_k": 2500.0},
+         0.5 * math.expm1(2500.0 * (1.0 / 278.15 - 1.0 / 296.15))),
+        ("resistance_soc", {"at_empty": 2.0, "at_full": 0.0, "width_pct": 10.0}, 2.0 / math.e),
+    ],
+)  # fmt: skip
+def test_what_is_not_delayed_scales_the_present_current_over_all_resistance(
+    effect_id: str, values: Values, rise: float
+) -> None:
+    """A current that has just begun: delayed, only what has arrived by now is scaled."""
+    state = at_onset(50.0, soc_pct=10.0, temperature_c=5.0)
+    whole_v = sum(MODEL.resistance_ohm) * 50.0
+    assert whole_v < 0.0
+    for delayed, part in ((0.0, 1.0), (1.0, 0.4), (0.25, 0.85)):
+        found = extra(effect_id, state, {**values, "delayed": delayed})
+        np.testing.assert_allclose(found, rise * part * whole_v, rtol=1e-12)
 
 
 def test_resistance_rises_toward_empty_and_full() -> None:
-    values = {"at_empty": 2.0, "at_full": 0.5, "width_pct": 10.0}
+    values = {"at_empty": 2.0, "at_full": 0.5, "width_pct": 10.0, "delayed": 1.0}
     for soc, share in ((0.0, 2.0), (100.0, 0.5), (10.0, 2.0 / math.e), (50.0, 0.0168)):
         state = steady(3.0, 50.0, soc_pct=soc)
         np.testing.assert_allclose(
@@ -186,14 +212,16 @@ def test_a_step_begins_at_its_moment_and_stays() -> None:
     np.testing.assert_allclose(found[300:], -2.0)
 
 
-def test_a_steps_moments_to_try_lie_within_the_log() -> None:
+def test_a_steps_moments_to_try_lie_inside_the_log() -> None:
+    """Before the start or after the end a step cannot be told from more or from no resistance."""
     effect = LIBRARY["resistance_step"]
     start = effect.parameters[1]
     for hours in (0.2, 3.0):
-        time_s = np.linspace(100.0, 100.0 + 3600.0 * hours, 50)
-        trials = effect.trials(start, PACK, time_s)
-        assert trials[0] == 0.0
-        assert trials[-1] == pytest.approx(0.9 * 3600.0 * hours)
+        seconds = 3600.0 * hours
+        trials = effect.trials(start, PACK, np.linspace(100.0, 100.0 + seconds, 50))
+        assert trials[0] == pytest.approx(0.05 * seconds)
+        assert trials[-1] == pytest.approx(0.95 * seconds)
+        np.testing.assert_allclose(np.diff(trials), 0.05 * seconds, rtol=1e-9)
         low, high = start.bounds(PACK)
         assert low <= trials[0] <= trials[-1] <= high
 
@@ -203,18 +231,38 @@ def test_a_steps_moments_to_try_lie_within_the_log() -> None:
 
 def test_charge_transfer_bends_between_rest_and_1c() -> None:
     current = PACK.capacity_ah * np.array([-3.0, -1.0, -0.2, 0.0, 0.2, 1.0, 3.0])
-    state = with_current(steady(6.0, 0.0), current)
-    found = extra("charge_transfer", state, {"scale_v": 5.0, "exchange_a": 3.0})
-    np.testing.assert_allclose(found[[1, 3, 5]], 0.0, atol=1e-12)
-    np.testing.assert_allclose(found, -found[::-1], atol=1e-12)
-    assert found[4] < -1.0
-    assert found[6] > 1.0
+    for temperature_c in (-10.0, 25.0):
+        state = with_current(steady(6.0, 0.0, temperature_c=temperature_c), current)
+        found = extra("charge_transfer", state, {"scale_v": 5.0, "exchange_a": 3.0})
+        np.testing.assert_allclose(found[[1, 3, 5]], 0.0, atol=1e-12)
+        np.testing.assert_allclose(found, -found[::-1], atol=1e-12)
+        assert found[4] < -1.0
+        assert found[6] > 1.0
 
 
-@pytest.mark.parametrize("effect_id", ["fast_polarization", "slow_diffusion"])
+@pytest.mark.parametrize("temperature_c", [-15.0, 25.0, 40.0])
+def test_the_exchange_current_is_as_stated_at_25_c_and_falls_in_the_cold(
+    temperature_c: float,
+) -> None:
+    """I₀(T) = I₀·exp(B·(1/298.15 − 1/T)), B = 5000 K: 13 times smaller at −15 °C."""
+    exchange_a = 3.0 * math.exp(5000.0 * (1.0 / 298.15 - 1.0 / (temperature_c + 273.15)))
+    assert (exchange_a == 3.0) == (temperature_c == 25.0)
+    one_c = PACK.capacity_ah
+    for current in (-80.0, 7.0, 150.0):
+        state = with_current(steady(2.0, 0.0, temperature_c=temperature_c), np.full(3, current))
+        bend = math.asinh(current / (2.0 * exchange_a))
+        bend -= current / one_c * math.asinh(one_c / (2.0 * exchange_a))
+        found = extra("charge_transfer", state, {"scale_v": 5.0, "exchange_a": 3.0})
+        np.testing.assert_allclose(found, -5.0 * bend, rtol=1e-12)
+
+
+POLARISATIONS = pytest.mark.parametrize("effect_id", ["fast_polarization", "slow_diffusion"])
+
+
+@POLARISATIONS
 def test_polarisation_charges_and_decays_with_its_time_constant(effect_id: str) -> None:
     tau = 5.0 if effect_id == "fast_polarization" else 400.0
-    values = {"ohm": 0.02, "tau_s": tau}
+    values = {"ohm": 0.02, "tau_s": tau, "activation_k": 0.0}
     state = steady(40.0 * tau, 50.0)
     current = np.where(state.time_s < 20.0 * tau, 50.0, 0.0)
     found = extra(effect_id, with_current(state, current), values)
@@ -225,11 +273,35 @@ def test_polarisation_charges_and_decays_with_its_time_constant(effect_id: str) 
     assert ratio == pytest.approx(math.exp(-1.0), rel=1e-6)
 
 
+@POLARISATIONS
+def test_polarisation_rises_in_the_cold_after_arrhenius_from_25_c(effect_id: str) -> None:
+    tau = 5.0 if effect_id == "fast_polarization" else 400.0
+    for temperature_c, activation_k in ((25.0, 3000.0), (0.0, 3000.0), (-10.0, 6000.0), (0.0, 0.0)):
+        state = steady(3.0 * tau, 50.0, temperature_c=temperature_c)
+        values = {"ohm": 0.02, "tau_s": tau, "activation_k": activation_k}
+        colder = math.exp(activation_k * (1.0 / (temperature_c + 273.15) - 1.0 / 298.15))
+        expected = -1.0 * colder * -np.expm1(-state.time_s / tau)
+        np.testing.assert_allclose(extra(effect_id, state, values), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_polarisation_follows_the_present_temperature_not_that_of_the_past() -> None:
+    """It is the resistance that rises in the cold; the time constant stays."""
+    state = steady(3000.0, 50.0, temperature_c=25.0)
+    warming = replace(state, temperature_c=np.where(state.time_s < 2999.5, 0.0, 25.0))
+    values = {"ohm": 0.02, "tau_s": 400.0, "activation_k": 3000.0}
+    cold, warm = extra("slow_diffusion", warming, values), extra("slow_diffusion", state, values)
+    assert cold[-1] == warm[-1]
+    assert cold[-2] == pytest.approx(
+        warm[-2] * math.exp(3000.0 * (1.0 / 273.15 - 1.0 / 298.15)), rel=1e-12
+    )
+
+
 def test_polarisation_has_decayed_after_a_night_asleep() -> None:
     time_s = np.concatenate([np.arange(0.0, 3600.0), 3600.0 + 8 * 3600.0 + np.arange(10.0)])
     current = np.full_like(time_s, 50.0)
     state = PackState(time_s, current, current, current, current)
-    found = extra("slow_diffusion", state, {"ohm": 0.02, "tau_s": 1000.0})
+    values = {"ohm": 0.02, "tau_s": 1000.0, "activation_k": 0.0}
+    found = extra("slow_diffusion", state, values)
     assert found[3599] == pytest.approx(-1.0 * (1.0 - math.exp(-3.599)), rel=1e-3)
     assert abs(found[3600]) < 1e-6
 
@@ -263,8 +335,32 @@ def test_entropy_bounds_are_tenths_of_a_millivolt_per_kelvin_and_cell() -> None:
         assert -low == high
         assert 1e-4 < high / PACK.cells < 5e-4
     warm = steady(3.0, 0.0, soc_pct=100.0, temperature_c=MODEL.t_ref_c + 10.0)
-    found = extra("entropic_coefficient", warm, {"slope_v_per_k": 0.01, "curve_v_per_k": 0.02})
+    found = extra(
+        "entropic_coefficient",
+        warm,
+        {"level_v_per_k": 0.0, "slope_v_per_k": 0.01, "curve_v_per_k": 0.02},
+    )
     np.testing.assert_allclose(found, 10.0 * 0.03)
+
+
+def test_the_entropic_level_is_the_same_at_every_soc_and_turns_sign_at_t_r() -> None:
+    values = {"level_v_per_k": 0.02, "slope_v_per_k": 0.0, "curve_v_per_k": 0.0}
+    for soc_pct in (0.0, 37.0, 100.0):
+        for kelvin in (-12.0, 0.0, 10.0):
+            state = steady(3.0, 60.0, soc_pct=soc_pct, temperature_c=MODEL.t_ref_c + kelvin)
+            found = extra("entropic_coefficient", state, values)
+            np.testing.assert_allclose(found, 0.02 * kelvin, rtol=1e-12, atol=1e-15)
+
+
+def test_the_entropic_slope_and_curve_are_nothing_on_average_over_the_soc() -> None:
+    """Legendre's polynomials: the level alone says what the mean over all SoC is."""
+    soc = np.linspace(0.0, 100.0, 2001)
+    state = replace(steady(2000.0, 0.0, temperature_c=MODEL.t_ref_c + 10.0), soc_pct=soc)
+    for name in ("slope_v_per_k", "curve_v_per_k"):
+        values = dict.fromkeys(("level_v_per_k", "slope_v_per_k", "curve_v_per_k"), 0.0)
+        found = extra("entropic_coefficient", state, values | {name: 0.02})
+        assert np.abs(found).max() == pytest.approx(0.2)
+        assert abs(np.trapezoid(found, soc)) / 100.0 < 1e-6
 
 
 def test_weak_cells_bring_the_knee_forward_and_keep_the_pack_rising() -> None:

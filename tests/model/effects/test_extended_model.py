@@ -124,7 +124,7 @@ def test_slope_over_soc_is_the_derivative_and_stays_positive() -> None:
 
 def test_slope_stays_positive_where_the_voltage_turns_around() -> None:
     """Charging hard near empty: as the SoC rises, the rise over the resistance fades faster."""
-    values = {"at_empty": 3.0, "at_full": 0.0, "width_pct": 10.0}
+    values = {"at_empty": 3.0, "at_full": 0.0, "width_pct": 10.0, "delayed": 1.0}
     online = ExtendedModel(MODEL, CAPACITY_AH, ((LIBRARY["resistance_soc"], values),)).online()
     online.advance(0.0, -200.0, 20.0, [-200.0] * 4)
     (low, slope), (high, _) = online.pseudo_ocv_at(14.0), online.pseudo_ocv_at(15.0)
@@ -138,7 +138,7 @@ def test_newton_finds_a_root_with_all_effects_at_once(
     current: float, temperature: float, soc: float, part: float
 ) -> None:
     """Even where an effect turns the curve around, what comes back gives the voltage asked for."""
-    values = {"at_empty": 3.0 * part, "at_full": 1.0, "width_pct": 10.0}
+    values = {"at_empty": 3.0 * part, "at_full": 1.0, "width_pct": 10.0, "delayed": 1.0}
     effects = tuple(
         (effect, values if effect.id == "resistance_soc" else middle(effect)) for effect in EFFECTS
     )

@@ -24,6 +24,7 @@ class Capacity(Effect):
     signature = "OCV′·(Ah since the start): a slope over charge, steep in the knee near empty"
     equation = "S = S₀ − 100·∫I dt / (C·(1 + x))"
     source = "Plett, Battery Management Systems vol. II, Artech House 2015, ch. 4"
+    bends_at = (-0.6, -0.2, 0.2, 0.5)
     separated_by = (
         "a discharge from full to the knee at steady temperature; from current_offset by driving"
         " and resting in turn, from current_gain by the drop over the resistance"

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from cangauge.model.effects.arrhenius import arrhenius, arrhenius_at
 from cangauge.model.effects.effect import (
     Effect,
     FloatArray,
@@ -20,6 +21,10 @@ from cangauge.model.voltage_model import VoltageModel
 ALIKE_AT_C_RATE = 1.0
 """At this current [1/h] the effect adds nothing, as at none: the model's own resistance already
 holds the mean slope over the currents of a drive, and only the bend is left to explain."""
+
+
+ACTIVATION_K = 5000.0
+"""Of the exchange current [K], about 42 kJ/mol; `exchange_a` is that at 25 °C."""
 
 
 class ChargeTransfer(Effect):
@@ -39,7 +44,7 @@ class ChargeTransfer(Effect):
         ),
     )  # fmt: skip
     signature = "I − c·asinh(I/2I₀): too much drop at small currents, too little at large ones"
-    equation = "ΔU = −v·(asinh(I/2I₀) − (I/I₁)·asinh(I₁/2I₀)), I₁ = 1 C"
+    equation = "ΔU = −v·(asinh(I/2I₀) − (I/I₁)·asinh(I₁/2I₀)), I₁ = 1 C, I₀ after Arrhenius"
     source = "Newman, Thomas-Alyea, Electrochemical Systems, 3rd ed., Wiley 2004, ch. 8"
     separated_by = (
         "pulses of several sizes in both directions; resistance_asymmetry is straight on each"
@@ -51,32 +56,31 @@ class ChargeTransfer(Effect):
     ) -> FloatArray:
         """Return the bend [V]."""
         del model
-        per_a, slope = _shape(values["exchange_a"], pack)
+        per_a = 0.5 / values["exchange_a"] * arrhenius(state.temperature_c, ACTIVATION_K)
+        alike_a = ALIKE_AT_C_RATE * pack.capacity_ah
+        slope = np.arcsinh(alike_a * per_a) / alike_a
         bend = np.arcsinh(state.current_a * per_a) - slope * state.current_a
         return np.asarray(-values["scale_v"] * bend)
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
         """Return the bend at one sample at a time."""
         del model
-        return _Online(values["scale_v"], *_shape(values["exchange_a"], pack))
-
-
-def _shape(exchange_a: float, pack: Pack) -> tuple[float, float]:
-    """Return 1/2I₀ and the straight line's slope [1/A]."""
-    per_a, alike_a = 0.5 / exchange_a, ALIKE_AT_C_RATE * pack.capacity_ah
-    return per_a, math.asinh(alike_a * per_a) / alike_a
+        alike_a = ALIKE_AT_C_RATE * pack.capacity_ah
+        return _Online(values["scale_v"], 0.5 / values["exchange_a"], alike_a)
 
 
 class _Online(OnlineEffect):
-    def __init__(self, scale_v: float, per_a: float, slope: float) -> None:
+    def __init__(self, scale_v: float, per_a: float, alike_a: float) -> None:
         self._scale_v = scale_v
         self._per_a = per_a
-        self._slope = slope
+        self._alike_a = alike_a
         self._volts = 0.0
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
-        del time_s, temperature_c, drop_v
-        bend = math.asinh(current_a * self._per_a) - self._slope * current_a
+        del time_s, drop_v
+        per_a = self._per_a * arrhenius_at(temperature_c, ACTIVATION_K)
+        slope = math.asinh(self._alike_a * per_a) / self._alike_a
+        bend = math.asinh(current_a * per_a) - slope * current_a
         self._volts = -self._scale_v * bend
 
     def extra_voltage(self, soc_pct: float) -> float:

@@ -26,6 +26,7 @@ class CurrentOffset(Effect):
     signature = "a constant R·b, and a slope over time as the count drifts: OCV′·b·t/C"
     equation = "I = I_measured − b"
     source = "zero error, JCGM 200:2012 (VIM)"
+    bends_at = (-0.3, 0.3)
     separated_by = (
         "a long rest with the bus awake: the count drifts with no current flowing. Not to be told"
         " from a load that bypasses the sensor; from capacity by driving and resting in turn"

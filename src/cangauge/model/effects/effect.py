@@ -22,7 +22,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -167,6 +167,22 @@ class PackState:
     drop_v: FloatArray
     """Σ Rj·I(t − dj) of the voltage model [V]; negative while discharging."""
 
+    def scaled_drop_v(self, delayed: float, pack: Pack) -> FloatArray:
+        """Return the drop that an effect scales [V], shape (n,) (`DELAYED`)."""
+        now_v = -pack.resistance_ohm * self.current_a
+        return delayed * self.drop_v + (1.0 - delayed) * now_v
+
+
+def scaled_drop_at(drop_v: float, current_a: float, delayed: float, resistance_ohm: float) -> float:
+    """Return the same of one sample, the pack's resistance being `resistance_ohm`."""
+    return delayed * drop_v + (1.0 - delayed) * (-resistance_ohm * current_a)
+
+
+DELAYED: Final = Parameter("delayed", "1", 0.0, 1.0, neutral=None, grid=(1.0, 0.0))
+"""Whether an effect scales the whole drop of the voltage model (1), or only that of the current
+now, over the sum of the resistances (0): contacts and electrolyte answer at once, diffusion not.
+In between it scales a mixture of both."""
+
 
 class Reading(NamedTuple):
     """One sample on its way through the corrections.
@@ -232,6 +248,9 @@ class Effect(ABC):
     source: ClassVar[str]
     separated_by: ClassVar[str]
     """What test would tell it from its look-alikes."""
+    bends_at: ClassVar[tuple[float, ...]] = ()
+    """Parts of the widest bound of its only amplitude at which the diagnosis takes the voltage's
+    change, beside a small one: for effects that are far from linear in their amplitude."""
 
     @property
     def amplitudes(self) -> tuple[Parameter, ...]:

@@ -11,7 +11,7 @@ from cangauge.model.effects.effect import (
     Parameter,
     Values,
 )
-from cangauge.model.effects.rc_element import OnlineRc, rc_voltage
+from cangauge.model.effects.rc_element import ACTIVATION, OnlineRc, rc_voltage
 from cangauge.model.voltage_model import VoltageModel
 
 
@@ -23,9 +23,10 @@ class FastPolarization(Effect):
     parameters = (
         Parameter("ohm", "ohm", 0.0, 1.0, scale="resistance"),
         Parameter("tau_s", "s", 0.3, 9.0, neutral=None, grid=(0.5, 1.0, 2.0, 3.5, 6.0, 9.0)),
+        ACTIVATION,
     )
     signature = "a tail of seconds after every change of load"
-    equation = "ΔU = −R·y, τ·dy/dt = I − y"
+    equation = "ΔU = −R·y·exp(B·(1/T − 1/T₂₅)), τ·dy/dt = I − y"
     source = "Hu, Li, Peng, J. Power Sources 198 (2012) 359"
     separated_by = (
         "a log at 10 Hz or faster with sharp pulses: time_skew gives spikes without tails"
@@ -36,9 +37,9 @@ class FastPolarization(Effect):
     ) -> FloatArray:
         """Return the element's voltage [V]."""
         del model, pack
-        return rc_voltage(state, values["ohm"], values["tau_s"])
+        return rc_voltage(state, values["ohm"], values["tau_s"], values["activation_k"])
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
         """Return the element, one sample at a time."""
         del model, pack
-        return OnlineRc(values["ohm"], values["tau_s"])
+        return OnlineRc(values["ohm"], values["tau_s"], values["activation_k"])

@@ -28,6 +28,7 @@ class InitialSoc(Effect):
     signature = "OCV′(S): larger where the OCV is steep, at any current and time"
     equation = "S₀ = S₀_assumed + x"
     source = "definition"
+    bends_at = (-0.7, -0.3, 0.3, 0.7)
     separated_by = (
         "a long rest before the start (the first voltage is then the OCV), or a log that reaches"
         " the steep ends of the OCV, where it grows and voltage_offset does not"

@@ -43,11 +43,11 @@ class ResistanceStep(Effect):
     )
 
     def trials(self, parameter: Parameter, pack: Pack, time_s: FloatArray) -> tuple[float, ...]:
-        """Return moments spread evenly over the first nine tenths of the log [s]."""
+        """Return moments spread evenly over the log, its ends apart [s]."""
         if parameter.name != "start_s":
             return parameter.trials(pack)
         duration = float(time_s[-1] - time_s[0])
-        return tuple(duration * part / 20.0 for part in range(19))
+        return tuple(duration * part / 20.0 for part in range(1, 20))
 
     def extra_voltage(
         self, state: PackState, values: Values, model: VoltageModel, pack: Pack

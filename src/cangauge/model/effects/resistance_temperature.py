@@ -6,7 +6,9 @@ import math
 
 import numpy as np
 
+from cangauge.model.effects.arrhenius import ZERO_C_IN_K, inverse_k, inverse_k_at
 from cangauge.model.effects.effect import (
+    DELAYED,
     Effect,
     FloatArray,
     OnlineEffect,
@@ -14,25 +16,29 @@ from cangauge.model.effects.effect import (
     PackState,
     Parameter,
     Values,
+    scaled_drop_at,
 )
 from cangauge.model.voltage_model import VoltageModel
 
-ZERO_C_IN_K = 273.15
-COLDEST_C, HOTTEST_C = -60.0, 120.0
-"""Beyond these no temperature of a pack is believed [°C]; the law is held there."""
-
 
 class ResistanceTemperature(Effect):
-    """Arrhenius factor on the whole drop of the voltage model.
+    """A share of the voltage model's drop that follows Arrhenius' law.
 
     It is 1 in the middle of the temperatures that the model was identified on.
     """
 
     id = "resistance_temperature"
     family = "resistance"
-    parameters = (Parameter("activation_k", "K", 0.0, 6000.0),)
+    parameters = (
+        Parameter("share", "1", 0.0, 3.0),
+        Parameter("activation_k", "K", 100.0, 8000.0, neutral=None, grid=(1000.0, 2500.0, 4500.0)),
+        DELAYED,
+    )
     signature = "the drop over the resistance, growing with (T₀ − T)"
-    equation = "ΔU = ΣRj·I(t − dj)·(exp(B·(1/T − 1/T₀)) − 1), T₀ the middle of the model's range"
+    equation = (
+        "ΔU = a·ΣRj·I(t − dj)·(exp(B·(1/T − 1/T₀)) − 1), T₀ the middle of the model's range;"
+        " or ΣRj·I in place of ΣRj·I(t − dj)"
+    )
     source = "Waag, Käbitz, Sauer, Applied Energy 102 (2013) 885"
     separated_by = (
         "the same SoC at two temperatures (a second day): where temperature and SoC move"
@@ -43,14 +49,13 @@ class ResistanceTemperature(Effect):
         self, state: PackState, values: Values, model: VoltageModel, pack: Pack
     ) -> FloatArray:
         """Return the change of the drop [V]."""
-        del pack
-        inverse = 1.0 / (np.clip(state.temperature_c, COLDEST_C, HOTTEST_C) + ZERO_C_IN_K)
-        return state.drop_v * np.expm1(values["activation_k"] * (inverse - _usual_per_k(model)))
+        drop_v = state.scaled_drop_v(values["delayed"], pack)
+        colder = inverse_k(state.temperature_c) - _usual_per_k(model)
+        return values["share"] * drop_v * np.expm1(values["activation_k"] * colder)
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
         """Return the change of the drop at one sample at a time."""
-        del pack
-        return _Online(values["activation_k"], _usual_per_k(model))
+        return _Online(values, _usual_per_k(model), pack.resistance_ohm)
 
 
 def _usual_per_k(model: VoltageModel) -> float:
@@ -59,15 +64,19 @@ def _usual_per_k(model: VoltageModel) -> float:
 
 
 class _Online(OnlineEffect):
-    def __init__(self, activation_k: float, usual_per_k: float) -> None:
-        self._activation_k = activation_k
+    def __init__(self, values: Values, usual_per_k: float, resistance_ohm: float) -> None:
+        self._share = values["share"]
+        self._activation_k = values["activation_k"]
+        self._delayed = values["delayed"]
         self._usual_per_k = usual_per_k
+        self._resistance_ohm = resistance_ohm
         self._volts = 0.0
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
-        del time_s, current_a
-        inverse = 1.0 / (min(max(temperature_c, COLDEST_C), HOTTEST_C) + ZERO_C_IN_K)
-        self._volts = drop_v * math.expm1(self._activation_k * (inverse - self._usual_per_k))
+        del time_s
+        scaled_v = scaled_drop_at(drop_v, current_a, self._delayed, self._resistance_ohm)
+        colder = inverse_k_at(temperature_c) - self._usual_per_k
+        self._volts = self._share * scaled_v * math.expm1(self._activation_k * colder)
 
     def extra_voltage(self, soc_pct: float) -> float:
         del soc_pct

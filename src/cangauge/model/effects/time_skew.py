@@ -47,6 +47,7 @@ class TimeSkew(Effect):
     signature = "∝ R·dI/dt: spikes of either sign at every change of load"
     equation = "I(t) = I_measured(t + skew)"
     source = "definition"
+    bends_at = (-0.8, -0.35, 0.35, 0.8)
     separated_by = (
         "a log at 10 Hz or faster: a skew gives spikes of both signs and the same area at both"
         " ends of a pulse, fast_polarization a tail after each"

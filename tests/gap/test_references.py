@@ -1,0 +1,184 @@
+"""What references teach: how far clean logs stray, and how far the model file is to be believed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cangauge.gap.diagnose import diagnose
+from cangauge.gap.extend import library_without
+from cangauge.gap.settle import Settled, settle
+from cangauge.identify.fit import FitOptions, fit
+from cangauge.logs.log import Log
+from cangauge.model.model_file import ModelFile
+from cangauge.model.published import CAPACITY_AH
+from synthetic import synthetic_log
+
+
+def day(seed: int, noise_v: float = 0.5) -> Log:
+    return synthetic_log(
+        hours=0.6, start_pct=85.0, end_pct=65.0, noise_v=noise_v, seed=seed, name=f"day {seed}"
+    )
+
+
+def more_resistance(log: Log, ohm: float) -> Log:
+    return replace(log, voltage_v=log.voltage_v - ohm * log.current_a)
+
+
+def more_volts(log: Log, volts: float) -> Log:
+    return replace(log, voltage_v=log.voltage_v + volts)
+
+
+def more_amperes(log: Log, amperes: float) -> Log:
+    return replace(log, current_a=log.current_a + amperes)
+
+
+@pytest.fixture(scope="module")
+def model() -> ModelFile:
+    logs = [synthetic_log(noise_v=0.5, seed=seed) for seed in (1, 2, 3)]
+    return fit(logs, FitOptions(capacity_ah=CAPACITY_AH)).model
+
+
+@pytest.fixture(scope="module")
+def learn(model: ModelFile) -> Callable[[Sequence[Log]], Settled]:
+    def learned(references: Sequence[Log]) -> Settled:
+        return settle([day(21)], model, references, library_without([]))
+
+    return learned
+
+
+@pytest.fixture(scope="module")
+def references() -> list[Log]:
+    return [day(seed) for seed in (11, 12, 13)]
+
+
+@pytest.fixture(scope="module")
+def alike(learn: Callable[[Sequence[Log]], Settled], references: list[Log]) -> Settled:
+    """What is learned from references that differ by their noise alone."""
+    return learn(references)
+
+
+def own_std(settled: Settled, effect_id: str) -> float:
+    """By how much logs are taken to differ in an effect, over what is usual; its largest shape."""
+    frame, error = settled.frame, settled.error
+    names = [frame.choices[k].effect.id for k in frame.own for _ in frame.choices[k].amplitudes]
+    parts = np.array(error.own_std)[: len(names)] / frame.own_prior[: len(names)]
+    return max(part for name, part in zip(names, parts.tolist(), strict=True) if name == effect_id)
+
+
+def level_std(settled: Settled) -> float:
+    """The same of the level of the resistance."""
+    return settled.error.own_std[-1] / float(settled.frame.own_prior[-1])
+
+
+def apart(change: Callable[[Log, float], Log], references: Sequence[Log], size: float) -> list[Log]:
+    return [
+        change(log, part * size) for log, part in zip(references, (-1.0, 0.0, 1.0), strict=True)
+    ]
+
+
+def test_where_references_differ_logs_are_taken_to_differ(
+    learn: Callable[[Sequence[Log]], Settled], references: list[Log], alike: Settled
+) -> None:
+    volts = learn(apart(more_volts, references, 1.5))
+    amperes = learn(apart(more_amperes, references, 3.0))
+    ohms = learn(apart(more_resistance, references, 0.03))
+    # A constant offset looks like a wrong gain too: between them they hold it.
+    assert own_std(volts, "voltage_gain") > 2.0 * own_std(alike, "voltage_gain")
+    assert own_std(amperes, "current_offset") > 3.0 * own_std(alike, "current_offset")
+    assert level_std(ohms) > 3.0 * level_std(alike)
+    # And nothing is learned of what they do not differ in.
+    for settled in (volts, ohms):
+        assert own_std(settled, "current_offset") < 1.2 * own_std(alike, "current_offset")
+        assert own_std(settled, "time_skew") < 1.2 * own_std(alike, "time_skew")
+    assert level_std(volts) < 1.2 * level_std(alike)
+
+
+def test_the_error_is_that_of_the_references_not_that_of_the_model_file(
+    learn: Callable[[Sequence[Log]], Settled], alike: Settled, model: ModelFile
+) -> None:
+    """0.5 V of white noise on every scale; then twice as much."""
+    assert alike.error.rmse_v == pytest.approx(0.5, rel=0.05)
+    np.testing.assert_allclose(np.sqrt(alike.error.scale_v2[:5]), 0.5, rtol=0.1)
+    noisy = learn([day(seed, 1.0) for seed in (11, 12, 13)])
+    assert model.noise.voltage_rmse_v == pytest.approx(0.5, rel=0.05)
+    assert noisy.error.rmse_v == pytest.approx(1.0, rel=0.12)
+
+
+def test_an_effect_that_strays_on_references_is_believed_less(
+    learn: Callable[[Sequence[Log]], Settled], references: list[Log], alike: Settled
+) -> None:
+    """One reference with 4 A too much, of three: the others would have called it an offset."""
+    assert all(worth >= 1.0 for worth in alike.error.strays.values())
+    strange = learn([*references[:2], more_amperes(references[2], 4.0)])
+    before, after = alike.error.strays, strange.error.strays
+    assert after["current_offset"] > 1.5 * before["current_offset"]
+    assert after["current_offset"] > after["time_skew"]
+    # A model that strays in one way is believed less in all: none is worth more than the mean.
+    assert min(after.values()) > min(before.values())
+
+
+def test_an_effect_that_references_stray_in_is_no_cause(
+    model: ModelFile, references: list[Log]
+) -> None:
+    """4 A too much are a fault beside references without; not beside references that vary so."""
+    logs = [more_amperes(day(seed), 4.0) for seed in (21, 22)]
+    assert diagnose(logs, model, references).verdict.cause == "current_offset"
+    varied = diagnose(logs, model, apart(more_amperes, references, 6.0))
+    assert varied.verdict.cause == "none"
+
+
+def test_references_that_bear_the_model_file_out_keep_its_word(alike: Settled) -> None:
+    """Not exactly 1: chance alone puts thirteen coefficients a little further away, or nearer."""
+    assert alike.error.trust > 0.3
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda log: more_resistance(log, 0.05),
+        lambda log: replace(log, voltage_v=log.voltage_v + 0.5 * (log.temperature_c - 20.0)),
+    ],
+    ids=["resistance", "entropy"],
+)
+def test_references_that_all_contradict_the_model_file_overrule_it(
+    change: Callable[[Log], Log],
+    learn: Callable[[Sequence[Log]], Settled],
+    references: list[Log],
+    alike: Settled,
+    model: ModelFile,
+) -> None:
+    """What all of them share is the pack, not a difference from log to log."""
+    found = learn([change(log) for log in references])
+    assert found.error.trust < 0.01
+    assert level_std(found) < 1.5 * level_std(alike)
+    logs = [change(day(seed)) for seed in (21, 22)]
+    diagnosis = diagnose(logs, model, [change(log) for log in references])
+    assert diagnosis.verdict.cause == "none"
+    # The given model is 1 V and more out; the extended one has only the noise left.
+    assert diagnosis.baseline_rmse_v > 1.0
+    assert diagnosis.extended_rmse_v == pytest.approx(0.5, rel=0.1)
+
+
+@pytest.mark.parametrize("noise_v", [0.52, 0.6, 0.75])
+def test_a_noisier_sensor_is_no_gap(
+    noise_v: float, model: ModelFile, references: list[Log]
+) -> None:
+    for seed in (41, 42):
+        found = diagnose([day(seed, noise_v)], model, references)
+        assert found.verdict.cause == "none"
+        assert found.verdict.accepted == ()
+
+
+def test_a_single_reference_leaves_the_model_files_noise(
+    learn: Callable[[Sequence[Log]], Settled], references: list[Log], model: ModelFile
+) -> None:
+    one = learn(references[:1])
+    none = learn([])
+    assert one.error == none.error
+    assert none.error.rmse_v**2 == pytest.approx(
+        model.noise.fast_std_v**2 + model.noise.slow_std_v**2
+    )
