@@ -37,9 +37,11 @@ KNOWN_LOGS = 0.5
 KNOWN_COEFFICIENTS = 2.0
 """So many coefficients are taken to agree with the model file, beside those that are looked at."""
 
-TRUSTS: tuple[float, ...] = tuple(np.logspace(-1.0, 0.0, 9).tolist())
-"""Weights of the model file's information to choose from. It is never quite let go: at temperatures
-that no reference has, it is all that there is."""
+TRUSTS: tuple[float, ...] = tuple(np.logspace(-7.0, 0.0, 29).tolist())
+"""Weights of the model file's information to choose from."""
+
+LEAST_TRUST_BEYOND = 0.1
+"""At temperatures that no reference has, the model file is all that there is: it keeps this."""
 
 FEW = 2.0
 """Chance on few references: a mean of n squares is taken to be low by this over n."""
@@ -68,7 +70,9 @@ def error_from_noise(noise: ModelNoise, rate_hz: float, frame: Frame) -> ErrorMo
     )
 
 
-def error_from_references(frame: Frame, grams: Sequence[Gram], stated: ErrorModel) -> ErrorModel:
+def error_from_references(
+    frame: Frame, grams: Sequence[Gram], stated: ErrorModel, least_trust: float = 0.0
+) -> ErrorModel:
     """Return the error under which each reference is most probable, given the others.
 
     Expectation maximisation on the variance of every scale and of all that is a log's own; what
@@ -83,7 +87,7 @@ def error_from_references(frame: Frame, grams: Sequence[Gram], stated: ErrorMode
     """
     # What all references share comes first, or it is taken for what differs from log to log: under
     # information that is too sure the differences grow until they explain it, and it stays so.
-    error = replace(stated, trust=_trust(frame, grams, stated))
+    error = replace(stated, trust=_trust(frame, grams, stated, least_trust))
     known_v2, known_own = np.array(stated.scale_v2), np.array(stated.own_std)
     counts = np.sum([gram.counts for gram in grams], axis=0)
     known = KNOWN_LOGS * counts / len(grams) + 1e-9
@@ -102,7 +106,7 @@ def error_from_references(frame: Frame, grams: Sequence[Gram], stated: ErrorMode
                 ).tolist()
             ),
             rmse_v=float(np.sqrt(np.sum(counts * variance) / np.sum(counts))),
-            trust=_trust(frame, grams, error),
+            trust=_trust(frame, grams, error, least_trust),
         )
     return error
 
@@ -153,7 +157,7 @@ def with_strays(frame: Frame, grams: Sequence[Gram], error: ErrorModel) -> Error
     return replace(error, strays=worth, clean_v2=float(np.mean(kept)), clean_excess=max(excesses))
 
 
-def _trust(frame: Frame, grams: Sequence[Gram], error: ErrorModel) -> float:
+def _trust(frame: Frame, grams: Sequence[Gram], error: ErrorModel, least: float) -> float:
     """Return how far the references bear out the model file's information (`ErrorModel.trust`).
 
     It says where the coefficients are, and how surely. If the references put them ten times further
@@ -179,7 +183,7 @@ def _trust(frame: Frame, grams: Sequence[Gram], error: ErrorModel) -> float:
         agreed = KNOWN_COEFFICIENTS * (np.log(trust) - trust)
         return float(0.5 * (gained - volume + p * np.log(trust) + agreed))
 
-    return max(TRUSTS, key=log_probability)
+    return max((trust for trust in TRUSTS if trust >= least), key=log_probability)
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,12 @@ from cangauge.gap.columns import (
     residual,
 )
 from cangauge.gap.evidence import ErrorModel, Frame, Gram, gather, gram_of
-from cangauge.gap.references import error_from_noise, error_from_references, with_strays
+from cangauge.gap.references import (
+    LEAST_TRUST_BEYOND,
+    error_from_noise,
+    error_from_references,
+    with_strays,
+)
 from cangauge.identify.options import FitOptions
 from cangauge.logs.log import Log
 from cangauge.model.effects.effect import Effect, Pack
@@ -162,8 +167,11 @@ def settle(
         reference_terms = _reference_terms(of_references, model, frame)
         grams = [gram_of(terms, frame.scale) for terms in reference_terms]
         if len(grams) > 1:
-            error = with_strays(frame, grams, error_from_references(frame, grams, error))
-            if not _temperatures_covered(of_references, of_logs):
+            covered = _temperatures_covered(of_references, of_logs)
+            least_trust = 0.0 if covered else LEAST_TRUST_BEYOND
+            error = error_from_references(frame, grams, error, least_trust)
+            error = with_strays(frame, grams, error)
+            if not covered:
                 error = _beyond_the_references(error)
         solution, _ = within_bounds(gather(frame, grams, [], error), model.model, [])
         change = solution[: frame.scale.size]

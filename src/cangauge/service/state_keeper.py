@@ -77,7 +77,15 @@ def state_path(given: str | None, environment: Mapping[str, str]) -> Path | None
     if not chosen:
         return None
     path = Path(chosen)
-    return path / FILE_NAME if not given or path.is_dir() else path
+    try:
+        return path / FILE_NAME if not given or path.is_dir() else path
+    except OSError as error:  # a name that no file can have
+        raise InputError(
+            f"no file can have this name: {error.strerror}",
+            field="state",
+            value=f"{str(path)[:40]}…",
+            cure="give a shorter one",
+        ) from error
 
 
 class StateKeeper:
