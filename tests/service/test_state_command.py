@@ -61,6 +61,9 @@ def test_stopped_killed_and_started_again(tmp_path: Path) -> None:
     with BusPort(open_bus(address, wanted), "bus") as port:
         service = run(path)
         drive(port, 0, 100)
+        assert waits(
+            lambda: samples_kept(path) == 100
+        )  # what still stands in the queue would be lost
         service.process.send_signal(signal.SIGTERM)
         ended = service.end()
         assert ended.code == 0
@@ -101,7 +104,11 @@ def test_the_loop_asks_for_the_state_soon_then_every_so_often_and_at_the_end() -
     service.checkpoint = lambda: asked.append(time.monotonic() - began)
     with service:
         service.join(5.0)
-    assert [round(each, 1) for each in asked] == pytest.approx([1.0, 2.2, 2.6], abs=0.25)
+    first, second, last = asked
+    # A busy machine may be late, never early.
+    assert first > 0.95
+    assert second - first > 1.15
+    assert last > 2.55
 
 
 def test_the_state_is_no_other_file_of_the_service(tmp_path: Path) -> None:
