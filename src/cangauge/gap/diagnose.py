@@ -190,6 +190,8 @@ def _observability(settled: Settled) -> list[dict[str, object]]:
     best: dict[str, float] = {}
     needs: dict[str, str] = {}
     for k, choice in enumerate(settled.frame.choices):
+        if not choice.effect.is_cause:
+            continue
         at = evidence.of(k)
         information = np.diag(evidence.curvature[at, at])
         reach = np.abs(choice.bounds).max(axis=1)

@@ -105,10 +105,10 @@ class Score:
     effect_id: str
     log_bayes_factor: float
     """Against no effect, averaged over the effect's shapes."""
-    candidate: int
-    """Index of the best shape's candidate."""
+    candidates: tuple[int, ...]
+    """Index of the best shape's candidate, or of two whose mixture is better than either."""
     amplitude: FloatArray
-    """Most probable amplitudes beside the neutral ones, within bounds, shape (k,)."""
+    """Most probable amplitudes beside the neutral ones, within bounds, of all of them, (k,)."""
     covariance: FloatArray
     """Shape (k, k)."""
     explained: float
@@ -173,6 +173,27 @@ class Frame:
         widths = [len(choice.amplitudes) for choice in self.choices]
         return np.concatenate(([0], np.cumsum(widths))).astype(np.intp)
 
+    @cached_property
+    def neighbours(self) -> tuple[tuple[int, int], ...]:
+        """Pairs of candidates next to each other in one shape: what lies in between is a mixture.
+
+        A time constant between two of the grid, or a spread of them, is none of the grid's.
+        """
+        found = []
+        for a, one in enumerate(self.choices):
+            values = _shape_values(self.choices, one.effect.id)
+            for b in range(a + 1, len(self.choices)):
+                other = self.choices[b]
+                if other.effect.id != one.effect.id:
+                    break
+                differ = [name for name in one.shape if one.shape[name] != other.shape[name]]
+                if len(differ) == 1:
+                    grid = values[differ[0]]
+                    places = grid.index(one.shape[differ[0]]), grid.index(other.shape[differ[0]])
+                    if abs(places[0] - places[1]) == 1:
+                        found.append((a, b))
+        return tuple(found)
+
     @property
     def shown(self) -> tuple[int, ...]:
         """Candidates whose columns are wanted of references too: repairs, then own."""
@@ -186,6 +207,12 @@ class Frame:
     def bounds_of(self, chosen: Sequence[int]) -> FloatArray:
         """Return the bounds of some candidates' amplitudes, shape (…, 2)."""
         return np.vstack([np.zeros((0, 2)), *(self.choices[k].bounds for k in chosen)])
+
+
+def _shape_values(choices: Sequence[Candidate], effect_id: str) -> dict[str, list[float]]:
+    """Return each shape's values on an effect's grid, ascending."""
+    shapes = [choice.shape for choice in choices if choice.effect.id == effect_id]
+    return {name: sorted({shape[name] for shape in shapes}) for name in shapes[0]}
 
 
 def gather(
@@ -207,12 +234,12 @@ def gather(
     cross = np.zeros((shared, amplitudes))
     curvature, gradient, squares = np.zeros((amplitudes, amplitudes)), np.zeros(amplitudes), 0.0
     for log in references:
-        products, _ = _without_own(log, frame, error, is_reference=True)
+        products, _, _ = _without_own(log, frame, error, is_reference=True)
         precision += products[:shared, :shared]
         right += products[:shared, -1]
         squares += float(products[-1, -1])
     for log in diagnosed:
-        products, _ = _without_own(log, frame, error, is_reference=False)
+        products, _, _ = _without_own(log, frame, error, is_reference=False)
         precision += products[:shared, :shared]
         right += products[:shared, -1]
         squares += float(products[-1, -1])
@@ -239,7 +266,7 @@ def gather(
 
 def _without_own(
     log: Gram, frame: Frame, error: ErrorModel, *, is_reference: bool
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, float]:
     """Integrate out what is a log's own.
 
     Returns
@@ -248,6 +275,8 @@ def _without_own(
         Weighed products of the shared columns, all amplitudes' (not of a reference), residual.
     own : array
         By how much the log's own amplitudes follow each of these, shape (own, …).
+    volume : float
+        ln det of their precision over that of their prior.
     """
     p = frame.scale.size
     repairs, varying = frame.amplitudes_of(frame.repairs), frame.amplitudes_of(frame.own)
@@ -262,11 +291,41 @@ def _without_own(
         every = p + np.arange(int(frame.first[-1]))
         kept = np.concatenate((np.arange(p), p + repairs, every, last))
         own = np.concatenate((p + varying, levels))
-    block = weighed[np.ix_(own, own)]
-    block[np.diag_indices(own.size)] += np.array(error.own_std) ** -2.0
-    toward = weighed[np.ix_(own, kept)]
-    follows = _solver(block)(toward)
-    return weighed[np.ix_(kept, kept)] - toward.T @ follows, follows
+    # In units of how much logs differ, so that the prior is 1.
+    std = np.array(error.own_std)
+    block = weighed[np.ix_(own, own)] * std * std[:, None]
+    block[np.diag_indices(own.size)] += 1.0
+    toward = std[:, None] * weighed[np.ix_(own, kept)]
+    factor = cho_factor(block)
+    follows = cho_solve(factor, toward)
+    volume = 2.0 * float(np.sum(np.log(np.diag(factor[0]))))
+    return weighed[np.ix_(kept, kept)] - toward.T @ follows, std[:, None] * follows, volume
+
+
+def log_likelihood(frame: Frame, references: Sequence[Gram], error: ErrorModel) -> float:
+    """Return ln of the probability of some references, but for what no error model changes.
+
+    Parameters
+    ----------
+    frame : Frame
+    references : sequence of Gram
+    error : ErrorModel
+    """
+    p = frame.scale.size
+    shared = p + frame.amplitudes_of(frame.repairs).size
+    precision, right, squares = np.zeros((shared, shared)), np.zeros(shared), 0.0
+    volume = 0.0
+    for log in references:
+        products, _, own_volume = _without_own(log, frame, error, is_reference=True)
+        precision += products[:shared, :shared]
+        right += products[:shared, -1]
+        squares += float(products[-1, -1])
+        volume += own_volume + float(log.counts @ np.log(error.scale_v2))
+    squares += _add_priors(precision, right, frame, error)
+    balance = 1.0 / np.sqrt(np.diag(precision))
+    volume += float(np.linalg.slogdet(precision * balance * balance[:, None])[1])
+    volume -= 2.0 * float(np.sum(np.log(balance)))
+    return -0.5 * (squares - float(right @ _solver(precision)(right)) + volume)
 
 
 def _add_priors(precision: FloatArray, right: FloatArray, frame: Frame, error: ErrorModel) -> float:
@@ -348,7 +407,7 @@ def left_over(
     known[-1] = 1.0
     total = np.zeros(SCALES)
     for log in diagnosed:
-        _, follows = _without_own(log, frame, evidence.error, is_reference=False)
+        _, follows, _ = _without_own(log, frame, evidence.error, is_reference=False)
         mine = follows @ known
         weights = np.zeros(log.products.shape[1])
         weights[:p] = -solution[:p]
@@ -412,7 +471,7 @@ def excess(
     score : Score, optional
         An effect to add.
     """
-    chosen = [] if score is None else [score.candidate]
+    chosen = () if score is None else score.candidates
     amplitude = np.zeros(0) if score is None else score.amplitude
     total = evidence.squares - clean - (0.0 if score is None else score.explained)
     counts = np.sum([gram.counts for gram in diagnosed], axis=0)
@@ -446,10 +505,14 @@ def scores(evidence: Evidence, leave_out: Sequence[str] = ()) -> list[Score]:
     leave_out : sequence of str
         Effects that are not asked for.
     """
+    choices = evidence.frame.choices
     by_effect: dict[str, list[Score]] = {}
-    for k, choice in enumerate(evidence.frame.choices):
-        if choice.effect.id not in leave_out:
-            by_effect.setdefault(choice.effect.id, []).append(_score(evidence, k))
+    for chosen in (*((k,) for k in range(len(choices))), *evidence.frame.neighbours):
+        effect = choices[chosen[0]].effect
+        if effect.is_cause and effect.id not in leave_out:
+            score = _score(evidence, chosen)
+            if score is not None:
+                by_effect.setdefault(effect.id, []).append(score)
     best = []
     for shapes in by_effect.values():
         top = max(shapes, key=lambda score: score.log_bayes_factor)
@@ -458,25 +521,31 @@ def scores(evidence: Evidence, leave_out: Sequence[str] = ()) -> list[Score]:
     return sorted(best, key=lambda score: -score.log_bayes_factor)
 
 
-def _score(evidence: Evidence, k: int) -> Score:
-    at, choice = evidence.of(k), evidence.frame.choices[k]
+def _score(evidence: Evidence, chosen: tuple[int, ...]) -> Score | None:
+    """Return the score of a candidate or of a mixture, None where physics allows no mixture."""
+    frame = evidence.frame
+    at, bounds = frame.amplitudes_of(chosen), frame.bounds_of(chosen)
+    effect_id = frame.choices[chosen[0]].effect.id
     # What references left out bring up as well is worth so much less.
-    strays = evidence.error.strays.get(choice.effect.id, 1.0)
-    gradient, curvature = evidence.gradient[at] / strays, evidence.curvature[at, at] / strays
-    prior = prior_precision(choice.bounds)
+    strays = evidence.error.strays.get(effect_id, 1.0)
+    gradient = evidence.gradient[at] / strays
+    curvature = evidence.curvature[np.ix_(at, at)] / strays
+    prior = prior_precision(bounds)
     total = curvature + prior
-    amplitude = np.clip(np.linalg.solve(total, gradient), choice.bounds[:, 0], choice.bounds[:, 1])
+    amplitude = np.linalg.solve(total, gradient)
+    within = np.clip(amplitude, bounds[:, 0], bounds[:, 1])
+    if len(chosen) > 1 and np.any(within != amplitude):
+        return None  # then one of them alone is the best that the bounds allow
     factors = [
-        _log_bayes_factor(gradient, curvature, prior / part**2, choice.bounds)
-        for part in PRIOR_PARTS
+        _log_bayes_factor(gradient, curvature, prior / part**2, bounds) for part in PRIOR_PARTS
     ]
     return Score(
-        effect_id=choice.effect.id,
+        effect_id=effect_id,
         log_bayes_factor=_log_mean(factors),
-        candidate=k,
-        amplitude=amplitude,
+        candidates=chosen,
+        amplitude=within,
         covariance=np.asarray(np.linalg.inv(total), dtype=np.float64),
-        explained=strays * float(2.0 * gradient @ amplitude - amplitude @ curvature @ amplitude),
+        explained=strays * float(2.0 * gradient @ within - within @ curvature @ within),
     )
 
 

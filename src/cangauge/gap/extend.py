@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from cangauge import __version__
 from cangauge.gap.bounded import moved, within_bounds
-from cangauge.gap.columns import residual
+from cangauge.gap.columns import Candidate, residual
 from cangauge.gap.evidence import Score, gather
 from cangauge.gap.settle import Settled
 from cangauge.model.effects.effect import Effect, Pack, Values
@@ -50,16 +50,17 @@ def extend(settled: Settled, accepted: Sequence[Score]) -> Extension:
         settled.frame, settled.reference_grams, settled.diagnosed_grams, settled.error
     )
     solution, amplitudes = within_bounds(
-        evidence, settled.model.model, [score.candidate for score in accepted]
+        evidence, settled.model.model, [k for score in accepted for k in score.candidates]
     )
     base, remarks = _base(settled, solution)
     frame = settled.frame
     cause: dict[str, dict[str, float]] = {}
     model = base
-    for score, start in zip(accepted, amplitudes, strict=True):
-        choice = frame.choices[score.candidate]
-        model, values = _refined(settled, model, score, start)
-        cause[choice.effect.id] = values
+    rest = iter(amplitudes)
+    for score in accepted:
+        choices = [frame.choices[k] for k in score.candidates]
+        start = mixed(choices, [next(rest) for _ in choices])
+        model, cause[score.effect_id] = _refined(settled, model, choices[0].effect, start)
     return Extension(model, cause, tuple(remarks))
 
 
@@ -84,25 +85,44 @@ def _base(settled: Settled, solution: FloatArray) -> tuple[ExtendedModel, list[s
     return base, remarks
 
 
+def mixed(choices: Sequence[Candidate], amplitudes: Sequence[FloatArray]) -> dict[str, float]:
+    """Return the one effect that stands for a mixture of two shapes: sums and weighted means."""
+    total = np.sum(amplitudes, axis=0)
+    weights = np.array([float(np.sum(np.abs(each))) for each in amplitudes])
+    weights = weights / weights.sum() if weights.sum() > 0.0 else np.full(weights.size, 0.5)
+    values = choices[0].values(total)
+    for name in choices[0].shape:
+        values[name] = float(weights @ np.array([choice.shape[name] for choice in choices]))
+    return values
+
+
 def _refined(
-    settled: Settled, model: ExtendedModel, score: Score, start: FloatArray
+    settled: Settled, model: ExtendedModel, effect: Effect, start: Values
 ) -> tuple[ExtendedModel, dict[str, float]]:
-    """Return model and parameters with the amplitudes fitted through the model's own equations."""
-    choice = settled.frame.choices[score.candidate]
-    low, high = choice.bounds[:, 0], choice.bounds[:, 1]
-    scale = high - low
-    prior = 4.0 * np.sqrt(settled.error.lasting_v2)
+    """Return model and parameters, fitted through the model's own equations from a start."""
+    parameters = effect.parameters
+    bounds = np.array([parameter.bounds(model.pack) for parameter in parameters])
+    neutral = effect.neutral(model.pack)
+    centre = np.array([neutral[parameter.name] for parameter in parameters])
+    scale = bounds[:, 1] - bounds[:, 0]
+    low, high = (bounds[:, 0] - centre) / scale, (bounds[:, 1] - centre) / scale
+    is_amplitude = np.array([parameter.grid is None for parameter in parameters])
+    prior = 4.0 * np.sqrt(settled.error.lasting_v2) * is_amplitude
+
+    def values_of(unit: FloatArray) -> dict[str, float]:
+        return {p.name: float(c + u * s) for p, c, u, s in
+                zip(parameters, centre, unit, scale, strict=True)}  # fmt: skip
 
     def errors(unit: FloatArray) -> FloatArray:
-        trial = model.with_effect(choice.effect, choice.values(unit * scale))
+        trial = model.with_effect(effect, values_of(unit))
         volts = [residual(terms.prepared, trial) for terms in settled.diagnosed]
         return np.concatenate([*volts, prior * unit])
 
-    inside = np.clip(start / scale, low / scale + 1e-9, high / scale - 1e-9)
-    found = least_squares(errors, inside, bounds=(low / scale, high / scale), diff_step=1e-3,
-                          max_nfev=12)  # fmt: skip
-    values = choice.values(found.x * scale)
-    return model.with_effect(choice.effect, values), values
+    begin = (np.array([start[parameter.name] for parameter in parameters]) - centre) / scale
+    begin = np.clip(begin, low + 1e-9, high - 1e-9)
+    found = least_squares(errors, begin, bounds=(low, high), diff_step=1e-3, max_nfev=12)
+    values = values_of(found.x)
+    return model.with_effect(effect, values), values
 
 
 def model_file_of(extension: Extension, given: ModelFile, floor_v: float) -> ModelFile:
@@ -186,20 +206,19 @@ def _for_later_drives(effect: Effect, values: Values) -> Values:
 
 def cause_parameters(score: Score, settled: Settled) -> dict[str, dict[str, object]]:
     """Return each parameter of a candidate with its 95 % interval and unit."""
-    choice = settled.frame.choices[score.candidate]
-    std = np.sqrt(np.diag(score.covariance))
-    units = {parameter.name: parameter.unit for parameter in choice.effect.parameters}
+    choices = [settled.frame.choices[k] for k in score.candidates]
+    first, size = choices[0], len(choices[0].amplitudes)
+    values = mixed(choices, np.split(score.amplitude, len(choices)))
+    units = {parameter.name: parameter.unit for parameter in first.effect.parameters}
     result: dict[str, dict[str, object]] = {}
-    for k, name in enumerate(choice.amplitudes):
-        value = float(choice.neutral[k] + score.amplitude[k])
-        low, high = choice.neutral[k] + choice.bounds[k]
-        result[name] = {
-            "value": value,
-            "ci": [max(value - 1.96 * std[k], low), min(value + 1.96 * std[k], high)],
-            "unit": units[name],
-        }
-    for name, shape in choice.shape.items():
-        result[name] = {"value": shape, "ci": None, "unit": units[name]}
+    for k, name in enumerate(first.amplitudes):
+        of_one = np.arange(k, score.amplitude.size, size)
+        std = float(np.sqrt(np.sum(score.covariance[np.ix_(of_one, of_one)])))
+        low, high = first.neutral[k] + first.bounds[k]
+        interval = [max(values[name] - 1.96 * std, low), min(values[name] + 1.96 * std, high)]
+        result[name] = {"value": values[name], "ci": interval, "unit": units[name]}
+    for name in first.shape:
+        result[name] = {"value": values[name], "ci": None, "unit": units[name]}
     return result
 
 

@@ -72,10 +72,9 @@ def solution_with(evidence: Evidence, effects: Sequence[str]) -> FloatArray:
     """
     frame = evidence.frame
     p = frame.scale.size
-    chosen = [
-        next(score for score in scores(evidence) if score.effect_id == effect_id).candidate
-        for effect_id in effects
-    ]
+    others = [key for key in {choice.effect.id for choice in frame.choices} if key not in effects]
+    best = {score.effect_id: score.candidates for score in scores(evidence, leave_out=others)}
+    chosen = [k for effect_id in effects for k in best[effect_id]]
     whole = np.zeros(p + int(frame.first[-1]))
     at = frame.amplitudes_of(chosen)
     bounds = frame.bounds_of(chosen)

@@ -9,11 +9,12 @@ stands in.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cangauge.gap.columns import LEVELS
 from cangauge.gap.evidence import (
     ErrorModel,
     Frame,
@@ -22,6 +23,7 @@ from cangauge.gap.evidence import (
     gather,
     information_of,
     kept_v2,
+    log_likelihood,
     prior_precision,
 )
 from cangauge.gap.scales import SCALES, scale_variances
@@ -29,10 +31,19 @@ from cangauge.model.model_file import ModelNoise
 
 FloatArray = NDArray[np.float64]
 
-ROUNDS = 5
+ROUNDS = 4
 
-KNOWN_LOGS = 0.5
-"""What the model file says counts like so much of a reference log."""
+KNOWN_LOGS = 0.05
+"""What the model file says of the error counts like so much of a reference log. That error was
+judged on logs left out of a fit to a few, so it may be many times too large."""
+
+OWN_LEVELS: tuple[float, ...] = tuple(np.logspace(-1.75, -0.5, 6).tolist())
+"""By how much less than is usual logs of one pack may differ, in all ways at once. Not by more: all
+effects together can mimic nearly any error of the model, and what differs from log to log in all
+ways would hide every cause; how far references stray (`with_strays`) guards against those."""
+
+OWN_LEVEL_SPREAD = 1.0
+"""Standard deviation, before references were seen, of that level's logarithm."""
 
 KNOWN_COEFFICIENTS = 2.0
 """So many coefficients are taken to agree with the model file, beside those that are looked at."""
@@ -46,11 +57,10 @@ LEAST_TRUST_BEYOND = 0.1
 FEW = 2.0
 """Chance on few references: a mean of n squares is taken to be low by this over n."""
 
-OWN_AT_MOST = 4.0
-"""Nor by more than this many times it: effects that cancel each other could grow without end."""
-
-OWN_AT_LEAST = 0.25
-"""Few references cannot show that logs differ by less than this part of what is usual."""
+OWN_EACH: tuple[float, ...] = (0.3, 2.0, 4.0)
+OWN_EACH_SPREAD = 1.0
+"""By how much one effect's own may differ more, or less, than that of all, and the standard
+deviation of that level's logarithm before references were seen."""
 
 LEAST = 1e-4
 """No scale's variance is below this part of the largest."""
@@ -88,30 +98,72 @@ def error_from_references(
     # What all references share comes first, or it is taken for what differs from log to log: under
     # information that is too sure the differences grow until they explain it, and it stays so.
     error = replace(stated, trust=_trust(frame, grams, stated, least_trust))
-    known_v2, known_own = np.array(stated.scale_v2), np.array(stated.own_std)
+    known_v2, usual = np.array(stated.scale_v2), np.array(stated.own_std)
     counts = np.sum([gram.counts for gram in grams], axis=0)
     known = KNOWN_LOGS * counts / len(grams) + 1e-9
     for _ in range(ROUNDS):
-        seen = [_left_out(frame, grams, number, error) for number in range(len(grams))]
-        squares = np.sum([item.squares_v2 for item in seen], axis=0)
-        own = np.sum([item.own for item in seen], axis=0)
-        variance = (squares + known * known_v2) / (counts + known)
-        error = ErrorModel(
+        seen = [_left_out(frame, grams, k, error) for k in range(len(grams))]
+        variance = (np.sum(seen, axis=0) + known * known_v2) / (counts + known)
+        error = replace(
+            error,
             scale_v2=_positive(variance),
-            own_std=tuple(
-                np.clip(
-                    np.sqrt((own + KNOWN_LOGS * known_own**2) / (len(grams) + KNOWN_LOGS)),
-                    OWN_AT_LEAST * known_own,
-                    OWN_AT_MOST * known_own,
-                ).tolist()
-            ),
             rmse_v=float(np.sqrt(np.sum(counts * variance) / np.sum(counts))),
-            trust=_trust(frame, grams, error, least_trust),
         )
-    return error
+        error = replace(error, trust=_trust(frame, grams, error, least_trust))
+        error = replace(error, own_std=_own_level(frame, grams, error, usual))
+    return replace(error, own_std=_own_levels(frame, grams, error))
 
 
-def with_strays(frame: Frame, grams: Sequence[Gram], error: ErrorModel) -> ErrorModel:
+def _own_level(
+    frame: Frame, grams: Sequence[Gram], error: ErrorModel, usual: FloatArray
+) -> tuple[float, ...]:
+    """Return what is usual of a log's own times the level under which the logs are most probable.
+
+    Few logs say little of one way to differ, but much of all ways together.
+    """
+
+    def log_probability(level: float) -> float:
+        found = replace(error, own_std=tuple((level * usual).tolist()))
+        known = -0.5 * (np.log(level) / OWN_LEVEL_SPREAD) ** 2
+        return log_likelihood(frame, grams, found) + float(known)
+
+    return tuple((max(OWN_LEVELS, key=log_probability) * usual).tolist())
+
+
+def _own_levels(frame: Frame, grams: Sequence[Gram], error: ErrorModel) -> tuple[float, ...]:
+    """Return a log's own with a level for every effect, each with the others at theirs."""
+    own_std = np.array(error.own_std)
+    best = log_likelihood(frame, grams, error)
+    for at in _own_by_effect(frame):
+        here = own_std.copy()
+        for level in OWN_EACH:
+            trial = own_std.copy()
+            trial[at] *= level
+            found = replace(error, own_std=tuple(trial.tolist()))
+            known = -0.5 * float(np.log(level) / OWN_EACH_SPREAD) ** 2
+            chance = log_likelihood(frame, grams, found) + known
+            if chance > best:
+                best, here = chance, trial
+        own_std = here
+    return tuple(own_std.tolist())
+
+
+def _own_by_effect(frame: Frame) -> list[NDArray[np.intp]]:
+    """Return where each effect's own amplitudes are, and each of `columns.LEVELS`."""
+    places: dict[str, list[int]] = {}
+    at = 0
+    for k in frame.own:
+        choice = frame.choices[k]
+        of_one = places.setdefault(choice.effect.id, [])
+        of_one += range(at, at + len(choice.amplitudes))
+        at += len(choice.amplitudes)
+    groups = [*places.values(), *([at + k] for k in range(len(LEVELS)))]
+    return [np.array(group, dtype=np.intp) for group in groups]
+
+
+def with_strays(
+    frame: Frame, grams: Sequence[Gram], error: ErrorModel, covered: Sequence[float] = ()
+) -> ErrorModel:
     """Return the error with how far references stray that are diagnosed like the logs.
 
     A voltage model that lacks something shows it as if it were an effect, more on one day than on
@@ -126,7 +178,10 @@ def with_strays(frame: Frame, grams: Sequence[Gram], error: ErrorModel) -> Error
         Of the references, two at least.
     error : ErrorModel
         From `error_from_references`.
+    covered : sequence of float, optional
+        How much each reference counts: the part of it that lies where the others have been.
     """
+    weights = np.array(covered) if len(covered) else np.ones(len(grams))
     shown = frame.shown
     few = replace(
         frame,
@@ -149,12 +204,21 @@ def with_strays(frame: Frame, grams: Sequence[Gram], error: ErrorModel) -> Error
             chance = float(np.trace(np.linalg.solve(total, evidence.curvature[at, at])))
             square = float(evidence.gradient[at] @ np.linalg.solve(total, evidence.gradient[at]))
             squares.setdefault(choice.effect.id, []).append(square / max(chance, 1e-9))
-    few_logs = 1.0 + FEW / len(grams)
-    worth = {key: max(1.0, few_logs * float(np.mean(seen))) for key, seen in squares.items()}
+    few_logs = 1.0 + FEW / float(weights.sum())
+    worth = {}
+    for key, seen in squares.items():  # all shapes of the first reference, then of the second …
+        each = np.reshape(seen, (len(grams), -1)).mean(axis=1)
+        worth[key] = max(1.0, few_logs * float(np.average(each, weights=weights)))
     # A model that strays in some ways will stray in others too, on a day that nobody has seen.
-    usual = float(np.mean([*worth.values()]))
+    # (The median: one way to stray, however far, says nothing of a quite different one.)
+    usual = float(np.median([*worth.values()]))
     worth = {key: max(value, usual) for key, value in worth.items()}
-    return replace(error, strays=worth, clean_v2=float(np.mean(kept)), clean_excess=max(excesses))
+    return replace(
+        error,
+        strays=worth,
+        clean_v2=float(np.average(kept, weights=weights)),
+        clean_excess=max(excesses),
+    )
 
 
 def _trust(frame: Frame, grams: Sequence[Gram], error: ErrorModel, least: float) -> float:
@@ -186,17 +250,8 @@ def _trust(frame: Frame, grams: Sequence[Gram], error: ErrorModel, least: float)
     return max((trust for trust in TRUSTS if trust >= least), key=log_probability)
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """Expected squares of one reference, its own coefficients' uncertainty included."""
-
-    squares_v2: FloatArray
-    """Of the error, summed over each scale [V²]."""
-    own: FloatArray
-    """Of all that is the log's own."""
-
-
-def _left_out(frame: Frame, grams: Sequence[Gram], number: int, error: ErrorModel) -> _Seen:
+def _left_out(frame: Frame, grams: Sequence[Gram], number: int, error: ErrorModel) -> FloatArray:
+    """Return the expected squares of one reference's error, summed over each scale [V²]."""
     others = gather(frame, [gram for k, gram in enumerate(grams) if k != number], [], error)
     shared = others.mean.size
     own = np.arange(shared, shared + len(error.own_std))
@@ -218,7 +273,7 @@ def _left_out(frame: Frame, grams: Sequence[Gram], number: int, error: ErrorMode
             + mean @ block @ mean
             + np.sum(block * spread)
         )
-    return _Seen(np.maximum(squares, 0.0), mean[own] ** 2 + np.diag(spread)[own])
+    return np.maximum(squares, 0.0)
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:

@@ -43,12 +43,14 @@ CLEAN_STRUCTURE: tuple[tuple[str, dict[str, float]], ...] = (
     ("slow_diffusion", {"tau_s": 220.0, "activation_k": 0.0}),
     ("slow_diffusion", {"tau_s": 220.0, "activation_k": 3000.0}),
     ("slow_diffusion", {"tau_s": 750.0, "activation_k": 3000.0}),
-    ("resistance_temperature", {"activation_k": 1000.0, "delayed": 0.0}),
-    ("resistance_temperature", {"activation_k": 4500.0, "delayed": 0.0}),
-    ("resistance_temperature", {"activation_k": 2500.0, "delayed": 1.0}),
+    ("resistance_temperature", {"activation_k": 1000.0, "neutral_c": 25.0, "delayed": 0.0}),
+    ("resistance_temperature", {"activation_k": 4500.0, "neutral_c": 25.0, "delayed": 0.0}),
+    ("resistance_temperature", {"activation_k": 2500.0, "neutral_c": 25.0, "delayed": 1.0}),
     ("resistance_soc", {"width_pct": 40.0, "delayed": 1.0}),
-    ("charge_transfer", {"exchange_a": 0.12}),
+    ("charge_transfer", {"exchange_a": 0.12, "bend_only": 1.0}),
     ("hysteresis", {"travel_pct": 4.0}),
+    ("ocv_shape", {}),
+    ("entropic_coefficient", {}),
 )
 """Structure that a clean pack may well have and the 13 coefficients lack: all logs share it, so it
 is learned from the references and is no cause."""
@@ -66,8 +68,11 @@ OWN_PART = 0.01
 ALWAYS_OF_TEMPERATURE = frozenset({"charge_transfer"})
 """Structure that follows the temperature whatever its shape."""
 
-COVERED_K = 3.0
-"""References cover temperatures up to this far outside their own [K]."""
+COVERED_K, COVERED_PCT = 3.0, 3.0
+"""References cover temperatures and SoC up to this far outside their own [K, %]."""
+
+LEAST_COUNT = 0.1
+"""A reference that went where no other has been still counts so much."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +175,7 @@ def settle(
             covered = _temperatures_covered(of_references, of_logs)
             least_trust = 0.0 if covered else LEAST_TRUST_BEYOND
             error = error_from_references(frame, grams, error, least_trust)
-            error = with_strays(frame, grams, error)
+            error = with_strays(frame, grams, error, counting(of_references, of_logs))
             if not covered:
                 error = _beyond_the_references(error)
         solution, _ = within_bounds(gather(frame, grams, [], error), model.model, [])
@@ -258,6 +263,8 @@ def _own(choices: Sequence[Candidate], model_file: ModelFile) -> tuple[tuple[int
     """Return by which candidates logs may differ, all of them, and how much at first."""
     by_effect: dict[str, list[int]] = {}
     for k, choice in enumerate(choices):
+        if not choice.effect.is_cause:
+            continue
         by_effect.setdefault(choice.effect.id, []).append(k)
     noise = model_file.noise
     constant_v = max(noise.lasting_std_v, 0.25 * math.hypot(noise.fast_std_v, noise.slow_std_v))
@@ -309,6 +316,33 @@ def _temperatures_covered(references: Sequence[Prepared], diagnosed: Sequence[Pr
     asked = np.concatenate([item.rows.temperature_c for item in diagnosed])
     low, high = seen.min() - COVERED_K, seen.max() + COVERED_K
     return bool(np.mean((asked >= low) & (asked <= high)) > 0.5)
+
+
+def counting(references: Sequence[Prepared], diagnosed: Sequence[Prepared]) -> list[float]:
+    """Return how much each reference says of how far the diagnosed logs may stray.
+
+    One that went where no other has been shows how the model extrapolates. If the diagnosed logs
+    stay where references have been, that is another question, and it counts little.
+    """
+    asked = min(_part_inside(item, references) for item in diagnosed)
+    return [
+        max(
+            LEAST_COUNT,
+            1.0 - asked,
+            _part_inside(item, [other for other in references if other is not item]),
+        )
+        for item in references
+    ]
+
+
+def _part_inside(item: Prepared, others: Sequence[Prepared]) -> float:
+    """Return the part of a log's rows within the temperatures and SoC of others [-]."""
+    inside = np.ones(item.rows.time_s.size, dtype=bool)
+    for name, margin in (("temperature_c", COVERED_K), ("soc_pct", COVERED_PCT)):
+        values = np.concatenate([getattr(other.rows, name) for other in others])
+        mine = getattr(item.rows, name)
+        inside &= (mine >= values.min() - margin) & (mine <= values.max() + margin)
+    return float(np.mean(inside))
 
 
 def _check_pack(log: Log, model: ExtendedModel) -> None:

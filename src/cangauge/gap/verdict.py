@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,41 +72,61 @@ def decide(settled: Settled) -> Verdict:
     evidence = gather(
         settled.frame, settled.reference_grams, settled.diagnosed_grams, settled.error
     )
-    ranked = scores(evidence)
-    best = ranked[0]
+    ranked = believable(evidence)
+    best = ranked.candidates[0]
     alone = gather(settled.frame, settled.reference_grams, [], settled.error)
     before = excess(evidence, settled.diagnosed_grams, alone.squares)
     explained = _explained(settled, evidence, alone, best)
     chances = _chances(ranked, explained)
     beyond = before / max(settled.error.clean_excess, 1.0)
-    if best.log_bayes_factor < ACCEPT_LOG_BAYES:
-        return Verdict(NONE, chances[NONE], (), (), tuple(ranked), chances, explained, beyond)
+
+    def verdict(
+        cause: str, alike: tuple[str, ...] = (), accepted: tuple[Score, ...] = ()
+    ) -> Verdict:
+        return Verdict(
+            cause, chances[cause], alike, accepted, ranked.candidates, chances, explained, beyond
+        )
+
+    if ranked.found < ACCEPT_LOG_BAYES:
+        return verdict(NONE)
     if explained < EXPLAINED_AT_LEAST:
-        cause = UNKNOWN if beyond > UNKNOWN_BEYOND else NONE
-        return Verdict(cause, chances[cause], (), (), tuple(ranked), chances, explained, beyond)
+        return verdict(UNKNOWN if beyond > UNKNOWN_BEYOND else NONE)
     alike = tuple(
         score.effect_id
-        for score in ranked[1:]
+        for score in ranked.candidates[1:]
         if score.log_bayes_factor > best.log_bayes_factor - ALIKE_WITHIN
     )
-    accepted = _accepted(evidence, best, alike)
-    return Verdict(
-        best.effect_id,
-        chances[best.effect_id],
-        alike,
-        accepted,
-        tuple(ranked),
-        chances,
-        explained,
-        beyond,
-    )
+    return verdict(best.effect_id, alike, _accepted(evidence, best, alike))
+
+
+@dataclass(frozen=True, eq=False)
+class Ranked:
+    """Effects in the order in which they are believed."""
+
+    candidates: tuple[Score, ...]
+    """As if all strayed alike: that one strays less on the references makes it no more likely to
+    be what the logs show. Those that are not accepted by their own measure follow the others."""
+    found: float
+    """Log Bayes factor against no effect, by its own measure, of the best."""
+
+
+def believable(evidence: Evidence) -> Ranked:
+    """Return the effects, the best first."""
+    own = {score.effect_id: score.log_bayes_factor for score in scores(evidence)}
+    strays = evidence.error.strays
+    alike = dict.fromkeys(strays, float(np.exp(np.mean(np.log([*strays.values()]))))) if strays else {}
+    together = scores(replace(evidence, error=replace(evidence.error, strays=alike)))
+    order = sorted(together, key=lambda score: own[score.effect_id] < ACCEPT_LOG_BAYES)
+    if own[order[0].effect_id] < ACCEPT_LOG_BAYES:
+        order = sorted(together, key=lambda score: -own[score.effect_id])
+    return Ranked(tuple(order), own[order[0].effect_id])
 
 
 def _accepted(evidence: Evidence, best: Score, alike: Sequence[str]) -> tuple[Score, ...]:
     accepted = [best]
     while len(accepted) < FURTHER_AT_MOST:
         rest = scores(
-            condition_on(evidence, [score.candidate for score in accepted]),
+            condition_on(evidence, [k for score in accepted for k in score.candidates]),
             leave_out=[*(score.effect_id for score in accepted), *alike],
         )
         if not rest or rest[0].log_bayes_factor < FURTHER_LOG_BAYES:
@@ -123,12 +143,12 @@ def _explained(settled: Settled, evidence: Evidence, alone: Evidence, score: Sco
     """
     frame, grams = settled.frame, settled.diagnosed_grams
     amplitude = score.amplitude
-    at = evidence.of(score.candidate)
+    at = frame.amplitudes_of(score.candidates)
     with_it = evidence.mean - evidence.per_amplitude[:, at] @ amplitude
     before = sum(kept_v2(frame, gram, alone.mean) for gram in grams) / len(grams)
-    after = sum(
-        kept_v2(frame, gram, with_it, [score.candidate], amplitude) for gram in grams
-    ) / len(grams)
+    after = sum(kept_v2(frame, gram, with_it, score.candidates, amplitude) for gram in grams) / len(
+        grams
+    )
     clean = settled.error.clean_v2 or settled.error.rmse_v**2
     gap = before - clean
     if gap > VISIBLE * clean:
@@ -139,16 +159,17 @@ def _explained(settled: Settled, evidence: Evidence, alone: Evidence, score: Sco
     return float(np.clip(1.0 - left / chance, 0.0, 1.0)) if chance > 0.0 else 0.0
 
 
-def _chances(ranked: Sequence[Score], explained: float) -> dict[str, float]:
+def _chances(ranked: Ranked, explained: float) -> dict[str, float]:
     """Return tempered probabilities of every effect, of `none` and of `unknown`."""
     known = 1.0 / (1.0 + math.exp(-10.0 * (explained - HALF_KNOWN)))
-    factors = np.array([score.log_bayes_factor for score in ranked])
-    weights = np.exp(TEMPERING * (factors - max(factors.max(), ACCEPT_LOG_BAYES)))
-    none = math.exp(TEMPERING * (ACCEPT_LOG_BAYES - max(factors.max(), ACCEPT_LOG_BAYES)))
+    factors = np.array([score.log_bayes_factor for score in ranked.candidates])
+    found = max(ranked.found, ACCEPT_LOG_BAYES)
+    weights = np.exp(TEMPERING * (ranked.found - found + factors - factors.max()))
+    none = math.exp(TEMPERING * (ACCEPT_LOG_BAYES - found))
     total = float(weights.sum()) + none
     chances = {
         score.effect_id: known * float(weight) / total
-        for score, weight in zip(ranked, weights, strict=True)
+        for score, weight in zip(ranked.candidates, weights, strict=True)
     }
     chances[NONE] = none / total
     chances[UNKNOWN] = (1.0 - known) * float(weights.sum()) / total

@@ -19,8 +19,8 @@ from cangauge.model.effects.effect import (
 from cangauge.model.voltage_model import VoltageModel
 
 ALIKE_AT_C_RATE = 1.0
-"""At this current [1/h] the effect adds nothing, as at none: the model's own resistance already
-holds the mean slope over the currents of a drive, and only the bend is left to explain."""
+"""At this current [1/h] the bend alone adds nothing, as at none: where logs of the same pack gave
+the model's resistance, it already holds the mean slope over the currents of a drive."""
 
 
 ACTIVATION_K = 5000.0
@@ -28,7 +28,8 @@ ACTIVATION_K = 5000.0
 
 
 class ChargeTransfer(Effect):
-    """The bend of asinh(I/2I₀) against a straight line that meets it at 0 and ±1 C.
+    """An overpotential v·asinh(I/2I₀), or (`bend_only`) its bend against a straight line that
+    meets it at 0 and ±1 C.
 
     `scale_v` is 2RT/F a cell and electrode (51 mV at 25 °C) times the cells in series, so the
     bound is that of two electrodes.
@@ -42,9 +43,10 @@ class ChargeTransfer(Effect):
             "exchange_a", "A", 0.01, 2.0, neutral=None, scale="capacity",
             grid=(0.02, 0.05, 0.12, 0.3, 0.8),
         ),
+        Parameter("bend_only", "1", 0.0, 1.0, neutral=None, grid=(0.0, 1.0)),
     )  # fmt: skip
     signature = "I − c·asinh(I/2I₀): too much drop at small currents, too little at large ones"
-    equation = "ΔU = −v·(asinh(I/2I₀) − (I/I₁)·asinh(I₁/2I₀)), I₁ = 1 C, I₀ after Arrhenius"
+    equation = "ΔU = −v·(asinh(I/2I₀) − b·(I/I₁)·asinh(I₁/2I₀)), I₁ = 1 C, I₀ after Arrhenius"
     source = "Newman, Thomas-Alyea, Electrochemical Systems, 3rd ed., Wiley 2004, ch. 8"
     separated_by = (
         "pulses of several sizes in both directions; resistance_asymmetry is straight on each"
@@ -58,7 +60,7 @@ class ChargeTransfer(Effect):
         del model
         per_a = 0.5 / values["exchange_a"] * arrhenius(state.temperature_c, ACTIVATION_K)
         alike_a = ALIKE_AT_C_RATE * pack.capacity_ah
-        slope = np.arcsinh(alike_a * per_a) / alike_a
+        slope = values["bend_only"] * np.arcsinh(alike_a * per_a) / alike_a
         bend = np.arcsinh(state.current_a * per_a) - slope * state.current_a
         return np.asarray(-values["scale_v"] * bend)
 
@@ -66,20 +68,21 @@ class ChargeTransfer(Effect):
         """Return the bend at one sample at a time."""
         del model
         alike_a = ALIKE_AT_C_RATE * pack.capacity_ah
-        return _Online(values["scale_v"], 0.5 / values["exchange_a"], alike_a)
+        return _Online(values, alike_a)
 
 
 class _Online(OnlineEffect):
-    def __init__(self, scale_v: float, per_a: float, alike_a: float) -> None:
-        self._scale_v = scale_v
-        self._per_a = per_a
+    def __init__(self, values: Values, alike_a: float) -> None:
+        self._scale_v = values["scale_v"]
+        self._per_a = 0.5 / values["exchange_a"]
+        self._bend_only = values["bend_only"]
         self._alike_a = alike_a
         self._volts = 0.0
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         del time_s, drop_v
         per_a = self._per_a * arrhenius_at(temperature_c, ACTIVATION_K)
-        slope = math.asinh(self._alike_a * per_a) / self._alike_a
+        slope = self._bend_only * math.asinh(self._alike_a * per_a) / self._alike_a
         bend = math.asinh(current_a * per_a) - slope * current_a
         self._volts = -self._scale_v * bend
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from cangauge.model.effects.arrhenius import ZERO_C_IN_K, inverse_k, inverse_k_at
+from cangauge.model.effects.arrhenius import inverse_k, inverse_k_at
 from cangauge.model.effects.effect import (
     DELAYED,
     Effect,
@@ -24,7 +24,8 @@ from cangauge.model.voltage_model import VoltageModel
 class ResistanceTemperature(Effect):
     """A share of the voltage model's drop that follows Arrhenius' law.
 
-    It is 1 in the middle of the temperatures that the model was identified on.
+    At `neutral_c` the drop stays as it is: the temperature at which the model's own resistances
+    hold. They were identified over a range, so it is a shape to be tried.
     """
 
     id = "resistance_temperature"
@@ -32,13 +33,11 @@ class ResistanceTemperature(Effect):
     parameters = (
         Parameter("share", "1", 0.0, 3.0),
         Parameter("activation_k", "K", 100.0, 8000.0, neutral=None, grid=(1000.0, 2500.0, 4500.0)),
+        Parameter("neutral_c", "°C", -40.0, 60.0, neutral=None, grid=(5.0, 15.0, 25.0, 40.0)),
         DELAYED,
     )
     signature = "the drop over the resistance, growing with (T₀ − T)"
-    equation = (
-        "ΔU = a·ΣRj·I(t − dj)·(exp(B·(1/T − 1/T₀)) − 1), T₀ the middle of the model's range;"
-        " or ΣRj·I in place of ΣRj·I(t − dj)"
-    )
+    equation = "ΔU = a·ΣRj·I(t − dj)·(exp(B·(1/T − 1/T₀)) − 1); or ΣRj·I in place of ΣRj·I(t − dj)"
     source = "Waag, Käbitz, Sauer, Applied Energy 102 (2013) 885"
     separated_by = (
         "the same SoC at two temperatures (a second day): where temperature and SoC move"
@@ -50,32 +49,29 @@ class ResistanceTemperature(Effect):
     ) -> FloatArray:
         """Return the change of the drop [V]."""
         drop_v = state.scaled_drop_v(values["delayed"], pack)
-        colder = inverse_k(state.temperature_c) - _usual_per_k(model)
+        del model
+        colder = inverse_k(state.temperature_c) - inverse_k_at(values["neutral_c"])
         return values["share"] * drop_v * np.expm1(values["activation_k"] * colder)
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
         """Return the change of the drop at one sample at a time."""
-        return _Online(values, _usual_per_k(model), pack.resistance_ohm)
-
-
-def _usual_per_k(model: VoltageModel) -> float:
-    low, high = model.temperature_range_c
-    return 1.0 / (0.5 * (low + high) + ZERO_C_IN_K)
+        del model
+        return _Online(values, pack.resistance_ohm)
 
 
 class _Online(OnlineEffect):
-    def __init__(self, values: Values, usual_per_k: float, resistance_ohm: float) -> None:
+    def __init__(self, values: Values, resistance_ohm: float) -> None:
         self._share = values["share"]
         self._activation_k = values["activation_k"]
         self._delayed = values["delayed"]
-        self._usual_per_k = usual_per_k
+        self._neutral_per_k = inverse_k_at(values["neutral_c"])
         self._resistance_ohm = resistance_ohm
         self._volts = 0.0
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         del time_s
         scaled_v = scaled_drop_at(drop_v, current_a, self._delayed, self._resistance_ohm)
-        colder = inverse_k_at(temperature_c) - self._usual_per_k
+        colder = inverse_k_at(temperature_c) - self._neutral_per_k
         self._volts = self._share * scaled_v * math.expm1(self._activation_k * colder)
 
     def extra_voltage(self, soc_pct: float) -> float:

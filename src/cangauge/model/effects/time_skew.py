@@ -38,16 +38,16 @@ class TimeSkew(Effect):
         Parameter(
             "skew_s",
             "s",
-            -1.5,
-            1.5,
-            grid=(-1.5, -1.2, -0.9, -0.7, -0.5, -0.35, -0.2, -0.1, 0.0,
-                  0.1, 0.2, 0.35, 0.5, 0.7, 0.9, 1.2, 1.5),
+            -4.0,
+            4.0,
+            grid=(-4.0, -3.0, -2.0, -1.5, -1.0, -0.7, -0.5, -0.35, -0.2, -0.1, 0.0,
+                  0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0),
         ),
     )  # fmt: skip
     signature = "∝ R·dI/dt: spikes of either sign at every change of load"
     equation = "I(t) = I_measured(t + skew)"
     source = "definition"
-    bends_at = (-0.8, -0.35, 0.35, 0.8)
+    bends_at = (-0.9, -0.6, -0.35, -0.2, -0.1, 0.1, 0.2, 0.35, 0.6, 0.9)
     separated_by = (
         "a log at 10 Hz or faster: a skew gives spikes of both signs and the same area at both"
         " ends of a pulse, fast_polarization a tail after each"
