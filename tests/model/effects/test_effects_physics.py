@@ -158,8 +158,8 @@ def at_onset(current_a: float, **state: float) -> PackState:
     return replace(just, drop_v=0.4 * just.drop_v)
 
 
-def test_a_share_of_the_drop_follows_arrhenius_from_the_middle_of_the_models_range() -> None:
-    values = {"share": 0.7, "activation_k": 4000.0, "delayed": 1.0}
+def test_a_share_of_the_drop_follows_arrhenius_from_its_own_reference() -> None:
+    values = {"share": 0.7, "activation_k": 4000.0, "delayed": 1.0, "reference_c": 23.0}
     at_23 = extra("resistance_temperature", steady(10.0, 50.0, temperature_c=23.0), values)
     np.testing.assert_allclose(at_23, 0.0, atol=1e-12)
     cold = steady(10.0, 50.0, temperature_c=0.0)
@@ -172,7 +172,7 @@ def test_a_share_of_the_drop_follows_arrhenius_from_the_middle_of_the_models_ran
 @pytest.mark.parametrize(
     ("effect_id", "values", "rise"),
     [
-        ("resistance_temperature", {"share": 0.5, "activation_k": 2500.0},
+        ("resistance_temperature", {"share": 0.5, "activation_k": 2500.0, "reference_c": 23.0},
          0.5 * math.expm1(2500.0 * (1.0 / 278.15 - 1.0 / 296.15))),
         ("resistance_soc", {"at_empty": 2.0, "at_full": 0.0, "width_pct": 10.0}, 2.0 / math.e),
     ],
@@ -233,16 +233,18 @@ def test_charge_transfer_bends_between_rest_and_1c() -> None:
     current = PACK.capacity_ah * np.array([-3.0, -1.0, -0.2, 0.0, 0.2, 1.0, 3.0])
     for temperature_c in (-10.0, 25.0):
         state = with_current(steady(6.0, 0.0, temperature_c=temperature_c), current)
-        found = extra("charge_transfer", state, {"scale_v": 5.0, "exchange_a": 3.0})
+        bent = {"scale_v": 5.0, "exchange_a": 3.0, "bend_only": 1.0}
+        found = extra("charge_transfer", state, bent)
         np.testing.assert_allclose(found[[1, 3, 5]], 0.0, atol=1e-12)
         np.testing.assert_allclose(found, -found[::-1], atol=1e-12)
         assert found[4] < -1.0
         assert found[6] > 1.0
 
 
+@pytest.mark.parametrize("bend_only", [0.0, 1.0])
 @pytest.mark.parametrize("temperature_c", [-15.0, 25.0, 40.0])
 def test_the_exchange_current_is_as_stated_at_25_c_and_falls_in_the_cold(
-    temperature_c: float,
+    temperature_c: float, bend_only: float
 ) -> None:
     """I₀(T) = I₀·exp(B·(1/298.15 − 1/T)), B = 5000 K: 13 times smaller at −15 °C."""
     exchange_a = 3.0 * math.exp(5000.0 * (1.0 / 298.15 - 1.0 / (temperature_c + 273.15)))
@@ -251,8 +253,9 @@ def test_the_exchange_current_is_as_stated_at_25_c_and_falls_in_the_cold(
     for current in (-80.0, 7.0, 150.0):
         state = with_current(steady(2.0, 0.0, temperature_c=temperature_c), np.full(3, current))
         bend = math.asinh(current / (2.0 * exchange_a))
-        bend -= current / one_c * math.asinh(one_c / (2.0 * exchange_a))
-        found = extra("charge_transfer", state, {"scale_v": 5.0, "exchange_a": 3.0})
+        bend -= bend_only * current / one_c * math.asinh(one_c / (2.0 * exchange_a))
+        values = {"scale_v": 5.0, "exchange_a": 3.0, "bend_only": bend_only}
+        found = extra("charge_transfer", state, values)
         np.testing.assert_allclose(found, -5.0 * bend, rtol=1e-12)
 
 

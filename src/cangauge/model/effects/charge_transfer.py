@@ -28,8 +28,9 @@ ACTIVATION_K = 5000.0
 
 
 class ChargeTransfer(Effect):
-    """An overpotential v·asinh(I/2I₀), or (`bend_only`) its bend against a straight line that
-    meets it at 0 and ±1 C.
+    """An overpotential v·asinh(I/2I₀), or its bend against a straight line.
+
+    That line (`bend_only`) meets it at 0 and ±1 C.
 
     `scale_v` is 2RT/F a cell and electrode (51 mV at 25 °C) times the cells in series, so the
     bound is that of two electrodes.

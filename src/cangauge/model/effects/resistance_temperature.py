@@ -24,7 +24,7 @@ from cangauge.model.voltage_model import VoltageModel
 class ResistanceTemperature(Effect):
     """A share of the voltage model's drop that follows Arrhenius' law.
 
-    At `neutral_c` the drop stays as it is: the temperature at which the model's own resistances
+    At `reference_c` the drop stays as it is: the temperature at which the model's own resistances
     hold. They were identified over a range, so it is a shape to be tried.
     """
 
@@ -33,7 +33,7 @@ class ResistanceTemperature(Effect):
     parameters = (
         Parameter("share", "1", 0.0, 3.0),
         Parameter("activation_k", "K", 100.0, 8000.0, neutral=None, grid=(1000.0, 2500.0, 4500.0)),
-        Parameter("neutral_c", "°C", -40.0, 60.0, neutral=None, grid=(5.0, 15.0, 25.0, 40.0)),
+        Parameter("reference_c", "°C", -40.0, 60.0, neutral=None, grid=(5.0, 15.0, 25.0, 40.0)),
         DELAYED,
     )
     signature = "the drop over the resistance, growing with (T₀ − T)"
@@ -50,7 +50,7 @@ class ResistanceTemperature(Effect):
         """Return the change of the drop [V]."""
         drop_v = state.scaled_drop_v(values["delayed"], pack)
         del model
-        colder = inverse_k(state.temperature_c) - inverse_k_at(values["neutral_c"])
+        colder = inverse_k(state.temperature_c) - inverse_k_at(values["reference_c"])
         return values["share"] * drop_v * np.expm1(values["activation_k"] * colder)
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
@@ -64,14 +64,14 @@ class _Online(OnlineEffect):
         self._share = values["share"]
         self._activation_k = values["activation_k"]
         self._delayed = values["delayed"]
-        self._neutral_per_k = inverse_k_at(values["neutral_c"])
+        self._reference_per_k = inverse_k_at(values["reference_c"])
         self._resistance_ohm = resistance_ohm
         self._volts = 0.0
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         del time_s
         scaled_v = scaled_drop_at(drop_v, current_a, self._delayed, self._resistance_ohm)
-        colder = inverse_k_at(temperature_c) - self._neutral_per_k
+        colder = inverse_k_at(temperature_c) - self._reference_per_k
         self._volts = self._share * scaled_v * math.expm1(self._activation_k * colder)
 
     def extra_voltage(self, soc_pct: float) -> float:
