@@ -10,9 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cangauge.gap.evidence import gather
-from cangauge.gap.extend import Extension, cause_parameters, extend, library_without
+from cangauge.gap.extend import (
+    Extension,
+    cause_parameters,
+    extend,
+    library_without,
+    model_file_of,
+)
 from cangauge.gap.held_out import Judged, closed_fraction, closed_interval, judge, rms
 from cangauge.gap.settle import Settled, settle
+from cangauge.gap.soc_error import soc_mae_pct
 from cangauge.gap.verdict import ACCEPT_LOG_BAYES, NONE, UNKNOWN, Verdict, decide
 from cangauge.gap.where import Place, places, worst_moments
 from cangauge.logs.log import Log
@@ -33,6 +40,11 @@ class Diagnosis:
     baseline_rmse_v: float
     extended_rmse_v: float
     floor_v: float
+    explainable_v: float | None
+    """What the most flexible structure of the references leaves of one that is left out [V]."""
+    baseline_soc_mae_pct: float | None
+    extended_soc_mae_pct: float | None
+    """By the online estimator, initial SoC withheld; None where the logs do not tell their SoC."""
     closed: float | None
     closed_ci: tuple[float, float] | None
     where: tuple[Place, ...]
@@ -50,11 +62,11 @@ class Diagnosis:
                 "baseline_rmse_v": self.baseline_rmse_v,
                 "extended_rmse_v": self.extended_rmse_v,
                 "floor_sensor_v": self.floor_v,
-                "floor_explainable_v": None,
+                "floor_explainable_v": self.explainable_v,
                 "closed_fraction": self.closed,
                 "closed_fraction_ci": None if self.closed_ci is None else list(self.closed_ci),
-                "baseline_soc_mae_pct": None,
-                "extended_soc_mae_pct": None,
+                "baseline_soc_mae_pct": self.baseline_soc_mae_pct,
+                "extended_soc_mae_pct": self.extended_soc_mae_pct,
             },
             "where": [place.to_dict() for place in self.where],
             "worst_moments": list(self.worst),
@@ -127,19 +139,26 @@ def diagnose(
     extended = rms(np.concatenate([item.extended_v for item in judged]))
     is_gap = verdict.cause != NONE
     say("extending the model")
+    extension = extend(settled, verdict.accepted)
+    say("running the estimator with either model")
+    better = model_file_of(extension, model_file, extended)
+    clean_v2 = settled.error.clean_v2
     return Diagnosis(
         settled=settled,
         verdict=verdict,
         baseline_rmse_v=baseline,
         extended_rmse_v=extended,
         floor_v=floor,
+        explainable_v=float(np.sqrt(clean_v2)) if clean_v2 > 0.0 else None,
+        baseline_soc_mae_pct=soc_mae_pct(logs, model_file),
+        extended_soc_mae_pct=soc_mae_pct(logs, better),
         closed=closed_fraction(baseline, extended, floor) if is_gap else None,
         closed_ci=closed_interval(settled, judged, floor) if is_gap else None,
         where=tuple(places(settled.diagnosed, model_file.capacity_ah)),
         worst=tuple(worst_moments(settled.diagnosed)),
         candidates=tuple(_candidates(settled, verdict, floor)),
         observability=tuple(_observability(settled)),
-        extension=extend(settled, verdict.accepted),
+        extension=extension,
     )
 
 
