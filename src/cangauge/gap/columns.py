@@ -141,6 +141,7 @@ def candidates(effects: Sequence[Effect], pack: Pack, time_s: FloatArray) -> lis
         grids = [effect.trials(parameter, pack, time_s) for parameter in shapes]
         for choice in itertools.product(*grids):
             shape = dict(zip((p.name for p in shapes), choice, strict=True))
+            shape |= effect.constants(pack)
             result += [
                 Candidate(effect, shape, names, centre, bounds, steps)
                 for steps in _steps(effect, bounds)

@@ -15,7 +15,7 @@ from cangauge.gap.columns import residual
 from cangauge.gap.evidence import Score, gather
 from cangauge.gap.settle import Settled
 from cangauge.model.effects.effect import Effect, Pack, Values
-from cangauge.model.effects.library import LIBRARY, effect_entries
+from cangauge.model.effects.library import LIBRARY, effect_entries, one_of
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Made, ModelFile, Ranges
 
@@ -166,7 +166,7 @@ def _merged(effects: Sequence[tuple[Effect, Values]], pack: Pack) -> list[tuple[
     """Return the effects, those of one kind and shape added up, within physical bounds."""
     merged: dict[tuple[object, ...], tuple[Effect, dict[str, float]]] = {}
     for effect, values in effects:
-        key = (effect.id, *(values[parameter.name] for parameter in effect.shapes))
+        key = one_of(effect, values)
         if key not in merged:
             merged[key] = (effect, dict(values))
             continue

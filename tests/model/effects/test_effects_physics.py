@@ -158,8 +158,8 @@ def at_onset(current_a: float, **state: float) -> PackState:
     return replace(just, drop_v=0.4 * just.drop_v)
 
 
-def test_a_share_of_the_drop_follows_arrhenius_from_the_middle_of_the_models_range() -> None:
-    values = {"share": 0.7, "activation_k": 4000.0, "delayed": 1.0}
+def test_a_share_of_the_drop_follows_arrhenius_from_its_own_reference() -> None:
+    values = {"share": 0.7, "activation_k": 4000.0, "delayed": 1.0, "reference_c": 23.0}
     at_23 = extra("resistance_temperature", steady(10.0, 50.0, temperature_c=23.0), values)
     np.testing.assert_allclose(at_23, 0.0, atol=1e-12)
     cold = steady(10.0, 50.0, temperature_c=0.0)
@@ -172,7 +172,7 @@ def test_a_share_of_the_drop_follows_arrhenius_from_the_middle_of_the_models_ran
 @pytest.mark.parametrize(
     ("effect_id", "values", "rise"),
     [
-        ("resistance_temperature", {"share": 0.5, "activation_k": 2500.0},
+        ("resistance_temperature", {"share": 0.5, "activation_k": 2500.0, "reference_c": 23.0},
          0.5 * math.expm1(2500.0 * (1.0 / 278.15 - 1.0 / 296.15))),
         ("resistance_soc", {"at_empty": 2.0, "at_full": 0.0, "width_pct": 10.0}, 2.0 / math.e),
     ],

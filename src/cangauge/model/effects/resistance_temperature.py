@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 
-from cangauge.model.effects.arrhenius import ZERO_C_IN_K, inverse_k, inverse_k_at
+from cangauge.model.effects.arrhenius import inverse_k, inverse_k_at
 from cangauge.model.effects.effect import (
     DELAYED,
+    WITHIN_C,
     Effect,
     FloatArray,
     OnlineEffect,
@@ -24,7 +25,8 @@ from cangauge.model.voltage_model import VoltageModel
 class ResistanceTemperature(Effect):
     """A share of the voltage model's drop that follows Arrhenius' law.
 
-    It is 1 in the middle of the temperatures that the model was identified on.
+    It adds nothing at `reference_c`, the middle of the temperatures that the model was identified
+    on when the effect was added.
     """
 
     id = "resistance_temperature"
@@ -33,10 +35,11 @@ class ResistanceTemperature(Effect):
         Parameter("share", "1", 0.0, 3.0),
         Parameter("activation_k", "K", 100.0, 8000.0, neutral=None, grid=(1000.0, 2500.0, 4500.0)),
         DELAYED,
+        Parameter("reference_c", "°C", *WITHIN_C, neutral=None, from_pack="temperature_c"),
     )
     signature = "the drop over the resistance, growing with (T₀ − T)"
     equation = (
-        "ΔU = a·ΣRj·I(t − dj)·(exp(B·(1/T − 1/T₀)) − 1), T₀ the middle of the model's range;"
+        "ΔU = a·ΣRj·I(t − dj)·(exp(B·(1/T − 1/T₀)) − 1), T₀ = reference_c;"
         " or ΣRj·I in place of ΣRj·I(t − dj)"
     )
     source = "Waag, Käbitz, Sauer, Applied Energy 102 (2013) 885"
@@ -49,26 +52,23 @@ class ResistanceTemperature(Effect):
         self, state: PackState, values: Values, model: VoltageModel, pack: Pack
     ) -> FloatArray:
         """Return the change of the drop [V]."""
+        del model
         drop_v = state.scaled_drop_v(values["delayed"], pack)
-        colder = inverse_k(state.temperature_c) - _usual_per_k(model)
+        colder = inverse_k(state.temperature_c) - inverse_k_at(values["reference_c"])
         return values["share"] * drop_v * np.expm1(values["activation_k"] * colder)
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
         """Return the change of the drop at one sample at a time."""
-        return _Online(values, _usual_per_k(model), pack.resistance_ohm)
-
-
-def _usual_per_k(model: VoltageModel) -> float:
-    low, high = model.temperature_range_c
-    return 1.0 / (0.5 * (low + high) + ZERO_C_IN_K)
+        del model
+        return _Online(values, pack.resistance_ohm)
 
 
 class _Online(OnlineEffect):
-    def __init__(self, values: Values, usual_per_k: float, resistance_ohm: float) -> None:
+    def __init__(self, values: Values, resistance_ohm: float) -> None:
         self._share = values["share"]
         self._activation_k = values["activation_k"]
         self._delayed = values["delayed"]
-        self._usual_per_k = usual_per_k
+        self._usual_per_k = inverse_k_at(values["reference_c"])
         self._resistance_ohm = resistance_ohm
         self._volts = 0.0
 
