@@ -42,7 +42,7 @@ class Solution:
 
 def solve(
     columns: FloatArray, target: FloatArray, block: NDArray[np.intp], bounds: FloatArray | None,
-    at_least: float,
+    at_least: float | FloatArray,
 ) -> Solution:  # fmt: skip
     """Minimise |columns·x − target|² subject to bounds·x ≥ at_least.
 
@@ -53,7 +53,7 @@ def solve(
     block : array of shape (n,)
         Rows with the same number may have correlated residuals.
     bounds : array of shape (m, p), optional
-    at_least : float
+    at_least : float or array of shape (m,)
 
     Raises
     ------
@@ -70,7 +70,7 @@ def solve(
     z = left.T @ target
     constrained = bounds is not None and bool(np.any(bounds @ (back @ z) < at_least))
     if constrained and bounds is not None:
-        z = _nearest(z, bounds @ back, np.full(bounds.shape[0], at_least))
+        z = _nearest(z, bounds @ back, np.broadcast_to(at_least, bounds.shape[:1]))
     x = back @ z
     return Solution(
         coefficients=x,
@@ -107,6 +107,9 @@ def nearest_rising(
 def _nearest(z: FloatArray, bounds: FloatArray, at_least: FloatArray) -> FloatArray:
     """Return the point nearest to z with bounds·point ≥ at_least."""
     length = np.linalg.norm(bounds, axis=1)
+    # What no kept direction moves cannot be bounded.
+    moves = length > 0.0
+    bounds, at_least, length = bounds[moves], at_least[moves], length[moves]
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     solution = clarabel.DefaultSolver(

@@ -1,0 +1,318 @@
+"""Which effects clean logs show: forward selection, shapes moved, and a backward pass.
+
+Forward: every effect with every value of its shapes is weighed by a linear step on the folds; the
+most promising are fitted together with all that is there, on the model's own equations, and the
+best is taken if it is better by more than chance (`judge`). Backward: an effect whose removal
+costs no more than chance goes, the least missed first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from cangauge.errors import CangaugeError, InputError
+from cangauge.identify.effects.judge import Comparison, Judge, Judged, compare
+from cangauge.identify.effects.linear import Linear, linearise, refine, residual_of
+from cangauge.identify.effects.prepared import Prepared, as_modelled, effect_columns
+from cangauge.model.effects.candidate import Candidate, candidates
+from cangauge.model.effects.effect import Effect, Values
+from cangauge.model.effects.library import LIBRARY, effect_of, one_of
+from cangauge.model.extended import ExtendedModel
+
+Progress = Callable[[str], None]
+
+AUTO = "auto"
+
+CLEAN = (
+    "resistance_temperature", "resistance_soc", "resistance_asymmetry", "charge_transfer",
+    "fast_polarization", "slow_diffusion", "hysteresis", "entropic_coefficient",
+    "temperature_lag", "core_temperature",
+)  # fmt: skip
+"""Structure that a clean pack may well have and the coefficients lack: what `auto` tries."""
+
+REFUSED = {
+    "initial_soc": "it belongs to one log: give --initial-soc",
+    "resistance_step": "it belongs to one log: a clean pack has none",
+    "capacity": "give --capacity-ah; the curve over SoC follows it",
+    "current_gain": "resistances and capacity hold it: give --capacity-ah",
+    "voltage_offset": "k0 holds it",
+    "voltage_gain": "the coefficients hold it",
+}
+"""Effects that a fit cannot tell from its own numbers, and why."""
+
+EFFECTS_AT_MOST = 8
+TWICE = 2
+"""So often one effect may be taken, with different shapes: a chain of RC elements."""
+
+APART = 2.0
+"""Two elements of one effect differ in their time constants by this factor at least."""
+
+TRIES = 3
+"""So many of the best effects of a round are fitted in full before it is given up."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One effect taken, or left out again."""
+
+    what: Literal["added", "removed", "not added"]
+    effect_id: str
+    comparison: Comparison
+    """Against the model without it."""
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the step as `fit --json` prints it."""
+        return {
+            "step": self.what,
+            "effect": self.effect_id,
+            "held_out_rmse_without_v": self.comparison.before_rmse_v,
+            "held_out_rmse_with_v": self.comparison.after_rmse_v,
+            "t_value": self.comparison.t_value,
+            "t_needed": self.comparison.needed,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The model with the effects that were found."""
+
+    model: ExtendedModel
+    judged: Judged
+    plain: Judged
+    """Of the model without effects."""
+    steps: tuple[Step, ...]
+
+
+def parse_ids(given: Sequence[str]) -> tuple[str, ...]:
+    """Return effect ids from options that may hold several, separated by commas.
+
+    Raises
+    ------
+    InputError
+        If an id is unknown, cannot be told from the coefficients, is there too often, or stands
+        beside `auto`.
+    """
+    ids = [part.strip() for text in given for part in text.split(",")]
+    if ids == [AUTO]:
+        return (AUTO,)
+    if AUTO in ids:
+        raise InputError(
+            "auto chooses by itself", field="--effects", value=", ".join(ids),
+            cure="give auto alone, or ids alone",
+        )  # fmt: skip
+    for effect_id in ids:
+        effect_of(effect_id, "--effects")
+        if effect_id in REFUSED:
+            raise InputError(
+                "a fit on clean logs cannot find it",
+                field="--effects",
+                value=effect_id,
+                cure=REFUSED[effect_id],
+            )
+        often = TWICE if LIBRARY[effect_id].shapes and LIBRARY[effect_id].amplitudes else 1
+        if ids.count(effect_id) > often:
+            raise InputError(
+                f"may be there {'twice' if often == TWICE else 'once'}",
+                field="--effects",
+                value=", ".join(ids),
+            )
+    return tuple(ids)
+
+
+def find_effects(
+    plain: ExtendedModel,
+    logs: Sequence[Prepared],
+    ids: Sequence[str],
+    progress: Progress,
+) -> Found:
+    """Return the model with the effects that the logs show, or that were named.
+
+    Parameters
+    ----------
+    plain : ExtendedModel
+        The fitted voltage model, without effects.
+    logs : sequence of Prepared
+    ids : sequence of str
+        From `parse_ids`: `auto`, or effects that are all taken, whatever they bring.
+    progress : callable
+        Called with a line of text before each long step.
+
+    Raises
+    ------
+    InputError
+        If the logs are too short to judge anything.
+    """
+    judge = Judge(logs)
+    search = _Search(judge, judge(plain), progress)
+    if tuple(ids) == (AUTO,):
+        model, judged = search.forward(plain, search.plain)
+        model, judged = search.backward(model, judged)
+    else:
+        model, judged = search.named(plain, search.plain, ids)
+    return Found(model, judged, search.plain, tuple(search.steps))
+
+
+@dataclass(eq=False)
+class _Tried:
+    model: ExtendedModel
+    judged: Judged
+    comparison: Comparison
+
+    @property
+    def order(self) -> tuple[bool, float]:
+        """The better the smaller."""
+        return not self.comparison.better, self.judged.rmse_v
+
+
+class _Search:
+    def __init__(self, judge: Judge, plain: Judged, progress: Progress) -> None:
+        self.judge = judge
+        self.plain = plain
+        self.steps: list[Step] = []
+        self._say = progress
+
+    def forward(self, model: ExtendedModel, judged: Judged) -> tuple[ExtendedModel, Judged]:
+        """Take effects as long as one is better by more than chance."""
+        pool = [LIBRARY[effect_id] for effect_id in CLEAN]
+        while len(model.effects) < EFFECTS_AT_MOST:
+            best: tuple[Candidate, _Tried] | None = None
+            for choice in self._promising(model, pool)[:TRIES]:
+                tried = self._with(model, judged, choice, len(pool))
+                if tried is None:
+                    continue
+                if best is None or tried.order < best[1].order:
+                    best = choice, tried
+            if best is None:
+                break
+            choice, tried = best
+            taken = tried.comparison.better
+            self._note("added" if taken else "not added", choice.effect.id, tried.comparison)
+            if not taken:
+                break
+            model, judged = tried.model, tried.judged
+        return model, judged
+
+    def named(
+        self, model: ExtendedModel, judged: Judged, ids: Sequence[str]
+    ) -> tuple[ExtendedModel, Judged]:
+        """Take all effects that were named, the most helpful first."""
+        left = list(ids)
+        while left:
+            pool = [LIBRARY[effect_id] for effect_id in dict.fromkeys(left)]
+            for choice in self._promising(model, pool):
+                tried = self._with(model, judged, choice, 1)
+                if tried is not None:
+                    break
+            else:
+                raise InputError(
+                    "the model cannot be fitted with it", field="--effects", value=", ".join(left)
+                )
+            self._note("added", choice.effect.id, tried.comparison)
+            model, judged = tried.model, tried.judged
+            left.remove(choice.effect.id)
+        return model, judged
+
+    def backward(self, model: ExtendedModel, judged: Judged) -> tuple[ExtendedModel, Judged]:
+        """Leave out effects whose removal costs no more than chance, the least missed first."""
+        while len(model.effects) > 1:
+            least: _Tried | None = None
+            gone = ""
+            for number, (effect, _) in enumerate(model.effects):
+                self._say(f"effects: without {effect.id}")
+                kept = [item for k, item in enumerate(model.effects) if k != number]
+                without = refine(replace(model, effects=tuple(kept)), self.judge.logs)
+                seen = self.judge(without)
+                comparison = compare(seen, judged, len(CLEAN))
+                if least is None or seen.rmse_v < least.judged.rmse_v:
+                    least, gone = _Tried(without, seen, comparison), effect.id
+            if least is None or least.comparison.better:
+                break
+            self._note("removed", gone, least.comparison)
+            model, judged = least.model, least.judged
+        return model, judged
+
+    def _note(
+        self, what: Literal["added", "removed", "not added"], effect_id: str, found: Comparison
+    ) -> None:
+        self.steps.append(Step(what, effect_id, found))
+        self._say(
+            f"effects: {effect_id} {what}, held out {found.before_rmse_v:.3f} V without,"
+            f" {found.after_rmse_v:.3f} V with it"
+        )
+
+    def _promising(self, model: ExtendedModel, pool: Sequence[Effect]) -> list[Candidate]:
+        """Return each effect with its best shape, the most promising effect first."""
+        self._say(f"effects: weighing {len(pool)} beside {len(model.effects)} taken")
+        logs = self.judge.logs
+        choices = [
+            choice
+            for choice in candidates(pool, model.pack, logs[0].log.time_s)
+            if _beside(choice, model)
+        ]
+        if not choices:
+            return []
+        linear = linearise(model, logs)
+        columns = _columns(linear, logs, choices)
+        gains = self.judge.screen(linear, columns, [choice.bounds for choice in choices])
+        best: dict[str, tuple[float, Candidate]] = {}
+        for gain, choice in zip(gains, choices, strict=True):
+            if choice.effect.id not in best or gain > best[choice.effect.id][0]:
+                best[choice.effect.id] = gain, choice
+        return [choice for _, choice in sorted(best.values(), key=lambda item: -item[0])]
+
+    def _with(
+        self, model: ExtendedModel, judged: Judged, choice: Candidate, tried: int
+    ) -> _Tried | None:
+        """Return the model fitted with one more effect; None if it cannot be."""
+        self._say(f"effects: fitting {choice.effect.id} with the others")
+        start = choice.values(_inside(choice))
+        try:
+            more = refine(model.with_effect(choice.effect, start), self.judge.logs)
+        except CangaugeError:
+            return None
+        seen = self.judge(more)
+        return _Tried(more, seen, compare(judged, seen, tried))
+
+
+def _inside(choice: Candidate) -> np.ndarray:
+    """Return amplitudes to start from: small ones, so that the shapes already tell."""
+    return choice.steps
+
+
+def _columns(
+    linear: Linear, logs: Sequence[Prepared], choices: Sequence[Candidate]
+) -> list[np.ndarray]:
+    smooth = [as_modelled(item, linear.model) for item in logs]
+    here = [residual_of(linear.model, [item]) for item in smooth]
+    return [
+        np.vstack(
+            [
+                effect_columns(item, linear.model, choice, at)
+                for item, at in zip(smooth, here, strict=True)
+            ]
+        )
+        for choice in choices
+    ]
+
+
+def _beside(choice: Candidate, model: ExtendedModel) -> bool:
+    """Return whether a candidate is another one than the effects that the model has."""
+    values = choice.values(_inside(choice))
+    alike = [taken for effect, taken in model.effects if effect.id == choice.effect.id]
+    if len(alike) >= TWICE or (alike and not choice.shape):
+        return False
+    own = one_of(choice.effect, values)
+    return all(
+        own != one_of(choice.effect, taken) and _apart(values, taken) for taken in alike
+    )
+
+
+def _apart(one: Values, other: Values) -> bool:
+    if "tau_s" not in one:
+        return True
+    ratio = one["tau_s"] / other["tau_s"]
+    return max(ratio, 1.0 / ratio) >= APART
