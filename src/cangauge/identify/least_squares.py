@@ -8,7 +8,7 @@ problem is solved as a convex quadratic programme with the slope bounded from be
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import clarabel
 import numpy as np
@@ -38,6 +38,12 @@ class Solution:
     """Of the scaled columns."""
     constrained: bool
     """Whether the plain solution broke the bounds, so that they had to hold it."""
+
+    def part(self, first: int) -> Solution:
+        """Return what is known of the first coefficients."""
+        return replace(
+            self, coefficients=self.coefficients[:first], std_error=self.std_error[:first]
+        )
 
 
 def solve(

@@ -22,7 +22,6 @@ from cangauge.model.extended import ExtendedModel, Prediction
 from cangauge.model.voltage_model import (
     BASIS_NAMES,
     SLOPE_AT_LEAST,
-    VoltageModel,
     ocv_basis,
     ocv_basis_slope,
 )
@@ -39,9 +38,9 @@ SHAPE_WITHIN = (0.7, 1.4)
 REFINED_FROM = 3
 """A shape with fewer values to try is a choice between them; others are refined in between."""
 
-STEPS_AT_MOST, HALVINGS_AT_MOST = 8, 4
-CONVERGED = 1e-4
-"""The steps end when the sum of squares falls by less than this part."""
+STEPS_AT_MOST, HALVINGS_AT_MOST = 12, 4
+CONVERGED, ROUGHLY_CONVERGED = 1e-5, 1e-3
+"""The steps end when the sum of squares falls by less than this part; roughly, in a search."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +71,8 @@ class Linear:
     """The residual of all logs near a model: residual − columns·change; n rows in all."""
 
     model: ExtendedModel
+    here: tuple[Prediction, ...]
+    """What the model says of each log."""
     free: tuple[Free, ...]
     columns: FloatArray
     """Of the voltage model's coefficients, then of `free`, shape (n, p)."""
@@ -155,7 +156,7 @@ def linearise(model: ExtendedModel, logs: Sequence[Prepared]) -> Linear:
     for item in free:
         moved = _with_value(model, item, item.value + item.step)
         columns.append((residual_v - residual_of(moved, logs)) / item.step)
-    return Linear(model, free, np.column_stack(columns), residual_v)
+    return Linear(model, tuple(here), free, np.column_stack(columns), residual_v)
 
 
 def moved_by(linear: Linear, change: FloatArray) -> ExtendedModel:
@@ -184,10 +185,18 @@ def _with_value(model: ExtendedModel, item: Free, value: float) -> ExtendedModel
 
 
 def spanning(
-    model: ExtendedModel, logs: Sequence[Prepared], keep: Mask | None = None
+    model: ExtendedModel, here: Sequence[Prediction], keep: Mask | None = None
 ) -> ExtendedModel:
-    """Return the model with its ranges set to what the (corrected) rows of the logs span."""
-    here = predictions(model, logs)
+    """Return the model with its ranges set to what the (corrected) rows of the logs span.
+
+    Parameters
+    ----------
+    model : ExtendedModel
+    here : sequence of Prediction
+        What the model says of each log.
+    keep : array of bool, shape (n,), optional
+        Rows of all logs that count; all by default.
+    """
     kept = slice(None) if keep is None else keep
 
     def span(values: Sequence[FloatArray]) -> tuple[float, float]:
@@ -196,26 +205,13 @@ def spanning(
         )[kept]
         return float(of_rows.min()), float(of_rows.max())
 
-    return replace(
-        model,
-        model=_ranges(
-            model.model,
-            span([item.soc_pct for item in here]),
-            span([item.signals.temperature_c for item in here]),
-            span([item.signals.current_a for item in here]),
-        ),
+    ranged = replace(
+        model.model,
+        soc_range_pct=span([item.soc_pct for item in here]),
+        temperature_range_c=span([item.signals.temperature_c for item in here]),
+        current_range_a=span([item.signals.current_a for item in here]),
     )
-
-
-def _ranges(
-    model: VoltageModel,
-    soc_pct: tuple[float, float],
-    temperature_c: tuple[float, float],
-    current_a: tuple[float, float],
-) -> VoltageModel:
-    return replace(
-        model, soc_range_pct=soc_pct, temperature_range_c=temperature_c, current_range_a=current_a
-    )
+    return replace(model, model=ranged)
 
 
 def step_on(linear: Linear, keep: Mask | None = None) -> FloatArray:
@@ -239,34 +235,34 @@ def best_change(compact: FloatArray, limits: tuple[FloatArray, FloatArray]) -> F
     return solve(compact[:, :-1], compact[:, -1], rows, *limits).coefficients
 
 
-def refine(model: ExtendedModel, logs: Sequence[Prepared]) -> ExtendedModel:
+def refine(
+    model: ExtendedModel, logs: Sequence[Prepared], converged: float = CONVERGED
+) -> ExtendedModel:
     """Return the model fitted to the logs on its own equations, its ranges those of the logs."""
-    model = spanning(model, logs)
-    square = _square(model, logs)
+    model, square = _ranged(model, logs)
     for _ in range(STEPS_AT_MOST):
         linear = linearise(model, logs)
         change = step_on(linear)
         for _halving in range(HALVINGS_AT_MOST):
             try:
-                trial = spanning(moved_by(linear, change), logs)
+                trial, now = _ranged(moved_by(linear, change), logs)
             except InputError:
-                change = 0.5 * change
-                continue
-            now = _square(trial, logs)
+                now = np.inf
             if now < square:
                 break
             change = 0.5 * change
         else:
             return model
         model, before, square = trial, square, now
-        if square > (1.0 - CONVERGED) * before:
+        if square > (1.0 - converged) * before:
             break
     return model
 
 
-def _square(model: ExtendedModel, logs: Sequence[Prepared]) -> float:
-    residual_v = residual_of(model, logs)
-    return float(residual_v @ residual_v)
+def _ranged(model: ExtendedModel, logs: Sequence[Prepared]) -> tuple[ExtendedModel, float]:
+    """Return the model with the ranges of the logs, and its sum of squares [V²]."""
+    here = predictions(model, logs)
+    return spanning(model, here), float(sum(item.residual_v @ item.residual_v for item in here))
 
 
 def solution_at(linear: Linear, block: NDArray[np.intp]) -> Solution:

@@ -16,7 +16,13 @@ import numpy as np
 
 from cangauge.errors import CangaugeError, InputError
 from cangauge.identify.effects.judge import Comparison, Judge, Judged, compare
-from cangauge.identify.effects.linear import Linear, linearise, refine, residual_of
+from cangauge.identify.effects.linear import (
+    ROUGHLY_CONVERGED,
+    Linear,
+    linearise,
+    refine,
+    residual_of,
+)
 from cangauge.identify.effects.prepared import Prepared, as_modelled, effect_columns
 from cangauge.model.effects.candidate import Candidate, candidates
 from cangauge.model.effects.effect import Effect, Values
@@ -127,7 +133,7 @@ def find_effects(
     plain: ExtendedModel,
     logs: Sequence[Prepared],
     ids: Sequence[str],
-    progress: Progress,
+    say: Progress,
 ) -> Found:
     """Return the model with the effects that the logs show, or that were named.
 
@@ -138,7 +144,7 @@ def find_effects(
     logs : sequence of Prepared
     ids : sequence of str
         From `parse_ids`: `auto`, or effects that are all taken, whatever they bring.
-    progress : callable
+    say : callable
         Called with a line of text before each long step.
 
     Raises
@@ -147,12 +153,16 @@ def find_effects(
         If the logs are too short to judge anything.
     """
     judge = Judge(logs)
-    search = _Search(judge, judge(plain), progress)
+    search = _Search(judge, judge(plain), say)
     if tuple(ids) == (AUTO,):
         model, judged = search.forward(plain, search.plain)
         model, judged = search.backward(model, judged)
     else:
         model, judged = search.named(plain, search.plain, ids)
+    if model.effects:
+        say("effects: fitting all of them once more")
+        model = refine(model, logs)
+        judged = judge(model)
     return Found(model, judged, search.plain, tuple(search.steps))
 
 
@@ -169,11 +179,11 @@ class _Tried:
 
 
 class _Search:
-    def __init__(self, judge: Judge, plain: Judged, progress: Progress) -> None:
+    def __init__(self, judge: Judge, plain: Judged, say: Progress) -> None:
         self.judge = judge
         self.plain = plain
         self.steps: list[Step] = []
-        self._say = progress
+        self._say = say
 
     def forward(self, model: ExtendedModel, judged: Judged) -> tuple[ExtendedModel, Judged]:
         """Take effects as long as one is better by more than chance."""
@@ -181,11 +191,13 @@ class _Search:
         while len(model.effects) < EFFECTS_AT_MOST:
             best: tuple[Candidate, _Tried] | None = None
             for choice in self._promising(model, pool)[:TRIES]:
-                tried = self._with(model, judged, choice, len(pool))
+                tried = self._with(model, judged, choice)
                 if tried is None:
                     continue
                 if best is None or tried.order < best[1].order:
                     best = choice, tried
+                if tried.comparison.better:
+                    break
             if best is None:
                 break
             choice, tried = best
@@ -204,7 +216,7 @@ class _Search:
         while left:
             pool = [LIBRARY[effect_id] for effect_id in dict.fromkeys(left)]
             for choice in self._promising(model, pool):
-                tried = self._with(model, judged, choice, 1)
+                tried = self._with(model, judged, choice)
                 if tried is not None:
                     break
             else:
@@ -224,9 +236,10 @@ class _Search:
             for number, (effect, _) in enumerate(model.effects):
                 self._say(f"effects: without {effect.id}")
                 kept = [item for k, item in enumerate(model.effects) if k != number]
-                without = refine(replace(model, effects=tuple(kept)), self.judge.logs)
+                fewer = replace(model, effects=tuple(kept))
+                without = refine(fewer, self.judge.logs, ROUGHLY_CONVERGED)
                 seen = self.judge(without)
-                comparison = compare(seen, judged, len(CLEAN))
+                comparison = compare(seen, judged)
                 if least is None or seen.rmse_v < least.judged.rmse_v:
                     least, gone = _Tried(without, seen, comparison), effect.id
             if least is None or least.comparison.better:
@@ -264,18 +277,17 @@ class _Search:
                 best[choice.effect.id] = gain, choice
         return [choice for _, choice in sorted(best.values(), key=lambda item: -item[0])]
 
-    def _with(
-        self, model: ExtendedModel, judged: Judged, choice: Candidate, tried: int
-    ) -> _Tried | None:
+    def _with(self, model: ExtendedModel, judged: Judged, choice: Candidate) -> _Tried | None:
         """Return the model fitted with one more effect; None if it cannot be."""
         self._say(f"effects: fitting {choice.effect.id} with the others")
         start = choice.values(_inside(choice))
         try:
-            more = refine(model.with_effect(choice.effect, start), self.judge.logs)
+            with_it = model.with_effect(choice.effect, start)
+            more = refine(with_it, self.judge.logs, ROUGHLY_CONVERGED)
         except CangaugeError:
             return None
         seen = self.judge(more)
-        return _Tried(more, seen, compare(judged, seen, tried))
+        return _Tried(more, seen, compare(judged, seen))
 
 
 def _inside(choice: Candidate) -> np.ndarray:
@@ -306,9 +318,7 @@ def _beside(choice: Candidate, model: ExtendedModel) -> bool:
     if len(alike) >= TWICE or (alike and not choice.shape):
         return False
     own = one_of(choice.effect, values)
-    return all(
-        own != one_of(choice.effect, taken) and _apart(values, taken) for taken in alike
-    )
+    return all(own != one_of(choice.effect, taken) and _apart(values, taken) for taken in alike)
 
 
 def _apart(one: Values, other: Values) -> bool:
