@@ -218,8 +218,12 @@ class Comparison:
     @property
     def better(self) -> bool:
         """Whether the second is better by more than chance, and by enough."""
-        fallen = self.after_rmse_v <= (1.0 - GAIN_AT_LEAST) * self.before_rmse_v
-        return fallen and self.t_value > self.needed
+        return self.worth_it and self.t_value > self.needed
+
+    @property
+    def worth_it(self) -> bool:
+        """Whether the error falls by enough, be it by chance."""
+        return self.after_rmse_v <= (1.0 - GAIN_AT_LEAST) * self.before_rmse_v
 
 
 def compare(before: Judged, after: Judged) -> Comparison:

@@ -2,15 +2,15 @@
 
 Forward: every effect with every value of its shapes is weighed by a linear step on the folds; the
 most promising are fitted together with all that is there, on the model's own equations, and the
-best is taken if it is better by more than chance (`judge`). Backward: an effect whose removal
-costs no more than chance goes, the least missed first.
+better one is taken if it is so by more than chance (`judge`). Backward: an effect whose removal
+costs no more than chance goes, the least missed first; and each is weighed against the best other
+one in its place.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -57,18 +57,19 @@ TWICE = 2
 APART = 2.0
 """Two elements of one effect differ in their time constants by this factor at least."""
 
-TRIES = 3
-"""So many of the best effects of a round are fitted in full before it is given up."""
+TRIES = 2
+"""So many of the most promising effects of a round are fitted in full; the better one counts."""
 
 
 @dataclass(frozen=True)
 class Step:
     """One effect taken, or left out again."""
 
-    what: Literal["added", "removed", "not added"]
+    what: str
+    """`added`, `not added`, `removed`, or `in place of` another."""
     effect_id: str
     comparison: Comparison
-    """Against the model without it."""
+    """Against the model without it (with the other, where it takes its place)."""
 
     def to_dict(self) -> dict[str, object]:
         """Return the step as `fit --json` prints it."""
@@ -196,8 +197,6 @@ class _Search:
                     continue
                 if best is None or tried.order < best[1].order:
                     best = choice, tried
-                if tried.comparison.better:
-                    break
             if best is None:
                 break
             choice, tried = best
@@ -229,28 +228,47 @@ class _Search:
         return model, judged
 
     def backward(self, model: ExtendedModel, judged: Judged) -> tuple[ExtendedModel, Judged]:
-        """Leave out effects whose removal costs no more than chance, the least missed first."""
-        while len(model.effects) > 1:
-            least: _Tried | None = None
-            gone = ""
-            for number, (effect, _) in enumerate(model.effects):
-                self._say(f"effects: without {effect.id}")
-                kept = [item for k, item in enumerate(model.effects) if k != number]
-                fewer = replace(model, effects=tuple(kept))
-                without = refine(fewer, self.judge.logs, ROUGHLY_CONVERGED)
-                seen = self.judge(without)
-                comparison = compare(seen, judged)
-                if least is None or seen.rmse_v < least.judged.rmse_v:
-                    least, gone = _Tried(without, seen, comparison), effect.id
-            if least is None or least.comparison.better:
+        """Leave out effects whose removal costs no more than chance; try others in their place."""
+        for _ in range(EFFECTS_AT_MOST):
+            if len(model.effects) < 2:
                 break
-            self._note("removed", gone, least.comparison)
-            model, judged = least.model, least.judged
+            fewer = [self._without(model, judged, k) for k in range(len(model.effects))]
+            least = min(fewer, key=lambda item: item.judged.rmse_v)
+            if not least.comparison.better:
+                gone = model.effects[fewer.index(least)][0].id
+                self._note("removed", gone, least.comparison)
+                model, judged = least.model, least.judged
+                continue
+            exchanged = self._exchanged(model, judged, fewer)
+            if exchanged is None:
+                break
+            model, judged = exchanged.model, exchanged.judged
         return model, judged
 
-    def _note(
-        self, what: Literal["added", "removed", "not added"], effect_id: str, found: Comparison
-    ) -> None:
+    def _without(self, model: ExtendedModel, judged: Judged, number: int) -> _Tried:
+        self._say(f"effects: without {model.effects[number][0].id}")
+        kept = tuple(item for k, item in enumerate(model.effects) if k != number)
+        without = refine(replace(model, effects=kept), self.judge.logs, ROUGHLY_CONVERGED)
+        seen = self.judge(without)
+        return _Tried(without, seen, compare(seen, judged))
+
+    def _exchanged(
+        self, model: ExtendedModel, judged: Judged, fewer: Sequence[_Tried]
+    ) -> _Tried | None:
+        """Return the model with one effect in the place of another, if that is better.
+
+        What was taken first stood in for what came later; it need not be the best beside it.
+        """
+        for (gone, _), without in zip(model.effects, fewer, strict=True):
+            pool = [LIBRARY[effect_id] for effect_id in CLEAN if effect_id != gone.id]
+            for choice in self._promising(without.model, pool)[:1]:
+                tried = self._with(without.model, judged, choice)
+                if tried is not None and tried.comparison.worth_it:
+                    self._note(f"in place of {gone.id}", choice.effect.id, tried.comparison)
+                    return tried
+        return None
+
+    def _note(self, what: str, effect_id: str, found: Comparison) -> None:
         self.steps.append(Step(what, effect_id, found))
         self._say(
             f"effects: {effect_id} {what}, held out {found.before_rmse_v:.3f} V without,"
