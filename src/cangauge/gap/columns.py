@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cangauge.identify.effects.linear import coefficient_columns, predictions
 from cangauge.identify.effects.prepared import (
     Prepared,
     as_modelled,
@@ -90,7 +91,10 @@ def log_terms(prepared: Prepared, model: ExtendedModel, choices: Sequence[Candid
     return LogTerms(
         prepared=prepared,
         residual_v=residual(prepared, model),
-        baseline=columns_of(rows, voltage_model.epsilon, voltage_model.t_ref_c),
+        # Effects that the model has already may scale what its coefficients multiply.
+        baseline=coefficient_columns(model, [prepared], predictions(model, [prepared]))
+        if model.effects
+        else columns_of(rows, voltage_model.epsilon, voltage_model.t_ref_c),
         own=own,
         effects=tuple(effect_columns(smooth, model, choice, here) for choice in choices),
     )

@@ -139,24 +139,36 @@ def residual_of(model: ExtendedModel, logs: Sequence[Prepared]) -> FloatArray:
 
 def linearise(model: ExtendedModel, logs: Sequence[Prepared]) -> Linear:
     """Return the residual of the logs near a model."""
-    voltage_model = model.model
     here = predictions(model, logs)
     residual_v = np.concatenate([item.residual_v for item in here])
-    soc = np.concatenate([item.soc_pct[item.rows] for item in here])
-    coefficients = voltage_model.coefficients
-    n = len(BASIS_NAMES)
-    columns = [ocv_basis(np.clip(soc, *voltage_model.soc_range_pct), voltage_model.epsilon)]
-    # The model is linear in kt and the resistances, whatever effects scale them: any step will do.
-    for k in range(n, coefficients.size):
-        step = np.zeros(coefficients.size)
-        step[k] = max(abs(coefficients[k]), 1e-3)
-        moved = replace(model, model=voltage_model.with_coefficients(coefficients + step))
-        columns.append((residual_v - residual_of(moved, logs)) / step[k])
+    columns = [coefficient_columns(model, logs, here)]
     free = free_of(model)
     for item in free:
         moved = _with_value(model, item, item.value + item.step)
         columns.append((residual_v - residual_of(moved, logs)) / item.step)
     return Linear(model, tuple(here), free, np.column_stack(columns), residual_v)
+
+
+def coefficient_columns(
+    model: ExtendedModel, logs: Sequence[Prepared], here: Sequence[Prediction]
+) -> FloatArray:
+    """Return how the voltage moves with k0 … k7, kt, R1 … Rn, effects included, shape (n, p).
+
+    Without effects these are the columns of the fit (`voltage_fit.columns_of`). An effect may
+    scale the drop, or the temperature, that a coefficient multiplies.
+    """
+    voltage_model = model.model
+    residual_v = np.concatenate([item.residual_v for item in here])
+    soc = np.concatenate([item.soc_pct[item.rows] for item in here])
+    coefficients = voltage_model.coefficients
+    columns = [ocv_basis(np.clip(soc, *voltage_model.soc_range_pct), voltage_model.epsilon)]
+    # The model is linear in kt and the resistances, whatever effects scale them: any step will do.
+    for k in range(len(BASIS_NAMES), coefficients.size):
+        step = np.zeros(coefficients.size)
+        step[k] = max(abs(coefficients[k]), 1e-3)
+        moved = replace(model, model=voltage_model.with_coefficients(coefficients + step))
+        columns.append((residual_v - residual_of(moved, logs)) / step[k])
+    return np.column_stack(columns)
 
 
 def moved_by(linear: Linear, change: FloatArray) -> ExtendedModel:
