@@ -7,8 +7,9 @@ log that is hard for both does not outweigh the others.
 
 The rule: a model with one more effect is better by more than chance if the mean of these
 logarithms exceeds its standard error by so much as Student's t exceeds with probability `CHANCE`
-(2.2 standard errors for eleven logs, 4.3 for three), and if the pooled root mean square error
-falls by `GAIN_AT_LEAST`. One standard error would let in the best of ten useless effects too often.
+(2.2 standard errors for eleven logs, 4.3 for three) over the effect's amplitudes, and if the pooled
+root mean square error falls by `GAIN_AT_LEAST`. One standard error would let in the best of ten
+useless effects too often, and those with several amplitudes first.
 """
 
 from __future__ import annotations
@@ -226,8 +227,15 @@ class Comparison:
         return self.after_rmse_v <= (1.0 - GAIN_AT_LEAST) * self.before_rmse_v
 
 
-def compare(before: Judged, after: Judged) -> Comparison:
-    """Compare two models on the same rows."""
+def compare(before: Judged, after: Judged, amplitudes: int = 1) -> Comparison:
+    """Compare two models on the same rows.
+
+    Parameters
+    ----------
+    before, after : Judged
+    amplitudes : int
+        Of the effect that the second has beside the first.
+    """
     logs = np.log(before.unit_v2) - np.log(after.unit_v2)
     n = logs.size
     t_value = -math.inf
@@ -238,7 +246,7 @@ def compare(before: Judged, after: Judged) -> Comparison:
         before.rmse_v,
         after.rmse_v,
         t_value,
-        float(student_t.ppf(1.0 - CHANCE, n - 1)),
+        float(student_t.ppf(1.0 - CHANCE / amplitudes, n - 1)),
     )
 
 

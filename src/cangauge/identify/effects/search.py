@@ -250,7 +250,8 @@ class _Search:
         kept = tuple(item for k, item in enumerate(model.effects) if k != number)
         without = refine(replace(model, effects=kept), self.judge.logs, ROUGHLY_CONVERGED)
         seen = self.judge(without)
-        return _Tried(without, seen, compare(seen, judged))
+        amplitudes = _amplitudes(model.effects[number][0])
+        return _Tried(without, seen, compare(seen, judged, amplitudes))
 
     def _exchanged(
         self, model: ExtendedModel, judged: Judged, fewer: Sequence[_Tried]
@@ -305,7 +306,11 @@ class _Search:
         except CangaugeError:
             return None
         seen = self.judge(more)
-        return _Tried(more, seen, compare(judged, seen))
+        return _Tried(more, seen, compare(judged, seen, len(choice.amplitudes)))
+
+
+def _amplitudes(effect: Effect) -> int:
+    return max(len(effect.amplitudes), 1)
 
 
 def _inside(choice: Candidate) -> np.ndarray:
