@@ -120,6 +120,7 @@ def test_auto_takes_nothing_on_logs_without_effects() -> None:
     assert result.found.model.effects == ()
     assert result.model.effects == []
     assert {step.what for step in result.found.steps} <= {"not added"}
+    assert any("none taken" in remark for remark in result.remarks)
     plain = fit(trips("nothing"), OPTIONS)
     for key, item in plain.model.coefficients.items():
         assert result.model.coefficients[key].value == pytest.approx(item.value, rel=1e-6)
@@ -148,6 +149,7 @@ def test_named_effects_are_all_taken_and_reported() -> None:
     assert [step.effect_id for step in result.found.steps] == ids  # the more helpful one first
     value, std_error = parameters(result, "resistance_asymmetry")["charging_ohm"]
     assert abs(value) < 3.5 * std_error + 1e-9  # there is none
+    assert not any("bound" in remark for remark in result.remarks)
     described = result.to_dict()
     assert [item["id"] for item in described["effects"]] == ids
     assert described["effects"][0]["parameters"]["share"]["unit"] == "1"
@@ -165,6 +167,17 @@ def test_the_model_file_runs_in_the_estimator_and_gives_the_fits_own_newton(name
         at = np.searchsorted(log.time_s, rows.time_s)
         expected = result.fits[number].soc_newton_pct
         np.testing.assert_allclose(table.soc_newton_pct[at], expected, atol=1e-6)
+
+
+def test_a_parameter_that_physics_holds_is_said_so() -> None:
+    """Cold would need a share below zero on a pack whose resistance falls in the cold."""
+    turned = []
+    for log, plain in zip(trips("cold"), trips("nothing"), strict=True):
+        turned.append(replace(log, voltage_v=2.0 * plain.voltage_v - log.voltage_v))
+    result = fit(turned, replace(OPTIONS, effects=("resistance_temperature",)))
+    assert parameters(result, "resistance_temperature")["share"][0] == pytest.approx(0.0, abs=1e-3)
+    assert any("share lies at its bound of 0" in remark for remark in result.remarks)
+    assert all(resistance < 0.0 for resistance in result.voltage_model.resistance_ohm)
 
 
 def test_information_holds_the_coefficients_with_the_effects_left_open() -> None:

@@ -163,7 +163,10 @@ def fit(
         voltage_mae_pct=100.0 * float(np.mean(np.abs(residual) / volts)),
         voltage_rmse_v=float(np.sqrt(np.mean(residual**2))),
         soc_newton_mae_pct=float(np.mean(np.abs(newton_error))),
-        remarks=tuple(_remarks(voltage_model, solution, rows)),
+        remarks=(
+            *_remarks(voltage_model, solution, rows),
+            *(found.remarks() if found is not None else ()),
+        ),
         found=found,
     )
 

@@ -18,6 +18,10 @@ from cangauge.model.extended import ExtendedModel
 FloatArray = NDArray[np.float64]
 
 
+AT_BOUND = 1e-6
+"""A parameter this near its bound, in parts of the bounds, is held by it."""
+
+
 @dataclass(frozen=True)
 class Estimate:
     """One parameter of an effect."""
@@ -49,6 +53,23 @@ class FittedEffects:
     held_out_rmse_v: tuple[float, float]
     """Without any effect, and with all of them [V]."""
     steps: tuple[Step, ...]
+
+    def remarks(self) -> list[str]:
+        """Return what a user should know of the effects beside their numbers."""
+        before, after = self.held_out_rmse_v
+        if not self.model.effects:
+            return ["no effect lowers the error on data left out by more than chance: none taken"]
+        found = ["the slope resistance expected from the coefficients leaves out the effects' part"]
+        if after > before:
+            found.append("the effects raise the error on data left out: leave them out")
+        for item in self.linear.free:
+            reach = AT_BOUND * (item.high - item.low)
+            edge = {item.low: item.value - item.low, item.high: item.high - item.value}
+            for bound, distance in edge.items():
+                if distance <= reach:
+                    effect = self.model.effects[item.effect][0]
+                    found.append(f"{effect.id}: {item.name} lies at its bound of {bound:.4g}")
+        return found
 
     def to_dict(self) -> dict[str, object]:
         """Return the part of `cangauge fit --json` that is about effects."""
