@@ -13,10 +13,10 @@ import pytest
 from cangauge.errors import InputError
 from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import estimate_log
+from cangauge.identify.effects.ids import CLEAN, REFUSED, parse_ids
 from cangauge.identify.effects.judge import Judge, Judged, compare
 from cangauge.identify.effects.linear import linearise, moved_by, residual_of
 from cangauge.identify.effects.prepared import Prepared, prepare_log
-from cangauge.identify.effects.search import CLEAN, REFUSED, parse_ids
 from cangauge.identify.fit import FitOptions, Identification, fit
 from cangauge.logs.log import Log
 from cangauge.model.effects.effect import Signals

@@ -29,7 +29,7 @@ from cangauge.cli.tables import print_table
 from cangauge.errors import InputError
 from cangauge.identify.charge import capacity_from_full_discharge, capacity_from_reference
 from cangauge.identify.delays import DelaySearch, search_delays
-from cangauge.identify.effects.search import parse_ids
+from cangauge.identify.effects.ids import parse_ids
 from cangauge.identify.fit import FitOptions, Identification, fit
 from cangauge.logs.log import Log
 from cangauge.model.model_file import model_json

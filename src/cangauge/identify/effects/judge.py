@@ -127,7 +127,7 @@ class Judge:
                 f"{seconds:.0f} s of data are too few to hold rows out and judge effects on them",
                 source=", ".join(item.log.name for item in logs),
                 field="effects",
-                cure="give an hour with changing load, or better three logs and more; or fit"
+                cure="give an hour with changing load, or three logs and more over the same SoC; or fit"
                 " without --effects",
             )
 

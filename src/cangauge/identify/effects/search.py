@@ -15,9 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cangauge.errors import CangaugeError, InputError
+from cangauge.identify.effects.ids import AUTO, CLEAN, TWICE
 from cangauge.identify.effects.judge import Comparison, Judge, Judged, compare
 from cangauge.identify.effects.linear import (
     ROUGHLY_CONVERGED,
+    FloatArray,
     Linear,
     linearise,
     refine,
@@ -26,34 +28,12 @@ from cangauge.identify.effects.linear import (
 from cangauge.identify.effects.prepared import Prepared, as_modelled, effect_columns
 from cangauge.model.effects.candidate import Candidate, candidates
 from cangauge.model.effects.effect import Effect, Values
-from cangauge.model.effects.library import LIBRARY, effect_of, one_of
+from cangauge.model.effects.library import LIBRARY, effect_entries, one_of, parse_effects
 from cangauge.model.extended import ExtendedModel
 
 Progress = Callable[[str], None]
 
-AUTO = "auto"
-
-CLEAN = (
-    "resistance_temperature", "resistance_soc", "resistance_asymmetry", "charge_transfer",
-    "fast_polarization", "slow_diffusion", "hysteresis", "entropic_coefficient",
-    "temperature_lag", "core_temperature",
-)  # fmt: skip
-"""Structure that a clean pack may well have and the coefficients lack: what `auto` tries."""
-
-REFUSED = {
-    "initial_soc": "it belongs to one log: give --initial-soc",
-    "resistance_step": "it belongs to one log: a clean pack has none",
-    "capacity": "give --capacity-ah; the curve over SoC follows it",
-    "current_gain": "resistances and capacity hold it: give --capacity-ah",
-    "voltage_offset": "k0 holds it",
-    "voltage_gain": "the coefficients hold it",
-}
-"""Effects that a fit cannot tell from its own numbers, and why."""
-
 EFFECTS_AT_MOST = 8
-TWICE = 2
-"""So often one effect may be taken, with different shapes: a chain of RC elements."""
-
 APART = 2.0
 """Two elements of one effect differ in their time constants by this factor at least."""
 
@@ -94,42 +74,6 @@ class Found:
     steps: tuple[Step, ...]
 
 
-def parse_ids(given: Sequence[str]) -> tuple[str, ...]:
-    """Return effect ids from options that may hold several, separated by commas.
-
-    Raises
-    ------
-    InputError
-        If an id is unknown, cannot be told from the coefficients, is there too often, or stands
-        beside `auto`.
-    """
-    ids = [part.strip() for text in given for part in text.split(",")]
-    if ids == [AUTO]:
-        return (AUTO,)
-    if AUTO in ids:
-        raise InputError(
-            "auto chooses by itself", field="--effects", value=", ".join(ids),
-            cure="give auto alone, or ids alone",
-        )  # fmt: skip
-    for effect_id in ids:
-        effect_of(effect_id, "--effects")
-        if effect_id in REFUSED:
-            raise InputError(
-                "a fit on clean logs cannot find it",
-                field="--effects",
-                value=effect_id,
-                cure=REFUSED[effect_id],
-            )
-        often = TWICE if LIBRARY[effect_id].shapes and LIBRARY[effect_id].amplitudes else 1
-        if ids.count(effect_id) > often:
-            raise InputError(
-                f"may be there {'twice' if often == TWICE else 'once'}",
-                field="--effects",
-                value=", ".join(ids),
-            )
-    return tuple(ids)
-
-
 def find_effects(
     plain: ExtendedModel,
     logs: Sequence[Prepared],
@@ -144,7 +88,7 @@ def find_effects(
         The fitted voltage model, without effects.
     logs : sequence of Prepared
     ids : sequence of str
-        From `parse_ids`: `auto`, or effects that are all taken, whatever they bring.
+        From `ids.parse_ids`: `auto`, or effects that are all taken, whatever they bring.
     say : callable
         Called with a line of text before each long step.
 
@@ -200,6 +144,7 @@ class _Search:
             if best is None:
                 break
             choice, tried = best
+            # The better one of those tried, and only if it is so by more than chance.
             taken = tried.comparison.better
             self._note("added" if taken else "not added", choice.effect.id, tried.comparison)
             if not taken:
@@ -303,6 +248,8 @@ class _Search:
         try:
             with_it = model.with_effect(choice.effect, start)
             more = refine(with_it, self.judge.logs, ROUGHLY_CONVERGED)
+            # Two elements may have become one, or bounds that follow the resistance left behind.
+            parse_effects(effect_entries(more.effects), more.pack)
         except CangaugeError:
             return None
         seen = self.judge(more)
@@ -313,14 +260,14 @@ def _amplitudes(effect: Effect) -> int:
     return max(len(effect.amplitudes), 1)
 
 
-def _inside(choice: Candidate) -> np.ndarray:
+def _inside(choice: Candidate) -> FloatArray:
     """Return amplitudes to start from: small ones, so that the shapes already tell."""
     return choice.steps
 
 
 def _columns(
     linear: Linear, logs: Sequence[Prepared], choices: Sequence[Candidate]
-) -> list[np.ndarray]:
+) -> list[FloatArray]:
     smooth = [as_modelled(item, linear.model) for item in logs]
     here = [residual_of(linear.model, [item]) for item in smooth]
     return [
