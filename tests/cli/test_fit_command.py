@@ -145,7 +145,7 @@ def test_too_short_a_log_for_effects_is_refused(run: Run, made: Path, tmp_path: 
     write_log(log.rows(np.arange(700)), tmp_path / "short.csv")
     given = ("fit", tmp_path / "short.csv", "-o", tmp_path / "m.json", "--capacity-ah", "51.5")
     assert run(*given).code == 0
-    refused(run(*given, "--effects", "auto"), "short", "too few to hold rows out", "--effects")
+    refused(run(*given, "--effects", "auto"), "short", "can be held out", "--effects")
 
 
 @pytest.mark.parametrize(

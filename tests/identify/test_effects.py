@@ -270,6 +270,6 @@ def test_ids_come_in_lists_and_repeated() -> None:
 def test_one_short_log_shows_no_effect() -> None:
     short = synthetic_log(hours=0.25, start_pct=80.0, end_pct=70.0, noise_v=0.3)
     assert fit([short], OPTIONS).model.effects == []
-    with pytest.raises(InputError, match="too few to hold rows out") as error:
+    with pytest.raises(InputError, match="can be held out") as error:
         fit([short], replace(OPTIONS, effects=("auto",)))
     assert "--effects" in str(error.value)

@@ -124,11 +124,12 @@ class Judge:
         if not self.folds or np.unique(self.unit[judged]).size < UNITS_AT_LEAST:
             seconds = sum(item.log.duration_s for item in logs)
             raise InputError(
-                f"{seconds:.0f} s of data are too few to hold rows out and judge effects on them",
+                f"too little of {seconds:.0f} s in {len(logs)} log{'s' * (len(logs) > 1)} can be held"
+                " out to judge effects on",
                 source=", ".join(item.log.name for item in logs),
                 field="effects",
-                cure="give an hour with changing load, or three logs and more over the same SoC; or fit"
-                " without --effects",
+                cure="give an hour with changing load, or three logs and more over the same SoC;"
+                " or fit without --effects",
             )
 
     def __call__(self, model: ExtendedModel) -> Judged:
