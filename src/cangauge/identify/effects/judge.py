@@ -124,8 +124,7 @@ class Judge:
         if not self.folds or np.unique(self.unit[judged]).size < UNITS_AT_LEAST:
             seconds = sum(item.log.duration_s for item in logs)
             raise InputError(
-                f"too little of {seconds:.0f} s in {len(logs)} log{'s' * (len(logs) > 1)} can be held"
-                " out to judge effects on",
+                f"too little of {seconds:.0f} s of data can be held out to judge effects on",
                 source=", ".join(item.log.name for item in logs),
                 field="effects",
                 cure="give an hour with changing load, or three logs and more over the same SoC;"
