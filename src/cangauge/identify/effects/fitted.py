@@ -11,12 +11,17 @@ from numpy.typing import NDArray
 from cangauge.identify.effects.linear import Linear, linearise, solution_at
 from cangauge.identify.effects.prepared import Prepared
 from cangauge.identify.effects.search import Progress, Step, find_effects
+from cangauge.identify.held_out import LOGS_AT_LEAST
 from cangauge.identify.least_squares import Solution
 from cangauge.identify.voltage_fit import blocks_of
 from cangauge.model.extended import ExtendedModel
 
 FloatArray = NDArray[np.float64]
 
+
+FEW_LOGS = 5
+"""With fewer whole logs, simulated ones without effects but with errors that last as long as a log
+still showed an effect in two of ten cases."""
 
 AT_BOUND = 1e-6
 """A parameter this near its bound, in parts of the bounds, is held by it."""
@@ -60,6 +65,11 @@ class FittedEffects:
         if not self.model.effects:
             return ["no effect lowers the error on data left out by more than chance: none taken"]
         found = ["the slope resistance expected from the coefficients leaves out the effects' part"]
+        if LOGS_AT_LEAST <= len(self.held_out_error_v) < FEW_LOGS:
+            found.append(
+                f"the effects were judged on {len(self.held_out_error_v)} logs left out in turn:"
+                " so few hardly tell chance from effect; give five or more"
+            )
         if after > before:
             found.append("the effects raise the error on data left out: leave them out")
         for item in self.linear.free:
