@@ -111,10 +111,49 @@ def test_several_logs_and_a_report(run: Run, made: Path, tmp_path: Path) -> None
     assert files(tmp_path) == ["m.html", "m.json"]
 
 
+def test_effects_go_into_model_json_tables_and_report(run: Run, made: Path, tmp_path: Path) -> None:
+    given = ("fit", made / "full.parquet", "-o", tmp_path / "m.json")
+    chosen = ("--effects", "resistance_asymmetry,fast_polarization")
+    ran = run(*given, *chosen, "--report", tmp_path / "m.html", "--json")
+    assert ran.code == 0, ran.err
+    assert "held out" in ran.err
+    found = json.loads(ran.out)
+    assert set(found) >= CONTRACT
+    by_id = {item["id"]: item["parameters"] for item in found["effects"]}
+    assert set(by_id) == {"fast_polarization", "resistance_asymmetry"}
+    assert set(by_id["fast_polarization"]["tau_s"]) == {"value", "std_error", "unit"}
+    search = found["effect_search"]
+    assert [step["step"] for step in search["steps"]] == ["added", "added"]
+    assert search["held_out_rmse_with_v"] == found["held_out"]["voltage_rmse_v"]
+    model = load_model(tmp_path / "m.json")
+    assert [effect.id for effect, _ in model.extended_model().effects] == [
+        "resistance_asymmetry", "fast_polarization",
+    ]  # fmt: skip
+    assert model.made.options["effects"] == "resistance_asymmetry, fast_polarization"
+    page = (tmp_path / "m.html").read_text(encoding="utf-8")
+    assert "not proof of a mechanism" in page
+    ran = run(*given, *chosen)
+    assert ran.code == 0, ran.err
+    for text in ("charging_ohm", "tau_s", "Search for effects", "t needed"):
+        assert text in ran.out
+    ran = run("estimate", made / "part.csv", "-m", tmp_path / "m.json", "-o", tmp_path / "e.csv")
+    assert ran.code == 0, ran.err
+
+
+def test_too_short_a_log_for_effects_is_refused(run: Run, made: Path, tmp_path: Path) -> None:
+    log = read_log(made / "part.csv")
+    write_log(log.rows(np.arange(700)), tmp_path / "short.csv")
+    given = ("fit", tmp_path / "short.csv", "-o", tmp_path / "m.json", "--capacity-ah", "51.5")
+    assert run(*given).code == 0
+    refused(run(*given, "--effects", "auto"), "short", "can be held out", "--effects")
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--effects", "hysteresis"], ["--effects", "this release knows no effects yet"]),
+        (["--effects", "gremlin"], ["--effects", "gremlin", "known are", "hysteresis"]),
+        (["--effects", "auto,hysteresis"], ["--effects", "auto alone"]),
+        (["--effects", "voltage_offset"], ["--effects", "voltage_offset", "k0 holds it"]),
         (["--delays", "0,10,5"], ["--delays", "increase", "0,10,5"]),
         (["--delays", "0;10"], ["--delays", "0;10"]),
         (["--epsilon", "0.6"], ["--epsilon", "0.6"]),

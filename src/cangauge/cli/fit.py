@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from itertools import pairwise
@@ -29,9 +29,11 @@ from cangauge.cli.tables import print_table
 from cangauge.errors import InputError
 from cangauge.identify.charge import capacity_from_full_discharge, capacity_from_reference
 from cangauge.identify.delays import DelaySearch, search_delays
+from cangauge.identify.effects.ids import parse_ids
 from cangauge.identify.fit import FitOptions, Identification, fit
 from cangauge.logs.log import Log
 from cangauge.model.model_file import model_json
+from cangauge.report.effect_rows import effect_rows, step_rows
 from cangauge.report.words import number, significant, span
 
 FROM_SOC = "from-soc"
@@ -80,7 +82,11 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
     ] = 20.0,
     effects: Annotated[
         list[str] | None,
-        typer.Option(metavar="ID…|auto", help="Effects beyond the baseline; none yet."),
+        typer.Option(
+            metavar="ID…|auto",
+            help="Effects beyond the coefficients: ids (repeated or separated by commas), or"
+            " `auto`: those that lower the error on data held out by more than chance.",
+        ),
     ] = None,
     name: Annotated[
         str | None, typer.Option(help="Name of the model. Default: the logs' names.")
@@ -106,15 +112,10 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge fit drive.log --vehicle leaf_ze0 -o pack.json --capacity-ah 51.5 --initial-soc 92`
 
+    `cangauge fit trip1.csv trip2.csv trip3.csv -o pack.json --capacity-ah from-soc --effects auto`
+
     The model file and the report are written only when all has succeeded.
     """
-    if effects:
-        raise InputError(
-            "this release knows no effects yet",
-            field="--effects",
-            value=", ".join(effects),
-            cure="leave the option out",
-        )
     options = FitOptions(
         capacity_ah=_capacity(capacity_ah),
         initial_soc_pct=initial_soc
@@ -124,6 +125,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         epsilon=within(epsilon, 1e-4, 0.49, option="--epsilon", unit=""),
         t_ref_c=within(t_ref, -60.0, 120.0, option="--t-ref", unit="°C"),
         name=name,
+        effects=parse_ids(effects) if effects else (),
     )
     if delays != AUTO:
         options = replace(options, delay_s=_delays(delays))
@@ -148,7 +150,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         search = None
         if delays == AUTO:
             options, search = _search(recorded, options)
-        result = fit(recorded, options, status.update)
+        result = fit(recorded, options, _Progress(status.update))
         page = None
         if report is not None:
             status.update("drawing the report")
@@ -169,6 +171,18 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
     for remark in result.remarks:
         note(f"note: {remark}")
     note(f"model: {output}" + (f"\nreport: {report}" if report else ""))
+
+
+class _Progress:
+    """Shows each step, and keeps on the screen what was decided about an effect."""
+
+    def __init__(self, show: Callable[[str], None]) -> None:
+        self._show = show
+
+    def __call__(self, text: str) -> None:
+        if " held out " in text:
+            note(text)
+        self._show(text)
 
 
 def _capacity(given: str | None) -> float | None:
@@ -260,6 +274,9 @@ def _show(result: Identification, search: DelaySearch | None) -> None:
             for name, item in model.coefficients.items()
         ],
     )  # fmt: skip
+    if result.found is not None:
+        print_table("Effects", *effect_rows(result.found))
+        print_table("Search for effects", *step_rows(result.found))
     print_table(
         "Energy at the terminals",
         ["", "value", "<unit"],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,16 +91,7 @@ def _root(matrix: FloatArray) -> FloatArray:
 
 def moved(model: VoltageModel, change: FloatArray) -> VoltageModel | None:
     """Return the model with its coefficients moved; None if its pseudo-OCV would not rise."""
-    n = len(BASIS_NAMES)
-    by = change.tolist()
     try:
-        return replace(
-            model,
-            ocv_v=tuple(a + b for a, b in zip(model.ocv_v, by[:n], strict=True)),
-            kt_v_per_k=model.kt_v_per_k + by[n],
-            resistance_ohm=tuple(
-                a + b for a, b in zip(model.resistance_ohm, by[n + 1 :], strict=True)
-            ),
-        )
+        return model.with_coefficients(model.coefficients + change)
     except InputError:
         return None

@@ -15,7 +15,7 @@ from cangauge.gap.columns import Candidate, residual
 from cangauge.gap.evidence import Score, gather
 from cangauge.gap.settle import Settled
 from cangauge.model.effects.effect import Effect, Pack, Values
-from cangauge.model.effects.library import LIBRARY, effect_entries
+from cangauge.model.effects.library import LIBRARY, effect_entries, one_of
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Made, ModelFile, Ranges
 
@@ -100,18 +100,20 @@ def _refined(
     settled: Settled, model: ExtendedModel, effect: Effect, start: Values
 ) -> tuple[ExtendedModel, dict[str, float]]:
     """Return model and parameters, fitted through the model's own equations from a start."""
-    parameters = effect.parameters
+    parameters = (*effect.amplitudes, *effect.shapes)
+    parameters = parameters or effect.parameters
+    constants = {p.name: start[p.name] for p in effect.parameters if p not in parameters}
     bounds = np.array([parameter.bounds(model.pack) for parameter in parameters])
     neutral = effect.neutral(model.pack)
     centre = np.array([neutral[parameter.name] for parameter in parameters])
     scale = bounds[:, 1] - bounds[:, 0]
     low, high = (bounds[:, 0] - centre) / scale, (bounds[:, 1] - centre) / scale
-    is_amplitude = np.array([parameter.grid is None for parameter in parameters])
+    is_amplitude = np.array([parameter in effect.amplitudes for parameter in parameters])
     prior = 4.0 * np.sqrt(settled.error.lasting_v2) * is_amplitude
 
     def values_of(unit: FloatArray) -> dict[str, float]:
-        return {p.name: float(c + u * s) for p, c, u, s in
-                zip(parameters, centre, unit, scale, strict=True)}  # fmt: skip
+        values = (centre + unit * scale).tolist()
+        return {p.name: value for p, value in zip(parameters, values, strict=True)} | constants
 
     def errors(unit: FloatArray) -> FloatArray:
         trial = model.with_effect(effect, values_of(unit))
@@ -186,7 +188,7 @@ def _merged(effects: Sequence[tuple[Effect, Values]], pack: Pack) -> list[tuple[
     """Return the effects, those of one kind and shape added up, within physical bounds."""
     merged: dict[tuple[object, ...], tuple[Effect, dict[str, float]]] = {}
     for effect, values in effects:
-        key = (effect.id, *(values[parameter.name] for parameter in effect.shapes))
+        key = one_of(effect, values)
         if key not in merged:
             merged[key] = (effect, dict(values))
             continue

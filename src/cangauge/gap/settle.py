@@ -43,9 +43,9 @@ CLEAN_STRUCTURE: tuple[tuple[str, dict[str, float]], ...] = (
     ("slow_diffusion", {"tau_s": 220.0, "activation_k": 0.0}),
     ("slow_diffusion", {"tau_s": 220.0, "activation_k": 3000.0}),
     ("slow_diffusion", {"tau_s": 750.0, "activation_k": 3000.0}),
-    ("resistance_temperature", {"activation_k": 1000.0, "reference_c": 25.0, "delayed": 0.0}),
-    ("resistance_temperature", {"activation_k": 4500.0, "reference_c": 25.0, "delayed": 0.0}),
-    ("resistance_temperature", {"activation_k": 2500.0, "reference_c": 25.0, "delayed": 1.0}),
+    ("resistance_temperature", {"activation_k": 1000.0, "delayed": 0.0}),
+    ("resistance_temperature", {"activation_k": 4500.0, "delayed": 0.0}),
+    ("resistance_temperature", {"activation_k": 2500.0, "delayed": 1.0}),
     ("resistance_soc", {"width_pct": 40.0, "delayed": 1.0}),
     ("charge_transfer", {"exchange_a": 0.12, "bend_only": 1.0}),
     ("hysteresis", {"travel_pct": 4.0}),
@@ -161,7 +161,7 @@ def settle(
     )
     for log in (*logs, *references):
         _check_pack(log, model)
-    choices = candidates(effects, model.pack, logs[0].time_s)
+    choices = candidates(effects, model.pack, logs[0].time_s, elsewhere=True)
     say = progress or _silent
     of_logs = [prepare_log(log, options) for log in logs]
     of_references = [prepare_log(log, replace(options, initial_soc_pct=None)) for log in references]
@@ -214,7 +214,7 @@ def _terms(
     choices: Sequence[Candidate],
 ) -> LogTerms:
     # A shape may depend on the log (a moment as a part of its length), so each has its own list.
-    own = candidates(effects, model.pack, prepared.log.time_s)
+    own = candidates(effects, model.pack, prepared.log.time_s, elsewhere=True)
     if len(own) != len(choices):
         raise InputError("the effects' shapes differ between logs", source=prepared.log.source)
     return log_terms(prepared, model, own)

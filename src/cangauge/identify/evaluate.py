@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cangauge.identify.effects.prepared import Prepared
 from cangauge.identify.rows import FitRows
+from cangauge.model.delay_line import delayed_currents
+from cangauge.model.extended import ExtendedModel, Prediction
 from cangauge.model.inverse import soc_from_ocv
 from cangauge.model.voltage_model import VoltageModel
 
@@ -58,6 +61,54 @@ def _log_fit(model: VoltageModel, rows: FitRows) -> LogFit:
         voltage_model_v=model.voltage(rows.soc_pct, rows.temperature_c, rows.delayed_current_a),
         soc_newton_pct=newton,
     )
+
+
+def evaluate_extended(model: ExtendedModel, logs: Sequence[Prepared]) -> tuple[LogFit, ...]:
+    """Return how a model with effects explains each log's rows.
+
+    The rows are what perfect sensors would have shown, where an effect corrects them.
+    """
+    return tuple(_extended_fit(model, item) for item in logs)
+
+
+def _extended_fit(model: ExtendedModel, log: Prepared) -> LogFit:
+    found = model.predict(log.signals, log.initial_soc_pct, log.at)
+    signals = found.signals
+    delayed = delayed_currents(
+        signals.time_s, signals.current_a, model.model.delay_s, signals.time_s
+    )
+    rows = replace(
+        log.rows,
+        voltage_v=signals.voltage_v[log.at],
+        temperature_c=signals.temperature_c[log.at],
+        soc_pct=found.soc_pct[log.at],
+        delayed_current_a=delayed[log.at],
+    )
+    return LogFit(
+        rows=rows,
+        pseudo_ocv_v=model.model.pseudo_ocv(rows.soc_pct, rows.temperature_c),
+        voltage_model_v=found.voltage_v,
+        soc_newton_pct=_newton(model, found, delayed),
+    )
+
+
+def _newton(model: ExtendedModel, found: Prediction, delayed_a: FloatArray) -> FloatArray:
+    """Return the inverse on the rows, the effects carried through every sample [%], shape (m,)."""
+    online, signals = model.online(), found.signals
+    wanted = dict(zip(found.rows.tolist(), range(found.rows.size), strict=True))
+    newton = np.empty(found.rows.size)
+    guess = 50.0
+    samples = zip(
+        signals.time_s.tolist(), signals.current_a.tolist(), signals.temperature_c.tolist(),
+        signals.voltage_v.tolist(), delayed_a.tolist(), strict=True,
+    )  # fmt: skip
+    for k, (time_s, current_a, temperature_c, voltage_v, delayed) in enumerate(samples):
+        online.advance(time_s, current_a, temperature_c, delayed)
+        if k in wanted:
+            beside = model.model.offset_at(temperature_c, delayed)
+            guess = soc_from_ocv(online, voltage_v - beside, guess).soc_pct
+            newton[wanted[k]] = guess
+    return newton
 
 
 def slope_resistance(model: VoltageModel, rows: Sequence[FitRows]) -> tuple[float, float]:

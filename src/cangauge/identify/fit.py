@@ -10,14 +10,17 @@ from numpy.typing import NDArray
 
 from cangauge.errors import InputError
 from cangauge.identify.charge import capacity_from_full_discharge
+from cangauge.identify.effects.fitted import FittedEffects, fit_effects
+from cangauge.identify.effects.prepared import prepare_log
 from cangauge.identify.energy import Energy, energy_balance
-from cangauge.identify.evaluate import LogFit, evaluate, slope_resistance
+from cangauge.identify.evaluate import LogFit, evaluate, evaluate_extended, slope_resistance
 from cangauge.identify.least_squares import Solution
 from cangauge.identify.model_from_fit import model_from_fit
 from cangauge.identify.options import FitOptions
 from cangauge.identify.rows import FitRows
 from cangauge.identify.voltage_fit import fit_voltage_model, held_out_errors, prepare
 from cangauge.logs.log import Log
+from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import ModelFile
 from cangauge.model.voltage_model import VoltageModel
 
@@ -48,6 +51,8 @@ class Identification:
     voltage_rmse_v: float
     soc_newton_mae_pct: float
     remarks: tuple[str, ...] = ()
+    found: FittedEffects | None = None
+    """Effects, where the options ask for them."""
 
     def to_dict(self) -> dict[str, object]:
         """Return the object that `cangauge fit --json` prints."""
@@ -83,7 +88,7 @@ class Identification:
                 for item in self.fits
             ],
             "remarks": list(self.remarks),
-        }
+        } | ({} if self.found is None else self.found.to_dict())
 
 
 def fit(
@@ -128,15 +133,25 @@ def fit(
     rows = prepare(logs, options)
     say(f"fitting {sum(map(len, rows))} rows of {len(rows)} logs")
     voltage_model, solution = fit_voltage_model(rows, options)
-    say("judging on rows that the fit did not see")
-    held_out = held_out_errors(rows, options)
-    fits = evaluate(voltage_model, rows)
+    found = None
+    if options.effects:
+        plain = ExtendedModel(voltage_model, capacity)
+        prepared = [prepare_log(log, options) for log in logs]
+        found = fit_effects(plain, prepared, options.effects, say)
+        voltage_model, solution = found.model.model, found.solution
+        fits = evaluate_extended(found.model, prepared)
+        held_out = list(found.held_out_error_v)
+    else:
+        say("judging on rows that the fit did not see")
+        held_out = held_out_errors(rows, options)
+        fits = evaluate(voltage_model, rows)
     residual = np.concatenate([item.residual_v for item in fits])
     volts = np.concatenate([item.rows.voltage_v for item in fits])
+    rows = [item.rows for item in fits]
     slope, expected = slope_resistance(voltage_model, rows)
     newton_error = np.concatenate([item.soc_newton_pct - item.rows.soc_pct for item in fits])
     return Identification(
-        model=model_from_fit(logs, options, voltage_model, solution, (fits, held_out)),
+        model=model_from_fit(logs, options, voltage_model, solution, (fits, held_out), found=found),
         voltage_model=voltage_model,
         logs=tuple(logs),
         fits=fits,
@@ -148,7 +163,11 @@ def fit(
         voltage_mae_pct=100.0 * float(np.mean(np.abs(residual) / volts)),
         voltage_rmse_v=float(np.sqrt(np.mean(residual**2))),
         soc_newton_mae_pct=float(np.mean(np.abs(newton_error))),
-        remarks=tuple(_remarks(voltage_model, solution, rows)),
+        remarks=(
+            *_remarks(voltage_model, solution, rows),
+            *(found.remarks() if found is not None else ()),
+        ),
+        found=found,
     )
 
 

@@ -8,7 +8,7 @@ problem is solved as a convex quadratic programme with the slope bounded from be
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import clarabel
 import numpy as np
@@ -39,10 +39,16 @@ class Solution:
     constrained: bool
     """Whether the plain solution broke the bounds, so that they had to hold it."""
 
+    def part(self, first: int) -> Solution:
+        """Return what is known of the first coefficients."""
+        return replace(
+            self, coefficients=self.coefficients[:first], std_error=self.std_error[:first]
+        )
+
 
 def solve(
     columns: FloatArray, target: FloatArray, block: NDArray[np.intp], bounds: FloatArray | None,
-    at_least: float,
+    at_least: float | FloatArray,
 ) -> Solution:  # fmt: skip
     """Minimise |columns·x − target|² subject to bounds·x ≥ at_least.
 
@@ -53,7 +59,7 @@ def solve(
     block : array of shape (n,)
         Rows with the same number may have correlated residuals.
     bounds : array of shape (m, p), optional
-    at_least : float
+    at_least : float or array of shape (m,)
 
     Raises
     ------
@@ -70,7 +76,7 @@ def solve(
     z = left.T @ target
     constrained = bounds is not None and bool(np.any(bounds @ (back @ z) < at_least))
     if constrained and bounds is not None:
-        z = _nearest(z, bounds @ back, np.full(bounds.shape[0], at_least))
+        z = _nearest(z, bounds @ back, np.broadcast_to(at_least, bounds.shape[:1]))
     x = back @ z
     return Solution(
         coefficients=x,
@@ -107,6 +113,9 @@ def nearest_rising(
 def _nearest(z: FloatArray, bounds: FloatArray, at_least: FloatArray) -> FloatArray:
     """Return the point nearest to z with bounds·point ≥ at_least."""
     length = np.linalg.norm(bounds, axis=1)
+    # What no kept direction moves cannot be bounded.
+    moves = length > 0.0
+    bounds, at_least, length = bounds[moves], at_least[moves], length[moves]
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     solution = clarabel.DefaultSolver(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cangauge import __version__
+from cangauge.identify.effects.fitted import FittedEffects
 from cangauge.identify.evaluate import LogFit
 from cangauge.identify.held_out import LOGS_AT_LEAST
 from cangauge.identify.least_squares import Solution
@@ -18,6 +19,7 @@ from cangauge.identify.options import FitOptions
 from cangauge.identify.rows import FitRows
 from cangauge.identify.voltage_fit import stack
 from cangauge.logs.log import Log
+from cangauge.model.effects.library import effect_entries
 from cangauge.model.model_file import (
     Coefficient,
     Information,
@@ -39,6 +41,8 @@ def model_from_fit(
     model: VoltageModel,
     solution: Solution,
     errors: tuple[Sequence[LogFit], Sequence[FloatArray]],
+    *,
+    found: FittedEffects | None = None,
 ) -> ModelFile:
     """Return the model file of a fit.
 
@@ -51,6 +55,8 @@ def model_from_fit(
     solution : Solution
     errors : pair
         How the model fits each log, and each log's held-out errors [V].
+    found : FittedEffects, optional
+        Effects of the model.
     """
     fits, held_out_error_v = errors
     names = [*BASIS_NAMES, "kt", *resistance_names(len(options.delay_s))]
@@ -76,7 +82,8 @@ def model_from_fit(
                 current_a=model.current_range_a,
             ),
             "noise": _noise(fits, held_out_error_v, options),
-            "information": information_of(rows, options, names),
+            "effects": [] if found is None else effect_entries(found.model.effects),
+            "information": _information(rows, options, names, found),
             "made": _made(logs, options, rows),
         }
     )
@@ -122,14 +129,28 @@ def _noise(
     )
 
 
-def information_of(
-    rows: Sequence[FitRows], options: FitOptions, names: Sequence[str]
+def _information(
+    rows: Sequence[FitRows],
+    options: FitOptions,
+    names: Sequence[str],
+    found: FittedEffects | None,
 ) -> Information:
-    """Return the square root of the information that the rows hold on the coefficients."""
-    columns, volts, _ = stack(rows, options)
+    """Return the square root of the information that the rows hold on the coefficients.
+
+    With effects, what the rows tell of both is shared: the effects' columns come first in the
+    triangular factor, so that what is left to the coefficients is their own.
+    """
+    if found is None:
+        columns, volts, _ = stack(rows, options)
+        beside = np.empty((volts.size, 0))
+    else:
+        n = len(names)
+        columns, beside = found.linear.columns[:, :n], found.linear.columns[:, n:]
+        volts = found.linear.residual_v + columns @ found.linear.model.model.coefficients
     scale = np.linalg.norm(columns, axis=0)
     scale[scale == 0.0] = 1.0
-    root = np.linalg.qr(np.column_stack([columns / scale, volts])).R
+    first = beside.shape[1]
+    root = np.linalg.qr(np.column_stack([beside, columns / scale, volts])).R[first:, first:]
     n = columns.shape[1]
     return Information(
         columns=list(names),
@@ -152,7 +173,8 @@ def _made(logs: Sequence[Log], options: FitOptions, rows: Sequence[FitRows]) -> 
             "delay_s": list(options.delay_s),
             "epsilon": options.epsilon,
             "t_ref_c": options.t_ref_c,
-        },
+        }
+        | ({"effects": ", ".join(options.effects)} if options.effects else {}),
         logs=[
             SourceLog(name=log.name, rows=len(item), sha256=digest)
             for log, item, digest in zip(logs, rows, hashes, strict=True)

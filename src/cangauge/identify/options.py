@@ -21,3 +21,5 @@ class FitOptions:
     epsilon: float = 0.05
     t_ref_c: float = 20.0
     name: str | None = None
+    effects: tuple[str, ...] = ()
+    """Effects beyond the coefficients: ids, or `auto` alone to let logs left out choose."""

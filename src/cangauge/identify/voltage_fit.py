@@ -110,12 +110,18 @@ def stack(
     """Return columns (n, 9 + delays), voltage [V] (n,) and block numbers (n,) of all logs."""
     columns = np.vstack([columns_of(item, options.epsilon, options.t_ref_c) for item in rows])
     volts = np.concatenate([item.voltage_v for item in rows])
-    blocks, first = [], 0
+    return columns, volts, blocks_of(rows)
+
+
+def blocks_of(rows: Sequence[FitRows]) -> NDArray[np.intp]:
+    """Return the number of each row's block of `BLOCK_S`, over all logs in order, shape (n,)."""
+    blocks: list[NDArray[np.intp]] = []
+    first = 0
     for item in rows:
         number = ((item.time_s - item.time_s[0]) // BLOCK_S).astype(np.intp) + first
         first = int(number[-1]) + 1
         blocks.append(number)
-    return columns, volts, np.concatenate(blocks)
+    return np.concatenate(blocks)
 
 
 def _check_identifiable(

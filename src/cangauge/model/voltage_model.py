@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -197,6 +197,28 @@ class VoltageModel:
         return volts
 
     # --- facts of the model ---------------------------------------------------------------
+
+    @property
+    def coefficients(self) -> FloatArray:
+        """All coefficients, shape (9 + delays,): k0 … k7 [V], kt [V/K], R1 … Rn [Ω]."""
+        return np.array([*self.ocv_v, self.kt_v_per_k, *self.resistance_ohm])
+
+    def with_coefficients(self, coefficients: FloatArray) -> VoltageModel:
+        """Return the model with other coefficients, in the order of `coefficients`.
+
+        Raises
+        ------
+        InputError
+            If the pseudo-OCV would not rise.
+        """
+        values = coefficients.tolist()
+        n = len(BASIS_NAMES)
+        return replace(
+            self,
+            ocv_v=tuple(values[:n]),
+            kt_v_per_k=values[n],
+            resistance_ohm=tuple(values[n + 1 :]),
+        )
 
     @cached_property
     def _slope_beyond(self) -> tuple[float, float]:

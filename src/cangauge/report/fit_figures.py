@@ -101,7 +101,8 @@ def fit_figures(result: Identification, time: TimeFigures) -> list[Block]:
                 Figure(
                     "Pseudo-OCV against SoC",
                     _ocv_plane(result),
-                    f"Dots: the measured voltage less the model's resistances and temperature term."
+                    "Dots: the measured voltage less the model's resistances"
+                    f"{_and_effects(result)} and temperature term."
                     f" The logs cover {number(lo, 1)} … {number(hi, 1)} %; in the shaded part the"
                     " curve goes on as a straight line.",
                 ),
@@ -114,6 +115,10 @@ def fit_figures(result: Identification, time: TimeFigures) -> list[Block]:
             ]
         ),
     ]
+
+
+def _and_effects(result: Identification) -> str:
+    return ", effects" if result.found is not None and result.found.model.effects else ""
 
 
 def _ocv_plane(result: Identification) -> Plot:

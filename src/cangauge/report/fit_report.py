@@ -13,6 +13,7 @@ from cangauge.report.fit_figures import (
 )
 from cangauge.report.fit_tables import (
     coefficient_table,
+    effect_tables,
     log_table,
     removed_table,
     settings_table,
@@ -51,6 +52,7 @@ def fit_page(result: Identification) -> Page:
         Section("Resistance", [resistance_figure(result)]),
         Section("Energy", energy_figures(result)),
         Section("Coefficients", [coefficient_table(result)]),
+        *([Section("Effects", effect_tables(result))] if result.found is not None else []),
         Section("How it was made", _made(result)),
     ]
     return Page(

@@ -7,7 +7,9 @@ import math
 import numpy as np
 
 from cangauge.identify.fit import Identification
-from cangauge.report.page import Table
+from cangauge.model.effects.library import LIBRARY
+from cangauge.report.effect_rows import effect_rows, step_rows
+from cangauge.report.page import Block, Table
 from cangauge.report.words import duration, number, significant, span
 
 UNITS = {"V": "V", "V/K": "V/K", "ohm": "Ω"}
@@ -61,6 +63,41 @@ def _meaning(name: str, result: Identification) -> str:
         return basis[name]
     delay = result.model.delays_s[int(name.removeprefix("R")) - 1]
     return "current" if delay == 0.0 else f"current {delay:g} s ago"
+
+
+def effect_tables(result: Identification) -> list[Block]:
+    """Return the effects with their parameters, and how they were found."""
+    found = result.found
+    if found is None:
+        return []
+    ids = dict.fromkeys(effect_id for effect_id, _ in found.estimates)
+    equations = "; ".join(f"{effect_id}: {LIBRARY[effect_id].equation}" for effect_id in ids)
+    before, after = found.held_out_rmse_v
+    headings, rows = effect_rows(found)
+    tried, steps = step_rows(found)
+    return [
+        Table(
+            _plain(headings),
+            rows,
+            f"{equations}. Names are signatures at the terminals, not proof of a mechanism."
+            if ids
+            else "The logs show none by more than chance.",
+        ),
+        Table(
+            _plain(tried),
+            steps,
+            f"Root mean square error on data left out: {significant(before, 4)} V without effects,"
+            f" {significant(after, 4)} V with those above. One is taken if the mean logarithm of"
+            " the ratio of errors, log by log, lies so many standard errors (t) above zero as"
+            " chance seldom reaches, and if the error falls by 1 % at least. Which effects to take"
+            " was chosen on the same data that judge them, so the last figure is a little too"
+            " good.",
+        ),
+    ]
+
+
+def _plain(headings: list[str]) -> list[str]:
+    return [heading.removeprefix("<") for heading in headings]
 
 
 def error_table(result: Identification) -> Table:

@@ -39,7 +39,9 @@ def middle(effect: Effect, pack: Pack = PACK) -> dict[str, float]:
     values = {}
     for parameter in effect.parameters:
         low, high = parameter.bounds(pack)
-        if parameter.neutral is None:
+        if parameter.from_pack is not None:
+            values |= effect.constants(pack)
+        elif parameter.neutral is None:
             trials = parameter.trials(pack)
             values[parameter.name] = trials[len(trials) // 2]
         else:

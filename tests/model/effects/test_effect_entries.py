@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from stepping import EFFECTS, PACK, middle, within
+from stepping import EFFECTS, MODEL, PACK, irregular_signals, middle, within
 
 from cangauge.errors import InputError
-from cangauge.model.effects.effect import Effect
+from cangauge.model.effects.effect import Effect, Pack
 from cangauge.model.effects.library import LIBRARY, effect_entries, effect_of, parse_effects
+from cangauge.model.extended import ExtendedModel
+from cangauge.model.published import CAPACITY_AH
 
 OFFSET = {"id": "current_offset", "parameters": {"offset_a": 1.5}}
 
@@ -79,3 +83,29 @@ def test_an_unknown_id_lists_the_known_ones() -> None:
     with pytest.raises(InputError) as error:
         effect_of("current_ofset", "--effects")
     assert all(known in str(error.value) for known in LIBRARY)
+
+
+def test_a_file_from_before_the_reference_was_kept_takes_it_from_its_own_range() -> None:
+    old = {"share": 0.5, "activation_k": 2500.0, "delayed": 1.0}
+    ((_, values),) = parse_effects([{"id": "resistance_temperature", "parameters": old}], PACK)
+    assert values == old | {"reference_c": 23.0}
+    with pytest.raises(InputError, match="has the parameters share"):
+        parse_effects([{"id": "resistance_temperature", "parameters": {"reference_c": 23.0}}], PACK)
+
+
+@pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.id)
+def test_what_an_effect_does_stays_when_the_models_temperatures_are_widened(
+    effect: Effect,
+) -> None:
+    """The diagnosis widens them to those of its logs: learnt effects must not move with them."""
+    values = middle(effect)
+    signals = irregular_signals(400)
+    model = replace(MODEL, temperature_range_c=(0.0, 30.0))
+    wider = replace(MODEL, temperature_range_c=(-30.0, 30.0))
+    assert Pack.of(wider, CAPACITY_AH).temperature_c == 0.0
+    rows = np.arange(400)
+    found = [
+        ExtendedModel(each, CAPACITY_AH).with_effect(effect, values).predict(signals, 80.0, rows)
+        for each in (model, wider)
+    ]
+    assert np.array_equal(found[0].residual_v, found[1].residual_v)

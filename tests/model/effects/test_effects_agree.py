@@ -60,10 +60,13 @@ def test_describes_itself(effect: Effect) -> None:
     for parameter in effect.parameters:
         assert parameter.low < parameter.high
         assert parameter.neutral is None or parameter.low <= parameter.neutral <= parameter.high
-        assert parameter.neutral is not None or parameter.grid
+        assert parameter.neutral is not None or parameter.grid or parameter.from_pack
         for value in parameter.grid or ():
             assert parameter.low <= value <= parameter.high
-    assert set(effect.parameters) == {*effect.amplitudes, *effect.shapes}
+    constants = effect.constants(PACK)
+    named = {parameter.name for parameter in (*effect.amplitudes, *effect.shapes)}
+    assert named.isdisjoint(constants)
+    assert {parameter.name for parameter in effect.parameters} == named | set(constants)
     if effect.bends_at:
         # Taken as parts of the widest bound of the one parameter that the effect has.
         (only,) = effect.parameters
@@ -84,7 +87,7 @@ def test_neutral_values_do_exactly_nothing(effect: Effect) -> None:
     for shape in range(max(len(item.grid or ()) for item in effect.parameters) or 1):
         values = effect.neutral(PACK)
         for parameter in effect.parameters:
-            if parameter.neutral is None:
+            if parameter.grid and parameter.neutral is None:
                 trials = parameter.trials(PACK)
                 values[parameter.name] = trials[shape % len(trials)]
         extended = plain.with_effect(effect, values)

@@ -7,11 +7,10 @@ from typing import Final
 
 import numpy as np
 
-from cangauge.model.effects.effect import FloatArray
+from cangauge.model.effects.effect import WITHIN_C, FloatArray
 
 ZERO_C_IN_K: Final = 273.15
-COLDEST_C, HOTTEST_C = -60.0, 120.0
-"""Beyond these no temperature of a pack is believed [°C]; the law is held there."""
+COLDEST_C, HOTTEST_C = WITHIN_C
 
 USUAL_C: Final = 25.0
 

@@ -12,7 +12,8 @@ effect's file and must agree. With neutral values an effect does nothing.
 
 Parameters are amplitudes, which enter the voltage (nearly) linearly and have a neutral value, or
 shapes (a time constant, a moment), which have values to try and mean nothing alone. `time_skew`
-has a single parameter that is both.
+has a single parameter that is both. A few are constants, taken from the pack once
+(`Parameter.from_pack`).
 
 Labels are signatures seen at the terminals, not proof of a mechanism.
 """
@@ -47,6 +48,9 @@ Family = Literal[
 
 Scale = Literal["one", "capacity", "voltage", "resistance"]
 
+WITHIN_C: Final = (-60.0, 120.0)
+"""Beyond these no temperature of a pack is believed [°C]; laws of temperature are held there."""
+
 RESISTANCE_AT_LEAST = 0.002
 """Least resistance that bounds are relative to, in voltage over 1 C current (a Leaf has 0.018): a
 model whose resistances happen to cancel must not shut every resistance effect out."""
@@ -63,11 +67,14 @@ class Pack:
     """Sum of the model's resistances, positive [Ω]."""
     cells: int
     """Cells in series, from `voltage_v` at about 3.7 V a cell."""
+    temperature_c: float = 25.0
+    """Middle of the temperatures that the model was identified on [°C]."""
 
     @classmethod
     def of(cls, model: VoltageModel, capacity_ah: float) -> Pack:
         """Return the sizes of the pack that a model describes."""
         volts = model.pseudo_ocv_at(50.0)[0]
+        coldest, hottest = WITHIN_C
         return cls(
             voltage_v=volts,
             capacity_ah=capacity_ah,
@@ -75,6 +82,7 @@ class Pack:
                 abs(sum(model.resistance_ohm)), RESISTANCE_AT_LEAST * volts / capacity_ah
             ),
             cells=max(1, round(volts / 3.7)),
+            temperature_c=min(max(0.5 * sum(model.temperature_range_c), coldest), hottest),
         )
 
 
@@ -95,6 +103,12 @@ class Parameter:
     grid : tuple of floats, optional
         Values to try for a shape (a time constant, a moment); amplitudes have none and enter the
         voltage nearly linearly.
+    from_pack : {"temperature_c"}, optional
+        A constant that is neither fitted nor tried: this of the pack's sizes when the effect is
+        added, and kept from then on, whatever becomes of the model.
+    elsewhere : tuple of float, optional
+        Added to such a constant, what a diagnosis tries beside it. A fit has no use for that: its
+        coefficients, which move with the effect, take up the difference.
     """
 
     name: str
@@ -104,6 +118,8 @@ class Parameter:
     neutral: float | None = 0.0
     scale: Scale = "one"
     grid: tuple[float, ...] | None = None
+    from_pack: Literal["temperature_c"] | None = None
+    elsewhere: tuple[float, ...] = ()
 
     def factor(self, pack: Pack) -> float:
         """Return what turns bounds and grid into the parameter's unit for a pack."""
@@ -257,17 +273,47 @@ class Effect(ABC):
     @property
     def amplitudes(self) -> tuple[Parameter, ...]:
         """Parameters without values to try: they enter the voltage nearly linearly."""
-        return tuple(parameter for parameter in self.parameters if parameter.grid is None)
+        return tuple(
+            parameter
+            for parameter in self.parameters
+            if parameter.grid is None and parameter.from_pack is None
+        )
 
     @property
     def shapes(self) -> tuple[Parameter, ...]:
         """Parameters with values to try."""
         return tuple(parameter for parameter in self.parameters if parameter.grid is not None)
 
+    @property
+    def adds_voltage_only(self) -> bool:
+        """Whether it leaves signals and count alone: then its voltage is all that it changes."""
+        kind = type(self)
+        return kind.correct is Effect.correct and kind.count is Effect.count
+
+    def constants(self, pack: Pack) -> dict[str, float]:
+        """Return the parameters that are taken from the pack when the effect is added to it."""
+        return {
+            parameter.name: float(getattr(pack, parameter.from_pack))
+            for parameter in self.parameters
+            if parameter.from_pack is not None
+        }
+
+    def constants_to_try(self, pack: Pack) -> list[dict[str, float]]:
+        """Return the constants, those of the pack first, and what a diagnosis tries beside them."""
+        tried = [self.constants(pack)]
+        for parameter in self.parameters:
+            low, high = parameter.bounds(pack)
+            for beside in parameter.elsewhere:
+                value = min(max(tried[0][parameter.name] + beside, low), high)
+                tried.append(tried[0] | {parameter.name: value})
+        return tried
+
     def neutral(self, pack: Pack) -> dict[str, float]:
         """Return values with which the effect does nothing."""
-        values = {}
+        values = self.constants(pack)
         for parameter in self.parameters:
+            if parameter.from_pack is not None:
+                continue
             if parameter.neutral is None:
                 trials = parameter.trials(pack)
                 values[parameter.name] = trials[len(trials) // 2]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cangauge.model.effects.effect import (
+    WITHIN_C,
     Effect,
     FloatArray,
     OnlineEffect,
@@ -14,9 +15,6 @@ from cangauge.model.effects.effect import (
     Values,
 )
 from cangauge.model.voltage_model import VoltageModel
-
-WITHIN_C = (-60.0, 120.0)
-"""Beyond these no temperature of a pack is believed [°C]; the law is held there."""
 
 
 class EntropicCoefficient(Effect):

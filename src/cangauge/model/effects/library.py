@@ -112,12 +112,18 @@ def parse_effects(entries: Sequence[object], pack: Pack) -> list[tuple[Effect, V
         effect = effect_of(entry["id"], f"{field}.id")
         values = _values(effect, entry["parameters"], pack, f"{field}.parameters")
         # Two elements of different time constants are a chain; the same one twice is a slip.
-        one = (effect.id, *(values[parameter.name] for parameter in effect.shapes))
+        one = one_of(effect, values)
         if one in seen:
             raise InputError("is given twice", field=f"{field}.id", value=effect.id)
         seen.add(one)
         parsed.append((effect, values))
     return parsed
+
+
+def one_of(effect: Effect, values: Values) -> tuple[object, ...]:
+    """Return what makes two effects the same but for how large they are: id, shapes, constants."""
+    sizes = {parameter.name for parameter in effect.amplitudes}
+    return (effect.id, *(values[p.name] for p in effect.parameters if p.name not in sizes))
 
 
 def effect_entries(effects: Sequence[tuple[Effect, Values]]) -> list[dict[str, object]]:
@@ -133,11 +139,17 @@ def effect_entries(effects: Sequence[tuple[Effect, Values]]) -> list[dict[str, o
 
 def _values(effect: Effect, given: object, pack: Pack, field: str) -> Values:
     names = [parameter.name for parameter in effect.parameters]
+    constants = effect.constants(pack)
+    if isinstance(given, Mapping):
+        # A file from before a constant was kept: it was the pack's then too.
+        given = {**constants, **given}
     if not isinstance(given, Mapping) or set(given) != set(names):
         raise InputError(
             f"{effect.id} has the parameters {', '.join(names)}",
             field=field,
-            value=sorted(map(str, given)) if isinstance(given, Mapping) else given,
+            value=sorted(set(map(str, given)) - set(constants))
+            if isinstance(given, Mapping)
+            else given,
         )
     return {
         parameter.name: _value(parameter, given[parameter.name], pack, f"{field}.{parameter.name}")

@@ -9,6 +9,7 @@ import numpy as np
 from cangauge.model.effects.arrhenius import inverse_k, inverse_k_at
 from cangauge.model.effects.effect import (
     DELAYED,
+    WITHIN_C,
     Effect,
     FloatArray,
     OnlineEffect,
@@ -24,8 +25,8 @@ from cangauge.model.voltage_model import VoltageModel
 class ResistanceTemperature(Effect):
     """A share of the voltage model's drop that follows Arrhenius' law.
 
-    At `reference_c` the drop stays as it is: the temperature at which the model's own resistances
-    hold. They were identified over a range, so it is a shape to be tried.
+    It adds nothing at `reference_c`, the middle of the temperatures that the model was identified
+    on when the effect was added.
     """
 
     id = "resistance_temperature"
@@ -33,11 +34,17 @@ class ResistanceTemperature(Effect):
     parameters = (
         Parameter("share", "1", 0.0, 3.0),
         Parameter("activation_k", "K", 100.0, 8000.0, neutral=None, grid=(1000.0, 2500.0, 4500.0)),
-        Parameter("reference_c", "°C", -40.0, 60.0, neutral=None, grid=(5.0, 15.0, 25.0, 40.0)),
         DELAYED,
-    )
+        Parameter(
+            "reference_c", "°C", *WITHIN_C, neutral=None, from_pack="temperature_c",
+            elsewhere=(-20.0, -10.0, 10.0, 20.0),
+        ),
+    )  # fmt: skip
     signature = "the drop over the resistance, growing with (T₀ − T)"
-    equation = "ΔU = a·ΣRj·I(t − dj)·(exp(B·(1/T − 1/T₀)) − 1); or ΣRj·I in place of ΣRj·I(t − dj)"
+    equation = (
+        "ΔU = a·ΣRj·I(t − dj)·(exp(B·(1/T − 1/T₀)) − 1), T₀ = reference_c;"
+        " or ΣRj·I in place of ΣRj·I(t − dj)"
+    )
     source = "Waag, Käbitz, Sauer, Applied Energy 102 (2013) 885"
     separated_by = (
         "the same SoC at two temperatures (a second day): where temperature and SoC move"
@@ -48,8 +55,8 @@ class ResistanceTemperature(Effect):
         self, state: PackState, values: Values, model: VoltageModel, pack: Pack
     ) -> FloatArray:
         """Return the change of the drop [V]."""
-        drop_v = state.scaled_drop_v(values["delayed"], pack)
         del model
+        drop_v = state.scaled_drop_v(values["delayed"], pack)
         colder = inverse_k(state.temperature_c) - inverse_k_at(values["reference_c"])
         return values["share"] * drop_v * np.expm1(values["activation_k"] * colder)
 

@@ -1,0 +1,1 @@
+"""Which effects clean logs show, found by error on logs left out."""

@@ -1,0 +1,275 @@
+"""`fit --effects`: what was put into a log is found with its parameter, and nothing else is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from cangauge.errors import InputError
+from cangauge.estimate.estimator import EstimatorSettings
+from cangauge.estimate.offline import estimate_log
+from cangauge.identify.effects.ids import CLEAN, REFUSED, parse_ids
+from cangauge.identify.effects.judge import Judge, Judged, compare
+from cangauge.identify.effects.linear import linearise, moved_by, residual_of
+from cangauge.identify.effects.prepared import Prepared, prepare_log
+from cangauge.identify.fit import FitOptions, Identification, fit
+from cangauge.logs.log import Log
+from cangauge.model.effects.effect import Signals
+from cangauge.model.effects.library import LIBRARY, effect_entries, parse_effects
+from cangauge.model.extended import ExtendedModel
+from cangauge.model.published import CAPACITY_AH, leaf_2012_model
+from synthetic import synthetic_log
+
+TRUTH = replace(leaf_2012_model(), temperature_range_c=(0.0, 40.0))
+NOISE_V = 0.4
+OPTIONS = FitOptions(capacity_ah=CAPACITY_AH)
+
+PUT_IN: dict[str, tuple[tuple[str, dict[str, float]], ...]] = {
+    "nothing": (),
+    "cold": (
+        (
+            "resistance_temperature",
+            {"share": 0.8, "activation_k": 3500.0, "delayed": 1.0, "reference_c": 20.0},
+        ),
+    ),
+    "dynamics": (
+        ("fast_polarization", {"ohm": 0.03, "tau_s": 3.0, "activation_k": 0.0}),
+        ("slow_diffusion", {"ohm": 0.05, "tau_s": 300.0, "activation_k": 0.0}),
+    ),
+    "hysteresis": (("hysteresis", {"half_width_v": 2.0, "travel_pct": 3.0}),),
+}
+"""Name → effects of the truth; time constants lie between the values that are tried."""
+
+
+def truth(name: str) -> ExtendedModel:
+    effects = tuple((LIBRARY[effect_id], values) for effect_id, values in PUT_IN[name])
+    return ExtendedModel(TRUTH, CAPACITY_AH, effects)
+
+
+@cache
+def trips(name: str, number: int = 5) -> tuple[Log, ...]:
+    """Trips of 25 minutes on days of 4 to 28 °C, made by the model's own equation and noise.
+
+    Six minutes of rest in each tell what decays from what stays.
+    """
+    made = []
+    for k in range(number):
+        start = 92.0 - 14.0 * k
+        log = synthetic_log(hours=0.42, start_pct=start, end_pct=start - 22.0, seed=40 + k)
+        warmth = np.linspace(4.0, 28.0, number)[(2 * k) % number]
+        rests = (log.time_s > 800.0) & (log.time_s < 1160.0)
+        current_a = np.where(rests, 0.0, log.current_a)
+        log = replace(log, temperature_c=log.temperature_c - 23.0 + warmth, current_a=current_a)
+        signals = Signals(log.time_s, log.current_a, np.zeros(len(log)), log.temperature_c)
+        found = truth(name).predict(signals, start, np.arange(len(log)))
+        noise = np.random.default_rng(k).normal(0.0, NOISE_V, len(log))
+        volts = found.voltage_v + noise
+        made.append(replace(log, voltage_v=volts, soc_pct=found.soc_pct, name=f"trip{k}"))
+    return tuple(made)
+
+
+@cache
+def fitted(name: str, effects: tuple[str, ...] = ("auto",)) -> Identification:
+    return fit(trips(name), replace(OPTIONS, effects=effects))
+
+
+def parameters(result: Identification, effect_id: str) -> dict[str, tuple[float, float | None]]:
+    assert result.found is not None
+    ((_, estimates),) = [item for item in result.found.estimates if item[0] == effect_id]
+    return {item.name: (item.value, item.std_error) for item in estimates}
+
+
+def share_at(reference_c: float, of: dict[str, float]) -> float:
+    """The share that does the same with another reference temperature, the resistance with it."""
+    grown = math.exp(
+        of["activation_k"] * (1.0 / (reference_c + 273.15) - 1.0 / (of["reference_c"] + 273.15))
+    )
+    return of["share"] * grown / (1.0 - of["share"] + of["share"] * grown)
+
+
+@pytest.mark.parametrize("name", ["cold", "dynamics", "hysteresis"])
+def test_auto_finds_what_was_put_in_with_its_parameters(name: str) -> None:
+    result = fitted(name)
+    assert result.found is not None
+    assert [effect.id for effect, _ in result.found.model.effects] == [i for i, _ in PUT_IN[name]]
+    for effect_id, put_in in PUT_IN[name]:
+        true = dict(put_in)
+        found = parameters(result, effect_id)
+        if effect_id == "resistance_temperature":
+            true["share"] = share_at(found["reference_c"][0], put_in)
+        for parameter, (value, std_error) in found.items():
+            if std_error is None:
+                continue
+            assert abs(value - true[parameter]) < 3.5 * std_error
+            assert 0.0 < std_error < 0.1 * abs(true[parameter])
+    before, after = result.found.held_out_rmse_v
+    # What is left is what the same trips leave without any effect, in trips with other SoC.
+    assert after == pytest.approx(fitted("nothing").model.noise.voltage_rmse_v, rel=0.03)
+    assert before > 1.2 * after
+    assert result.model.noise.voltage_rmse_v == pytest.approx(after)
+
+
+def test_auto_takes_nothing_on_logs_without_effects() -> None:
+    result = fitted("nothing")
+    assert result.found is not None
+    assert result.found.model.effects == ()
+    assert result.model.effects == []
+    assert {step.what for step in result.found.steps} <= {"not added"}
+    assert any("none taken" in remark for remark in result.remarks)
+    plain = fit(trips("nothing"), OPTIONS)
+    for key, item in plain.model.coefficients.items():
+        assert result.model.coefficients[key].value == pytest.approx(item.value, rel=1e-6)
+        assert result.model.coefficients[key].std_error == pytest.approx(item.std_error, rel=1e-6)
+    assert result.model.noise.voltage_rmse_v == pytest.approx(plain.model.noise.voltage_rmse_v)
+    assert result.soc_newton_mae_pct == pytest.approx(plain.soc_newton_mae_pct, abs=1e-6)
+
+
+def test_one_log_is_judged_by_blocks() -> None:
+    log = synthetic_log(hours=1.2, start_pct=95.0, end_pct=30.0)
+    signals = Signals(log.time_s, log.current_a, np.zeros(len(log)), log.temperature_c)
+    volts = truth("dynamics").predict(signals, 95.0, np.arange(len(log))).voltage_v
+    noise = np.random.default_rng(0).normal(0.0, NOISE_V, len(log))
+    result = fit([replace(log, voltage_v=volts + noise)], replace(OPTIONS, effects=("auto",)))
+    ids = [effect.id for effect, _ in result.found.model.effects]
+    assert ids == ["fast_polarization", "slow_diffusion"]
+    value, std_error = parameters(result, "fast_polarization")["tau_s"]
+    assert abs(value - 3.0) < 3.5 * std_error
+    assert "blocks" in result.model.noise.judged_on
+
+
+def test_named_effects_are_all_taken_and_reported() -> None:
+    result = fitted("cold", ("resistance_asymmetry", "resistance_temperature"))
+    ids = [effect.id for effect, _ in result.found.model.effects]
+    assert ids == ["resistance_temperature", "resistance_asymmetry"]
+    assert [step.effect_id for step in result.found.steps] == ids  # the more helpful one first
+    value, std_error = parameters(result, "resistance_asymmetry")["charging_ohm"]
+    assert abs(value) < 3.5 * std_error + 1e-9  # there is none
+    assert not any("bound" in remark for remark in result.remarks)
+    described = result.to_dict()
+    assert [item["id"] for item in described["effects"]] == ids
+    assert described["effects"][0]["parameters"]["share"]["unit"] == "1"
+    assert described["effect_search"]["held_out_rmse_with_v"] == result.found.held_out_rmse_v[1]
+
+
+@pytest.mark.parametrize("name", ["cold", "hysteresis"])
+def test_the_model_file_runs_in_the_estimator_and_gives_the_fits_own_newton(name: str) -> None:
+    result = fitted(name)
+    entries = effect_entries(result.found.model.effects)
+    assert parse_effects(entries, result.found.model.pack) == list(result.found.model.effects)
+    for number, log in enumerate(trips(name)[:2]):
+        table, _ = estimate_log(log, result.model, EstimatorSettings(initial_soc_pct=None))
+        rows = result.fits[number].rows
+        at = np.searchsorted(log.time_s, rows.time_s)
+        expected = result.fits[number].soc_newton_pct
+        np.testing.assert_allclose(table.soc_newton_pct[at], expected, atol=1e-6)
+
+
+def test_a_parameter_that_physics_holds_is_said_so() -> None:
+    """Cold would need a share below zero on a pack whose resistance falls in the cold."""
+    turned = []
+    for log, plain in zip(trips("cold"), trips("nothing"), strict=True):
+        turned.append(replace(log, voltage_v=2.0 * plain.voltage_v - log.voltage_v))
+    result = fit(turned, replace(OPTIONS, effects=("resistance_temperature",)))
+    assert parameters(result, "resistance_temperature")["share"][0] == pytest.approx(0.0, abs=1e-3)
+    assert any("share lies at its bound of 0" in remark for remark in result.remarks)
+    assert all(resistance < 0.0 for resistance in result.voltage_model.resistance_ohm)
+
+
+def test_information_holds_the_coefficients_with_the_effects_left_open() -> None:
+    result = fitted("cold")
+    information = result.model.information
+    assert information is not None
+    root, scale = np.array(information.root), np.array(information.scale)
+    # Compared as resistances: k0 … k7 lean on each other.
+    at = np.linalg.solve(root, np.array(information.projected)) / scale
+    assert at[-4:] == pytest.approx(result.voltage_model.resistance_ohm, rel=0.02)
+    spread = np.linalg.inv(root.T @ root) / scale / scale[:, None]
+    plain = fit(trips("cold"), OPTIONS).model.information
+    plain_root, plain_scale = np.array(plain.root), np.array(plain.scale)
+    held = np.linalg.inv(plain_root.T @ plain_root) / plain_scale / plain_scale[:, None]
+    # What the effect may take from the resistance is no longer known of it.
+    assert spread[-4, -4] > 1.05 * held[-4, -4]
+
+
+def of_trips(name: str) -> list[Prepared]:
+    return [prepare_log(log, OPTIONS) for log in trips(name)]
+
+
+def test_columns_are_the_residuals_derivative() -> None:
+    logs, model = of_trips("dynamics"), truth("dynamics")
+    linear = linearise(model, logs)
+    rng = np.random.default_rng(4)
+    spans = np.array([item.step for item in linear.free])
+    change = np.concatenate((1e-4 * np.abs(model.model.coefficients), 0.05 * spans))
+    change *= rng.uniform(-1.0, 1.0, change.size)
+    moved = residual_of(moved_by(linear, change), logs)
+    expected = linear.residual_v - linear.columns @ change
+    scale = np.abs(linear.columns @ change).max()
+    assert np.abs(moved - expected).max() < 0.02 * scale
+
+
+def test_no_row_is_judged_by_a_fit_that_saw_it() -> None:
+    """A log that is spoilt must not change what the folds without it say of the others."""
+    logs = of_trips("dynamics")
+    judge = Judge(logs)
+    seen = np.zeros(judge.unit.size, dtype=int)
+    for fold in judge.folds:
+        assert not np.any(fold.fit_on & fold.judge_on)
+        seen += fold.judge_on
+    assert seen.max() == 1
+    assert seen.mean() > 0.5
+    plain = fit(trips("dynamics"), OPTIONS)
+    expected = np.concatenate(plain.held_out_error_v)
+    found = judge(ExtendedModel(plain.voltage_model, CAPACITY_AH)).error_v
+    np.testing.assert_allclose(found, expected, atol=1e-6)  # exact: without effects it is linear
+
+
+def judged(unit_rmse_v: Sequence[float]) -> Judged:
+    return Judged(np.repeat(unit_rmse_v, 50), np.repeat(np.arange(len(unit_rmse_v)), 50))
+
+
+def test_better_needs_most_logs_and_not_one_alone() -> None:
+    before = judged([1.0] * 8)
+    assert compare(before, judged([0.8, 0.85, 0.9, 0.8, 0.9, 0.85, 0.8, 0.88])).better
+    assert not compare(before, judged([0.2, *[1.0] * 7])).better
+    assert not compare(before, judged([0.999] * 8)).better  # sure, but not worth it
+    assert not compare(before, judged([1.2, 0.8] * 4)).better
+    assert not compare(judged([1.0] * 3), judged([0.9, 0.8, 0.97])).better
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (["gremlin"], "known are"),
+        (["hysteresis,"], "no effect that this release knows"),
+        (["auto,hysteresis"], "auto alone"),
+        (["auto", "auto"], "auto alone"),
+        (["resistance_asymmetry", "resistance_asymmetry"], "once"),
+        (["slow_diffusion"] * 3, "twice"),
+        *(([effect_id], "cannot find it") for effect_id in REFUSED),
+    ],
+)
+def test_bad_ids_are_refused(given: list[str], words: str) -> None:
+    with pytest.raises(InputError, match=words) as error:
+        parse_ids(given)
+    assert error.value.field == "--effects"
+
+
+def test_ids_come_in_lists_and_repeated() -> None:
+    given = ["slow_diffusion, fast_polarization", "slow_diffusion"]
+    assert parse_ids(given) == ("slow_diffusion", "fast_polarization", "slow_diffusion")
+    assert parse_ids(["auto"]) == ("auto",)
+    assert parse_ids([",".join(CLEAN)]) == CLEAN
+
+
+def test_one_short_log_shows_no_effect() -> None:
+    short = synthetic_log(hours=0.25, start_pct=80.0, end_pct=70.0, noise_v=0.3)
+    assert fit([short], OPTIONS).model.effects == []
+    with pytest.raises(InputError, match="can be held out") as error:
+        fit([short], replace(OPTIONS, effects=("auto",)))
+    assert "--effects" in str(error.value)
