@@ -242,6 +242,21 @@ def test_better_needs_most_logs_and_not_one_alone() -> None:
     assert not compare(judged([1.0] * 3), judged([0.9, 0.8, 0.97])).better
 
 
+def test_what_only_shifts_whole_logs_is_not_enough() -> None:
+    """Errors that last as long as a log may be guessed by chance; within the logs nothing tells."""
+    rng = np.random.default_rng(0)
+    fast = rng.normal(0.0, 0.3, (8, 200))
+    unit = np.repeat(np.arange(8), 200)
+
+    def with_offsets(offset_v: float, scale: float) -> Judged:
+        return Judged((scale * fast + offset_v).ravel(), unit, whole_logs=True)
+
+    assert not compare(with_offsets(0.5, 1.0), with_offsets(0.1, 1.0)).better
+    smaller = rng.uniform(0.7, 0.95, (8, 1))
+    after = Judged((smaller * fast + 0.1).ravel(), unit, whole_logs=True)
+    assert compare(with_offsets(0.5, 1.0), after).better
+
+
 @pytest.mark.parametrize(
     ("given", "words"),
     [

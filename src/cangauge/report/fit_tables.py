@@ -89,9 +89,9 @@ def effect_tables(result: Identification) -> list[Block]:
             f"Root mean square error on data left out: {significant(before, 4)} V without effects,"
             f" {significant(after, 4)} V with those above. One is taken if the mean logarithm of"
             " the ratio of errors, log by log, lies so many standard errors (t) above zero as"
-            " chance seldom reaches, and if the error falls by 1 % at least. Which effects to take"
-            " was chosen on the same data that judge them, so the last figure is a little too"
-            " good.",
+            " chance seldom reaches (within the logs half as many), and if the error falls by 1 %."
+            " Which effects to take was chosen on the same data that judge them, so the last figure"
+            " is a little too good.",
         ),
     ]
 

@@ -20,8 +20,7 @@ FloatArray = NDArray[np.float64]
 
 
 FEW_LOGS = 5
-"""With fewer whole logs, simulated ones without effects but with errors that last as long as a log
-still showed an effect in two of ten cases."""
+"""With fewer whole logs their mean gain has hardly a standard error; it is said."""
 
 AT_BOUND = 1e-6
 """A parameter this near its bound, in parts of the bounds, is held by it."""

@@ -9,7 +9,10 @@ The rule: a model with one more effect is better by more than chance if the mean
 logarithms exceeds its standard error by so much as Student's t exceeds with probability `CHANCE`
 (2.2 standard errors for eleven logs, 4.3 for three) over the effect's amplitudes, and if the pooled
 root mean square error falls by `GAIN_AT_LEAST`. One standard error would let in the best of ten
-useless effects too often, and those with several amplitudes first.
+useless effects too often, and those with several amplitudes first. Where whole logs are left out,
+half as many standard errors are asked of the error's variance within each log: a few logs that
+differ by what lasts as long as they do are easily told apart by an effect of the temperature, by
+chance, and nothing within them bears it out.
 """
 
 from __future__ import annotations
@@ -49,6 +52,9 @@ GAIN_AT_LEAST = 0.01
 UNITS_AT_LEAST = 3
 """Fewer logs or blocks than this tell nothing about chance."""
 
+WITHIN = 0.5
+"""So many standard errors, in parts of those asked for, must the error fall within the logs."""
+
 LEAST_V2 = 1e-12
 """Mean square errors below this are alike [V²]."""
 
@@ -74,6 +80,8 @@ class Judged:
     """Shape (n,); NaN where no fold judged the row."""
     unit: NDArray[np.intp]
     """Number of the log, or block, that each row belongs to, shape (n,)."""
+    whole_logs: bool = False
+    """Whether whole logs were left out."""
 
     @property
     def rmse_v(self) -> float:
@@ -85,6 +93,14 @@ class Judged:
         """Mean square error of each judged log or block [V²], shape (units,)."""
         seen = ~np.isnan(self.error_v)
         return mean_squares(self.error_v[seen] ** 2, self.unit[seen])
+
+    @property
+    def within_v2(self) -> FloatArray:
+        """Variance of the error within each log, shape (units,)."""
+        seen = ~np.isnan(self.error_v)
+        unit = self.unit[seen]
+        mean = np.bincount(unit, self.error_v[seen]) / np.maximum(np.bincount(unit), 1)
+        return mean_squares((self.error_v[seen] - mean[unit]) ** 2, unit)
 
 
 def mean_squares(squares: FloatArray, unit: NDArray[np.intp]) -> FloatArray:
@@ -150,7 +166,7 @@ class Judge:
             of_logs = np.isin(self._owner, fold.logs)
             seen = residual_of(moved, [self.logs[k] for k in fold.logs])
             error_v[fold.judge_on] = seen[fold.judge_on[of_logs]]
-        return Judged(error_v, self.unit)
+        return Judged(error_v, self.unit, whole_logs=len(self.logs) >= LOGS_AT_LEAST)
 
     def screen(
         self, linear: Linear, extra: Sequence[FloatArray], bounds: Sequence[FloatArray]
@@ -212,7 +228,8 @@ class Comparison:
     before_rmse_v: float
     after_rmse_v: float
     t_value: float
-    """Mean logarithm of the ratio of mean square errors over its standard error."""
+    """Mean logarithm of the ratio of mean square errors over its standard error; where whole logs
+    are left out, the lesser of that and twice the same of the variances within the logs."""
     needed: float
     """What chance would not exceed."""
 
@@ -236,18 +253,25 @@ def compare(before: Judged, after: Judged, amplitudes: int = 1) -> Comparison:
     amplitudes : int
         Of the effect that the second has beside the first.
     """
-    logs = np.log(before.unit_v2) - np.log(after.unit_v2)
-    n = logs.size
-    t_value = -math.inf
-    if np.all(np.isfinite(logs)):
-        error = max(float(np.std(logs, ddof=1)) / math.sqrt(n), 1e-12)
-        t_value = float(np.mean(logs)) / error
+    t_value = _t_value(before.unit_v2, after.unit_v2)
+    if before.whole_logs:
+        t_value = min(t_value, _t_value(before.within_v2, after.within_v2) / WITHIN)
     return Comparison(
         before.rmse_v,
         after.rmse_v,
         t_value,
-        float(student_t.ppf(1.0 - CHANCE / amplitudes, n - 1)),
+        float(student_t.ppf(1.0 - CHANCE / amplitudes, before.unit_v2.size - 1)),
     )
+
+
+def _t_value(before_v2: FloatArray, after_v2: FloatArray) -> float:
+    """Return the mean logarithm of the ratio of mean squares over its standard error."""
+    with np.errstate(invalid="ignore"):
+        logs = np.log(before_v2) - np.log(after_v2)
+    if not np.all(np.isfinite(logs)):
+        return -math.inf
+    error = float(np.std(logs, ddof=1)) / math.sqrt(logs.size)
+    return float(np.mean(logs)) / max(error, 1e-12)
 
 
 def _units(logs: Sequence[Prepared]) -> NDArray[np.intp]:
