@@ -156,13 +156,15 @@ def diagnose(
         closed_ci=closed_interval(settled, judged, floor) if is_gap else None,
         where=tuple(places(settled.diagnosed, model_file.capacity_ah)),
         worst=tuple(worst_moments(settled.diagnosed)),
-        candidates=tuple(_candidates(settled, verdict, floor)),
+        candidates=tuple(_candidates(settled, verdict, floor, extension)),
         observability=tuple(_observability(settled)),
         extension=extension,
     )
 
 
-def _candidates(settled: Settled, verdict: Verdict, floor: float) -> list[dict[str, Any]]:
+def _candidates(
+    settled: Settled, verdict: Verdict, floor: float, extension: Extension
+) -> list[dict[str, Any]]:
     result = []
     for number, score in enumerate(verdict.candidates):
         judged = judge(settled, [score.effect_id]) if number < SHOWN else []
@@ -172,7 +174,9 @@ def _candidates(settled: Settled, verdict: Verdict, floor: float) -> list[dict[s
                 "probability": verdict.chances[score.effect_id],
                 "log_bayes_factor": score.log_bayes_factor,
                 **_errors(settled, judged, floor),
-                "parameters": cause_parameters(score, settled),
+                "parameters": cause_parameters(
+                    score, settled, extension.cause.get(score.effect_id)
+                ),
             }
         )
     return result

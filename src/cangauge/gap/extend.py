@@ -206,11 +206,22 @@ def _for_later_drives(effect: Effect, values: Values) -> Values:
     return {**values, "start_s": 0.0} if effect.id == "resistance_step" else values
 
 
-def cause_parameters(score: Score, settled: Settled) -> dict[str, dict[str, object]]:
-    """Return each parameter of a candidate with its 95 % interval and unit."""
+def cause_parameters(
+    score: Score, settled: Settled, refined: Values | None = None
+) -> dict[str, dict[str, object]]:
+    """Return each parameter of a candidate with its 95 % interval and unit.
+
+    Parameters
+    ----------
+    score : Score
+    settled : Settled
+    refined : mapping, optional
+        Values fitted through the model's own equations (`Extension.cause`): the intervals, which
+        are those of the linear solution, are laid around these.
+    """
     choices = [settled.frame.choices[k] for k in score.candidates]
     first, size = choices[0], len(choices[0].amplitudes)
-    values = mixed(choices, np.split(score.amplitude, len(choices)))
+    values = refined or mixed(choices, np.split(score.amplitude, len(choices)))
     units = {parameter.name: parameter.unit for parameter in first.effect.parameters}
     result: dict[str, dict[str, object]] = {}
     for k, name in enumerate(first.amplitudes):
