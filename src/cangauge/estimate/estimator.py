@@ -47,6 +47,9 @@ USUAL_CURRENT_C_RATE = 1.0 / 3.0
 CONTRADICTED_S = 300.0
 """For how long after a lasting contradiction, or the filter's loss, the estimate is marked [s]."""
 
+AGREES_PCT = 1e-6
+"""A state's estimate is what its filter or count says, to rounding [%]."""
+
 TEMPERATURE_STD_K = 10.0
 """Uncertainty of a temperature that is not measured [K]."""
 
@@ -462,7 +465,7 @@ class Estimator:
             If the state does not fit the model; the estimator must then not be used.
         """
         self._resume(state, age_s)
-        self._online.remember(state.effects)
+        self._online.remember(state.effects, state.clock.last_s)
         self._anchors.restore(state.anchors)
         self.resets = state.resets
         is_same = (state.method, state.capacity_ah) == (self.settings.method, self.capacity_ah)
@@ -471,7 +474,24 @@ class Estimator:
         elif self.settings.method == "ekf" and math.isfinite(self._coulomb_start_pct):
             self._fusion.restore(state.belief)
             self._fused = True
+        if is_same:
+            self._check_agreement(state)
         return self._last_estimate
+
+    def _check_agreement(self, state: EstimatorState) -> None:
+        """Refuse a state whose filter or count says something else than its last estimate."""
+        if self.settings.method == "newton":
+            return
+        soc, std = self._chosen(self._coulomb_start_pct - self._counter.discharged_pct)
+        kept_std = state.soc_std_pct
+        # An estimator that has just taken over from another one began from no more than that.
+        apart_pct = min(abs(std - kept_std), abs(std - min(kept_std, UNKNOWN_SOC_STD_PCT)))
+        if abs(soc - state.soc_pct) > AGREES_PCT or apart_pct > AGREES_PCT:
+            raise InputError(
+                f"the last estimate, {state.soc_pct:g} ± {kept_std:g} %, is not what filter and"
+                f" count say, {soc:g} ± {std:g} %",
+                field="estimate",
+            )
 
     def take_over(self, before: Estimator) -> None:
         """Go on where another estimator stands, of another model or other settings.
