@@ -569,3 +569,24 @@ def test_a_state_holds_no_nan_and_is_plain_json(machine: Machine) -> None:
     data = json.loads(machine.path.read_text(), parse_constant=pytest.fail)
     assert data["content"]["estimator"]["gap_until_s"] is None
     assert math.isfinite(data["content"]["estimator"]["estimate"][1])
+
+
+@pytest.mark.parametrize("method", ["ekf", "coulomb"])
+def test_after_a_refused_state_the_given_soc_is_of_an_earlier_start(
+    machine: Machine, method: Any
+) -> None:
+    given = EstimatorSettings(method=method, initial_soc_pct=40.0, initial_soc_std_pct=1.0)
+    machine.settings = GaugeSettings(estimator=given)
+    first = machine.start()
+    # At a first start it is believed: the drive begins at 80 %, so this shows.
+    assert first.drive(DRIVE[:3])[-1].soc_pct == pytest.approx(40.0, abs=2.0)
+    first.stop()
+    machine.path.write_bytes(b"")
+    again = machine.start()
+    assert "starting by voltage, for the given SoC is of an earlier start" in machine.text
+    found = again.drive(DRIVE[:1000])[-1]
+    assert abs(found.soc_pct - 79.0) < 3.0 * found.soc_std_pct
+    assert found.soc_pct == pytest.approx(79.0, abs=4.0)
+    # Nor is it taken up again when the configuration is read again.
+    again.gauge.reconfigure(None, machine.model, machine.settings)
+    assert again.drive(DRIVE[1000:1010])[-1].soc_pct == pytest.approx(79.0, abs=4.0)

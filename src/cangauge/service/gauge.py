@@ -207,6 +207,10 @@ class Gauge:
         """Go on from a state; see `EstimateStream.restore`."""
         return self._stream.restore(state, age_s)
 
+    def ask_the_voltage(self) -> bool:
+        """Begin from the voltage; see `EstimateStream.ask_the_voltage`."""
+        return self._stream.ask_the_voltage()
+
     def _publish(self, estimate: Estimate) -> list[can.Message]:
         if not self._is_replay:
             return []

@@ -228,7 +228,15 @@ class StateKeeper:
             kept = f"; kept as {aside.name}"
         except OSError as problem:
             kept = f" (and cannot be put aside: {problem.strerror})"
-        self._tell(f"warning: state refused: {error}{kept}; starting without")
+        # A SoC that the user gave was true at some earlier start: there is a state, so the car has
+        # been used since. Kept with a wide deviation it would tell nothing that the voltage does
+        # not, and counting alone would never be rid of it.
+        how = (
+            "by voltage, for the given SoC is of an earlier start"
+            if (self._gauge.ask_the_voltage())
+            else "without"
+        )
+        self._tell(f"warning: state refused: {error}{kept}; starting {how}")
 
     def _sweep(self) -> None:
         """Remove what a process that was killed while writing has left."""

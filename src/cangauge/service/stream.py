@@ -224,6 +224,18 @@ class EstimateStream:
         self.latest = latest._replace(status=Status.INVALID, reasons=reasons)
         return self.latest
 
+    def ask_the_voltage(self) -> bool:
+        """Begin from the first voltages, whatever initial SoC was given; False if none was.
+
+        For a start at which the given one is known to be of another time.
+        """
+        if self._settings.initial_soc_pct is None:
+            return False
+        default = EstimatorSettings().initial_soc_std_pct
+        self._settings = replace(self._settings, initial_soc_pct=None, initial_soc_std_pct=default)
+        self._estimator = Estimator(self._model, self._settings)
+        return True
+
     def _step(self, sample: Sample | None) -> Estimate | None:
         if sample is None:
             return None
