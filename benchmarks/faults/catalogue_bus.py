@@ -6,7 +6,6 @@ import time
 from pathlib import Path
 from typing import Final, Literal
 
-from faults.catalogue_state import WITHOUT_SOC
 from faults.drive import REAL
 from faults.fault import Fault, Need, Plan, at
 from faults.line import run
@@ -110,9 +109,9 @@ INTERFACE = [
 
 DISK = [
     Fault("disk full", "state on a full file system, then killed and started again", REAL,
-          plan=small_disk("full"), needs=STATE, config=WITHOUT_SOC),
+          plan=small_disk("full"), needs=STATE),
     Fault("state read-only", "state on a read-only file system, then killed and started again",
-          REAL, plan=small_disk("read-only"), needs=STATE, config=WITHOUT_SOC),
+          REAL, plan=small_disk("read-only"), needs=STATE),
 ]  # fmt: skip
 
 CLOCK = [

@@ -107,6 +107,13 @@ def run_command(  # noqa: PLR0917 - typer passes options by name
         float | None,
         typer.Option(metavar="X", help="Its standard deviation [%]. Default: 1."),
     ] = None,
+    valid_std: Annotated[
+        float | None,
+        typer.Option(
+            metavar="X",
+            help="A SoC with a larger standard deviation is degraded [%]. Default: 1.5.",
+        ),
+    ] = None,
     capacity_ah: Annotated[
         float | None, typer.Option(metavar="A", help="Capacity [Ah]. Default: the model's.")
     ] = None,
@@ -215,6 +222,7 @@ def run_command(  # noqa: PLR0917 - typer passes options by name
         "method": method,
         "initial_soc": initial_soc,
         "initial_soc_std": initial_soc_std,
+        "valid_std": valid_std,
         "capacity_ah": capacity_ah,
         "max_gap_s": max_gap_s,
         "pair_within_s": pair_within_s,

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
 
 from cangauge.errors import InputError
-from cangauge.estimate.anchors import Anchor, AnchorWatch, FullCharge, LongRest
+from cangauge.estimate.anchors import Anchor, AnchorWatch
 from cangauge.estimate.belief import Belief, Since, Verdict
 from cangauge.estimate.clock import EstimatorClock
 from cangauge.estimate.coulomb import ChargeStep, CoulombCounter
 from cangauge.estimate.fusion import UNKNOWN_SOC_STD_PCT, Fusion, Measurement
+from cangauge.estimate.settings import EstimatorSettings, Method
 from cangauge.estimate.state import DelayLineState, EstimatorState
 from cangauge.estimate.types import Estimate, Reason, Sample, Status
 from cangauge.estimate.validity import (
@@ -27,13 +26,12 @@ from cangauge.estimate.validity import (
     status_of,
     temperature_mismatch,
 )
-from cangauge.logs.log import TemperatureSource
-from cangauge.model.delay_line import GAP_S, DelayLine
+from cangauge.model.delay_line import DelayLine
 from cangauge.model.effects.effect import Reading
 from cangauge.model.inverse import Inverse, soc_from_ocv
 from cangauge.model.model_file import ModelFile, effective_error_std_v
 
-Method = Literal["ekf", "newton", "coulomb"]
+__all__ = ["Estimator", "EstimatorSettings", "Method"]
 
 REST_CURRENT_C_RATE = 0.02
 """Below this current the pack rests [1/h]: 1.2 A at 60 Ah."""
@@ -52,50 +50,6 @@ AGREES_PCT = 1e-6
 
 TEMPERATURE_STD_K = 10.0
 """Uncertainty of a temperature that is not measured [K]."""
-
-
-@dataclass(frozen=True)
-class EstimatorSettings:
-    """What a user may choose.
-
-    Parameters
-    ----------
-    method : {"ekf", "newton", "coulomb"}
-        Whose SoC is published.
-    initial_soc_pct : float, optional
-        SoC at the first sample [%]; by default from the first voltages.
-    initial_soc_std_pct : float
-        Its standard deviation [%].
-    capacity_ah : float, optional
-        Overrides the model's capacity [Ah].
-    gap_s : float
-        A longer step between current samples is a gap [s].
-    temperature_source : str
-        What the input's temperature is measured on.
-    full_charge : FullCharge, optional
-    long_rest : LongRest, optional
-        Rules that say what the SoC is at some moments; None is off.
-    """
-
-    method: Method = "ekf"
-    initial_soc_pct: float | None = None
-    initial_soc_std_pct: float = 1.0
-    capacity_ah: float | None = None
-    gap_s: float = GAP_S
-    temperature_source: TemperatureSource = "unknown"
-    full_charge: FullCharge | None = None
-    long_rest: LongRest | None = None
-
-    def __post_init__(self) -> None:
-        for name, low, high in (
-            ("initial_soc_pct", 0.0, 100.0),
-            ("initial_soc_std_pct", 0.0, 100.0),
-            ("capacity_ah", 1e-3, 1e5),
-            ("gap_s", 1e-3, 3600.0),
-        ):
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                raise InputError(f"must lie within {low:g} … {high:g}", field=name, value=value)
 
 
 _SCALARS = (
@@ -356,7 +310,7 @@ class Estimator:
         if math.isfinite(soc):
             beside_v = self._model.offset_at(self._known_temperature_c(), self._line.currents())
             voltage_model_v = self._online.pseudo_ocv_at(soc)[0] + beside_v
-        reasons = self._reasons(sample, soc)
+        reasons = self._reasons(sample, soc, std)
         return Estimate(
             time_s=time_s,
             soc_pct=soc,
@@ -390,10 +344,12 @@ class Estimator:
         moved_pct = self._counter.moved_pct - self._coulomb_moved_pct
         return self._fusion.count_std_pct(self._coulomb_var_pct2, hours, moved_pct)
 
-    def _reasons(self, sample: Sample, soc_pct: float) -> Reason:
+    def _reasons(self, sample: Sample, soc_pct: float, std_pct: float) -> Reason:
         reasons = self._standing | self._implausible
         if math.isnan(soc_pct):
             reasons |= Reason.NO_INITIAL_SOC
+        if std_pct > self.settings.valid_std_pct:
+            reasons |= Reason.SOC_UNCERTAIN
         if not self._line.full:
             reasons |= Reason.DELAY_LINE_FILLING
         if sample.time_s < self._gap_until_s:

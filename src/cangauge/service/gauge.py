@@ -15,7 +15,7 @@ from cangauge.bus.time_source import TimeSourceName
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.belief import Verdict
-from cangauge.estimate.estimator import EstimatorSettings
+from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.state import EstimatorState
 from cangauge.estimate.types import Estimate, Reason, Sample
 from cangauge.estimate.validity import status_of

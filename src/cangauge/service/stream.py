@@ -24,7 +24,8 @@ from cangauge.bus.time_source import (
 )
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.belief import Verdict
-from cangauge.estimate.estimator import Estimator, EstimatorSettings
+from cangauge.estimate.estimator import Estimator
+from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.state import EstimatorState
 from cangauge.estimate.types import Estimate, Reason, Sample, Status
 from cangauge.estimate.validity import status_of
