@@ -164,7 +164,7 @@ def run_command(  # noqa: PLR0917 - typer passes options by name
         typer.Option(
             metavar="FILE",
             help="Keep SoC, its uncertainty and the delay line here over restarts: written every"
-            " 30 s and at the end. A folder stands for a file in it. Default: systemd's"
+            " 10 s and at the end. A folder stands for a file in it. Default: systemd's"
             " StateDirectory, if there is one.",
         ),
     ] = None,
@@ -176,7 +176,7 @@ def run_command(  # noqa: PLR0917 - typer passes options by name
     ] = None,
     state_every_s: Annotated[
         float | None,
-        typer.Option("--state-every", metavar="S", help="Write it so often [s]. Default: 30."),
+        typer.Option("--state-every", metavar="S", help="Write it so often [s]. Default: 10."),
     ] = None,
     soc_estimate_id: EstimateIdOption = None,
     soc_detail_id: DetailIdOption = None,

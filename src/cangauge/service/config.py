@@ -71,6 +71,7 @@ from cangauge.service.gauge import GaugeSettings
 from cangauge.service.loop import LoopSettings
 from cangauge.service.ops_config import OPS_PATHS, OpsConfig
 from cangauge.service.state_keeper import StateSettings, state_path
+from cangauge.service.upkeep import CHECKPOINT_EVERY_S
 
 DEFAULT_VEHICLE: Final = "generic"
 """What `replay` sends by default, so that both commands find each other without options."""
@@ -215,7 +216,7 @@ class RunConfig(OpsConfig):
     until_idle_s: Seconds | None = None
     state: str | None = None
     state_max_age_s: Seconds = 7.0 * 86400.0
-    state_every_s: Annotated[FiniteFloat, Field(ge=0.1, le=86400.0)] = 30.0
+    state_every_s: Annotated[FiniteFloat, Field(ge=0.1, le=86400.0)] = CHECKPOINT_EVERY_S
     full_charge: FullChargeConfig | None = None
     long_rest: LongRestConfig | None = None
     _file: str = PrivateAttr("the configuration")

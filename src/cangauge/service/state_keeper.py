@@ -29,6 +29,7 @@ from cangauge.service.state_file import (
     read_state,
     state_text,
 )
+from cangauge.service.upkeep import CHECKPOINT_EVERY_S
 
 FILE_NAME: Final = "cangauge-state.json"
 """What the file is called in a folder."""
@@ -63,7 +64,7 @@ class StateSettings:
 
     path: Path
     max_age_s: float = 7.0 * 86400.0
-    every_s: float = 30.0
+    every_s: float = CHECKPOINT_EVERY_S
 
 
 def state_path(given: str | None, environment: Mapping[str, str]) -> Path | None:
