@@ -22,14 +22,14 @@ from cangauge.estimate.validity import (
     acceptable,
     cleaned,
     outside_model,
-    outside_model_std_v,
     status_of,
     temperature_mismatch,
 )
+from cangauge.estimate.voltage_error import VoltageError
 from cangauge.model.delay_line import DelayLine
 from cangauge.model.effects.effect import Reading
 from cangauge.model.inverse import Inverse, soc_from_ocv
-from cangauge.model.model_file import ModelFile, effective_error_std_v
+from cangauge.model.model_file import ModelFile
 
 __all__ = ["Estimator", "EstimatorSettings", "Method"]
 
@@ -39,17 +39,11 @@ REST_CURRENT_C_RATE = 0.02
 REST_S = 600.0
 """After this long at rest, slow polarisation has decayed [s]."""
 
-USUAL_CURRENT_C_RATE = 1.0 / 3.0
-"""What a current that was not seen may have been [1/h]: 20 A at 60 Ah."""
-
 CONTRADICTED_S = 300.0
 """For how long after a lasting contradiction, or the filter's loss, the estimate is marked [s]."""
 
 AGREES_PCT = 1e-6
 """A state's estimate is what its filter or count says, to rounding [%]."""
-
-TEMPERATURE_STD_K = 10.0
-"""Uncertainty of a temperature that is not measured [K]."""
 
 
 _SCALARS = (
@@ -91,7 +85,7 @@ class Estimator:
         self._fusion = Belief(lambda: Fusion(self._online, self.capacity_ah, noise))
         self._anchors = AnchorWatch(self.settings.full_charge, self.settings.long_rest)
         self._bias_std_v = math.hypot(noise.slow_std_v, noise.lasting_std_v)
-        self._fast_std_v = effective_error_std_v(noise, 1.0 / model.rate_hz)
+        self._voltage_error = VoltageError(self._model, model, self.capacity_ah)
         self._standing = temperature_mismatch(
             model.temperature_source, self.settings.temperature_source
         )
@@ -251,7 +245,11 @@ class Estimator:
         beside_v = self._model.offset_at(self._known_temperature_c(), self._line.currents())
         guess = self._newton.soc_pct if math.isfinite(self._newton.soc_pct) else 50.0
         self._newton = soc_from_ocv(self._online, sample.voltage_v - beside_v, guess)
-        std_v = self._error_std_v()
+        std_v = self._voltage_error.std_v(
+            self._fusion.soc_pct if self._fused else self._newton.soc_pct,
+            self._temperature_c,
+            self._line,
+        )
         slope = self._online.pseudo_ocv_at(self._newton.soc_pct)[1]
         self._newton_std_pct = min(math.hypot(std_v, self._bias_std_v) / slope, UNKNOWN_SOC_STD_PCT)
         if math.isnan(self._coulomb_start_pct):
@@ -271,35 +269,6 @@ class Estimator:
         self._fusion.start(soc_pct, UNKNOWN_SOC_STD_PCT)
         self._contradicted_until_s = time_s + CONTRADICTED_S
         self.resets += 1
-
-    def _error_std_v(self) -> float:
-        """Return the fast error of this voltage [V], larger where the model is out of its depth."""
-        squares = self._fast_std_v**2
-        if not self._line.full:
-            squares = self._filling_var_v2(squares)
-        if math.isnan(self._temperature_c):
-            squares += (self._model.kt_v_per_k * TEMPERATURE_STD_K) ** 2
-        soc = self._fusion.soc_pct if self._fused else self._newton.soc_pct
-        squares += outside_model_std_v(self._model, soc, self._temperature_c) ** 2
-        return math.sqrt(squares)
-
-    def _filling_var_v2(self, settled_var_v2: float) -> float:
-        """Return the error's variance while the delay line fills [V²].
-
-        The currents before the first sample are a guess, and the same guess for all samples until
-        the line is full: together they must tell no more than one of them.
-        """
-        filled = self._line.filled_s
-        unknown_ohm = sum(
-            abs(resistance)
-            for resistance, delay in zip(
-                self._model.resistance_ohm, self._model.delay_s, strict=True
-            )
-            if delay > filled
-        )
-        guess_v = unknown_ohm * USUAL_CURRENT_C_RATE * self.capacity_ah
-        alike = max(self._model.delay_s[-1] * self._file.rate_hz, 1.0)
-        return (settled_var_v2 + guess_v**2) * alike
 
     # --- estimate -------------------------------------------------------------------------
 
@@ -345,7 +314,10 @@ class Estimator:
         return self._fusion.count_std_pct(self._coulomb_var_pct2, hours, moved_pct)
 
     def _reasons(self, sample: Sample, soc_pct: float, std_pct: float) -> Reason:
-        reasons = self._standing | self._implausible
+        # Operations on flags are slow, and mostly there are none.
+        reasons = self._standing
+        if self._implausible:
+            reasons |= self._implausible
         if math.isnan(soc_pct):
             reasons |= Reason.NO_INITIAL_SOC
         if std_pct > self.settings.valid_std_pct:
@@ -362,7 +334,8 @@ class Estimator:
             reasons |= Reason.VOLTAGE_OUTSIDE_MODEL
         if sample.time_s < self._contradicted_until_s:
             reasons |= Reason.INNOVATION_LARGE
-        return reasons | outside_model(self._model, soc_pct, sample)
+        outside = outside_model(self._model, soc_pct, sample)
+        return reasons | outside if outside else reasons
 
     def _refuse(self) -> Estimate:
         last = self._last_estimate

@@ -274,7 +274,8 @@ class EstimateStream:
         reasons = estimate.reasons
         if sample is not None and math.isnan(sample.voltage_v):
             reasons &= ~Reason.VOLTAGE_MISSING
-        reasons |= missing
+        if missing:
+            reasons |= missing
         if reasons == estimate.reasons:
             return estimate
         return estimate._replace(reasons=reasons, status=status_of(reasons))
