@@ -27,7 +27,6 @@ from cangauge.service.record import Recorder
 from cangauge.service.reload import Reloader
 from cangauge.service.signals import note_hangups, stop_on_signals
 from cangauge.service.state_keeper import StateKeeper
-from cangauge.service.table import EstimateWriter
 
 _LOG = logging.getLogger(__name__)
 
@@ -62,6 +61,9 @@ def run_service(config: RunConfig, read: Callable[[], RunConfig]) -> dict[str, A
         if config.record is not None:
             recorder = stack.enter_context(Recorder(config.record, config.record_limits()))
         if config.output is not None:
+            # pyarrow is slow to import, and few services write a table.
+            from cangauge.service.table import EstimateWriter  # noqa: PLC0415
+
             table = stack.enter_context(EstimateWriter(config.output, _voice("file.failed")))
         monitor = stack.enter_context(operated(config, vehicle.name, gauge, port, recorder))
         if console.is_terminal:
