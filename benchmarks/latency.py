@@ -218,11 +218,12 @@ class Sent:
         return self.frames / self.seconds
 
 
-def loss(address: BusAddress, seconds: float) -> Result:
+def loss(address: BusAddress, seconds: float, shares: list[float], highest_hz: float) -> Result:
     """Search the bare loop's highest rate, then let the service see it."""
     result: Result = {}
-    for name, share in (("5 % wanted", WANTED_SHARE), ("all wanted", 1.0)):
-        rate_hz = highest_rate(address, share)
+    for share in shares:
+        name = "all wanted" if share == 1.0 else f"{100.0 * share:.0f} % wanted"
+        rate_hz = highest_rate(address, share, highest_hz)
         sys.stderr.write(f"loss, {name}: {rate_hz:.0f} frames/s for {seconds:.0f} s …\n")
         with service(address, "--until-idle", "5") as process:
             sent = _send(address, rate_hz, seconds, share)
@@ -242,10 +243,10 @@ def loss(address: BusAddress, seconds: float) -> Result:
     return result
 
 
-def highest_rate(address: BusAddress, share: float) -> float:
+def highest_rate(address: BusAddress, share: float, highest_hz: float = HIGHEST_HZ) -> float:
     """Return the highest rate [frames/s], to 10 %, that the bare loop carries without loss."""
-    good, rate_hz, bad = 0.0, 2000.0, HIGHEST_HZ
-    while rate_hz < 1.1 * HIGHEST_HZ and bad > 1.1 * max(good, 1.0):
+    good, rate_hz, bad = 0.0, min(2000.0, highest_hz), 1.1 * highest_hz
+    while good < highest_hz and bad > 1.1 * max(good, 1.0):
         sent, got = _bare_count(address, rate_hz, TRY_S, share)
         is_carried = got == sent.wanted and sent.rate_hz > 0.95 * rate_hz
         sys.stderr.write(
@@ -254,7 +255,7 @@ def highest_rate(address: BusAddress, share: float) -> float:
         )
         if is_carried:
             good = rate_hz
-            rate_hz = min(2.0 * rate_hz, 0.5 * (good + bad))
+            rate_hz = min(2.0 * rate_hz, 0.5 * (good + bad), highest_hz)
         else:
             bad = rate_hz
             rate_hz = 0.5 * (good + bad)
@@ -344,6 +345,13 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=20.0, help="of a round of latency")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--minutes", type=float, default=1.0, help="of the loss part (wanted: 10)")
+    parser.add_argument(
+        "--highest", type=float, default=HIGHEST_HZ, metavar="HZ",
+        help="rate that the search ends at; a bus of 1 Mbit/s carries less than 20,000 frames/s",
+    )  # fmt: skip
+    parser.add_argument(
+        "--wanted", action="append", type=float, help="shares of the frames: 0.05 and 1"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     more = udp(0).options if options.interface == "udp_multicast" else {}
@@ -353,7 +361,9 @@ def main() -> int:
     if "latency" in parts:
         result["latency"] = latency(address, options.seconds, options.rounds)
     if "loss" in parts:
-        result["loss"] = loss(address, 60.0 * options.minutes)
+        result["loss"] = loss(
+            address, 60.0 * options.minutes, options.wanted or [WANTED_SHARE, 1.0], options.highest
+        )
     if options.json:
         sys.stdout.write(json.dumps(result) + "\n")
     else:

@@ -5,7 +5,7 @@
 in-process  A drive of 10 Hz is estimated without a break, and beside it by a service that is killed
             again and again. A kill throws the gauge and the state keeper away; the next service has
             the state file as it was written by then, and nothing else. The file is written a second
-            after the start and then every 30 s of the drive, as by the service's loop; one in ten
+            after the start and then every 10 s of the drive, as by the service's loop; one in ten
             kills falls into the writing and leaves half a temporary file. Between kill and first
             frame 0.2 to 3 s of the drive are lost.
 process     `cangauge run` in a process of its own on a bus (udp_multicast), SIGKILLed at random
@@ -47,10 +47,10 @@ from cangauge.estimate.types import Estimate, Reason, Sample
 from cangauge.model.model_file import ModelFile, load_model
 from cangauge.service.gauge import Gauge, GaugeSettings
 from cangauge.service.state_keeper import StateKeeper, StateSettings
-from cangauge.service.upkeep import FIRST_CHECKPOINT_S
+from cangauge.service.upkeep import CHECKPOINT_EVERY_S, FIRST_CHECKPOINT_S
 from cangauge.share import shared_file
 
-EVERY_S = 30.0
+EVERY_S = CHECKPOINT_EVERY_S
 RATE_HZ = 10
 START_PCT = 90.0
 MEAN_BETWEEN_KILLS_S = 60.0

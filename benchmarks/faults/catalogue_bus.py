@@ -6,11 +6,13 @@ import time
 from pathlib import Path
 from typing import Final, Literal
 
-from faults.catalogue_state import WITHOUT_SOC
 from faults.drive import REAL
 from faults.fault import Fault, Need, Plan, at
 from faults.line import run
 from faults.stage import Stage
+
+DISK_KB: Final = 256
+"""A disk that a state fits on several times [kB], until it is filled."""
 
 VCAN: Final = frozenset[Need]({"vcan"})
 STATE: Final = frozenset[Need]({"vcan", "root", "state"})
@@ -60,7 +62,7 @@ def small_disk(how: Literal["full", "read-only"]) -> Plan:
     def do(stage: Stage) -> None:
         folder = str(stage.state_path.parent)
         kept = stage.state_path.read_bytes() if stage.state_path.exists() else b""
-        run(["mount", "-t", "tmpfs", "-o", "size=16k", "tmpfs", folder])
+        run(["mount", "-t", "tmpfs", "-o", f"size={DISK_KB}k", "tmpfs", folder])
         stage.at_end(lambda: run(["umount", "-l", folder]))
         if kept:
             stage.state_path.write_bytes(kept)
@@ -77,7 +79,7 @@ def small_disk(how: Literal["full", "read-only"]) -> Plan:
 def _fill(path: Path) -> None:
     try:
         with path.open("wb") as file:
-            for _ in range(64):
+            for _ in range(2 * DISK_KB):
                 file.write(bytes(1024))
                 file.flush()
     except OSError:
@@ -110,9 +112,9 @@ INTERFACE = [
 
 DISK = [
     Fault("disk full", "state on a full file system, then killed and started again", REAL,
-          plan=small_disk("full"), needs=STATE, config=WITHOUT_SOC),
+          plan=small_disk("full"), needs=STATE),
     Fault("state read-only", "state on a read-only file system, then killed and started again",
-          REAL, plan=small_disk("read-only"), needs=STATE, config=WITHOUT_SOC),
+          REAL, plan=small_disk("read-only"), needs=STATE),
 ]  # fmt: skip
 
 CLOCK = [

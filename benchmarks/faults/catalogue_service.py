@@ -8,7 +8,6 @@ from random import Random
 from typing import Final
 
 from faults.alter import flood, foreign
-from faults.catalogue_state import WITHOUT_SOC
 from faults.drive import REAL, Profile
 from faults.fault import Action, Fault, Plan, at, during
 from faults.line import Wire
@@ -88,11 +87,11 @@ def garbage(stage: Stage) -> None:
 
 RESTARTS = [
     Fault("SIGTERM, restart", "ended and started again", REAL, plan=at(BEGIN, Stage.restart),
-          needs=frozenset({"state"}), config=WITHOUT_SOC),
+          needs=frozenset({"state"})),
     Fault("SIGKILL, restart", "killed at a random moment, a fresh interpreter started", REAL,
-          plan=kills(1), needs=frozenset({"state"}), config=WITHOUT_SOC, cold=True),
+          plan=kills(1), needs=frozenset({"state"}), cold=True),
     Fault("SIGKILL three times", "killed at random moments and started again", REAL, plan=kills(3),
-          needs=frozenset({"state"}), config=WITHOUT_SOC),
+          needs=frozenset({"state"})),
 ]  # fmt: skip
 
 CONFIG = [

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 from random import Random
-from typing import Any, Final
+from typing import Any
 
 from faults.drive import REAL
 from faults.fault import Fault, at
@@ -80,9 +80,6 @@ def without_keys(data: bytes, rng: Random) -> bytes:
     return json.dumps(found).encode()
 
 
-WITHOUT_SOC: Final = {"initial_soc": "auto"}
-"""A SoC in the configuration would be that of another moment at the second start."""
-
 WAYS: list[tuple[str, str, Callable[[Stage], None]]] = [
     ("empty", "no byte in it", spoil(lambda _d, _r: b"")),
     ("one byte", "its first byte only", spoil(lambda data, _r: data[:1])),
@@ -113,6 +110,6 @@ WAYS: list[tuple[str, str, Callable[[Stage], None]]] = [
 # In real time: by the replay clock a start would take half a minute of the log.
 ALL = [
     Fault(f"state: {name}", f"state file: {done}; restarted", REAL, plan=at(0.0, do),
-          needs=frozenset({"state"}), config=WITHOUT_SOC)
+          needs=frozenset({"state"}))
     for name, done, do in WAYS
 ]  # fmt: skip

@@ -87,9 +87,9 @@ def test_estimate_frames_say_what_the_estimator_says() -> None:
     assert status == {int(each): each.name.lower() for each in Status}
     reason = message.get_signal_by_name("reason")
     assert reason.length == 17
-    for bit in range(16):
+    for bit in range(17):
         assert f" {bit}: " in str(reason.comment)
-    assert max(Reason).bit_length() == 16
+    assert max(Reason).bit_length() == 17
     assert (message.frame_id, message.cycle_time) == (0x5A0, 100)
     detail = soc.get_message_by_name("SOC_DETAIL")
     assert (detail.frame_id, detail.cycle_time) == (0x5A1, 1000)

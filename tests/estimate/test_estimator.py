@@ -108,7 +108,7 @@ def test_starts_without_initial_soc_from_the_first_voltage(model: ModelFile) -> 
     assert first.soc_pct == pytest.approx(70.0, abs=8.0)
     assert first.soc_std_pct > 1.0
     assert first.status is Status.DEGRADED
-    assert first.reasons == Reason.DELAY_LINE_FILLING
+    assert first.reasons == Reason.DELAY_LINE_FILLING | Reason.SOC_UNCERTAIN
 
 
 def test_status_is_valid_once_the_delay_line_is_full(model: ModelFile) -> None:
@@ -214,3 +214,27 @@ def test_a_long_rest_draws_the_soc_toward_the_rest_voltage(model: ModelFile) -> 
     assert abs(error[-1]) < 1.5
     # After ten minutes slow polarisation has decayed, so the voltage is worth more.
     assert sigma[620] < sigma[590]
+
+
+def test_a_soc_too_uncertain_is_degraded_and_says_so(model: ModelFile) -> None:
+    log = synthetic_log(start_pct=70.0, end_pct=60.0, noise_v=0.2, seed=4, hours=0.5)
+    table, _ = estimate_log(log, model, EstimatorSettings(valid_std_pct=0.8))
+    uncertain = (table.reasons & Reason.SOC_UNCERTAIN) != 0
+    assert np.array_equal(uncertain, table.soc_std_pct > 0.8)
+    assert 0.01 < np.mean(uncertain) < 0.5
+    assert not np.any(table.status[uncertain] == Status.VALID)
+    # Nothing but the mark changes.
+    wide, _ = estimate_log(log, model, EstimatorSettings(valid_std_pct=100.0))
+    assert np.array_equal(wide.soc_pct, table.soc_pct)
+    assert not np.any(wide.reasons & Reason.SOC_UNCERTAIN)
+
+
+def test_a_gap_just_after_driving_off_is_as_uncertain_as_the_current_at_its_ends() -> None:
+    counter = CoulombCounter(capacity_ah=10.0, gap_s=2.0)
+    for second in range(60):
+        counter.step(float(second), 0.0)
+    counter.step(60.0, 30.0)
+    bridged = counter.step(90.0, 30.0)
+    assert bridged.gap_std_pct == pytest.approx(100.0 * 30.0 * 30.0 / 36000.0)
+    away = counter.step(190.0, 0.0)
+    assert away.parked_std_pct > 100.0 * 30.0 * 100.0 / 36000.0 - 0.1

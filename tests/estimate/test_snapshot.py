@@ -205,7 +205,7 @@ def places(data: Any, here: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 PLACES = [place for place in places(state_of_a_drive()) if "line" not in place]
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=150, deadline=None)
 @given(
     st.lists(
         st.tuples(
@@ -235,3 +235,62 @@ def test_a_damaged_state_is_refused_or_does_no_harm(changes: list[tuple[Any, Any
         assert 0.0 <= found.soc_pct <= 100.0 or math.isnan(found.soc_pct)
         assert found.soc_std_pct >= 0.0 or math.isnan(found.soc_std_pct)
         assert math.isnan(found.soc_pct) == math.isnan(found.soc_std_pct)
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        ("belief", "filters", 0, "x", 0),
+        ("belief", "filters", 0, "p", 0, 0),
+        ("belief", "log_odds"),
+        ("since", "discharged_pct"),
+        ("since", "gap_var_pct2"),
+    ],
+)
+def test_what_does_not_bear_the_last_estimate_out_is_refused(place: tuple[Any, ...]) -> None:
+    data = state_of_a_drive()
+    at = data
+    for key in place[:-1]:
+        at = at[key]
+    at[place[-1]] += 0.001
+    with pytest.raises(InputError, match="the last estimate"):
+        Estimator(extended_by(["time_skew", "hysteresis", "slow_diffusion"])).restore(
+            EstimatorState.model_validate(data)
+        )
+
+
+@pytest.mark.parametrize(
+    ("place", "later_s"),
+    [
+        (("counter", "time_s"), -0.9),
+        (("line", "since_s"), 1e5),
+        (("first_s",), 1e5),
+        (("rest_since_s",), 1e5),
+    ],
+)
+def test_times_that_do_not_fit_each_other_are_refused(
+    place: tuple[str, ...], later_s: float
+) -> None:
+    data = state_of_a_drive()
+    at = data
+    for key in place[:-1]:
+        at = at[key]
+    at[place[-1]] = data["clock"]["last_s"] + later_s
+    with pytest.raises(ValueError, match=r"different times|later than the latest sample"):
+        EstimatorState.model_validate(data)
+
+
+def test_what_an_effect_remembers_lies_before_the_latest_sample() -> None:
+    ids = ["time_skew", "slow_diffusion", "hysteresis", "resistance_step", "core_temperature"]
+    whole = Estimator(extended_by(ids))
+    for sample in EVENTFUL[:465]:
+        whole.step(sample)
+    state = through_json(whole.snapshot())
+    Estimator(extended_by(ids)).restore(state)
+    for number, memory in enumerate(state.effects):
+        # Of `time_skew` the first is how many wait, and the second the time of the first of them.
+        at = 1 if len(memory) > 3 else 0
+        effects = [list(each) for each in state.effects]
+        effects[number][at] = state.clock.last_s + 10.0
+        with pytest.raises(InputError, match=rf"effects\.{number}"):
+            Estimator(extended_by(ids)).restore(state.model_copy(update={"effects": effects}))

@@ -19,9 +19,10 @@ from fuzzing import corpus
 # `status` answers 1 where no service runs, and `gap-check` draws its own cases: they are tested in
 # tests/service and tests/gapcheck.
 ELSEWHERE = {"status", "gap-check"}
+GROUP: Any = typer.main.get_command(app)
 COMMANDS: dict[str, Any] = {
-    name: command
-    for name, command in typer.main.get_command(app).commands.items()  # type: ignore[attr-defined]
+    name: GROUP.get_command(None, name)
+    for name in GROUP.list_commands(None)
     if name not in ELSEWHERE
 }
 VALID = {

@@ -168,3 +168,18 @@ def test_only_wanted_ids_pass_the_filters() -> None:
     settings = GaugeSettings(time_source="replay-clock")
     clocked = Gauge(load_vehicle("leaf_aze0"), leaf_model(), settings)
     assert {each["can_id"] for each in clocked.filters} == {0x1DB, 0x55B, 0x5C0, 0x5AF}
+
+
+def test_a_wide_standard_deviation_is_degraded_on_the_bus_and_says_so(log: Log) -> None:
+    reader = SocReader()
+    for limit, status, reasons in (
+        (0.5, Status.DEGRADED, Reason.SOC_UNCERTAIN),
+        (1.5, Status.VALID, Reason.NONE),
+    ):
+        given = EstimatorSettings(initial_soc_pct=80.0, valid_std_pct=limit)
+        gauge = Gauge(load_vehicle("generic"), leaf_model(), GaugeSettings(given))
+        for frame in frames_of(log, load_vehicle("generic")):
+            gauge.handle(frame)
+        told = reader.read(gauge.heartbeat(is_stale=False)[0])
+        assert isinstance(told, SocEstimate)
+        assert (told.status, told.reasons) == (status, reasons)

@@ -370,6 +370,12 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "half": (lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
              "is no JSON"),
     "one bit": (flip, ""),
+    "utf-16": (lambda path: path.write_bytes(path.read_text("utf-8").encode("utf-16")),
+               "is no JSON"),
+    "utf-32": (lambda path: path.write_bytes(path.read_text("utf-8").encode("utf-32")),
+               "is no JSON"),
+    "byte order mark": (lambda path: path.write_text(path.read_text("utf-8"), "utf-8-sig"),
+                        "is no JSON"),
     "a list": (lambda path: path.write_text("[]"), "is no cangauge state"),
     "a model": (lambda path: path.write_text('{"format": "cangauge-model"}'),
                 "is no cangauge state"),
@@ -386,6 +392,8 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
         "damaged"),
     "unknown key": (edited("more", value=1), "content.more"),
     "soc beyond": (edited("estimator", "estimate", 1, value=130.0), "outside 0–100"),
+    "another soc": (edited("estimator", "estimate", 1, value=33.0), "the last estimate"),
+    "later than the latest": (edited("estimator", "rest_since_s", value=1e11), "later than"),
     "filter beyond": (edited("estimator", "belief", "filters", 0, "x", 0, value=-3.0),
                       "belief.filters"),
     "no covariance": (edited("estimator", "belief", "filters", 0, "p", 0, 0, value=-1.0),
@@ -561,3 +569,24 @@ def test_a_state_holds_no_nan_and_is_plain_json(machine: Machine) -> None:
     data = json.loads(machine.path.read_text(), parse_constant=pytest.fail)
     assert data["content"]["estimator"]["gap_until_s"] is None
     assert math.isfinite(data["content"]["estimator"]["estimate"][1])
+
+
+@pytest.mark.parametrize("method", ["ekf", "coulomb"])
+def test_after_a_refused_state_the_given_soc_is_of_an_earlier_start(
+    machine: Machine, method: Any
+) -> None:
+    given = EstimatorSettings(method=method, initial_soc_pct=40.0, initial_soc_std_pct=1.0)
+    machine.settings = GaugeSettings(estimator=given)
+    first = machine.start()
+    # At a first start it is believed: the drive begins at 80 %, so this shows.
+    assert first.drive(DRIVE[:3])[-1].soc_pct == pytest.approx(40.0, abs=2.0)
+    first.stop()
+    machine.path.write_bytes(b"")
+    again = machine.start()
+    assert "starting by voltage, for the given SoC is of an earlier start" in machine.text
+    found = again.drive(DRIVE[:1000])[-1]
+    assert abs(found.soc_pct - 79.0) < 3.0 * found.soc_std_pct
+    assert found.soc_pct == pytest.approx(79.0, abs=4.0)
+    # Nor is it taken up again when the configuration is read again.
+    again.gauge.reconfigure(None, machine.model, machine.settings)
+    assert again.drive(DRIVE[1000:1010])[-1].soc_pct == pytest.approx(79.0, abs=4.0)

@@ -15,10 +15,11 @@ from rich.console import Console
 from cangauge.bus.encode import FrameEncoder
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.errors import InputError
+from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.types import Estimate, Reason, Status
 from cangauge.service.display import LiveLine, live_text
-from cangauge.service.gauge import Gauge
+from cangauge.service.gauge import Gauge, GaugeSettings
 from cangauge.service.table import EstimateWriter
 from live import leaf_model, short_log
 
@@ -75,7 +76,7 @@ def test_other_suffixes_are_refused(tmp_path: Path) -> None:
 
 def test_the_line_tells_soc_status_and_rate() -> None:
     vehicle = load_vehicle("generic")
-    gauge = Gauge(vehicle, leaf_model())
+    gauge = Gauge(vehicle, leaf_model(), GaugeSettings(EstimatorSettings(valid_std_pct=5.0)))
     assert "SoC – ± –  initialising (no initial soc; input stale)" in live_text(gauge, 0.0).plain
     encoder = FrameEncoder(vehicle)
     for sample in samples_of(short_log(90.0)):

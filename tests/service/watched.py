@@ -7,8 +7,9 @@ from typing import Any
 
 from cangauge.bus.encode import FrameEncoder
 from cangauge.bus.vehicle import load_vehicle
+from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import samples_of
-from cangauge.service.gauge import Gauge
+from cangauge.service.gauge import Gauge, GaugeSettings
 from cangauge.service.monitor import Monitor
 from cangauge.service.notify import Notifier
 from cangauge.service.snapshot import Identity
@@ -43,7 +44,8 @@ class Watched:
     record: Any = None
 
     def __post_init__(self) -> None:
-        self.gauge = Gauge(load_vehicle("generic"), leaf_model())
+        known = GaugeSettings(EstimatorSettings(initial_soc_pct=80.0))
+        self.gauge = Gauge(load_vehicle("generic"), leaf_model(), known)
         self.monitor = Monitor(
             self.gauge,
             self.port,

@@ -88,6 +88,7 @@ class SignalHealth:
         "_learned_s",
         "_passes",
         "_period_s",
+        "_shortest_timeout_s",
         "_steps",
         "fault",
         "latest",
@@ -101,6 +102,12 @@ class SignalHealth:
         self._checks = checks
         self._period_s = period_s
         self._is_cyclic = is_cyclic
+        # Whatever the period is found to be, the time-out is no shorter.
+        self._shortest_timeout_s = (
+            min(checks.usual_timeout_s, TIMEOUT_AT_LEAST_S)
+            if checks.timeout_s is None
+            else checks.timeout_s
+        )
         self.trust = Trust.UNKNOWN
         self.fault = Fault.NONE
         self.latest = self.latest_s = math.nan
@@ -158,7 +165,9 @@ class SignalHealth:
 
     def is_old(self, now_s: float) -> bool:
         """Return whether there is no good value within the time-out before `now_s` [s]."""
-        return not now_s - self.latest_s <= self.timeout_s
+        age_s = now_s - self.latest_s
+        # Asked for every signal at every sample: mostly there is no need to know the time-out.
+        return not (age_s <= self._shortest_timeout_s or age_s <= self.timeout_s)
 
     def is_usable(self, now_s: float) -> bool:
         """Return whether the latest good value still holds at `now_s` [s]."""

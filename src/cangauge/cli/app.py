@@ -6,26 +6,55 @@ Exit 0: done; 1: failed; 2: bad usage or input.
 from __future__ import annotations
 
 import sys
+from importlib import import_module
+from typing import Any, Final
 
 import typer
+from typer.core import TyperGroup
+from typer.main import get_command as made_of
 
 from cangauge import __version__
-from cangauge.cli.demo import demo_command
-from cangauge.cli.estimate import estimate_command
-from cangauge.cli.fit import fit_command
-from cangauge.cli.gap import gap_command
-from cangauge.cli.gap_check import gap_check_command
-from cangauge.cli.inspect import inspect_command
 from cangauge.cli.output import note
-from cangauge.cli.replay import replay_command
-from cangauge.cli.run import run_command
-from cangauge.cli.status import status_command
-from cangauge.cli.twin import twin_command
 from cangauge.cli.usage import UsageError, usage_line
 from cangauge.errors import CangaugeError
 
+COMMANDS: Final = (
+    "demo",
+    "fit",
+    "estimate",
+    "gap",
+    "gap-check",
+    "run",
+    "status",
+    "replay",
+    "inspect",
+    "twin",
+)
+"""Each is `cangauge.cli.NAME.NAME_command`."""
+
+
+class LazyGroup(TyperGroup):
+    """Imports a command only when it is asked for: the service needs no plots, nor any other."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the commands' names."""
+        del ctx
+        return list(COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a command; None if there is none of that name."""
+        del ctx
+        if cmd_name not in COMMANDS:
+            return None
+        name = cmd_name.replace("-", "_")
+        alone = typer.Typer(rich_markup_mode="markdown", add_completion=False)
+        alone.command(cmd_name)(getattr(import_module(f"cangauge.cli.{name}"), f"{name}_command"))
+        return made_of(alone)
+
+
 app = typer.Typer(
     name="cangauge",
+    cls=LazyGroup,
     help="State of charge from CAN frames by an identified voltage model, live and offline."
     " Positive current discharges, everywhere.",
     no_args_is_help=True,
@@ -48,18 +77,6 @@ def _root(
     ),
 ) -> None:
     del version
-
-
-app.command("demo")(demo_command)
-app.command("fit")(fit_command)
-app.command("estimate")(estimate_command)
-app.command("gap")(gap_command)
-app.command("gap-check")(gap_check_command)
-app.command("run")(run_command)
-app.command("status")(status_command)
-app.command("replay")(replay_command)
-app.command("inspect")(inspect_command)
-app.command("twin")(twin_command)
 
 
 def main() -> None:

@@ -19,8 +19,8 @@ from cangauge.bus.vehicle import load_vehicle
 from cangauge.cli.inputs import JsonOption
 from cangauge.cli.output import console, emit_json, note
 from cangauge.errors import CangaugeError, InputError
-from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import EstimateTable, Scores, estimate_log, score
+from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.types import Reason, Status
 from cangauge.identify.fit import Identification, fit
 from cangauge.logs.read import read_log

@@ -30,8 +30,8 @@ from cangauge.cli.inputs import (
 from cangauge.cli.output import emit_json, note
 from cangauge.cli.tables import print_table
 from cangauge.errors import InputError
-from cangauge.estimate.estimator import EstimatorSettings, Method
 from cangauge.estimate.offline import EstimateTable
+from cangauge.estimate.settings import VALID_STD_PCT, EstimatorSettings, Method
 from cangauge.estimate.types import Reason
 from cangauge.logs.read import CaptureGivenError
 from cangauge.model.delay_line import GAP_S
@@ -74,6 +74,10 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     initial_soc_std: Annotated[
         float, typer.Option(metavar="X", help="Standard deviation of the initial SoC [%].")
     ] = 1.0,
+    valid_std: Annotated[
+        float,
+        typer.Option(metavar="X", help="A SoC with a larger standard deviation is degraded [%]."),
+    ] = VALID_STD_PCT,
     capacity_ah: Annotated[
         float | None,
         typer.Option(metavar="A", help="Charge from 100 to 0 % [Ah]. Default: the model's."),
@@ -113,6 +117,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     chosen = _method(method)
     start = _start(initial_soc)
     within(initial_soc_std, 0.0, 100.0, option="--initial-soc-std", unit="%")
+    within(valid_std, 0.01, 100.0, option="--valid-std", unit="%")
     if capacity_ah is not None:
         within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
     if max_gap_s is not None:
@@ -123,6 +128,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
         method=chosen,
         initial_soc_pct=start,
         initial_soc_std_pct=initial_soc_std,
+        valid_std_pct=valid_std,
         capacity_ah=capacity_ah,
         gap_s=GAP_S if max_gap_s is None else max_gap_s,
     )

@@ -12,8 +12,8 @@ from rich.progress import Progress
 from cangauge.cli.inputs import refuse_single_row, refuse_turned_current
 from cangauge.cli.output import console, note
 from cangauge.errors import InputError
-from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import EstimateTable, Scores, estimate_log, score
+from cangauge.estimate.settings import EstimatorSettings
 from cangauge.identify.charge import counted_soc_pct
 from cangauge.identify.rows import usual_gap_s
 from cangauge.logs.log import Log

@@ -12,9 +12,7 @@ import typer
 from cangauge.atomic import check_writable
 from cangauge.cli.output import note
 from cangauge.errors import InputError
-from cangauge.inspect.sign import require_discharge_positive
 from cangauge.logs.log import TEMPERATURE_SOURCES, Log, TemperatureSource
-from cangauge.logs.read import CaptureGivenError, read_log
 
 VehicleOption = Annotated[
     str | None,
@@ -100,6 +98,9 @@ def load_log(
         If the input cannot be read, an option has no known value, or (with `refuse_turned`) the
         sign of current is turned.
     """
+    # pyarrow is slow to import, and the service, which has the same options, does without.
+    from cangauge.logs.read import CaptureGivenError, read_log  # noqa: PLC0415
+
     source = known_temperature_source(temperature_source)
     described = vehicle is not None or dbc is not None or map_file is not None
     is_capture = False
@@ -179,6 +180,9 @@ def refuse_single_row(recorded: Sized) -> None:
 
 def refuse_turned_current(log: Log, *, is_capture: bool) -> None:
     """Raise InputError if the data show clearly that positive current charges."""
+    # For the same reason as in `load_log`.
+    from cangauge.inspect.sign import require_discharge_positive  # noqa: PLC0415
+
     try:
         require_discharge_positive(log)
     except InputError as error:

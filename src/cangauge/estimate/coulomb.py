@@ -91,10 +91,13 @@ class CoulombCounter:
         lately = math.exp(-seconds / MEAN_MEMORY_S)
         self._mean_a = lately * self._mean_a + (1.0 - lately) * current_a
         recent = math.exp(-seconds / CURRENT_MEMORY_S)
-        rms_a = math.sqrt(self._mean_square_a2)
+        # The average forgets slowly, and so learns slowly that a drive began: what was seen at the
+        # gap's ends counts as well.
+        mean_square_a2 = self._mean_square_a2
         self._mean_square_a2 = recent * self._mean_square_a2 + (1.0 - recent) * current_a**2
         if seconds > BRIDGE_S:
             away_pct = AWAY_PCT_PER_HOUR * seconds / 3600.0
+            rms_a = math.sqrt(max(mean_square_a2, last[1] ** 2))
             parked_pct = parked_std_pct(seconds, rms_a * self._pct_per_as)
             away_pct = min(away_pct, AWAY_AT_MOST_PCT)
             return ChargeStep(seconds, 0.0, away_pct, seconds, parked_pct)
@@ -102,8 +105,10 @@ class CoulombCounter:
         out_pct = across_a * seconds * self._pct_per_as
         self.discharged_pct += out_pct
         self.moved_pct += abs(out_pct)
-        gap_std_pct = rms_a * seconds * self._pct_per_as if seconds > self._gap_s else 0.0
-        return ChargeStep(seconds, out_pct, gap_std_pct)
+        if seconds <= self._gap_s:
+            return ChargeStep(seconds, out_pct, 0.0)
+        rms_a = math.sqrt(max(mean_square_a2, 0.5 * (current_a**2 + last[1] ** 2)))
+        return ChargeStep(seconds, out_pct, rms_a * seconds * self._pct_per_as)
 
     def state(self) -> CounterState:
         """Return what is to be remembered."""

@@ -8,32 +8,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
 
 from cangauge.errors import InputError
-from cangauge.estimate.anchors import Anchor, AnchorWatch, FullCharge, LongRest
+from cangauge.estimate.anchors import Anchor, AnchorWatch
 from cangauge.estimate.belief import Belief, Since, Verdict
 from cangauge.estimate.clock import EstimatorClock
 from cangauge.estimate.coulomb import ChargeStep, CoulombCounter
 from cangauge.estimate.fusion import UNKNOWN_SOC_STD_PCT, Fusion, Measurement
+from cangauge.estimate.settings import EstimatorSettings, Method
 from cangauge.estimate.state import DelayLineState, EstimatorState
 from cangauge.estimate.types import Estimate, Reason, Sample, Status
 from cangauge.estimate.validity import (
     acceptable,
     cleaned,
     outside_model,
-    outside_model_std_v,
     status_of,
     temperature_mismatch,
 )
-from cangauge.logs.log import TemperatureSource
-from cangauge.model.delay_line import GAP_S, DelayLine
+from cangauge.estimate.voltage_error import VoltageError
+from cangauge.model.delay_line import DelayLine
 from cangauge.model.effects.effect import Reading
 from cangauge.model.inverse import Inverse, soc_from_ocv
-from cangauge.model.model_file import ModelFile, effective_error_std_v
+from cangauge.model.model_file import ModelFile
 
-Method = Literal["ekf", "newton", "coulomb"]
+__all__ = ["Estimator", "EstimatorSettings", "Method"]
 
 REST_CURRENT_C_RATE = 0.02
 """Below this current the pack rests [1/h]: 1.2 A at 60 Ah."""
@@ -41,58 +39,11 @@ REST_CURRENT_C_RATE = 0.02
 REST_S = 600.0
 """After this long at rest, slow polarisation has decayed [s]."""
 
-USUAL_CURRENT_C_RATE = 1.0 / 3.0
-"""What a current that was not seen may have been [1/h]: 20 A at 60 Ah."""
-
 CONTRADICTED_S = 300.0
 """For how long after a lasting contradiction, or the filter's loss, the estimate is marked [s]."""
 
-TEMPERATURE_STD_K = 10.0
-"""Uncertainty of a temperature that is not measured [K]."""
-
-
-@dataclass(frozen=True)
-class EstimatorSettings:
-    """What a user may choose.
-
-    Parameters
-    ----------
-    method : {"ekf", "newton", "coulomb"}
-        Whose SoC is published.
-    initial_soc_pct : float, optional
-        SoC at the first sample [%]; by default from the first voltages.
-    initial_soc_std_pct : float
-        Its standard deviation [%].
-    capacity_ah : float, optional
-        Overrides the model's capacity [Ah].
-    gap_s : float
-        A longer step between current samples is a gap [s].
-    temperature_source : str
-        What the input's temperature is measured on.
-    full_charge : FullCharge, optional
-    long_rest : LongRest, optional
-        Rules that say what the SoC is at some moments; None is off.
-    """
-
-    method: Method = "ekf"
-    initial_soc_pct: float | None = None
-    initial_soc_std_pct: float = 1.0
-    capacity_ah: float | None = None
-    gap_s: float = GAP_S
-    temperature_source: TemperatureSource = "unknown"
-    full_charge: FullCharge | None = None
-    long_rest: LongRest | None = None
-
-    def __post_init__(self) -> None:
-        for name, low, high in (
-            ("initial_soc_pct", 0.0, 100.0),
-            ("initial_soc_std_pct", 0.0, 100.0),
-            ("capacity_ah", 1e-3, 1e5),
-            ("gap_s", 1e-3, 3600.0),
-        ):
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                raise InputError(f"must lie within {low:g} … {high:g}", field=name, value=value)
+AGREES_PCT = 1e-6
+"""A state's estimate is what its filter or count says, to rounding [%]."""
 
 
 _SCALARS = (
@@ -134,7 +85,7 @@ class Estimator:
         self._fusion = Belief(lambda: Fusion(self._online, self.capacity_ah, noise))
         self._anchors = AnchorWatch(self.settings.full_charge, self.settings.long_rest)
         self._bias_std_v = math.hypot(noise.slow_std_v, noise.lasting_std_v)
-        self._fast_std_v = effective_error_std_v(noise, 1.0 / model.rate_hz)
+        self._voltage_error = VoltageError(self._model, model, self.capacity_ah)
         self._standing = temperature_mismatch(
             model.temperature_source, self.settings.temperature_source
         )
@@ -294,7 +245,11 @@ class Estimator:
         beside_v = self._model.offset_at(self._known_temperature_c(), self._line.currents())
         guess = self._newton.soc_pct if math.isfinite(self._newton.soc_pct) else 50.0
         self._newton = soc_from_ocv(self._online, sample.voltage_v - beside_v, guess)
-        std_v = self._error_std_v()
+        std_v = self._voltage_error.std_v(
+            self._fusion.soc_pct if self._fused else self._newton.soc_pct,
+            self._temperature_c,
+            self._line,
+        )
         slope = self._online.pseudo_ocv_at(self._newton.soc_pct)[1]
         self._newton_std_pct = min(math.hypot(std_v, self._bias_std_v) / slope, UNKNOWN_SOC_STD_PCT)
         if math.isnan(self._coulomb_start_pct):
@@ -315,35 +270,6 @@ class Estimator:
         self._contradicted_until_s = time_s + CONTRADICTED_S
         self.resets += 1
 
-    def _error_std_v(self) -> float:
-        """Return the fast error of this voltage [V], larger where the model is out of its depth."""
-        squares = self._fast_std_v**2
-        if not self._line.full:
-            squares = self._filling_var_v2(squares)
-        if math.isnan(self._temperature_c):
-            squares += (self._model.kt_v_per_k * TEMPERATURE_STD_K) ** 2
-        soc = self._fusion.soc_pct if self._fused else self._newton.soc_pct
-        squares += outside_model_std_v(self._model, soc, self._temperature_c) ** 2
-        return math.sqrt(squares)
-
-    def _filling_var_v2(self, settled_var_v2: float) -> float:
-        """Return the error's variance while the delay line fills [V²].
-
-        The currents before the first sample are a guess, and the same guess for all samples until
-        the line is full: together they must tell no more than one of them.
-        """
-        filled = self._line.filled_s
-        unknown_ohm = sum(
-            abs(resistance)
-            for resistance, delay in zip(
-                self._model.resistance_ohm, self._model.delay_s, strict=True
-            )
-            if delay > filled
-        )
-        guess_v = unknown_ohm * USUAL_CURRENT_C_RATE * self.capacity_ah
-        alike = max(self._model.delay_s[-1] * self._file.rate_hz, 1.0)
-        return (settled_var_v2 + guess_v**2) * alike
-
     # --- estimate -------------------------------------------------------------------------
 
     def _estimate(self, sample: Sample, time_s: float) -> Estimate:
@@ -353,7 +279,7 @@ class Estimator:
         if math.isfinite(soc):
             beside_v = self._model.offset_at(self._known_temperature_c(), self._line.currents())
             voltage_model_v = self._online.pseudo_ocv_at(soc)[0] + beside_v
-        reasons = self._reasons(sample, soc)
+        reasons = self._reasons(sample, soc, std)
         return Estimate(
             time_s=time_s,
             soc_pct=soc,
@@ -387,10 +313,15 @@ class Estimator:
         moved_pct = self._counter.moved_pct - self._coulomb_moved_pct
         return self._fusion.count_std_pct(self._coulomb_var_pct2, hours, moved_pct)
 
-    def _reasons(self, sample: Sample, soc_pct: float) -> Reason:
-        reasons = self._standing | self._implausible
+    def _reasons(self, sample: Sample, soc_pct: float, std_pct: float) -> Reason:
+        # Operations on flags are slow, and mostly there are none.
+        reasons = self._standing
+        if self._implausible:
+            reasons |= self._implausible
         if math.isnan(soc_pct):
             reasons |= Reason.NO_INITIAL_SOC
+        if std_pct > self.settings.valid_std_pct:
+            reasons |= Reason.SOC_UNCERTAIN
         if not self._line.full:
             reasons |= Reason.DELAY_LINE_FILLING
         if sample.time_s < self._gap_until_s:
@@ -403,7 +334,8 @@ class Estimator:
             reasons |= Reason.VOLTAGE_OUTSIDE_MODEL
         if sample.time_s < self._contradicted_until_s:
             reasons |= Reason.INNOVATION_LARGE
-        return reasons | outside_model(self._model, soc_pct, sample)
+        outside = outside_model(self._model, soc_pct, sample)
+        return reasons | outside if outside else reasons
 
     def _refuse(self) -> Estimate:
         last = self._last_estimate
@@ -462,7 +394,7 @@ class Estimator:
             If the state does not fit the model; the estimator must then not be used.
         """
         self._resume(state, age_s)
-        self._online.remember(state.effects)
+        self._online.remember(state.effects, state.clock.last_s)
         self._anchors.restore(state.anchors)
         self.resets = state.resets
         is_same = (state.method, state.capacity_ah) == (self.settings.method, self.capacity_ah)
@@ -471,7 +403,24 @@ class Estimator:
         elif self.settings.method == "ekf" and math.isfinite(self._coulomb_start_pct):
             self._fusion.restore(state.belief)
             self._fused = True
+        if is_same:
+            self._check_agreement(state)
         return self._last_estimate
+
+    def _check_agreement(self, state: EstimatorState) -> None:
+        """Refuse a state whose filter or count says something else than its last estimate."""
+        if self.settings.method == "newton":
+            return
+        soc, std = self._chosen(self._coulomb_start_pct - self._counter.discharged_pct)
+        kept_std = state.soc_std_pct
+        # An estimator that has just taken over from another one began from no more than that.
+        apart_pct = min(abs(std - kept_std), abs(std - min(kept_std, UNKNOWN_SOC_STD_PCT)))
+        if abs(soc - state.soc_pct) > AGREES_PCT or apart_pct > AGREES_PCT:
+            raise InputError(
+                f"the last estimate, {state.soc_pct:g} ± {kept_std:g} %, is not what filter and"
+                f" count say, {soc:g} ± {std:g} %",
+                field="estimate",
+            )
 
     def take_over(self, before: Estimator) -> None:
         """Go on where another estimator stands, of another model or other settings.

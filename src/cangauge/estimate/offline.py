@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cangauge.estimate.estimator import Estimator, EstimatorSettings
+from cangauge.estimate.estimator import Estimator
+from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.types import Estimate, Sample, Status
 from cangauge.logs.log import Log
 from cangauge.model.model_file import ModelFile

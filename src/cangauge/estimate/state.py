@@ -49,7 +49,12 @@ def _null_for_nan(value: float) -> float | None:
     return None if math.isnan(value) else value
 
 
+PLAUSIBLE_A = 1e5
+"""No current in a state is larger [A]: that of a sample, which `validity` bounds, and what effects
+make of it."""
+
 Finite = Annotated[float, Field(allow_inf_nan=False, ge=-LARGEST, le=LARGEST)]
+Current = Annotated[float, Field(allow_inf_nan=False, ge=-PLAUSIBLE_A, le=PLAUSIBLE_A)]
 NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0.0, le=LARGEST)]
 MaybeNan = Annotated[
     float,
@@ -70,9 +75,9 @@ class CounterState(_Strict):
 
     time_s: MaybeNan
     """Time of the last sample [s]; NaN before the first."""
-    current_a: Finite
-    mean_square_a2: NotNegative
-    mean_a: Finite
+    current_a: Current
+    mean_square_a2: Annotated[float, Field(allow_inf_nan=False, ge=0.0, le=PLAUSIBLE_A**2)]
+    mean_a: Current
     discharged_pct: Finite
     moved_pct: NotNegative
     counted_s: NotNegative
@@ -82,7 +87,7 @@ class DelayLineState(_Strict):
     """A `DelayLine`: times [s], increasing, and currents [A]."""
 
     time_s: Annotated[list[Finite], Field(max_length=DELAY_LINE_AT_MOST)]
-    current_a: Annotated[list[Finite], Field(max_length=DELAY_LINE_AT_MOST)]
+    current_a: Annotated[list[Current], Field(max_length=DELAY_LINE_AT_MOST)]
     since_s: Finite
 
     @model_validator(mode="after")
@@ -173,7 +178,7 @@ class EstimatorState(_Strict):
     rest_since_s: MaybeNan
     estimate: Annotated[list[MaybeNan], Field(min_length=7, max_length=7)]
     """Numbers of the last `Estimate`, in its order, from `time_s` to `residual_v`."""
-    reasons: Annotated[int, Field(ge=0, le=0xFFFF)]
+    reasons: Annotated[int, Field(ge=0, le=0x1FFFF)]
 
     @model_validator(mode="after")
     def _believable(self) -> Self:
@@ -183,6 +188,33 @@ class EstimatorState(_Strict):
                 raise ValueError("a state of charge lies outside 0–100 %")
         if std_pct < 0.0:
             raise ValueError("a standard deviation is negative")
+        return self
+
+    @model_validator(mode="after")
+    def _one_time(self) -> Self:
+        """Nothing remembered may lie after the latest sample: time would run backwards."""
+        latest_s, taken_s, line = self.clock.last_s, self.counter.time_s, self.line.time_s
+        if (line[-1] if line else math.nan) != taken_s and (line or not math.isnan(taken_s)):
+            raise ValueError("counter and delay line end at different times")
+        if math.isnan(latest_s) and not math.isnan(taken_s):
+            raise ValueError("a sample was counted before the first")
+        for name, value in (
+            ("counter.time_s", taken_s),
+            ("line.since_s", self.line.since_s if line else math.nan),
+            ("first_s", self.first_s if self.samples else math.nan),
+            ("rest_since_s", self.rest_since_s),
+            ("anchors.full_since_s", self.anchors.full_since_s),
+            ("clock.behind_s", self.clock.behind_s + self.clock.shift_s),
+        ):
+            if value > latest_s:
+                raise ValueError(f"{name} is later than the latest sample")
+        if self.since.away_s > self.since.seconds:
+            raise ValueError("longer away than time passed")
+        if (
+            self.coulomb_counted_s > self.counter.counted_s
+            or self.coulomb_moved_pct > self.counter.moved_pct
+        ):
+            raise ValueError("the count began after its end")
         return self
 
     @property

@@ -65,6 +65,8 @@ class Reason(enum.IntFlag):
     """A signal stands still while another one proves that it should move."""
     CURRENT_MISSING = 1 << 15
     """No current within its time-out, or none that is believed: charge is not counted."""
+    SOC_UNCERTAIN = 1 << 16
+    """The standard deviation is larger than a valid SoC may have."""
 
 
 class Estimate(NamedTuple):

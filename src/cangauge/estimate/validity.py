@@ -93,8 +93,10 @@ def temperature_mismatch(of_model: TemperatureSource, of_input: TemperatureSourc
 
 def status_of(reasons: Reason) -> Status:
     """Return the status that the reasons amount to."""
+    if not reasons:
+        return Status.VALID
     if reasons & Reason.NO_INITIAL_SOC:
         return Status.INITIALISING
     if reasons & (Reason.INPUT_STALE | Reason.CURRENT_MISSING):
         return Status.INVALID
-    return Status.DEGRADED if reasons else Status.VALID
+    return Status.DEGRADED

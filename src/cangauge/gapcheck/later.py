@@ -10,8 +10,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import run_estimator, samples_of
+from cangauge.estimate.settings import EstimatorSettings
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import ModelFile, load_model

@@ -256,8 +256,14 @@ class OnlineExtendedModel:
         """Return what the effects are to remember, one list each."""
         return [effect.memory() for effect in self._effects]
 
-    def remember(self, memory: Sequence[Sequence[float]]) -> None:
+    def remember(self, memory: Sequence[Sequence[float]], latest_s: float) -> None:
         """Go on from a memory of the same effects.
+
+        Parameters
+        ----------
+        memory : sequence of sequences
+        latest_s : float
+            Time of the latest sample before [s], after which nothing may lie; NaN: none came yet.
 
         Raises
         ------
@@ -268,7 +274,7 @@ class OnlineExtendedModel:
             raise InputError(f"the model has {len(self._effects)} effects", field="effects")
         for number, (effect, of_effect) in enumerate(zip(self._effects, memory, strict=True)):
             try:
-                effect.remember(of_effect)
+                effect.remember(of_effect, latest_s)
             except ValueError as error:
                 raise InputError(str(error), field=f"effects.{number}") from error
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import EstimateTable, Scores
+from cangauge.estimate.settings import EstimatorSettings
 from cangauge.identify.rows import running_rows
 from cangauge.model.model_file import ModelFile
 from cangauge.report.figures import (

@@ -29,6 +29,7 @@ REASON_WORDS: Final = {
     Reason.PROTECTION_FAILED: "frames were refused: CRC wrong, counter still, or too short",
     Reason.SIGNAL_STUCK: "a signal stands still while another one proves that it should move",
     Reason.CURRENT_MISSING: "no current that is believed: charge is not counted",
+    Reason.SOC_UNCERTAIN: "the standard deviation is larger than a valid SoC may have",
 }
 
 

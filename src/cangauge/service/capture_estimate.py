@@ -17,8 +17,8 @@ from cangauge.bus.capture_log import open_vehicle_capture
 from cangauge.bus.time_source import REPLAY_CLOCK_ID, TimeSourceName, is_clock
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import EstimateTable
+from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.types import Estimate
 from cangauge.logs.log import FloatArray
 from cangauge.model.model_file import ModelFile

@@ -8,6 +8,7 @@ Keys are the options' names, with underscores::
     vehicle = "leaf_aze0"           # or: dbc = "car.dbc" and map = "car.toml"
     method = "ekf"                  # ekf, newton, coulomb
     initial_soc = "auto"            # or a number [%]
+    valid_std = 1.5                 # a SoC less certain than this [%] is degraded
     time_source = "receive"         # or "replay-clock"
     wait_for_bus = true             # start even if it is not there yet
 
@@ -63,13 +64,14 @@ from cangauge.bus.validation import read_toml, validated
 from cangauge.bus.vehicle import Vehicle, load_vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.anchors import FullCharge, LongRest
-from cangauge.estimate.estimator import EstimatorSettings, Method
+from cangauge.estimate.settings import VALID_STD_PCT, EstimatorSettings, Method
 from cangauge.logs.log import TemperatureSource
 from cangauge.model.delay_line import GAP_S
 from cangauge.service.gauge import GaugeSettings
 from cangauge.service.loop import LoopSettings
 from cangauge.service.ops_config import OPS_PATHS, OpsConfig
 from cangauge.service.state_keeper import StateSettings, state_path
+from cangauge.service.upkeep import CHECKPOINT_EVERY_S
 
 DEFAULT_VEHICLE: Final = "generic"
 """What `replay` sends by default, so that both commands find each other without options."""
@@ -156,6 +158,8 @@ class RunConfig(OpsConfig):
         [%]; None, "auto" in the file: from the first voltages.
     initial_soc_std : float
         Its standard deviation [%].
+    valid_std : float
+        A SoC with a larger standard deviation is published as degraded [%].
     capacity_ah : float, optional
         Instead of the model's [Ah].
     max_gap_s : float
@@ -197,6 +201,7 @@ class RunConfig(OpsConfig):
     method: Method = "ekf"
     initial_soc: Annotated[Percent | None, BeforeValidator(_none_for_auto)] = None
     initial_soc_std: Percent = 1.0
+    valid_std: Annotated[FiniteFloat, Field(ge=0.01, le=100.0)] = VALID_STD_PCT
     capacity_ah: Annotated[FiniteFloat, Field(ge=1e-3, le=1e5)] | None = None
     max_gap_s: Annotated[FiniteFloat, Field(ge=1e-3, le=3600.0)] = GAP_S
     pair_within_s: Annotated[FiniteFloat, Field(ge=0.0, le=1.0)] | None = None
@@ -211,7 +216,7 @@ class RunConfig(OpsConfig):
     until_idle_s: Seconds | None = None
     state: str | None = None
     state_max_age_s: Seconds = 7.0 * 86400.0
-    state_every_s: Annotated[FiniteFloat, Field(ge=0.1, le=86400.0)] = 30.0
+    state_every_s: Annotated[FiniteFloat, Field(ge=0.1, le=86400.0)] = CHECKPOINT_EVERY_S
     full_charge: FullChargeConfig | None = None
     long_rest: LongRestConfig | None = None
     _file: str = PrivateAttr("the configuration")
@@ -250,6 +255,7 @@ class RunConfig(OpsConfig):
                 method=self.method,
                 initial_soc_pct=self.initial_soc,
                 initial_soc_std_pct=self.initial_soc_std,
+                valid_std_pct=self.valid_std,
                 capacity_ah=self.capacity_ah,
                 gap_s=self.max_gap_s,
                 temperature_source=self.temperature_source or "unknown",

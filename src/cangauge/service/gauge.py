@@ -15,7 +15,7 @@ from cangauge.bus.time_source import TimeSourceName
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.belief import Verdict
-from cangauge.estimate.estimator import EstimatorSettings
+from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.state import EstimatorState
 from cangauge.estimate.types import Estimate, Reason, Sample
 from cangauge.estimate.validity import status_of
@@ -206,6 +206,10 @@ class Gauge:
     def restore(self, state: EstimatorState, age_s: float = 0.0) -> Estimate:
         """Go on from a state; see `EstimateStream.restore`."""
         return self._stream.restore(state, age_s)
+
+    def ask_the_voltage(self) -> bool:
+        """Begin from the voltage; see `EstimateStream.ask_the_voltage`."""
+        return self._stream.ask_the_voltage()
 
     def _publish(self, estimate: Estimate) -> list[can.Message]:
         if not self._is_replay:

@@ -21,7 +21,7 @@ from cangauge.bus.time_source import is_clock
 from cangauge.estimate.types import Estimate
 from cangauge.service.gauge import Gauge
 from cangauge.service.rivals import Rivals
-from cangauge.service.upkeep import Upkeep
+from cangauge.service.upkeep import CHECKPOINT_EVERY_S, Upkeep
 
 LATE_S: Final = 0.01
 """So much later than due a beat may come, so that it tells of a sample that is about to [s]."""
@@ -61,7 +61,7 @@ class LoopSettings:
     timeout_s: float = 2.0
     duration_s: float | None = None
     until_idle_s: float | None = None
-    checkpoint_every_s: float = 30.0
+    checkpoint_every_s: float = CHECKPOINT_EVERY_S
 
 
 @dataclass(frozen=True)

@@ -120,7 +120,8 @@ def _bytes(path: Path) -> bytes:
 
 def _parsed(raw: bytes, path: Path) -> object:
     try:
-        return json.loads(raw, parse_constant=_no_constant)
+        # Decoded here: of bytes, `json` would also take UTF-16 and UTF-32, which is never written.
+        return json.loads(raw.decode("utf-8"), parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
         reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)[:200]
         raise InputError(f"is no JSON: {reason}", source=path) from error

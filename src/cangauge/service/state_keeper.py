@@ -29,6 +29,7 @@ from cangauge.service.state_file import (
     read_state,
     state_text,
 )
+from cangauge.service.upkeep import CHECKPOINT_EVERY_S
 
 FILE_NAME: Final = "cangauge-state.json"
 """What the file is called in a folder."""
@@ -63,7 +64,7 @@ class StateSettings:
 
     path: Path
     max_age_s: float = 7.0 * 86400.0
-    every_s: float = 30.0
+    every_s: float = CHECKPOINT_EVERY_S
 
 
 def state_path(given: str | None, environment: Mapping[str, str]) -> Path | None:
@@ -228,7 +229,15 @@ class StateKeeper:
             kept = f"; kept as {aside.name}"
         except OSError as problem:
             kept = f" (and cannot be put aside: {problem.strerror})"
-        self._tell(f"warning: state refused: {error}{kept}; starting without")
+        # A SoC that the user gave was true at some earlier start: there is a state, so the car has
+        # been used since. Kept with a wide deviation it would tell nothing that the voltage does
+        # not, and counting alone would never be rid of it.
+        how = (
+            "by voltage, for the given SoC is of an earlier start"
+            if (self._gauge.ask_the_voltage())
+            else "without"
+        )
+        self._tell(f"warning: state refused: {error}{kept}; starting {how}")
 
     def _sweep(self) -> None:
         """Remove what a process that was killed while writing has left."""

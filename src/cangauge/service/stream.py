@@ -24,7 +24,8 @@ from cangauge.bus.time_source import (
 )
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.belief import Verdict
-from cangauge.estimate.estimator import Estimator, EstimatorSettings
+from cangauge.estimate.estimator import Estimator
+from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.state import EstimatorState
 from cangauge.estimate.types import Estimate, Reason, Sample, Status
 from cangauge.estimate.validity import status_of
@@ -224,6 +225,18 @@ class EstimateStream:
         self.latest = latest._replace(status=Status.INVALID, reasons=reasons)
         return self.latest
 
+    def ask_the_voltage(self) -> bool:
+        """Begin from the first voltages, whatever initial SoC was given; False if none was.
+
+        For a start at which the given one is known to be of another time.
+        """
+        if self._settings.initial_soc_pct is None:
+            return False
+        default = EstimatorSettings().initial_soc_std_pct
+        self._settings = replace(self._settings, initial_soc_pct=None, initial_soc_std_pct=default)
+        self._estimator = Estimator(self._model, self._settings)
+        return True
+
     def _step(self, sample: Sample | None) -> Estimate | None:
         if sample is None:
             return None
@@ -261,7 +274,8 @@ class EstimateStream:
         reasons = estimate.reasons
         if sample is not None and math.isnan(sample.voltage_v):
             reasons &= ~Reason.VOLTAGE_MISSING
-        reasons |= missing
+        if missing:
+            reasons |= missing
         if reasons == estimate.reasons:
             return estimate
         return estimate._replace(reasons=reasons, status=status_of(reasons))

@@ -11,6 +11,11 @@ from cangauge.errors import CangaugeError
 
 LOOK_EVERY_S: Final = 0.1
 
+CHECKPOINT_EVERY_S: Final = 10.0
+"""How often the state is saved [s]: a service that is killed, writes for a while and takes three
+seconds to start again then has missed less than half a minute of charge, however it flowed. A
+state of 20 kB makes 0.2 GB of writing a day."""
+
 FIRST_CHECKPOINT_S: Final = 1.0
 """The first checkpoint comes so soon, lest a service that is killed again and again keeps nothing
 [s]."""
@@ -34,7 +39,7 @@ class Upkeep:
         self,
         port: BusPort,
         checkpoint: Callable[[], None] | None = None,
-        every_s: float = 30.0,
+        every_s: float = CHECKPOINT_EVERY_S,
         warn: Callable[[str], None] | None = None,
     ) -> None:
         self._port = port

@@ -68,5 +68,5 @@ class _Online(OnlineEffect):
     def memory(self) -> list[float]:
         return self._above.memory()
 
-    def remember(self, memory: Sequence[float]) -> None:
-        self._above.remember(memory)
+    def remember(self, memory: Sequence[float], latest_s: float) -> None:
+        self._above.remember(memory, latest_s)

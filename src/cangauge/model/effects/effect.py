@@ -240,14 +240,22 @@ class OnlineEffect:
         """Return what is to be remembered of earlier samples; NaN where nothing is known yet."""
         return []
 
-    def remember(self, memory: Sequence[float]) -> None:
+    def remember(self, memory: Sequence[float], latest_s: float) -> None:
         """Go on from a memory of the same effect.
+
+        Parameters
+        ----------
+        memory : sequence of floats
+        latest_s : float
+            Time of the latest sample before [s]; NaN: none came yet. No time in the memory may
+            lie after it, for time would run backwards.
 
         Raises
         ------
         ValueError
             If it is none.
         """
+        del latest_s
         if memory:
             raise ValueError("this effect remembers nothing")
 

@@ -115,8 +115,8 @@ class LowPass:
         """Return time [s], input and lagged value of the last sample; nothing before the first."""
         return [] if self._last is None else [*self._last, self.value]
 
-    def remember(self, memory: Sequence[float]) -> None:
-        """Go on from a memory; may raise ValueError."""
+    def remember(self, memory: Sequence[float], latest_s: float) -> None:
+        """Go on from a memory, no later than `latest_s` [s]; may raise ValueError."""
         if not memory:
             self._last, self.value = None, 0.0
             return
@@ -124,3 +124,5 @@ class LowPass:
         self._last = (time_s, last)
         if not all(map(math.isfinite, memory)):
             raise ValueError("not finite")
+        if not time_s <= latest_s:
+            raise ValueError("later than the latest sample")

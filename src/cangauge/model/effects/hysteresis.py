@@ -82,10 +82,12 @@ class _Online(OnlineEffect):
     def memory(self) -> list[float]:
         return [] if self._last is None else [*self._last, self._state]
 
-    def remember(self, memory: Sequence[float]) -> None:
+    def remember(self, memory: Sequence[float], latest_s: float) -> None:
         self._last = None
         if memory:
             time_s, current_a, self._state = memory
             self._last = (time_s, current_a)
             if not (all(map(math.isfinite, memory)) and abs(self._state) <= 1.0):
                 raise ValueError("the state lies within ±1")
+            if not time_s <= latest_s:
+                raise ValueError("later than the latest sample")

@@ -58,6 +58,6 @@ class OnlineRc(OnlineEffect):
         """Return the last sample's time, current and lagged current."""
         return self._lagged.memory()
 
-    def remember(self, memory: Sequence[float]) -> None:
+    def remember(self, memory: Sequence[float], latest_s: float) -> None:
         """Go on from a memory; may raise ValueError."""
-        self._lagged.remember(memory)
+        self._lagged.remember(memory, latest_s)

@@ -84,7 +84,9 @@ class _Online(OnlineEffect):
     def memory(self) -> list[float]:
         return [] if self._first_s is None else [self._first_s]
 
-    def remember(self, memory: Sequence[float]) -> None:
+    def remember(self, memory: Sequence[float], latest_s: float) -> None:
         self._first_s = None
         if memory:
             (self._first_s,) = memory
+            if not self._first_s <= latest_s:
+                raise ValueError("later than the latest sample")

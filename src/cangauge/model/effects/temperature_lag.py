@@ -66,5 +66,5 @@ class _Online(OnlineEffect):
     def memory(self) -> list[float]:
         return self._smooth.memory()
 
-    def remember(self, memory: Sequence[float]) -> None:
-        self._smooth.remember(memory)
+    def remember(self, memory: Sequence[float], latest_s: float) -> None:
+        self._smooth.remember(memory, latest_s)

@@ -108,7 +108,7 @@ class _Online(OnlineEffect):
         flat = [value for reading in self._waiting for value in reading]
         return [float(len(self._waiting)), *flat, *self._times, *self._currents]
 
-    def remember(self, memory: Sequence[float]) -> None:
+    def remember(self, memory: Sequence[float], latest_s: float) -> None:
         waiting = int(memory[0]) if memory else -1
         first = 1 + 4 * waiting
         kept, odd = divmod(len(memory) - first, 2)
@@ -119,6 +119,12 @@ class _Online(OnlineEffect):
         stamps = [reading.time_s for reading in readings]
         if not all(map(math.isfinite, [*times, *currents, *stamps])):
             raise ValueError("not finite")
-        if any(b <= a for a, b in itertools.pairwise(times)):
+        if any(b <= a for kind in (times, stamps) for a, b in itertools.pairwise(kind)):
             raise ValueError("times must increase")
+        if times and not times[-1] <= latest_s:
+            raise ValueError("later than the latest sample")
+        # What waits are the latest samples, and so are the times, as far back as they are kept.
+        both = min(waiting, kept)
+        if stamps[waiting - both :] != times[kept - both :] or (waiting and not kept):
+            raise ValueError("what waits does not fit the times")
         self._waiting, self._times, self._currents = deque(readings), times, currents
