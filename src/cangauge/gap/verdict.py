@@ -46,7 +46,7 @@ TEMPERING = 0.35
 """Log Bayes factors are multiplied by this before they become probabilities: the error is not
 Gaussian and the plant is not the model, so evidence is worth less than it claims."""
 
-RIGHT = (-3.5, -0.54, 1.57, 1.32)
+RIGHT = (-4.1, -0.57, 2.1, 1.95)
 """Logit of the probability that the best effect is the cause: a constant, and factors of the
 logarithm of the part of the excess that it leaves, of its lead over the second in parts of its own
 evidence, and of the part of the gap in volts that it explains. By logistic regression on
