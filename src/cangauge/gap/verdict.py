@@ -190,10 +190,11 @@ def _chances(ranked: Ranked, explained: float, left: float) -> dict[str, float]:
     lead = (factors[0] - factors[1:].max()) / max(factors[0], 1.0) if factors.size > 1 else 1.0
     terms = (1.0, math.log(min(max(left, LEAST_LEFT), 1.5)), min(max(lead, 0.0), 1.0), explained)
     logit = sum(factor * term for factor, term in zip(RIGHT, terms, strict=True))
-    right = 1.0 / (1.0 + math.exp(-logit))
+    weights = np.exp(TEMPERING * (factors - factors[0]).clip(max=0.0))
+    # However well it explains, it is no surer than those allow that explain as much.
+    right = min(1.0 / (1.0 + math.exp(-logit)), 1.0 / float(weights.sum()))
     # What the best does not have is shared by how close the others come; that none of them is it
     # counts like an effect as good as the best.
-    weights = np.exp(TEMPERING * (factors - factors[0]).clip(max=0.0))
     rest = (1.0 - right) / float(weights.sum())
     something = 1.0 - _none(ranked.found)
     chances = {
