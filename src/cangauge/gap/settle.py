@@ -87,6 +87,8 @@ class Settled:
     diagnosed: tuple[LogTerms, ...]
     as_given: ExtendedModel
     """The model before its temperatures were widened; what the gap is measured from."""
+    covered: bool = True
+    """Whether references have been at the diagnosed logs' temperatures."""
 
     @cached_property
     def given_errors_v(self) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...]]:
@@ -197,6 +199,7 @@ def settle(
         _reference_terms(of_references, model, frame),
         tuple(diagnosed),
         given,
+        not of_references or _temperatures_covered(of_references, of_logs),
     )
 
 

@@ -55,6 +55,11 @@ development cases, each diagnosed also with its cause out of the library."""
 LEAST_LEFT = 0.003
 """No effect explains more than all but this part of the excess."""
 
+OF_TEMPERATURE = ("resistance_temperature",)
+EXPECTED_TIMES = 1.6
+"""At temperatures that no reference has, the resistance differs for certain: every cell's grows in
+the cold. What resembles it must have so many times its evidence to be named in its place."""
+
 NONE_MISSED = 0.5
 """Odds that logs which show nothing hide a cause that is too small to be seen."""
 
@@ -81,7 +86,7 @@ def decide(settled: Settled) -> Verdict:
     evidence = gather(
         settled.frame, settled.reference_grams, settled.diagnosed_grams, settled.error
     )
-    ranked = believable(evidence)
+    ranked = believable(evidence, expected=() if settled.covered else OF_TEMPERATURE)
     best = ranked.candidates[0]
     alone = gather(settled.frame, settled.reference_grams, [], settled.error)
     before = excess(evidence, settled.diagnosed_grams, alone.squares)
@@ -124,8 +129,15 @@ class Ranked:
     """Log Bayes factor against no effect, by its own measure, of the best."""
 
 
-def believable(evidence: Evidence) -> Ranked:
-    """Return the effects, the best first."""
+def believable(evidence: Evidence, expected: Sequence[str] = ()) -> Ranked:
+    """Return the effects, the best first.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    expected : sequence of str
+        Effects that come first if they are accepted and nearly as good as the best.
+    """
     own = {score.effect_id: score.log_bayes_factor for score in scores(evidence)}
     strays = evidence.error.strays
     alike = (
@@ -135,6 +147,16 @@ def believable(evidence: Evidence) -> Ranked:
     order = sorted(together, key=lambda score: own[score.effect_id] < ACCEPT_LOG_BAYES)
     if own[order[0].effect_id] < ACCEPT_LOG_BAYES:
         order = sorted(together, key=lambda score: -own[score.effect_id])
+    enough = order[0].log_bayes_factor / EXPECTED_TIMES
+    order.sort(
+        key=lambda score: (
+            not (
+                score.effect_id in expected
+                and own[score.effect_id] >= ACCEPT_LOG_BAYES
+                and score.log_bayes_factor >= enough
+            )
+        )
+    )
     return Ranked(tuple(order), own[order[0].effect_id])
 
 
