@@ -18,10 +18,11 @@ from cangauge.gap.extend import (
     model_file_of,
 )
 from cangauge.gap.held_out import Judged, closed_fraction, closed_interval, judge, rms
+from cangauge.gap.moments import Moment, worst_moments
 from cangauge.gap.settle import Settled, settle
 from cangauge.gap.soc_error import soc_mae_pct
 from cangauge.gap.verdict import ACCEPT_LOG_BAYES, NONE, UNKNOWN, Verdict, decide
-from cangauge.gap.where import Place, places, worst_moments
+from cangauge.gap.where import Place, places
 from cangauge.logs.log import Log
 from cangauge.model.model_file import ModelFile
 
@@ -48,7 +49,7 @@ class Diagnosis:
     closed: float | None
     closed_ci: tuple[float, float] | None
     where: tuple[Place, ...]
-    worst: tuple[dict[str, object], ...]
+    worst: tuple[Moment, ...]
     candidates: tuple[dict[str, Any], ...]
     observability: tuple[dict[str, object], ...]
     extension: Extension
@@ -69,7 +70,7 @@ class Diagnosis:
                 "extended_soc_mae_pct": self.extended_soc_mae_pct,
             },
             "where": [place.to_dict() for place in self.where],
-            "worst_moments": list(self.worst),
+            "worst_moments": [moment.to_dict() for moment in self.worst],
             "cause": {
                 "verdict": verdict.cause,
                 "probability": verdict.probability,
@@ -143,6 +144,7 @@ def diagnose(
     say("running the estimator with either model")
     better = model_file_of(extension, model_file, extended)
     clean_v2 = settled.error.clean_v2
+    _, given_v = settled.given_errors_v
     return Diagnosis(
         settled=settled,
         verdict=verdict,
@@ -154,8 +156,8 @@ def diagnose(
         extended_soc_mae_pct=soc_mae_pct(logs, better),
         closed=closed_fraction(baseline, extended, floor) if is_gap else None,
         closed_ci=closed_interval(settled, judged, floor) if is_gap else None,
-        where=tuple(places(settled.diagnosed, model_file.capacity_ah)),
-        worst=tuple(worst_moments(settled.diagnosed)),
+        where=tuple(places(settled.diagnosed, given_v, model_file.capacity_ah)),
+        worst=tuple(worst_moments(settled.diagnosed, given_v)),
         candidates=tuple(_candidates(settled, verdict, floor)),
         observability=tuple(_observability(settled)),
         extension=extension,
