@@ -229,9 +229,12 @@ def _observability(settled: Settled) -> list[dict[str, object]]:
 def in_words(diagnosis: Diagnosis) -> str:
     """Return the verdict in one sentence."""
     verdict = diagnosis.verdict
-    gap = f"{diagnosis.baseline_rmse_v:.2f} V where references show {diagnosis.floor_v:.2f} V"
+    floor = "references show" if diagnosis.settled.references else "the model file states"
+    gap = f"{diagnosis.baseline_rmse_v:.2f} V where {floor} {diagnosis.floor_v:.2f} V"
     if verdict.cause == NONE:
-        return f"No gap beyond what the references show ({gap})."
+        if diagnosis.settled.references and diagnosis.baseline_rmse_v > diagnosis.floor_v:
+            gap += f", {diagnosis.extended_rmse_v:.2f} V with what they teach"
+        return f"No gap beyond what the references show or explain ({gap})."
     if verdict.cause == UNKNOWN:
         return f"A gap ({gap}) that no effect in the library explains."
     alike = (

@@ -9,11 +9,19 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-LEAST_ROWS = 20
+LEAST_ROWS = 10
 """A bin with fewer rows says little and is left empty."""
+
+ROWS_A_BIN = 150
+"""No axis has more bins than one for so many rows of the logs, or than `LEAST_BINS`."""
+
+LEAST_BINS = 5
 
 SOC_BINS, OTHER_BINS = 20, 14
 """No axis has more bins than this."""
+
+TAIL_ROWS, TAIL_PART = 100, (0.01, 0.1)
+"""So many rows at either end of the current, within these parts of all, share one bin."""
 
 LEAST_WIDTH = 1.0
 """No bin is narrower than 1 %, 1 A or 1 K."""
@@ -35,7 +43,9 @@ class ErrorMap:
     """Mean error [V]; NaN where `rms_v` is."""
 
 
-def error_map(soc_pct: FloatArray, values: FloatArray, error_v: FloatArray) -> ErrorMap:
+def error_map(
+    soc_pct: FloatArray, values: FloatArray, error_v: FloatArray, *, tails: bool = False
+) -> ErrorMap:
     """Return the map of an error.
 
     Parameters
@@ -45,8 +55,14 @@ def error_map(soc_pct: FloatArray, values: FloatArray, error_v: FloatArray) -> E
         that maps of two errors on the same rows can be compared.
     error_v : array of shape (n,)
         Measured − model [V].
+    tails : bool
+        Whether `values` has long tails, which then go into its outermost bins.
     """
-    across, up = even_edges(soc_pct, SOC_BINS), even_edges(values, OTHER_BINS)
+    if tails:
+        values = _without_tails(values)
+    most = max(LEAST_BINS, soc_pct.size // ROWS_A_BIN)
+    across = even_edges(soc_pct, min(SOC_BINS, most))
+    up = even_edges(values, min(OTHER_BINS, most))
     shape = up.size - 1, across.size - 1
     at = _bin(up, values) * shape[1] + _bin(across, soc_pct)
 
@@ -63,6 +79,13 @@ def error_map(soc_pct: FloatArray, values: FloatArray, error_v: FloatArray) -> E
         rms_v=np.sqrt(total(error_v**2) / enough),
         mean_v=total(error_v) / enough,
     )
+
+
+def _without_tails(values: FloatArray) -> FloatArray:
+    # One pulse of 400 A must not squeeze a drive at 50 A into two rows of bins.
+    part = float(np.clip(TAIL_ROWS / values.size, *TAIL_PART))
+    low, high = np.quantile(values, [part, 1.0 - part])
+    return np.clip(values, low, high)
 
 
 def even_edges(values: FloatArray, at_most: int) -> FloatArray:

@@ -15,9 +15,16 @@ def verdict_limit(diagnosis: Diagnosis) -> str:
     """Return what the verdict itself leaves open; "" for a clear cause."""
     verdict = diagnosis.verdict
     if verdict.cause == NONE:
+        beside = ""
+        if diagnosis.settled.references:
+            beside = (
+                " beside what the references teach"
+                f" ({number(diagnosis.baseline_rmse_v, 2)} V as given,"
+                f" {number(diagnosis.extended_rmse_v, 2, 'V')} with that)"
+            )
         return (
-            "No cause can be named: nothing here exceeds what logs without a cause show. That does"
-            f" not prove that there is none.{_unseen(diagnosis)}"
+            f"No cause can be named: no effect has more evidence{beside} than chance gives on logs"
+            f" without a cause. That does not prove that there is none.{_unseen(diagnosis)}"
         )
     if verdict.cause == UNKNOWN:
         best = verdict.candidates[0].effect_id

@@ -52,7 +52,7 @@ def map_figures(errors: Sequence[LogErrors], extended: str | None) -> list[Block
     before = np.concatenate([item.before_v for item in errors])
     after = np.concatenate([item.after_v for item in errors])
     maps = {
-        (axis, when): error_map(soc, values, error_v)
+        (axis, when): error_map(soc, values, error_v, tails=axis == "current")
         for axis, values in others.items()
         for when, error_v in (("before", before), ("after", after))
     }
@@ -73,9 +73,10 @@ def _largest(each: ErrorMap) -> float:
 def _map(axis: str, each: ErrorMap, most: float, model: str) -> Figure:
     quantity, unit = AXES[axis]
     return Figure(
-        f"Error over state of charge and {quantity}, {model}",
+        f"RMS error over SoC × {quantity}, {model}",
         heat_map(each, (quantity, unit), most),
-        _map_words(each, unit),
+        _map_words(each, unit)
+        + (" The outermost hold all currents beyond." if axis == "current" else ""),
     )
 
 

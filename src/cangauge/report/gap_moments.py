@@ -97,6 +97,7 @@ def _small(
         [[above], [below]],
         sizing_mode="stretch_width",
         merge_tools=True,
+        toolbar_location="right",
         toolbar_options={"logo": None, "autohide": True},
     )
 

@@ -47,11 +47,11 @@ def gap_page(diagnosis: Diagnosis) -> Page:
     extended = _extended(diagnosis)
     sections = [
         Section("How large it is", size_blocks(diagnosis, extended)),
-        Section("Which effect", _which(diagnosis)),
         Section(
             "Where it lies",
             [*map_figures(errors, extended), *share_figures(diagnosis.where)],
         ),
+        Section("Which effect", _which(diagnosis)),
         Section("How far it shrinks", [_shrinks(diagnosis), *shrink_figures(errors, extended)]),
         Section("The worst moments", moment_figures(diagnosis.worst, errors, extended)),
         Section("How much of each effect these logs can show", _observability(diagnosis)),
@@ -85,7 +85,11 @@ def _tiles(diagnosis: Diagnosis) -> list[Tile]:
         Tile("Verdict", verdict.cause.replace("_", " "), f"probability {verdict.probability:.2f}"),
         Tile("Error of the model", number(diagnosis.baseline_rmse_v, 2, "V"), "RMS, these logs"),
         Tile("Extended model", number(diagnosis.extended_rmse_v, 2, "V"), "RMS, rows left out"),
-        Tile("Floor: references", number(diagnosis.floor_v, 2, "V"), "RMS, model as given"),
+        Tile(
+            "Floor: references" if diagnosis.settled.references else "Floor: model file",
+            number(diagnosis.floor_v, 2, "V"),
+            "RMS, model as given",
+        ),
     ]
     if diagnosis.explainable_v is not None:
         tiles.append(
@@ -135,10 +139,9 @@ def _which(diagnosis: Diagnosis) -> list[Block]:
     blocks: list[Block] = [Paragraph(_cause_words(diagnosis))]
     ranked = diagnosis.candidates[:SHOWN]
     chances = [
-        (str(item["effect"]), 100.0 * float(item["probability"]), BLUE if k == 0 else GREY)
-        for k, item in enumerate(ranked)
+        (name, 100.0 * verdict.chances[name], BLUE if name == verdict.cause else GREY)
+        for name in (*(str(item["effect"]) for item in ranked), UNKNOWN, NONE)
     ]
-    chances.extend((name, 100.0 * verdict.chances[name], GREY) for name in (UNKNOWN, NONE))
     blocks.append(
         Figure(
             "How probable each cause is",

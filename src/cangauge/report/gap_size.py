@@ -26,7 +26,7 @@ def size_blocks(diagnosis: Diagnosis, extended: str) -> list[Block]:
          diagnosis.baseline_soc_mae_pct, "these logs"),
         (extended, diagnosis.extended_rmse_v, BLUE,
          diagnosis.extended_soc_mae_pct, "these logs, rows that its fit did not see"),
-        ("floor: references", diagnosis.floor_v, GREY, None, _floor_words(diagnosis)),
+        (_floor_name(diagnosis), diagnosis.floor_v, GREY, None, _floor_words(diagnosis)),
     ]  # fmt: skip
     if diagnosis.explainable_v is not None:
         entries.append(
@@ -60,6 +60,10 @@ def slope_v_per_pct(diagnosis: Diagnosis) -> float:
     return float(np.median(settled.as_given.model.pseudo_ocv_slope(soc)))
 
 
+def _floor_name(diagnosis: Diagnosis) -> str:
+    return "floor: references" if diagnosis.settled.references else "floor: model file"
+
+
 def _floor_words(diagnosis: Diagnosis) -> str:
     if diagnosis.settled.references:
         return "references, with the model as given: sensors and what repeats no better"
@@ -72,7 +76,7 @@ def _see(diagnosis: Diagnosis) -> str:
     if not diagnosis.settled.references:
         words = f"The model's error here is {times:.1f} times what its file states."
     if diagnosis.explainable_v is None:
-        return words + " The second floor, what flexible structure explains, needs references."
+        return words + " The second floor, what flexible structure explains, needs more references."
     return (
         words
         + " What lies above both floors is the gap; between them, structure that the model lacks"
