@@ -69,6 +69,7 @@ def test_bins_with_few_rows_are_empty() -> None:
 def test_a_few_pulses_take_no_bins_of_their_own_but_are_in_the_map() -> None:
     current = np.concatenate([np.linspace(-20.0, 40.0, 9_990), np.full(10, 400.0)])
     found = error_map(np.full(10_000, 60.0), current, np.ones(10_000), tails=True)
+    assert found.tails
     assert found.edges[-1] < 50.0
     assert found.rows.sum() == 10_000
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cangauge.errors import InputError
 from cangauge.gap.diagnose import Diagnosis, diagnose
 from cangauge.gap.moments import MOMENTS
 from cangauge.identify.fit import FitOptions, fit
@@ -185,3 +186,9 @@ def test_a_poor_log_is_told_first_what_it_cannot_show(model: ModelFile) -> None:
                  "One temperature", "A narrow range of SoC", "No reference logs"):  # fmt: skip
         assert said in words
     assert any(tile.label == "Floor: model file" for tile in page.tiles)
+
+
+def test_a_log_too_short_to_judge_on_is_refused(model: ModelFile) -> None:
+    five = synthetic_log(hours=305.0 / 3600.0, start_pct=70.0, end_pct=69.0, noise_v=0.5)
+    with pytest.raises(InputError, match="nothing can be concluded"):
+        diagnose([five], model, [])

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cangauge.errors import InputError
 from cangauge.gap.evidence import gather
 from cangauge.gap.extend import (
     Extension,
@@ -135,6 +136,13 @@ def diagnose(
     accepted = [score.effect_id for score in verdict.accepted]
     say("judging on rows left out")
     judged = judge(settled, accepted)
+    if not judged:
+        raise InputError(
+            f"{logs[0].duration_s:.0f} s are too short to leave rows out and judge on them:"
+            " nothing can be concluded",
+            source=logs[0].source or logs[0].name,
+            cure="give a log of at least 10 min, better half an hour with changing load and SoC",
+        )
     floor = _floor_v(settled, model_file)
     baseline = rms(np.concatenate([item.baseline_v for item in judged]))
     extended = rms(np.concatenate([item.extended_v for item in judged]))

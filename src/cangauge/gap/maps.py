@@ -41,6 +41,8 @@ class ErrorMap:
     """Root mean square error [V]; NaN in bins with fewer than `LEAST_ROWS` rows."""
     mean_v: FloatArray
     """Mean error [V]; NaN where `rms_v` is."""
+    tails: bool = False
+    """Whether the lowest and highest bins of the second quantity hold all that lies beyond."""
 
 
 def error_map(
@@ -78,6 +80,7 @@ def error_map(
         rows=rows.astype(np.intp),
         rms_v=np.sqrt(total(error_v**2) / enough),
         mean_v=total(error_v) / enough,
+        tails=tails,
     )
 
 

@@ -75,8 +75,7 @@ def _map(axis: str, each: ErrorMap, most: float, model: str) -> Figure:
     return Figure(
         f"RMS error over SoC × {quantity}, {model}",
         heat_map(each, (quantity, unit), most),
-        _map_words(each, unit)
-        + (" The outermost hold all currents beyond." if axis == "current" else ""),
+        _map_words(each, unit),
     )
 
 
@@ -95,7 +94,7 @@ def heat_map(each: ErrorMap, axis: tuple[str, str], most_v: float) -> Plot:
     plot = plane(
         ("state of charge", quantity),
         f"RMS @rms{{0.00}} V, mean @mean{{0.00}} V, @rows rows<br>SoC @left{{0.[0]}} …"
-        f" @right{{0.[0]}} %, {quantity} @bottom{{0.[0]}} … @top{{0.[0]}} {unit}",
+        f" @right{{0.[0]}} %, {quantity} @range",
         units=("%", unit),
         height=330,
         x_range=Range1d(float(each.soc_edges_pct[0]), float(each.soc_edges_pct[-1])),
@@ -108,6 +107,7 @@ def heat_map(each: ErrorMap, axis: tuple[str, str], most_v: float) -> Plot:
             "right": each.soc_edges_pct[across + 1],
             "bottom": each.edges[up],
             "top": each.edges[up + 1],
+            "range": [_range(each, int(k), unit) for k in up],
             "rms": each.rms_v[up, across],
             "mean": each.mean_v[up, across],
             "rows": each.rows[up, across],
@@ -136,9 +136,20 @@ def _map_words(each: ErrorMap, unit: str) -> str:
     low, high = each.soc_edges_pct[across], each.soc_edges_pct[across + 1]
     return (
         f"Largest {each.rms_v[up, across]:.2f} V (mean {number(float(each.mean_v[up, across]), 2)}"
-        f" V) at {span(low, high, 0)} % and {span(each.edges[up], each.edges[up + 1], 0, unit)}."
+        f" V) at {span(low, high, 0)} % and {_range(each, int(up), unit)}."
         f" Bins with fewer than {LEAST_ROWS} rows are empty."
+        + (" The top and the bottom ones hold all beyond." if each.tails else "")
     )
+
+
+def _range(each: ErrorMap, up: int, unit: str) -> str:
+    """Return what a bin of the second quantity holds, in words."""
+    low, high = float(each.edges[up]), float(each.edges[up + 1])
+    if each.tails and up == each.edges.size - 2:
+        return f"over {number(low, 0, unit)}"
+    if each.tails and up == 0:
+        return f"below {number(high, 0, unit)}"
+    return span(low, high, 0, unit)
 
 
 def share_figures(places: Sequence[Place]) -> list[Block]:

@@ -32,6 +32,8 @@ from cangauge.report.page import (
 from cangauge.report.words import number, significant, span
 
 SHOWN = 8
+UNITS = {"1": "", "ohm": " Ω"}
+"""Units that a reader writes otherwise than the model file."""
 
 
 def gap_report(diagnosis: Diagnosis) -> str:
@@ -109,7 +111,7 @@ def _tiles(diagnosis: Diagnosis) -> list[Tile]:
         tiles.append(
             Tile(
                 "SoC error (EKF)",
-                f"{number(before, 1)} → {number(after, 1, '%')}",
+                f"{number(before, 2)} → {number(after, 2, '%')}",
                 "mean, before → extended",
             )
         )
@@ -184,7 +186,7 @@ def _candidate_row(item: dict[str, Any]) -> list[str]:
     parameters = "; ".join(
         f"{name} {significant(each['value'], 3)}"
         + ("" if each["ci"] is None else f" ({span(each['ci'][0], each['ci'][1], 3)})")
-        + f" {each['unit']}"
+        + UNITS.get(each["unit"], f" {each['unit']}")
         for name, each in item["parameters"].items()
     )
     return [
