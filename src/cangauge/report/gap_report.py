@@ -105,13 +105,13 @@ def _tiles(diagnosis: Diagnosis) -> list[Tile]:
         hint = "of its square, above the floor"
         if diagnosis.closed_ci is not None:
             low, high = diagnosis.closed_ci
-            hint = f"squared; 95 %: {100.0 * low:.0f} … {100.0 * high:.0f} %"
-        tiles.append(Tile("Gap closed", f"{100.0 * diagnosis.closed:.0f} %", hint))
+            hint = f"squared; 95 %: {_percents(low, high)}"
+        tiles.append(Tile("Gap closed", _percent(diagnosis.closed), hint))
     if before is not None:
         tiles.append(
             Tile(
                 "SoC error (EKF)",
-                f"{number(before, 2)} → {number(after, 2, '%')}",
+                f"{significant(before, 2)} → {significant(after, 2, '%')}",
                 "mean, before → extended",
             )
         )
@@ -122,10 +122,10 @@ def _shrinks(diagnosis: Diagnosis) -> Paragraph:
     before, after = diagnosis.baseline_rmse_v, diagnosis.extended_rmse_v
     words = f"On rows left out of the fit: {before:.2f} V before, {after:.2f} V after."
     if diagnosis.closed is not None:
-        words += f" That closes {100.0 * diagnosis.closed:.0f} %"
+        words += f" That closes {_percent(diagnosis.closed)}"
         if diagnosis.closed_ci is not None:
             low, high = diagnosis.closed_ci
-            words += f" (95 % interval {100.0 * low:.0f} … {100.0 * high:.0f} %)"
+            words += f" (95 % interval {_percents(low, high)})"
         words += " of the squared gap above the floor."
     if not diagnosis.settled.references:
         return Paragraph(words)
@@ -134,6 +134,14 @@ def _shrinks(diagnosis: Diagnosis) -> Paragraph:
         f"{words} The extended model has {added}what the references teach: coefficients moved, and"
         " structure that logs without a cause show as well."
     )
+
+
+def _percent(part: float) -> str:
+    return number(100.0 * part, 0, "%")
+
+
+def _percents(low: float, high: float) -> str:
+    return span(100.0 * low, 100.0 * high, 0, "%")
 
 
 def _which(diagnosis: Diagnosis) -> list[Block]:
@@ -193,7 +201,7 @@ def _candidate_row(item: dict[str, Any]) -> list[str]:
         str(item["effect"]),
         number(item["log_bayes_factor"], 1),
         number(item["rmse_v"], 2),
-        "–" if closed is None else f"{100.0 * closed:.0f} %",
+        "–" if closed is None else _percent(closed),
         parameters,
     ]
 
