@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cangauge.errors import InputError
 from cangauge.gap.evidence import gather
 from cangauge.gap.extend import (
     Extension,
@@ -18,10 +19,11 @@ from cangauge.gap.extend import (
     model_file_of,
 )
 from cangauge.gap.held_out import Judged, closed_fraction, closed_interval, judge, rms
+from cangauge.gap.moments import Moment, worst_moments
 from cangauge.gap.settle import Settled, settle
 from cangauge.gap.soc_error import soc_mae_pct
 from cangauge.gap.verdict import ACCEPT_LOG_BAYES, NONE, UNKNOWN, Verdict, decide
-from cangauge.gap.where import Place, places, worst_moments
+from cangauge.gap.where import Place, places
 from cangauge.logs.log import Log
 from cangauge.model.model_file import ModelFile
 
@@ -48,7 +50,7 @@ class Diagnosis:
     closed: float | None
     closed_ci: tuple[float, float] | None
     where: tuple[Place, ...]
-    worst: tuple[dict[str, object], ...]
+    worst: tuple[Moment, ...]
     candidates: tuple[dict[str, Any], ...]
     observability: tuple[dict[str, object], ...]
     extension: Extension
@@ -69,7 +71,7 @@ class Diagnosis:
                 "extended_soc_mae_pct": self.extended_soc_mae_pct,
             },
             "where": [place.to_dict() for place in self.where],
-            "worst_moments": list(self.worst),
+            "worst_moments": [moment.to_dict() for moment in self.worst],
             "cause": {
                 "verdict": verdict.cause,
                 "probability": verdict.probability,
@@ -134,6 +136,13 @@ def diagnose(
     accepted = [score.effect_id for score in verdict.accepted]
     say("judging on rows left out")
     judged = judge(settled, accepted)
+    if not judged:
+        raise InputError(
+            f"{logs[0].duration_s:.0f} s are too short to leave rows out and judge on them:"
+            " nothing can be concluded",
+            source=logs[0].source or logs[0].name,
+            cure="give a log of at least 10 min, better half an hour with changing load and SoC",
+        )
     floor = _floor_v(settled, model_file)
     baseline = rms(np.concatenate([item.baseline_v for item in judged]))
     extended = rms(np.concatenate([item.extended_v for item in judged]))
@@ -143,6 +152,7 @@ def diagnose(
     say("running the estimator with either model")
     better = model_file_of(extension, model_file, extended)
     clean_v2 = settled.error.clean_v2
+    _, given_v = settled.given_errors_v
     return Diagnosis(
         settled=settled,
         verdict=verdict,
@@ -154,8 +164,8 @@ def diagnose(
         extended_soc_mae_pct=soc_mae_pct(logs, better),
         closed=closed_fraction(baseline, extended, floor) if is_gap else None,
         closed_ci=closed_interval(settled, judged, floor) if is_gap else None,
-        where=tuple(places(settled.diagnosed, model_file.capacity_ah)),
-        worst=tuple(worst_moments(settled.diagnosed)),
+        where=tuple(places(settled.diagnosed, given_v, model_file.capacity_ah)),
+        worst=tuple(worst_moments(settled.diagnosed, given_v)),
         candidates=tuple(_candidates(settled, verdict, floor, extension)),
         observability=tuple(_observability(settled)),
         extension=extension,
@@ -231,9 +241,12 @@ def _observability(settled: Settled) -> list[dict[str, object]]:
 def in_words(diagnosis: Diagnosis) -> str:
     """Return the verdict in one sentence."""
     verdict = diagnosis.verdict
-    gap = f"{diagnosis.baseline_rmse_v:.2f} V where references show {diagnosis.floor_v:.2f} V"
+    floor = "references show" if diagnosis.settled.references else "the model file states"
+    gap = f"{diagnosis.baseline_rmse_v:.2f} V where {floor} {diagnosis.floor_v:.2f} V"
     if verdict.cause == NONE:
-        return f"No gap beyond what the references show ({gap})."
+        if diagnosis.settled.references and diagnosis.baseline_rmse_v > diagnosis.floor_v:
+            gap += f", {diagnosis.extended_rmse_v:.2f} V with what they teach"
+        return f"No gap beyond what the references show or explain ({gap})."
     if verdict.cause == UNKNOWN:
         return f"A gap ({gap}) that no effect in the library explains."
     alike = (

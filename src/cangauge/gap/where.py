@@ -46,17 +46,21 @@ class Place:
         }
 
 
-def places(logs: Sequence[LogTerms], capacity_ah: float) -> list[Place]:
+def places(
+    logs: Sequence[LogTerms], errors_v: Sequence[FloatArray], capacity_ah: float
+) -> list[Place]:
     """Return the shares of every axis; on each axis they sum to one.
 
     Parameters
     ----------
     logs : sequence of LogTerms
-        Diagnosed logs; their residual is that of the model as it is.
+        Diagnosed logs.
+    errors_v : sequence of arrays
+        Measured − model as given on the rows of each log [V].
     capacity_ah : float
         To tell rest from drive [Ah].
     """
-    square = np.concatenate([terms.residual_v**2 for terms in logs])
+    square = np.concatenate(errors_v) ** 2
     piece = _pieces(logs)
     result = []
     for axis, unit, values, edges in _axes(logs, capacity_ah):
@@ -66,7 +70,7 @@ def places(logs: Sequence[LogTerms], capacity_ah: float) -> list[Place]:
                 result.append(
                     _place(axis, unit, (low, high), square * inside, (inside, square, piece))
                 )
-    return result + _time_scales(logs, piece)
+    return result + _time_scales(logs, errors_v, piece)
 
 
 def _axes(
@@ -128,13 +132,16 @@ def _interval(mine: FloatArray, whole: FloatArray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _time_scales(logs: Sequence[LogTerms], piece: NDArray[np.intp]) -> list[Place]:
+def _time_scales(
+    logs: Sequence[LogTerms], errors_v: Sequence[FloatArray], piece: NDArray[np.intp]
+) -> list[Place]:
     """Split the residual into bands by moving averages; a band's share is its squares'."""
     bands: list[list[FloatArray]] = [[] for _ in SCALES_S[1:]]
-    for terms in logs:
-        rest = terms.residual_v
+    for terms, error_v in zip(logs, errors_v, strict=True):
+        rest = error_v
+        step_s = float(np.median(np.diff(terms.prepared.rows.time_s)))
         for k, width in enumerate(SCALES_S[1:]):
-            smooth = _moving_average(rest, width)
+            smooth = _moving_average(rest, width / step_s)
             bands[k].append(rest - smooth if np.isfinite(width) else rest)
             rest = smooth
     squares = [np.concatenate(parts) ** 2 for parts in bands]
@@ -174,28 +181,3 @@ def _pieces(logs: Sequence[LogTerms]) -> NDArray[np.intp]:
         first = int(number[-1]) + 1
         numbers.append(number)
     return np.concatenate(numbers)
-
-
-def worst_moments(logs: Sequence[LogTerms], number: int = 10) -> list[dict[str, object]]:
-    """Return the moments with the largest error, at least a minute apart."""
-    found: list[dict[str, object]] = []
-    for terms in logs:
-        rows = terms.prepared.rows
-        taken = np.zeros(len(rows), dtype=bool)
-        for at in np.argsort(-np.abs(terms.residual_v)):
-            if taken[at]:
-                continue
-            taken |= np.abs(rows.time_s - rows.time_s[at]) < 60.0
-            found.append(
-                {
-                    "log": rows.name,
-                    "time_s": float(rows.time_s[at]),
-                    "residual_v": float(terms.residual_v[at]),
-                    "soc_pct": float(rows.soc_pct[at]),
-                    "current_a": float(rows.delayed_current_a[at, 0]),
-                    "temperature_c": float(rows.temperature_c[at]),
-                }
-            )
-            if taken.all() or len(found) > 4 * number:
-                break
-    return sorted(found, key=lambda item: -abs(float(str(item["residual_v"]))))[:number]

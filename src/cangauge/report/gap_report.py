@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from cangauge.gap.before_after import errors_before_and_after
 from cangauge.gap.diagnose import Diagnosis, in_words
 from cangauge.gap.verdict import NONE, UNKNOWN
-from cangauge.gap.where import Place
 from cangauge.model.effects.library import LIBRARY
 from cangauge.report.bars import bars
+from cangauge.report.figures import BLUE, GREY
+from cangauge.report.gap_limits import log_limits, verdict_limit
+from cangauge.report.gap_maps import map_figures, share_figures
+from cangauge.report.gap_moments import moment_figures
+from cangauge.report.gap_shrink import shrink_figures
+from cangauge.report.gap_size import size_blocks
 from cangauge.report.page import (
     Block,
     Bullets,
@@ -27,16 +32,8 @@ from cangauge.report.page import (
 from cangauge.report.words import number, significant, span
 
 SHOWN = 8
-LONGEST_S = 1e6
-BLUE, GREY = "#1f77b4", "#b0b0b0"
-AXIS_WORDS = {
-    "soc": "state of charge [%]",
-    "temperature": "temperature [°C]",
-    "current": "current [A], positive = discharge",
-    "rest": "rest (1) or drive (0)",
-    "time": "time since the log's start [s]",
-    "timescale": "time scale of the error [s]",
-}
+UNITS = {"1": "", "ohm": " Ω"}
+"""Units that a reader writes otherwise than the model file."""
 
 
 def gap_report(diagnosis: Diagnosis) -> str:
@@ -48,46 +45,113 @@ def gap_page(diagnosis: Diagnosis) -> Page:
     """Return the page of a diagnosis."""
     logs = [terms.prepared.log for terms in diagnosis.settled.diagnosed]
     names = ", ".join(log.name for log in logs)
+    errors = errors_before_and_after(diagnosis.settled, diagnosis.extension.model)
+    extended = _extended(diagnosis)
+    sections = [
+        Section("How large it is", size_blocks(diagnosis, extended)),
+        Section(
+            "Where it lies",
+            [*map_figures(errors, extended), *share_figures(diagnosis.where)],
+        ),
+        Section("Which effect", _which(diagnosis)),
+        Section("How far it shrinks", [_shrinks(diagnosis), *shrink_figures(errors, extended)]),
+        Section("The worst moments", moment_figures(diagnosis.worst, errors, extended)),
+        Section("How much of each effect these logs can show", _observability(diagnosis)),
+        Section("How it was done", [Bullets(_method(diagnosis, names))]),
+    ]
+    open_question, cannot = verdict_limit(diagnosis), log_limits(diagnosis)
+    if open_question or cannot:
+        said = [open_question] if open_question else []
+        sections.insert(0, Section("What these logs cannot show", [Bullets([*said, *cannot])]))
     return Page(
         title="Gap between model and log",
         subtitle=in_words(diagnosis),
         tiles=_tiles(diagnosis),
-        sections=[
-            _which(diagnosis),
-            _where(diagnosis),
-            Section("The worst moments", [_worst(diagnosis)]),
-            Section("What these logs can show", _observability(diagnosis)),
-            Section("How it was done", [Bullets(_method(diagnosis, names))]),
-        ],
+        sections=sections,
         banners=reconstruction_banners(names, *(log.source for log in logs)),
     )
 
 
+def _extended(diagnosis: Diagnosis) -> str:
+    """Return what the extended model adds, in words."""
+    accepted = diagnosis.extension.cause
+    if accepted:
+        return f"with {' and '.join(accepted)}"
+    return "with what references add" if diagnosis.settled.references else "nothing added"
+
+
 def _tiles(diagnosis: Diagnosis) -> list[Tile]:
     verdict = diagnosis.verdict
+    before, after = diagnosis.baseline_soc_mae_pct, diagnosis.extended_soc_mae_pct
     tiles = [
         Tile("Verdict", verdict.cause.replace("_", " "), f"probability {verdict.probability:.2f}"),
         Tile("Error of the model", number(diagnosis.baseline_rmse_v, 2, "V"), "RMS, these logs"),
-        Tile("Floor", number(diagnosis.floor_v, 2, "V"), "RMS, reference logs"),
+        Tile("Extended model", number(diagnosis.extended_rmse_v, 2, "V"), "RMS, rows left out"),
+        Tile(
+            "Floor: references" if diagnosis.settled.references else "Floor: model file",
+            number(diagnosis.floor_v, 2, "V"),
+            "RMS, model as given",
+        ),
     ]
-    if verdict.cause not in {NONE, UNKNOWN}:
-        closed = "–" if diagnosis.closed is None else f"{100.0 * diagnosis.closed:.0f} %"
-        tiles += [
-            Tile("With the effect", number(diagnosis.extended_rmse_v, 2, "V"), "RMS, left out"),
-            Tile("Closed", closed, "of the squared gap above the floor"),
-        ]
+    if diagnosis.explainable_v is not None:
+        tiles.append(
+            Tile(
+                "Floor: explainable",
+                number(diagnosis.explainable_v, 2, "V"),
+                "RMS, with references' structure",
+            )
+        )
+    if diagnosis.closed is not None:
+        hint = "of its square, above the floor"
+        if diagnosis.closed_ci is not None:
+            low, high = diagnosis.closed_ci
+            hint = f"squared; 95 %: {_percents(low, high)}"
+        tiles.append(Tile("Gap closed", _percent(diagnosis.closed), hint))
+    if before is not None:
+        tiles.append(
+            Tile(
+                "SoC error (EKF)",
+                f"{significant(before, 2)} → {significant(after, 2, '%')}",
+                "mean, before → extended",
+            )
+        )
     return tiles
 
 
-def _which(diagnosis: Diagnosis) -> Section:
+def _shrinks(diagnosis: Diagnosis) -> Paragraph:
+    before, after = diagnosis.baseline_rmse_v, diagnosis.extended_rmse_v
+    words = f"On rows left out of the fit: {before:.2f} V before, {after:.2f} V after."
+    if diagnosis.closed is not None:
+        words += f" That closes {_percent(diagnosis.closed)}"
+        if diagnosis.closed_ci is not None:
+            low, high = diagnosis.closed_ci
+            words += f" (95 % interval {_percents(low, high)})"
+        words += " of the squared gap above the floor."
+    if not diagnosis.settled.references:
+        return Paragraph(words)
+    added = "the cause and " if diagnosis.extension.cause else "no cause, only "
+    return Paragraph(
+        f"{words} The extended model has {added}what the references teach: coefficients moved, and"
+        " structure that logs without a cause show as well."
+    )
+
+
+def _percent(part: float) -> str:
+    return number(100.0 * part, 0, "%")
+
+
+def _percents(low: float, high: float) -> str:
+    return span(100.0 * low, 100.0 * high, 0, "%")
+
+
+def _which(diagnosis: Diagnosis) -> list[Block]:
     verdict = diagnosis.verdict
     blocks: list[Block] = [Paragraph(_cause_words(diagnosis))]
     ranked = diagnosis.candidates[:SHOWN]
     chances = [
-        (str(item["effect"]), 100.0 * float(item["probability"]), BLUE if k == 0 else GREY)
-        for k, item in enumerate(ranked)
+        (name, 100.0 * verdict.chances[name], BLUE if name == verdict.cause else GREY)
+        for name in (*(str(item["effect"]) for item in ranked), UNKNOWN, NONE)
     ]
-    chances.extend((name, 100.0 * verdict.chances[name], GREY) for name in (UNKNOWN, NONE))
     blocks.append(
         Figure(
             "How probable each cause is",
@@ -103,7 +167,7 @@ def _which(diagnosis: Diagnosis) -> Section:
             note="Errors are on rows that the fit of the effect did not see.",
         )
     )
-    return Section("Which effect", blocks)
+    return blocks
 
 
 def _cause_words(diagnosis: Diagnosis) -> str:
@@ -130,76 +194,16 @@ def _candidate_row(item: dict[str, Any]) -> list[str]:
     parameters = "; ".join(
         f"{name} {significant(each['value'], 3)}"
         + ("" if each["ci"] is None else f" ({span(each['ci'][0], each['ci'][1], 3)})")
-        + f" {each['unit']}"
+        + UNITS.get(each["unit"], f" {each['unit']}")
         for name, each in item["parameters"].items()
     )
     return [
         str(item["effect"]),
         number(item["log_bayes_factor"], 1),
         number(item["rmse_v"], 2),
-        "–" if closed is None else f"{100.0 * closed:.0f} %",
+        "–" if closed is None else _percent(closed),
         parameters,
     ]
-
-
-def _where(diagnosis: Diagnosis) -> Section:
-    blocks: list[Block] = []
-    for axis, words in AXIS_WORDS.items():
-        places = [place for place in diagnosis.where if place.axis == axis]
-        if places:
-            blocks.append(
-                Figure(
-                    f"Share of the squared error over {words}",
-                    bars(
-                        "share",
-                        "%",
-                        [(_range(place), 100.0 * place.share, BLUE) for place in places],
-                    ),
-                    _where_words(places),
-                )
-            )
-    return Section("Where the error lies", blocks)
-
-
-def _range(place: Place) -> str:
-    if place.axis == "rest":
-        return "rest" if place.low > 0.0 else "drive"
-    if place.axis == "timescale" and place.high >= LONGEST_S:
-        return f"over {number(place.low, 0)}"
-    return span(place.low, place.high, 0)
-
-
-def _where_words(places: Sequence[Place]) -> str:
-    most = max(places, key=lambda place: place.share)
-    low, high = most.ci
-    return (
-        f"Most lies at {_range(most)}: {100.0 * most.share:.0f} %"
-        f" ({100.0 * low:.0f}–{100.0 * high:.0f} %), {most.rmse_v:.2f} V there."
-    )
-
-
-def _worst(diagnosis: Diagnosis) -> Table:
-    rows = [
-        [
-            str(item["log"]),
-            *(
-                number(float(str(item[name])), digits)
-                for name, digits in (
-                    ("time_s", 0),
-                    ("residual_v", 2),
-                    ("soc_pct", 1),
-                    ("current_a", 1),
-                    ("temperature_c", 1),
-                )
-            ),
-        ]
-        for item in diagnosis.worst
-    ]
-    return Table(
-        ["log", "time [s]", "measured − model [V]", "SoC [%]", "current [A]", "temperature [°C]"],
-        rows,
-        note="At least a minute apart.",
-    )
 
 
 def _observability(diagnosis: Diagnosis) -> list[Block]:

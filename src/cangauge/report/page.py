@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from html import escape
 from typing import Any
 
+from bokeh.document import Document
 from bokeh.embed import components
 from bokeh.resources import Resources
 
@@ -96,6 +97,7 @@ def render(page: Page) -> str:
     """Return the page as one self-contained HTML text."""
     figures = [item for section in page.sections for item in _figures(section)]
     plots = {f"f{number}": item.plot for number, item in enumerate(figures)}
+    _gather(list(plots.values()))
     script, divs = components(plots, theme=THEME) if plots else ("", {})
     # Only bokeh's core is needed: its widgets, tables and formulae would add 2.7 MB.
     bokeh = Resources(mode="inline", components=["bokeh"]).render() if plots else ""
@@ -103,7 +105,7 @@ def render(page: Page) -> str:
     body = "\n".join(
         _section(section, number, drawn) for number, section in enumerate(page.sections)
     )
-    links = "".join(
+    links = " ".join(  # a space to break the line at
         f'<a href="#s{number}">{escape(section.title)}</a>'
         for number, section in enumerate(page.sections)
     )
@@ -121,6 +123,16 @@ def render(page: Page) -> str:
         version=escape(__version__),
         points=POINTS_AT_MOST,
     )
+
+
+def _gather(plots: Sequence[Any]) -> None:
+    """Put drawings into one document, which bokeh would search anew after each of them."""
+    if any(plot.document is not None for plot in plots):
+        return  # rendered before
+    document = Document()
+    with document.models.freeze():
+        for plot in plots:
+            document.add_root(plot)
 
 
 def reconstruction_banners(*texts: str) -> list[str]:

@@ -1,0 +1,158 @@
+"""What logs cannot show, whatever the evidence says: too short, too narrow, nothing to compare.
+
+Each limit is a sentence: what the logs are like, and what can therefore not be concluded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from cangauge.gap.columns import Prepared
+from cangauge.gap.settle import COVERED_K, COVERED_PCT
+
+SHORT_S = 600.0
+"""In a shorter log little builds up [s]."""
+
+ONE_TEMPERATURE_K, ONE_SOC_PCT = 3.0, 10.0
+"""Logs within less than this show nothing of temperature, or of SoC [K, %]."""
+
+REST_C_RATE, REST_PART = 0.02, 0.005
+"""Charging or resting for less than this part of the rows counts as never; a current below this
+is rest [1/h]."""
+
+FEW_REFERENCES = 3
+"""Fewer tell hardly how much logs differ without a cause."""
+
+
+def limits(
+    logs: Sequence[Prepared],
+    references: Sequence[Prepared],
+    capacity_ah: float,
+    initial_soc_pct: float | None = None,
+) -> list[str]:
+    """Return what these logs cannot show and why; nothing for logs without such limits.
+
+    Parameters
+    ----------
+    logs : sequence of Prepared
+        Diagnosed logs.
+    references : sequence of Prepared
+    capacity_ah : float
+        Of the model [Ah].
+    initial_soc_pct : float, optional
+        SoC at each diagnosed log's first row, if it was given [%].
+    """
+    found = [
+        _duration(logs),
+        _temperature(logs, references),
+        _soc(logs, references),
+        _start(logs, initial_soc_pct),
+        _charging(logs, capacity_ah),
+        _reference_number(len(references)),
+    ]
+    return [sentence for sentence in found if sentence]
+
+
+def _duration(logs: Sequence[Prepared]) -> str:
+    short = [item.log for item in logs if item.log.duration_s < SHORT_S]
+    if not short:
+        return ""
+    lasting = ", ".join(f"{log.name} ({log.duration_s / 60.0:.1f} min)" for log in short)
+    return (
+        f"Shorter than {SHORT_S / 60.0:.0f} min: {lasting}. What builds up over minutes to hours"
+        " (slow_diffusion, core_temperature, hysteresis, a drift of the count by current_offset,"
+        " current_gain, capacity or coulombic_efficiency) can be neither named nor ruled out"
+        " there, because it has hardly begun to show."
+    )
+
+
+def _temperature(logs: Sequence[Prepared], references: Sequence[Prepared]) -> str:
+    low, high = _range([item.rows.temperature_c for item in logs])
+    sentences = []
+    if high - low < ONE_TEMPERATURE_K:
+        sentences.append(
+            f"One temperature ({low:.1f} … {high:.1f} °C): how the gap changes with temperature"
+            " cannot be concluded from these logs alone, so resistance_temperature,"
+            " entropic_coefficient and temperature_lag look like any change of the resistance or"
+            " of the OCV."
+        )
+    if references:
+        known = _range([item.rows.temperature_c for item in references])
+        if low < known[0] - COVERED_K or high > known[1] + COVERED_K:
+            sentences.append(
+                f"Temperatures of {low:.0f} … {high:.0f} °C where the references have"
+                f" {known[0]:.0f} … {known[1]:.0f} °C: what the temperature alone does to a pack"
+                " without a fault is not known there, and cannot be told safely from a cause."
+            )
+    return " ".join(sentences)
+
+
+def _soc(logs: Sequence[Prepared], references: Sequence[Prepared]) -> str:
+    low, high = _range([item.rows.soc_pct for item in logs])
+    sentences = []
+    if high - low < ONE_SOC_PCT:
+        sentences.append(
+            f"A narrow range of SoC ({low:.1f} … {high:.1f} %): how the gap changes with SoC cannot"
+            " be concluded, so initial_soc, capacity, voltage_gain, voltage_offset, ocv_shape and"
+            " weak_cell look alike, and resistance_soc looks like any other resistance."
+        )
+    if references:
+        known = _range([item.rows.soc_pct for item in references])
+        if low < known[0] - COVERED_PCT or high > known[1] + COVERED_PCT:
+            sentences.append(
+                f"SoC of {low:.0f} … {high:.0f} % where the references have"
+                f" {known[0]:.0f} … {known[1]:.0f} %: outside it the model's own OCV may be wrong,"
+                " and that cannot be told safely from a cause."
+            )
+    return " ".join(sentences)
+
+
+def _start(logs: Sequence[Prepared], initial_soc_pct: float | None) -> str:
+    names = [item.log.name for item in logs if item.log.first_soc() is None]
+    if initial_soc_pct is not None or not names:
+        return ""
+    return (
+        f"No SoC at the start of {', '.join(names)}: 100 % was assumed. If that is wrong, it looks"
+        " like initial_soc, voltage_offset or capacity, and none of these can be concluded; give"
+        " the SoC with --initial-soc."
+    )
+
+
+def _charging(logs: Sequence[Prepared], capacity_ah: float) -> str:
+    current = np.concatenate([item.rows.delayed_current_a[:, 0] for item in logs])
+    least_a = REST_C_RATE * capacity_ah
+    sentences = []
+    if np.mean(current < -least_a) < REST_PART:
+        sentences.append(
+            "The pack is never charged: resistance_asymmetry and coulombic_efficiency cannot be"
+            " seen, and hysteresis not told from an offset of the OCV."
+        )
+    if np.mean(np.abs(current) < least_a) < REST_PART:
+        sentences.append(
+            "The pack never rests: what decays without current (slow_diffusion) cannot be told"
+            " from what stays (hysteresis), nor an error of the voltage from one of the resistance"
+            " by looking at rest."
+        )
+    return " ".join(sentences)
+
+
+def _reference_number(number: int) -> str:
+    if number >= FEW_REFERENCES:
+        return ""
+    if not number:
+        return (
+            "No reference logs: whether the model was ever right on this pack cannot be concluded;"
+            " the error that the model file states stands for the floor, and structure that the"
+            " model never had counts as a cause."
+        )
+    return (
+        f"Only {number} reference log{'s' if number > 1 else ''}: how much logs of this pack differ"
+        " without a cause is hardly known, so probabilities are less sure than they look."
+    )
+
+
+def _range(values: Sequence[np.ndarray]) -> tuple[float, float]:
+    whole = np.concatenate(values)
+    return float(whole.min()), float(whole.max())

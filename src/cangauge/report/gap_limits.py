@@ -1,0 +1,66 @@
+"""What cannot be concluded, said before anything else on the page."""
+
+from __future__ import annotations
+
+from cangauge.gap.diagnose import Diagnosis
+from cangauge.gap.limits import limits
+from cangauge.gap.verdict import NONE, UNKNOWN
+from cangauge.model.effects.library import LIBRARY
+from cangauge.report.words import number
+
+LIKELY = 0.5
+
+
+def verdict_limit(diagnosis: Diagnosis) -> str:
+    """Return what the verdict itself leaves open; "" for a clear cause."""
+    verdict = diagnosis.verdict
+    if verdict.cause == NONE:
+        beside = ""
+        if diagnosis.settled.references:
+            beside = (
+                " beside what the references teach"
+                f" ({number(diagnosis.baseline_rmse_v, 2)} V as given,"
+                f" {number(diagnosis.extended_rmse_v, 2, 'V')} with that)"
+            )
+        return (
+            f"No cause can be named: no effect has more evidence{beside} than chance gives on logs"
+            f" without a cause. That does not prove that there is none.{_unseen(diagnosis)}"
+        )
+    if verdict.cause == UNKNOWN:
+        best = verdict.candidates[0].effect_id
+        return (
+            f"No cause can be named: the gap is real ({number(diagnosis.baseline_rmse_v, 2, 'V')},"
+            f" references {number(diagnosis.floor_v, 2, 'V')}), but the best effect of the library,"
+            f" {best}, explains only {100.0 * verdict.explained:.0f} % of the excess. The cause is"
+            " not in the library, or several act at once, or the model is not of this pack."
+        )
+    words = []
+    if verdict.probability < LIKELY:
+        words.append(
+            f"{verdict.cause} is the likeliest cause, yet with a probability of only"
+            f" {verdict.probability:.2f}: do not act on it alone."
+        )
+    if verdict.ambiguous_with:
+        words.append(
+            f"These logs cannot tell {verdict.cause} from {', '.join(verdict.ambiguous_with)}."
+            f" What would: {LIBRARY[verdict.cause].separated_by}."
+        )
+    return " ".join(words)
+
+
+def log_limits(diagnosis: Diagnosis) -> list[str]:
+    """Return what the logs cannot show, whatever the verdict."""
+    settled = diagnosis.settled
+    return limits(
+        [terms.prepared for terms in settled.diagnosed],
+        [terms.prepared for terms in settled.references],
+        settled.model.capacity_ah,
+        settled.options.initial_soc_pct,
+    )
+
+
+def _unseen(diagnosis: Diagnosis) -> str:
+    names = [str(item["effect"]) for item in diagnosis.observability if item["visible"] == 0.0]
+    if not names:
+        return " Smaller causes than the last table says would stay unseen."
+    return f" These logs would not show {', '.join(names)} at any size that physics allows."

@@ -1,0 +1,194 @@
+"""The page of a diagnosis: every question has its figure, and limits come first."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cangauge.errors import InputError
+from cangauge.gap.diagnose import Diagnosis, diagnose
+from cangauge.gap.moments import MOMENTS
+from cangauge.identify.fit import FitOptions, fit
+from cangauge.logs.log import Log
+from cangauge.model.model_file import ModelFile
+from cangauge.model.published import CAPACITY_AH
+from cangauge.report.gap_report import gap_page
+from cangauge.report.page import Beside, Bullets, Figure, Page, Section, Table, render
+from synthetic import synthetic_log
+
+LARGEST_PAGE_BYTES = 3_000_000
+
+
+SECTIONS = [
+    "How large it is",
+    "Where it lies",
+    "Which effect",
+    "How far it shrinks",
+    "The worst moments",
+    "How much of each effect these logs can show",
+]
+
+
+def day(seed: int) -> Log:
+    return synthetic_log(
+        hours=0.5, start_pct=85.0, end_pct=65.0, noise_v=0.5, seed=seed, name=f"day {seed}"
+    )
+
+
+@pytest.fixture(scope="module")
+def model() -> ModelFile:
+    logs = [synthetic_log(noise_v=0.5, seed=seed) for seed in (1, 2)]
+    return fit(logs, FitOptions(capacity_ah=CAPACITY_AH)).model
+
+
+@pytest.fixture(scope="module")
+def references() -> list[Log]:
+    return [day(seed) for seed in (11, 12, 13)]
+
+
+@pytest.fixture(scope="module")
+def offset(model: ModelFile, references: list[Log]) -> Diagnosis:
+    logs = [replace(day(seed), current_a=day(seed).current_a + 6.0) for seed in (21, 22)]
+    return diagnose(logs, model, references)
+
+
+@pytest.fixture(scope="module")
+def page(offset: Diagnosis) -> Page:
+    return gap_page(offset)
+
+
+def figures(page: Page) -> list[Figure]:
+    blocks = [block for section in page.sections for block in section.blocks]
+    inside = [figure for block in blocks if isinstance(block, Beside) for figure in block.figures]
+    return [block for block in blocks if isinstance(block, Figure)] + inside
+
+
+def section(page: Page, title: str) -> Section:
+    return next(item for item in page.sections if item.title == title)
+
+
+def tables(part: Section) -> list[Table]:
+    return [block for block in part.blocks if isinstance(block, Table)]
+
+
+def stacked(figure: Figure) -> list[Any]:
+    """Return the drawings of a figure that stands one above the other."""
+    grid = next(item for item in figure.plot.references() if type(item).__name__ == "GridPlot")
+    return [drawn for drawn, _row, _column in grid.children]
+
+
+def test_every_question_has_its_section(page: Page) -> None:
+    titles = [item.title for item in page.sections]
+    assert [title for title in titles if title in SECTIONS] == SECTIONS
+
+
+def test_size_is_in_volts_and_soc_against_two_floors(page: Page, offset: Diagnosis) -> None:
+    rows = {row[0]: row for row in tables(section(page, "How large it is"))[0].rows}
+    assert list(rows) == [
+        "model as given", "with current_offset", "floor: references", "floor: explainable",
+    ]  # fmt: skip
+    assert rows["model as given"][1] == f"{offset.baseline_rmse_v:.2f}"
+    assert rows["floor: references"][1] == f"{offset.floor_v:.2f}"
+    assert rows["floor: explainable"][1] == f"{offset.explainable_v:.2f}"
+    assert rows["with current_offset"][3] == f"{offset.extended_soc_mae_pct:.2f}"
+    slope = offset.baseline_rmse_v / float(rows["model as given"][2])
+    assert 0.2 < slope < 2.0  # V per % of a 96-cell pack
+
+
+def test_maps_show_before_and_after_in_the_same_shades(page: Page) -> None:
+    maps = [item for item in figures(page) if item.title.startswith("RMS error over SoC ×")]
+    assert [item.title for item in maps] == [
+        "RMS error over SoC × current, model as given",
+        "RMS error over SoC × temperature, model as given",
+        "RMS error over SoC × current, with current_offset",
+        "RMS error over SoC × temperature, with current_offset",
+    ]
+    bars = [item for each in maps for item in each.plot.right if type(item).__name__ == "ColorBar"]
+    assert len(bars) == 4
+    assert len({bar.color_mapper.high for bar in bars}) == 1
+    assert all("[V]" in bar.title for bar in bars)
+    before, after = (np.array(maps[k].plot.renderers[0].data_source.data["rms"]) for k in (0, 2))
+    assert after.mean() < 0.6 * before.mean()
+    assert np.isfinite(before).all()
+
+
+def test_ten_worst_moments_are_drawn_on_one_scale(page: Page, offset: Diagnosis) -> None:
+    part = section(page, "The worst moments")
+    drawn = [item for block in part.blocks if isinstance(block, Beside) for item in block.figures]
+    assert len(drawn) == MOMENTS
+    assert drawn[0].title == f"1. {offset.worst[0].log} at {offset.worst[0].time_s:.0f} s"
+    ranges = set()
+    for each in drawn:
+        error, current = stacked(each)
+        names = {line.name for line in error.renderers}
+        assert {"model as given", "with current_offset"} <= names
+        assert current.yaxis[0].axis_label == "current [A]"
+        x = current.renderers[0].data_source.data["x"]
+        assert np.abs(x).max() <= 60.0
+        ranges.add((error.y_range.start, error.y_range.end))
+    assert len(ranges) == 1
+    assert len(tables(part)[0].rows) == MOMENTS
+
+
+def test_how_far_it_shrinks_is_shown_over_time_and_by_log(page: Page) -> None:
+    part = section(page, "How far it shrinks")
+    over_time = next(block for block in part.blocks if isinstance(block, Figure))
+    names = {line.name for line in over_time.plot.renderers}
+    assert {"model as given", "with current_offset"} <= names
+    rows = tables(part)[0].rows
+    assert [row[0] for row in rows] == ["day 21", "day 22"]
+    assert all(float(row[5]) < float(row[4]) for row in rows)
+
+
+def test_shares_have_intervals(page: Page) -> None:
+    shares = [item for item in figures(page) if item.title.startswith("Share of the squared error")]
+    assert len(shares) == 6
+    for each in shares:
+        assert any(type(item).__name__ == "Whisker" for item in each.plot.center)
+        data = each.plot.renderers[0].data_source.data
+        assert all(low <= high for low, high in zip(data["low"], data["high"], strict=True))
+
+
+def test_every_figure_has_units_and_a_sentence(page: Page) -> None:
+    for each in figures(page):
+        assert each.see.endswith("."), each.title
+        drawn = stacked(each) if each.title[0].isdigit() else [each.plot]
+        for plot in drawn:
+            for axis in (plot.xaxis[0], plot.yaxis[0]):
+                label = axis.axis_label or ""
+                unlabelled = hasattr(plot.y_range, "factors") or not axis.visible
+                assert unlabelled or re.search(r"\[.+\]$", label), (each.title, label)
+
+
+def test_page_is_small_and_loads_nothing(page: Page) -> None:
+    text = render(page)
+    assert len(text.encode()) < LARGEST_PAGE_BYTES
+    assert "default-src 'none'" in text
+    assert "NaN" not in re.sub(r"<script.*?</script>", "", text, flags=re.DOTALL)
+    assert render(page).count("<figure>") == text.count("<figure>") == len(figures(page))
+
+
+def test_a_poor_log_is_told_first_what_it_cannot_show(model: ModelFile) -> None:
+    short = synthetic_log(hours=0.15, start_pct=70.0, end_pct=68.0, noise_v=0.5, name="stub")
+    short = replace(short, temperature_c=np.full(len(short), 23.0))
+    found = diagnose([short], model, [])
+    assert found.verdict.cause == "none"
+    page = gap_page(found)
+    assert page.sections[0].title == "What these logs cannot show"
+    bullets = page.sections[0].blocks[0]
+    assert isinstance(bullets, Bullets)
+    words = " ".join(bullets.items)
+    for said in ("No cause can be named", "does not prove that there is none", "Shorter than 10",
+                 "One temperature", "A narrow range of SoC", "No reference logs"):  # fmt: skip
+        assert said in words
+    assert any(tile.label == "Floor: model file" for tile in page.tiles)
+
+
+def test_a_log_too_short_to_judge_on_is_refused(model: ModelFile) -> None:
+    five = synthetic_log(hours=305.0 / 3600.0, start_pct=70.0, end_pct=69.0, noise_v=0.5)
+    with pytest.raises(InputError, match="nothing can be concluded"):
+        diagnose([five], model, [])
