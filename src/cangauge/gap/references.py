@@ -85,8 +85,9 @@ def error_from_references(
 ) -> ErrorModel:
     """Return the error under which each reference is most probable, given the others.
 
-    Expectation maximisation on the variance of every scale and of all that is a log's own; what
-    `stated` says counts like `KNOWN_LOGS` logs.
+    Expectation maximisation on the variance of every scale, in which what `stated` says counts like
+    `KNOWN_LOGS` logs; then the level of all that is a log's own, and of each effect's, under which
+    the references are most probable.
 
     Parameters
     ----------
