@@ -14,8 +14,9 @@ from scipy.stats import halfnorm, norm
 
 from cangauge.gap.columns import Candidate, candidates
 from cangauge.gap.diagnose import diagnose
-from cangauge.gap.evidence import PRIOR_PARTS, ErrorModel, Evidence, Frame, scores
+from cangauge.gap.evidence import ErrorModel, Evidence, Frame
 from cangauge.gap.scales import SCALES
+from cangauge.gap.scores import PRIOR_PARTS, scores
 from cangauge.identify.fit import FitOptions, fit
 from cangauge.logs.log import Log
 from cangauge.model.effects.effect import Pack

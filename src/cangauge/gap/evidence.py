@@ -3,7 +3,7 @@
     residual = baseline·δθ + own·o + repairs·ρ + effect·a + error
 
 δθ are the voltage model's coefficients, held by the information that its own logs gave; o is what
-differs from log to log without a cause (`columns.OWN`), held by how much clean logs differ; ρ are
+differs from log to log without a cause (`Frame.own`), held by how much clean logs differ; ρ are
 effects that clean logs show too; a is the effect in question, which only the diagnosed logs have.
 All but a are integrated out. What is left is a quadratic form in a, for all candidates at once:
 
@@ -17,28 +17,20 @@ in S.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.special import log_ndtr
 
 from cangauge.gap.columns import LEVELS, Candidate, LogTerms
-from cangauge.gap.scales import SCALES, by_scale
+from cangauge.gap.scales import by_scale
 
 FloatArray = NDArray[np.float64]
 
 PRIOR_SIGMAS = 2.0
 """Half the width of an amplitude's bounds is this many prior standard deviations."""
-
-PRIOR_PARTS = (1.0, 0.3, 0.1, 0.03)
-"""An effect may be as large as its bounds, or much smaller: the prior's width in parts of that of
-the bounds, each as probable as the others."""
-
-NOISIER = 0.2
-"""Errors' variance differs from log to log by this part without a cause."""
 
 PIN = 0.1
 """How far the structure of clean logs may move with the diagnosed ones, in parts of its bounds."""
@@ -96,23 +88,6 @@ class Evidence:
     def of(self, k: int) -> slice:
         """Return where candidate k's amplitudes are."""
         return slice(int(self.frame.first[k]), int(self.frame.first[k + 1]))
-
-
-@dataclass(frozen=True, eq=False)
-class Score:
-    """One effect, at its best shape."""
-
-    effect_id: str
-    log_bayes_factor: float
-    """Against no effect, averaged over the effect's shapes."""
-    candidates: tuple[int, ...]
-    """Index of the best shape's candidate, or of two whose mixture is better than either."""
-    amplitude: FloatArray
-    """Most probable amplitudes beside the neutral ones, within bounds, of all of them, (k,)."""
-    covariance: FloatArray
-    """Shape (k, k)."""
-    explained: float
-    """By how much the weighted sum of squares falls."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,12 +209,12 @@ def gather(
     cross = np.zeros((shared, amplitudes))
     curvature, gradient, squares = np.zeros((amplitudes, amplitudes)), np.zeros(amplitudes), 0.0
     for log in references:
-        products, _, _ = _without_own(log, frame, error, is_reference=True)
+        products, _, _ = without_own(log, frame, error, is_reference=True)
         precision += products[:shared, :shared]
         right += products[:shared, -1]
         squares += float(products[-1, -1])
     for log in diagnosed:
-        products, _, _ = _without_own(log, frame, error, is_reference=False)
+        products, _, _ = without_own(log, frame, error, is_reference=False)
         precision += products[:shared, :shared]
         right += products[:shared, -1]
         squares += float(products[-1, -1])
@@ -264,7 +239,7 @@ def gather(
     )
 
 
-def _without_own(
+def without_own(
     log: Gram, frame: Frame, error: ErrorModel, *, is_reference: bool
 ) -> tuple[FloatArray, FloatArray, float]:
     """Integrate out what is a log's own.
@@ -316,7 +291,7 @@ def log_likelihood(frame: Frame, references: Sequence[Gram], error: ErrorModel) 
     precision, right, squares = np.zeros((shared, shared)), np.zeros(shared), 0.0
     volume = 0.0
     for log in references:
-        products, _, own_volume = _without_own(log, frame, error, is_reference=True)
+        products, _, own_volume = without_own(log, frame, error, is_reference=True)
         precision += products[:shared, :shared]
         right += products[:shared, -1]
         squares += float(products[-1, -1])
@@ -380,193 +355,6 @@ def _solver(precision: FloatArray) -> Callable[[FloatArray], FloatArray]:
         return np.asarray(balance * cho_solve(factor, balance * right))
 
     return solve
-
-
-def left_over(
-    evidence: Evidence, diagnosed: Sequence[Gram], chosen: Sequence[int], amplitude: FloatArray
-) -> FloatArray:
-    """Return the diagnosed logs' squares once some candidates explain them, shape (SCALES,) [V²].
-
-    Parameters
-    ----------
-    evidence : Evidence
-    diagnosed : sequence of Gram
-        Of the diagnosed logs, the last ones of the evidence.
-    chosen : sequence of int
-        Candidates.
-    amplitude : array
-        Of all of them, in order.
-    """
-    frame = evidence.frame
-    p, repairs = frame.scale.size, frame.amplitudes_of(frame.repairs)
-    varying, at = frame.amplitudes_of(frame.own), frame.amplitudes_of(chosen)
-    solution = evidence.mean - evidence.per_amplitude[:, at] @ amplitude
-    known = np.zeros(solution.size + int(frame.first[-1]) + 1)
-    known[: solution.size] = -solution
-    known[solution.size + at] = -amplitude
-    known[-1] = 1.0
-    total = np.zeros(SCALES)
-    for log in diagnosed:
-        _, follows, _ = _without_own(log, frame, evidence.error, is_reference=False)
-        mine = follows @ known
-        weights = np.zeros(log.products.shape[1])
-        weights[:p] = -solution[:p]
-        # A candidate may be a repair, a log's own and the cause at once.
-        weights[p + repairs] -= solution[p:]
-        weights[p + varying] -= mine[: varying.size]
-        weights[p + at] -= amplitude
-        weights[-1 - len(LEVELS) : -1] = -mine[varying.size :]
-        weights[-1] = 1.0
-        total += (log.products @ weights) @ weights
-    return total
-
-
-def kept_v2(
-    frame: Frame,
-    log: Gram,
-    solution: FloatArray,
-    chosen: Sequence[int] = (),
-    amplitude: FloatArray | None = None,
-) -> float:
-    """Return a log's mean square error with what is shared and some effects alone [V²].
-
-    What is the log's own is not taken off: it could hide a gap that no effect explains.
-
-    Parameters
-    ----------
-    frame : Frame
-    log : Gram
-        With the columns of all of the frame's candidates.
-    solution : array
-        Coefficients and repairs, as `Evidence.mean`.
-    chosen, amplitude : optional
-        Candidates and all their amplitudes.
-    """
-    p, repairs = frame.scale.size, frame.amplitudes_of(frame.repairs)
-    weights = np.zeros(log.products.shape[1])
-    weights[:p] = -solution[:p]
-    weights[p + repairs] -= solution[p:]
-    if amplitude is not None:
-        weights[p + frame.amplitudes_of(chosen)] -= amplitude
-    weights[-1] = 1.0
-    return float(np.sum((log.products @ weights) @ weights) / np.sum(log.counts))
-
-
-def excess(
-    evidence: Evidence, diagnosed: Sequence[Gram], clean: float, score: Score | None = None
-) -> float:
-    """Return by how much the weighted squares of some logs exceed what chance leaves.
-
-    These are the squares of their errors, of what their own terms and the coefficients had to
-    give, and of what the references lost by it. Errors count only scale by scale and beyond what
-    varies from log to log: a sensor that is a little noisier is no gap.
-
-    Parameters
-    ----------
-    evidence : Evidence
-    diagnosed : sequence of Gram
-        The last logs of the evidence.
-    clean : float
-        Squares of the references alone.
-    score : Score, optional
-        An effect to add.
-    """
-    chosen = () if score is None else score.candidates
-    amplitude = np.zeros(0) if score is None else score.amplitude
-    total = evidence.squares - clean - (0.0 if score is None else score.explained)
-    counts = np.sum([gram.counts for gram in diagnosed], axis=0)
-    errors = left_over(evidence, diagnosed, chosen, amplitude) / np.array(evidence.error.scale_v2)
-    usual = (1.0 + NOISIER) * counts + 2.0 * np.sqrt(2.0 * counts)
-    given = max(total - float(errors.sum()), 0.0)
-    return given + float(np.sum(np.maximum(errors - usual, 0.0)))
-
-
-def condition_on(evidence: Evidence, given: Sequence[int]) -> Evidence:
-    """Return the evidence once some candidates are in the model, their amplitudes left free."""
-    taken = evidence.frame.amplitudes_of(given)
-    block = evidence.curvature[np.ix_(taken, taken)]
-    block = block + prior_precision(evidence.frame.bounds_of(given))
-    gain = np.linalg.solve(block, evidence.curvature[taken]).T
-    return replace(
-        evidence,
-        gradient=evidence.gradient - gain @ evidence.gradient[taken],
-        curvature=evidence.curvature - gain @ evidence.curvature[taken],
-        squares=evidence.squares
-        - float(evidence.gradient[taken] @ np.linalg.solve(block, evidence.gradient[taken])),
-    )
-
-
-def scores(evidence: Evidence, leave_out: Sequence[str] = ()) -> list[Score]:
-    """Return every effect's score, the best first.
-
-    Parameters
-    ----------
-    evidence : Evidence
-    leave_out : sequence of str
-        Effects that are not asked for.
-    """
-    choices = evidence.frame.choices
-    by_effect: dict[str, list[Score]] = {}
-    for chosen in (*((k,) for k in range(len(choices))), *evidence.frame.neighbours):
-        effect = choices[chosen[0]].effect
-        if effect.is_cause and effect.id not in leave_out:
-            score = _score(evidence, chosen)
-            if score is not None:
-                by_effect.setdefault(effect.id, []).append(score)
-    best = []
-    for shapes in by_effect.values():
-        top = max(shapes, key=lambda score: score.log_bayes_factor)
-        mean = _log_mean([score.log_bayes_factor for score in shapes])
-        best.append(replace(top, log_bayes_factor=mean))
-    return sorted(best, key=lambda score: -score.log_bayes_factor)
-
-
-def _score(evidence: Evidence, chosen: tuple[int, ...]) -> Score | None:
-    """Return the score of a candidate or of a mixture, None where physics allows no mixture."""
-    frame = evidence.frame
-    at, bounds = frame.amplitudes_of(chosen), frame.bounds_of(chosen)
-    effect_id = frame.choices[chosen[0]].effect.id
-    # What references left out bring up as well is worth so much less.
-    strays = evidence.error.strays.get(effect_id, 1.0)
-    gradient = evidence.gradient[at] / strays
-    curvature = evidence.curvature[np.ix_(at, at)] / strays
-    prior = prior_precision(bounds)
-    total = curvature + prior
-    amplitude = np.linalg.solve(total, gradient)
-    within = np.clip(amplitude, bounds[:, 0], bounds[:, 1])
-    if len(chosen) > 1 and np.any(within != amplitude):
-        return None  # then one of them alone is the best that the bounds allow
-    factors = [
-        _log_bayes_factor(gradient, curvature, prior / part**2, bounds) for part in PRIOR_PARTS
-    ]
-    return Score(
-        effect_id=effect_id,
-        log_bayes_factor=_log_mean(factors),
-        candidates=chosen,
-        amplitude=within,
-        covariance=np.asarray(np.linalg.inv(total), dtype=np.float64),
-        explained=strays * float(2.0 * gradient @ within - within @ curvature @ within),
-    )
-
-
-def _log_bayes_factor(
-    gradient: FloatArray, curvature: FloatArray, prior: FloatArray, bounds: FloatArray
-) -> float:
-    """Return ln of the Bayes factor of amplitudes with this prior against none."""
-    total = curvature + prior
-    occam = 0.5 * float(np.linalg.slogdet(np.linalg.solve(prior, total))[1])
-    if gradient.size == 1 and np.any(bounds == 0.0):  # one sign only: a half-normal prior
-        sign = 1.0 if bounds[0, 0] == 0.0 else -1.0
-        root = float(np.sqrt(total[0, 0]))
-        at = sign * float(gradient[0]) / root
-        return 0.5 * at**2 - occam + float(np.log(2.0) + log_ndtr(at))
-    best = np.clip(np.linalg.solve(total, gradient), bounds[:, 0], bounds[:, 1])
-    return float(gradient @ best - 0.5 * best @ total @ best) - occam
-
-
-def _log_mean(values: Sequence[float]) -> float:
-    array = np.array(values)
-    return float(np.log(np.mean(np.exp(array - array.max()))) + array.max())
 
 
 def prior_precision(bounds: FloatArray) -> FloatArray:

@@ -12,7 +12,8 @@ from scipy.optimize import least_squares
 from cangauge import __version__
 from cangauge.gap.bounded import moved, within_bounds
 from cangauge.gap.columns import Candidate, residual
-from cangauge.gap.evidence import Score, gather
+from cangauge.gap.evidence import gather
+from cangauge.gap.scores import Score
 from cangauge.gap.settle import Settled
 from cangauge.model.effects.effect import Effect, Pack, Values
 from cangauge.model.effects.library import LIBRARY, effect_entries, one_of

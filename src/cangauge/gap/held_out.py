@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cangauge.gap.columns import LogTerms
-from cangauge.gap.evidence import Evidence, Gram, gather, gram_of, scores
+from cangauge.gap.evidence import Evidence, Gram, gather, gram_of
+from cangauge.gap.scores import scores
 from cangauge.gap.settle import Settled
 
 FloatArray = NDArray[np.float64]

@@ -19,13 +19,12 @@ from cangauge.gap.evidence import (
     ErrorModel,
     Frame,
     Gram,
-    excess,
     gather,
     information_of,
-    kept_v2,
     log_likelihood,
     prior_precision,
 )
+from cangauge.gap.remainder import excess, kept_v2
 from cangauge.gap.scales import SCALES, scale_variances
 from cangauge.model.model_file import ModelNoise
 

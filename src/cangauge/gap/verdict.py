@@ -14,7 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cangauge.gap.evidence import Evidence, Score, condition_on, excess, gather, kept_v2, scores
+from cangauge.gap.evidence import Evidence, gather
+from cangauge.gap.remainder import excess, kept_v2
+from cangauge.gap.scores import Score, condition_on, scores
 from cangauge.gap.settle import Settled
 
 FloatArray = NDArray[np.float64]
