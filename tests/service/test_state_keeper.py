@@ -490,18 +490,18 @@ def test_a_disk_that_fails_is_told_of_once_a_minute(
     service.drive(DRIVE[:100])
     service.keep()
     before = machine.path.read_bytes()
-    monkeypatch.setattr(Path, "write_text", fail(error))
-    machine.said.clear()
-    for number in range(7):
-        service.drive(DRIVE[100 + number : 101 + number])
+    with monkeypatch.context() as disk:
+        disk.setattr(Path, "write_text", fail(error))
+        machine.said.clear()
+        for number in range(7):
+            service.drive(DRIVE[100 + number : 101 + number])
+            service.keep()
+            machine.clock.monotonic_s += 30.0
         service.keep()
-        machine.clock.monotonic_s += 30.0
-    service.keep()
-    warnings = [line for line in machine.said if "state not written" in line]
-    assert 3 <= len(warnings) <= 4
-    assert machine.path.read_bytes() == before
-    assert [each.name for each in machine.path.parent.iterdir()] == ["state.json"]
-    monkeypatch.undo()
+        warnings = [line for line in machine.said if "state not written" in line]
+        assert 3 <= len(warnings) <= 4
+        assert machine.path.read_bytes() == before
+        assert [each.name for each in machine.path.parent.iterdir()] == ["state.json"]
     service.drive(DRIVE[200:201])
     service.stop()
     assert read_state(machine.path).estimator.samples == 108
