@@ -27,6 +27,7 @@ from cangauge.bus.captures import read_capture
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.errors import InputError
 from cangauge.logs.read import read_log
+from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import load_model
 from cangauge.service.config import load_config
 from fuzzing import corpus
@@ -281,7 +282,7 @@ def test_models(tmp_path: Path, change: dict[str, object]) -> None:
 def test_a_model_as_it_should_be_is_read(tmp_path: Path) -> None:
     path = tmp_path / "x.json"
     path.write_text(json.dumps(corpus.model_tree()))
-    assert len(load_model(path).effects) == 20
+    assert len(load_model(path).effects) == len(LIBRARY)
 
 
 def test_stamps_that_are_no_time_are_malformed(tmp_path: Path) -> None:
