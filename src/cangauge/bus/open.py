@@ -31,12 +31,8 @@ MULTICAST_CHANNEL: Final = "239.74.163.2"
 MULTICAST_HOPS: Final = 0
 """0: packets stay on this machine; 1 (`--bus-option hop_limit=1`): they reach the local network."""
 
-RECEIVE_BUFFER_BYTES: Final = 32 << 20
-"""Asked for at sockets, to ride out pauses of seconds at 20,000 frames/s: Linux's default holds
-about 270 frames only. It is a limit: memory is taken as frames wait."""
-
-_SO_RCVBUFFORCE: Final = 33
-"""As SO_RCVBUF, but beyond `net.core.rmem_max`; only for who may configure networks (Linux)."""
+RECEIVE_BUFFER_BYTES: Final = 4 << 20
+"""Asked for at sockets, to ride out pauses: Linux's default holds about 270 frames only."""
 
 _DEFAULT_CHANNELS: Final = {
     "socketcan": SOCKETCAN_CHANNEL,
@@ -252,10 +248,6 @@ def _widen_receive_buffer(bus: can.BusABC) -> None:
     # The driver keeps its socket to itself; a duplicate of the descriptor is the same socket.
     # What cannot be had is left: the system caps the size silently, or refuses.
     with suppress(OSError), socket.socket(fileno=os.dup(bus.fileno())) as own:
-        if sys.platform == "linux":
-            with suppress(OSError):
-                own.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
-                return
         own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
 
 
