@@ -115,6 +115,9 @@ def gap_check_command(  # noqa: PLR0917 - typer passes options by name
     model alone diagnose them; then the file is opened and the answers are scored. Gaps are 0.5 to
     5 times what a model of training and reference days misses on further clean days.
 
+    `simulated` is a pack of the twin's own physics, which the voltage model fits only roughly;
+    `equation` one that obeys the published equation as long as it is healthy.
+
     For example:
 
     `cangauge gap-check --part small`

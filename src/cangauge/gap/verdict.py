@@ -127,13 +127,16 @@ class Ranked:
 
     candidates: tuple[Score, ...]
     """As if all strayed alike: that one strays less on the references makes it no more likely to
-    be what the logs show. Those that are not accepted by their own measure follow the others."""
+    be what the logs show."""
     found: float
-    """Log Bayes factor against no effect, by its own measure, of the best."""
+    """Largest log Bayes factor against no effect, each effect by how far it strays itself."""
 
 
 def believable(evidence: Evidence, expected: Sequence[str] = ()) -> Ranked:
     """Return the effects, the best first.
+
+    That something is there is asked of every effect by its own strays, for a cause shows in more
+    effects than its own; which one it is, as if all strayed alike.
 
     Parameters
     ----------
@@ -146,12 +149,9 @@ def believable(evidence: Evidence, expected: Sequence[str] = ()) -> Ranked:
     alike = (
         dict.fromkeys(strays, float(np.exp(np.mean(np.log([*strays.values()]))))) if strays else {}
     )
-    together = scores(replace(evidence, error=replace(evidence.error, strays=alike)))
-    order = sorted(together, key=lambda score: own[score.effect_id] < ACCEPT_LOG_BAYES)
-    if own[order[0].effect_id] < ACCEPT_LOG_BAYES:
-        order = sorted(together, key=lambda score: -own[score.effect_id])
-    enough = order[0].log_bayes_factor / EXPECTED_TIMES
-    order.sort(
+    ranked = scores(replace(evidence, error=replace(evidence.error, strays=alike)))
+    enough = ranked[0].log_bayes_factor / EXPECTED_TIMES
+    ranked.sort(
         key=lambda score: (
             not (
                 score.effect_id in expected
@@ -160,7 +160,7 @@ def believable(evidence: Evidence, expected: Sequence[str] = ()) -> Ranked:
             )
         )
     )
-    return Ranked(tuple(order), own[order[0].effect_id])
+    return Ranked(tuple(ranked), max(own.values()))
 
 
 def _accepted(evidence: Evidence, best: Score, alike: Sequence[str]) -> tuple[Score, ...]:

@@ -35,6 +35,7 @@ OPTIONS: Final[Mapping[str, CaseOptions]] = {
     "simulated": CaseOptions(),
     "outside": CaseOptions(),
     "two-effects": CaseOptions(),
+    "equation": CaseOptions(plant_name="equation"),
     "pybamm": CaseOptions(plant_name="pybamm", n_logs=3, hours=0.75),
 }
 """One log against three reference days; on the PyBaMM plant three logs share the effect."""

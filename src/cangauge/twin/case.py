@@ -40,7 +40,7 @@ class CaseOptions:
         Of the pack; at random without.
     climate : {"wide", "mild"}
         Ambient temperature from −10–35 or 10–28 °C.
-    plant_name : {"twin", "pybamm"}
+    plant_name : {"twin", "equation", "pybamm"}
         What simulates the cells.
     gap_in_floors : tuple of float
         Range of the gap of one effect, in floors, drawn evenly in its logarithm.

@@ -24,7 +24,7 @@ from cangauge.twin.relaxation import relax
 FloatArray = NDArray[np.float64]
 
 _VOGEL_ZERO_K: Final = 170.0
-_VOLT_A_KELVIN: Final = 8.617333e-5  # gas constant over Faraday constant
+VOLT_A_KELVIN: Final = 8.617333e-5  # gas constant over Faraday constant
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ def ohmic_factor(pack: Pack, kelvin: FloatArray) -> FloatArray:
     return np.exp(pack.ohmic_vogel_k * exponent)
 
 
-def _overpotential_table(anodic: float) -> tuple[FloatArray, FloatArray]:
+def overpotential_table(anodic: float) -> tuple[FloatArray, FloatArray]:
     """Return i/i0 and Fη/RT of asymmetric Butler–Volmer kinetics, tabulated to be inverted."""
     eta = np.sinh(np.linspace(-6.0, 6.0, 1201)) / np.sinh(6.0) * 30.0
     return np.exp(anodic * eta) - np.exp(-(1.0 - anodic) * eta), eta
@@ -150,5 +150,5 @@ def _kinetics(
     fill = np.clip(soc, 0.02, 0.98)
     exchange = pack.exchange_a * 2.0 * np.sqrt(fill * (1.0 - fill)) * np.exp(activation)
     exchange /= (1.0 + condition.transfer_slowdown) * stiffness(condition, kelvin)
-    ratio, eta = _overpotential_table(pack.anodic)
-    return np.interp(current_a / exchange, ratio, eta) * (_VOLT_A_KELVIN * kelvin)
+    ratio, eta = overpotential_table(pack.anodic)
+    return np.interp(current_a / exchange, ratio, eta) * (VOLT_A_KELVIN * kelvin)

@@ -20,7 +20,9 @@ class CoulombicEfficiency(Effect):
 
     id = "coulombic_efficiency"
     family = "charge"
-    parameters = (Parameter("efficiency", "1", 0.9, 1.0, neutral=1.0),)
+    # Cells lose less than a tenth; more is a sensor that reads charging too high, or a charge that
+    # goes past it, and looks the same.
+    parameters = (Parameter("efficiency", "1", 0.7, 1.0, neutral=1.0),)
     signature = "OCV′·(Ah charged since the start): a drift that grows with regeneration only"
     equation = "S = S₀ − 100·∫(I⁺ + η·I⁻)dt / C"
     source = "Plett, Battery Management Systems vol. II, Artech House 2015, ch. 1"
