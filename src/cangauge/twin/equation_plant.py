@@ -136,6 +136,7 @@ def draw_equation_plant(rng: np.random.Generator, pack: Pack) -> EquationPlant:
     table = Chemistry("equation", drawn.grid, volts, np.zeros_like(drawn.grid))
     shares = np.array(SHARES) * rng.uniform(0.7, 1.3, len(SHARES))
     resistance = pack.resistance_ohm * shares / shares.sum()
-    # From entropy alone to what a fit to one log makes of it (−7.7 mV/K a cell as published).
-    temperature = -pack.cells * float(np.exp(rng.uniform(np.log(1e-4), np.log(7e-3))))
+    # As entropy has it. The published −7.7 mV/K a cell is what a fit to one log made of it; here it
+    # would turn the few kelvin between core and sensor into volts that the equation lacks.
+    temperature = -pack.cells * float(np.exp(rng.uniform(np.log(1e-4), np.log(1e-3))))
     return EquationPlant(replace(pack, chemistry=table), temperature, resistance)
