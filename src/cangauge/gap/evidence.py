@@ -59,6 +59,8 @@ class ErrorModel:
     trust: float = 1.0
     """Weight of the information that the model file brings: less than 1 where the references
     contradict it."""
+    structure: float = 1.0
+    """How much of its physical range each of `Frame.repairs` may take."""
 
     @property
     def lasting_v2(self) -> float:
@@ -300,6 +302,7 @@ def log_likelihood(frame: Frame, references: Sequence[Gram], error: ErrorModel) 
     balance = 1.0 / np.sqrt(np.diag(precision))
     volume += float(np.linalg.slogdet(precision * balance * balance[:, None])[1])
     volume -= 2.0 * float(np.sum(np.log(balance)))
+    volume -= float(np.sum(np.log(structure_precision(frame, error))))
     return -0.5 * (squares - float(right @ _solver(precision)(right)) + volume)
 
 
@@ -315,10 +318,15 @@ def _add_priors(precision: FloatArray, right: FloatArray, frame: Frame, error: E
             right[:p] += information @ frame.centre
             squares = float(frame.centre @ information @ frame.centre)
     block[np.diag_indices(p)] += JITTER * np.trace(block) / p
-    repairs = prior_precision(frame.bounds_of(frame.repairs))
-    at = p + np.arange(repairs.shape[0])
-    precision[np.ix_(at, at)] += repairs
+    repairs = structure_precision(frame, error)
+    at = p + np.arange(repairs.size)
+    precision[at, at] += repairs
     return squares
+
+
+def structure_precision(frame: Frame, error: ErrorModel) -> FloatArray:
+    """Return the precision with which each of the repairs' amplitudes is held at none."""
+    return np.diag(prior_precision(frame.bounds_of(frame.repairs))) / error.structure**2
 
 
 def information_of(frame: Frame, error: ErrorModel) -> FloatArray:

@@ -36,7 +36,7 @@ KNOWN_LOGS = 0.05
 """What the model file says of the error counts like so much of a reference log. That error was
 judged on logs left out of a fit to a few, so it may be many times too large."""
 
-OWN_LEVELS: tuple[float, ...] = tuple(np.logspace(-1.75, -0.5, 6).tolist())
+OWN_LEVELS: tuple[float, ...] = (0.001, *np.logspace(-1.75, -0.5, 6).tolist())
 """By how much less than is usual logs of one pack may differ, in all ways at once. Not by more: all
 effects together can mimic nearly any error of the model, and what differs from log to log in all
 ways would hide every cause; how far references stray (`with_strays`) guards against those."""
@@ -55,6 +55,10 @@ LEAST_TRUST_BEYOND = 0.1
 
 FEW = 2.0
 """Chance on few references: a mean of n squares is taken to be low by this over n."""
+
+STRUCTURE_LEVELS: tuple[float, ...] = (0.001, 0.03, 0.1, 0.3, 1.0)
+"""How much of its physical range the structure that clean logs share may take: a pack that obeys
+the model shows none, and what is looked for in vain costs certainty elsewhere."""
 
 OWN_EACH: tuple[float, ...] = (0.3, 2.0, 4.0)
 OWN_EACH_SPREAD = 1.0
@@ -85,8 +89,9 @@ def error_from_references(
     """Return the error under which each reference is most probable, given the others.
 
     Expectation maximisation on the variance of every scale, in which what `stated` says counts like
-    `KNOWN_LOGS` logs; then the level of all that is a log's own, and of each effect's, under which
-    the references are most probable.
+    `KNOWN_LOGS` logs, in turn with the levels of the structure that all share and of all that is a
+    log's own; then the level of each effect's own. Structure and own begin at next to nothing and
+    grow where the references need them.
 
     Parameters
     ----------
@@ -95,10 +100,14 @@ def error_from_references(
         Of the references, two at least.
     stated : ErrorModel
     """
+    usual = np.array(stated.own_std)
+    error = replace(
+        stated, structure=STRUCTURE_LEVELS[0], own_std=tuple((OWN_LEVELS[0] * usual).tolist())
+    )
     # What all references share comes first, or it is taken for what differs from log to log: under
     # information that is too sure the differences grow until they explain it, and it stays so.
-    error = replace(stated, trust=_trust(frame, grams, stated, least_trust))
-    known_v2, usual = np.array(stated.scale_v2), np.array(stated.own_std)
+    error = replace(error, trust=_trust(frame, grams, error, least_trust))
+    known_v2 = np.array(stated.scale_v2)
     counts = np.sum([gram.counts for gram in grams], axis=0)
     known = KNOWN_LOGS * counts / len(grams) + 1e-9
     for _ in range(ROUNDS):
@@ -110,8 +119,17 @@ def error_from_references(
             rmse_v=float(np.sqrt(np.sum(counts * variance) / np.sum(counts))),
         )
         error = replace(error, trust=_trust(frame, grams, error, least_trust))
+        error = replace(error, structure=_structure_level(frame, grams, error))
         error = replace(error, own_std=_own_level(frame, grams, error, usual))
     return replace(error, own_std=_own_levels(frame, grams, error))
+
+
+def _structure_level(frame: Frame, grams: Sequence[Gram], error: ErrorModel) -> float:
+    """Return the level of shared structure under which the references are most probable."""
+    return max(
+        STRUCTURE_LEVELS,
+        key=lambda level: log_likelihood(frame, grams, replace(error, structure=level)),
+    )
 
 
 def _own_level(
