@@ -26,6 +26,9 @@ from cangauge.service.upkeep import CHECKPOINT_EVERY_S, Upkeep
 LATE_S: Final = 0.01
 """So much later than due a beat may come, so that it tells of a sample that is about to [s]."""
 
+GLANCE_EVERY_S: Final = 0.01
+"""While frames come, whatever else there is to do is looked after so often [s], not each time."""
+
 LOOK_EVERY_S: Final = 0.1
 """How long receiving may block before signals and heartbeats are looked at again [s]."""
 
@@ -75,7 +78,7 @@ class Outputs:
     table : callable, optional
         Takes the time [s] of every sample and the estimate after it.
     show : callable, optional
-        Called with the monotonic time [s] after every frame and at every heartbeat.
+        Called with the monotonic time [s] every `LOOK_EVERY_S` at least.
     warn : callable, optional
         Takes a line of text.
     checkpoint : callable, optional
@@ -172,6 +175,7 @@ class _Loop:
         self.step_ns: deque[int] = deque(maxlen=STEPS_KEPT)
         self._now_s = self.began_s
         self._beat_s = self.began_s
+        self._glance_s = self.began_s
         self._sample_s = self.began_s
 
     def is_over(self) -> bool:
@@ -194,6 +198,11 @@ class _Loop:
         late_s = 0.0 if self._gauge.samples != before else LATE_S
         if self._now_s >= self._beat_s + late_s:
             self._beat()
+        if message is None or self._now_s >= self._glance_s:
+            self._glance_s = self._now_s + GLANCE_EVERY_S
+            self._look_after_others()
+
+    def _look_after_others(self) -> None:
         self._upkeep.look(self._now_s)
         if self._outputs.reload is not None and (settings := self._outputs.reload()) is not None:
             self._settings = settings
