@@ -7,7 +7,8 @@ import pytest
 
 from cangauge.errors import InputError
 from fuzzing.supervise import Share, Tally, fuzz, input_of, try_one
-from fuzzing.targets import FindingError, Target, attempt, targets
+from fuzzing.target import FindingError, Target, attempt
+from fuzzing.targets import targets
 
 
 @pytest.mark.slow
