@@ -88,8 +88,8 @@ class Outputs:
         Asked like `stop`; if the gauge has been given another configuration, it returns the
         loop's.
     stepped : callable, optional
-        Takes, after every sample, the receive stamp [s] of the frame that completed it, and the
-        time that the estimate took [ns].
+        Takes, after every sample, the receive stamp [s] of the frame that completed it, the time
+        from receiving it to the estimate [s], and the monotonic time [s].
     sent : callable, optional
         Called after frames were sent.
     """
@@ -100,7 +100,7 @@ class Outputs:
     warn: Callable[[str], None] | None = None
     checkpoint: Callable[[], None] | None = None
     reload: Callable[[], LoopSettings | None] | None = None
-    stepped: Callable[[float, int], None] | None = None
+    stepped: Callable[[float, float, float], None] | None = None
     sent: Callable[[], None] | None = None
 
 
@@ -154,7 +154,7 @@ def serve(
     return RunSummary(
         seconds=time.monotonic() - loop.began_s,
         cpu_seconds=time.process_time() - cpu,
-        step_p50_us=statistics.median(loop.step_ns) / 1e3 if loop.step_ns else None,
+        step_p50_us=1e6 * statistics.median(loop.step_s) if loop.step_s else None,
         rival_frames=loop.rivals.frames,
     )
 
@@ -172,7 +172,7 @@ class _Loop:
         self._ignores_clock = gauge.settings.time_source == "receive"
         self._set_filters()
         self.began_s = time.monotonic()
-        self.step_ns: deque[int] = deque(maxlen=STEPS_KEPT)
+        self.step_s: deque[float] = deque(maxlen=STEPS_KEPT)
         self._now_s = self.began_s
         self._beat_s = self.began_s
         self._glance_s = self.began_s
@@ -191,10 +191,12 @@ class _Loop:
     def turn(self) -> None:
         left_s = self._beat_s + LATE_S - self._now_s
         message = self._port.receive(min(max(left_s, 0.0), LOOK_EVERY_S))
+        # The clock is asked once a frame and once a sample: where it takes a system call that is
+        # not little.
+        self._now_s = time.monotonic()
         before = self._gauge.samples
         if message is not None:
             self._take(message)
-        self._now_s = time.monotonic()
         late_s = 0.0 if self._gauge.samples != before else LATE_S
         if self._now_s >= self._beat_s + late_s:
             self._beat()
@@ -240,15 +242,14 @@ class _Loop:
         if self._outputs.record is not None:
             self._outputs.record.write(message)
         before, stamp_s = gauge.samples, message.timestamp
-        began_ns = time.perf_counter_ns()
         frames = gauge.handle(message)
         if gauge.samples == before:
             return
-        step_ns = time.perf_counter_ns() - began_ns
-        self.step_ns.append(step_ns)
+        came_s, self._now_s = self._now_s, time.monotonic()
+        self._sample_s, step_s = self._now_s, self._now_s - came_s
+        self.step_s.append(step_s)
         if self._outputs.stepped is not None:
-            self._outputs.stepped(stamp_s, step_ns)
-        self._sample_s = time.monotonic()
+            self._outputs.stepped(stamp_s, step_s, self._now_s)
         self._tell()
         if frames:
             self._send(frames)
