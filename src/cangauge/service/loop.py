@@ -89,7 +89,7 @@ class Outputs:
         loop's.
     stepped : callable, optional
         Takes, after every sample, the receive stamp [s] of the frame that completed it, the time
-        from receiving it to the estimate [s], and the monotonic time [s].
+        from receiving it to having taken the sample in [s], and the monotonic time [s].
     sent : callable, optional
         Called after frames were sent.
     """
@@ -111,7 +111,7 @@ class RunSummary:
     seconds: float
     cpu_seconds: float
     step_p50_us: float | None
-    """Median time from a frame that completes a sample to its estimate [µs]."""
+    """Median time from receiving a frame that completes a sample to having taken that in [µs]."""
     rival_frames: int = 0
     """Frames with this service's ids that somebody else sent."""
 

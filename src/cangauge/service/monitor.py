@@ -107,7 +107,7 @@ class Monitor:
         stamp_s : float
             Receive stamp of the frame that completed the sample, seconds since 1970.
         step_s : float
-            From receiving that frame to the estimate [s].
+            From receiving that frame to having taken the sample in [s].
         now_s : float
             Monotonic clock [s].
         """
