@@ -31,7 +31,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from fuzzing.guided import guided
 from fuzzing.supervise import CHUNK, Share, Tally, fuzz, input_of
-from fuzzing.targets import Target, attempt, targets
+from fuzzing.target import Target, attempt
+from fuzzing.targets import targets
 
 console = Console(stderr=True, highlight=False)
 

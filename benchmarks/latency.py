@@ -1,15 +1,16 @@
 """Latency from a frame to the SoC made of it, and frames lost at high rates, beside a bare loop.
 
     python benchmarks/latency.py [--only latency|loss]… [--interface I --channel C]
-                                 [--seconds 20] [--rounds 3] [--minutes 10] [--json]
+                                 [--seconds 20] [--rounds 3] [--minutes 10] [--bare-minutes 10]
+                                 [--highest HZ] [--wanted SHARE]… [--json]
 
 latency  1,000 wanted frames/s (current and voltage at 500 Hz each, and REPLAY_CLOCK). SOC_DETAIL
          tells how many samples it was made of, so the time from the frame that completed the last
          of them to it is known exactly; both are the kernel's stamps at one listener. Beside it, in
          turn: a bare python-can loop that receives, decodes by cantools and sends as often.
 loss     the highest rate that a bare python-can receive loop carries without loss is searched for;
-         then the service sees that rate, for --minutes. Twice: 5 % of the frames wanted, as on a
-         car's bus, and all of them.
+         then the service sees that rate, for --minutes, and after it the bare loop once more.
+         Twice: 5 % of the frames wanted, as on a car's bus, and all of them.
 
 Both on UDP multicast on this machine, or on SocketCAN (`--interface socketcan --channel vcan0`).
 Start-up is not counted: the service listens before the first frame.
@@ -218,8 +219,14 @@ class Sent:
         return self.frames / self.seconds
 
 
-def loss(address: BusAddress, seconds: float, shares: list[float], highest_hz: float) -> Result:
-    """Search the bare loop's highest rate, then let the service see it."""
+def loss(
+    address: BusAddress,
+    seconds: float,
+    bare_seconds: float,
+    shares: list[float],
+    highest_hz: float,
+) -> Result:
+    """Search the bare loop's highest rate, then let the service see it, and the bare loop again."""
     result: Result = {}
     for share in shares:
         name = "all wanted" if share == 1.0 else f"{100.0 * share:.0f} % wanted"
@@ -229,15 +236,16 @@ def loss(address: BusAddress, seconds: float, shares: list[float], highest_hz: f
             sent = _send(address, rate_hz, seconds, share)
             out, _ = process.communicate(timeout=seconds + 120.0)
         run = json.loads(out)
-        # The same bare loop once more, as long: a rate that it carried for a moment is no measure.
-        bare = _bare_count(address, rate_hz, seconds, share)
+        # The same bare loop once more: a rate that it carried for a moment is no measure.
+        bare, bare_got = _bare_count(address, rate_hz, bare_seconds, share)
         result[name] = {
             "rate_hz": sent.rate_hz,
             "seconds": sent.seconds,
             "frames": sent.frames,
             "wanted": sent.wanted,
             "wanted_lost": sent.wanted - run["frames"],
-            "bare_lost": bare[0].wanted - bare[1],
+            "bare_seconds": bare.seconds,
+            "bare_lost": bare.wanted - bare_got,
             "cpu_share": run["cpu_seconds"] / sent.seconds,
         }
     return result
@@ -345,6 +353,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=20.0, help="of a round of latency")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--minutes", type=float, default=1.0, help="of the loss part (wanted: 10)")
+    parser.add_argument("--bare-minutes", type=float, help="of the bare loop after it; as long")
     parser.add_argument(
         "--highest", type=float, default=HIGHEST_HZ, metavar="HZ",
         help="rate that the search ends at; a bus of 1 Mbit/s carries less than 20,000 frames/s",
@@ -361,9 +370,10 @@ def main() -> int:
     if "latency" in parts:
         result["latency"] = latency(address, options.seconds, options.rounds)
     if "loss" in parts:
-        result["loss"] = loss(
-            address, 60.0 * options.minutes, options.wanted or [WANTED_SHARE, 1.0], options.highest
-        )
+        seconds = 60.0 * options.minutes
+        bare_seconds = seconds if options.bare_minutes is None else 60.0 * options.bare_minutes
+        shares = options.wanted or [WANTED_SHARE, 1.0]
+        result["loss"] = loss(address, seconds, bare_seconds, shares, options.highest)
     if options.json:
         sys.stdout.write(json.dumps(result) + "\n")
     else:
@@ -387,7 +397,7 @@ def _show(result: Result, console: Console) -> None:
         table.add_row(
             f"lost at {found['rate_hz']:.0f} frames/s for {found['seconds']:.0f} s, {name}",
             f"{found['wanted_lost']} of {found['wanted']} ({100 * found['cpu_share']:.0f} % CPU)",
-            str(found["bare_lost"]),
+            f"{found['bare_lost']} in {found['bare_seconds']:.0f} s",
             "0",
         )
     console.print(table)

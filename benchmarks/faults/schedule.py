@@ -78,6 +78,7 @@ def run_all(
     *,
     target: Target = cangauge,
     progress: Callable[[str], None] = lambda _name: None,
+    again_if_disturbed: bool = True,
 ) -> list[Done]:
     """Run faults and their undisturbed runs, and judge them.
 
@@ -92,6 +93,9 @@ def run_all(
         The service.
     progress : callable
         Told the name of each run that is over.
+    again_if_disturbed : bool
+        Whether a run that the machine held up, and an undisturbed run that is no reference, are
+        tried once more.
 
     Returns
     -------
@@ -121,7 +125,7 @@ def run_all(
         if seen[number].late_s > LATE_S
         or (fault.name == UNDISTURBED and isinstance(references[fault.alike], str))
     ]
-    if again:
+    if again and again_if_disturbed:
         repeated = _run_each([runs[number] for number in again], one, jobs)
         seen = [*seen]
         for number, found in zip(again, repeated, strict=True):

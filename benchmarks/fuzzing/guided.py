@@ -10,7 +10,7 @@ from random import Random
 from typing import Any
 
 from fuzzing.mutate import mutate
-from fuzzing.targets import Target, attempt
+from fuzzing.target import Target, attempt
 
 SEEDS = 200
 

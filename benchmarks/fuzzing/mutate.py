@@ -170,7 +170,11 @@ def mutate_json(rng: Random, tree: Any) -> Any:
         elif what == 1:
             del owner[key]
         elif what == 2 and isinstance(value, int | float) and not isinstance(value, bool):
-            owner[key] = value * rng.choice((-1, 0, 2, 10, 1e-3, 1e6, 1e30, 0.999, 1.001))
+            factor = rng.choice((-1, 0, 2, 10, 1e-3, 1e6, 1e30, 0.999, 1.001))
+            try:
+                owner[key] = value * factor
+            except OverflowError:  # an integer that no float can hold, of a mutation before
+                owner[key] = value * 10
         elif what == 3 and isinstance(value, list):
             owner[key] = value * rng.choice((2, 50))
         elif what == 4:

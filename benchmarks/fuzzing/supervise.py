@@ -22,7 +22,7 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from fuzzing.targets import Target, attempt
+from fuzzing.target import Target, attempt
 
 SLOW_S = 2.0
 """More CPU time than this for one input (or 200 frames) is a finding [s]."""

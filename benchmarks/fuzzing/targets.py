@@ -1,8 +1,4 @@
-"""What is fuzzed: how an input is made, and all that cangauge does with it.
-
-A target's `run` returns whether the input was accepted. `InputError` (any `CangaugeError`) is how
-it may be refused; whatever else comes out is a finding.
-"""
+"""What is fuzzed: how an input is made, and all that cangauge does with it."""
 
 from __future__ import annotations
 
@@ -15,7 +11,6 @@ import tempfile
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from random import Random
@@ -32,7 +27,6 @@ from cangauge.bus.protection import GENERIC_RULE
 from cangauge.bus.publish import SocPublisher, SocReader
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle, load_vehicle
-from cangauge.errors import CangaugeError
 from cangauge.estimate.estimator import Estimator, EstimatorSettings
 from cangauge.estimate.offline import estimate_log
 from cangauge.estimate.types import Estimate, Sample
@@ -46,61 +40,12 @@ from cangauge.share import shared_file
 from cangauge.twin.schedule import read_speed
 from fuzzing import corpus
 from fuzzing.mutate import json_bytes, mutate, mutate_json
+from fuzzing.target import FindingError, Target, refusable
 
 FRAMES_AT_ONCE = 200
 """Frames of one stream: each is an input."""
-LONGEST_MESSAGE = 2000
 ESTIMATED_ROWS = 200
 """Longer logs are read and inspected, but not estimated."""
-
-
-class FindingError(Exception):
-    """An input was accepted, and what came of it is wrong."""
-
-
-@dataclass(frozen=True)
-class Target:
-    """One kind of input.
-
-    Parameters
-    ----------
-    name : str
-    make : callable
-        Draws an input from a generator of random numbers; `bytes`, or what `run` takes.
-    run : callable
-        Takes it; returns whether it was accepted.
-    weight : int
-        How many inputs one call counts for.
-    share : float
-        Share of all inputs in a whole run.
-    seeds : callable, optional
-        Valid files; None for what is no file.
-    """
-
-    name: str
-    make: Callable[[Random], bytes]
-    run: Callable[[bytes], bool]
-    share: float
-    weight: int = 1
-    seeds: Callable[[], dict[str, bytes]] | None = None
-
-
-def attempt(target: Target, data: bytes) -> bool:
-    """Run a target; return whether the input was accepted; anything else is raised."""
-    with refusable():
-        return target.run(data)
-    return False
-
-
-@contextmanager
-def refusable() -> Iterator[None]:
-    """Let the inside end by a `CangaugeError` whose message is one readable line."""
-    try:
-        yield
-    except CangaugeError as error:
-        line = str(error)
-        if not line or not line.isprintable() or len(line) > LONGEST_MESSAGE:
-            raise FindingError(f"a message of {len(line)} characters: {line[:100]!r}") from error
 
 
 # --- a place for files ---------------------------------------------------------------------------

@@ -136,3 +136,20 @@ def test_a_model_without_noise_is_no_trap(zero: str) -> None:
     samples = [Sample(0.5 * k, 20.0, 370.0 + (k % 7), 23.0) for k in range(400)]
     samples += [Sample(1000.0 + k, 0.0, 390.0, 23.0) for k in range(200)]
     run(model, EstimatorSettings(initial_soc_pct=50.0, initial_soc_std_pct=0.0), samples)
+
+
+@pytest.mark.parametrize("which", ["plain", "time_skew", "together"])
+@pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
+@settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
+@given(drawn=inputs, asked_every=st.sampled_from([2, 3, 17]))
+def test_asking_for_an_estimate_changes_nothing(
+    which: str, method: Any, drawn: Any, asked_every: int
+) -> None:
+    chosen = EstimatorSettings(method=method)
+    often, seldom = Estimator(MODELS[which], chosen), Estimator(MODELS[which], chosen)
+    for number, sample in enumerate(samples_of_rows(drawn)):
+        told = often.step(sample)
+        seldom.take(sample)
+        if number % asked_every == 0:
+            assert repr(seldom.estimate) == repr(told)  # NaN is NaN
+    assert repr(seldom.snapshot()) == repr(often.snapshot())

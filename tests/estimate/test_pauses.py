@@ -13,6 +13,7 @@ from cangauge.estimate.anchors import FullCharge, LongRest
 from cangauge.estimate.clock import SET_BACK_SAMPLES
 from cangauge.estimate.estimator import Estimator, EstimatorSettings
 from cangauge.estimate.offline import samples_of
+from cangauge.estimate.pause import moved_log_odds
 from cangauge.estimate.types import Estimate, Reason, Sample
 from cangauge.model.published import leaf_2012_model, leaf_2012_model_file
 from synthetic import synthetic_log
@@ -246,3 +247,9 @@ def test_anchors_are_checked() -> None:
         FullCharge(voltage_v=math.nan, current_a=2.0)
     with pytest.raises(InputError, match=r"long_rest\.after_s"):
         LongRest(after_s=1.0)
+
+
+def test_the_odds_of_any_time_are_finite_and_grow() -> None:
+    odds = [moved_log_odds(seconds) for seconds in (5e-324, 1e-9, 2.0, 60.0, 7200.0, 1e300)]
+    assert all(math.isfinite(each) for each in odds)
+    assert odds == sorted(odds)

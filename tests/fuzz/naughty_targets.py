@@ -8,7 +8,7 @@ import time
 from random import Random
 
 from cangauge.errors import InputError
-from fuzzing.targets import Target
+from fuzzing.target import Target
 
 HANGS, DIES, RAISES, GROWS = 13, 29, 41, 47
 

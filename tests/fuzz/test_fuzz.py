@@ -10,7 +10,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fuzzing import corpus
-from fuzzing.targets import Target, attempt, targets
+from fuzzing.target import Target, attempt
+from fuzzing.targets import targets
 
 TARGETS = {target.name: target for target in targets()}
 EXAMPLES = {"frames": 12, "captures": 120, "logs": 100, "model": 80, "dbc": 80}

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from random import Random
+
 import naughty_targets as naughty
 import pytest
 
 from cangauge.errors import InputError
+from fuzzing.mutate import mutate_json
 from fuzzing.supervise import Share, Tally, fuzz, input_of, try_one
-from fuzzing.targets import FindingError, Target, attempt, targets
+from fuzzing.target import FindingError, Target, attempt
+from fuzzing.targets import targets
 
 
 @pytest.mark.slow
@@ -56,3 +60,8 @@ def test_the_same_seed_and_number_are_the_same_input(target: Target) -> None:
     assert [input_of(target, 3, n) for n in range(5)] == [input_of(target, 3, n) for n in range(5)]
     assert len({input_of(target, 3, n) for n in range(20)}) > 10
     assert input_of(target, 3, 1) != input_of(target, 4, 1)
+
+
+def test_numbers_that_no_float_can_hold_can_be_mutated() -> None:
+    mutants = [mutate_json(Random(seed), {"x": 10**400}) for seed in range(300)]  # noqa: S311
+    assert {"x": 10**401} in mutants

@@ -78,6 +78,7 @@ def test_refuses_a_falling_pseudo_ocv() -> None:
         ({"resistance_ohm": (-0.1,)}, "resistance_ohm"),
         ({"kt_v_per_k": math.nan}, "coefficients"),
         ({"soc_range_pct": (50.0, 50.0)}, "soc_range_pct"),
+        ({"soc_range_pct": (0.0, 5e-324)}, "soc_range_pct"),
     ],
 )
 def test_names_the_field_that_is_wrong(change: dict[str, object], field: str) -> None:

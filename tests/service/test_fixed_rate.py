@@ -66,7 +66,6 @@ def served(
     clock = SimpleNamespace(
         monotonic=lambda: desk.now_s,
         process_time=time.process_time,
-        perf_counter_ns=time.perf_counter_ns,
     )
     monkeypatch.setattr(loop, "time", clock)
     gauge = Gauge(load_vehicle("generic"), leaf_model(), GaugeSettings())
@@ -124,7 +123,6 @@ def test_a_machine_that_slept_goes_on_the_grid_and_makes_up_for_nothing(
     clock = SimpleNamespace(
         monotonic=lambda: desk.now_s,
         process_time=time.process_time,
-        perf_counter_ns=time.perf_counter_ns,
     )
     monkeypatch.setattr(loop, "time", clock)
     gauge = Gauge(load_vehicle("generic"), leaf_model(), GaugeSettings())

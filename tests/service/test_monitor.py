@@ -105,13 +105,13 @@ def test_what_was_published_as_stale_is_shown_so() -> None:
 def test_latency_is_that_of_the_latest_sample_once_it_is_sent() -> None:
     watched = Watched()
     watched.monitor.sent()  # no sample yet
-    watched.monitor.stepped(time.time() - 0.5, 1000)
-    watched.monitor.stepped(time.time() - 0.0015, 1000)
+    watched.monitor.stepped(time.time() - 0.5, 1e-6, watched.now_s)
+    watched.monitor.stepped(time.time() - 0.0015, 1e-6, watched.now_s)
     watched.monitor.sent()
     watched.monitor.sent()  # told already
-    watched.monitor.stepped(time.time() + 5.0, 1000)  # the clock was set
+    watched.monitor.stepped(time.time() + 5.0, 1e-6, watched.now_s)  # the clock was set
     watched.monitor.sent()
-    watched.monitor.stepped(12.0, 1000)  # stamps of another clock
+    watched.monitor.stepped(12.0, 1e-6, watched.now_s)  # stamps of another clock
     watched.monitor.sent()
     watched.turn()
     latency = watched.monitor.latest.latency
@@ -176,7 +176,7 @@ def test_watching_costs_little() -> None:
     watched.drive(5.0)
     began = time.perf_counter()
     for _ in range(2000):
-        watched.monitor.stepped(time.time(), 30_000)
+        watched.monitor.stepped(time.time(), 30e-6, watched.now_s)
         watched.monitor.sent()
         watched.monitor.turn(watched.now_s)
     # About 2 µs each where the machine is not busy; a copy of everything each time would be 50.

@@ -63,7 +63,7 @@ class Watched:
                 before = self.gauge.samples
                 self.gauge.handle(frame)
                 if self.gauge.samples != before:
-                    self.monitor.stepped(frame.timestamp, 30_000)
+                    self.monitor.stepped(frame.timestamp, 30e-6, self.now_s)
         self.gauge.heartbeat(is_stale=False)
 
     def turn(self, later_s: float = 1.0) -> None:

@@ -113,7 +113,10 @@ class Estimator:
         self.resets = 0
         """How often the filter was lost and started anew."""
         self._rest_since_s = math.nan
-        self._last_estimate = _nothing_yet()
+        self._made = _nothing_yet()
+        # What the next estimate is to be made of, the sample and its stamp; None: it is made.
+        self._unmade: tuple[Sample, float] | None = None
+        self._is_refused = False
         if self.settings.initial_soc_pct is not None:
             start = self._online.initial_soc_pct(self.settings.initial_soc_pct)
             self._begin(start, self.settings.initial_soc_std_pct)
@@ -124,7 +127,15 @@ class Estimator:
         return self._fusion.offset_a if self._fused else 0.0
 
     def step(self, sample: Sample) -> Estimate:
-        """Take one sample and return the estimate after it.
+        """Take one sample and return the estimate after it; see `take`."""
+        self.take(sample)
+        return self.estimate
+
+    def take(self, sample: Sample) -> None:
+        """Take one sample.
+
+        What it does to the estimate is worked out when somebody asks for it: a service that hears
+        thousands of samples a second tells ten of them. Asking changes nothing.
 
         A sample without a believable current, or not later than the one before, is refused: the
         last estimate comes back, marked `IMPLAUSIBLE_INPUT`; a clock that was set back is noticed
@@ -136,9 +147,12 @@ class Estimator:
         after the last sample that was given out.
         """
         time_s = self._clock.at(sample.time_s) if acceptable(sample) else None
+        self._is_refused = time_s is None
         if time_s is None:
-            return self._refuse()
+            return
         stamp_s = sample.time_s
+        if not self._online.plain:
+            self._make()  # an effect may hold this sample back, and the estimate stays that one
         sample, self._implausible = cleaned(sample._replace(time_s=time_s), self._usual_v)
         if self._samples == 0:
             self._first_s = time_s
@@ -147,12 +161,18 @@ class Estimator:
         for item in corrected:
             self._take(item)
         if corrected:
-            self._last_estimate = self._estimate(corrected[-1], stamp_s)
+            self._unmade = corrected[-1], stamp_s
         else:
-            self._last_estimate = self._last_estimate._replace(
-                time_s=stamp_s, samples=self._samples
-            )
-        return self._last_estimate
+            self._made = self._made._replace(time_s=stamp_s, samples=self._samples)
+
+    @property
+    def estimate(self) -> Estimate:
+        """The estimate after the latest sample."""
+        made = self._make()
+        if not self._is_refused:
+            return made
+        reasons = made.reasons | Reason.IMPLAUSIBLE_INPUT
+        return made._replace(reasons=reasons, status=status_of(reasons))
 
     def _corrected(self, sample: Sample) -> Sequence[Sample]:
         if self._online.plain:
@@ -224,6 +244,7 @@ class Estimator:
     # --- voltage --------------------------------------------------------------------------
 
     def _use_voltage(self, sample: Sample) -> None:
+        before_pct, _ = self._chosen(self._coulomb_pct)
         since, self._since = self._since, Since()
         if self._fused:
             self._fusion.predict(since)
@@ -239,7 +260,7 @@ class Estimator:
         ):
             self._anchor(anchor)
         if self._fused and self._fusion.is_lost:
-            self._reset(sample.time_s)
+            self._reset(sample.time_s, before_pct)
 
     def _weigh_voltage(self, sample: Sample, since: Since) -> None:
         beside_v = self._model.offset_at(self._known_temperature_c(), self._line.currents())
@@ -262,9 +283,9 @@ class Estimator:
         ):
             self._contradicted_until_s = sample.time_s + CONTRADICTED_S
 
-    def _reset(self, time_s: float) -> None:
+    def _reset(self, time_s: float, before_pct: float) -> None:
         """Start the filter anew, from the voltage if there is one, and forget its offset."""
-        known = (self._newton.soc_pct, self._last_estimate.soc_pct, 50.0)
+        known = (self._newton.soc_pct, before_pct, 50.0)
         soc_pct = next(soc for soc in known if math.isfinite(soc))
         self._fusion.start(soc_pct, UNKNOWN_SOC_STD_PCT)
         self._contradicted_until_s = time_s + CONTRADICTED_S
@@ -272,8 +293,15 @@ class Estimator:
 
     # --- estimate -------------------------------------------------------------------------
 
+    def _make(self) -> Estimate:
+        """Return the estimate after the latest sample that was not refused."""
+        if self._unmade is not None:
+            self._made = self._estimate(*self._unmade)
+            self._unmade = None
+        return self._made
+
     def _estimate(self, sample: Sample, time_s: float) -> Estimate:
-        coulomb = self._coulomb_start_pct - self._counter.discharged_pct
+        coulomb = self._coulomb_pct
         soc, std = self._chosen(coulomb)
         voltage_model_v = math.nan
         if math.isfinite(soc):
@@ -308,6 +336,11 @@ class Estimator:
             self._fusion.soc_std_pct**2 + self._since.spread_pct2()
         )
 
+    @property
+    def _coulomb_pct(self) -> float:
+        """What counting alone says [%], not clipped; NaN while it has not begun."""
+        return self._coulomb_start_pct - self._counter.discharged_pct
+
     def _coulomb_std_pct(self) -> float:
         hours = (self._counter.counted_s - self._coulomb_counted_s) / 3600.0
         moved_pct = self._counter.moved_pct - self._coulomb_moved_pct
@@ -337,11 +370,6 @@ class Estimator:
         outside = outside_model(self._model, soc_pct, sample)
         return reasons | outside if outside else reasons
 
-    def _refuse(self) -> Estimate:
-        last = self._last_estimate
-        reasons = last.reasons | Reason.IMPLAUSIBLE_INPUT
-        return last._replace(reasons=reasons, status=status_of(reasons))
-
     # --- interruptions --------------------------------------------------------------------
 
     @property
@@ -352,6 +380,7 @@ class Estimator:
     def snapshot(self) -> EstimatorState:
         """Return all that must be remembered to go on as if not interrupted: copies."""
         times, currents, since_s = self._line.contents
+        latest = self._make()
         return EstimatorState.model_construct(
             method=self.settings.method,
             capacity_ah=self.capacity_ah,
@@ -364,8 +393,8 @@ class Estimator:
             anchors=self._anchors.state(),
             newton_pct=self._newton.soc_pct,
             newton_inside=self._newton.inside,
-            estimate=list(self._last_estimate[:7]),
-            reasons=int(self._last_estimate.reasons),
+            estimate=list(latest[:7]),
+            reasons=int(latest.reasons),
             resets=self.resets,
             **{name: getattr(self, f"_{name}") for name in _SCALARS},
         )
@@ -405,13 +434,13 @@ class Estimator:
             self._fused = True
         if is_same:
             self._check_agreement(state)
-        return self._last_estimate
+        return self._made
 
     def _check_agreement(self, state: EstimatorState) -> None:
         """Refuse a state whose filter or count says something else than its last estimate."""
         if self.settings.method == "newton":
             return
-        soc, std = self._chosen(self._coulomb_start_pct - self._counter.discharged_pct)
+        soc, std = self._chosen(self._coulomb_pct)
         kept_std = state.soc_std_pct
         # An estimator that has just taken over from another one began from no more than that.
         apart_pct = min(abs(std - kept_std), abs(std - min(kept_std, UNKNOWN_SOC_STD_PCT)))
@@ -449,9 +478,8 @@ class Estimator:
         for name in _SCALARS:
             setattr(self, f"_{name}", getattr(state, name))
         reasons = Reason(state.reasons)
-        self._last_estimate = Estimate._make(
-            [*state.estimate, status_of(reasons), reasons, state.samples]
-        )
+        self._made = Estimate._make([*state.estimate, status_of(reasons), reasons, state.samples])
+        self._unmade, self._is_refused = None, False
         self._fused = False
 
     def _begin_from(self, state: EstimatorState) -> None:

@@ -24,6 +24,9 @@ little notice."""
 MOVED_TIME_S = 1800.0
 """Within such a time it grows to 63 % of that [s]."""
 
+SHORTEST_S = 1.0
+"""No time is so short that nobody can have [s]."""
+
 FASTEST_PCT_PER_HOUR = 150.0
 """How fast the SoC may change unseen [% per hour]: a fast charger."""
 
@@ -53,5 +56,5 @@ def moved_std_pct(seconds: float) -> float:
 
 def moved_log_odds(seconds: float) -> float:
     """Return ln(p / (1 − p)) for p, the probability that somebody did, before any voltage."""
-    probability = -MOVED_AT_MOST * math.expm1(-seconds / MOVED_TIME_S)
+    probability = -MOVED_AT_MOST * math.expm1(-max(seconds, SHORTEST_S) / MOVED_TIME_S)
     return math.log(probability / (1.0 - probability))

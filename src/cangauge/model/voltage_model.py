@@ -36,6 +36,9 @@ SLOPE_AT_LEAST = 2e-5
 the inverse has one root, but a flat (LFP) plateau must stay possible. It is 7 mV per % for a
 Leaf, a fiftieth of its flattest slope."""
 
+NARROWEST_SOC_PCT = 0.01
+"""A model that saw less SoC than this saw none: its slope would be a quotient of roundings [%]."""
+
 EDGE = 0.25
 """Outside the identified SoC the pseudo-OCV goes on with the mean slope of this outermost part of
 the range: at the very edge the fitted slope is mostly noise."""
@@ -275,7 +278,8 @@ def _check_shape(model: VoltageModel) -> None:
                 value=(lo, hi),
                 cure="identify the model with a larger epsilon",
             )
-        if not lo <= hi or (name == "soc_range_pct" and not lo < hi):
+        least = NARROWEST_SOC_PCT if name == "soc_range_pct" else 0.0
+        if not hi - lo >= least:
             raise InputError("the range is empty", field=name, value=(lo, hi))
 
 

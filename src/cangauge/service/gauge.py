@@ -115,8 +115,9 @@ class Gauge:
 
     def handle(self, message: can.Message) -> list[can.Message]:
         """Take one frame; return those to send at once, which only a replay's time asks for."""
-        estimate = self._stream.handle(message)
-        return [] if estimate is None else self._publish(estimate)
+        if not self._stream.take(message) or not self._is_replay:
+            return []
+        return self._publish(self._stream.latest)
 
     def finish(self) -> list[can.Message]:
         """Return the last frames to send, at the end."""
@@ -212,8 +213,6 @@ class Gauge:
         return self._stream.ask_the_voltage()
 
     def _publish(self, estimate: Estimate) -> list[can.Message]:
-        if not self._is_replay:
-            return []
         if self._stream.beginnings != self._beginnings:
             self._beginnings = self._stream.beginnings
             self._publisher.restart()

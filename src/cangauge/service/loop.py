@@ -26,6 +26,9 @@ from cangauge.service.upkeep import CHECKPOINT_EVERY_S, Upkeep
 LATE_S: Final = 0.01
 """So much later than due a beat may come, so that it tells of a sample that is about to [s]."""
 
+GLANCE_EVERY_S: Final = 0.01
+"""While frames come, whatever else there is to do is looked after so often [s], not each time."""
+
 LOOK_EVERY_S: Final = 0.1
 """How long receiving may block before signals and heartbeats are looked at again [s]."""
 
@@ -75,7 +78,7 @@ class Outputs:
     table : callable, optional
         Takes the time [s] of every sample and the estimate after it.
     show : callable, optional
-        Called with the monotonic time [s] after every frame and at every heartbeat.
+        Called with the monotonic time [s] every `LOOK_EVERY_S` at least.
     warn : callable, optional
         Takes a line of text.
     checkpoint : callable, optional
@@ -85,8 +88,8 @@ class Outputs:
         Asked like `stop`; if the gauge has been given another configuration, it returns the
         loop's.
     stepped : callable, optional
-        Takes, after every sample, the receive stamp [s] of the frame that completed it, and the
-        time that the estimate took [ns].
+        Takes, after every sample, the receive stamp [s] of the frame that completed it, the time
+        from receiving it to having taken the sample in [s], and the monotonic time [s].
     sent : callable, optional
         Called after frames were sent.
     """
@@ -97,7 +100,7 @@ class Outputs:
     warn: Callable[[str], None] | None = None
     checkpoint: Callable[[], None] | None = None
     reload: Callable[[], LoopSettings | None] | None = None
-    stepped: Callable[[float, int], None] | None = None
+    stepped: Callable[[float, float, float], None] | None = None
     sent: Callable[[], None] | None = None
 
 
@@ -108,7 +111,7 @@ class RunSummary:
     seconds: float
     cpu_seconds: float
     step_p50_us: float | None
-    """Median time from a frame that completes a sample to its estimate [µs]."""
+    """Median time from receiving a frame that completes a sample to having taken that in [µs]."""
     rival_frames: int = 0
     """Frames with this service's ids that somebody else sent."""
 
@@ -151,7 +154,7 @@ def serve(
     return RunSummary(
         seconds=time.monotonic() - loop.began_s,
         cpu_seconds=time.process_time() - cpu,
-        step_p50_us=statistics.median(loop.step_ns) / 1e3 if loop.step_ns else None,
+        step_p50_us=1e6 * statistics.median(loop.step_s) if loop.step_s else None,
         rival_frames=loop.rivals.frames,
     )
 
@@ -169,9 +172,10 @@ class _Loop:
         self._ignores_clock = gauge.settings.time_source == "receive"
         self._set_filters()
         self.began_s = time.monotonic()
-        self.step_ns: deque[int] = deque(maxlen=STEPS_KEPT)
+        self.step_s: deque[float] = deque(maxlen=STEPS_KEPT)
         self._now_s = self.began_s
         self._beat_s = self.began_s
+        self._glance_s = self.began_s
         self._sample_s = self.began_s
 
     def is_over(self) -> bool:
@@ -187,13 +191,20 @@ class _Loop:
     def turn(self) -> None:
         left_s = self._beat_s + LATE_S - self._now_s
         message = self._port.receive(min(max(left_s, 0.0), LOOK_EVERY_S))
+        # The clock is asked once a frame and once a sample: where it takes a system call that is
+        # not little.
+        self._now_s = time.monotonic()
         before = self._gauge.samples
         if message is not None:
             self._take(message)
-        self._now_s = time.monotonic()
         late_s = 0.0 if self._gauge.samples != before else LATE_S
         if self._now_s >= self._beat_s + late_s:
             self._beat()
+        if message is None or self._now_s >= self._glance_s:
+            self._glance_s = self._now_s + GLANCE_EVERY_S
+            self._look_after_others()
+
+    def _look_after_others(self) -> None:
         self._upkeep.look(self._now_s)
         if self._outputs.reload is not None and (settings := self._outputs.reload()) is not None:
             self._settings = settings
@@ -231,15 +242,14 @@ class _Loop:
         if self._outputs.record is not None:
             self._outputs.record.write(message)
         before, stamp_s = gauge.samples, message.timestamp
-        began_ns = time.perf_counter_ns()
         frames = gauge.handle(message)
         if gauge.samples == before:
             return
-        step_ns = time.perf_counter_ns() - began_ns
-        self.step_ns.append(step_ns)
+        came_s, self._now_s = self._now_s, time.monotonic()
+        self._sample_s, step_s = self._now_s, self._now_s - came_s
+        self.step_s.append(step_s)
         if self._outputs.stepped is not None:
-            self._outputs.stepped(stamp_s, step_ns)
-        self._sample_s = time.monotonic()
+            self._outputs.stepped(stamp_s, step_s, self._now_s)
         self._tell()
         if frames:
             self._send(frames)

@@ -81,7 +81,7 @@ class _SnapshotCollector(Collector):
         )
         yield _histogram(
             "cangauge_step_seconds",
-            "From the frame that completes a sample to its estimate.",
+            "From receiving the frame that completes a sample to having taken it in.",
             snapshot.step,
         )
         yield from _record(snapshot)

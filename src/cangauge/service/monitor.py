@@ -86,7 +86,6 @@ class Monitor:
         self.identity = identity
         self._notifier = notifier
         self._record = record
-        self._clock = clock
         self._began_s = now_s = clock()
         self._latency = Histogram()
         self._step = Histogram()
@@ -100,19 +99,21 @@ class Monitor:
         self._pace = Pace()
         self.latest = self._snapshot(now_s)
 
-    def stepped(self, stamp_s: float, step_ns: int) -> None:
+    def stepped(self, stamp_s: float, step_s: float, now_s: float) -> None:
         """Count a step of the estimator.
 
         Parameters
         ----------
         stamp_s : float
             Receive stamp of the frame that completed the sample, seconds since 1970.
-        step_ns : int
-            From that frame to the estimate [ns].
+        step_s : float
+            From receiving that frame to having taken the sample in [s].
+        now_s : float
+            Monotonic clock [s].
         """
-        self._sample_s = self._clock()
+        self._sample_s = now_s
         self._untold_stamp_s = stamp_s
-        self._step.add(1e-9 * step_ns)
+        self._step.add(step_s)
 
     def sent(self) -> None:
         """Count the latency of the latest sample: an estimate that knows it was just sent."""

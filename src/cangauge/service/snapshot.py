@@ -90,7 +90,8 @@ class Snapshot:
     bus_trouble : str
         What is or went wrong with the bus, in words; empty if nothing is known to.
     latency, step : HistogramCounts
-        From receive stamp to SoC sent; from the frame that completes a sample to its estimate.
+        From receive stamp to SoC sent; from receiving the frame that completes a sample to having
+        taken it in.
     record : RecordState or None
     """
 

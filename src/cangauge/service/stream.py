@@ -110,17 +110,22 @@ class EstimateStream:
         self.beginnings = 0
         self.samples = 0
         """Samples handed to the estimator so far, those that it refused included."""
-        self.latest = NOTHING_YET
-        """The latest estimate; `NOTHING_YET` before the first."""
         self.latest_sample: Sample | None = None
         self._pack = pack_of(model, settings.capacity_ah)
         self._assembler = SampleAssembler(vehicle, self._pack)
         self._estimator = Estimator(model, settings)
-        # The latest estimate as the estimator gave it; None until there was a sample.
+        # The latest estimate as the estimator gave it (None until there was a sample) and judged;
+        # a sample that came since is waiting for somebody to ask for its estimate.
         self._estimated: Estimate | None = None
+        self._latest = NOTHING_YET
+        self._is_behind = False
 
     def handle(self, message: can.Message) -> Estimate | None:
-        """Take one frame; return the estimate after the sample that it completes, if any.
+        """Take one frame; return the estimate after the sample that it completes, if any."""
+        return self.latest if self.take(message) else None
+
+    def take(self, message: can.Message) -> bool:
+        """Take one frame; return whether it completed a sample, of which `latest` then tells.
 
         The message's time stamp is set to bus time.
         """
@@ -128,7 +133,7 @@ class EstimateStream:
         if time_s is None:
             if not is_clock(message, self._clock_id):
                 self._untimed += 1
-            return None
+            return False
         if self._time.beginnings != self.beginnings:
             self._begin_anew()
         message.timestamp = time_s
@@ -136,7 +141,13 @@ class EstimateStream:
 
     def finish(self) -> Estimate | None:
         """Return the estimate after a last current that still waits for a voltage, if any."""
-        return self._step(self._assembler.flush())
+        return self.latest if self._step(self._assembler.flush()) else None
+
+    @property
+    def latest(self) -> Estimate:
+        """The latest estimate; `NOTHING_YET` before the first."""
+        self._catch_up()
+        return self._latest
 
     def reconfigure(
         self, vehicle: Vehicle | None, model: ModelFile, settings: EstimatorSettings
@@ -147,6 +158,7 @@ class EstimateStream:
         estimator is made anew and takes SoC and delay line over; the initial SoC stays what it
         was.
         """
+        self._catch_up()
         old = self._settings
         settings = replace(
             _filled(settings, vehicle or self._vehicle),
@@ -222,8 +234,9 @@ class EstimateStream:
         if isinstance(self._time, ReplayClock):
             self._time.resume(latest.time_s)
         reasons = latest.reasons | Reason.INPUT_STALE
-        self.latest = latest._replace(status=Status.INVALID, reasons=reasons)
-        return self.latest
+        self._latest = latest._replace(status=Status.INVALID, reasons=reasons)
+        self._is_behind = False
+        return self._latest
 
     def ask_the_voltage(self) -> bool:
         """Begin from the first voltages, whatever initial SoC was given; False if none was.
@@ -237,18 +250,26 @@ class EstimateStream:
         self._estimator = Estimator(self._model, self._settings)
         return True
 
-    def _step(self, sample: Sample | None) -> Estimate | None:
+    def _step(self, sample: Sample | None) -> bool:
         if sample is None:
-            return None
+            return False
         self.samples += 1
         self.latest_sample = sample
-        self._estimated = self._estimator.step(sample)
-        self.latest = self._judged(sample.time_s)
-        return self.latest
+        self._estimator.take(sample)
+        self._is_behind = True
+        return True
+
+    def _catch_up(self) -> None:
+        """Ask for the estimate after the latest sample, unless that was done."""
+        if self._is_behind and self.latest_sample is not None:
+            self._is_behind = False
+            self._estimated = self._estimator.estimate
+            self._latest = self._judged(self.latest_sample.time_s)
 
     @property
     def told(self) -> Estimate:
         """The latest estimate, with what the signals are worth since: for the next heartbeat."""
+        self._catch_up()
         return self._judged(self._assembler.now_s)
 
     @property
@@ -269,7 +290,7 @@ class EstimateStream:
         and one that is too old.
         """
         sample = self.latest_sample
-        estimate = self.latest if self._estimated is None else self._estimated
+        estimate = self._latest if self._estimated is None else self._estimated
         missing = self._assembler.health.reasons(now_s)
         reasons = estimate.reasons
         if sample is not None and math.isnan(sample.voltage_v):
@@ -281,6 +302,7 @@ class EstimateStream:
         return estimate._replace(reasons=reasons, status=status_of(reasons))
 
     def _begin_anew(self) -> None:
+        self._catch_up()
         self._past = replace(self.counts, beginnings=self._past.beginnings + 1)
         self._untimed = 0
         self.beginnings = self._time.beginnings
