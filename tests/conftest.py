@@ -5,9 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 PROJECT = Path(__file__).resolve().parent.parent
 SHARED_DATA = PROJECT.parent / "shared" / "data"
+
+# How long an example takes is a matter of the machine's other work, not of the code.
+settings.register_profile("cangauge", deadline=None)
+settings.load_profile("cangauge")
 
 
 @pytest.fixture(scope="session")
