@@ -18,7 +18,15 @@ from cangauge.gap.extend import (
     library_without,
     model_file_of,
 )
-from cangauge.gap.held_out import Judged, closed_fraction, closed_interval, judge, rms
+from cangauge.gap.held_out import (
+    Fold,
+    Judged,
+    closed_fraction,
+    closed_interval,
+    folds,
+    judge,
+    rms,
+)
 from cangauge.gap.moments import Moment, worst_moments
 from cangauge.gap.settle import Settled, settle
 from cangauge.gap.soc_error import soc_mae_pct
@@ -135,7 +143,8 @@ def diagnose(
     verdict = decide(settled)
     accepted = [score.effect_id for score in verdict.accepted]
     say("judging on rows left out")
-    judged = judge(settled, accepted)
+    held_out = folds(settled)
+    judged = judge(settled, held_out, accepted)
     if not judged:
         raise InputError(
             f"{logs[0].duration_s:.0f} s are too short to leave rows out and judge on them:"
@@ -166,18 +175,18 @@ def diagnose(
         closed_ci=closed_interval(settled, judged, floor) if is_gap else None,
         where=tuple(places(settled.diagnosed, given_v, model_file.capacity_ah)),
         worst=tuple(worst_moments(settled.diagnosed, given_v)),
-        candidates=tuple(_candidates(settled, verdict, floor, extension)),
+        candidates=tuple(_candidates(settled, held_out, verdict, floor, extension)),
         observability=tuple(_observability(settled)),
         extension=extension,
     )
 
 
 def _candidates(
-    settled: Settled, verdict: Verdict, floor: float, extension: Extension
+    settled: Settled, held_out: Sequence[Fold], verdict: Verdict, floor: float, extension: Extension
 ) -> list[dict[str, Any]]:
     result = []
     for number, score in enumerate(verdict.candidates):
-        judged = judge(settled, [score.effect_id]) if number < SHOWN else []
+        judged = judge(settled, held_out, [score.effect_id]) if number < SHOWN else []
         result.append(
             {
                 "effect": score.effect_id,

@@ -15,6 +15,7 @@ from cangauge.gap.columns import Candidate, residual
 from cangauge.gap.evidence import gather
 from cangauge.gap.scores import Score
 from cangauge.gap.settle import Settled
+from cangauge.gap.structure import with_needed_structure
 from cangauge.model.effects.effect import Effect, Pack, Values
 from cangauge.model.effects.library import LIBRARY, effect_entries, one_of
 from cangauge.model.extended import ExtendedModel
@@ -47,6 +48,7 @@ def extend(settled: Settled, accepted: Sequence[Score]) -> Extension:
     settled : Settled
     accepted : sequence of Score
     """
+    settled = with_needed_structure(settled)
     evidence = gather(
         settled.frame, settled.reference_grams, settled.diagnosed_grams, settled.error
     )

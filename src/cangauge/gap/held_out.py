@@ -38,21 +38,44 @@ class Judged:
     extended_v: FloatArray
 
 
-def judge(settled: Settled, effects: Sequence[str]) -> list[Judged]:
+@dataclass(frozen=True, eq=False)
+class Fold:
+    """What the other rows say, and the rows that judge it."""
+
+    evidence: Evidence
+    rows: tuple[tuple[int, NDArray[np.bool_]], ...]
+    """Which of the diagnosed logs, and which rows of it, shape (m,)."""
+
+
+def folds(settled: Settled) -> list[Fold]:
+    """Return the evidence without some rows, in turn, with those rows; none for a log too short.
+
+    Parameters
+    ----------
+    settled : Settled
+    """
+    return [
+        Fold(gather(settled.frame, settled.reference_grams, fit_on, settled.error), tuple(judged))
+        for fit_on, judged in _folds(settled)
+    ]
+
+
+def judge(settled: Settled, held_out: Sequence[Fold], effects: Sequence[str]) -> list[Judged]:
     """Return the errors with some effects added, each fitted without the rows that judge it.
 
     Parameters
     ----------
     settled : Settled
+    held_out : sequence of Fold
+        From `folds`.
     effects : sequence of str
         Effects to add, in order; their shapes are chosen on the rows of the fit.
     """
     result = []
     _, given = settled.given_errors_v
-    for fit_on, judged in _folds(settled):
-        evidence = gather(settled.frame, settled.reference_grams, fit_on, settled.error)
-        solution = solution_with(evidence, effects)
-        for number, keep in judged:
+    for fold in held_out:
+        solution = solution_with(fold.evidence, effects)
+        for number, keep in fold.rows:
             terms = settled.diagnosed[number].at(keep)
             result.append(
                 Judged(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -30,30 +30,11 @@ from cangauge.gap.references import (
 )
 from cangauge.identify.options import FitOptions
 from cangauge.logs.log import Log
-from cangauge.model.effects.effect import Effect, Pack
+from cangauge.model.effects.effect import Effect
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import ModelFile
 
 FloatArray = NDArray[np.float64]
-
-CLEAN_STRUCTURE: tuple[tuple[str, dict[str, float]], ...] = (
-    ("fast_polarization", {"tau_s": 3.5, "activation_k": 0.0}),
-    ("fast_polarization", {"tau_s": 3.5, "activation_k": 3000.0}),
-    ("fast_polarization", {"tau_s": 9.0, "activation_k": 3000.0}),
-    ("slow_diffusion", {"tau_s": 220.0, "activation_k": 0.0}),
-    ("slow_diffusion", {"tau_s": 220.0, "activation_k": 3000.0}),
-    ("slow_diffusion", {"tau_s": 750.0, "activation_k": 3000.0}),
-    ("resistance_temperature", {"activation_k": 1000.0, "delayed": 0.0}),
-    ("resistance_temperature", {"activation_k": 4500.0, "delayed": 0.0}),
-    ("resistance_temperature", {"activation_k": 2500.0, "delayed": 1.0}),
-    ("resistance_soc", {"width_pct": 40.0, "delayed": 1.0}),
-    ("charge_transfer", {"exchange_a": 0.12, "bend_only": 1.0}),
-    ("hysteresis", {"travel_pct": 4.0}),
-    ("ocv_shape", {}),
-    ("entropic_coefficient", {}),
-)
-"""Structure that a clean pack may well have and the 13 coefficients lack: all logs share it, so it
-is learned from the references and is no cause."""
 
 SOC_STD_PCT = 0.5
 """How well a log's assumed initial SoC is known without a cause [%]."""
@@ -167,7 +148,7 @@ def settle(
     say = progress or _silent
     of_logs = [prepare_log(log, options) for log in logs]
     of_references = [prepare_log(log, replace(options, initial_soc_pct=None)) for log in references]
-    frame = _frame(model_file, choices, of_references, of_logs, model.pack)
+    frame = _frame(model_file, choices, of_references, of_logs)
     error = error_from_noise(model_file.noise, model_file.rate_hz, frame)
     if of_references:
         say("learning from the references")
@@ -206,8 +187,10 @@ def settle(
 def _reference_terms(
     references: Sequence[Prepared], model: ExtendedModel, frame: Frame
 ) -> tuple[LogTerms, ...]:
-    shown = [frame.choices[k] for k in frame.shown]
-    return tuple(log_terms(item, model, shown) for item in references)
+    wanted = tuple(dict.fromkeys(frame.shown))  # structure may be a log's own as well
+    at = [wanted.index(k) for k in frame.shown]
+    found = [log_terms(item, model, [frame.choices[k] for k in wanted]) for item in references]
+    return tuple(replace(terms, effects=tuple(terms.effects[k] for k in at)) for terms in found)
 
 
 def _terms(
@@ -228,18 +211,15 @@ def _frame(
     choices: Sequence[Candidate],
     references: Sequence[Prepared],
     diagnosed: Sequence[Prepared],
-    pack: Pack,
 ) -> Frame:
-    known = [item for item in CLEAN_STRUCTURE if references]
-    if references and not _temperatures_covered(references, diagnosed):
-        # References that were never so cold cannot have shown what resistance does there.
-        known = [
-            (effect_id, shape)
-            for effect_id, shape in known
-            if not shape.get("activation_k") and effect_id not in ALWAYS_OF_TEMPERATURE
-        ]
-    found = [_first_like(choices, effect_id, shape, pack) for effect_id, shape in known]
-    repairs = tuple(k for k in found if k is not None)
+    # References that were never so cold cannot have shown what resistance does there.
+    covered = not references or _temperatures_covered(references, diagnosed)
+    found: dict[tuple[object, ...], int] = {}
+    for k, choice in enumerate(choices if references else ()):
+        if choice.effect.is_structure and (covered or not _follows_temperature(choice)):
+            # The first of one shape: that which an effect does when it is small.
+            found.setdefault((choice.effect.id, *choice.shape.items()), k)
+    repairs = tuple(found.values())
     own, own_prior = _own(choices, model_file)
     information = model_file.information
     root, scale = None, np.ones(9 + len(model_file.delays_s))
@@ -248,18 +228,8 @@ def _frame(
     return Frame(tuple(choices), root, scale, repairs, own, own_prior)
 
 
-def _first_like(
-    choices: Sequence[Candidate], effect_id: str, shape: Mapping[str, float], pack: Pack
-) -> int | None:
-    """Return the effect's first candidate of a shape; None where the library lacks it."""
-    for k, choice in enumerate(choices):
-        effect = choice.effect
-        if effect.id != effect_id:
-            continue
-        wanted = {p.name: shape[p.name] * p.factor(pack) for p in effect.shapes}
-        if all(math.isclose(choice.shape[name], value) for name, value in wanted.items()):
-            return k
-    return None
+def _follows_temperature(choice: Candidate) -> bool:
+    return choice.effect.id in ALWAYS_OF_TEMPERATURE or bool(choice.shape.get("activation_k"))
 
 
 def _own(choices: Sequence[Candidate], model_file: ModelFile) -> tuple[tuple[int, ...], FloatArray]:

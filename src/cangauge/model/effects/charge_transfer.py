@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import numpy as np
 
@@ -38,6 +39,7 @@ class ChargeTransfer(Effect):
 
     id = "charge_transfer"
     family = "dynamics"
+    is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("scale_v", "V", 0.0, 0.03, scale="voltage"),
         Parameter(

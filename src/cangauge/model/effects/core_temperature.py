@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import ClassVar
 
 from cangauge.model.charge import BRIDGE_S
 from cangauge.model.effects.effect import (
@@ -28,6 +29,7 @@ class CoreTemperature(Effect):
 
     id = "core_temperature"
     family = "thermal"
+    is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("rise_k", "K", 0.0, 25.0),
         Parameter(

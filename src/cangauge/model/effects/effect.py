@@ -274,6 +274,8 @@ class Effect(ABC):
     """What test would tell it from its look-alikes."""
     is_cause: ClassVar[bool] = True
     """Whether the diagnosis may name it; else it is structure that only clean logs teach."""
+    is_structure: ClassVar[bool] = False
+    """Whether a healthy pack may have it for good: what the references show of it is no cause."""
     bends_at: ClassVar[tuple[float, ...]] = ()
     """Parts of the widest bound of its only amplitude at which the diagnosis takes the voltage's
     change, beside a small one: for effects that are far from linear in their amplitude."""

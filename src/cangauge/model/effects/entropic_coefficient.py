@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from cangauge.model.effects.effect import (
@@ -25,6 +27,7 @@ class EntropicCoefficient(Effect):
 
     id = "entropic_coefficient"
     family = "equilibrium"
+    is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("level_v_per_k", "V/K", -1.1e-4, 1.1e-4, scale="voltage"),
         Parameter("slope_v_per_k", "V/K", -1.1e-4, 1.1e-4, scale="voltage"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from cangauge.model.effects.effect import (
     Effect,
     FloatArray,
@@ -20,6 +22,7 @@ class FastPolarization(Effect):
 
     id = "fast_polarization"
     family = "dynamics"
+    is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("ohm", "ohm", 0.0, 1.0, scale="resistance"),
         Parameter("tau_s", "s", 0.3, 9.0, neutral=None, grid=(0.5, 1.0, 2.0, 3.5, 6.0, 9.0)),

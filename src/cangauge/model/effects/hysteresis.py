@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -30,6 +31,7 @@ class Hysteresis(Effect):
 
     id = "hysteresis"
     family = "equilibrium"
+    is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("half_width_v", "V", 0.0, 0.01, scale="voltage"),
         Parameter("travel_pct", "%", 0.5, 12.0, neutral=None, grid=(1.0, 2.0, 4.0, 7.0, 11.0)),

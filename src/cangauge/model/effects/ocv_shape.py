@@ -32,6 +32,7 @@ class OcvShape(Effect):
 
     id = "ocv_shape"
     family = "equilibrium"
+    is_structure: ClassVar[bool] = True
     is_cause: ClassVar[bool] = False
     parameters = tuple(
         Parameter(f"at_{centre:.0f}_pct_v", "V", -0.01, 0.01, scale="voltage")

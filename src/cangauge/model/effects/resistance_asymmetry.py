@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from cangauge.model.effects.effect import (
@@ -21,6 +23,7 @@ class ResistanceAsymmetry(Effect):
 
     id = "resistance_asymmetry"
     family = "resistance"
+    is_structure: ClassVar[bool] = True
     parameters = (Parameter("charging_ohm", "ohm", -0.6, 1.5, scale="resistance"),)
     signature = "min(I, 0): only while charging, in step with the current"
     equation = "ΔU = −r·min(I, 0)"

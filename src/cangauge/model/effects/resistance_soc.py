@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import numpy as np
 
@@ -25,6 +26,7 @@ class ResistanceSoc(Effect):
 
     id = "resistance_soc"
     family = "resistance"
+    is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("at_empty", "1", -0.4, 3.0),
         Parameter("at_full", "1", -0.4, 1.5),

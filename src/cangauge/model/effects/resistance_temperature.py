@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import numpy as np
 
@@ -31,6 +32,7 @@ class ResistanceTemperature(Effect):
 
     id = "resistance_temperature"
     family = "resistance"
+    is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("share", "1", 0.0, 3.0),
         Parameter("activation_k", "K", 100.0, 8000.0, neutral=None, grid=(1000.0, 2500.0, 4500.0)),

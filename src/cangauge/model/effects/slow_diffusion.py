@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from cangauge.model.effects.effect import (
     Effect,
     FloatArray,
@@ -20,6 +22,7 @@ class SlowDiffusion(Effect):
 
     id = "slow_diffusion"
     family = "dynamics"
+    is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("ohm", "ohm", 0.0, 1.5, scale="resistance"),
         Parameter(

@@ -8,6 +8,7 @@ from bisect import bisect_right
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -34,6 +35,7 @@ class TimeSkew(Effect):
 
     id = "time_skew"
     family = "timing"
+    is_structure: ClassVar[bool] = True
     parameters = (
         Parameter(
             "skew_s",
