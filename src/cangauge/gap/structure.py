@@ -65,7 +65,7 @@ def needed(frame: Frame, references: Sequence[Gram], error: ErrorModel) -> tuple
 def with_needed_structure(settled: Settled) -> Settled:
     """Return the common ground with no more structure than the references call for."""
     before = settled.frame
-    frame = replace(before, repairs=needed(before, settled.reference_grams, settled.error))
+    frame = replace(before, repairs=needed(before, settled.reference_grams, settled.clean_error))
     at = [before.shown.index(k) for k in frame.shown]
     return replace(
         settled,
