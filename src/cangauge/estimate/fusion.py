@@ -24,7 +24,6 @@ from cangauge.errors import InputError
 from cangauge.estimate.state import FilterState
 from cangauge.model.extended import OnlineExtendedModel
 from cangauge.model.model_file import ModelNoise
-from cangauge.model.voltage_model import VoltageModel
 
 FloatArray = NDArray[np.float64]
 
@@ -82,18 +81,16 @@ class Fusion:
 
     Parameters
     ----------
-    model : VoltageModel or OnlineExtendedModel
+    model : OnlineExtendedModel
     capacity_ah : float
     noise : ModelNoise
         Size and duration of the model's biases.
     """
 
-    def __init__(
-        self, model: VoltageModel | OnlineExtendedModel, capacity_ah: float, noise: ModelNoise
-    ) -> None:
+    def __init__(self, model: OnlineExtendedModel, capacity_ah: float, noise: ModelNoise) -> None:
         self._model = model
         self._pct_per_as = 100.0 / (3600.0 * capacity_ah)
-        self._resistance_sum = sum(model.resistance_ohm)
+        self._steady_ohm = model.steady_ohm
         self._slow_var = noise.slow_std_v**2
         self._slow_time_s = noise.slow_time_s
         self._lasting_var = noise.lasting_std_v**2
@@ -274,13 +271,13 @@ class Fusion:
 
     def _predicted(self, x: FloatArray, measurement: Measurement) -> FloatArray:
         volts, _ = self._model.pseudo_ocv_at(float(x[0, 0]))
-        volts += measurement.beside_v - self._resistance_sum * float(x[1, 0])
+        volts += measurement.beside_v - self._steady_ohm * float(x[1, 0])
         volts += float(x[2, 0] + x[3, 0])
         return np.array([[volts]])
 
     def _jacobian(self, x: FloatArray) -> FloatArray:
         _, slope = self._model.pseudo_ocv_at(float(x[0, 0]))
-        return np.array([[slope, -self._resistance_sum, 1.0, 1.0]])
+        return np.array([[slope, -self._steady_ohm, 1.0, 1.0]])
 
     def _watch(self, measurement: Measurement, std_v: float, seconds: float) -> bool:
         """Whether the mean innovation, before any bias, contradicts state and model."""
