@@ -112,6 +112,24 @@ def test_goes_on_bit_for_bit(method: Any, at: int) -> None:
     check_goes_on(PLAIN, EstimatorSettings(method=method, **ANCHORS), at)
 
 
+@pytest.mark.parametrize("at", [0, 1, 3, 40, 201])
+@pytest.mark.parametrize("start_pct", [80.0, 65.0])
+def test_goes_on_bit_for_bit_while_a_given_soc_is_in_question(start_pct: float, at: int) -> None:
+    check_goes_on(PLAIN, EstimatorSettings(initial_soc_pct=start_pct), at)
+
+
+def test_a_state_from_before_given_socs_were_questioned_is_taken() -> None:
+    estimator = Estimator(PLAIN, EstimatorSettings(initial_soc_pct=80.0))
+    for sample in EVENTFUL[:20]:
+        estimator.step(sample)
+    data = estimator.snapshot().model_dump(mode="json")
+    del data["belief"]["is_untried"]
+    after = Estimator(PLAIN, EstimatorSettings(initial_soc_pct=80.0))
+    after.restore(EstimatorState.model_validate(data))
+    found, expected = after.step(EVENTFUL[20]), estimator.step(EVENTFUL[20])
+    assert found.soc_pct == expected.soc_pct
+
+
 @pytest.mark.parametrize("effect_id", LIBRARY)
 def test_goes_on_bit_for_bit_with_each_effect(effect_id: str) -> None:
     check_goes_on(extended_by([effect_id]), EstimatorSettings(initial_soc_pct=80.0), 465)

@@ -32,3 +32,9 @@ def test_capacity_comes_from_the_training_trips(result: dict[str, object]) -> No
 
 def test_chain_lasts_at_least_three_hours(result: dict[str, object]) -> None:
     assert result["chain_hours"] >= 3.0
+
+
+def test_with_effects_every_target_is_met_by_the_one_model(shared_data: Path) -> None:
+    repaired = judge(shared_data / "bmw_i3", Console(quiet=True), ("auto",))
+    assert repaired["effects"]
+    assert [row for row in checks(repaired) if not row["met"]] == []

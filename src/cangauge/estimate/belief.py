@@ -1,12 +1,14 @@
-"""What the estimator believes of the SoC: one filter, or two while a pause leaves two stories.
+"""What the estimator believes of the SoC: one filter, or two while there are two stories of it.
 
-After a time that nobody saw (`pause`) the filter is doubled: *parked* keeps its SoC to within a
-little, *moved* knows next to nothing of it. Both take every voltage, and the likelihood of what
-each saw moves the odds between them (a static multiple-model estimator; Bar-Shalom, Li,
-Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, ch. 11.6). What is
-published is the mean of both, weighed by the odds, with the spread between them in its standard
-deviation; so the SoC goes toward the voltage as far as the voltage proves, and does not jump. Once
-the odds are clear the other story is dropped; if they never are, the two are merged.
+There are two after a time that nobody saw (`pause`): *parked* keeps the SoC to within a little,
+*moved* knows next to nothing of it. And there are two after a SoC was given: the first takes it as
+it was told, the second as *wrong*, and begins from the first voltage as if none had been told. Both
+filters take every voltage, and the likelihood of what each saw moves the odds between them (a
+static multiple-model estimator; Bar-Shalom, Li, Kirubarajan, Estimation with Applications to
+Tracking and Navigation, 2001, ch. 11.6). What is published is the mean of both, weighed by the
+odds, with the spread between them in its standard deviation; so the SoC goes toward the voltage as
+far as the voltage proves, and does not jump. Once the odds are clear the other story is dropped; if
+they never are, the two are merged. A given SoC that the voltages refute thus leaves no trace.
 
 A pause is thereby also the check of a SoC that was kept in a file.
 """
@@ -22,12 +24,16 @@ import numpy as np
 
 from cangauge.errors import InputError
 from cangauge.estimate.coulomb import ChargeStep
-from cangauge.estimate.fusion import Fusion, Measurement
+from cangauge.estimate.fusion import UNKNOWN_SOC_STD_PCT, Fusion, Measurement
 from cangauge.estimate.pause import moved_log_odds, moved_std_pct
 from cangauge.estimate.state import BeliefState, FilterState, SinceState
 
 CLEAR_LOG_ODDS = math.log(1000.0)
 """Beyond this the less likely story is dropped."""
+
+WRONG_LOG_ODDS = -math.log(1000.0)
+"""Of a SoC that was given, before any voltage, that it is another pack's or another day's: a
+guess. It says what error at the start is believed to be a wrong SoC, and not a wrong voltage."""
 
 OPEN_AT_MOST_S = 900.0
 """After this long with voltages the stories are merged, if the odds are not clear [s]."""
@@ -101,8 +107,9 @@ class Belief:
 
     def __init__(self, make: Callable[[], Fusion]) -> None:
         self._make = make
-        # Parked (or the only one) first.
+        # Parked, as told, or the only one first.
         self._filters = [make()]
+        self._is_untried = False
         self._log_odds = 0.0
         self._open_s = 0.0
         self._outlier_s = 0.0
@@ -112,6 +119,7 @@ class Belief:
         """Begin from a SoC with its standard deviation [%]; everything before is forgotten."""
         self._filters = [self._make()]
         self._filters[0].start(soc_pct, std_pct)
+        self._is_untried = std_pct < UNKNOWN_SOC_STD_PCT
         self._outlier_s = 0.0
         if self.verdict == "open":
             self.verdict = "unclear"
@@ -121,9 +129,7 @@ class Belief:
         variances = [since.gap_var_pct2 + since.unseen_var_pct2]
         if since.away_s:
             self._merge("unclear")
-            self._filters.append(self._copy(self._filters[0].state()))
-            self._log_odds = moved_log_odds(since.away_s)
-            self._open_s = 0.0
+            self._open(self._copy(self._filters[0].state()), moved_log_odds(since.away_s))
             self.verdict = "open"
             variances.append(since.gap_var_pct2 + moved_std_pct(since.away_s) ** 2)
         elif len(self._filters) > 1:
@@ -134,18 +140,20 @@ class Belief:
             )
 
     def update(self, measurement: Measurement, since: Since) -> bool:
-        """Take one voltage in; return True if a lasting contradiction made the SoC uncertain."""
+        """Take one voltage in; return True if it shows that the SoC was wrong all the time."""
+        if self._is_untried:
+            self._try(measurement)
         contradicted = [each.update(measurement, since.seconds) for each in self._filters]
         self._watch(since)
         if len(self._filters) == 1:
             return contradicted[0]
-        parked, moved = self._filters
-        change = moved.log_likelihood - parked.log_likelihood
+        first, second = self._filters
+        change = second.log_likelihood - first.log_likelihood
         self._log_odds = min(max(self._log_odds + change, -50.0), 50.0)
         self._open_s += since.counted_s
         if contradicted[0] != contradicted[1]:
             return self._settle(contradicted.index(False))
-        if contradicted[0] or abs(self._log_odds) > CLEAR_LOG_ODDS:
+        if contradicted[0] or self._is_clear:
             return self._settle(int(self._log_odds > 0.0), is_doubted=contradicted[0])
         if self._open_s > OPEN_AT_MOST_S:
             self._merge("unclear")
@@ -154,6 +162,7 @@ class Belief:
     def anchor(self, soc_pct: float, std_pct: float) -> None:
         """Take a SoC in that is known otherwise, with its standard deviation [%]."""
         self._merge("unclear")
+        self._is_untried = False
         self._filters[0].anchor(soc_pct, std_pct)
 
     def rested(self) -> None:
@@ -204,6 +213,7 @@ class Belief:
         """Return what is to be remembered."""
         return BeliefState.model_construct(
             filters=[each.state() for each in self._filters],
+            is_untried=self._is_untried,
             log_odds=self._log_odds,
             open_s=self._open_s,
             outlier_s=self._outlier_s,
@@ -224,6 +234,7 @@ class Belief:
         if not all(each.is_sound and 0.0 <= each.soc_pct <= 100.0 for each in filters):
             raise InputError("holds no covariance, or no SoC", field="belief.filters")
         self._filters = filters
+        self._is_untried = state.is_untried
         self._log_odds = min(max(state.log_odds, -50.0), 50.0)
         self._open_s = state.open_s
         self._outlier_s = state.outlier_s
@@ -236,13 +247,42 @@ class Belief:
         copy.restore(state)
         return copy
 
+    @property
+    def _second(self) -> float:
+        """Probability of the second story."""
+        return 1.0 / (1.0 + math.exp(-self._log_odds))
+
     def _mean(self, values: Sequence[float]) -> float:
-        moved = 1.0 / (1.0 + math.exp(-self._log_odds))
-        return (1.0 - moved) * values[0] + moved * values[1]
+        return (1.0 - self._second) * values[0] + self._second * values[1]
+
+    def _open(self, other: Fusion, log_odds: float) -> None:
+        """Let another filter tell a second story."""
+        self._filters.append(other)
+        self._log_odds = log_odds
+        self._open_s = 0.0
+
+    def _try(self, measurement: Measurement) -> None:
+        """Set the story beside a given SoC that it is wrong, and only the voltage is known."""
+        self._is_untried = False
+        if len(self._filters) == 1:
+            told_wrong = self._make()
+            told_wrong.start(measurement.soc_pct, UNKNOWN_SOC_STD_PCT)
+            self._open(told_wrong, WRONG_LOG_ODDS)
+
+    @property
+    def _is_clear(self) -> bool:
+        """Whether the voltages leave one story only.
+
+        That a given SoC is wrong is so unlikely from the beginning that this alone must not end it.
+        """
+        unlikely = 0.0 if self.verdict == "open" else WRONG_LOG_ODDS
+        return self._log_odds > CLEAR_LOG_ODDS or self._log_odds < unlikely - CLEAR_LOG_ODDS
 
     def _settle(self, story: int, *, is_doubted: bool = False) -> bool:
-        """Keep one of two stories; return whether it is contradicted as well."""
+        """Keep one of two stories; return whether the SoC believed so far was wrong."""
         self._filters = [self._filters[story]]
+        if self.verdict != "open":
+            return is_doubted or story == 1
         self.verdict = "moved" if story else "parked"
         return is_doubted
 
@@ -251,19 +291,19 @@ class Belief:
         if len(self._filters) == 1:
             return
         states = [each.state() for each in self._filters]
-        moved = 1.0 / (1.0 + math.exp(-self._log_odds))
-        weights = (1.0 - moved, moved)
+        weights = (1.0 - self._second, self._second)
         xs, ps = [np.array(each.x) for each in states], [np.array(each.p) for each in states]
         x = weights[0] * xs[0] + weights[1] * xs[1]
         p = sum(
             weight * (cov + np.outer(at - x, at - x))
             for weight, at, cov in zip(weights, xs, ps, strict=True)
         )
-        likelier = states[int(moved > 0.5)]
+        likelier = states[int(self._second > 0.5)]
         self._filters = [
             self._copy(likelier.model_copy(update={"x": x.tolist(), "p": np.asarray(p).tolist()}))
         ]
-        self.verdict = verdict
+        if self.verdict == "open":
+            self.verdict = verdict
 
     def _watch(self, since: Since) -> None:
         """Note for how long every voltage has been an outlier, to all filters."""

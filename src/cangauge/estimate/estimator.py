@@ -266,11 +266,8 @@ class Estimator:
         beside_v = self._model.offset_at(self._known_temperature_c(), self._line.currents())
         guess = self._newton.soc_pct if math.isfinite(self._newton.soc_pct) else 50.0
         self._newton = soc_from_ocv(self._online, sample.voltage_v - beside_v, guess)
-        std_v = self._voltage_error.std_v(
-            self._fusion.soc_pct if self._fused else self._newton.soc_pct,
-            self._temperature_c,
-            self._line,
-        )
+        std_v_at = self._voltage_error.at(self._temperature_c, self._line)
+        std_v = std_v_at(self._fusion.soc_pct if self._fused else self._newton.soc_pct)
         slope = self._online.pseudo_ocv_at(self._newton.soc_pct)[1]
         self._newton_std_pct = min(math.hypot(std_v, self._bias_std_v) / slope, UNKNOWN_SOC_STD_PCT)
         if math.isnan(self._coulomb_start_pct):
@@ -279,7 +276,7 @@ class Estimator:
             self._begin(self._newton.soc_pct, UNKNOWN_SOC_STD_PCT)
             self._coulomb_var_pct2 = self._newton_std_pct**2
         if self._fused and self._fusion.update(
-            Measurement(sample.voltage_v, beside_v, std_v), since
+            Measurement(sample.voltage_v, beside_v, self._newton.soc_pct, std_v_at), since
         ):
             self._contradicted_until_s = sample.time_s + CONTRADICTED_S
 

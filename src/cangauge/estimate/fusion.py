@@ -13,6 +13,7 @@ average out.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,6 @@ from cangauge.errors import InputError
 from cangauge.estimate.state import FilterState
 from cangauge.model.extended import OnlineExtendedModel
 from cangauge.model.model_file import ModelNoise
-from cangauge.model.voltage_model import VoltageModel
 
 FloatArray = NDArray[np.float64]
 
@@ -70,8 +70,10 @@ class Measurement:
     voltage_v: float
     beside_v: float
     """The part that does not depend on SoC, at the measured currents [V]."""
-    std_v: float
-    """Standard deviation of its fast error [V]."""
+    soc_pct: float
+    """SoC by the inverse [%]."""
+    std_v: Callable[[float], float]
+    """Standard deviation of its fast error [V] if the SoC is so large [%]."""
 
 
 class Fusion:
@@ -79,18 +81,16 @@ class Fusion:
 
     Parameters
     ----------
-    model : VoltageModel or OnlineExtendedModel
+    model : OnlineExtendedModel
     capacity_ah : float
     noise : ModelNoise
         Size and duration of the model's biases.
     """
 
-    def __init__(
-        self, model: VoltageModel | OnlineExtendedModel, capacity_ah: float, noise: ModelNoise
-    ) -> None:
+    def __init__(self, model: OnlineExtendedModel, capacity_ah: float, noise: ModelNoise) -> None:
         self._model = model
         self._pct_per_as = 100.0 / (3600.0 * capacity_ah)
-        self._resistance_sum = sum(model.resistance_ohm)
+        self._steady_ohm = model.steady_ohm
         self._slow_var = noise.slow_std_v**2
         self._slow_time_s = noise.slow_time_s
         self._lasting_var = noise.lasting_std_v**2
@@ -159,14 +159,15 @@ class Fusion:
         seconds : float
             Time since the last voltage [s].
         """
-        contradicted = self._watch(measurement, seconds)
+        std_v = measurement.std_v(self.soc_pct)
+        contradicted = self._watch(measurement, std_v, seconds)
         if contradicted:
             self._doubt()
         ekf = self._ekf
         innovation = measurement.voltage_v - float(self._predicted(ekf.x, measurement)[0, 0])
         jacobian = self._jacobian(ekf.x)
         spread = float((jacobian @ ekf.P @ jacobian.T)[0, 0])
-        variance = measurement.std_v**2
+        variance = std_v**2
         self.was_outlier = innovation**2 > OUTLIER_SIGMAS**2 * (spread + variance)
         if self.was_outlier:
             variance = max(variance, innovation**2 - spread)
@@ -270,15 +271,15 @@ class Fusion:
 
     def _predicted(self, x: FloatArray, measurement: Measurement) -> FloatArray:
         volts, _ = self._model.pseudo_ocv_at(float(x[0, 0]))
-        volts += measurement.beside_v - self._resistance_sum * float(x[1, 0])
+        volts += measurement.beside_v - self._steady_ohm * float(x[1, 0])
         volts += float(x[2, 0] + x[3, 0])
         return np.array([[volts]])
 
     def _jacobian(self, x: FloatArray) -> FloatArray:
         _, slope = self._model.pseudo_ocv_at(float(x[0, 0]))
-        return np.array([[slope, -self._resistance_sum, 1.0, 1.0]])
+        return np.array([[slope, -self._steady_ohm, 1.0, 1.0]])
 
-    def _watch(self, measurement: Measurement, seconds: float) -> bool:
+    def _watch(self, measurement: Measurement, std_v: float, seconds: float) -> bool:
         """Whether the mean innovation, before any bias, contradicts state and model."""
         ekf = self._ekf
         if seconds > PERSISTENT_S:
@@ -294,7 +295,7 @@ class Fusion:
             return False
         slope = self._model.pseudo_ocv_at(self.soc_pct)[1]
         mean_var = self._slow_var + self._lasting_var + slope**2 * float(ekf.P[0, 0])
-        mean_var += measurement.std_v**2 * seconds / (2.0 * PERSISTENT_S)
+        mean_var += std_v**2 * seconds / (2.0 * PERSISTENT_S)
         seen = 1.0 - math.exp(-self._mean_seconds / PERSISTENT_S)
         mean = self._mean_innovation_v / seen
         return mean**2 > PERSISTENT_SIGMAS**2 * mean_var

@@ -109,9 +109,11 @@ class FilterState(_Strict):
 
 
 class BeliefState(_Strict):
-    """A `Belief`: one filter, or two while it is open what happened in a pause."""
+    """A `Belief`: one filter, or two while it is open which of two stories is true."""
 
     filters: Annotated[list[FilterState], Field(max_length=2)]
+    is_untried: bool = False
+    """Whether a given SoC has not met a voltage yet."""
     log_odds: Finite
     open_s: NotNegative
     outlier_s: NotNegative

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from cangauge.estimate.validity import outside_model_std_v
 from cangauge.model.delay_line import DelayLine
@@ -34,13 +35,13 @@ class VoltageError:
         # The guesses of one filling delay line are the same guess for all its samples.
         self._alike = max(model.delay_s[-1] * file.rate_hz, 1.0)
 
-    def std_v(self, soc_pct: float, temperature_c: float, line: DelayLine) -> float:
-        """Return the standard deviation of a voltage [V].
+    def at(self, temperature_c: float, line: DelayLine) -> Callable[[float], float]:
+        """Return what gives the standard deviation of a voltage [V] by the SoC [%], NaN: unknown.
 
         Parameters
         ----------
-        soc_pct, temperature_c : float
-            As far as they are known [%; °C], else NaN.
+        temperature_c : float
+            As far as it is known [°C], else NaN.
         line : DelayLine
         """
         squares = self._fast_std_v**2
@@ -48,8 +49,12 @@ class VoltageError:
             squares = self._filling_var_v2(squares, line.filled_s)
         if math.isnan(temperature_c):
             squares += (self._model.kt_v_per_k * TEMPERATURE_STD_K) ** 2
-        squares += outside_model_std_v(self._model, soc_pct, temperature_c) ** 2
-        return math.sqrt(squares)
+
+        def std_v(soc_pct: float) -> float:
+            outside_v = outside_model_std_v(self._model, soc_pct, temperature_c)
+            return math.sqrt(squares + outside_v**2)
+
+        return std_v
 
     def _filling_var_v2(self, settled_var_v2: float, filled_s: float) -> float:
         """Return the error's variance while the delay line fills [V²].

@@ -33,6 +33,14 @@ from cangauge.model.voltage_model import SLOPE_AT_LEAST, VoltageModel
 SLOPE_STEP_PCT = 0.05
 """Half the step of the numerical slope of the effects' voltage over SoC [%]."""
 
+STEADY_S, STEADY_STEP_S = 4.0 * 3600.0, 10.0
+"""So long does a current last until the voltage is taken to have settled, in such steps [s]."""
+
+STEADY_C_RATE = 1.0 / 3.0
+STEADY_CHANGE = 0.05
+"""Current at which the settled voltage's change is taken, either way [1/h]: 20 A at 60 Ah, as in
+driving; and by how much it is changed, relative."""
+
 _ORDER = {effect_id: number for number, effect_id in enumerate(LIBRARY)}
 
 
@@ -174,6 +182,37 @@ class ExtendedModel:
                 volts += extra
         return volts
 
+    def steady_ohm(self) -> float:
+        """Return by how much the voltage changes with a lasting current, negative [V/A].
+
+        So much of a current sensor's offset the voltage would not show. Polarisation counts in
+        full; what only the sign of current decides, not at all.
+        """
+        ohm = sum(self.model.resistance_ohm)
+        if not self.effects:
+            return ohm
+        usual_a = STEADY_C_RATE * self.capacity_ah
+        change_a = STEADY_CHANGE * usual_a
+        settled_v = [
+            self._settled_extra_v(sign * usual_a + change)
+            for sign in (1.0, -1.0)
+            for change in (change_a, -change_a)
+        ]
+        return ohm + (settled_v[0] - settled_v[1] + settled_v[2] - settled_v[3]) / (4.0 * change_a)
+
+    def _settled_extra_v(self, current_a: float) -> float:
+        """Return the effects' voltage after a long constant current, at 50 % SoC [V]."""
+        time_s = np.arange(0.0, STEADY_S, STEADY_STEP_S)
+        constant = np.ones_like(time_s)
+        state = PackState(
+            time_s=time_s,
+            current_a=current_a * constant,
+            temperature_c=self.model.t_ref_c * constant,
+            soc_pct=50.0 * constant,
+            drop_v=current_a * sum(self.model.resistance_ohm) * constant,
+        )
+        return float(self.extra_voltage(state)[-1])
+
 
 class OnlineExtendedModel:
     """The extended model in the estimator: call `correct`, then `advance` for each that comes out.
@@ -204,10 +243,10 @@ class OnlineExtendedModel:
         self._beside_soc_v = 0.0
         self._slope_at_least = SLOPE_AT_LEAST * extended.pack.voltage_v
 
-    @property
-    def resistance_ohm(self) -> tuple[float, ...]:
-        """The voltage model's resistances [Ω]."""
-        return self.model.resistance_ohm
+    @cached_property
+    def steady_ohm(self) -> float:
+        """By how much the voltage changes with a lasting current, the effects' part too [V/A]."""
+        return self._extended.steady_ohm()
 
     @property
     def plain(self) -> bool:
