@@ -32,13 +32,13 @@ class Desk:
         self.sent: list[tuple[float, can.Message]] = []
         self._began_s = began_s
 
-    def receive(self, timeout_s: float) -> can.Message | None:
+    def receive_waiting(self, timeout_s: float) -> list[can.Message]:
         if self._frames and self._frames[0][0] <= self.now_s + timeout_s:
             at_s, frame = self._frames.pop(0)
             self.now_s = max(self.now_s, at_s)
-            return frame
+            return [frame]
         self.now_s += max(timeout_s, 1e-6)
-        return None
+        return []
 
     def post(self, frame: can.Message, _within_s: float) -> None:
         self.sent.append((self.now_s - self._began_s, frame))
@@ -112,14 +112,14 @@ def test_a_machine_that_slept_goes_on_the_grid_and_makes_up_for_nothing(
 ) -> None:
     frames = [*frames_every(0.1, 2.0), *frames_every(0.1, 12.0, from_s=9.0)]
     desk = Desk(frames)
-    receive = desk.receive
+    receive = desk.receive_waiting
 
-    def sleepy(timeout_s: float) -> can.Message | None:
+    def sleepy(timeout_s: float) -> list[can.Message]:
         if 2.0 < desk.now_s - 5000.0 < 2.5:
             desk.now_s += 5.678
         return receive(timeout_s)
 
-    desk.receive = sleepy  # type: ignore[method-assign] # the machine sleeps once
+    desk.receive_waiting = sleepy  # type: ignore[method-assign] # the machine sleeps once
     clock = SimpleNamespace(
         monotonic=lambda: desk.now_s,
         process_time=time.process_time,
