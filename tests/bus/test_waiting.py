@@ -177,6 +177,9 @@ class Script:
     def wait(self, _timeout_s: float) -> bool:
         return bool(self._steps)
 
+    def forget_filters(self) -> None:
+        pass
+
     def close(self) -> None:
         pass
 

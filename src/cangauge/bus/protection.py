@@ -30,6 +30,10 @@ class Verdict(enum.IntEnum):
     """Refused: the counter stands still, so this is no new frame."""
 
 
+# Of every frame; members of an enum are slow to look up.
+_GOOD: Final = Verdict.GOOD
+
+
 class Protection(Protocol):
     """How a message shows that it is new and whole."""
 
@@ -240,13 +244,13 @@ class FrameChecker:
             self._refused += 1
             return Verdict.CRC_WRONG
         if not modulus:
-            return Verdict.GOOD
+            return _GOOD
         last, counter = self._last, rule.counter(data)
         elapsed_s, self._last_s = time_s - self._last_s, time_s
         steps = (counter - last) % modulus
         if steps == 1 or last < 0:
             self._last, self._refused = counter, 0
-            return Verdict.GOOD
+            return _GOOD
         if steps == 0:
             if elapsed_s <= self._half_round_s:
                 return Verdict.REPEATED

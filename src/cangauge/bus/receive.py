@@ -230,6 +230,8 @@ class BusPort:
         """
         try:
             self._open_bus().set_filters(filters)
+            if self._waiting is not None:
+                self._waiting.forget_filters()
         except BusError:
             raise
         except Exception as error:  # as when receiving

@@ -31,7 +31,8 @@ _PACKET_BYTES: Final = 4096
 """As python-can: a longer packet is cut off, and then is no frame."""
 _STAMP: Final = struct.Struct("@ll")
 _IDS_KEPT: Final = 4096
-"""So many unwanted ids are remembered at most: anybody may send any."""
+"""So many ids are remembered at most: anybody may send any."""
+_DO_NOT_WAIT: Final = int(socket.MSG_DONTWAIT) if sys.platform == "linux" else 0
 
 
 class NothingWaitsError(Exception):
@@ -54,6 +55,9 @@ class WaitingFrames(Protocol):
     def wait(self, timeout_s: float) -> bool:
         """Return whether a frame waits, as soon as one does or the time is up [s]."""
 
+    def forget_filters(self) -> None:
+        """Take note that the bus has other filters."""
+
     def close(self) -> None:
         """Let go of the socket; the bus stays open."""
 
@@ -69,6 +73,31 @@ def waiting_frames(bus: can.BusABC) -> WaitingFrames | None:
     return None
 
 
+class _SocketcanFrames:
+    """Those of SocketCAN: the kernel filters."""
+
+    def __init__(self, bus: SocketcanBus) -> None:
+        self._socket = bus.socket
+        self._channel = bus.channel
+        # python-can's function asks nothing of a socket but this.
+        self._impatient = cast("socket.socket", _Impatient(bus.socket))
+
+    def next(self) -> can.Message | None:
+        message = capture_message(self._impatient, get_channel=not self._channel)
+        if message is not None and self._channel:
+            message.channel = self._channel
+        return message
+
+    def wait(self, timeout_s: float) -> bool:
+        return bool(select.select([self._socket], [], [], timeout_s)[0])
+
+    def forget_filters(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass  # the socket is the bus's
+
+
 class _Impatient:
     """A socket that is read without waiting."""
 
@@ -78,35 +107,9 @@ class _Impatient:
     def recvmsg(self, size: int, ancillary_size: int) -> tuple[Any, ...]:
         """As the socket's."""
         try:
-            return self._socket.recvmsg(size, ancillary_size, socket.MSG_DONTWAIT)
+            return self._socket.recvmsg(size, ancillary_size, _DO_NOT_WAIT)
         except BlockingIOError:
             raise NothingWaitsError from None
-
-    def wait(self, timeout_s: float) -> bool:
-        """Return whether there is anything to read, an error included, in time [s]."""
-        return bool(select.select([self._socket], [], [], timeout_s)[0])
-
-
-class _SocketcanFrames:
-    """Those of SocketCAN: the kernel filters."""
-
-    def __init__(self, bus: SocketcanBus) -> None:
-        self._socket = _Impatient(bus.socket)
-        # All that it asks of a socket is `recvmsg`.
-        self._as_socket = cast("socket.socket", self._socket)
-        self._channel = bus.channel
-
-    def next(self) -> can.Message | None:
-        message = capture_message(self._as_socket, get_channel=not self._channel)
-        if message is not None and self._channel:
-            message.channel = self._channel
-        return message
-
-    def wait(self, timeout_s: float) -> bool:
-        return self._socket.wait(timeout_s)
-
-    def close(self) -> None:
-        pass  # the socket is the bus's
 
 
 class _UdpFrames:
@@ -114,12 +117,10 @@ class _UdpFrames:
 
     def __init__(self, bus: UdpMulticastBus, own: socket.socket) -> None:
         self._bus = bus
-        self._own = own
-        self._socket = _Impatient(own)
+        self._socket = own
         self._stamp_space = socket.CMSG_SPACE(_STAMP.size)
         self._carries_fd = bus.protocol is can.CanProtocol.CAN_FD
-        self._filters = bus.filters
-        self._unwanted: set[Hashable] = set()
+        self._passes: dict[Hashable, bool] = {}
 
     @classmethod
     def of(cls, bus: UdpMulticastBus) -> _UdpFrames | None:
@@ -132,35 +133,41 @@ class _UdpFrames:
         return None
 
     def next(self) -> can.Message | None:
-        packet, ((_, _, stamp),), _, _ = self._socket.recvmsg(_PACKET_BYTES, self._stamp_space)
+        try:
+            packet, ((_, _, stamp),), _, _ = self._socket.recvmsg(
+                _PACKET_BYTES, self._stamp_space, _DO_NOT_WAIT
+            )
+        except BlockingIOError:
+            raise NothingWaitsError from None
         seconds, nanoseconds = _STAMP.unpack(stamp)
         try:
             fields = msgpack.unpackb(packet, raw=False)
-            if self._is_unwanted(fields):
+            key = fields.get("arbitration_id"), fields.get("is_extended_id")
+            passes = self._passes.get(key)
+            if passes is False:
                 return None
             fields["timestamp"] = seconds + nanoseconds * 1.0e-9
             message = can.Message(check=True, **fields)
         except Exception as error:
             # As python-can: whatever it is, it is this packet's.
             raise can.CanOperationError("could not unpack received message") from error
-        if message.is_fd and not self._carries_fd:
-            return None
-        if self._bus._matches_filters(message):  # noqa: SLF001 - as python-can's `recv` does
-            return message
-        if len(self._unwanted) >= _IDS_KEPT:
-            self._unwanted.clear()
-        self._unwanted.add((message.arbitration_id, message.is_extended_id))
-        return None
+        if passes is None:
+            passes = self._look_up(key, message)
+        return message if passes and (self._carries_fd or not message.is_fd) else None
 
-    def _is_unwanted(self, fields: dict[str, Any]) -> bool:
-        """Whether a frame with this id was refused by the filters before."""
-        if self._bus.filters is not self._filters:
-            self._filters = self._bus.filters
-            self._unwanted.clear()
-        return (fields.get("arbitration_id"), fields.get("is_extended_id")) in self._unwanted
+    def _look_up(self, key: Hashable, message: can.Message) -> bool:
+        """Return whether frames with an id pass, and remember it."""
+        if len(self._passes) >= _IDS_KEPT:
+            self._passes.clear()
+        # As python-can's `recv` does.
+        self._passes[key] = passes = self._bus._matches_filters(message)  # noqa: SLF001
+        return passes
 
     def wait(self, timeout_s: float) -> bool:
-        return self._socket.wait(timeout_s)
+        return bool(select.select([self._socket], [], [], timeout_s)[0])
+
+    def forget_filters(self) -> None:
+        self._passes.clear()
 
     def close(self) -> None:
-        self._own.close()
+        self._socket.close()
