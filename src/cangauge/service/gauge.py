@@ -141,8 +141,8 @@ class Gauge:
         is_stale : bool
             No sample within the service's time-out: the latest estimate is told as invalid.
         silent_s : float
-            Time since the latest sample by the loop's monotonic clock [s]. While the receive
-            stamps are bus time, the current's own time-out counts, too.
+            Time since the latest sample came in, by the loop's monotonic clock [s]. While the
+            receive stamps are bus time, the current's own time-out counts, too.
         """
         estimate = self._stream.told
         is_stale = is_stale or (not self._is_replay and silent_s > self._stream.current_timeout_s)

@@ -90,7 +90,7 @@ class Outputs:
     stepped : callable, optional
         Takes, after every sample, or where several frames waited after the last of theirs, the
         receive stamp [s] of the frame that completed it, the time from receiving to having taken
-        it in [s] (the mean of them), and the monotonic time [s].
+        it in [s] (the mean of them), and the monotonic time at which that frame came in [s].
     sent : callable, optional
         Called after frames were sent.
     """
@@ -172,6 +172,7 @@ class _Loop:
         self.rivals = Rivals(gauge.settings.ids, echoes=port.facts.echoes, warn=outputs.warn)
         self._upkeep = Upkeep(port, outputs.checkpoint, settings.checkpoint_every_s, outputs.warn)
         self._ignores_clock = self._awaits_clock = gauge.settings.time_source == "receive"
+        self._stamps_are_wall_time = port.facts.stamps == "kernel"
         self._no_input: frozenset[int] = frozenset()
         self._set_filters()
         self.began_s = time.monotonic()
@@ -179,7 +180,10 @@ class _Loop:
         self._now_s = self.began_s
         self._beat_s = self.began_s
         self._glance_s = self.began_s
+        # When the latest sample was taken, and when it had come in: while the service lags behind
+        # (after a pause, under load) frames wait in the socket, and are old when they are read.
         self._sample_s = self.began_s
+        self._came_s = self.began_s
 
     def is_over(self) -> bool:
         settings = self._settings
@@ -218,7 +222,7 @@ class _Loop:
             self._outputs.show(self._now_s)
 
     def _beat(self) -> None:
-        gauge, silent_s = self._gauge, self._now_s - self._sample_s
+        gauge, silent_s = self._gauge, self._now_s - self._came_s
         is_stale = silent_s > max(self._settings.timeout_s, gauge.patience_s)
         self._send(gauge.heartbeat(is_stale=is_stale, silent_s=silent_s))
         # On the grid of the clock, whatever came when; beats that were slept through are left out.
@@ -266,11 +270,13 @@ class _Loop:
         return False
 
     def _note_samples(self, samples: int, stamp_s: float) -> None:
-        came_s, self._now_s = self._now_s, time.monotonic()
-        self._sample_s, step_s = self._now_s, (self._now_s - came_s) / samples
+        before_s, self._now_s = self._now_s, time.monotonic()
+        self._sample_s, step_s = self._now_s, (self._now_s - before_s) / samples
+        lag_s = max(time.time() - stamp_s, 0.0) if self._stamps_are_wall_time else 0.0
+        self._came_s = self._now_s - lag_s
         self.step_s.append(step_s)
         if self._outputs.stepped is not None:
-            self._outputs.stepped(stamp_s, step_s, self._now_s)
+            self._outputs.stepped(stamp_s, step_s, self._came_s)
 
     def _tell(self) -> None:
         sample = self._gauge.latest_sample
