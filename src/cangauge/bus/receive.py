@@ -155,9 +155,10 @@ class BusPort:
     def _read(self, waiting: WaitingFrames) -> list[can.Message]:
         found: list[can.Message] = []
         self._is_empty = False
+        take_next = waiting.next
         for _ in range(AT_ONCE):
             try:
-                message = waiting.next()
+                message = take_next()
             except NothingWaitsError:
                 self._is_empty = True
                 break
@@ -174,10 +175,13 @@ class BusPort:
             if message is None:
                 continue
             if message.is_error_frame:
+                # Ends this go: whoever looks at `is_off` after each misses no change of it.
+                self.is_off = self.is_off and not found
                 self._count_error(message)
-                break  # whoever looks at `is_off` after each call misses no change of it
-            self.is_off = False
+                return found
             found.append(message)
+        if found:
+            self.is_off = False
         return found
 
     def send(self, message: can.Message, within_s: float = SEND_WITHIN_S) -> bool:

@@ -217,4 +217,5 @@ class SignalHealth:
         if math.isnan(learned_s):
             self._learned_s = step_s
         else:
-            self._learned_s += _LEARN_WEIGHT * (min(step_s, _PAUSE * learned_s) - learned_s)
+            step_s = min(step_s, _PAUSE * learned_s)
+            self._learned_s = learned_s + _LEARN_WEIGHT * (step_s - learned_s)
