@@ -152,6 +152,15 @@ class BrokenBus:
         self.closed += 1
 
 
+def same_frames(found: list[can.Message], expected: list[can.Message]) -> bool:
+    """Whether two lists hold the same frames: every field, the stamp to the last bit."""
+    fields = [name for name in can.Message.__slots__ if name != "__weakref__"]
+    told = [
+        [[getattr(each, name) for name in fields] for each in some] for some in (found, expected)
+    ]
+    return told[0] == told[1]
+
+
 def unpack_error() -> can.CanOperationError:
     error = can.CanOperationError("could not unpack received message")
     error.__cause__ = ValueError("junk")

@@ -10,9 +10,10 @@ import can
 import pytest
 
 from cangauge.bus.encode import FrameEncoder
-from cangauge.bus.interface_facts import UNKNOWN_INTERFACE
+from cangauge.bus.interface_facts import UNKNOWN_INTERFACE, InterfaceFacts, Stamps
 from cangauge.bus.publish import SocDetail, SocEstimate, SocReader
 from cangauge.bus.vehicle import load_vehicle
+from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.types import Reason, Sample, Status
 from cangauge.service import loop
 from cangauge.service.gauge import Gauge, GaugeSettings
@@ -30,15 +31,16 @@ class Desk:
         self.now_s = began_s
         self._frames = [(began_s + at_s, frame) for at_s, frame in frames]
         self.sent: list[tuple[float, can.Message]] = []
+        self.work_s = 0.0
         self._began_s = began_s
 
-    def receive(self, timeout_s: float) -> can.Message | None:
+    def receive_waiting(self, timeout_s: float) -> list[can.Message]:
         if self._frames and self._frames[0][0] <= self.now_s + timeout_s:
             at_s, frame = self._frames.pop(0)
-            self.now_s = max(self.now_s, at_s)
-            return frame
+            self.now_s = max(self.now_s, at_s) + self.work_s
+            return [frame]
         self.now_s += max(timeout_s, 1e-6)
-        return None
+        return []
 
     def post(self, frame: can.Message, _within_s: float) -> None:
         self.sent.append((self.now_s - self._began_s, frame))
@@ -112,14 +114,14 @@ def test_a_machine_that_slept_goes_on_the_grid_and_makes_up_for_nothing(
 ) -> None:
     frames = [*frames_every(0.1, 2.0), *frames_every(0.1, 12.0, from_s=9.0)]
     desk = Desk(frames)
-    receive = desk.receive
+    receive = desk.receive_waiting
 
-    def sleepy(timeout_s: float) -> can.Message | None:
+    def sleepy(timeout_s: float) -> list[can.Message]:
         if 2.0 < desk.now_s - 5000.0 < 2.5:
             desk.now_s += 5.678
         return receive(timeout_s)
 
-    desk.receive = sleepy  # type: ignore[method-assign] # the machine sleeps once
+    desk.receive_waiting = sleepy  # type: ignore[method-assign] # the machine sleeps once
     clock = SimpleNamespace(
         monotonic=lambda: desk.now_s,
         process_time=time.process_time,
@@ -147,3 +149,44 @@ def test_old_and_unknown_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None
         [1 for at_s, _ in old if at_s > 34.5]
     )
     assert next(each.age_s for at_s, each in old if at_s > 10.0) == 6.0
+
+
+@pytest.mark.parametrize("stamps", ["kernel", "driver"])
+def test_a_backlog_is_old_until_it_is_worked_off(
+    monkeypatch: pytest.MonkeyPatch, stamps: Stamps
+) -> None:
+    """Stopped from 3.0 to 9.0 s, the service then reads in two seconds what waited meanwhile."""
+    desk = Desk(frames_every(0.02, 14.0))
+    desk.facts = InterfaceFacts(stamps, echoes=False, has_error_classes=False)
+    receive = desk.receive_waiting
+
+    def stopped(timeout_s: float) -> list[can.Message]:
+        since_s = desk.now_s - 5000.0
+        if 3.0 <= since_s < 3.5:
+            desk.now_s += 6.0
+        # Working off six seconds of fifty samples, two frames each, and what comes meanwhile.
+        desk.work_s = 0.0025 if 9.0 <= since_s < 11.0 else 0.0
+        return receive(timeout_s)
+
+    desk.receive_waiting = stopped  # type: ignore[method-assign] # is stopped once
+    clock = SimpleNamespace(
+        monotonic=lambda: desk.now_s,
+        time=lambda: 1.7e9 + desk.now_s - 5000.0,
+        process_time=time.process_time,
+    )
+    monkeypatch.setattr(loop, "time", clock)
+    known = GaugeSettings(EstimatorSettings(initial_soc_pct=60.0))
+    gauge = Gauge(load_vehicle("generic"), leaf_model(), known)
+    serve(desk, gauge, LoopSettings(duration_s=14.0), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for
+    told = beats(desk)
+    fresh = [content for at_s, content in told if 0.5 < at_s < 3.0 or at_s > 13.0]
+    assert not any(each.reasons & Reason.INPUT_STALE for each in fresh)
+    behind = [content for at_s, content in told if 9.0 < at_s < 9.9]
+    assert len(behind) >= 9
+    if stamps == "kernel":
+        assert {each.status for each in behind} == {Status.INVALID}
+        assert all(each.reasons & Reason.INPUT_STALE for each in behind)
+        assert behind[0].age_s == 6.0  # and falls by three seconds a second
+        assert behind[-1].age_s == 3.0
+    else:  # nobody can tell
+        assert not any(each.reasons & Reason.INPUT_STALE for each in behind[1:])

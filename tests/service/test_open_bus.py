@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import os
 import socket
+import sys
+from pathlib import Path
 
 import can
 import pytest
 
 from cangauge.bus import open as opening
-from cangauge.bus.open import BusAddress, bus_address, open_bus, parse_bus_options
+from cangauge.bus.open import (
+    RECEIVE_BUFFER_BYTES,
+    BusAddress,
+    bus_address,
+    open_bus,
+    parse_bus_options,
+)
 from cangauge.errors import InputError
 
 GROUP = "239.74.163.2"
@@ -26,6 +34,18 @@ def test_udp_multicast_stays_on_this_machine() -> None:
     finally:
         bus.shutdown()
     assert bus_address("udp_multicast", options={"hop_limit": 1}).options["hop_limit"] == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the limit is Linux's")
+def test_the_receive_buffer_is_as_large_as_the_system_allows() -> None:
+    allowed = int(Path("/proc/sys/net/core/rmem_max").read_text())
+    with (
+        open_bus(bus_address("udp_multicast")) as bus,
+        socket.socket(fileno=os.dup(bus.fileno())) as own,
+    ):
+        size = own.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+    # Linux doubles what is asked for, for its own book-keeping.
+    assert 2 * min(RECEIVE_BUFFER_BYTES, allowed) <= size <= 2 * RECEIVE_BUFFER_BYTES
 
 
 def test_two_ports_of_one_machine_hear_each_other() -> None:

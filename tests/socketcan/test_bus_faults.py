@@ -21,7 +21,7 @@ import pytest
 from cangauge.bus.encode import FrameEncoder
 from cangauge.bus.lasting import LONGEST_PAUSE_S, LastingPort
 from cangauge.bus.open import BusAddress, has_socketcan, open_bus
-from cangauge.bus.publish import SocEstimate, SocReader, standard_filter
+from cangauge.bus.publish import SocDetail, SocEstimate, SocReader, standard_filter
 from cangauge.bus.receive import BusPort
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.errors import InputError
@@ -300,7 +300,7 @@ def test_two_services_notice_each_other() -> None:
 
 def test_one_service_through_overflow_signals_and_a_bus_that_is_down(tmp_path: Path) -> None:
     """Processes start slowly in a guest, so one is led through all of it."""
-    config, burst = tmp_path / "car.toml", 4000
+    config = tmp_path / "car.toml"
     config.write_text(f'model = "{leaf_model_path()}"\nchannel = "vcan0"\n')
     ip("set", "vcan0", "down")
     live = Command("run", "--config", config, "--wait-for-bus", "--json")
@@ -309,11 +309,10 @@ def test_one_service_through_overflow_signals_and_a_bus_that_is_down(tmp_path: P
     live.wait_for("there after")
     # A pause of the process: what does not fit the queue is lost, and counted.
     live.process.send_signal(signal.SIGSTOP)
-    with BusPort(open_bus(VCAN, []), "sender") as sender:
-        for frame in _frames(burst):
-            sender.send(frame)
+    burst = _overflow()
     live.process.send_signal(signal.SIGCONT)
     live.wait_for("the receive queue overflowed")
+    _wait_until_worked_off()
     config.write_text("timeout_s = [")
     live.process.send_signal(signal.SIGHUP)
     live.wait_for("new configuration refused")
@@ -342,13 +341,26 @@ def test_one_service_through_overflow_signals_and_a_bus_that_is_down(tmp_path: P
     assert f"{result['queue_drops']} dropped in the receive queue" in ended.err
 
 
-def _frames(count: int) -> Iterator[can.Message]:
-    encoder = FrameEncoder(load_vehicle("generic"))
-    made = 0
-    for sample in samples_of(short_log(200.0)):
-        for frame in encoder.encode(sample):
-            yield frame
-            made += 1
-            if made == count:
+def _wait_until_worked_off() -> None:
+    """Wait until the count of samples that the service tells stands still."""
+    reader, before = SocReader(), -1
+    with open_bus(VCAN, [standard_filter(0x5A1)]) as listener:
+        while (frame := listener.recv(3.0)) is not None:
+            detail = reader.read(frame)
+            assert isinstance(detail, SocDetail)
+            if detail.samples == before:
                 return
-    raise AssertionError("the log is too short")
+            before = detail.samples
+    raise AssertionError("nothing is published")
+
+
+def _overflow() -> int:
+    """Send until a receive queue as large as the service's has overflowed; return how many."""
+    encoder, sent = FrameEncoder(load_vehicle("generic")), 0
+    frames = [frame for each in samples_of(short_log(200.0)) for frame in encoder.encode(each)]
+    with BusPort(open_bus(VCAN), "witness") as witness, BusPort(open_bus(VCAN, []), "tx") as sender:
+        while not witness.queue_drops:
+            for frame in frames:
+                sender.send(frame)
+            sent += len(frames)
+    return sent

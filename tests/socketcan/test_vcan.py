@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import socket
+import struct
 import subprocess
 import time
 from collections.abc import Iterator
@@ -18,6 +19,7 @@ from cangauge.bus.open import BusAddress, bus_address, has_socketcan, open_bus
 from cangauge.bus.publish import FrameIds, SocEstimate, SocReader, standard_filter
 from cangauge.bus.receive import BusPort
 from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.waiting import NothingWaitsError, waiting_frames
 from cangauge.errors import InputError
 from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import run_estimator, samples_of
@@ -28,7 +30,17 @@ from cangauge.service.capture_estimate import estimate_capture
 from cangauge.service.gauge import Gauge, GaugeSettings
 from cangauge.service.loop import LoopSettings
 from cangauge.service.record import Recorder
-from live import Command, Service, leaf_model, leaf_model_path, never, run_to_end, short_log, waits
+from live import (
+    Command,
+    Service,
+    leaf_model,
+    leaf_model_path,
+    never,
+    run_to_end,
+    same_frames,
+    short_log,
+    waits,
+)
 
 pytestmark = pytest.mark.socketcan
 
@@ -52,6 +64,50 @@ def replay_port() -> Iterator[BusPort]:
 def service(preset: str, settings: GaugeSettings, record: Recorder | None = None) -> Service:
     gauge = Gauge(load_vehicle(preset), leaf_model(), settings)
     return Service(BusPort(open_bus(VCAN, gauge.filters), str(VCAN)), gauge, LoopSettings(), record)
+
+
+@pytest.mark.parametrize("filters", [None, SOC_FRAMES], ids=["all", "filtered"])
+@pytest.mark.parametrize("options", [{"fd": True}, {"fd": False}], ids=["fd", "classic"])
+def test_frames_read_without_asking_are_those_of_python_can(
+    options: dict[str, bool], filters: list[can.typechecking.CanFilter] | None
+) -> None:
+    address = BusAddress("socketcan", "vcan0", {**options, "receive_own_messages": True})
+    standard = {"arbitration_id": 0x5A0, "is_extended_id": False}
+    sent = [
+        can.Message(**standard, data=bytes(range(8))),
+        can.Message(**standard, is_remote_frame=True, dlc=3),
+        can.Message(arbitration_id=0x5A0, data=b"12"),
+        can.Message(arbitration_id=0x7FF, is_extended_id=False),
+    ]
+    if options["fd"]:
+        sent += [
+            can.Message(**standard, data=bytes(64), is_fd=True, bitrate_switch=True),
+            can.Message(**standard, data=bytes(12), is_fd=True, error_state_indicator=True),
+        ]
+    with (
+        open_bus(address, filters) as theirs,
+        open_bus(address, filters) as ours,
+        open_bus(address, []) as sender,
+        socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw,
+    ):
+        waiting = waiting_frames(ours)
+        assert waiting is not None
+        for frame in sent:
+            sender.send(frame)
+        ours.send(sent[0])  # one's own, that comes back
+        raw.bind(("vcan0",))
+        raw.send(struct.pack("=IB3x8s", 0x20000040, 8, bytes(8)))  # bus-off
+        expected = []
+        while (message := theirs.recv(0.5)) is not None:
+            expected.append(message)
+        found = [waiting.next() for _ in expected]
+        with pytest.raises(NothingWaitsError):
+            waiting.next()
+        waiting.close()
+    # The kernel's filters let pass two of the sent ones less, and every error frame.
+    assert len(expected) == len(sent) + 2 - (0 if filters is None else 2)
+    assert [each.is_error_frame for each in expected].count(True) == 1
+    assert same_frames([each for each in found if each is not None], expected)
 
 
 def test_the_default_bus_is_vcan0() -> None:

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Final
 
 import can
 
 from cangauge.bus.counters import Counters, MessageCounters
-from cangauge.bus.input_health import InputHealth
+from cangauge.bus.input_health import InputHealth, SignalGate
 from cangauge.bus.pairing import Pairing
 from cangauge.bus.protection import FrameChecker, Verdict
 from cangauge.bus.signal_health import Fault
 from cangauge.bus.stuck import Pack
 from cangauge.bus.vehicle import EXTENDED, BoundSignal, Vehicle
 from cangauge.estimate.types import Sample
+
+_GOOD: Final = Verdict.GOOD  # of every frame; members of an enum are slow to look up
 
 
 @dataclass(slots=True)
@@ -24,9 +28,9 @@ class _Route:
     length: int
     checker: FrameChecker | None
     counters: MessageCounters
-    current: BoundSignal | None = None
-    voltage: BoundSignal | None = None
-    slow: tuple[BoundSignal, ...] = ()
+    take_fast: Callable[[bytearray, float], Sample | None] | None = None
+    """Takes a payload and its bus time [s], if there is current or voltage in it."""
+    slow: tuple[SignalGate, ...] = ()
     last_s: float = -math.inf
 
 
@@ -61,10 +65,11 @@ class SampleAssembler:
         self.vehicle = vehicle
         self.wanted_ids = vehicle.wanted_ids
         self._pairing = Pairing(vehicle.pair_within_s)
+        self.health = InputHealth(vehicle, pack)
+        self._temperature = None if vehicle.temperature is None else self.health["temperature"]
         self._routes: dict[int, _Route] = {}
         for signal in vehicle.signals:
             self._add(signal)
-        self.health = InputHealth(vehicle, pack)
         self._counters = Counters({key: route.counters for key, route in self._routes.items()})
         self._now_s = -math.inf
 
@@ -75,12 +80,16 @@ class SampleAssembler:
             checker = None if message.rule is None else FrameChecker(message.rule, message.period_s)
             route = _Route(signal.length, checker, MessageCounters())
             self._routes[signal.key] = route
+        gate = self.health.gate(signal, route.counters)
         if signal.role == "current":
-            route.current = signal
+            self._current = gate
+            route.take_fast = self._take_current
         elif signal.role == "voltage":
-            route.voltage = signal
+            self._voltage = gate
+            both = signal.key == self.vehicle.current.key
+            route.take_fast = self._take_both if both else self._take_voltage
         else:
-            route.slow = (*route.slow, signal)
+            route.slow = (*route.slow, gate)
 
     @property
     def last_update_s(self) -> dict[str, float]:
@@ -129,11 +138,11 @@ class SampleAssembler:
         payload = self._accept(key, route, message)
         if payload is None:
             return None
-        for signal in route.slow:
-            self._read(route, signal, payload, message.timestamp)
-        if route.current is None and route.voltage is None:
+        for gate in route.slow:
+            gate.read(payload, message.timestamp)
+        if route.take_fast is None:
             return None
-        sample = self._take_fast(route, payload, message.timestamp)
+        sample = route.take_fast(payload, message.timestamp)
         if sample is not None:
             counters.samples += 1
         return sample
@@ -163,7 +172,7 @@ class SampleAssembler:
         checker = route.checker
         if checker is not None:
             verdict = checker.check(payload, time_s)
-            if verdict is not Verdict.GOOD:
+            if verdict is not _GOOD:
                 if verdict is Verdict.CRC_WRONG:
                     fate.crc_errors += 1
                     self.health.refused(key, Fault.PROTECTION)
@@ -183,31 +192,27 @@ class SampleAssembler:
         if last_s - time_s > self.vehicle.pair_within_s:
             self.health.rewind(time_s)
 
-    def _take_fast(self, route: _Route, payload: bytearray, time_s: float) -> Sample | None:
-        current_a = self._read(route, route.current, payload, time_s)
-        voltage_v = self._read(route, route.voltage, payload, time_s)
-        if route.current is not None and route.voltage is not None:
-            # Both in one frame: a sample at once.
-            if math.isnan(current_a):
-                return None
-            if math.isnan(voltage_v):
-                self._pairing.current_unpaired += 1
-            return Sample(time_s, current_a, voltage_v, self._temperature_at(time_s))
-        if not math.isnan(current_a):
-            return self._pairing.current(time_s, current_a, self._temperature_at(time_s))
-        if not math.isnan(voltage_v):
-            return self._pairing.voltage(time_s, voltage_v)
-        return None
+    def _take_current(self, payload: bytearray, time_s: float) -> Sample | None:
+        current_a = self._current.read(payload, time_s)
+        if math.isnan(current_a):
+            return None
+        return self._pairing.current(time_s, current_a, self._temperature_at(time_s))
 
-    def _read(
-        self, route: _Route, signal: BoundSignal | None, payload: bytearray, time_s: float
-    ) -> float:
-        """Return the value; NaN if the frame does not hold it or it is not to be used."""
-        if signal is None or (signal.codec.conditions and not signal.codec.is_in(payload)):
-            return math.nan
-        return self.health.passed(signal, signal.decode(payload), time_s, route.counters)
+    def _take_voltage(self, payload: bytearray, time_s: float) -> Sample | None:
+        voltage_v = self._voltage.read(payload, time_s)
+        return None if math.isnan(voltage_v) else self._pairing.voltage(time_s, voltage_v)
+
+    def _take_both(self, payload: bytearray, time_s: float) -> Sample | None:
+        """Take a frame with current and voltage: a sample at once."""
+        current_a = self._current.read(payload, time_s)
+        voltage_v = self._voltage.read(payload, time_s)
+        if math.isnan(current_a):
+            return None
+        if math.isnan(voltage_v):
+            self._pairing.current_unpaired += 1
+        return Sample(time_s, current_a, voltage_v, self._temperature_at(time_s))
 
     def _temperature_at(self, time_s: float) -> float:
-        if self.vehicle.temperature is None:
+        if self._temperature is None:
             return self.vehicle.fixed_temperature_c
-        return self.health.latest("temperature", time_s)
+        return self._temperature.value_at(time_s)

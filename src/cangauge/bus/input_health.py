@@ -9,6 +9,7 @@ capture, and not as a signal that never comes.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
@@ -43,6 +44,76 @@ TEMPERATURE_RATE_K_PER_S: Final = 1.0
 voltage may change as fast as they like: contactors, fuses, short circuits."""
 
 
+_NO_FAULT: Final = Fault.NONE
+
+Watch = Callable[[float, float], bool]
+"""Takes a value and its bus time [s]; returns whether the signal is stuck."""
+
+
+class SignalGate:
+    """Reads one signal, and lets through what may be used.
+
+    Parameters
+    ----------
+    signal : BoundSignal
+    health : SignalHealth
+    is_stuck : Watch, optional
+    fate : MessageCounters
+        Where it is counted what became of a value.
+    """
+
+    __slots__ = ("_decode", "_fate", "_gain", "_health", "_is_in", "_is_stuck", "_offset")
+
+    def __init__(
+        self,
+        signal: BoundSignal,
+        health: SignalHealth,
+        is_stuck: Watch | None,
+        fate: MessageCounters,
+    ) -> None:
+        codec = signal.codec
+        self._decode = codec.decode
+        self._is_in = codec.is_in if codec.conditions else None
+        self._gain, self._offset = signal.gain, signal.offset
+        self._health = health
+        self._is_stuck = is_stuck
+        self._fate = fate
+
+    def read(self, payload: bytes | bytearray, time_s: float) -> float:
+        """Return the value [A, V, °C, %]; NaN if the frame has none or it is not to be used.
+
+        Parameters
+        ----------
+        payload : bytes
+            Of the message's own length.
+        time_s : float
+            Bus time [s].
+        """
+        if self._is_in is not None and not self._is_in(payload):
+            return math.nan
+        value = self._gain * self._decode(payload) + self._offset  # as `BoundSignal.decode`
+        health, is_stuck = self._health, self._is_stuck
+        fault = health.judge(value, time_s)
+        if fault is _NO_FAULT:
+            if is_stuck is None or not is_stuck(value, time_s):
+                if health.take(value, time_s):
+                    return value
+                self._fate.held_back += 1
+                return math.nan
+            fault = Fault.STUCK
+        self._refuse(fault)
+        return math.nan
+
+    def _refuse(self, fault: Fault) -> None:
+        self._health.fail(fault)
+        if fault is Fault.NOT_AVAILABLE:
+            self._fate.not_available += 1
+        elif fault is Fault.STUCK:
+            self._fate.stuck += 1
+        else:
+            self._fate.implausible += 1
+
+
 class InputHealth:
     """Judges every value of a vehicle's signals; pure, driven by the frames' time stamps alone.
 
@@ -66,33 +137,14 @@ class InputHealth:
             for signal in vehicle.signals
         }
         self._pair = None if pack is None else _pair(vehicle, pack)
-        self._still_temperature = Still(0.0)
 
     def __getitem__(self, role: str) -> SignalHealth:
         """Return what is known of one signal."""
         return self._of[role]
 
-    def passed(
-        self, signal: BoundSignal, value: float, time_s: float, fate: MessageCounters
-    ) -> float:
-        """Return a value if it may be used, else NaN; what became of it is counted in `fate`."""
-        health = self._of[signal.role]
-        fault = health.judge(value, time_s)
-        if fault is Fault.NONE and self._is_stuck(signal, value, time_s):
-            fault = Fault.STUCK
-        if fault is Fault.NONE:
-            if health.take(value, time_s):
-                return value
-            fate.held_back += 1
-            return math.nan
-        health.fail(fault)
-        if fault is Fault.NOT_AVAILABLE:
-            fate.not_available += 1
-        elif fault is Fault.STUCK:
-            fate.stuck += 1
-        else:
-            fate.implausible += 1
-        return math.nan
+    def gate(self, signal: BoundSignal, fate: MessageCounters) -> SignalGate:
+        """Return what reads a signal's values; what becomes of them is counted in `fate`."""
+        return SignalGate(signal, self._of[signal.role], self._watch(signal), fate)
 
     def refused(self, key: int, fault: Fault) -> None:
         """Take note that a frame of the message with that key was refused."""
@@ -108,7 +160,7 @@ class InputHealth:
     def latest(self, role: str, now_s: float) -> float:
         """Return a signal's latest value if it still holds at bus time `now_s` [s], else NaN."""
         health = self._of.get(role)
-        return health.latest if health is not None and health.is_usable(now_s) else math.nan
+        return math.nan if health is None else health.value_at(now_s)
 
     @property
     def latest_s(self) -> dict[str, float]:
@@ -130,17 +182,25 @@ class InputHealth:
                     reasons |= _WHY[health.fault]
         return reasons
 
-    def _is_stuck(self, signal: BoundSignal, value: float, time_s: float) -> bool:
-        if signal.role == "temperature":
-            after_s = signal.checks.stuck_after_s
-            if after_s == math.inf or self._still_temperature.take(value, time_s):
-                return False
-            return time_s - self._still_temperature.since_s >= after_s
-        if self._pair is None:
-            return False
-        if signal.role == "current":
-            return self._pair.current(value, time_s)
-        return signal.role == "voltage" and self._pair.voltage(value, time_s)
+    def _watch(self, signal: BoundSignal) -> Watch | None:
+        """Return what notices that a signal is stuck; None where nothing can."""
+        if signal.role == "temperature" and signal.checks.stuck_after_s < math.inf:
+            return _StillFor(signal.checks.stuck_after_s)
+        if self._pair is not None and signal.role in _FAST:
+            return self._pair.current if signal.role == "current" else self._pair.voltage
+        return None
+
+
+class _StillFor:
+    """Says that a signal is stuck once it has stood still for a stated time [s]."""
+
+    def __init__(self, after_s: float) -> None:
+        self._after_s = after_s
+        self._still = Still(0.0)
+
+    def __call__(self, value: float, time_s: float) -> bool:
+        moved = self._still.take(value, time_s)
+        return not moved and time_s - self._still.since_s >= self._after_s
 
 
 def _bounded(role: str, checks: SignalChecks, pack: Pack) -> SignalChecks:

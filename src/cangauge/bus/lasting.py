@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Final
+from typing import Final, TypeVar
 
 import can
 from can.typechecking import CanFilter
@@ -34,6 +34,7 @@ not."""
 REMIND_S: Final = 60.0
 """While nothing changes, a bus that is away is mentioned so often [s]."""
 
+_Received = TypeVar("_Received")
 Opener = Callable[[BusAddress, Sequence[CanFilter] | None], can.BusABC]
 
 
@@ -93,7 +94,7 @@ class LastingPort(BusPort):
             As `open_bus`; with `wait` only where waiting cannot help.
         """
         try:
-            self._bus = self._opener(self._address, self._filters)
+            self._use(self._opener(self._address, self._filters))
         except DriverMissingError:
             raise
         except InputError as error:
@@ -118,18 +119,14 @@ class LastingPort(BusPort):
 
         While the bus is away it waits, and tries to open it.
         """
-        self._voice.look()
-        if self._bus is None:
-            self._try_again(timeout_s)
-            return None
-        try:
-            message = super().receive(timeout_s)
-        except BusError as error:
-            self._lose(error)
-            return None
-        if self.is_off != self._was_off:
-            self._tell_off()
-        return message
+        return self._received(super().receive, timeout_s)
+
+    def receive_waiting(self, timeout_s: float) -> list[can.Message]:
+        """Return the frames that wait; empty if none came in time.
+
+        While the bus is away it waits, and tries to open it.
+        """
+        return self._received(super().receive_waiting, timeout_s) or []
 
     def post(self, message: can.Message, within_s: float = SEND_WITHIN_S) -> None:
         """Send a frame without ever waiting; while the bus is away it is dropped."""
@@ -173,6 +170,23 @@ class LastingPort(BusPort):
             found.append(f"{drops} frames lost in the receive queue")
         return ", ".join(found)
 
+    def _received(
+        self, receive: Callable[[float], _Received], timeout_s: float
+    ) -> _Received | None:
+        """Return what is received; None if the bus is away or goes."""
+        self._voice.look()
+        if self._bus is None:
+            self._try_again(timeout_s)
+            return None
+        try:
+            received = receive(timeout_s)
+        except BusError as error:
+            self._lose(error)
+            return None
+        if self.is_off != self._was_off:
+            self._tell_off()
+        return received
+
     def _lose(self, error: BusError) -> None:
         now_s = time.monotonic()
         if now_s - self._since_s >= STEADY_S:
@@ -215,7 +229,7 @@ class LastingPort(BusPort):
                 away = f"away for {now_s - self._since_s:.0f} s"
                 self._voice.say(f"warning: {self.name}: {away} ({outcome}); trying again")
             return
-        self._bus = outcome
+        self._use(outcome)
         away_s = now_s - self._since_s
         self._away_s += away_s
         self._since_s = now_s

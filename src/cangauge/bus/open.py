@@ -31,8 +31,12 @@ MULTICAST_CHANNEL: Final = "239.74.163.2"
 MULTICAST_HOPS: Final = 0
 """0: packets stay on this machine; 1 (`--bus-option hop_limit=1`): they reach the local network."""
 
-RECEIVE_BUFFER_BYTES: Final = 4 << 20
-"""Asked for at sockets, to ride out pauses: Linux's default holds about 270 frames only."""
+RECEIVE_BUFFER_BYTES: Final = 16 << 20
+"""Asked for at sockets, to ride out pauses: Linux's default holds about 270 frames only. The system
+gives less to those who have no right to more (CAP_NET_ADMIN, or net.core.rmem_max)."""
+
+_SO_RCVBUFFORCE: Final = 33
+"""Linux's; Python has no name for it."""
 
 _DEFAULT_CHANNELS: Final = {
     "socketcan": SOCKETCAN_CHANNEL,
@@ -246,9 +250,13 @@ def _widen_receive_buffer(bus: can.BusABC) -> None:
     if sys.platform == "win32":
         return
     # The driver keeps its socket to itself; a duplicate of the descriptor is the same socket.
-    # What cannot be had is left: the system caps the size silently, or refuses.
-    with suppress(OSError), socket.socket(fileno=os.dup(bus.fileno())) as own:
-        own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+    # What cannot be had is left: the system refuses it, or caps the size silently.
+    options = [socket.SO_RCVBUF]
+    if sys.platform == "linux":
+        options.append(_SO_RCVBUFFORCE)
+    for option in options:
+        with suppress(OSError), socket.socket(fileno=os.dup(bus.fileno())) as own:
+            own.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER_BYTES)
 
 
 def _check_up(bus: can.BusABC, address: BusAddress) -> None:

@@ -30,6 +30,10 @@ class Verdict(enum.IntEnum):
     """Refused: the counter stands still, so this is no new frame."""
 
 
+# Of every frame; members of an enum are slow to look up.
+_GOOD: Final = Verdict.GOOD
+
+
 class Protection(Protocol):
     """How a message shows that it is new and whole."""
 
@@ -211,18 +215,19 @@ class FrameChecker:
     """
 
     __slots__ = (
+        "_counter",
         "_half_round_s",
+        "_is_whole",
         "_last",
         "_last_s",
         "_modulus",
         "_period_s",
         "_refused",
-        "_rule",
         "lost",
     )
 
     def __init__(self, rule: Protection, period_s: float | None = None) -> None:
-        self._rule = rule
+        self._is_whole, self._counter = rule.is_whole, rule.counter
         self._modulus = rule.modulus
         self._period_s = math.inf if period_s is None else period_s
         self._half_round_s = (
@@ -235,18 +240,18 @@ class FrameChecker:
 
     def check(self, data: bytes | bytearray, time_s: float) -> Verdict:
         """Judge one payload, cut to the message's length, received at bus time `time_s` [s]."""
-        rule, modulus = self._rule, self._modulus
-        if not rule.is_whole(data):
+        modulus = self._modulus
+        if not self._is_whole(data):
             self._refused += 1
             return Verdict.CRC_WRONG
         if not modulus:
-            return Verdict.GOOD
-        last, counter = self._last, rule.counter(data)
+            return _GOOD
+        last, counter = self._last, self._counter(data)
         elapsed_s, self._last_s = time_s - self._last_s, time_s
         steps = (counter - last) % modulus
         if steps == 1 or last < 0:
             self._last, self._refused = counter, 0
-            return Verdict.GOOD
+            return _GOOD
         if steps == 0:
             if elapsed_s <= self._half_round_s:
                 return Verdict.REPEATED

@@ -19,10 +19,14 @@ from can.typechecking import CanFilter
 from cangauge.bus.error_frames import BUS_OFF, RESTARTED, UNSPECIFIED, error_kinds
 from cangauge.bus.interface_facts import UNKNOWN_INTERFACE, InterfaceFacts
 from cangauge.bus.queue_drops import queue_drops
+from cangauge.bus.waiting import NothingWaitsError, WaitingFrames, waiting_frames
 from cangauge.errors import CangaugeError
 
 SEND_WITHIN_S: Final = 1.0
 """How long sending may wait for room in the transmit queue [s]."""
+
+AT_ONCE: Final = 64
+"""So many frames that wait are received in one go at most: there is more to do than receive."""
 
 _RETRY_S: Final = 0.0005
 _POSTED_RETRY_S: Final = 0.005
@@ -64,7 +68,10 @@ class BusPort:
     def __init__(
         self, bus: can.BusABC | None, name: str, facts: InterfaceFacts = UNKNOWN_INTERFACE
     ) -> None:
-        self._bus = bus
+        self._bus: can.BusABC | None = None
+        self._waiting: WaitingFrames | None = None
+        self._is_empty = True
+        self._failed: BusError | None = None
         self.name = name
         self.facts = facts
         self.garbled = 0
@@ -74,6 +81,8 @@ class BusPort:
         self.unsent = 0
         self._posted: deque[tuple[float, can.Message]] = deque()
         self._dropped_before: int | None = None
+        if bus is not None:
+            self._use(bus)
 
     def __enter__(self) -> Self:
         return self
@@ -100,20 +109,14 @@ class BusPort:
         BusError
             If the bus is gone.
         """
-        if self._posted:
-            self._send_posted()
-            timeout_s = min(timeout_s, _POSTED_RETRY_S)
+        timeout_s = self._before_receiving(timeout_s)
         try:
             message = self._open_bus().recv(timeout_s)
         except BusError:
             raise
-        except Exception as error:
-            # Drivers raise what they like, asserts and errors of libraries included. One bad
-            # packet is none of the bus's; whatever else it was, this bus is of no more use.
-            if _is_one_packets(error):
-                self.garbled += 1
-                return None
-            raise self._lost(error, "receiving") from error
+        except Exception as error:  # noqa: BLE001 - drivers raise what they like
+            self._sort_out(error)
+            return None
         if message is None:
             return None
         if message.is_error_frame:
@@ -121,6 +124,65 @@ class BusPort:
             return None
         self.is_off = False
         return message
+
+    def receive_waiting(self, timeout_s: float) -> list[can.Message]:
+        """Return the frames that wait, `AT_ONCE` at most; if none does, wait for one.
+
+        Returns
+        -------
+        list of can.Message
+            Those that pass the filters; empty if none came in time, or (sooner) none that passes.
+
+        Raises
+        ------
+        BusError
+            If the bus is gone.
+        """
+        if self._waiting is None:
+            message = self.receive(timeout_s)
+            return [] if message is None else [message]
+        timeout_s = self._before_receiving(timeout_s)
+        if self._failed is not None:
+            raise self._failed
+        try:
+            # While they come faster than they are taken, nobody needs to ask whether any waits.
+            if self._is_empty and not self._waiting.wait(timeout_s):
+                return []
+        except Exception as error:  # noqa: BLE001 - as above
+            self._sort_out(error)
+        return self._read(self._waiting)
+
+    def _read(self, waiting: WaitingFrames) -> list[can.Message]:
+        found: list[can.Message] = []
+        self._is_empty = False
+        take_next = waiting.next
+        for _ in range(AT_ONCE):
+            try:
+                message = take_next()
+            except NothingWaitsError:
+                self._is_empty = True
+                break
+            except Exception as error:  # noqa: BLE001 - as above
+                try:
+                    self._sort_out(error)
+                except BusError as lost:
+                    # What was read before is good; the error comes but once.
+                    self._failed = lost
+                    if found:
+                        break
+                    raise
+                continue
+            if message is None:
+                continue
+            if message.is_error_frame:
+                # Ends this go: whoever looks at `is_off` after each misses no change of it.
+                self.is_off = self.is_off and not found
+                self._count_error(message)
+                return found
+            found.append(message)
+        if found:
+            self.is_off = False
+        return found
 
     def send(self, message: can.Message, within_s: float = SEND_WITHIN_S) -> bool:
         """Send a frame; return False if the transmit queue stayed full for `within_s` [s].
@@ -172,6 +234,8 @@ class BusPort:
         """
         try:
             self._open_bus().set_filters(filters)
+            if self._waiting is not None:
+                self._waiting.forget_filters()
         except BusError:
             raise
         except Exception as error:  # as when receiving
@@ -182,6 +246,27 @@ class BusPort:
         """Whether the bus is open for CAN FD frames."""
         return self._bus is not None and self._bus.protocol is not can.CanProtocol.CAN_20
 
+    def _before_receiving(self, timeout_s: float) -> float:
+        """Send what waits for room; return how long receiving may block then [s]."""
+        if not self._posted:
+            return timeout_s
+        self._send_posted()
+        return min(timeout_s, _POSTED_RETRY_S)
+
+    def _sort_out(self, error: Exception) -> None:
+        """Count what is one packet's fault only; raise what means that the bus is gone.
+
+        Drivers raise what they like, asserts and errors of libraries included. One bad packet is
+        none of the bus's; whatever else it was, this bus is of no more use.
+        """
+        if not _is_one_packets(error):
+            raise self._lost(error, "receiving") from error
+        self.garbled += 1
+
+    def _use(self, bus: can.BusABC) -> None:
+        self._bus, self._waiting = bus, waiting_frames(bus)
+        self._is_empty, self._failed = True, None
+
     def _open_bus(self) -> can.BusABC:
         if self._bus is None:
             raise BusError(f"{self.name}: not open")
@@ -191,6 +276,9 @@ class BusPort:
         """Give up the bus, if there is one, without closing it."""
         self._dropped_before = self.queue_drops
         bus, self._bus = self._bus, None
+        if self._waiting is not None:
+            self._waiting.close()
+            self._waiting = None
         self.unsent += len(self._posted)
         self._posted.clear()
         self.is_off = False

@@ -60,6 +60,12 @@ class Trust(enum.IntEnum):
     INVALID = 2
 
 
+# Of every value; members of an enum are slow to look up.
+_NO_FAULT: Final = Fault.NONE
+_VALID: Final = Trust.VALID
+_INVALID: Final = Trust.INVALID
+
+
 class SignalHealth:
     """Judges the values of one signal, one after the other.
 
@@ -136,17 +142,17 @@ class SignalHealth:
             most = checks.max_jump + checks.max_rate_per_s * abs(time_s - self.latest_s)
             if abs(value - self.latest) > most:  # never before the first good value: NaN
                 return Fault.RATE
-        return Fault.NONE
+        return _NO_FAULT
 
     def take(self, value: float, time_s: float) -> bool:
         """Take a good value; return whether it may be used, or is held back."""
         self._failures = 0
-        if self.trust is Trust.INVALID:
+        if self.trust is _INVALID:
             self._passes += 1
             if self._passes < self._checks.valid_after:
                 return False
-        self.trust = Trust.VALID
-        self.fault = Fault.NONE
+        self.trust = _VALID
+        self.fault = _NO_FAULT
         self.latest, self.latest_s = value, time_s
         return True
 
@@ -171,7 +177,11 @@ class SignalHealth:
 
     def is_usable(self, now_s: float) -> bool:
         """Return whether the latest good value still holds at `now_s` [s]."""
-        return self.trust is Trust.VALID and not self.is_old(now_s)
+        return self.trust is _VALID and not self.is_old(now_s)
+
+    def value_at(self, now_s: float) -> float:
+        """Return the latest good value if it still holds at `now_s` [s], else NaN."""
+        return self.latest if self.is_usable(now_s) else math.nan
 
     @property
     def is_failing(self) -> bool:
@@ -207,4 +217,5 @@ class SignalHealth:
         if math.isnan(learned_s):
             self._learned_s = step_s
         else:
-            self._learned_s += _LEARN_WEIGHT * (min(step_s, _PAUSE * learned_s) - learned_s)
+            step_s = min(step_s, _PAUSE * learned_s)
+            self._learned_s = learned_s + _LEARN_WEIGHT * (step_s - learned_s)

@@ -115,7 +115,11 @@ class Swings:
 
     def take(self, value: float, size: float) -> None:
         """Take a value."""
-        self._low, self._high = min(self._low, value), max(self._high, value)
+        # Of every value, so no `min` and `max`: they would cost more than all the rest.
+        if value < self._low:  # noqa: PLR1730
+            self._low = value
+        if value > self._high:  # noqa: PLR1730
+            self._high = value
         if self._rises <= 0 and value - self._low >= size:
             self._turn(1, value)
         elif self._rises >= 0 and self._high - value >= size:
@@ -153,28 +157,41 @@ class StuckPair:
         self._current, self._voltage = Still(current_step_a), Still(voltage_step_v)
         # What the other one did while this one stood still.
         self._voltage_swings, self._current_swings = Swings(), Swings()
+        self._size_current_swings()
+        self._size_voltage_swings()
 
     def current(self, current_a: float, time_s: float) -> bool:
         """Take a current [A]; return whether the current is stuck."""
         if self._current.take(current_a, time_s):
             self._voltage_swings.reset()
-        pack = self._pack
-        if math.isfinite(pack.resistance_ohm) and pack.resistance_ohm > 0.0:
-            swing_v = STEPS * self._voltage.step(UNKNOWN_STEP)
-            size_a = max(swing_v / pack.resistance_ohm, SWING_C_RATE * pack.capacity_ah)
-            self._current_swings.take(current_a, size_a)
+            self._size_voltage_swings()
+        self._current_swings.take(current_a, self._current_swing_a)
         return _stuck(self._current, self._voltage_swings, self._after_s[0], time_s)
 
     def voltage(self, voltage_v: float, time_s: float) -> bool:
         """Take a voltage [V]; return whether the voltage is stuck."""
         if self._voltage.take(voltage_v, time_s):
             self._current_swings.reset()
+            self._size_current_swings()
+        self._voltage_swings.take(voltage_v, self._voltage_swing_v)
+        return _stuck(self._voltage, self._current_swings, self._after_s[1], time_s)
+
+    def _size_current_swings(self) -> None:
+        """Say what counts as a swing of the current [A], beside the voltage as it moves now."""
+        pack = self._pack
+        self._current_swing_a = math.inf
+        if math.isfinite(pack.resistance_ohm) and pack.resistance_ohm > 0.0:
+            swing_v = STEPS * self._voltage.step(UNKNOWN_STEP)
+            self._current_swing_a = max(
+                swing_v / pack.resistance_ohm, SWING_C_RATE * pack.capacity_ah
+            )
+
+    def _size_voltage_swings(self) -> None:
+        """Say what counts as a swing of the voltage [V], beside the current as it moves now."""
         pack = self._pack
         swing_a = max(STEPS * self._current.step(0.0), SWING_C_RATE * pack.capacity_ah)
         size_v = max(swing_a * pack.resistance_ohm, ERRORS * pack.error_std_v)
-        if size_v > 0.0:
-            self._voltage_swings.take(voltage_v, size_v)
-        return _stuck(self._voltage, self._current_swings, self._after_s[1], time_s)
+        self._voltage_swing_v = size_v if size_v > 0.0 else math.inf
 
 
 def _stuck(still: Still, swings: Swings, after_s: float, time_s: float) -> bool:

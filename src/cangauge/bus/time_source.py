@@ -64,7 +64,7 @@ class ReceiveTime:
 
     def time_of(self, message: can.Message) -> float | None:
         """Return the frame's bus time [s]."""
-        now_us = whole_us(message.timestamp) + self._shift_us
+        now_us = round(message.timestamp * 1e6) + self._shift_us  # `whole_us`, of every frame
         last_us = self._last_us
         if last_us is not None and now_us < last_us - STEP_BACK_S * 1e6:
             self.steps_back += 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -141,7 +141,7 @@ def from_capture(
     _check_sign(recording)
     # All that is asked of the log here is what a recording has.
     scores = score(found.table, cast("Log", recording), found.seconds)
-    facts = {"time_source": found.time_source, "frames": vars(found.counts)}
+    facts = {"time_source": found.time_source, "frames": asdict(found.counts)}
     origin: Origin = "voltage" if settings.initial_soc_pct is None else "given"
     return Estimated(recording, found.table, scores, settings, origin, facts)
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Literal
 
 import numpy as np
@@ -88,7 +88,7 @@ class Since:
 
     def state(self) -> SinceState:
         """Return what is to be remembered."""
-        return SinceState.model_construct(**vars(self))
+        return SinceState.model_construct(**asdict(self))
 
     @classmethod
     def of(cls, state: SinceState) -> Since:

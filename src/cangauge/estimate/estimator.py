@@ -7,7 +7,6 @@ or after each tick of bus time. The same samples give the same numbers, live or 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 from cangauge.errors import InputError
 from cangauge.estimate.anchors import Anchor, AnchorWatch
@@ -78,6 +77,7 @@ class Estimator:
         extended = model.extended_model()
         self._model = extended.model
         self._online = extended.online(self.settings.capacity_ah)
+        self._is_plain = self._online.plain
         self.capacity_ah = self._online.capacity_ah
         self._counter = CoulombCounter(self.capacity_ah, self.settings.gap_s)
         self._line = DelayLine(self._model.delay_s, gap_s=self.settings.gap_s)
@@ -151,19 +151,19 @@ class Estimator:
         if time_s is None:
             return
         stamp_s = sample.time_s
-        if not self._online.plain:
+        if not self._is_plain:
             self._make()  # an effect may hold this sample back, and the estimate stays that one
-        sample, self._implausible = cleaned(sample._replace(time_s=time_s), self._usual_v)
+        if time_s != stamp_s:
+            sample = sample._replace(time_s=time_s)
+        sample, self._implausible = cleaned(sample, self._usual_v)
         if self._samples == 0:
             self._first_s = time_s
         self._samples += 1
-        corrected = self._corrected(sample)
-        for item in corrected:
-            self._take(item)
-        if corrected:
-            self._unmade = corrected[-1], stamp_s
+        if self._is_plain:
+            self._take(sample)
+            self._unmade = sample, stamp_s
         else:
-            self._made = self._made._replace(time_s=stamp_s, samples=self._samples)
+            self._take_corrected(sample, stamp_s)
 
     @property
     def estimate(self) -> Estimate:
@@ -174,10 +174,14 @@ class Estimator:
         reasons = made.reasons | Reason.IMPLAUSIBLE_INPUT
         return made._replace(reasons=reasons, status=status_of(reasons))
 
-    def _corrected(self, sample: Sample) -> Sequence[Sample]:
-        if self._online.plain:
-            return (sample,)
-        return [Sample(*reading) for reading in self._online.correct(Reading(*sample))]
+    def _take_corrected(self, sample: Sample, stamp_s: float) -> None:
+        corrected = [Sample(*reading) for reading in self._online.correct(Reading(*sample))]
+        for item in corrected:
+            self._take(item)
+        if corrected:
+            self._unmade = corrected[-1], stamp_s
+        else:
+            self._made = self._made._replace(time_s=stamp_s, samples=self._samples)
 
     def _take(self, sample: Sample) -> None:
         time_s, current_a = sample.time_s, sample.current_a
@@ -186,7 +190,7 @@ class Estimator:
         self._account(charge, time_s, current_a)
         if math.isfinite(sample.temperature_c):
             self._temperature_c = sample.temperature_c
-        if not self._online.plain:
+        if not self._is_plain:
             self._online.advance(
                 time_s, current_a, self._known_temperature_c(), self._line.currents()
             )

@@ -13,6 +13,8 @@ TEMPERATURE_WITHIN_C = (-60.0, 120.0)
 VOLTAGE_WITHIN = (0.5, 1.5)
 """Beyond these no current, temperature or voltage (relative to half charge) is believed."""
 
+_NO_REASON = Reason.NONE  # of every sample; members of an enum are slow to look up
+
 SOC_MARGIN_PCT = 1.0
 TEMPERATURE_MARGIN_K = 1.0
 CURRENT_MARGIN = 1.1
@@ -40,7 +42,7 @@ def cleaned(sample: Sample, usual_v: float) -> tuple[Sample, Reason]:
     usual_v : float
         Voltage of the pack at half charge [V]; a contactor that is open shows next to nothing.
     """
-    reason = Reason.NONE
+    reason = _NO_REASON
     low, high = VOLTAGE_WITHIN[0] * usual_v, VOLTAGE_WITHIN[1] * usual_v
     if not math.isnan(sample.voltage_v) and not low <= sample.voltage_v <= high:
         sample = sample._replace(voltage_v=math.nan)

@@ -51,6 +51,10 @@ def settled(
     return np.asarray(since >= longest_delay_s)
 
 
+_BLOCK = 512
+"""So many currents that nobody needs any more are dropped at once."""
+
+
 class DelayLine:
     """Ring buffer of current, as long as the longest delay.
 
@@ -89,8 +93,8 @@ class DelayLine:
         times.append(time_s)
         currents.append(current_a)
         # Drop in blocks: popping one element from the front of a list at each push costs more.
-        stale = bisect_right(times, time_s - self._longest) - 1
-        if stale > 512:
+        if len(times) > _BLOCK + 1 and times[_BLOCK + 1] <= time_s - self._longest:
+            stale = bisect_right(times, time_s - self._longest) - 1
             del times[:stale]
             del currents[:stale]
 

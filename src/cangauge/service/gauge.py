@@ -113,11 +113,17 @@ class Gauge:
             wanted.append(standard_filter(self.settings.ids.replay_clock))
         return wanted
 
+    def take(self, message: can.Message) -> bool:
+        """Take one frame; return whether it completed a sample."""
+        return self._stream.take(message)
+
+    def acknowledgement(self) -> list[can.Message]:
+        """Return what to send at once after a sample, which only a replay's time asks for."""
+        return self._publish(self._stream.latest) if self._is_replay else []
+
     def handle(self, message: can.Message) -> list[can.Message]:
-        """Take one frame; return those to send at once, which only a replay's time asks for."""
-        if not self._stream.take(message) or not self._is_replay:
-            return []
-        return self._publish(self._stream.latest)
+        """Take one frame; return those to send at once."""
+        return self.acknowledgement() if self.take(message) else []
 
     def finish(self) -> list[can.Message]:
         """Return the last frames to send, at the end."""
@@ -135,8 +141,8 @@ class Gauge:
         is_stale : bool
             No sample within the service's time-out: the latest estimate is told as invalid.
         silent_s : float
-            Time since the latest sample by the loop's monotonic clock [s]. While the receive
-            stamps are bus time, the current's own time-out counts, too.
+            Time since the latest sample came in, by the loop's monotonic clock [s]. While the
+            receive stamps are bus time, the current's own time-out counts, too.
         """
         estimate = self._stream.told
         is_stale = is_stale or (not self._is_replay and silent_s > self._stream.current_timeout_s)

@@ -88,8 +88,9 @@ class Outputs:
         Asked like `stop`; if the gauge has been given another configuration, it returns the
         loop's.
     stepped : callable, optional
-        Takes, after every sample, the receive stamp [s] of the frame that completed it, the time
-        from receiving it to having taken the sample in [s], and the monotonic time [s].
+        Takes, after every sample, or where several frames waited after the last of theirs, the
+        receive stamp [s] of the frame that completed it, the time from receiving to having taken
+        it in [s] (the mean of them), and the monotonic time at which that frame came in [s].
     sent : callable, optional
         Called after frames were sent.
     """
@@ -111,7 +112,8 @@ class RunSummary:
     seconds: float
     cpu_seconds: float
     step_p50_us: float | None
-    """Median time from receiving a frame that completes a sample to having taken that in [µs]."""
+    """Median time from receiving a frame that completes a sample to having taken that in [µs]; of
+    frames that waited together the mean counts."""
     rival_frames: int = 0
     """Frames with this service's ids that somebody else sent."""
 
@@ -169,14 +171,19 @@ class _Loop:
         self._outputs = outputs
         self.rivals = Rivals(gauge.settings.ids, echoes=port.facts.echoes, warn=outputs.warn)
         self._upkeep = Upkeep(port, outputs.checkpoint, settings.checkpoint_every_s, outputs.warn)
-        self._ignores_clock = gauge.settings.time_source == "receive"
+        self._ignores_clock = self._awaits_clock = gauge.settings.time_source == "receive"
+        self._stamps_are_wall_time = port.facts.stamps == "kernel"
+        self._no_input: frozenset[int] = frozenset()
         self._set_filters()
         self.began_s = time.monotonic()
         self.step_s: deque[float] = deque(maxlen=STEPS_KEPT)
         self._now_s = self.began_s
         self._beat_s = self.began_s
         self._glance_s = self.began_s
+        # When the latest sample was taken, and when it had come in: while the service lags behind
+        # (after a pause, under load) frames wait in the socket, and are old when they are read.
         self._sample_s = self.began_s
+        self._came_s = self.began_s
 
     def is_over(self) -> bool:
         settings = self._settings
@@ -190,17 +197,17 @@ class _Loop:
 
     def turn(self) -> None:
         left_s = self._beat_s + LATE_S - self._now_s
-        message = self._port.receive(min(max(left_s, 0.0), LOOK_EVERY_S))
-        # The clock is asked once a frame and once a sample: where it takes a system call that is
-        # not little.
+        messages = self._port.receive_waiting(min(max(left_s, 0.0), LOOK_EVERY_S))
+        # The clock is asked once a turn and once more if there was a sample: where it takes a
+        # system call that is not little.
         self._now_s = time.monotonic()
         before = self._gauge.samples
-        if message is not None:
-            self._take(message)
+        if messages:
+            self._take(messages)
         late_s = 0.0 if self._gauge.samples != before else LATE_S
         if self._now_s >= self._beat_s + late_s:
             self._beat()
-        if message is None or self._now_s >= self._glance_s:
+        if self._now_s >= self._glance_s:
             self._glance_s = self._now_s + GLANCE_EVERY_S
             self._look_after_others()
 
@@ -215,7 +222,7 @@ class _Loop:
             self._outputs.show(self._now_s)
 
     def _beat(self) -> None:
-        gauge, silent_s = self._gauge, self._now_s - self._sample_s
+        gauge, silent_s = self._gauge, self._now_s - self._came_s
         is_stale = silent_s > max(self._settings.timeout_s, gauge.patience_s)
         self._send(gauge.heartbeat(is_stale=is_stale, silent_s=silent_s))
         # On the grid of the clock, whatever came when; beats that were slept through are left out.
@@ -232,28 +239,44 @@ class _Loop:
     def save(self) -> None:
         self._upkeep.finish()
 
-    def _take(self, message: can.Message) -> None:
-        gauge = self._gauge
+    def _take(self, messages: list[can.Message]) -> None:
+        gauge, record, table = self._gauge, self._outputs.record, self._outputs.table
+        before, stamp_s = gauge.samples, math.nan
+        for message in messages:
+            if message.arbitration_id in self._no_input and self._is_no_input(message):
+                continue
+            if record is not None:
+                record.write(message)
+            received_s = message.timestamp
+            if not gauge.take(message):
+                continue
+            stamp_s = received_s
+            if table is not None:
+                self._tell()
+            if frames := gauge.acknowledgement():
+                self._send(frames)
+                self._beat_s = self._now_s + ESTIMATE_EVERY_S
+        if gauge.samples != before:
+            self._note_samples(gauge.samples - before, stamp_s)
+
+    def _is_no_input(self, message: can.Message) -> bool:
+        """Whether a frame with an id that is not a vehicle's is to be left out; then see to it."""
         if self.rivals.takes(message, self._now_s):
-            return
-        if self._ignores_clock and is_clock(message, gauge.settings.ids.replay_clock):
-            self._warn_of_clock()
-            return
-        if self._outputs.record is not None:
-            self._outputs.record.write(message)
-        before, stamp_s = gauge.samples, message.timestamp
-        frames = gauge.handle(message)
-        if gauge.samples == before:
-            return
-        came_s, self._now_s = self._now_s, time.monotonic()
-        self._sample_s, step_s = self._now_s, self._now_s - came_s
+            return True
+        if self._ignores_clock and is_clock(message, self._gauge.settings.ids.replay_clock):
+            if self._awaits_clock:
+                self._warn_of_clock()
+            return True
+        return False
+
+    def _note_samples(self, samples: int, stamp_s: float) -> None:
+        before_s, self._now_s = self._now_s, time.monotonic()
+        self._sample_s, step_s = self._now_s, (self._now_s - before_s) / samples
+        lag_s = max(time.time() - stamp_s, 0.0) if self._stamps_are_wall_time else 0.0
+        self._came_s = self._now_s - lag_s
         self.step_s.append(step_s)
         if self._outputs.stepped is not None:
-            self._outputs.stepped(stamp_s, step_s, self._now_s)
-        self._tell()
-        if frames:
-            self._send(frames)
-            self._beat_s = self._sample_s + ESTIMATE_EVERY_S
+            self._outputs.stepped(stamp_s, step_s, self._came_s)
 
     def _tell(self) -> None:
         sample = self._gauge.latest_sample
@@ -268,14 +291,16 @@ class _Loop:
             self._outputs.sent()
 
     def _set_filters(self) -> None:
+        clock_id = self._gauge.settings.ids.replay_clock
         wanted = [*self._gauge.filters, *self.rivals.filters]
-        if self._ignores_clock:
+        if self._awaits_clock:
             # Listened for, to warn, until the first one.
-            wanted.append(standard_filter(self._gauge.settings.ids.replay_clock))
+            wanted.append(standard_filter(clock_id))
+        self._no_input = self.rivals.ids | ({clock_id} if self._ignores_clock else set())
         self._port.set_filters(wanted)
 
     def _warn_of_clock(self) -> None:
-        self._ignores_clock = False
+        self._awaits_clock = False
         self._set_filters()
         if self._outputs.warn is not None:
             self._outputs.warn(

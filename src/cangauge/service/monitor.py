@@ -99,7 +99,7 @@ class Monitor:
         self._pace = Pace()
         self.latest = self._snapshot(now_s)
 
-    def stepped(self, stamp_s: float, step_s: float, now_s: float) -> None:
+    def stepped(self, stamp_s: float, step_s: float, came_s: float) -> None:
         """Count a step of the estimator.
 
         Parameters
@@ -108,10 +108,10 @@ class Monitor:
             Receive stamp of the frame that completed the sample, seconds since 1970.
         step_s : float
             From receiving that frame to having taken the sample in [s].
-        now_s : float
-            Monotonic clock [s].
+        came_s : float
+            When that frame came in, by the monotonic clock [s].
         """
-        self._sample_s = now_s
+        self._sample_s = came_s
         self._untold_stamp_s = stamp_s
         self._step.add(step_s)
 

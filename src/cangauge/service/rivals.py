@@ -41,6 +41,8 @@ class Rivals:
     ----------
     frames : int
         Frames with own ids that others sent.
+    ids : frozenset of int
+        What it looks out for.
     """
 
     def __init__(
@@ -56,12 +58,12 @@ class Rivals:
 
     def use(self, ids: FrameIds) -> None:
         """Look out for these ids from now on."""
-        self._ids = {ids.soc_estimate, ids.soc_detail}
+        self.ids = frozenset({ids.soc_estimate, ids.soc_detail})
 
     @property
     def filters(self) -> list[CanFilter]:
         """What must be received to notice them."""
-        return [standard_filter(each) for each in sorted(self._ids)]
+        return [standard_filter(each) for each in sorted(self.ids)]
 
     def sent(self, message: can.Message) -> None:
         """Note a frame of one's own."""
@@ -77,7 +79,7 @@ class Rivals:
         now_s : float
             Monotonic time [s].
         """
-        if message.arbitration_id not in self._ids or message.is_extended_id:
+        if message.arbitration_id not in self.ids or message.is_extended_id:
             return False
         if not self._is_echo(message):
             self._note(message.arbitration_id, now_s)

@@ -137,11 +137,19 @@ class EstimateStream:
         if self._time.beginnings != self.beginnings:
             self._begin_anew()
         message.timestamp = time_s
-        return self._step(self._assembler.handle(message))
+        sample = self._assembler.handle(message)
+        if sample is None:
+            return False
+        self._step(sample)
+        return True
 
     def finish(self) -> Estimate | None:
         """Return the estimate after a last current that still waits for a voltage, if any."""
-        return self.latest if self._step(self._assembler.flush()) else None
+        sample = self._assembler.flush()
+        if sample is None:
+            return None
+        self._step(sample)
+        return self.latest
 
     @property
     def latest(self) -> Estimate:
@@ -250,14 +258,11 @@ class EstimateStream:
         self._estimator = Estimator(self._model, self._settings)
         return True
 
-    def _step(self, sample: Sample | None) -> bool:
-        if sample is None:
-            return False
+    def _step(self, sample: Sample) -> None:
         self.samples += 1
         self.latest_sample = sample
         self._estimator.take(sample)
         self._is_behind = True
-        return True
 
     def _catch_up(self) -> None:
         """Ask for the estimate after the latest sample, unless that was done."""
