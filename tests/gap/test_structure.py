@@ -39,7 +39,7 @@ def model() -> ModelFile:
 
 
 def needed_of(settled: Settled) -> set[str]:
-    pieces = needed(settled.frame, settled.reference_grams, settled.clean_error)
+    pieces = needed(settled.frame, settled.reference_grams, settled.error)
     return {settled.frame.choices[k].effect.id for k in pieces}
 
 

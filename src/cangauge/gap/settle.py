@@ -64,9 +64,6 @@ class Settled:
     options: FitOptions
     frame: Frame
     error: ErrorModel
-    """At the diagnosed logs' temperatures."""
-    clean_error: ErrorModel
-    """At those of the references."""
     references: tuple[LogTerms, ...]
     diagnosed: tuple[LogTerms, ...]
     as_given: ExtendedModel
@@ -153,7 +150,6 @@ def settle(
     of_references = [prepare_log(log, replace(options, initial_soc_pct=None)) for log in references]
     frame = _frame(model_file, choices, of_references, of_logs)
     error = error_from_noise(model_file.noise, model_file.rate_hz, frame)
-    clean_error = error
     if of_references:
         say("learning from the references")
         reference_terms = _reference_terms(of_references, model, frame)
@@ -163,7 +159,6 @@ def settle(
             least_trust = 0.0 if covered else LEAST_TRUST_BEYOND
             error = error_from_references(frame, grams, error, least_trust)
             error = with_strays(frame, grams, error, counting(of_references, of_logs))
-            clean_error = error
             if not covered:
                 error = _beyond_the_references(error)
         solution, _ = within_bounds(gather(frame, grams, [], error), model.model, [])
@@ -182,7 +177,6 @@ def settle(
         options,
         frame,
         error,
-        clean_error,
         _reference_terms(of_references, model, frame),
         tuple(diagnosed),
         given,
