@@ -11,7 +11,6 @@ from real_trips import checks, judge
 
 pytestmark = [pytest.mark.real, pytest.mark.slow]
 
-
 MISSED = {"chain_capacity_high: 2σ coverage ≤"}
 """Stated in the README: the band is wider there than it should be (over 99 %)."""
 
@@ -32,9 +31,3 @@ def test_capacity_comes_from_the_training_trips(result: dict[str, object]) -> No
 
 def test_chain_lasts_at_least_three_hours(result: dict[str, object]) -> None:
     assert result["chain_hours"] >= 3.0
-
-
-def test_with_effects_every_target_is_met_by_the_one_model(shared_data: Path) -> None:
-    repaired = judge(shared_data / "bmw_i3", Console(quiet=True), ("auto",))
-    assert repaired["effects"]
-    assert [row for row in checks(repaired) if not row["met"]] == []
