@@ -30,10 +30,9 @@ $(VENV)/installed-dev: $(VENV)/installed
 demo: $(VENV)/installed
 	$(BIN)/cangauge demo
 
-# A worker a core; the tests of a file stay together, since they share what is slow to prepare, and in
-# their order: by number, the files of few but long tests would come last, on one worker.
+# A worker a core; the tests of a file stay together, since they share what is slow to prepare.
 test: $(VENV)/installed-dev
-	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check
