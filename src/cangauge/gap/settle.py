@@ -148,14 +148,14 @@ def settle(
     say = progress or _silent
     of_logs = [prepare_log(log, options) for log in logs]
     of_references = [prepare_log(log, replace(options, initial_soc_pct=None)) for log in references]
-    frame = _frame(model_file, choices, of_references, of_logs)
+    covered = not of_references or _temperatures_covered(of_references, of_logs)
+    frame = _frame(model_file, choices, has_references=bool(of_references), covered=covered)
     error = error_from_noise(model_file.noise, model_file.rate_hz, frame)
     if of_references:
         say("learning from the references")
         reference_terms = _reference_terms(of_references, model, frame)
         grams = [gram_of(terms, frame.scale) for terms in reference_terms]
         if len(grams) > 1:
-            covered = _temperatures_covered(of_references, of_logs)
             least_trust = 0.0 if covered else LEAST_TRUST_BEYOND
             error = error_from_references(frame, grams, error, least_trust)
             error = with_strays(frame, grams, error, counting(of_references, of_logs))
@@ -180,7 +180,7 @@ def settle(
         _reference_terms(of_references, model, frame),
         tuple(diagnosed),
         given,
-        not of_references or _temperatures_covered(of_references, of_logs),
+        covered,
     )
 
 
@@ -209,13 +209,13 @@ def _terms(
 def _frame(
     model_file: ModelFile,
     choices: Sequence[Candidate],
-    references: Sequence[Prepared],
-    diagnosed: Sequence[Prepared],
+    *,
+    has_references: bool,
+    covered: bool,
 ) -> Frame:
     # References that were never so cold cannot have shown what resistance does there.
-    covered = not references or _temperatures_covered(references, diagnosed)
     found: dict[tuple[object, ...], int] = {}
-    for k, choice in enumerate(choices if references else ()):
+    for k, choice in enumerate(choices if has_references else ()):
         if choice.effect.is_structure and (covered or not _follows_temperature(choice)):
             # The first of one shape: that which an effect does when it is small.
             found.setdefault((choice.effect.id, *choice.shape.items()), k)
