@@ -75,8 +75,23 @@ class LogTerms:
         )
 
 
-def log_terms(prepared: Prepared, model: ExtendedModel, choices: Sequence[Candidate]) -> LogTerms:
-    """Return the terms of one log, with the columns of some candidates."""
+def log_terms(
+    prepared: Prepared,
+    model: ExtendedModel,
+    choices: Sequence[Candidate],
+    acting: ExtendedModel | None = None,
+) -> LogTerms:
+    """Return the terms of one log, with the columns of some candidates.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    model : ExtendedModel
+    choices : sequence of Candidate
+    acting : ExtendedModel, optional
+        The model with the structure that references call for. What an effect does to the signals
+        or to the count shows through all that depends on them, in this model and not in the other.
+    """
     voltage_model = model.model
     rows = prepared.rows
     current = prepared.log.current_a
@@ -88,8 +103,10 @@ def log_terms(prepared: Prepared, model: ExtendedModel, choices: Sequence[Candid
         ]
     )
     smooth = as_modelled(prepared, model)
-    here = residual(smooth, model)
     state = state_of(smooth, model)
+    through = acting or model
+    smooth_through = smooth if acting is None else as_modelled(prepared, through)
+    here = residual(smooth_through, through)
     return LogTerms(
         prepared=prepared,
         residual_v=residual(prepared, model),
@@ -98,5 +115,10 @@ def log_terms(prepared: Prepared, model: ExtendedModel, choices: Sequence[Candid
         if model.effects
         else columns_of(rows, voltage_model.epsilon, voltage_model.t_ref_c),
         own=own,
-        effects=tuple(effect_columns(smooth, model, choice, here, state) for choice in choices),
+        effects=tuple(
+            effect_columns(smooth, model, choice, here, state)
+            if choice.effect.adds_voltage_only
+            else effect_columns(smooth_through, through, choice, here)
+            for choice in choices
+        ),
     )

@@ -15,16 +15,13 @@ from cangauge.gap.columns import Candidate, residual
 from cangauge.gap.evidence import gather
 from cangauge.gap.scores import Score
 from cangauge.gap.settle import Settled
-from cangauge.gap.structure import with_needed_structure
+from cangauge.gap.structure import needed, with_pieces
 from cangauge.model.effects.effect import Effect, Pack, Values
 from cangauge.model.effects.library import LIBRARY, effect_entries, one_of
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Made, ModelFile, Ranges
 
 FloatArray = NDArray[np.float64]
-
-NEGLIGIBLE = 1e-3
-"""A repair smaller than this part of its bounds is left out."""
 
 BELONGS_TO_A_LOG = frozenset({"initial_soc"})
 """Effects of one log that a model for later drives must not carry on."""
@@ -48,7 +45,7 @@ def extend(settled: Settled, accepted: Sequence[Score]) -> Extension:
     settled : Settled
     accepted : sequence of Score
     """
-    settled = with_needed_structure(settled)
+    settled = _with_needed_structure(settled)
     evidence = gather(
         settled.frame, settled.reference_grams, settled.diagnosed_grams, settled.error
     )
@@ -67,6 +64,26 @@ def extend(settled: Settled, accepted: Sequence[Score]) -> Extension:
     return Extension(model, cause, tuple(remarks))
 
 
+def _with_needed_structure(settled: Settled) -> Settled:
+    """Return the common ground with no more structure than the references call for.
+
+    Under the error that is expected of the diagnosed logs: beyond the references' temperatures that
+    is a large one, and little is worth a piece. (On winter trips, all that summer trips call for
+    made the voltage better and the SoC worse.)
+    """
+    before = settled.frame
+    frame = replace(before, repairs=needed(before, settled.reference_grams, settled.error))
+    at = [before.shown.index(k) for k in frame.shown]
+    return replace(
+        settled,
+        frame=frame,
+        references=tuple(
+            replace(terms, effects=tuple(terms.effects[k] for k in at))
+            for terms in settled.references
+        ),
+    )
+
+
 def _base(settled: Settled, solution: FloatArray) -> tuple[ExtendedModel, list[str]]:
     """Return the given model with coefficients and structure that the references add."""
     given, frame = settled.model, settled.frame
@@ -76,15 +93,7 @@ def _base(settled: Settled, solution: FloatArray) -> tuple[ExtendedModel, list[s
     if voltage_model is None:
         voltage_model = given.model
         remarks.append("the coefficients stay: moved, the pseudo-OCV would not rise everywhere")
-    base = replace(given, model=voltage_model)
-    at = p
-    for k in frame.repairs:
-        choice = frame.choices[k]
-        low, high = choice.bounds[:, 0], choice.bounds[:, 1]
-        amplitude = np.clip(solution[at : at + low.size], low, high)
-        at += low.size
-        if np.any(np.abs(amplitude) > NEGLIGIBLE * (high - low)):
-            base = base.with_effect(choice.effect, choice.values(amplitude))
+    base = with_pieces(replace(given, model=voltage_model), frame, solution[p:])
     return base, remarks
 
 

@@ -28,6 +28,7 @@ from cangauge.gap.references import (
     error_from_references,
     with_strays,
 )
+from cangauge.gap.structure import repaired
 from cangauge.identify.options import FitOptions
 from cangauge.logs.log import Log
 from cangauge.model.effects.effect import Effect
@@ -151,6 +152,7 @@ def settle(
     covered = not of_references or _temperatures_covered(of_references, of_logs)
     frame = _frame(model_file, choices, has_references=bool(of_references), covered=covered)
     error = error_from_noise(model_file.noise, model_file.rate_hz, frame)
+    acting: ExtendedModel | None = None
     if of_references:
         say("learning from the references")
         reference_terms = _reference_terms(of_references, model, frame)
@@ -161,6 +163,8 @@ def settle(
             error = with_strays(frame, grams, error, counting(of_references, of_logs))
             if not covered:
                 error = _beyond_the_references(error)
+        say("repairing the structure")
+        acting = repaired(model, frame, grams, error)
         solution, _ = within_bounds(gather(frame, grams, [], error), model.model, [])
         change = solution[: frame.scale.size]
         learned = moved(model.model, change)
@@ -171,13 +175,13 @@ def settle(
     diagnosed = []
     for item in of_logs:
         say(f"weighing {item.log.name} against every effect")
-        diagnosed.append(_terms(item, model, effects, choices))
+        diagnosed.append(_terms(item, model, effects, choices, acting))
     return Settled(
         model,
         options,
         frame,
         error,
-        _reference_terms(of_references, model, frame),
+        _reference_terms(of_references, model, frame, acting),
         tuple(diagnosed),
         given,
         covered,
@@ -185,11 +189,15 @@ def settle(
 
 
 def _reference_terms(
-    references: Sequence[Prepared], model: ExtendedModel, frame: Frame
+    references: Sequence[Prepared],
+    model: ExtendedModel,
+    frame: Frame,
+    acting: ExtendedModel | None = None,
 ) -> tuple[LogTerms, ...]:
     wanted = tuple(dict.fromkeys(frame.shown))  # structure may be a log's own as well
     at = [wanted.index(k) for k in frame.shown]
-    found = [log_terms(item, model, [frame.choices[k] for k in wanted]) for item in references]
+    choices = [frame.choices[k] for k in wanted]
+    found = [log_terms(item, model, choices, acting) for item in references]
     return tuple(replace(terms, effects=tuple(terms.effects[k] for k in at)) for terms in found)
 
 
@@ -198,12 +206,13 @@ def _terms(
     model: ExtendedModel,
     effects: Sequence[Effect],
     choices: Sequence[Candidate],
+    acting: ExtendedModel | None,
 ) -> LogTerms:
     # A shape may depend on the log (a moment as a part of its length), so each has its own list.
     own = candidates(effects, model.pack, prepared.log.time_s, elsewhere=True)
     if len(own) != len(choices):
         raise InputError("the effects' shapes differ between logs", source=prepared.log.source)
-    return log_terms(prepared, model, own)
+    return log_terms(prepared, model, own, acting)
 
 
 def _frame(
