@@ -71,6 +71,9 @@ class Settled:
     """The model before its temperatures were widened; what the gap is measured from."""
     covered: bool = True
     """Whether references have been at the diagnosed logs' temperatures."""
+    acting: ExtendedModel | None = None
+    """The model with the structure that references call for, in which effects on signals and count
+    are weighed (`columns.log_terms`)."""
 
     @cached_property
     def given_errors_v(self) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...]]:
@@ -185,6 +188,7 @@ def settle(
         tuple(diagnosed),
         given,
         covered,
+        acting,
     )
 
 
