@@ -47,7 +47,7 @@ the pack's resistance."""
 OWN_PART = 0.01
 """How much every other effect does, in parts of its physical range."""
 
-ALWAYS_OF_TEMPERATURE = frozenset({"charge_transfer"})
+ALWAYS_OF_TEMPERATURE = frozenset({"charge_transfer", "inner_temperature"})
 """Structure that follows the temperature whatever its shape."""
 
 COVERED_K, COVERED_PCT = 3.0, 3.0
@@ -156,25 +156,28 @@ def settle(
     frame = _frame(model_file, choices, has_references=bool(of_references), covered=covered)
     error = error_from_noise(model_file.noise, model_file.rate_hz, frame)
     acting: ExtendedModel | None = None
+    reference_terms: tuple[LogTerms, ...] = ()
     if of_references:
         say("learning from the references")
-        reference_terms = _reference_terms(of_references, model, frame)
-        grams = [gram_of(terms, frame.scale) for terms in reference_terms]
+        grams = _grams(_reference_terms(of_references, model, frame), frame)
         if len(grams) > 1:
             least_trust = 0.0 if covered else LEAST_TRUST_BEYOND
             error = error_from_references(frame, grams, error, least_trust)
-            error = with_strays(frame, grams, error, counting(of_references, of_logs))
-            if not covered:
-                error = _beyond_the_references(error)
+        expected = error if covered or len(grams) == 1 else _beyond_the_references(error)
         say("repairing the structure")
-        acting = repaired(model, frame, grams, error)
-        solution, _ = within_bounds(gather(frame, grams, [], error), model.model, [])
+        acting = repaired(model, frame, grams, expected)
+        solution, _ = within_bounds(gather(frame, grams, [], expected), model.model, [])
         change = solution[: frame.scale.size]
         learned = moved(model.model, change)
         if learned is not None:
             # Columns follow the model: resistances, slope and kt as the references know them.
             model = replace(model, model=learned)
             frame = replace(frame, centre=-change * frame.scale)
+        reference_terms = _reference_terms(of_references, model, frame, acting)
+        if len(grams) > 1:
+            grams = _grams(reference_terms, frame)
+            error = with_strays(frame, grams, error, counting(of_references, of_logs))
+            error = error if covered else _beyond_the_references(error)
     diagnosed = []
     for item in of_logs:
         say(f"weighing {item.log.name} against every effect")
@@ -184,12 +187,16 @@ def settle(
         options,
         frame,
         error,
-        _reference_terms(of_references, model, frame, acting),
+        reference_terms,
         tuple(diagnosed),
         given,
         covered,
         acting,
     )
+
+
+def _grams(references: Sequence[LogTerms], frame: Frame) -> list[Gram]:
+    return [gram_of(terms, frame.scale) for terms in references]
 
 
 def _reference_terms(
