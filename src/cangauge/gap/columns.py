@@ -89,8 +89,8 @@ def log_terms(
     model : ExtendedModel
     choices : sequence of Candidate
     acting : ExtendedModel, optional
-        The model with the structure that references call for. What an effect does to the signals
-        or to the count shows through all that depends on them, in this model and not in the other.
+        The model with the structure that references call for. A temperature that is wrong shows
+        through all that follows the temperature, and in `model` that is one coefficient.
     """
     voltage_model = model.model
     rows = prepared.rows
@@ -103,10 +103,11 @@ def log_terms(
         ]
     )
     smooth = as_modelled(prepared, model)
+    here = residual(smooth, model)
     state = state_of(smooth, model)
-    through = acting or model
-    smooth_through = smooth if acting is None else as_modelled(prepared, through)
-    here = residual(smooth_through, through)
+    if acting is not None:
+        smooth_acting = as_modelled(prepared, acting)
+        here_acting = residual(smooth_acting, acting)
     return LogTerms(
         prepared=prepared,
         residual_v=residual(prepared, model),
@@ -116,9 +117,9 @@ def log_terms(
         else columns_of(rows, voltage_model.epsilon, voltage_model.t_ref_c),
         own=own,
         effects=tuple(
-            effect_columns(smooth, model, choice, here, state)
-            if choice.effect.adds_voltage_only
-            else effect_columns(smooth_through, through, choice, here)
+            effect_columns(smooth_acting, acting, choice, here_acting)
+            if acting is not None and choice.effect.family == "thermal"
+            else effect_columns(smooth, model, choice, here, state)
             for choice in choices
         ),
     )

@@ -26,6 +26,7 @@ from cangauge.gap.references import (
     LEAST_TRUST_BEYOND,
     error_from_noise,
     error_from_references,
+    farther,
     with_strays,
 )
 from cangauge.gap.structure import repaired
@@ -72,7 +73,7 @@ class Settled:
     covered: bool = True
     """Whether references have been at the diagnosed logs' temperatures."""
     acting: ExtendedModel | None = None
-    """The model with the structure that references call for, in which effects on signals and count
+    """The model with the structure that references call for, in which effects on the temperature
     are weighed (`columns.log_terms`)."""
 
     @cached_property
@@ -163,6 +164,8 @@ def settle(
         if len(grams) > 1:
             least_trust = 0.0 if covered else LEAST_TRUST_BEYOND
             error = error_from_references(frame, grams, error, least_trust)
+            weights = counting(of_references, of_logs)
+            error = with_strays(frame, grams, error, weights)
         expected = error if covered or len(grams) == 1 else _beyond_the_references(error)
         say("repairing the structure")
         acting = repaired(model, frame, grams, expected)
@@ -176,7 +179,7 @@ def settle(
         reference_terms = _reference_terms(of_references, model, frame, acting)
         if len(grams) > 1:
             grams = _grams(reference_terms, frame)
-            error = with_strays(frame, grams, error, counting(of_references, of_logs))
+            error = farther(error, with_strays(frame, grams, error, weights))
             error = error if covered else _beyond_the_references(error)
     diagnosed = []
     for item in of_logs:
