@@ -75,8 +75,23 @@ class LogTerms:
         )
 
 
-def log_terms(prepared: Prepared, model: ExtendedModel, choices: Sequence[Candidate]) -> LogTerms:
-    """Return the terms of one log, with the columns of some candidates."""
+def log_terms(
+    prepared: Prepared,
+    model: ExtendedModel,
+    choices: Sequence[Candidate],
+    acting: ExtendedModel | None = None,
+) -> LogTerms:
+    """Return the terms of one log, with the columns of some candidates.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    model : ExtendedModel
+    choices : sequence of Candidate
+    acting : ExtendedModel, optional
+        The model with the structure that references call for. A temperature that is wrong shows
+        through all that follows the temperature, and in `model` that is one coefficient.
+    """
     voltage_model = model.model
     rows = prepared.rows
     current = prepared.log.current_a
@@ -90,6 +105,9 @@ def log_terms(prepared: Prepared, model: ExtendedModel, choices: Sequence[Candid
     smooth = as_modelled(prepared, model)
     here = residual(smooth, model)
     state = state_of(smooth, model)
+    if acting is not None:
+        smooth_acting = as_modelled(prepared, acting)
+        here_acting = residual(smooth_acting, acting)
     return LogTerms(
         prepared=prepared,
         residual_v=residual(prepared, model),
@@ -98,5 +116,10 @@ def log_terms(prepared: Prepared, model: ExtendedModel, choices: Sequence[Candid
         if model.effects
         else columns_of(rows, voltage_model.epsilon, voltage_model.t_ref_c),
         own=own,
-        effects=tuple(effect_columns(smooth, model, choice, here, state) for choice in choices),
+        effects=tuple(
+            effect_columns(smooth_acting, acting, choice, here_acting)
+            if acting is not None and choice.effect.family == "thermal"
+            else effect_columns(smooth, model, choice, here, state)
+            for choice in choices
+        ),
     )

@@ -193,9 +193,7 @@ def _candidates(
                 "probability": verdict.chances[score.effect_id],
                 "log_bayes_factor": score.log_bayes_factor,
                 **_errors(settled, judged, floor),
-                "parameters": cause_parameters(
-                    score, settled, extension.cause.get(score.effect_id)
-                ),
+                "parameters": cause_parameters(score, settled, extension),
             }
         )
     return result

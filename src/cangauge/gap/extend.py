@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from cangauge import __version__
+from cangauge.gap.at_cause import Cause, at_causes, with_causes
 from cangauge.gap.bounded import moved, within_bounds
 from cangauge.gap.columns import Candidate, residual
 from cangauge.gap.evidence import gather
 from cangauge.gap.scores import Score
 from cangauge.gap.settle import Settled
-from cangauge.gap.structure import with_needed_structure
+from cangauge.gap.structure import needed, with_pieces
 from cangauge.model.effects.effect import Effect, Pack, Values
 from cangauge.model.effects.library import LIBRARY, effect_entries, one_of
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Made, ModelFile, Ranges
 
 FloatArray = NDArray[np.float64]
-
-NEGLIGIBLE = 1e-3
-"""A repair smaller than this part of its bounds is left out."""
 
 BELONGS_TO_A_LOG = frozenset({"initial_soc"})
 """Effects of one log that a model for later drives must not carry on."""
@@ -35,9 +33,11 @@ class Extension:
     """The extended model with what could not be carried over."""
 
     model: ExtendedModel
-    cause: dict[str, dict[str, float]]
-    """Parameters of each accepted effect, refined on the model's own equations."""
     remarks: tuple[str, ...]
+    cause: dict[str, dict[str, float]] = field(default_factory=dict)
+    """Parameters of each accepted effect, found on the model's own equations."""
+    std: dict[str, dict[str, float]] = field(default_factory=dict)
+    """Standard deviation of each of their amplitudes."""
 
 
 def extend(settled: Settled, accepted: Sequence[Score]) -> Extension:
@@ -48,44 +48,78 @@ def extend(settled: Settled, accepted: Sequence[Score]) -> Extension:
     settled : Settled
     accepted : sequence of Score
     """
-    settled = with_needed_structure(settled)
+    few = _with_needed_structure(settled)
+    if not accepted:
+        return Extension(*_base(few))
+    found = at_causes(settled, _begin(few, accepted))
+    base, remarks = _base(_with_needed_structure(found.settled))
+    std = iter(np.sqrt(np.diag(found.covariance)).tolist())
+    return Extension(
+        with_causes(base, found.causes),
+        remarks,
+        {cause.choice.effect.id: dict(cause.values) for cause in found.causes},
+        {
+            cause.choice.effect.id: {name: next(std) for name in cause.choice.amplitudes}
+            for cause in found.causes
+        },
+    )
+
+
+def _begin(few: Settled, accepted: Sequence[Score]) -> list[Cause]:
+    """Return the causes by the linear solution and a fit of amplitudes and shapes from there."""
+    evidence = gather(few.frame, few.reference_grams, few.diagnosed_grams, few.error)
+    chosen = [k for score in accepted for k in score.candidates]
+    solution, amplitudes = within_bounds(evidence, few.model.model, chosen)
+    model, _ = _moved(few, solution)
+    rest = iter(amplitudes)
+    causes = []
+    for score in accepted:
+        choices = [few.frame.choices[k] for k in score.candidates]
+        start = mixed(choices, [next(rest) for _ in choices])
+        model, values = _refined(few, model, choices[0].effect, start)
+        causes.append(Cause(score.candidates[0], choices[0], values))
+    return causes
+
+
+def _with_needed_structure(settled: Settled) -> Settled:
+    """Return the common ground with no more structure than the references call for.
+
+    Under the error that is expected of the diagnosed logs: beyond the references' temperatures that
+    is a large one, and little is worth a piece. (On winter trips, all that summer trips call for
+    made the voltage better and the SoC worse.)
+    """
+    before = settled.frame
+    frame = replace(before, repairs=needed(before, settled.reference_grams, settled.error))
+    at = [before.shown.index(k) for k in frame.shown]
+    return replace(
+        settled,
+        frame=frame,
+        references=tuple(
+            replace(terms, effects=tuple(terms.effects[k] for k in at))
+            for terms in settled.references
+        ),
+    )
+
+
+def _base(settled: Settled) -> tuple[ExtendedModel, tuple[str, ...]]:
+    """Return the given model with coefficients and structure, the logs being without a cause."""
     evidence = gather(
         settled.frame, settled.reference_grams, settled.diagnosed_grams, settled.error
     )
-    solution, amplitudes = within_bounds(
-        evidence, settled.model.model, [k for score in accepted for k in score.candidates]
-    )
-    base, remarks = _base(settled, solution)
-    frame = settled.frame
-    cause: dict[str, dict[str, float]] = {}
-    model = base
-    rest = iter(amplitudes)
-    for score in accepted:
-        choices = [frame.choices[k] for k in score.candidates]
-        start = mixed(choices, [next(rest) for _ in choices])
-        model, cause[score.effect_id] = _refined(settled, model, choices[0].effect, start)
-    return Extension(model, cause, tuple(remarks))
+    solution, _ = within_bounds(evidence, settled.model.model, [])
+    return _moved(settled, solution)
 
 
-def _base(settled: Settled, solution: FloatArray) -> tuple[ExtendedModel, list[str]]:
-    """Return the given model with coefficients and structure that the references add."""
+def _moved(settled: Settled, solution: FloatArray) -> tuple[ExtendedModel, tuple[str, ...]]:
+    """Return the given model with a solution's coefficients and structure, and what was not."""
     given, frame = settled.model, settled.frame
     p = frame.scale.size
-    remarks: list[str] = []
+    remarks: tuple[str, ...] = ()
     voltage_model = moved(given.model, solution[:p])
     if voltage_model is None:
         voltage_model = given.model
-        remarks.append("the coefficients stay: moved, the pseudo-OCV would not rise everywhere")
-    base = replace(given, model=voltage_model)
-    at = p
-    for k in frame.repairs:
-        choice = frame.choices[k]
-        low, high = choice.bounds[:, 0], choice.bounds[:, 1]
-        amplitude = np.clip(solution[at : at + low.size], low, high)
-        at += low.size
-        if np.any(np.abs(amplitude) > NEGLIGIBLE * (high - low)):
-            base = base.with_effect(choice.effect, choice.values(amplitude))
-    return base, remarks
+        remarks = ("the coefficients stay: moved, the pseudo-OCV would not rise everywhere",)
+    return with_pieces(replace(given, model=voltage_model), frame, solution[p:]), remarks
 
 
 def mixed(choices: Sequence[Candidate], amplitudes: Sequence[FloatArray]) -> dict[str, float]:
@@ -210,7 +244,7 @@ def _for_later_drives(effect: Effect, values: Values) -> Values:
 
 
 def cause_parameters(
-    score: Score, settled: Settled, refined: Values | None = None
+    score: Score, settled: Settled, extension: Extension | None = None
 ) -> dict[str, dict[str, object]]:
     """Return each parameter of a candidate with its 95 % interval and unit.
 
@@ -218,20 +252,27 @@ def cause_parameters(
     ----------
     score : Score
     settled : Settled
-    refined : mapping, optional
-        Values fitted through the model's own equations (`Extension.cause`): the intervals, which
-        are those of the linear solution, are laid around these.
+    extension : Extension, optional
+        If the candidate is in it, values and intervals are those found there; else the linear
+        solution's.
     """
     choices = [settled.frame.choices[k] for k in score.candidates]
     first, size = choices[0], len(choices[0].amplitudes)
-    values = refined or mixed(choices, np.split(score.amplitude, len(choices)))
+    if extension is not None and score.effect_id in extension.cause:
+        values: Values = extension.cause[score.effect_id]
+        std = extension.std[score.effect_id]
+    else:
+        values = mixed(choices, np.split(score.amplitude, len(choices)))
+        std = {}
+        for k, name in enumerate(first.amplitudes):
+            of_one = np.arange(k, score.amplitude.size, size)
+            std[name] = float(np.sqrt(np.sum(score.covariance[np.ix_(of_one, of_one)])))
     units = {parameter.name: parameter.unit for parameter in first.effect.parameters}
     result: dict[str, dict[str, object]] = {}
     for k, name in enumerate(first.amplitudes):
-        of_one = np.arange(k, score.amplitude.size, size)
-        std = float(np.sqrt(np.sum(score.covariance[np.ix_(of_one, of_one)])))
         low, high = first.neutral[k] + first.bounds[k]
-        interval = [max(values[name] - 1.96 * std, low), min(values[name] + 1.96 * std, high)]
+        away = 1.96 * std[name]
+        interval = [max(values[name] - away, low), min(values[name] + away, high)]
         result[name] = {"value": values[name], "ci": interval, "unit": units[name]}
     for name in first.shape:
         result[name] = {"value": values[name], "ci": None, "unit": units[name]}

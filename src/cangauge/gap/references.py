@@ -239,6 +239,20 @@ def with_strays(
     )
 
 
+def farther(one: ErrorModel, other: ErrorModel) -> ErrorModel:
+    """Return the error whose effects stray as far as in that of the two where they stray farther.
+
+    A reference seen through the model as given, and through the one that the references teach, is
+    two chances to find how far the model strays.
+    """
+    return replace(
+        one,
+        strays={key: max(value, other.strays[key]) for key, value in one.strays.items()},
+        clean_v2=max(one.clean_v2, other.clean_v2),
+        clean_excess=max(one.clean_excess, other.clean_excess),
+    )
+
+
 def _trust(frame: Frame, grams: Sequence[Gram], error: ErrorModel, least: float) -> float:
     """Return how far the references bear out the model file's information (`ErrorModel.trust`).
 

@@ -26,8 +26,10 @@ from cangauge.gap.references import (
     LEAST_TRUST_BEYOND,
     error_from_noise,
     error_from_references,
+    farther,
     with_strays,
 )
+from cangauge.gap.structure import repaired
 from cangauge.identify.options import FitOptions
 from cangauge.logs.log import Log
 from cangauge.model.effects.effect import Effect
@@ -46,7 +48,7 @@ the pack's resistance."""
 OWN_PART = 0.01
 """How much every other effect does, in parts of its physical range."""
 
-ALWAYS_OF_TEMPERATURE = frozenset({"charge_transfer"})
+ALWAYS_OF_TEMPERATURE = frozenset({"charge_transfer", "inner_temperature"})
 """Structure that follows the temperature whatever its shape."""
 
 COVERED_K, COVERED_PCT = 3.0, 3.0
@@ -70,6 +72,9 @@ class Settled:
     """The model before its temperatures were widened; what the gap is measured from."""
     covered: bool = True
     """Whether references have been at the diagnosed logs' temperatures."""
+    acting: ExtendedModel | None = None
+    """The model with the structure that references call for, in which effects on the temperature
+    are weighed (`columns.log_terms`)."""
 
     @cached_property
     def given_errors_v(self) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...]]:
@@ -151,45 +156,62 @@ def settle(
     covered = not of_references or _temperatures_covered(of_references, of_logs)
     frame = _frame(model_file, choices, has_references=bool(of_references), covered=covered)
     error = error_from_noise(model_file.noise, model_file.rate_hz, frame)
+    acting: ExtendedModel | None = None
+    reference_terms: tuple[LogTerms, ...] = ()
     if of_references:
         say("learning from the references")
-        reference_terms = _reference_terms(of_references, model, frame)
-        grams = [gram_of(terms, frame.scale) for terms in reference_terms]
+        grams = _grams(_reference_terms(of_references, model, frame), frame)
         if len(grams) > 1:
             least_trust = 0.0 if covered else LEAST_TRUST_BEYOND
             error = error_from_references(frame, grams, error, least_trust)
-            error = with_strays(frame, grams, error, counting(of_references, of_logs))
-            if not covered:
-                error = _beyond_the_references(error)
-        solution, _ = within_bounds(gather(frame, grams, [], error), model.model, [])
+            weights = counting(of_references, of_logs)
+            error = with_strays(frame, grams, error, weights)
+        expected = error if covered or len(grams) == 1 else _beyond_the_references(error)
+        say("repairing the structure")
+        acting = repaired(model, frame, grams, expected)
+        solution, _ = within_bounds(gather(frame, grams, [], expected), model.model, [])
         change = solution[: frame.scale.size]
         learned = moved(model.model, change)
         if learned is not None:
             # Columns follow the model: resistances, slope and kt as the references know them.
             model = replace(model, model=learned)
             frame = replace(frame, centre=-change * frame.scale)
+        reference_terms = _reference_terms(of_references, model, frame, acting)
+        if len(grams) > 1:
+            grams = _grams(reference_terms, frame)
+            error = farther(error, with_strays(frame, grams, error, weights))
+            error = error if covered else _beyond_the_references(error)
     diagnosed = []
     for item in of_logs:
         say(f"weighing {item.log.name} against every effect")
-        diagnosed.append(_terms(item, model, effects, choices))
+        diagnosed.append(_terms(item, model, effects, choices, acting))
     return Settled(
         model,
         options,
         frame,
         error,
-        _reference_terms(of_references, model, frame),
+        reference_terms,
         tuple(diagnosed),
         given,
         covered,
+        acting,
     )
 
 
+def _grams(references: Sequence[LogTerms], frame: Frame) -> list[Gram]:
+    return [gram_of(terms, frame.scale) for terms in references]
+
+
 def _reference_terms(
-    references: Sequence[Prepared], model: ExtendedModel, frame: Frame
+    references: Sequence[Prepared],
+    model: ExtendedModel,
+    frame: Frame,
+    acting: ExtendedModel | None = None,
 ) -> tuple[LogTerms, ...]:
     wanted = tuple(dict.fromkeys(frame.shown))  # structure may be a log's own as well
     at = [wanted.index(k) for k in frame.shown]
-    found = [log_terms(item, model, [frame.choices[k] for k in wanted]) for item in references]
+    choices = [frame.choices[k] for k in wanted]
+    found = [log_terms(item, model, choices, acting) for item in references]
     return tuple(replace(terms, effects=tuple(terms.effects[k] for k in at)) for terms in found)
 
 
@@ -198,12 +220,13 @@ def _terms(
     model: ExtendedModel,
     effects: Sequence[Effect],
     choices: Sequence[Candidate],
+    acting: ExtendedModel | None,
 ) -> LogTerms:
     # A shape may depend on the log (a moment as a part of its length), so each has its own list.
     own = candidates(effects, model.pack, prepared.log.time_s, elsewhere=True)
     if len(own) != len(choices):
         raise InputError("the effects' shapes differ between logs", source=prepared.log.source)
-    return log_terms(prepared, model, own)
+    return log_terms(prepared, model, own, acting)
 
 
 def _frame(

@@ -5,19 +5,24 @@ The verdict integrates over all of them; a model that somebody reads and a servi
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cangauge.gap.bounded import moved, within_bounds
 from cangauge.gap.evidence import ErrorModel, Frame, Gram, gather, structure_precision
-from cangauge.gap.settle import Settled
+from cangauge.model.extended import ExtendedModel
 
 FloatArray = NDArray[np.float64]
 
 WORTH_IT = 3.0
 """A further piece must make the references more probable by this, as a logarithm."""
+
+NEGLIGIBLE = 1e-3
+"""A piece smaller than this part of its bounds is left out."""
 
 AT_MOST = 14
 """Pieces: more made no difference that was measured."""
@@ -39,10 +44,10 @@ def needed(frame: Frame, references: Sequence[Gram], error: ErrorModel) -> tuple
     right = whole.precision @ whole.mean
     prior = structure_precision(frame, error)
     p = frame.scale.size
-    ends = p + np.cumsum([0, *(len(frame.choices[k].amplitudes) for k in frame.repairs)])
+    ends = _ends(frame)
 
     def log_probability(pieces: Sequence[int]) -> float:
-        of_pieces = [np.arange(ends[j], ends[j + 1]) for j in pieces]
+        of_pieces = [np.arange(*ends[j]) for j in pieces]
         at = np.concatenate([np.arange(p), *of_pieces])
         balance = 1.0 / np.sqrt(np.diag(whole.precision)[at])
         root = np.linalg.cholesky(whole.precision[np.ix_(at, at)] * balance * balance[:, None])
@@ -62,21 +67,71 @@ def needed(frame: Frame, references: Sequence[Gram], error: ErrorModel) -> tuple
     return tuple(frame.repairs[j] for j in chosen)
 
 
-def with_needed_structure(settled: Settled) -> Settled:
-    """Return the common ground with no more structure than the references call for.
+def with_pieces(model: ExtendedModel, frame: Frame, amplitudes: FloatArray) -> ExtendedModel:
+    """Return a model with the pieces of structure that are not negligible.
 
-    Under the error that is expected of the diagnosed logs: beyond the references' temperatures that
-    is a large one, and little is worth a piece. (On winter trips, all that summer trips call for
-    made the voltage better and the SoC worse.)
+    Parameters
+    ----------
+    model : ExtendedModel
+    frame : Frame
+        Whose `repairs` are the pieces.
+    amplitudes : array
+        Of all pieces, in order, beside the neutral ones.
     """
-    before = settled.frame
-    frame = replace(before, repairs=needed(before, settled.reference_grams, settled.error))
-    at = [before.shown.index(k) for k in frame.shown]
-    return replace(
-        settled,
-        frame=frame,
-        references=tuple(
-            replace(terms, effects=tuple(terms.effects[k] for k in at))
-            for terms in settled.references
-        ),
+    at = 0
+    for k in frame.repairs:
+        choice = frame.choices[k]
+        low, high = choice.bounds[:, 0], choice.bounds[:, 1]
+        amplitude = np.clip(amplitudes[at : at + low.size], low, high)
+        at += low.size
+        if np.any(np.abs(amplitude) > NEGLIGIBLE * (high - low)):
+            model = model.with_effect(choice.effect, choice.values(amplitude))
+    return model
+
+
+def repaired(
+    model: ExtendedModel, frame: Frame, references: Sequence[Gram], error: ErrorModel
+) -> ExtendedModel | None:
+    """Return the model with the coefficients and the structure that the references call for.
+
+    Parameters
+    ----------
+    model : ExtendedModel
+        That the references' columns were taken of.
+    frame : Frame
+    references : sequence of Gram
+    error : ErrorModel
+
+    Returns
+    -------
+    ExtendedModel or None
+        None if its pseudo-OCV would not rise.
+    """
+    pieces = needed(frame, references, error)
+    whole = gather(frame, references, [], error)
+    p = frame.scale.size
+    ends = dict(zip(frame.repairs, _ends(frame), strict=True))
+    at = np.concatenate([np.arange(p), *(np.arange(*ends[k]) for k in pieces)])
+    precision = whole.precision[np.ix_(at, at)]
+    balance = 1.0 / np.sqrt(np.diag(precision))
+    right = (whole.precision @ whole.mean)[at]
+    mean = balance * np.linalg.solve(precision * balance * balance[:, None], balance * right)
+    few = replace(
+        whole,
+        frame=replace(frame, repairs=pieces),
+        precision=precision,
+        mean=mean,
+        per_amplitude=whole.per_amplitude[at],
     )
+    solution, _ = within_bounds(few, model.model, [])
+    voltage_model = moved(model.model, solution[:p])
+    if voltage_model is None:
+        return None
+    return with_pieces(replace(model, model=voltage_model), few.frame, solution[p:])
+
+
+def _ends(frame: Frame) -> list[tuple[int, int]]:
+    """Return where each piece's amplitudes begin and end in a solution."""
+    widths = [len(frame.choices[k].amplitudes) for k in frame.repairs]
+    ends = frame.scale.size + np.cumsum([0, *widths])
+    return list(itertools.pairwise(ends.tolist()))

@@ -24,7 +24,7 @@ each_effect = pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effe
 FAMILIES = {
     "current_sensing": {"current_offset", "current_gain"},
     "voltage_sensing": {"voltage_offset", "voltage_gain"},
-    "thermal": {"temperature_lag", "core_temperature"},
+    "thermal": {"temperature_lag", "core_temperature", "inner_temperature"},
     "timing": {"time_skew"},
     "charge": {"capacity", "initial_soc", "coulombic_efficiency"},
     "resistance": {
@@ -47,8 +47,11 @@ def test_library_holds_every_effect_of_the_contract_in_its_family() -> None:
         assert key == effect.id
         found.setdefault(effect.family, set()).add(effect.id)
     assert found == FAMILIES
-    # Structure of a chemistry is learned, and no cause.
-    assert {key for key, effect in LIBRARY.items() if not effect.is_cause} == {"ocv_shape"}
+    # Structure of chemistry and build is learned, and no cause.
+    assert {key for key, effect in LIBRARY.items() if not effect.is_cause} == {
+        "ocv_shape",
+        "inner_temperature",
+    }
 
 
 @each_effect
@@ -144,7 +147,9 @@ def test_offline_equals_online_whichever_drop_is_scaled(effect_id: str, delayed:
 @each_effect
 def test_mid_range_is_visible_on_a_drive(effect: Effect) -> None:
     log = synthetic_log(hours=1.5, start_pct=90.0, end_pct=8.0)
-    signals = Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c - 15.0)
+    # A pack that comes out of the cold, or nothing would tell the inside's temperature.
+    warming_c = log.temperature_c - 15.0 + np.linspace(0.0, 8.0, log.time_s.size)
+    signals = Signals(log.time_s, log.current_a, log.voltage_v, warming_c)
     rows = np.arange(70, log.time_s.size)
     base = ExtendedModel(replace(MODEL, temperature_range_c=(-20.0, 60.0)), CAPACITY_AH)
     plain = base.predict(signals, 90.0, rows).residual_v

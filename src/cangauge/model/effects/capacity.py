@@ -20,7 +20,7 @@ class Capacity(Effect):
 
     id = "capacity"
     family = "charge"
-    parameters = (Parameter("change_pct", "%", -35.0, 20.0),)
+    parameters = (Parameter("change_pct", "%", -35.0, 35.0),)
     signature = "OCV′·(Ah since the start): a slope over charge, steep in the knee near empty"
     equation = "S = S₀ − 100·∫I dt / (C·(1 + x))"
     source = "Plett, Battery Management Systems vol. II, Artech House 2015, ch. 4"

@@ -16,6 +16,7 @@ from cangauge.model.effects.entropic_coefficient import EntropicCoefficient
 from cangauge.model.effects.fast_polarization import FastPolarization
 from cangauge.model.effects.hysteresis import Hysteresis
 from cangauge.model.effects.initial_soc import InitialSoc
+from cangauge.model.effects.inner_temperature import InnerTemperature
 from cangauge.model.effects.ocv_shape import OcvShape
 from cangauge.model.effects.resistance_asymmetry import ResistanceAsymmetry
 from cangauge.model.effects.resistance_soc import ResistanceSoc
@@ -49,6 +50,7 @@ _EFFECTS: tuple[Effect, ...] = (
     SlowDiffusion(),
     Hysteresis(),
     EntropicCoefficient(),
+    InnerTemperature(),
     OcvShape(),
     WeakCell(),
 )
