@@ -44,6 +44,9 @@ UNKNOWN_BEYOND = 3.0
 ALIKE_WITHIN = 3.0
 """Effects with a log Bayes factor this close to the best are not told from it."""
 
+ALIKE_PART = 0.002
+"""Nor are those within this part of the best's: of evidence that large, so much is the model's."""
+
 TEMPERING = 0.35
 """Log Bayes factors are multiplied by this before they become probabilities: the error is not
 Gaussian and the plant is not the model, so evidence is worth less than it claims."""
@@ -113,10 +116,11 @@ def decide(settled: Settled) -> Verdict:
         chances[UNKNOWN] += chances[best.effect_id] - min(chances[best.effect_id], 0.1)
         chances[best.effect_id] = min(chances[best.effect_id], 0.1)
         return verdict(UNKNOWN)
+    within = max(ALIKE_WITHIN, ALIKE_PART * best.log_bayes_factor)
     alike = tuple(
         score.effect_id
         for score in ranked.candidates[1:]
-        if score.log_bayes_factor > best.log_bayes_factor - ALIKE_WITHIN
+        if score.log_bayes_factor > best.log_bayes_factor - within
     )
     return verdict(best.effect_id, alike, _accepted(evidence, best, alike))
 
