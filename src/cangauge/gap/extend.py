@@ -53,14 +53,19 @@ def extend(settled: Settled, accepted: Sequence[Score]) -> Extension:
         return Extension(*_base(few))
     found = at_causes(settled, _begin(few, accepted))
     base, remarks = _base(_with_needed_structure(found.settled))
+    # The pack's sizes, which bounds are relative to, have moved with the coefficients.
+    causes = [
+        replace(cause, values=cause.choice.effect.within(cause.values, base.pack))
+        for cause in found.causes
+    ]
     std = iter(np.sqrt(np.diag(found.covariance)).tolist())
     return Extension(
-        with_causes(base, found.causes),
+        with_causes(base, causes),
         remarks,
-        {cause.choice.effect.id: dict(cause.values) for cause in found.causes},
+        {cause.choice.effect.id: dict(cause.values) for cause in causes},
         {
             cause.choice.effect.id: {name: next(std) for name in cause.choice.amplitudes}
-            for cause in found.causes
+            for cause in causes
         },
     )
 

@@ -85,7 +85,9 @@ def with_pieces(model: ExtendedModel, frame: Frame, amplitudes: FloatArray) -> E
         amplitude = np.clip(amplitudes[at : at + low.size], low, high)
         at += low.size
         if np.any(np.abs(amplitude) > NEGLIGIBLE * (high - low)):
-            model = model.with_effect(choice.effect, choice.values(amplitude))
+            # The pack's sizes, which bounds are relative to, move with the coefficients.
+            values = choice.effect.within(choice.values(amplitude), model.pack)
+            model = model.with_effect(choice.effect, values)
     return model
 
 

@@ -331,6 +331,14 @@ class Effect(ABC):
                 values[parameter.name] = parameter.neutral * parameter.factor(pack)
         return values
 
+    def within(self, values: Values, pack: Pack) -> dict[str, float]:
+        """Return values with the amplitudes held within their bounds for a pack."""
+        held = dict(values)
+        for parameter in self.amplitudes:
+            low, high = parameter.bounds(pack)
+            held[parameter.name] = min(max(held[parameter.name], low), high)
+        return held
+
     def trials(self, parameter: Parameter, pack: Pack, time_s: FloatArray) -> tuple[float, ...]:
         """Return the values to try for a shape on a log with these times, in its unit.
 
