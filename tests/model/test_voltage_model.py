@@ -60,6 +60,18 @@ def test_rises_everywhere_and_stays_bounded_outside_the_identified_soc() -> None
     assert np.ptp(volts) < 4.0 * np.ptp(narrow.pseudo_ocv([40.0, 80.0]))
 
 
+@given(st.floats(0.0, 100.0), st.integers(0, 7))
+def test_columns_are_how_the_pseudo_ocv_moves_beyond_the_identified_soc_too(
+    soc: float, k: int
+) -> None:
+    narrow = VoltageModel(K, -0.74, (-0.1,), (0.0,), soc_range_pct=(40.0, 80.0))
+    coefficients = narrow.coefficients
+    coefficients[k] += 1e-3
+    moved = narrow.with_coefficients(coefficients)
+    change = moved.pseudo_ocv([soc])[0] - narrow.pseudo_ocv([soc])[0]
+    assert 1e-3 * narrow.pseudo_ocv_columns([soc])[0, k] == pytest.approx(change, abs=1e-8)
+
+
 def test_temperature_is_held_beyond_its_range() -> None:
     far, farther = MODEL.pseudo_ocv([50.0, 50.0], [-20.0, -40.0])
     assert far == farther

@@ -22,7 +22,6 @@ from cangauge.identify.effects.prepared import (
     residual,
     state_of,
 )
-from cangauge.identify.voltage_fit import columns_of
 from cangauge.model.charge import BRIDGE_S
 from cangauge.model.effects.candidate import Candidate, candidates
 from cangauge.model.effects.first_order import low_passed
@@ -114,7 +113,13 @@ def log_terms(
         # Effects that the model has already may scale what its coefficients multiply.
         baseline=coefficient_columns(model, [prepared], predictions(model, [prepared]))
         if model.effects
-        else columns_of(rows, voltage_model.epsilon, voltage_model.t_ref_c),
+        else np.column_stack(
+            [
+                voltage_model.pseudo_ocv_columns(rows.soc_pct),
+                rows.temperature_c - voltage_model.t_ref_c,
+                rows.delayed_current_a,
+            ]
+        ),
         own=own,
         effects=tuple(
             effect_columns(smooth_acting, acting, choice, here_acting)

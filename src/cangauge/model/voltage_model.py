@@ -139,6 +139,20 @@ class VoltageModel:
             volts = volts + self.kt_v_per_k * (bounded - self.t_ref_c)
         return np.asarray(volts)
 
+    def pseudo_ocv_columns(self, soc_pct: ArrayLike) -> FloatArray:
+        """Return how the pseudo-OCV moves with k0 … k7 [-], shape (n, 8), straight lines included.
+
+        Parameters
+        ----------
+        soc_pct : array_like of shape (n,)
+            State of charge [%].
+        """
+        soc = np.atleast_1d(np.asarray(soc_pct, dtype=np.float64))
+        inside = np.clip(soc, *self.soc_range_pct)
+        low, high = self._columns_beyond
+        beyond = (soc - inside)[:, None]
+        return ocv_basis(inside, self.epsilon) + beyond * np.where(beyond < 0.0, low, high)
+
     def pseudo_ocv_slope(self, soc_pct: ArrayLike) -> FloatArray:
         """Return dU/dS of the pseudo-OCV [V per % SoC], shape (n,)."""
         soc = np.atleast_1d(np.asarray(soc_pct, dtype=np.float64))
@@ -226,11 +240,17 @@ class VoltageModel:
     @cached_property
     def _slope_beyond(self) -> tuple[float, float]:
         """Slopes of the straight lines below and above the identified SoC [V per %]."""
+        low, high = self._columns_beyond
+        volts = np.array(self.ocv_v)
+        return float(low @ volts), float(high @ volts)
+
+    @cached_property
+    def _columns_beyond(self) -> tuple[FloatArray, FloatArray]:
+        """How those slopes move with k0 … k7 [1/%], shape (8,) each."""
         lo, hi = self.soc_range_pct
         part = EDGE * (hi - lo)
-        at = np.array([lo, lo + part, hi - part, hi])
-        volts = ocv_basis(at, self.epsilon) @ np.array(self.ocv_v)
-        return float(volts[1] - volts[0]) / part, float(volts[3] - volts[2]) / part
+        columns = ocv_basis([lo, lo + part, hi - part, hi], self.epsilon)
+        return (columns[1] - columns[0]) / part, (columns[3] - columns[2]) / part
 
     @cached_property
     def _temperature_limits_c(self) -> tuple[float, float]:

@@ -22,7 +22,6 @@ from cangauge.model.extended import ExtendedModel, Prediction
 from cangauge.model.voltage_model import (
     BASIS_NAMES,
     SLOPE_AT_LEAST,
-    ocv_basis,
     ocv_basis_slope,
 )
 
@@ -161,7 +160,7 @@ def coefficient_columns(
     residual_v = np.concatenate([item.residual_v for item in here])
     soc = np.concatenate([item.soc_pct[item.rows] for item in here])
     coefficients = voltage_model.coefficients
-    columns = [ocv_basis(np.clip(soc, *voltage_model.soc_range_pct), voltage_model.epsilon)]
+    columns = [voltage_model.pseudo_ocv_columns(soc)]
     # The model is linear in kt and the resistances, whatever effects scale them: any step will do.
     for k in range(len(BASIS_NAMES), coefficients.size):
         step = np.zeros(coefficients.size)
