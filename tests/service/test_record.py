@@ -121,14 +121,16 @@ def test_a_clock_that_is_set_back_is_kept(tmp_path: Path, suffix: str) -> None:
     assert content(recorder.path) == expected(messages)
 
 
-def test_one_file_is_what_was_asked_for_without_limits(tmp_path: Path) -> None:
+def test_without_limits_one_file_that_the_next_run_does_not_replace(tmp_path: Path) -> None:
     path = tmp_path / "drive.log"
-    for _ in range(2):  # the second replaces the first
+    for number, name in enumerate(("drive.log", "drive-0001.log", "drive-0002.log")):
+        begin_s = 1.7e9 + 100.0 * number
         with Recorder(path) as recorder:
-            for message in frames(1.0):
+            for message in frames(1.0, begin_s):
                 recorder.write(message)
-        assert recorder.path == path
-        assert len(content(path)) == len(frames(1.0))
+        assert recorder.path == tmp_path / name
+    for number, name in enumerate(("drive.log", "drive-0001.log", "drive-0002.log")):
+        assert content(tmp_path / name) == expected(frames(1.0, 1.7e9 + 100.0 * number))
     with Recorder(tmp_path / "none.csv"):
         pass
     assert (tmp_path / "none.csv").exists()

@@ -13,7 +13,8 @@ RecordOption = Annotated[
         metavar="FILE",
         help="Record the frames received (.log, .csv, .blf, .mf4): `cangauge estimate` on them"
         " gives the live numbers, bit for bit. A kill loses the last half second; of an .mf4 the"
-        " whole part. A full disk costs frames of the recording, never the estimate.",
+        " whole part. A full disk costs frames of the recording, never the estimate. A recording"
+        " that is there stays: the next run's is FILE-0001, FILE-0002, …",
     ),
 ]
 RecordPartMbOption = Annotated[

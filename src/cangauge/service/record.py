@@ -50,7 +50,9 @@ _LOG = logging.getLogger(__name__)
 class RecordLimits:
     """When a recording begins a new file, and how much of it is kept.
 
-    Without any, it is one file. With any, its runs and parts are numbered and never overwritten.
+    Without any, it is one file, unless that is there already: a service that was killed and started
+    again must not replace what the one before it recorded. Then, and with any limit, runs and parts
+    are numbered.
 
     Parameters
     ----------
@@ -95,7 +97,7 @@ class Recorder:
     path : path-like
         `.log` or `.csv`, or either with `.gz`; `.blf` and `.mf4`, which are always in parts.
     limits : RecordLimits, optional
-        By default one file, which is replaced if it is there.
+        By default one file, if it is not there yet or empty.
     clock : callable
         Monotonic time [s].
 
@@ -126,7 +128,7 @@ class Recorder:
         _check_writable(path)
         self._clock = clock
         self._base = path
-        self._in_parts = self._limits.any or self._kind in IN_PARTS_ONLY
+        self._in_parts = self._limits.any or self._kind in IN_PARTS_ONLY or _holds_something(path)
         self._run = max((each.run for each in all_parts(path)), default=0) + 1
         self._part = 0
         self.path = run_path(path, self._run) if self._in_parts else path
@@ -247,6 +249,10 @@ class Recorder:
             path.unlink(missing_ok=True)
             total -= size
             emit(_LOG, logging.INFO, "record.removed", f"{path}: removed to make room")
+
+
+def _holds_something(path: Path) -> bool:
+    return path.is_file() and path.stat().st_size > 0
 
 
 def _check_writable(path: Path) -> None:
