@@ -31,6 +31,9 @@ demo: $(VENV)/installed
 	$(BIN)/cangauge demo
 
 # A worker a core; the tests of a file stay together, since they share what is slow to prepare.
+# Matrices are small: where every worker's linear algebra has a thread a core, they wait for each other.
+test: export OMP_NUM_THREADS := 1
+test: export OPENBLAS_NUM_THREADS := 1
 test: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -n auto --dist loadfile
 
