@@ -54,6 +54,10 @@ ALWAYS_OF_TEMPERATURE = frozenset({"charge_transfer", "inner_temperature"})
 COVERED_K, COVERED_PCT = 3.0, 3.0
 """References cover temperatures and SoC up to this far outside their own [K, %]."""
 
+COVERED_PART = 0.5
+"""Nor are temperatures foreign that lie outside by less than this part of the range that
+references have: how the pack follows the temperature, they have shown."""
+
 LEAST_COUNT = 0.1
 """A reference that went where no other has been still counts so much."""
 
@@ -310,7 +314,8 @@ def _beyond_the_references(error: ErrorModel) -> ErrorModel:
 def _temperatures_covered(references: Sequence[Prepared], diagnosed: Sequence[Prepared]) -> bool:
     seen = np.concatenate([item.rows.temperature_c for item in references])
     asked = np.concatenate([item.rows.temperature_c for item in diagnosed])
-    low, high = seen.min() - COVERED_K, seen.max() + COVERED_K
+    margin = max(COVERED_K, COVERED_PART * float(np.ptp(seen)))
+    low, high = seen.min() - margin, seen.max() + margin
     return bool(np.mean((asked >= low) & (asked <= high)) > 0.5)
 
 
