@@ -265,7 +265,7 @@ POLARISATIONS = pytest.mark.parametrize("effect_id", ["fast_polarization", "slow
 @POLARISATIONS
 def test_polarisation_charges_and_decays_with_its_time_constant(effect_id: str) -> None:
     tau = 5.0 if effect_id == "fast_polarization" else 400.0
-    values = {"ohm": 0.02, "tau_s": tau, "activation_k": 0.0}
+    values = {"ohm": 0.02, "tau_s": tau, "spread": 0.0, "activation_k": 0.0}
     state = steady(40.0 * tau, 50.0)
     current = np.where(state.time_s < 20.0 * tau, 50.0, 0.0)
     found = extra(effect_id, with_current(state, current), values)
@@ -281,7 +281,7 @@ def test_polarisation_rises_in_the_cold_after_arrhenius_from_25_c(effect_id: str
     tau = 5.0 if effect_id == "fast_polarization" else 400.0
     for temperature_c, activation_k in ((25.0, 3000.0), (0.0, 3000.0), (-10.0, 6000.0), (0.0, 0.0)):
         state = steady(3.0 * tau, 50.0, temperature_c=temperature_c)
-        values = {"ohm": 0.02, "tau_s": tau, "activation_k": activation_k}
+        values = {"ohm": 0.02, "tau_s": tau, "spread": 0.0, "activation_k": activation_k}
         colder = math.exp(activation_k * (1.0 / (temperature_c + 273.15) - 1.0 / 298.15))
         expected = -1.0 * colder * -np.expm1(-state.time_s / tau)
         np.testing.assert_allclose(extra(effect_id, state, values), expected, rtol=1e-9, atol=1e-12)
@@ -291,7 +291,7 @@ def test_polarisation_follows_the_present_temperature_not_that_of_the_past() -> 
     """It is the resistance that rises in the cold; the time constant stays."""
     state = steady(3000.0, 50.0, temperature_c=25.0)
     warming = replace(state, temperature_c=np.where(state.time_s < 2999.5, 0.0, 25.0))
-    values = {"ohm": 0.02, "tau_s": 400.0, "activation_k": 3000.0}
+    values = {"ohm": 0.02, "tau_s": 400.0, "spread": 0.0, "activation_k": 3000.0}
     cold, warm = extra("slow_diffusion", warming, values), extra("slow_diffusion", state, values)
     assert cold[-1] == warm[-1]
     assert cold[-2] == pytest.approx(
@@ -303,10 +303,22 @@ def test_polarisation_has_decayed_after_a_night_asleep() -> None:
     time_s = np.concatenate([np.arange(0.0, 3600.0), 3600.0 + 8 * 3600.0 + np.arange(10.0)])
     current = np.full_like(time_s, 50.0)
     state = PackState(time_s, current, current, current, current)
-    values = {"ohm": 0.02, "tau_s": 1000.0, "activation_k": 0.0}
+    values = {"ohm": 0.02, "tau_s": 1000.0, "spread": 0.0, "activation_k": 0.0}
     found = extra("slow_diffusion", state, values)
     assert found[3599] == pytest.approx(-1.0 * (1.0 - math.exp(-3.599)), rel=1e-3)
     assert abs(found[3600]) < 1e-6
+
+
+def test_spread_diffusion_answers_sooner_and_ends_at_the_same_resistance() -> None:
+    state = steady(30_000.0, 50.0)
+    values = {"ohm": 0.02, "tau_s": 1000.0, "activation_k": 0.0}
+    one = extra("slow_diffusion", state, values | {"spread": 0.0})
+    many = extra("slow_diffusion", state, values | {"spread": 1.0})
+    assert many[-1] == pytest.approx(-1.0, rel=1e-6)
+    assert one[-1] == pytest.approx(-1.0, rel=1e-6)
+    # Like diffusion's, it grows at first with about the root of the time, one element's with time.
+    assert many[80] / many[20] == pytest.approx(2.0, rel=0.1)
+    assert one[80] / one[20] == pytest.approx(4.0, rel=0.05)
 
 
 # --- equilibrium and imbalance ------------------------------------------------------------

@@ -49,7 +49,7 @@ def candidates(
     time_s : array
         Times of a log; the k-th shape means the same on every log of a group.
     elsewhere : bool
-        Whether constants are tried beside those of the pack (`Parameter.elsewhere`).
+        Whether that is tried too which a fit does not try (`Parameter.elsewhere`).
     """
     result = []
     for effect in effects:
@@ -59,7 +59,10 @@ def candidates(
         centre = np.array([neutral[name] for name in names])
         bounds = np.array([parameter.bounds(pack) for parameter in amplitudes]) - centre[:, None]
         shapes = effect.shapes if effect.amplitudes else ()
-        grids = [effect.trials(parameter, pack, time_s) for parameter in shapes]
+        grids = [
+            (*effect.trials(parameter, pack, time_s), *(parameter.elsewhere if elsewhere else ()))
+            for parameter in shapes
+        ]
         constants = effect.constants_to_try(pack) if elsewhere else [effect.constants(pack)]
         for constant, choice in itertools.product(constants, itertools.product(*grids)):
             shape = dict(zip((p.name for p in shapes), choice, strict=True)) | constant

@@ -107,8 +107,11 @@ class Parameter:
         A constant that is neither fitted nor tried: this of the pack's sizes when the effect is
         added, and kept from then on, whatever becomes of the model.
     elsewhere : tuple of float, optional
-        Added to such a constant, what a diagnosis tries beside it. A fit has no use for that: its
-        coefficients, which move with the effect, take up the difference.
+        What a diagnosis tries and a fit does not. Of a shape: further values. Of such a constant:
+        what is added to it; a fit's coefficients, which move with the effect, take up the
+        difference.
+    formerly : float, optional
+        What it was before it was a parameter, in units of `scale`: that of a file without it.
     """
 
     name: str
@@ -120,6 +123,7 @@ class Parameter:
     grid: tuple[float, ...] | None = None
     from_pack: Literal["temperature_c"] | None = None
     elsewhere: tuple[float, ...] = ()
+    formerly: float | None = None
 
     def factor(self, pack: Pack) -> float:
         """Return what turns bounds and grid into the parameter's unit for a pack."""
@@ -312,6 +316,8 @@ class Effect(ABC):
         """Return the constants, those of the pack first, and what a diagnosis tries beside them."""
         tried = [self.constants(pack)]
         for parameter in self.parameters:
+            if parameter.from_pack is None:
+                continue
             low, high = parameter.bounds(pack)
             for beside in parameter.elsewhere:
                 value = min(max(tried[0][parameter.name] + beside, low), high)

@@ -141,9 +141,13 @@ def effect_entries(effects: Sequence[tuple[Effect, Values]]) -> list[dict[str, o
 
 def _values(effect: Effect, given: object, pack: Pack, field: str) -> Values:
     names = [parameter.name for parameter in effect.parameters]
-    constants = effect.constants(pack)
+    # A file from before a constant was kept: it was the pack's then too.
+    constants = effect.constants(pack) | {
+        item.name: item.formerly * item.factor(pack)
+        for item in effect.parameters
+        if item.formerly is not None
+    }
     if isinstance(given, Mapping):
-        # A file from before a constant was kept: it was the pack's then too.
         given = {**constants, **given}
     if not isinstance(given, Mapping) or set(given) != set(names):
         raise InputError(
