@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cangauge.gap import verdict
 from cangauge.gap.diagnose import diagnose
 from cangauge.gap.extend import library_without
 from cangauge.gap.settle import Settled, settle
@@ -116,24 +115,6 @@ def test_where_references_differ_logs_are_taken_to_differ(
     ]
     assert kept("time_skew", late) > 2.0 * max(of_the_same, 0.0)
     assert decide(settle(late, model, varied, library_without([]))).cause == "time_skew"
-
-
-def test_what_is_not_seen_in_volts_is_none_more_likely_than_not(
-    model: ModelFile, references: list[Log], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Evidence alone names nothing, and the probability does not contradict the verdict."""
-    late = [
-        replace(log, current_a=np.interp(log.time_s - 1.0, log.time_s, log.current_a))
-        for log in (day(21), day(22))
-    ]
-    settled = settle(late, model, references, library_without([]))
-    named = decide(settled)
-    monkeypatch.setattr(verdict, "_explained", lambda *_: 0.0)
-    monkeypatch.setattr(verdict, "UNKNOWN_BEYOND", np.inf)
-    found = decide(settled)
-    assert (named.cause, found.cause) == ("time_skew", "none")
-    assert found.probability == max(found.chances.values()) > 0.5
-    assert sum(found.chances.values()) == pytest.approx(1.0)
 
 
 def test_where_references_differ_in_resistance_logs_are_taken_to_differ(

@@ -39,7 +39,7 @@ PUT_IN: dict[str, tuple[tuple[str, dict[str, float]], ...]] = {
     ),
     "dynamics": (
         ("fast_polarization", {"ohm": 0.03, "tau_s": 3.0, "activation_k": 0.0}),
-        ("slow_diffusion", {"ohm": 0.05, "tau_s": 300.0, "activation_k": 0.0}),
+        ("slow_diffusion", {"ohm": 0.05, "tau_s": 300.0, "spread": 0.0, "activation_k": 0.0}),
     ),
     "hysteresis": (("hysteresis", {"half_width_v": 2.0, "travel_pct": 3.0}),),
 }

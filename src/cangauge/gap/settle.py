@@ -54,9 +54,10 @@ ALWAYS_OF_TEMPERATURE = frozenset({"charge_transfer", "inner_temperature"})
 COVERED_K, COVERED_PCT = 3.0, 3.0
 """References cover temperatures and SoC up to this far outside their own [K, %]."""
 
-COVERED_PART = 0.5
-"""Nor are temperatures foreign that lie outside by less than this part of the range that
-references have: how the pack follows the temperature, they have shown."""
+COLDER_PART, WARMER_PART = 0.2, 0.5
+"""Nor are temperatures foreign that lie below or above by less than these parts of the range that
+references have: how the pack follows the temperature, they have shown. In the cold resistance
+grows ever faster. (On trips that the check is made of, winter is 0.3 below summer.)"""
 
 LEAST_COUNT = 0.1
 """A reference that went where no other has been still counts so much."""
@@ -314,8 +315,9 @@ def _beyond_the_references(error: ErrorModel) -> ErrorModel:
 def _temperatures_covered(references: Sequence[Prepared], diagnosed: Sequence[Prepared]) -> bool:
     seen = np.concatenate([item.rows.temperature_c for item in references])
     asked = np.concatenate([item.rows.temperature_c for item in diagnosed])
-    margin = max(COVERED_K, COVERED_PART * float(np.ptp(seen)))
-    low, high = seen.min() - margin, seen.max() + margin
+    spread = float(np.ptp(seen))
+    low = seen.min() - max(COVERED_K, COLDER_PART * spread)
+    high = seen.max() + max(COVERED_K, WARMER_PART * spread)
     return bool(np.mean((asked >= low) & (asked <= high)) > 0.5)
 
 

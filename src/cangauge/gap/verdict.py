@@ -1,78 +1,60 @@
 """From evidence to a verdict: an effect, `none`, or `unknown`, with a probability.
 
-`none`: no effect beats "no effect" by more than chance does on clean logs. `unknown`: something
-does, but the best effect leaves too much of the excess unexplained. Otherwise the effect with the
-most evidence, with those that these logs cannot tell from it.
+`none`: what the logs show may well have no cause. `unknown`: they show something for certain, but
+no effect is likely enough to be it. Otherwise the most likely effect, with those that are not much
+less likely.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cangauge.gap.evidence import Evidence, gather
-from cangauge.gap.remainder import excess, kept_v2
+from cangauge.gap.belief import Belief, believe
+from cangauge.gap.compared import compare
+from cangauge.gap.evidence import Evidence
 from cangauge.gap.scores import Score, condition_on, scores
 from cangauge.gap.settle import Settled
-
-FloatArray = NDArray[np.float64]
 
 NONE, UNKNOWN = "none", "unknown"
 
 ACCEPT_LOG_BAYES = 5.0
-"""An effect is accepted above this log Bayes factor against no effect. On clean groups of real
-trips it was rarely reached; see the README for the false alarms measured."""
+"""An effect is seen from this log Bayes factor against no effect. It is asked for only where fewer
+than two references have shown how far evidence strays without a cause."""
+
+EXPLAINED_AT_LEAST = 0.4
+"""And, there, that it takes this part of the gap away."""
+
+LARGE = 1.5
+"""A gap of so many times what clean logs keep is there, explained or not."""
+
+UNSURE = 0.5
+"""Nor is any effect given more than this probability there."""
+
+SEEN_BELOW = 0.15
+"""Something is there if `none` has less than this probability."""
+
+NAMED_FROM = 0.25
+"""And it is named if the best effect is it with this probability, given that something is there."""
+
+ALIKE_FROM = 0.5
+"""Effects that are at least so likely, in parts of the best, are not told from it."""
+
+KNOWN_AT_MOST = 0.9
+"""Of what is not the best effect, no more than this part is another of the library."""
 
 FURTHER_LOG_BAYES = 12.0
 """A further effect must have this much evidence beside those accepted."""
 
 FURTHER_AT_MOST = 2
 
-EXPLAINED_AT_LEAST = 0.4
-"""The best effect must explain this part of the excess, or the verdict is `unknown`."""
-
-VISIBLE = 0.25
-"""A gap of this part of the clean mean square is seen in volts."""
-
-UNKNOWN_BEYOND = 3.0
-"""A gap that no effect explains must be so many times what the worst reference shows."""
-
-ALIKE_WITHIN = 3.0
-"""Effects with a log Bayes factor this close to the best are not told from it."""
-
-ALIKE_PART = 0.002
-"""Nor are those within this part of the best's: of evidence that large, so much is the model's."""
-
-UNSEEN = 0.6
-"""Probability of no cause where evidence is large but the best effect takes nothing visible away
-and no more is left than references show: 11 of 17 development cases had none, or one of less than
-half of the floor."""
-
-TEMPERING = 0.35
-"""Log Bayes factors are multiplied by this before they become probabilities: the error is not
-Gaussian and the plant is not the model, so evidence is worth less than it claims."""
-
-RIGHT = (-4.1, -0.57, 2.1, 1.95)
-"""Logit of the probability that the best effect is the cause: a constant, and factors of the
-logarithm of the part of the excess that it leaves, of its lead over the second in parts of its own
-evidence, and of the part of the gap in volts that it explains. By logistic regression on
-development cases, each diagnosed also with its cause out of the library."""
-
-LEAST_LEFT = 0.003
-"""No effect explains more than all but this part of the excess."""
-
 OF_TEMPERATURE = ("resistance_temperature",)
 EXPECTED_TIMES = 1.6
 """At temperatures that no reference has, the resistance differs for certain: every cell's grows in
 the cold. What resembles it must have so many times its evidence to be named in its place. Chosen
 after seeing that two groups of cold LG cells needed 1.5: no data has tested it."""
-
-NONE_MISSED = 0.5
-"""Odds that logs which show nothing hide a cause that is too small to be seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,95 +66,88 @@ class Verdict:
     ambiguous_with: tuple[str, ...]
     accepted: tuple[Score, ...]
     candidates: tuple[Score, ...]
+    """The best first."""
     chances: dict[str, float]
     """Probability of each effect, of `none` and of `unknown`."""
     explained: float
-    """Part of the excess that the best effect explains."""
-    excess: float
-    """What clean logs do not show, over the most that a reference left out shows."""
+    """Part of the gap that the best effect explains."""
 
 
 def decide(settled: Settled) -> Verdict:
     """Return the verdict on the diagnosed logs."""
-    evidence = gather(
-        settled.frame, settled.reference_grams, settled.diagnosed_grams, settled.error
-    )
-    ranked = believable(evidence, expected=() if settled.covered else OF_TEMPERATURE)
-    best = ranked.candidates[0]
-    alone = gather(settled.frame, settled.reference_grams, [], settled.error)
-    before = excess(evidence, settled.diagnosed_grams, alone.squares)
-    after = excess(evidence, settled.diagnosed_grams, alone.squares, best)
-    explained = _explained(settled, evidence, alone, best)
-    chances = _chances(ranked, explained, after / before if before > 0.0 else 1.0)
-    beyond = before / max(settled.error.clean_excess, 1.0)
-
-    def verdict(
-        cause: str, alike: tuple[str, ...] = (), accepted: tuple[Score, ...] = ()
-    ) -> Verdict:
-        return Verdict(
-            cause, chances[cause], alike, accepted, ranked.candidates, chances, explained, beyond
-        )
-
-    if ranked.found < ACCEPT_LOG_BAYES:
-        return verdict(NONE)
-    if explained < EXPLAINED_AT_LEAST and beyond <= UNKNOWN_BEYOND:
-        if chances[NONE] < UNSEEN:
-            rest = (1.0 - UNSEEN) / (1.0 - chances[NONE])
-            chances = {cause: UNSEEN if cause == NONE else rest * p for cause, p in chances.items()}
-        return verdict(NONE)
-    if explained < EXPLAINED_AT_LEAST:
-        chances[UNKNOWN] += chances[best.effect_id] - min(chances[best.effect_id], 0.1)
-        chances[best.effect_id] = min(chances[best.effect_id], 0.1)
-        return verdict(UNKNOWN)
-    within = max(ALIKE_WITHIN, ALIKE_PART * best.log_bayes_factor)
+    evidence, compared = compare(settled)
+    belief = believe(compared)
+    if not settled.covered:
+        belief = _expecting(belief, OF_TEMPERATURE)
+    best = belief.witnesses[0]
+    explained = compared.explained(best)
+    if settled.error.strays:
+        chances = _chances(belief)
+        seen = belief.none < SEEN_BELOW
+        named = seen and belief.best >= NAMED_FROM * (1.0 - belief.none)
+    else:
+        something = compared.found >= ACCEPT_LOG_BAYES
+        named = something and explained >= EXPLAINED_AT_LEAST
+        seen = named or (something and compared.before_v >= LARGE * compared.clean_v)
+        chances = _chances(_unsure(belief, named=named))
+    candidates = tuple(witness.score for witness in belief.witnesses)
+    if not named:
+        cause = UNKNOWN if seen else NONE
+        return Verdict(cause, chances[cause], (), (), candidates, chances, explained)
+    cause = best.score.effect_id
     alike = tuple(
         score.effect_id
-        for score in ranked.candidates[1:]
-        if score.log_bayes_factor > best.log_bayes_factor - within
+        for score, share in zip(candidates[1:], belief.shares[1:], strict=True)
+        if share >= ALIKE_FROM * belief.shares[0]
     )
-    return verdict(best.effect_id, alike, _accepted(evidence, best, alike))
+    accepted = _accepted(evidence, best.score, alike)
+    return Verdict(cause, chances[cause], alike, accepted, candidates, chances, explained)
 
 
-@dataclass(frozen=True, eq=False)
-class Ranked:
-    """Effects in the order in which they are believed."""
+def _expecting(belief: Belief, expected: Sequence[str]) -> Belief:
+    """Return the belief with the expected effects first that are seen and nearly as good."""
+    enough = max(each.score.log_bayes_factor for each in belief.witnesses) / EXPECTED_TIMES
+    first = [
+        k
+        for k, each in enumerate(belief.witnesses)
+        if each.score.effect_id in expected
+        and each.own_log_bayes >= ACCEPT_LOG_BAYES
+        and each.score.log_bayes_factor >= enough
+    ]
+    order = [*first, *(k for k in range(len(belief.witnesses)) if k not in first)]
+    shares = belief.shares.copy()
+    shares[first] = np.maximum(shares[first], shares.max())
+    shares = shares[order] / shares.sum()
+    return replace(belief, witnesses=tuple(belief.witnesses[k] for k in order), shares=shares)
 
-    candidates: tuple[Score, ...]
-    """As if all strayed alike: that one strays less on the references makes it no more likely to
-    be what the logs show."""
-    found: float
-    """Largest log Bayes factor against no effect, each effect by how far it strays itself."""
+
+def _unsure(belief: Belief, *, named: bool) -> Belief:
+    """Return the belief where nothing is known of how far evidence strays without a cause."""
+    if not named:
+        none = max(belief.none, 1.0 - UNSURE)
+        return replace(belief, none=none, best=min(belief.best, 0.5 * (1.0 - none)))
+    best = min(belief.best, UNSURE)
+    return replace(belief, best=best, none=min(belief.none, 0.5 * (1.0 - best)))
 
 
-def believable(evidence: Evidence, expected: Sequence[str] = ()) -> Ranked:
-    """Return the effects, the best first.
+def _chances(belief: Belief) -> dict[str, float]:
+    """Return the probability of every effect, of `none` and of `unknown`.
 
-    That something is there is asked of every effect by its own strays, for a cause shows in more
-    effects than its own; which one it is, as if all strayed alike.
-
-    Parameters
-    ----------
-    evidence : Evidence
-    expected : sequence of str
-        Effects that come first if they are accepted and nearly as good as the best.
+    Effects beside the best are as likely as their shares say; what is left is that it is none that
+    the library has.
     """
-    own = {score.effect_id: score.log_bayes_factor for score in scores(evidence)}
-    strays = evidence.error.strays
-    alike = (
-        dict.fromkeys(strays, float(np.exp(np.mean(np.log([*strays.values()]))))) if strays else {}
-    )
-    ranked = scores(replace(evidence, error=replace(evidence.error, strays=alike)))
-    enough = ranked[0].log_bayes_factor / EXPECTED_TIMES
-    ranked.sort(
-        key=lambda score: (
-            not (
-                score.effect_id in expected
-                and own[score.effect_id] >= ACCEPT_LOG_BAYES
-                and score.log_bayes_factor >= enough
-            )
-        )
-    )
-    return Ranked(tuple(ranked), max(own.values()))
+    another = max(1.0 - belief.none - belief.best, 0.0)
+    others = belief.best * belief.shares[1:] / belief.shares[0]
+    total = float(others.sum())
+    if total > KNOWN_AT_MOST * another:
+        others = others * KNOWN_AT_MOST * another / total
+    chances = {
+        each.score.effect_id: float(chance)
+        for each, chance in zip(belief.witnesses, [belief.best, *others], strict=True)
+    }
+    chances[UNKNOWN] = max(another - float(others.sum()), 0.0)
+    chances[NONE] = belief.none
+    return chances
 
 
 def _accepted(evidence: Evidence, best: Score, alike: Sequence[str]) -> tuple[Score, ...]:
@@ -186,64 +161,3 @@ def _accepted(evidence: Evidence, best: Score, alike: Sequence[str]) -> tuple[Sc
             break
         accepted.append(rest[0])
     return tuple(accepted)
-
-
-def _explained(settled: Settled, evidence: Evidence, alone: Evidence, score: Score) -> float:
-    """Return the part of the mean square gap beyond that of clean logs that an effect takes away.
-
-    From the model as the references alone know it, to that model with the effect; what is each
-    log's own is not taken off in either.
-    """
-    frame, grams = settled.frame, settled.diagnosed_grams
-    amplitude = score.amplitude
-    at = frame.amplitudes_of(score.candidates)
-    with_it = evidence.mean - evidence.per_amplitude[:, at] @ amplitude
-    before = sum(kept_v2(frame, gram, alone.mean) for gram in grams) / len(grams)
-    after = sum(kept_v2(frame, gram, with_it, score.candidates, amplitude) for gram in grams) / len(
-        grams
-    )
-    clean = settled.error.clean_v2 or settled.error.rmse_v**2
-    gap = before - clean
-    if gap > VISIBLE * clean:
-        return float(np.clip((before - max(after, clean)) / gap, 0.0, 1.0))
-    # Too small to be seen in volts, yet perhaps certain: then in units of what chance leaves.
-    chance = excess(evidence, grams, alone.squares)
-    left = excess(evidence, grams, alone.squares, score)
-    return float(np.clip(1.0 - left / chance, 0.0, 1.0)) if chance > 0.0 else 0.0
-
-
-def _chances(ranked: Ranked, explained: float, left: float) -> dict[str, float]:
-    """Return the probability of every effect, of `none` and of `unknown`.
-
-    Parameters
-    ----------
-    ranked : Ranked
-    explained : float
-        Part of the gap in volts that the best effect explains.
-    left : float
-        Part of the excess that it leaves.
-    """
-    factors = np.array([score.log_bayes_factor for score in ranked.candidates])
-    lead = (factors[0] - factors[1:].max()) / max(factors[0], 1.0) if factors.size > 1 else 1.0
-    terms = (1.0, math.log(min(max(left, LEAST_LEFT), 1.5)), min(max(lead, 0.0), 1.0), explained)
-    logit = sum(factor * term for factor, term in zip(RIGHT, terms, strict=True))
-    weights = np.exp(TEMPERING * (factors - factors[0]).clip(max=0.0))
-    # However well it explains, it is no surer than those allow that explain as much.
-    right = min(1.0 / (1.0 + math.exp(-logit)), 1.0 / float(weights.sum()))
-    # What the best does not have is shared by how close the others come; that none of them is it
-    # counts like an effect as good as the best.
-    rest = (1.0 - right) / float(weights.sum())
-    something = 1.0 - _none(ranked.found)
-    chances = {
-        score.effect_id: something * rest * float(weight)
-        for score, weight in zip(ranked.candidates, weights, strict=True)
-    }
-    chances[ranked.candidates[0].effect_id] = something * right
-    chances[UNKNOWN] = something * rest
-    chances[NONE] = 1.0 - something
-    return chances
-
-
-def _none(found: float) -> float:
-    """Return the probability that there is no cause, by the best log Bayes factor against it."""
-    return 1.0 / (1.0 + NONE_MISSED * math.exp(min(TEMPERING * max(found, 0.0), 700.0)))

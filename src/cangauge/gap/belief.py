@@ -1,0 +1,93 @@
+"""How likely each effect is the cause, learned from packs whose cause was known.
+
+Two steps. *Which*: a conditional logit (McFadden, in Frontiers in Econometrics, 1974) over the
+effects of the library, as if one of them were the cause. *Whether*: a multinomial logit of three
+answers: there is none, the best is it, or it is another. Neither knows an effect's name, so what
+was learned on one pack holds for another as far as evidence and volts mean the same there.
+
+The weights come from `benchmarks/belief.py`, which draws cases of several kinds of packs (none of
+them among those of a release's check), diagnoses them and prints the weights below.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cangauge.gap.compared import Compared, Witness
+
+FloatArray = NDArray[np.float64]
+
+NATS, LEAD_NATS, SHARP_LEAD_NATS = 5.0, 5.0, 20.0
+"""Log Bayes factors count in full below the first; leads are parts of the best's own factor, or of
+these where it has less."""
+
+WHICH = (0.422, 0.727, 1.451, 1.216, 0.87)
+"""Weights of an effect's log Bayes factor, its lead (negative), the same without strays, and of
+what it takes away in volts and of the excess (`which_features`)."""
+
+BEST_IS_IT = (-3.485, 0.238, 1.23, 0.262, 0.674, 3.713, 0.309)
+IS_ANOTHER = (-0.515, 0.165, 0.46, -0.055, 0.043, 1.83, 1.03)
+"""Weights for "the best is it" and "it is another", against "none": of one, and of
+`whether_features`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """Effects in the order in which they are believed, and how much."""
+
+    witnesses: tuple[Witness, ...]
+    shares: FloatArray
+    """Probability of each, as if one of them were the cause, shape (effects,)."""
+    none: float
+    """Probability that there is no cause."""
+    best: float
+    """Probability that the first is the cause."""
+
+
+def believe(compared: Compared) -> Belief:
+    """Return how likely each effect is the cause."""
+    utility = which_features(compared) @ np.array(WHICH)
+    order = np.argsort(-utility, kind="stable")
+    shares = np.exp(utility[order] - utility.max())
+    shares /= shares.sum()
+    witnesses = tuple(compared.witnesses[k] for k in order)
+    features = whether_features(compared, witnesses[0], float(shares[0]))
+    logits = np.array([0.0, features @ np.array(BEST_IS_IT), features @ np.array(IS_ANOTHER)])
+    chances = np.exp(logits - logits.max())
+    chances /= chances.sum()
+    return Belief(witnesses, shares, none=float(chances[0]), best=float(chances[1]))
+
+
+def which_features(compared: Compared) -> FloatArray:
+    """Return what is weighed of each effect, shape (effects, 5)."""
+    alike = np.array([witness.score.log_bayes_factor for witness in compared.witnesses])
+    sharp = np.array([witness.sharp_log_bayes for witness in compared.witnesses])
+    return np.column_stack(
+        [
+            np.arcsinh(alike / NATS),
+            (alike - alike.max()) / max(float(alike.max()), LEAD_NATS),
+            (sharp - sharp.max()) / max(float(sharp.max()), SHARP_LEAD_NATS),
+            [compared.taken_v(witness) for witness in compared.witnesses],
+            [compared.taken_excess(witness) for witness in compared.witnesses],
+        ]
+    )
+
+
+def whether_features(compared: Compared, best: Witness, share: float) -> FloatArray:
+    """Return what is weighed of the best effect: one, and six more, shape (7,)."""
+    gap = compared.before_v / max(compared.clean_v, 1e-9)
+    return np.array(
+        [
+            1.0,
+            math.asinh(compared.found / NATS),
+            compared.explained(best),
+            compared.taken_excess(best),
+            compared.taken_v(best),
+            share,
+            math.log(min(max(gap, 0.1), 20.0)),
+        ]
+    )
