@@ -255,7 +255,7 @@ def in_words(diagnosis: Diagnosis) -> str:
             gap += f", {diagnosis.extended_rmse_v:.2f} V with what they teach"
         return f"No gap beyond what the references show or explain ({gap})."
     if verdict.cause == UNKNOWN:
-        return f"A gap ({gap}) that no effect in the library explains."
+        return f"A gap ({gap}) that no effect in the library is likely to be the cause of."
     alike = (
         f", not to be told from {', '.join(verdict.ambiguous_with)}"
         if verdict.ambiguous_with

@@ -158,7 +158,7 @@ def settle(
     say = progress or _silent
     of_logs = [prepare_log(log, options) for log in logs]
     of_references = [prepare_log(log, replace(options, initial_soc_pct=None)) for log in references]
-    covered = not of_references or _temperatures_covered(of_references, of_logs)
+    covered = not of_references or temperatures_covered(of_references, of_logs)
     frame = _frame(model_file, choices, has_references=bool(of_references), covered=covered)
     error = error_from_noise(model_file.noise, model_file.rate_hz, frame)
     acting: ExtendedModel | None = None
@@ -312,7 +312,8 @@ def _beyond_the_references(error: ErrorModel) -> ErrorModel:
     return replace(error, scale_v2=(error.lasting_v2,) * len(error.scale_v2), strays={})
 
 
-def _temperatures_covered(references: Sequence[Prepared], diagnosed: Sequence[Prepared]) -> bool:
+def temperatures_covered(references: Sequence[Prepared], diagnosed: Sequence[Prepared]) -> bool:
+    """Return whether most rows of the diagnosed logs are at temperatures that references teach."""
     seen = np.concatenate([item.rows.temperature_c for item in references])
     asked = np.concatenate([item.rows.temperature_c for item in diagnosed])
     spread = float(np.ptp(seen))

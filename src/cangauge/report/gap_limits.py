@@ -23,16 +23,17 @@ def verdict_limit(diagnosis: Diagnosis) -> str:
                 f" {number(diagnosis.extended_rmse_v, 2, 'V')} with that)"
             )
         return (
-            f"No cause can be named: no effect has more evidence{beside} than chance gives on logs"
-            f" without a cause. That does not prove that there is none.{_unseen(diagnosis)}"
+            f"No cause can be named: what these logs show{beside}, logs without a cause may show"
+            f" as well. That does not prove that there is none.{_unseen(diagnosis)}"
         )
     if verdict.cause == UNKNOWN:
         best = verdict.candidates[0].effect_id
         return (
             f"No cause can be named: the gap is real ({number(diagnosis.baseline_rmse_v, 2, 'V')},"
-            f" references {number(diagnosis.floor_v, 2, 'V')}), but the best effect of the library,"
-            f" {best}, explains only {100.0 * verdict.explained:.0f} % of the excess. The cause is"
-            " not in the library, or several act at once, or the model is not of this pack."
+            f" references {number(diagnosis.floor_v, 2, 'V')}), but no effect of the library is"
+            f" likely enough to be the cause; the best one, {best}, takes"
+            f" {100.0 * verdict.explained:.0f} % of it away. The cause is not in the library, or"
+            " several act at once, or the model is not of this pack."
         )
     words = []
     if verdict.probability < LIKELY:

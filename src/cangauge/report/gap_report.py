@@ -156,7 +156,7 @@ def _which(diagnosis: Diagnosis) -> list[Block]:
         Figure(
             "How probable each cause is",
             bars("probability", "%", chances),
-            "Tempered evidence: bars of like height cannot be told apart by these logs.",
+            "By evidence, and by what each takes away: how often it was so on other packs.",
         )
     )
     rows = [_candidate_row(item) for item in ranked]
@@ -173,11 +173,12 @@ def _which(diagnosis: Diagnosis) -> list[Block]:
 def _cause_words(diagnosis: Diagnosis) -> str:
     verdict = diagnosis.verdict
     if verdict.cause == NONE:
-        return "No effect has more evidence than chance gives on clean logs."
+        return "What these logs show, clean ones may show as well."
     if verdict.cause == UNKNOWN:
         return (
-            "Something differs, but the best effect of the library explains only"
-            f" {100.0 * verdict.explained:.0f} % of the excess: the cause is not in it."
+            "Something differs, but no effect of the library is likely enough to be the cause: the"
+            f" best one, {verdict.candidates[0].effect_id}, takes"
+            f" {100.0 * verdict.explained:.0f} % of the gap away."
         )
     effect = LIBRARY[verdict.cause]
     words = f"{verdict.cause}: {effect.signature}. {effect.equation}."

@@ -48,10 +48,16 @@ def test_a_bound_of_zero_stays_zero() -> None:
     """The leeway of bounds that are relative to the pack must not let a resistance turn sign."""
     entry = {
         "id": "slow_diffusion",
-        "parameters": {"ohm": -0.001, "tau_s": 500.0, "activation_k": 0.0},
+        "parameters": {"ohm": -0.001, "tau_s": 500.0, "spread": 0.0, "activation_k": 0.0},
     }
     with pytest.raises(InputError, match="must lie within 0 "):
         parse_effects([entry], PACK)
+
+
+def test_a_file_from_before_a_parameter_means_what_it_meant() -> None:
+    parameters = {"ohm": 0.001, "tau_s": 500.0, "activation_k": 0.0}
+    ((_, values),) = parse_effects([{"id": "slow_diffusion", "parameters": parameters}], PACK)
+    assert values == parameters | {"spread": 0.0}
 
 
 @pytest.mark.parametrize(
