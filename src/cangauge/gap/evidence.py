@@ -54,8 +54,6 @@ class ErrorModel:
     chance alone would give; 1 where it is not listed."""
     clean_v2: float = 0.0
     """Mean square of what references left out keep, their own terms not taken off [V²]."""
-    clean_excess: float = 0.0
-    """The largest `excess` of a reference left out."""
     trust: float = 1.0
     """Weight of the information that the model file brings: less than 1 where the references
     contradict it."""

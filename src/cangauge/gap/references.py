@@ -24,7 +24,7 @@ from cangauge.gap.evidence import (
     log_likelihood,
     prior_precision,
 )
-from cangauge.gap.remainder import excess, kept_v2
+from cangauge.gap.remainder import kept_v2
 from cangauge.gap.scales import SCALES, scale_variances
 from cangauge.model.model_file import ModelNoise
 
@@ -208,12 +208,11 @@ def with_strays(
         own=tuple(range(len(frame.repairs), len(shown))),
     )
     squares: dict[str, list[float]] = {}
-    excesses, kept = [], []
+    kept = []
     for number, gram in enumerate(grams):
         others = [item for k, item in enumerate(grams) if k != number]
         evidence = gather(few, others, [gram], error)
         without = gather(few, others, [], error)
-        excesses.append(excess(evidence, [gram], without.squares))
         kept.append(kept_v2(few, gram, without.mean))
         for k, choice in enumerate(few.choices):
             at = evidence.of(k)
@@ -231,12 +230,7 @@ def with_strays(
     # (The median: one way to stray, however far, says nothing of a quite different one.)
     usual = float(np.median([*worth.values()]))
     worth = {key: max(value, usual) for key, value in worth.items()}
-    return replace(
-        error,
-        strays=worth,
-        clean_v2=float(np.average(kept, weights=weights)),
-        clean_excess=max(excesses),
-    )
+    return replace(error, strays=worth, clean_v2=float(np.average(kept, weights=weights)))
 
 
 def farther(one: ErrorModel, other: ErrorModel) -> ErrorModel:
@@ -249,7 +243,6 @@ def farther(one: ErrorModel, other: ErrorModel) -> ErrorModel:
         one,
         strays={key: max(value, other.strays[key]) for key, value in one.strays.items()},
         clean_v2=max(one.clean_v2, other.clean_v2),
-        clean_excess=max(one.clean_excess, other.clean_excess),
     )
 
 
