@@ -63,8 +63,8 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     """Diagnose the gap between a model and logs: where, which effect, how far it shrinks.
 
     The verdict is an effect, `none` (no gap beyond what the references show) or `unknown` (a gap
-    that no effect in the library explains). It is early work: the README says how often it is
-    right. Give at least three references, more are better.
+    of which no effect in the library is likely to be the cause). It is early work: the README says
+    how often it is right. Give at least three references, more are better.
 
     For example:
 
