@@ -1,0 +1,62 @@
+"""The weights of beliefs are what makes known causes probable (`benchmarks/belief.py`)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import belief as learning
+from cangauge.gap import belief
+from cangauge.gap.compared import Compared, Witness
+from cangauge.gap.scores import Score
+
+TRUE = np.array([0.2, 0.5, 1.0, 2.0, 0.5])
+EFFECTS = 6
+
+
+def case(rng: np.random.Generator, number: int) -> learning.Case:
+    """A comparison at random, its cause drawn as likely as the true weights say."""
+    witnesses = tuple(
+        Witness(
+            Score(f"effect_{k}", evidence, (0,), np.zeros(1), np.eye(1), 0.0),
+            evidence,
+            3.0 * evidence,
+            float(rng.uniform(0.2, 1.5)),
+            float(rng.uniform(10.0, 1000.0)),
+        )
+        for k, evidence in enumerate(rng.uniform(-1.0, 60.0, EFFECTS).tolist())
+    )
+    compared = Compared(witnesses, 1.5, 0.5, 1000.0)
+    utility = belief.which_features(compared) @ TRUE
+    chances = np.exp(utility) / np.exp(utility).sum()
+    truth = f"effect_{rng.choice(EFFECTS, p=chances)}"
+    return learning.Case("simulated", f"world {number}", truth, compared, learned=True)
+
+
+def test_the_weights_that_causes_were_drawn_by_are_found() -> None:
+    rng = np.random.default_rng(3)
+    cases = [case(rng, number) for number in range(3000)]
+    found = learning.fit_which(cases)
+    # Evidence, its lead and the lead without strays say nearly the same here; the volts do not.
+    assert found[3] == pytest.approx(TRUE[3], abs=0.3)
+    assert found[4] == pytest.approx(TRUE[4], abs=0.2)
+    assert found[:3].sum() > 0.5
+
+
+def test_a_case_without_its_cause_is_another() -> None:
+    rng = np.random.default_rng(4)
+    known = case(rng, 0)
+    unknown = known.without_cause()
+    assert known.known
+    assert not unknown.known
+    names, _, _ = learning.ranked(unknown, TRUE)
+    assert learning.answer(unknown, names) == learning.ANOTHER
+
+
+def test_final_seeds_are_not_learned_from(tmp_path: Path) -> None:
+    (tmp_path / "tasks.json").write_text(json.dumps({"final": True}), encoding="utf-8")
+    with pytest.raises(SystemExit, match="final seeds"):
+        learning.cases_of(tmp_path)
