@@ -16,6 +16,7 @@ from cangauge.logs.log import Log
 from cangauge.model.voltage_model import (
     BASIS_NAMES,
     SLOPE_AT_LEAST,
+    SLOPE_POINTS,
     VoltageModel,
     ocv_basis,
     ocv_basis_slope,
@@ -25,6 +26,9 @@ FloatArray = NDArray[np.float64]
 
 SLOPE_CHECKS = 201
 """Points over the identified SoC at which the pseudo-OCV must rise."""
+
+REFINED_AT_MOST = 6
+"""So often are points added between which it fell."""
 
 SOC_SPAN_AT_LEAST_PCT = 2.0
 """A fit over less SoC than this would be all extrapolation."""
@@ -58,10 +62,20 @@ def fit_voltage_model(
         columns, volts, block = columns[keep], volts[keep], block[keep]
         soc, temperature, current = soc[keep], temperature[keep], current[keep]
     _check_identifiable(rows, soc, current, columns.shape)
+    at_least = SLOPE_AT_LEAST * float(np.median(volts))
     grid = np.linspace(soc.min(), soc.max(), SLOPE_CHECKS)
-    bounds = np.zeros((SLOPE_CHECKS, columns.shape[1]))
-    bounds[:, : len(BASIS_NAMES)] = ocv_basis_slope(grid, options.epsilon)
-    solution = solve(columns, volts, block, bounds, SLOPE_AT_LEAST * float(np.median(volts)))
+    between = np.linspace(soc.min(), soc.max(), SLOPE_POINTS)
+    for _ in range(REFINED_AT_MOST):
+        bounds = np.zeros((grid.size, columns.shape[1]))
+        bounds[:, : len(BASIS_NAMES)] = ocv_basis_slope(grid, options.epsilon)
+        solution = solve(columns, volts, block, bounds, at_least)
+        slope = (
+            ocv_basis_slope(between, options.epsilon) @ solution.coefficients[: len(BASIS_NAMES)]
+        )
+        if np.all(slope > 0.0):
+            break
+        # Near empty the curve bends so sharply that it may fall between two points and rise again.
+        grid = np.union1d(grid, between[slope < at_least])
     x = [float(value) for value in solution.coefficients]
     return VoltageModel(
         ocv_v=tuple(x[: len(BASIS_NAMES)]),

@@ -36,6 +36,9 @@ SLOPE_AT_LEAST = 2e-5
 the inverse has one root, but a flat (LFP) plateau must stay possible. It is 7 mV per % for a
 Leaf, a fiftieth of its flattest slope."""
 
+SLOPE_POINTS = 401
+"""Points over the identified SoC at which a model's pseudo-OCV is checked to rise."""
+
 NARROWEST_SOC_PCT = 0.01
 """A model that saw less SoC than this saw none: its slope would be a quotient of roundings [%]."""
 
@@ -105,10 +108,11 @@ class VoltageModel:
 
     def __post_init__(self) -> None:
         _check_shape(self)
-        slope = self.pseudo_ocv_slope(np.linspace(*self.soc_range_pct, 401))
+        points = np.linspace(*self.soc_range_pct, SLOPE_POINTS)
+        slope = self.pseudo_ocv_slope(points)
         if not np.all(slope > 0.0):
             worst = int(np.argmin(slope))
-            at = float(np.linspace(*self.soc_range_pct, 401)[worst])
+            at = float(points[worst])
             raise InputError(
                 f"the pseudo-OCV falls with SoC at {at:.1f} %: it has no inverse there",
                 field="coefficients",
