@@ -148,13 +148,9 @@ def place(case: Case) -> int:
 
 def ranked(case: Case, which: FloatArray) -> tuple[list[str], FloatArray, FloatArray]:
     """Return effects, the best first, their shares, and what is weighed of the best."""
-    utility = belief.which_features(case.compared) @ which
-    order = np.argsort(-utility, kind="stable")
-    shares = np.exp(utility[order] - utility.max())
-    shares /= shares.sum()
-    best = case.compared.witnesses[order[0]]
-    names = [case.compared.witnesses[k].score.effect_id for k in order]
-    return names, shares, belief.whether_features(case.compared, best, float(shares[0]))
+    witnesses, shares = belief.ranked(case.compared, which)
+    names = [each.score.effect_id for each in witnesses]
+    return names, shares, belief.whether_features(case.compared, witnesses[0], float(shares[0]))
 
 
 def fit_whether(cases: Sequence[Case], which: FloatArray) -> FloatArray:

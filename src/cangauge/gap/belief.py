@@ -5,8 +5,8 @@ effects of the library, as if one of them were the cause. *Whether*: a multinomi
 answers: there is none, the best is it, or it is another. Neither knows an effect's name, so what
 was learned on one pack holds for another as far as evidence and volts mean the same there.
 
-The weights come from `benchmarks/belief.py`, which draws cases of several kinds of packs (none of
-them among those of a release's check), diagnoses them and prints the weights below.
+The weights come from `benchmarks/belief.py`, which diagnoses cases of several kinds of packs (none
+of them among those of a release's check) and prints the weights below.
 """
 
 from __future__ import annotations
@@ -50,16 +50,20 @@ class Belief:
 
 def believe(compared: Compared) -> Belief:
     """Return how likely each effect is the cause."""
-    utility = which_features(compared) @ np.array(WHICH)
-    order = np.argsort(-utility, kind="stable")
-    shares = np.exp(utility[order] - utility.max())
-    shares /= shares.sum()
-    witnesses = tuple(compared.witnesses[k] for k in order)
+    witnesses, shares = ranked(compared, np.array(WHICH))
     features = whether_features(compared, witnesses[0], float(shares[0]))
     logits = np.array([0.0, features @ np.array(BEST_IS_IT), features @ np.array(IS_ANOTHER)])
     chances = np.exp(logits - logits.max())
     chances /= chances.sum()
     return Belief(witnesses, shares, none=float(chances[0]), best=float(chances[1]))
+
+
+def ranked(compared: Compared, which: FloatArray) -> tuple[tuple[Witness, ...], FloatArray]:
+    """Return the effects, the best first, and the share of each, by weights of what is weighed."""
+    utility = which_features(compared) @ which
+    order = np.argsort(-utility, kind="stable")
+    shares = np.exp(utility[order] - utility.max())
+    return tuple(compared.witnesses[k] for k in order), shares / shares.sum()
 
 
 def which_features(compared: Compared) -> FloatArray:

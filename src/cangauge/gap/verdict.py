@@ -21,8 +21,9 @@ from cangauge.gap.settle import Settled
 NONE, UNKNOWN = "none", "unknown"
 
 ACCEPT_LOG_BAYES = 5.0
-"""An effect is seen from this log Bayes factor against no effect. It is asked for only where fewer
-than two references have shown how far evidence strays without a cause."""
+"""An effect is seen from this log Bayes factor against no effect. A verdict
+asks for it only where nothing is known of how far evidence strays without a cause: with fewer than
+two references, or at temperatures that they do not teach."""
 
 EXPLAINED_AT_LEAST = 0.4
 """And, there, that it takes this part of the gap away."""
