@@ -13,7 +13,7 @@ from cangauge.gap.belief import believe
 from cangauge.gap.compared import Compared, Witness
 from cangauge.gap.scores import Score
 
-CLEAN_V, BEFORE_V, EXCESS = 0.5, 1.5, 1000.0
+CLEAN_V, BEFORE_V, EXCESS, EXPECTED_V = 0.5, 1.5, 1000.0, 0.6
 
 evidence = st.floats(-3.0, 3000.0)
 left = st.floats(0.05, 3.0)
@@ -25,7 +25,7 @@ def witness(effect_id: str, log_bayes: float, left_v: float, left_excess: float)
 
 
 def compared(*witnesses: Witness, before_v: float = BEFORE_V) -> Compared:
-    return Compared(witnesses, before_v, CLEAN_V, EXCESS)
+    return Compared(witnesses, before_v, CLEAN_V, EXCESS, EXPECTED_V)
 
 
 @st.composite

@@ -29,7 +29,7 @@ def case(rng: np.random.Generator, number: int) -> learning.Case:
         )
         for k, evidence in enumerate(rng.uniform(-1.0, 60.0, EFFECTS).tolist())
     )
-    compared = Compared(witnesses, 1.5, 0.5, 1000.0)
+    compared = Compared(witnesses, 1.5, 0.5, 1000.0, 0.6)
     utility = belief.which_features(compared) @ TRUE
     chances = np.exp(utility) / np.exp(utility).sum()
     truth = f"effect_{rng.choice(EFFECTS, p=chances)}"

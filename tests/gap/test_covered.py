@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cangauge.gap.settle import temperatures_covered
+from cangauge.gap.settle import inside_charge, temperatures_covered
 from cangauge.model.effects.candidate import candidates
 from cangauge.model.effects.effect import Pack
 from cangauge.model.effects.library import LIBRARY
@@ -37,6 +37,17 @@ def test_a_pack_is_known_a_little_beyond_its_temperatures(
     middle = sum(references_c) / 2.0
     references = [log(references_c[0], middle), log(middle, references_c[1])]
     assert temperatures_covered(references, [log(*log_c)]) is covered
+
+
+def at_charge(*soc_pct: float) -> Any:
+    return SimpleNamespace(rows=SimpleNamespace(soc_pct=np.array(soc_pct)))
+
+
+def test_a_pseudo_ocv_is_known_where_references_have_been() -> None:
+    references = [at_charge(40.0, 50.0), at_charge(70.0, 60.0)]
+    inside = inside_charge(at_charge(36.0, 38.0, 55.0, 72.0, 74.0), references)
+    assert inside.tolist() == [False, True, True, True, False]
+    assert inside_charge(at_charge(10.0, 90.0), []).all()
 
 
 def test_a_diagnosis_tries_spread_diffusion_and_a_fit_does_not() -> None:

@@ -82,6 +82,17 @@ def test_says_none_on_clean_logs(model: ModelFile, references: list[Log]) -> Non
         assert found.closed is None
 
 
+def test_what_shows_only_at_a_charge_that_no_reference_has_been_at_is_no_cause(
+    model: ModelFile, references: list[Log]
+) -> None:
+    log = synthetic_log(hours=1.2, start_pct=85.0, end_pct=40.0, noise_v=0.5, seed=21)
+    assert log.soc_pct is not None
+    beyond = np.maximum(55.0 - log.soc_pct, 0.0)
+    found = diagnose([replace(log, voltage_v=log.voltage_v + 0.5 * beyond)], model, references)
+    assert found.baseline_rmse_v > 2.0 * found.floor_v
+    assert found.verdict.cause == "none"
+
+
 def test_says_unknown_of_what_no_effect_is_like(model: ModelFile, references: list[Log]) -> None:
     log = day(21)
     wave = 6.0 * np.sin(2.0 * np.pi * log.time_s / 240.0)

@@ -25,12 +25,12 @@ NATS, LEAD_NATS, SHARP_LEAD_NATS = 5.0, 5.0, 20.0
 """Log Bayes factors count in full below the first; leads are parts of the best's own factor, or of
 these where it has less."""
 
-WHICH = (0.422, 0.727, 1.451, 1.216, 0.87)
+WHICH = (0.412, 0.865, 1.468, 1.178, 0.872)
 """Weights of an effect's log Bayes factor, its lead (negative), the same without strays, and of
 what it takes away in volts and of the excess (`which_features`)."""
 
-BEST_IS_IT = (-3.485, 0.238, 1.23, 0.262, 0.674, 3.713, 0.309)
-IS_ANOTHER = (-0.515, 0.165, 0.46, -0.055, 0.043, 1.83, 1.03)
+BEST_IS_IT = (-3.667, 0.24, 1.361, 0.222, 0.662, 3.502, 0.748)
+IS_ANOTHER = (-0.782, 0.168, 0.77, -0.009, -0.109, 1.137, 1.51)
 """Weights for "the best is it" and "it is another", against "none": of one, and of
 `whether_features`."""
 
@@ -83,7 +83,7 @@ def which_features(compared: Compared) -> FloatArray:
 
 def whether_features(compared: Compared, best: Witness, share: float) -> FloatArray:
     """Return what is weighed of the best effect: one, and six more, shape (7,)."""
-    gap = compared.before_v / max(compared.clean_v, 1e-9)
+    gap = compared.before_v / max(compared.expected_v, 1e-9)
     return np.array(
         [
             1.0,

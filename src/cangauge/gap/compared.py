@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cangauge.gap.evidence import Evidence, gather
-from cangauge.gap.remainder import excess, kept_v2
+from cangauge.gap.remainder import excess, expected_v2, kept_v2
 from cangauge.gap.scores import Score, scores
 from cangauge.gap.settle import Settled
 
@@ -55,6 +55,8 @@ class Compared:
     clean_v: float
     """The same of references left out [V]."""
     before_excess: float
+    expected_v: float
+    """RMS of what such logs would keep without a cause, where these have been [V]."""
 
     @property
     def found(self) -> float:
@@ -88,7 +90,7 @@ class Compared:
 
 def compare(settled: Settled) -> tuple[Evidence, Compared]:
     """Return the evidence of the diagnosed logs, and every effect beside the others."""
-    frame, error, grams = settled.frame, settled.error, settled.diagnosed_grams
+    frame, error, grams = settled.frame, settled.error, settled.judged_grams
     evidence = gather(frame, settled.reference_grams, grams, error)
     alone = gather(frame, settled.reference_grams, [], error)
     own = _by_effect(evidence)
@@ -121,6 +123,7 @@ def compare(settled: Settled) -> tuple[Evidence, Compared]:
         before_v=math.sqrt(before_v2),
         clean_v=math.sqrt(error.clean_v2) or error.rmse_v,
         before_excess=excess(evidence, grams, alone.squares),
+        expected_v=math.sqrt(sum(expected_v2(gram, alone) for gram in grams) / len(grams)),
     )
 
 

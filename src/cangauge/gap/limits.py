@@ -104,7 +104,8 @@ def _soc(logs: Sequence[Prepared], references: Sequence[Prepared]) -> str:
             sentences.append(
                 f"SoC of {low:.0f} … {high:.0f} % where the references have"
                 f" {known[0]:.0f} … {known[1]:.0f} %: outside it the model's own OCV may be wrong,"
-                " and that cannot be told safely from a cause."
+                " and that cannot be told safely from a cause. Logs are judged inside it as far as"
+                " they have been there."
             )
     return " ".join(sentences)
 

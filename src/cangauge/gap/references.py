@@ -180,7 +180,11 @@ def _own_by_effect(frame: Frame) -> list[NDArray[np.intp]]:
 
 
 def with_strays(
-    frame: Frame, grams: Sequence[Gram], error: ErrorModel, covered: Sequence[float] = ()
+    frame: Frame,
+    grams: Sequence[Gram],
+    error: ErrorModel,
+    covered: Sequence[float] = (),
+    judged: Sequence[Gram] = (),
 ) -> ErrorModel:
     """Return the error with how far references stray that are diagnosed like the logs.
 
@@ -198,6 +202,8 @@ def with_strays(
         From `error_from_references`.
     covered : sequence of float, optional
         How much each reference counts: the part of it that lies where the others have been.
+    judged : sequence of Gram, optional
+        What of each reference is diagnosed, if not the whole.
     """
     weights = np.array(covered) if len(covered) else np.ones(len(grams))
     shown = frame.shown
@@ -209,7 +215,7 @@ def with_strays(
     )
     squares: dict[str, list[float]] = {}
     kept = []
-    for number, gram in enumerate(grams):
+    for number, gram in enumerate(judged or grams):
         others = [item for k, item in enumerate(grams) if k != number]
         evidence = gather(few, others, [gram], error)
         without = gather(few, others, [], error)

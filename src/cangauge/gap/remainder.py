@@ -88,6 +88,35 @@ def kept_v2(
     return float(np.sum((log.products @ weights) @ weights) / np.sum(log.counts))
 
 
+def expected_v2(log: Gram, alone: Evidence) -> float:
+    """Return the mean square error to expect of a log without a cause [V²].
+
+    Errors as the references have them, what is each log's own, and how surely the references and
+    the model file know the coefficients and the structure where this log went.
+
+    Parameters
+    ----------
+    log : Gram
+        With the columns of all of the frame's candidates.
+    alone : Evidence
+        Of the references alone.
+    """
+    frame, error = alone.frame, alone.error
+    p, repairs = frame.scale.size, frame.amplitudes_of(frame.repairs)
+    columns = log.products.shape[1]
+    shared = np.concatenate((np.arange(p), p + repairs))
+    levels = columns - 1 - len(LEVELS) + np.arange(len(LEVELS))
+    own = np.concatenate((p + frame.amplitudes_of(frame.own), levels))
+    products = log.products.sum(axis=0)
+    balance = 1.0 / np.sqrt(np.diag(alone.precision))
+    spread = np.linalg.inv(alone.precision * balance * balance[:, None])
+    spread *= balance * balance[:, None]
+    squares = float(np.sum(products[np.ix_(shared, shared)] * spread))
+    squares += float(np.diag(products)[own] @ np.array(error.own_std) ** 2)
+    squares += float(log.counts @ np.array(error.scale_v2))
+    return squares / float(np.sum(log.counts))
+
+
 def excess(
     evidence: Evidence, diagnosed: Sequence[Gram], clean: float, score: Score | None = None
 ) -> float:

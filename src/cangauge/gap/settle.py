@@ -59,6 +59,9 @@ COLDER_PART, WARMER_PART = 0.2, 0.5
 references have: how the pack follows the temperature, they have shown. In the cold resistance
 grows ever faster. (On trips that the check is made of, winter is 0.3 below summer.)"""
 
+LEAST_INSIDE = 0.2
+"""A log is judged where references have been, if that is at least this part of it."""
+
 LEAST_COUNT = 0.1
 """A reference that went where no other has been still counts so much."""
 
@@ -101,6 +104,23 @@ class Settled:
             gram_of(terms, self.frame.scale).weakened(self.hardness(terms))
             for terms in self.diagnosed
         )
+
+    @cached_property
+    def judged_grams(self) -> tuple[Gram, ...]:
+        """Products of the diagnosed logs where references have been at the same charge.
+
+        How a pseudo-OCV goes on beyond the charge that it was taught, nobody has seen: what shows
+        there may be the cause or the model. Without any such rows, those of all.
+        """
+        grams = []
+        for terms, gram in zip(self.diagnosed, self.diagnosed_grams, strict=True):
+            keep = inside_charge(terms.prepared, [item.prepared for item in self.references])
+            if keep.all():
+                grams.append(gram)
+            elif np.mean(keep) >= LEAST_INSIDE:
+                inside = gram_of(terms, self.frame.scale, keep)
+                grams.append(inside.weakened(self.hardness(terms)))
+        return tuple(grams) or self.diagnosed_grams
 
     def hardness(self, terms: LogTerms) -> float:
         """Return how much larger a log's error may be than the references', as variance.
@@ -165,12 +185,13 @@ def settle(
     reference_terms: tuple[LogTerms, ...] = ()
     if of_references:
         say("learning from the references")
-        grams = _grams(_reference_terms(of_references, model, frame), frame)
+        found = _reference_terms(of_references, model, frame)
+        grams = _grams(found, frame)
         if len(grams) > 1:
             least_trust = 0.0 if covered else LEAST_TRUST_BEYOND
             error = error_from_references(frame, grams, error, least_trust)
             weights = counting(of_references, of_logs)
-            error = with_strays(frame, grams, error, weights)
+            error = with_strays(frame, grams, error, weights, _judged(found, frame))
         expected = error if covered or len(grams) == 1 else _beyond_the_references(error)
         say("repairing the structure")
         acting = repaired(model, frame, grams, expected)
@@ -184,7 +205,8 @@ def settle(
         reference_terms = _reference_terms(of_references, model, frame, acting)
         if len(grams) > 1:
             grams = _grams(reference_terms, frame)
-            error = farther(error, with_strays(frame, grams, error, weights))
+            judged = _judged(reference_terms, frame)
+            error = farther(error, with_strays(frame, grams, error, weights, judged))
             error = error if covered else _beyond_the_references(error)
     diagnosed = []
     for item in of_logs:
@@ -205,6 +227,18 @@ def settle(
 
 def _grams(references: Sequence[LogTerms], frame: Frame) -> list[Gram]:
     return [gram_of(terms, frame.scale) for terms in references]
+
+
+def _judged(references: Sequence[LogTerms], frame: Frame) -> list[Gram]:
+    """Return each reference's products where others have been, as diagnosed logs are judged."""
+    found = []
+    for terms in references:
+        others = [other.prepared for other in references if other is not terms]
+        keep = inside_charge(terms.prepared, others)
+        if np.mean(keep) < LEAST_INSIDE:
+            keep = np.ones_like(keep)
+        found.append(gram_of(terms, frame.scale, keep))
+    return found
 
 
 def _reference_terms(
@@ -320,6 +354,15 @@ def temperatures_covered(references: Sequence[Prepared], diagnosed: Sequence[Pre
     low = seen.min() - max(COVERED_K, COLDER_PART * spread)
     high = seen.max() + max(COVERED_K, WARMER_PART * spread)
     return bool(np.mean((asked >= low) & (asked <= high)) > 0.5)
+
+
+def inside_charge(item: Prepared, references: Sequence[Prepared]) -> NDArray[np.bool_]:
+    """Return which rows of a log are at a charge that references have been at, shape (m,)."""
+    soc = item.rows.soc_pct
+    if not references:
+        return np.ones(soc.size, dtype=bool)
+    seen = np.concatenate([other.rows.soc_pct for other in references])
+    return np.asarray((soc >= seen.min() - COVERED_PCT) & (soc <= seen.max() + COVERED_PCT))
 
 
 def counting(references: Sequence[Prepared], diagnosed: Sequence[Prepared]) -> list[float]:

@@ -34,10 +34,10 @@ LARGE = 1.5
 UNSURE = 0.5
 """Nor is any effect given more than this probability there."""
 
-SEEN_BELOW = 0.15
+SEEN_BELOW = 0.2
 """Something is there if `none` has less than this probability."""
 
-NAMED_FROM = 0.25
+NAMED_FROM = 0.2
 """And it is named if the best effect is it with this probability, given that something is there."""
 
 ALIKE_FROM = 0.5
