@@ -3,7 +3,7 @@
     cangauge gap-check --protocol simulated --per-effect 5 --healthy 150 --seed 32 --keep cases
     python benchmarks/belief.py cases…
 
-The weights in use were learned from 553 cases: seeds 31 (--per-effect 2 --healthy 40) and 32 of
+The weights in use were learned from 552 cases: seeds 31 (--per-effect 2 --healthy 40) and 32 of
 `simulated`, 32 of `real-bmw_i3` (3, 20) and `outside` (three each), 31 of `equation` (2, 16), and
 60 more of `equation` with gaps counted in at least 0.15 % of the voltage, which no command draws.
 

@@ -191,7 +191,7 @@ def settle(
             least_trust = 0.0 if covered else LEAST_TRUST_BEYOND
             error = error_from_references(frame, grams, error, least_trust)
             weights = counting(of_references, of_logs)
-            error = with_strays(frame, grams, error, weights, _judged(found, frame))
+            error = with_strays(frame, grams, error, weights, _judged(found, grams, frame))
         expected = error if covered or len(grams) == 1 else _beyond_the_references(error)
         say("repairing the structure")
         acting = repaired(model, frame, grams, expected)
@@ -205,7 +205,7 @@ def settle(
         reference_terms = _reference_terms(of_references, model, frame, acting)
         if len(grams) > 1:
             grams = _grams(reference_terms, frame)
-            judged = _judged(reference_terms, frame)
+            judged = _judged(reference_terms, grams, frame)
             error = farther(error, with_strays(frame, grams, error, weights, judged))
             error = error if covered else _beyond_the_references(error)
     diagnosed = []
@@ -229,15 +229,14 @@ def _grams(references: Sequence[LogTerms], frame: Frame) -> list[Gram]:
     return [gram_of(terms, frame.scale) for terms in references]
 
 
-def _judged(references: Sequence[LogTerms], frame: Frame) -> list[Gram]:
+def _judged(references: Sequence[LogTerms], grams: Sequence[Gram], frame: Frame) -> list[Gram]:
     """Return each reference's products where others have been, as diagnosed logs are judged."""
     found = []
-    for terms in references:
+    for terms, gram in zip(references, grams, strict=True):
         others = [other.prepared for other in references if other is not terms]
         keep = inside_charge(terms.prepared, others)
-        if np.mean(keep) < LEAST_INSIDE:
-            keep = np.ones_like(keep)
-        found.append(gram_of(terms, frame.scale, keep))
+        whole = keep.all() or np.mean(keep) < LEAST_INSIDE
+        found.append(gram if whole else gram_of(terms, frame.scale, keep))
     return found
 
 
