@@ -64,6 +64,15 @@ def test_neither_names_nor_their_order_matter(given_: Compared, random: object) 
     assert one.best == pytest.approx(other.best)
 
 
+def test_of_equals_the_one_that_leaves_less_is_first_whatever_their_order() -> None:
+    """Below what is weighed, they are equals; what is explained still tells them apart."""
+    more, less = witness("more", 0.0, 1.0, 1.0), witness("less", 0.0, 1.0, 0.0)
+    beliefs = [believe(compared(*pair, before_v=0.0)) for pair in ((more, less), (less, more))]
+    for belief in beliefs:
+        assert [each.score.effect_id for each in belief.witnesses] == ["less", "more"]
+    assert beliefs[0].none == beliefs[1].none
+
+
 def test_of_two_with_like_evidence_the_one_that_takes_the_volts_away_is_believed() -> None:
     """Evidence counts what is certain; a cause must also be large enough."""
     small, large = witness("small", 50.0, 1.4, 500.0), witness("large", 48.0, 0.5, 500.0)

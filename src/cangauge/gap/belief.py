@@ -25,6 +25,9 @@ NATS, LEAD_NATS, SHARP_LEAD_NATS = 5.0, 5.0, 20.0
 """Log Bayes factors count in full below the first; leads are parts of the best's own factor, or of
 these where it has less."""
 
+TIED_DECIMALS = 9
+"""Effects whose utilities agree to so many decimals are equals."""
+
 WHICH = (0.412, 0.865, 1.468, 1.178, 0.872)
 """Weights of an effect's log Bayes factor, its lead (negative), the same without strays, and of
 what it takes away in volts and of the excess (`which_features`)."""
@@ -60,8 +63,10 @@ def believe(compared: Compared) -> Belief:
 
 def ranked(compared: Compared, which: FloatArray) -> tuple[tuple[Witness, ...], FloatArray]:
     """Return the effects, the best first, and the share of each, by weights of what is weighed."""
-    utility = which_features(compared) @ which
-    order = np.argsort(-utility, kind="stable")
+    utility = np.round(which_features(compared) @ which, TIED_DECIMALS)
+    left = [(witness.left_v, witness.left_excess) for witness in compared.witnesses]
+    # Of equals the one that leaves less, whatever order they come in.
+    order = sorted(range(len(left)), key=lambda k: (-utility[k], *left[k]))
     shares = np.exp(utility[order] - utility.max())
     return tuple(compared.witnesses[k] for k in order), shares / shares.sum()
 
