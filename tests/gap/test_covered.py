@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cangauge.gap.settle import inside_charge, temperatures_covered
+from cangauge.gap.covered import inside_charge, temperatures_covered
 from cangauge.model.effects.candidate import candidates
 from cangauge.model.effects.effect import Pack
 from cangauge.model.effects.library import LIBRARY

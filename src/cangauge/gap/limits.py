@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cangauge.gap.columns import Prepared
-from cangauge.gap.settle import COVERED_K, COVERED_PCT
+from cangauge.gap.covered import COVERED_K, COVERED_PCT
 
 SHORT_S = 600.0
 """In a shorter log little builds up [s]."""

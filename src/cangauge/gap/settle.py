@@ -21,6 +21,7 @@ from cangauge.gap.columns import (
     prepare_log,
     residual,
 )
+from cangauge.gap.covered import counting, inside_charge, temperatures_covered
 from cangauge.gap.evidence import ErrorModel, Frame, Gram, gather, gram_of
 from cangauge.gap.references import (
     LEAST_TRUST_BEYOND,
@@ -51,19 +52,8 @@ OWN_PART = 0.01
 ALWAYS_OF_TEMPERATURE = frozenset({"charge_transfer", "inner_temperature"})
 """Structure that follows the temperature whatever its shape."""
 
-COVERED_K, COVERED_PCT = 3.0, 3.0
-"""References cover temperatures and SoC up to this far outside their own [K, %]."""
-
-COLDER_PART, WARMER_PART = 0.2, 0.5
-"""Nor are temperatures foreign that lie below or above by less than these parts of the range that
-references have: how the pack follows the temperature, they have shown. In the cold resistance
-grows ever faster. (On trips that the check is made of, winter is 0.3 below summer.)"""
-
 LEAST_INSIDE = 0.2
 """A log is judged where references have been, if that is at least this part of it."""
-
-LEAST_COUNT = 0.1
-"""A reference that went where no other has been still counts so much."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -343,52 +333,6 @@ def _beyond_the_references(error: ErrorModel) -> ErrorModel:
     scales are given the variance of the slowest.
     """
     return replace(error, scale_v2=(error.lasting_v2,) * len(error.scale_v2), strays={})
-
-
-def temperatures_covered(references: Sequence[Prepared], diagnosed: Sequence[Prepared]) -> bool:
-    """Return whether most rows of the diagnosed logs are at temperatures that references teach."""
-    seen = np.concatenate([item.rows.temperature_c for item in references])
-    asked = np.concatenate([item.rows.temperature_c for item in diagnosed])
-    spread = float(np.ptp(seen))
-    low = seen.min() - max(COVERED_K, COLDER_PART * spread)
-    high = seen.max() + max(COVERED_K, WARMER_PART * spread)
-    return bool(np.mean((asked >= low) & (asked <= high)) > 0.5)
-
-
-def inside_charge(item: Prepared, references: Sequence[Prepared]) -> NDArray[np.bool_]:
-    """Return which rows of a log are at a charge that references have been at, shape (m,)."""
-    soc = item.rows.soc_pct
-    if not references:
-        return np.ones(soc.size, dtype=bool)
-    seen = np.concatenate([other.rows.soc_pct for other in references])
-    return np.asarray((soc >= seen.min() - COVERED_PCT) & (soc <= seen.max() + COVERED_PCT))
-
-
-def counting(references: Sequence[Prepared], diagnosed: Sequence[Prepared]) -> list[float]:
-    """Return how much each reference says of how far the diagnosed logs may stray.
-
-    One that went where no other has been shows how the model extrapolates. If the diagnosed logs
-    stay where references have been, that is another question, and it counts little.
-    """
-    asked = min(_part_inside(item, references) for item in diagnosed)
-    return [
-        max(
-            LEAST_COUNT,
-            1.0 - asked,
-            _part_inside(item, [other for other in references if other is not item]),
-        )
-        for item in references
-    ]
-
-
-def _part_inside(item: Prepared, others: Sequence[Prepared]) -> float:
-    """Return the part of a log's rows within the temperatures and SoC of others [-]."""
-    inside = np.ones(item.rows.time_s.size, dtype=bool)
-    for name, margin in (("temperature_c", COVERED_K), ("soc_pct", COVERED_PCT)):
-        values = np.concatenate([getattr(other.rows, name) for other in others])
-        mine = getattr(item.rows, name)
-        inside &= (mine >= values.min() - margin) & (mine <= values.max() + margin)
-    return float(np.mean(inside))
 
 
 def _check_pack(log: Log, model: ExtendedModel) -> None:
