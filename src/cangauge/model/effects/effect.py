@@ -22,12 +22,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cangauge.model.charge import BRIDGE_S
+from cangauge.model.effects.first_order import low_passed
 from cangauge.model.voltage_model import VoltageModel
 
 FloatArray = NDArray[np.float64]
@@ -186,6 +188,19 @@ class PackState:
     soc_pct: FloatArray
     drop_v: FloatArray
     """Σ Rj·I(t − dj) of the voltage model [V]; negative while discharging."""
+    _lagged_a: dict[float, FloatArray] = field(default_factory=dict, init=False, repr=False)
+
+    def lagged_current_a(self, tau_s: float) -> FloatArray:
+        """Return the current behind a first-order lag [A], shape (n,), at rest before the log.
+
+        Many effects and shapes ask for the same lags, which are most of the work on a long log, so
+        each is worked out once. The array is shared: not to be written to.
+        """
+        if tau_s not in self._lagged_a:
+            self._lagged_a[tau_s] = low_passed(
+                self.time_s, self.current_a, tau_s, 0.0, rest_s=BRIDGE_S
+            )
+        return self._lagged_a[tau_s]
 
     def scaled_drop_v(self, delayed: float, pack: Pack) -> FloatArray:
         """Return the drop that an effect scales [V], shape (n,) (`DELAYED`)."""

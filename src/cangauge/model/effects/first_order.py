@@ -39,8 +39,8 @@ def decaying_sum(decay: FloatArray, drive: FloatArray, start: float) -> FloatArr
     result[0] = start
     # Counting no further than `NOTHING_LEFT` a step keeps e^elapsed finite.
     elapsed = np.concatenate(([0.0], np.cumsum(np.minimum(decay, NOTHING_LEFT))))
-    block = (elapsed[1:] // DECAY_A_BLOCK).astype(np.intp)
-    edges = np.concatenate(([0], np.flatnonzero(np.diff(block)) + 1, [block.size]))
+    blocks = np.arange(DECAY_A_BLOCK, elapsed[-1], DECAY_A_BLOCK)
+    edges = np.concatenate(([0], np.searchsorted(elapsed[1:], blocks), [decay.size]))
     last = start
     for first, after in itertools.pairwise(edges.tolist()):
         grown = np.exp(elapsed[first + 1 : after + 1] - elapsed[first])
@@ -70,9 +70,9 @@ def low_passed(
     """
     seconds = np.diff(time_s)
     step = seconds / tau_s
-    a = np.exp(-step)
-    b = -np.expm1(-step) / step - a
-    drive = (1.0 - a) * values[1:] + b * (values[:-1] - values[1:])
+    rest = -np.expm1(-step)  # 1 − a
+    b = rest / step - (1.0 - rest)
+    drive = rest * values[1:] + b * (values[:-1] - values[1:])
     return decaying_sum(step, np.where(seconds > rest_s, 0.0, drive), start)
 
 

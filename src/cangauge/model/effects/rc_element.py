@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from cangauge.model.charge import BRIDGE_S
 from cangauge.model.effects.arrhenius import arrhenius, arrhenius_at
 from cangauge.model.effects.effect import FloatArray, OnlineEffect, PackState, Parameter
-from cangauge.model.effects.first_order import LowPass, low_passed
+from cangauge.model.effects.first_order import LowPass
 
 ACTIVATION = Parameter("activation_k", "K", 0.0, 6000.0, neutral=None, grid=(0.0, 3000.0))
 """How the element's resistance rises in the cold; it is the stated one at 25 °C."""
@@ -17,10 +15,10 @@ ACTIVATION = Parameter("activation_k", "K", 0.0, 6000.0, neutral=None, grid=(0.0
 
 def rc_voltage(state: PackState, ohm: float, tau_s: float, activation_k: float = 0.0) -> FloatArray:
     """Return −R(T)·(lagged current) [V], shape (n,), at rest before the first sample."""
-    lagged = low_passed(state.time_s, state.current_a, tau_s, 0.0, rest_s=BRIDGE_S)
+    lagged = state.lagged_current_a(tau_s)
     if activation_k:
         lagged = lagged * arrhenius(state.temperature_c, activation_k)
-    return np.asarray(-ohm * lagged)
+    return -ohm * lagged
 
 
 class OnlineRc(OnlineEffect):
