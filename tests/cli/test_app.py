@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -9,6 +10,7 @@ import pytest
 import typer
 
 from cangauge.cli.app import COMMANDS, app
+from cangauge.threads import THREADS
 
 SLOW_TO_IMPORT = ("bokeh", "pyarrow", "clarabel", "cangauge.gap", "cangauge.report.page")
 
@@ -30,3 +32,24 @@ def test_the_service_starts_without_what_only_others_need() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     )
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(("asked", "expected"), [(None, "1"), ("2", "2")])
+def test_linear_algebra_has_one_thread_unless_the_user_says_more(
+    asked: str | None, expected: str
+) -> None:
+    """It is asked for before numpy is imported, which would not hear of it later."""
+    code = (
+        "import os, sys; from cangauge.cli import app; loaded = 'numpy' in sys.modules\n"
+        "sys.argv = ['cangauge', '--version']\n"
+        "try: app.main()\n"
+        "except SystemExit: print(loaded, os.environ['OPENBLAS_NUM_THREADS'])"
+    )
+    environment = {k: v for k, v in os.environ.items() if k not in THREADS}
+    if asked:
+        environment["OPENBLAS_NUM_THREADS"] = asked
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True, text=True, check=True, timeout=60, env=environment,
+    )  # fmt: skip
+    assert done.stdout.splitlines()[-1] == f"False {expected}"

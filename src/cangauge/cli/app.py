@@ -5,6 +5,7 @@ Exit 0: done; 1: failed; 2: bad usage or input.
 
 from __future__ import annotations
 
+import os
 import sys
 from importlib import import_module
 from typing import Any, Final
@@ -17,6 +18,7 @@ from cangauge import __version__
 from cangauge.cli.output import note
 from cangauge.cli.usage import UsageError, usage_line
 from cangauge.errors import CangaugeError
+from cangauge.threads import one_thread
 
 COMMANDS: Final = (
     "demo",
@@ -81,6 +83,7 @@ def _root(
 
 def main() -> None:
     """Run the command line and exit with its code."""
+    one_thread(os.environ)  # no command has been imported yet, nor numpy
     try:
         code = app(standalone_mode=False)
     except CangaugeError as error:

@@ -23,6 +23,7 @@ from cangauge.gapcheck.outcome import Outcome, outcome_of
 from cangauge.gapcheck.plan import EFFECTS, Group
 from cangauge.gapcheck.seal import seal, unseal
 from cangauge.gapcheck.workers import Task, diagnose_all
+from cangauge.threads import THREADS
 
 OPEN, SEALED, TASKS, ANSWERS = "open", "sealed", "tasks.json", "answers.jsonl"
 SCHEMA: Final = 1
@@ -269,9 +270,8 @@ def later_of(
 @contextmanager
 def _one_thread() -> Iterator[None]:
     """Let the processes that start within use one thread each: the cores are theirs already."""
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, "1"))
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
     try:
         yield
     finally:

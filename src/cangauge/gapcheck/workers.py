@@ -16,6 +16,8 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Final
 
+from cangauge.threads import THREADS
+
 COMMAND: Final = (sys.executable, "-m", "cangauge.gapcheck.worker")
 LONGEST_S: Final = 600.0
 """A case that takes longer is stopped and counts as crashed."""
@@ -107,8 +109,7 @@ class _Worker:
 def environment() -> dict[str, str]:
     """Return what a diagnosing process knows of its surroundings: where Python is, one thread."""
     kept = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
-    threads = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    return kept | dict.fromkeys(threads, "1")
+    return kept | dict.fromkeys(THREADS, "1")
 
 
 def request_of(task: Task, source: Path, home: Path) -> dict[str, Any]:
