@@ -53,7 +53,7 @@ def extend(settled: Settled, accepted: Sequence[Score]) -> Extension:
         return Extension(*_base(few))
     found = at_causes(settled, _begin(few, accepted))
     base, remarks = _base(_with_needed_structure(found.settled))
-    # The pack's sizes, which bounds are relative to, have moved with the coefficients.
+    # The pack's sizes have moved with the coefficients, and a file must agree with them.
     causes = [
         replace(cause, values=cause.choice.effect.within(cause.values, base.pack))
         for cause in found.causes
@@ -145,8 +145,9 @@ def _refined(
     parameters = (*effect.amplitudes, *effect.shapes)
     parameters = parameters or effect.parameters
     constants = {p.name: start[p.name] for p in effect.parameters if p not in parameters}
-    bounds = np.array([parameter.bounds(model.pack) for parameter in parameters])
-    neutral = effect.neutral(model.pack)
+    pack = settled.model.pack  # not the model's, whose structure has taken much of its resistance
+    bounds = np.array([parameter.bounds(pack) for parameter in parameters])
+    neutral = effect.neutral(pack)
     centre = np.array([neutral[parameter.name] for parameter in parameters])
     scale = bounds[:, 1] - bounds[:, 0]
     low, high = (bounds[:, 0] - centre) / scale, (bounds[:, 1] - centre) / scale
@@ -237,9 +238,8 @@ def _merged(effects: Sequence[tuple[Effect, Values]], pack: Pack) -> list[tuple[
         neutral = effect.neutral(pack)
         _, total = merged[key]
         for parameter in effect.amplitudes:
-            low, high = parameter.bounds(pack)
-            more = total[parameter.name] + values[parameter.name] - neutral[parameter.name]
-            total[parameter.name] = min(max(more, low), high)
+            total[parameter.name] += values[parameter.name] - neutral[parameter.name]
+        merged[key] = (effect, effect.within(total, pack))
     return list(merged.values())
 
 

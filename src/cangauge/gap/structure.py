@@ -85,7 +85,7 @@ def with_pieces(model: ExtendedModel, frame: Frame, amplitudes: FloatArray) -> E
         amplitude = np.clip(amplitudes[at : at + low.size], low, high)
         at += low.size
         if np.any(np.abs(amplitude) > NEGLIGIBLE * (high - low)):
-            # The pack's sizes, which bounds are relative to, move with the coefficients.
+            # The pack's sizes move with the coefficients, and a file must agree with them.
             values = choice.effect.within(choice.values(amplitude), model.pack)
             model = model.with_effect(choice.effect, values)
     return model

@@ -57,6 +57,11 @@ RESISTANCE_AT_LEAST = 0.002
 """Least resistance that bounds are relative to, in voltage over 1 C current (a Leaf has 0.018): a
 model whose resistances happen to cancel must not shut every resistance effect out."""
 
+LEEWAY = 10.0
+"""Bounds that are relative to the pack are this much wider in a model that has effects: the pack's
+sizes are read off its coefficients, and effects such as RC elements may have taken most of its
+resistance from these. A wrong unit is still found."""
+
 
 @dataclass(frozen=True)
 class Pack:
@@ -137,10 +142,16 @@ class Parameter:
         }
         return sizes[self.scale]
 
-    def bounds(self, pack: Pack) -> tuple[float, float]:
-        """Return the physical bounds in the parameter's unit."""
+    def bounds(self, pack: Pack, leeway: float = 1.0) -> tuple[float, float]:
+        """Return the physical bounds in the parameter's unit.
+
+        Those that are relative to the pack are `leeway` times wider (`LEEWAY`).
+        """
         factor = self.factor(pack)
-        return self.low * factor, self.high * factor
+        low, high = self.low * factor, self.high * factor
+        if self.scale != "one":
+            low, high = (low * leeway if low < 0.0 else low / leeway), high * leeway
+        return low, high
 
     def trials(self, pack: Pack) -> tuple[float, ...]:
         """Return the values to try for a shape, in the parameter's unit; none for an amplitude."""
@@ -353,10 +364,10 @@ class Effect(ABC):
         return values
 
     def within(self, values: Values, pack: Pack) -> dict[str, float]:
-        """Return values with the amplitudes held within their bounds for a pack."""
+        """Return values with the amplitudes held within what a file for a pack may say."""
         held = dict(values)
         for parameter in self.amplitudes:
-            low, high = parameter.bounds(pack)
+            low, high = parameter.bounds(pack, LEEWAY)
             held[parameter.name] = min(max(held[parameter.name], low), high)
         return held
 

@@ -11,7 +11,7 @@ from cangauge.model.effects.core_temperature import CoreTemperature
 from cangauge.model.effects.coulombic_efficiency import CoulombicEfficiency
 from cangauge.model.effects.current_gain import CurrentGain
 from cangauge.model.effects.current_offset import CurrentOffset
-from cangauge.model.effects.effect import Effect, Pack, Parameter, Values
+from cangauge.model.effects.effect import LEEWAY, Effect, Pack, Parameter, Values
 from cangauge.model.effects.entropic_coefficient import EntropicCoefficient
 from cangauge.model.effects.fast_polarization import FastPolarization
 from cangauge.model.effects.hysteresis import Hysteresis
@@ -60,10 +60,6 @@ LIBRARY: Mapping[str, Effect] = {effect.id: effect for effect in _EFFECTS}
 
 LARGEST = 1e30
 """No parameter is larger, in any unit."""
-
-LEEWAY = 2.0
-"""Bounds that are relative to the pack are this much wider when a file is read: the pack's sizes
-are read off its coefficients, and a refit with the effect moves those."""
 
 
 def effect_of(effect_id: object, field: str = "effects") -> Effect:
@@ -171,10 +167,7 @@ def _value(parameter: Parameter, given: object, pack: Pack, field: str) -> float
         or not -LARGEST <= given <= LARGEST
     ):
         raise InputError("must be a finite number", field=field, value=given)
-    low, high = parameter.bounds(pack)
-    if parameter.scale != "one":
-        low = low * LEEWAY if low < 0.0 else low / LEEWAY
-        high = high * LEEWAY
+    low, high = parameter.bounds(pack, LEEWAY)
     rounding = 1e-9 * (high - low)
     if not low - rounding <= given <= high + rounding:
         raise InputError(
