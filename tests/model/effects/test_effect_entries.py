@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from stepping import EFFECTS, MODEL, PACK, irregular_signals, middle, within
 
 from cangauge.errors import InputError
-from cangauge.model.effects.effect import Effect, Pack
+from cangauge.model.effects.effect import LEEWAY, Effect, Pack
 from cangauge.model.effects.library import LIBRARY, effect_entries, effect_of, parse_effects
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.published import CAPACITY_AH
@@ -37,11 +37,24 @@ def test_everything_in_bounds_is_taken(effect: Effect, part: float) -> None:
 def test_far_out_of_bounds_is_refused_naming_the_parameter(effect: Effect) -> None:
     for parameter in effect.parameters:
         low, high = parameter.bounds(PACK)
-        for wrong in (high + 2.5 * (high - low), low - 2.5 * (high - low)):
+        widths = 2.5 if parameter.scale == "one" else 1.2 * LEEWAY
+        for wrong in (high + widths * (high - low), low - widths * (high - low)):
             values = middle(effect) | {parameter.name: wrong}
             with pytest.raises(InputError, match="must lie within") as error:
                 parse_effects([OFFSET | {}, *effect_entries([(effect, values)])][-1:], PACK)
             assert error.value.field == f"effects.0.parameters.{parameter.name}"
+
+
+@pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.id)
+@pytest.mark.parametrize("part", [0.0, 1.0])
+def test_an_effect_keeps_its_size_where_others_took_the_resistance(
+    effect: Effect, part: float
+) -> None:
+    """RC elements that clean logs show leave a model of the same pack little resistance."""
+    values = {item.name: within(item, part) for item in effect.parameters}
+    little = replace(PACK, resistance_ohm=0.2 * PACK.resistance_ohm)
+    assert effect.within(values, little) == values
+    assert parse_effects(effect_entries([(effect, values)]), little) == [(effect, values)]
 
 
 def test_a_bound_of_zero_stays_zero() -> None:
