@@ -19,8 +19,8 @@ import pyarrow.parquet as pq
 from cangauge.bus.encode import FrameEncoder
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.estimate.types import Sample
-from cangauge.model.effects.effect import Pack, Parameter
 from cangauge.model.effects.library import LIBRARY, effect_entries
+from cangauge.model.effects.parameter import Pack, Parameter
 from cangauge.model.model_file import load_model
 from cangauge.share import shared_file
 

@@ -17,8 +17,8 @@ from cangauge.estimate.estimator import Estimator, EstimatorSettings
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.state import EstimatorState
 from cangauge.estimate.types import Estimate, Reason, Sample
-from cangauge.model.effects.effect import Pack
 from cangauge.model.effects.library import LIBRARY, effect_entries
+from cangauge.model.effects.parameter import Pack
 from cangauge.model.model_file import ModelFile
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
 from synthetic import synthetic_log
@@ -305,9 +305,9 @@ def test_what_an_effect_remembers_lies_before_the_latest_sample() -> None:
         whole.step(sample)
     state = through_json(whole.snapshot())
     Estimator(extended_by(ids)).restore(state)
-    for number, memory in enumerate(state.effects):
+    for number in range(len(ids)):
         # Of `time_skew` the first is how many wait, and the second the time of the first of them.
-        at = 1 if len(memory) > 3 else 0
+        at = 1 if number == ids.index("time_skew") else 0
         effects = [list(each) for each in state.effects]
         effects[number][at] = state.clock.last_s + 10.0
         with pytest.raises(InputError, match=rf"effects\.{number}"):

@@ -10,8 +10,8 @@ import pytest
 
 from cangauge.gap.covered import inside_charge, temperatures_covered
 from cangauge.model.effects.candidate import candidates
-from cangauge.model.effects.effect import Pack
 from cangauge.model.effects.library import LIBRARY
+from cangauge.model.effects.parameter import Pack
 
 
 def log(low_c: float, high_c: float) -> Any:

@@ -13,14 +13,14 @@ from cangauge.gap.settle import _over_all_temperatures
 from cangauge.identify.effects.prepared import prepare_log, residual
 from cangauge.identify.fit import FitOptions, fit
 from cangauge.logs.log import Log
-from cangauge.model.effects.effect import Signals
 from cangauge.model.effects.library import LIBRARY
+from cangauge.model.effects.pack_state import Signals
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import ModelFile
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 from synthetic import synthetic_log
 
-COLD = {"share": 0.8, "activation_k": 3500.0, "delayed": 1.0, "reference_c": 20.0}
+COLD = {"share": 0.8, "activation_k": 3500.0, "delayed": 1.0, "reference_c": 20.0, "lag_s": 0.0}
 TRUTH = ExtendedModel(
     replace(leaf_2012_model(), temperature_range_c=(-20.0, 40.0)),
     CAPACITY_AH,

@@ -19,9 +19,9 @@ from cangauge.gap.scales import SCALES
 from cangauge.gap.scores import PRIOR_PARTS, scores
 from cangauge.identify.fit import FitOptions, fit
 from cangauge.logs.log import Log
-from cangauge.model.effects.effect import Pack
 from cangauge.model.effects.first_order import low_passed
 from cangauge.model.effects.library import LIBRARY
+from cangauge.model.effects.parameter import Pack
 from cangauge.model.model_file import ModelFile
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 from synthetic import synthetic_log

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from cangauge.gapcheck.floors import identify
 from cangauge.gapcheck.parameters import COMPARABLE, expected_parameters
 from cangauge.logs.log import Log
-from cangauge.model.effects.effect import Signals
 from cangauge.model.effects.library import LIBRARY
+from cangauge.model.effects.pack_state import Signals
 from cangauge.model.extended import ExtendedModel
 from cangauge.twin.case import CaseOptions
 from cangauge.twin.day import Day

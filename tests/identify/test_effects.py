@@ -19,8 +19,8 @@ from cangauge.identify.effects.linear import linearise, moved_by, residual_of
 from cangauge.identify.effects.prepared import Prepared, prepare_log
 from cangauge.identify.fit import FitOptions, Identification, fit
 from cangauge.logs.log import Log
-from cangauge.model.effects.effect import Signals
 from cangauge.model.effects.library import LIBRARY, effect_entries, parse_effects
+from cangauge.model.effects.pack_state import Signals
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 from synthetic import synthetic_log
@@ -34,12 +34,21 @@ PUT_IN: dict[str, tuple[tuple[str, dict[str, float]], ...]] = {
     "cold": (
         (
             "resistance_temperature",
-            {"share": 0.8, "activation_k": 3500.0, "delayed": 1.0, "reference_c": 20.0},
+            {
+                "share": 0.8,
+                "activation_k": 3500.0,
+                "delayed": 1.0,
+                "reference_c": 20.0,
+                "lag_s": 0.0,
+            },
         ),
     ),
     "dynamics": (
         ("fast_polarization", {"ohm": 0.03, "tau_s": 3.0, "activation_k": 0.0}),
-        ("slow_diffusion", {"ohm": 0.05, "tau_s": 300.0, "spread": 0.0, "activation_k": 0.0}),
+        (
+            "slow_diffusion",
+            {"ohm": 0.05, "tau_s": 300.0, "spread": 0.0, "activation_k": 0.0, "by_slope": 0.0},
+        ),
     ),
     "hysteresis": (("hysteresis", {"half_width_v": 2.0, "travel_pct": 3.0}),),
 }

@@ -17,8 +17,9 @@ from cangauge.gap.evidence import gather
 from cangauge.gap.scores import Score
 from cangauge.gap.settle import Settled
 from cangauge.gap.structure import needed, with_pieces
-from cangauge.model.effects.effect import Effect, Pack, Values
+from cangauge.model.effects.effect import Effect, Values
 from cangauge.model.effects.library import LIBRARY, effect_entries, one_of
+from cangauge.model.effects.parameter import Pack
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Made, ModelFile, Ranges
 

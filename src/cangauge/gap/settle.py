@@ -286,10 +286,13 @@ def _follows_temperature(choice: Candidate) -> bool:
 
 
 def _own(choices: Sequence[Candidate], model_file: ModelFile) -> tuple[tuple[int, ...], FloatArray]:
-    """Return by which candidates logs may differ, all of them, and how much at first."""
+    """Return by which candidates logs may differ, every effect, and how much at first.
+
+    At their usual shapes: what little logs differ by has no more of a shape than that.
+    """
     by_effect: dict[str, list[int]] = {}
     for k, choice in enumerate(choices):
-        if not choice.effect.is_cause:
+        if not choice.effect.is_cause or not choice.is_usual:
             continue
         by_effect.setdefault(choice.effect.id, []).append(k)
     noise = model_file.noise

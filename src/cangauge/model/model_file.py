@@ -21,8 +21,8 @@ from cangauge.errors import InputError
 from cangauge.files import read_bounded
 from cangauge.limits import MAX_MODEL_BYTES, MAX_MODEL_COLUMNS, MAX_MODEL_ITEMS
 from cangauge.logs.log import TemperatureSource
-from cangauge.model.effects.effect import Pack
 from cangauge.model.effects.library import parse_effects
+from cangauge.model.effects.parameter import Pack
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.voltage_model import BASIS_NAMES, VoltageModel
 from cangauge.schema import schema_error

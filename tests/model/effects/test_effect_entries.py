@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from stepping import EFFECTS, MODEL, PACK, irregular_signals, middle, within
 
 from cangauge.errors import InputError
-from cangauge.model.effects.effect import LEEWAY, Effect, Pack
+from cangauge.model.effects.effect import Effect
 from cangauge.model.effects.library import LIBRARY, effect_entries, effect_of, parse_effects
+from cangauge.model.effects.parameter import LEEWAY, Pack
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.published import CAPACITY_AH
 
@@ -61,7 +62,7 @@ def test_a_bound_of_zero_stays_zero() -> None:
     """The leeway of bounds that are relative to the pack must not let a resistance turn sign."""
     entry = {
         "id": "slow_diffusion",
-        "parameters": {"ohm": -0.001, "tau_s": 500.0, "spread": 0.0, "activation_k": 0.0},
+        "parameters": {"ohm": -0.001, "tau_s": 500.0, "activation_k": 0.0},
     }
     with pytest.raises(InputError, match="must lie within 0 "):
         parse_effects([entry], PACK)
@@ -70,7 +71,25 @@ def test_a_bound_of_zero_stays_zero() -> None:
 def test_a_file_from_before_a_parameter_means_what_it_meant() -> None:
     parameters = {"ohm": 0.001, "tau_s": 500.0, "activation_k": 0.0}
     ((_, values),) = parse_effects([{"id": "slow_diffusion", "parameters": parameters}], PACK)
-    assert values == parameters | {"spread": 0.0}
+    assert values == parameters | {"spread": 0.0, "by_slope": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("effect_id", "given", "then"),
+    [
+        ("charge_transfer", {"scale_v": 5.0, "exchange_a": 3.0, "bend_only": 1.0},
+         {"activation_k": 5000.0}),
+        ("core_temperature", {"rise_k": 4.0, "tau_s": 900.0}, {"late": 0.0}),
+        ("resistance_temperature",
+         {"share": 0.5, "activation_k": 2500.0, "delayed": 1.0, "reference_c": 20.0},
+         {"lag_s": 0.0}),
+    ],
+)  # fmt: skip
+def test_a_file_from_before_cells_had_an_inside_means_what_it_meant(
+    effect_id: str, given: dict[str, float], then: dict[str, float]
+) -> None:
+    ((_, values),) = parse_effects([{"id": effect_id, "parameters": given}], PACK)
+    assert values == given | then
 
 
 @pytest.mark.parametrize(
@@ -107,7 +126,7 @@ def test_an_unknown_id_lists_the_known_ones() -> None:
 def test_a_file_from_before_the_reference_was_kept_takes_it_from_its_own_range() -> None:
     old = {"share": 0.5, "activation_k": 2500.0, "delayed": 1.0}
     ((_, values),) = parse_effects([{"id": "resistance_temperature", "parameters": old}], PACK)
-    assert values == old | {"reference_c": 23.0}
+    assert values == old | {"reference_c": 23.0, "lag_s": 0.0}
     with pytest.raises(InputError, match="has the parameters share"):
         parse_effects([{"id": "resistance_temperature", "parameters": {"reference_c": 23.0}}], PACK)
 

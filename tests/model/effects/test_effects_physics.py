@@ -12,9 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stepping import MODEL, PACK, irregular_signals, step_through
 
-from cangauge.model.effects.effect import PackState, Reading, Signals, Values
+from cangauge.model.effects.effect import Reading, Values
 from cangauge.model.effects.first_order import LowPass, decaying_sum, low_passed
 from cangauge.model.effects.library import LIBRARY
+from cangauge.model.effects.pack_state import PackState, Signals
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.published import CAPACITY_AH
 
@@ -32,7 +33,9 @@ def steady(
 
 
 def extra(effect_id: str, state: PackState, values: Values) -> np.ndarray:
-    found = LIBRARY[effect_id].extra_voltage(state, values, MODEL, PACK)
+    """The extra voltage [V]; parameters that are not given are as if they were not there."""
+    effect = LIBRARY[effect_id]
+    found = effect.extra_voltage(state, {**effect.neutral(PACK), **values}, MODEL, PACK)
     assert found is not None
     return found
 
@@ -113,16 +116,31 @@ def test_a_lagging_sensor_is_put_ahead_on_a_ramp() -> None:
 
 
 def test_core_rises_with_the_square_of_a_lasting_current() -> None:
+    values = {"rise_k": 4.0, "late": 0.0, "tau_s": 1000.0}
     for c_rate, sign in ((1.0, 1.0), (2.0, -1.0)):
         state = steady(20_000.0, sign * c_rate * PACK.capacity_ah)
         signals = Signals(
             state.time_s, state.current_a, np.full_like(state.time_s, 370.0), state.temperature_c
         )
-        found = LIBRARY["core_temperature"].correct(signals, {"rise_k": 4.0, "tau_s": 1000.0}, PACK)
+        found = LIBRARY["core_temperature"].correct(signals, values, PACK)
         rise = found.temperature_c - 23.0
         assert rise[0] == 0.0
         assert rise[1000] == pytest.approx(4.0 * c_rate**2 * (1.0 - math.exp(-1.0)), rel=1e-6)
         assert rise[-1] == pytest.approx(4.0 * c_rate**2, rel=1e-6)
+
+
+def test_core_is_behind_a_surface_that_warms_from_outside() -> None:
+    """Behind a ramp of 10 K an hour, by its time constant: 2.78 K once settled, or a part of it."""
+    time_s = np.arange(0.0, 20_000.0)
+    outside = -5.0 + time_s * 10.0 / 3600.0
+    signals = Signals(time_s, np.zeros_like(time_s), np.full_like(time_s, 370.0), outside)
+    for late in (1.0, 0.5):
+        values = {"rise_k": 4.0, "late": late, "tau_s": 1000.0}
+        core = LIBRARY["core_temperature"].correct(signals, values, PACK).temperature_c
+        assert core[0] == -5.0
+        behind = late * 1000.0 * 10.0 / 3600.0
+        assert outside[1000] - core[1000] == pytest.approx(behind * (1.0 - math.exp(-1.0)))
+        assert outside[-1] - core[-1] == pytest.approx(behind)
 
 
 # --- charge -------------------------------------------------------------------------------
@@ -159,7 +177,9 @@ def at_onset(current_a: float, **state: float) -> PackState:
 
 
 def test_a_share_of_the_drop_follows_arrhenius_from_its_own_reference() -> None:
-    values = {"share": 0.7, "activation_k": 4000.0, "delayed": 1.0, "reference_c": 23.0}
+    values = {
+        "share": 0.7, "activation_k": 4000.0, "delayed": 1.0, "reference_c": 23.0, "lag_s": 0.0
+    }  # fmt: skip
     at_23 = extra("resistance_temperature", steady(10.0, 50.0, temperature_c=23.0), values)
     np.testing.assert_allclose(at_23, 0.0, atol=1e-12)
     cold = steady(10.0, 50.0, temperature_c=0.0)
@@ -169,10 +189,28 @@ def test_a_share_of_the_drop_follows_arrhenius_from_its_own_reference() -> None:
     np.testing.assert_allclose(found, 0.7 * cold.drop_v * (factor - 1.0), rtol=1e-12)
 
 
+def test_a_lagging_inside_resists_as_it_was_before() -> None:
+    """The sensor falls from 23 to 0 °C at once; the inside is at 23·e^(−t/τ) °C."""
+    values = {
+        "share": 0.7, "activation_k": 4000.0, "delayed": 1.0, "reference_c": 23.0, "lag_s": 900.0
+    }  # fmt: skip
+    state = steady(2000.0, 50.0)
+    outside = np.where(state.time_s < 1.0, 23.0, 0.0)
+    found = extra("resistance_temperature", replace(state, temperature_c=outside), values)
+    assert found[0] == 0.0
+    for at in (100, 900, 2000):
+        # The sensor is taken to fall in the first second evenly: half a second later than at once.
+        inside = 23.0 * math.exp(-(at - 0.5) / 900.0)
+        factor = math.exp(4000.0 * (1.0 / (inside + 273.15) - 1.0 / 296.15))
+        expected = 0.7 * state.drop_v[at] * (factor - 1.0)
+        np.testing.assert_allclose(found[at], expected, rtol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("effect_id", "values", "rise"),
     [
-        ("resistance_temperature", {"share": 0.5, "activation_k": 2500.0, "reference_c": 23.0},
+        ("resistance_temperature",
+         {"share": 0.5, "activation_k": 2500.0, "reference_c": 23.0, "lag_s": 0.0},
          0.5 * math.expm1(2500.0 * (1.0 / 278.15 - 1.0 / 296.15))),
         ("resistance_soc", {"at_empty": 2.0, "at_full": 0.0, "width_pct": 10.0}, 2.0 / math.e),
     ],
@@ -233,7 +271,7 @@ def test_charge_transfer_bends_between_rest_and_1c() -> None:
     current = PACK.capacity_ah * np.array([-3.0, -1.0, -0.2, 0.0, 0.2, 1.0, 3.0])
     for temperature_c in (-10.0, 25.0):
         state = with_current(steady(6.0, 0.0, temperature_c=temperature_c), current)
-        bent = {"scale_v": 5.0, "exchange_a": 3.0, "bend_only": 1.0}
+        bent = {"scale_v": 5.0, "exchange_a": 3.0, "bend_only": 1.0, "activation_k": 5000.0}
         found = extra("charge_transfer", state, bent)
         np.testing.assert_allclose(found[[1, 3, 5]], 0.0, atol=1e-12)
         np.testing.assert_allclose(found, -found[::-1], atol=1e-12)
@@ -241,20 +279,23 @@ def test_charge_transfer_bends_between_rest_and_1c() -> None:
         assert found[6] > 1.0
 
 
+@pytest.mark.parametrize("activation_k", [0.0, 5000.0])
 @pytest.mark.parametrize("bend_only", [0.0, 1.0])
 @pytest.mark.parametrize("temperature_c", [-15.0, 25.0, 40.0])
 def test_the_exchange_current_is_as_stated_at_25_c_and_falls_in_the_cold(
-    temperature_c: float, bend_only: float
+    temperature_c: float, bend_only: float, activation_k: float
 ) -> None:
-    """I₀(T) = I₀·exp(B·(1/298.15 − 1/T)), B = 5000 K: 13 times smaller at −15 °C."""
-    exchange_a = 3.0 * math.exp(5000.0 * (1.0 / 298.15 - 1.0 / (temperature_c + 273.15)))
-    assert (exchange_a == 3.0) == (temperature_c == 25.0)
+    """I₀(T) = I₀·exp(B·(1/298.15 − 1/T)): with B = 5000 K 13 times smaller at −15 °C."""
+    exchange_a = 3.0 * math.exp(activation_k * (1.0 / 298.15 - 1.0 / (temperature_c + 273.15)))
+    assert (exchange_a == 3.0) == (temperature_c == 25.0 or activation_k == 0.0)
     one_c = PACK.capacity_ah
     for current in (-80.0, 7.0, 150.0):
         state = with_current(steady(2.0, 0.0, temperature_c=temperature_c), np.full(3, current))
         bend = math.asinh(current / (2.0 * exchange_a))
         bend -= bend_only * current / one_c * math.asinh(one_c / (2.0 * exchange_a))
-        values = {"scale_v": 5.0, "exchange_a": 3.0, "bend_only": bend_only}
+        values = {
+            "scale_v": 5.0, "exchange_a": 3.0, "bend_only": bend_only, "activation_k": activation_k
+        }  # fmt: skip
         found = extra("charge_transfer", state, values)
         np.testing.assert_allclose(found, -5.0 * bend, rtol=1e-12)
 
@@ -321,6 +362,27 @@ def test_spread_diffusion_answers_sooner_and_ends_at_the_same_resistance() -> No
     assert one[80] / one[20] == pytest.approx(4.0, rel=0.05)
 
 
+def test_diffusion_in_the_particles_shows_by_the_slope_of_the_open_circuit_voltage() -> None:
+    """As a shift of the charge at the surface does: U(S − δ) − U(S), δ after the current."""
+    drops = []
+    for soc_pct in (15.0, 50.0, 85.0):
+        state = steady(20_000.0, 50.0, soc_pct=soc_pct)
+        values = {"ohm": 0.02, "tau_s": 500.0, "activation_k": 0.0}
+        alike = extra("slow_diffusion", state, values)[-1]
+        steep = extra("slow_diffusion", state, values | {"by_slope": 1.0})[-1]
+        half = extra("slow_diffusion", state, values | {"by_slope": 0.5})[-1]
+        assert half == pytest.approx(0.5 * (alike + steep), rel=1e-12)
+        drops.append(steep)
+    shifted = [
+        float(MODEL.pseudo_ocv(soc - 0.01)[0] - MODEL.pseudo_ocv(soc)[0])
+        for soc in (15.0, 50.0, 85.0)
+    ]
+    assert np.ptp(shifted) > 0.2 * abs(shifted[0])
+    np.testing.assert_allclose(
+        np.array(drops) / drops[0], np.array(shifted) / shifted[0], rtol=0.01
+    )
+
+
 # --- equilibrium and imbalance ------------------------------------------------------------
 
 
@@ -345,7 +407,7 @@ def test_hysteresis_turns_with_charge_and_stays_through_a_rest() -> None:
 
 def test_entropy_bounds_are_tenths_of_a_millivolt_per_kelvin_and_cell() -> None:
     effect = LIBRARY["entropic_coefficient"]
-    for parameter in effect.parameters:
+    for parameter in effect.amplitudes:
         low, high = parameter.bounds(PACK)
         assert -low == high
         assert 1e-4 < high / PACK.cells < 5e-4
@@ -365,6 +427,17 @@ def test_the_entropic_level_is_the_same_at_every_soc_and_turns_sign_at_t_r() -> 
             state = steady(3.0, 60.0, soc_pct=soc_pct, temperature_c=MODEL.t_ref_c + kelvin)
             found = extra("entropic_coefficient", state, values)
             np.testing.assert_allclose(found, 0.02 * kelvin, rtol=1e-12, atol=1e-15)
+
+
+def test_entropy_is_that_of_the_inside_which_warms_late() -> None:
+    values = {"level_v_per_k": 0.02, "slope_v_per_k": 0.0, "curve_v_per_k": 0.0}
+    state = steady(5000.0, 0.0)
+    outside = np.where(state.time_s < 1.0, MODEL.t_ref_c, MODEL.t_ref_c + 10.0)
+    warmed = replace(state, temperature_c=outside)
+    found = extra("entropic_coefficient", warmed, values | {"lag_s": 1000.0})
+    assert found[0] == 0.0
+    assert found[1000] == pytest.approx(0.2 * (1.0 - math.exp(-1.0)), rel=1e-3)
+    assert found[5000] == pytest.approx(0.2 * (1.0 - math.exp(-5.0)), rel=1e-3)
 
 
 def test_the_entropic_slope_and_curve_are_nothing_on_average_over_the_soc() -> None:

@@ -17,7 +17,7 @@ from cangauge.errors import InputError
 from cangauge.identify.effects.prepared import Prepared
 from cangauge.identify.least_squares import Solution, solve
 from cangauge.identify.voltage_fit import SLOPE_CHECKS
-from cangauge.model.effects.effect import Parameter
+from cangauge.model.effects.parameter import Parameter
 from cangauge.model.extended import ExtendedModel, Prediction
 from cangauge.model.voltage_model import (
     BASIS_NAMES,

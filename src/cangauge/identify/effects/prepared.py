@@ -18,7 +18,7 @@ from cangauge.identify.voltage_fit import prepare
 from cangauge.logs.log import Log
 from cangauge.model.charge import discharged_ah
 from cangauge.model.effects.candidate import Candidate
-from cangauge.model.effects.effect import PackState, Signals
+from cangauge.model.effects.pack_state import PackState, Signals
 from cangauge.model.extended import ExtendedModel
 
 FloatArray = NDArray[np.float64]

@@ -7,7 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from cangauge.model.effects.effect import WITHIN_C, FloatArray
+from cangauge.model.effects.effect import FloatArray
+from cangauge.model.effects.parameter import WITHIN_C
 
 ZERO_C_IN_K: Final = 273.15
 COLDEST_C, HOTTEST_C = WITHIN_C

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cangauge.model.effects.effect import Effect, Pack
+from cangauge.model.effects.effect import Effect
+from cangauge.model.effects.parameter import Pack
 
 FloatArray = NDArray[np.float64]
 
@@ -30,6 +31,8 @@ class Candidate:
     """Physical bounds of the amplitudes, less the neutral values, shape (k, 2)."""
     steps: FloatArray
     """Change of each amplitude over which the voltage's change is taken, shape (k,)."""
+    is_usual: bool = True
+    """Whether a fit tries it as well (else see `Parameter.elsewhere`)."""
 
     def values(self, amplitude: FloatArray) -> dict[str, float]:
         """Return the effect's parameters for amplitudes beside the neutral ones."""
@@ -66,8 +69,12 @@ def candidates(
         constants = effect.constants_to_try(pack) if elsewhere else [effect.constants(pack)]
         for constant, choice in itertools.product(constants, itertools.product(*grids)):
             shape = dict(zip((p.name for p in shapes), choice, strict=True)) | constant
+            is_usual = constant == constants[0] and not any(
+                value in parameter.elsewhere
+                for parameter, value in zip(shapes, choice, strict=True)
+            )
             result += [
-                Candidate(effect, shape, names, centre, bounds, steps)
+                Candidate(effect, shape, names, centre, bounds, steps, is_usual)
                 for steps in _steps(effect, bounds)
             ]
     return result

@@ -8,15 +8,9 @@ from typing import ClassVar
 import numpy as np
 
 from cangauge.model.effects.arrhenius import arrhenius, arrhenius_at
-from cangauge.model.effects.effect import (
-    Effect,
-    FloatArray,
-    OnlineEffect,
-    Pack,
-    PackState,
-    Parameter,
-    Values,
-)
+from cangauge.model.effects.effect import Effect, FloatArray, OnlineEffect, Values
+from cangauge.model.effects.pack_state import PackState
+from cangauge.model.effects.parameter import Pack, Parameter
 from cangauge.model.voltage_model import VoltageModel
 
 ALIKE_AT_C_RATE = 1.0
@@ -25,7 +19,7 @@ the model's resistance, it already holds the mean slope over the currents of a d
 
 
 ACTIVATION_K = 5000.0
-"""Of the exchange current [K], about 42 kJ/mol; `exchange_a` is that at 25 °C."""
+"""Usual of the exchange current [K], about 42 kJ/mol; `exchange_a` is that at 25 °C."""
 
 
 class ChargeTransfer(Effect):
@@ -47,9 +41,13 @@ class ChargeTransfer(Effect):
             grid=(0.02, 0.05, 0.12, 0.3, 0.8),
         ),
         Parameter("bend_only", "1", 0.0, 1.0, neutral=None, grid=(0.0, 1.0)),
+        Parameter(
+            "activation_k", "K", 0.0, 10000.0, neutral=None, grid=(ACTIVATION_K,),
+            elsewhere=(0.0,), formerly=ACTIVATION_K,
+        ),
     )  # fmt: skip
     signature = "I − c·asinh(I/2I₀): too much drop at small currents, too little at large ones"
-    equation = "ΔU = −v·(asinh(I/2I₀) − b·(I/I₁)·asinh(I₁/2I₀)), I₁ = 1 C, I₀ after Arrhenius"
+    equation = "ΔU = −v·(asinh(I/2I₀) − b·(I/I₁)·asinh(I₁/2I₀)), I₁ = 1 C, I₀ after Arrhenius (B)"
     source = "Newman, Thomas-Alyea, Electrochemical Systems, 3rd ed., Wiley 2004, ch. 8"
     separated_by = (
         "pulses of several sizes in both directions; resistance_asymmetry is straight on each"
@@ -61,7 +59,7 @@ class ChargeTransfer(Effect):
     ) -> FloatArray:
         """Return the bend [V]."""
         del model
-        per_a = 0.5 / values["exchange_a"] * arrhenius(state.temperature_c, ACTIVATION_K)
+        per_a = 0.5 / values["exchange_a"] * arrhenius(state.temperature_c, values["activation_k"])
         alike_a = ALIKE_AT_C_RATE * pack.capacity_ah
         slope = values["bend_only"] * np.arcsinh(alike_a * per_a) / alike_a
         bend = np.arcsinh(state.current_a * per_a) - slope * state.current_a
@@ -79,12 +77,13 @@ class _Online(OnlineEffect):
         self._scale_v = values["scale_v"]
         self._per_a = 0.5 / values["exchange_a"]
         self._bend_only = values["bend_only"]
+        self._activation_k = values["activation_k"]
         self._alike_a = alike_a
         self._volts = 0.0
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         del time_s, drop_v
-        per_a = self._per_a * arrhenius_at(temperature_c, ACTIVATION_K)
+        per_a = self._per_a * arrhenius_at(temperature_c, self._activation_k)
         slope = self._bend_only * math.asinh(self._alike_a * per_a) / self._alike_a
         bend = math.asinh(current_a * per_a) - slope * current_a
         self._volts = -self._scale_v * bend

@@ -22,14 +22,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import ClassVar, Final, Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cangauge.model.charge import BRIDGE_S
-from cangauge.model.effects.first_order import low_passed
+from cangauge.model.effects.pack_state import Counting, PackState, Signals
+from cangauge.model.effects.parameter import LEEWAY, Pack, Parameter
 from cangauge.model.voltage_model import VoltageModel
 
 FloatArray = NDArray[np.float64]
@@ -47,187 +46,6 @@ Family = Literal[
     "equilibrium",
     "imbalance",
 ]
-
-Scale = Literal["one", "capacity", "voltage", "resistance"]
-
-WITHIN_C: Final = (-60.0, 120.0)
-"""Beyond these no temperature of a pack is believed [°C]; laws of temperature are held there."""
-
-RESISTANCE_AT_LEAST = 0.002
-"""Least resistance that bounds are relative to, in voltage over 1 C current (a Leaf has 0.018): a
-model whose resistances happen to cancel must not shut every resistance effect out."""
-
-LEEWAY = 10.0
-"""Bounds that are relative to the pack are this much wider in a model that has effects: the pack's
-sizes are read off its coefficients, and effects such as RC elements may have taken most of its
-resistance from these. A wrong unit is still found."""
-
-
-@dataclass(frozen=True)
-class Pack:
-    """Sizes that bounds are relative to, so that one library fits a cell and an 800 V pack."""
-
-    voltage_v: float
-    """Pseudo-OCV at half charge [V]."""
-    capacity_ah: float
-    resistance_ohm: float
-    """Sum of the model's resistances, positive [Ω]."""
-    cells: int
-    """Cells in series, from `voltage_v` at about 3.7 V a cell."""
-    temperature_c: float = 25.0
-    """Middle of the temperatures that the model was identified on [°C]."""
-
-    @classmethod
-    def of(cls, model: VoltageModel, capacity_ah: float) -> Pack:
-        """Return the sizes of the pack that a model describes."""
-        volts = model.pseudo_ocv_at(50.0)[0]
-        coldest, hottest = WITHIN_C
-        return cls(
-            voltage_v=volts,
-            capacity_ah=capacity_ah,
-            resistance_ohm=max(
-                abs(sum(model.resistance_ohm)), RESISTANCE_AT_LEAST * volts / capacity_ah
-            ),
-            cells=max(1, round(volts / 3.7)),
-            temperature_c=min(max(0.5 * sum(model.temperature_range_c), coldest), hottest),
-        )
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One parameter of an effect.
-
-    Parameters
-    ----------
-    name, unit : str
-    low, high : float
-        Physical bounds, in units of `scale`.
-    neutral : float, optional
-        Value at which the effect does nothing, in units of `scale`; None for a shape that has no
-        such value.
-    scale : {"one", "capacity", "voltage", "resistance"}
-        What the bounds are multiplied by to get the parameter's unit.
-    grid : tuple of floats, optional
-        Values to try for a shape (a time constant, a moment); amplitudes have none and enter the
-        voltage nearly linearly.
-    from_pack : {"temperature_c"}, optional
-        A constant that is neither fitted nor tried: this of the pack's sizes when the effect is
-        added, and kept from then on, whatever becomes of the model.
-    elsewhere : tuple of float, optional
-        What a diagnosis tries and a fit does not. Of a shape: further values. Of such a constant:
-        what is added to it; a fit's coefficients, which move with the effect, take up the
-        difference.
-    formerly : float, optional
-        What it was before it was a parameter, in units of `scale`: that of a file without it.
-    """
-
-    name: str
-    unit: str
-    low: float
-    high: float
-    neutral: float | None = 0.0
-    scale: Scale = "one"
-    grid: tuple[float, ...] | None = None
-    from_pack: Literal["temperature_c"] | None = None
-    elsewhere: tuple[float, ...] = ()
-    formerly: float | None = None
-
-    def factor(self, pack: Pack) -> float:
-        """Return what turns bounds and grid into the parameter's unit for a pack."""
-        sizes = {
-            "one": 1.0,
-            "capacity": pack.capacity_ah,
-            "voltage": pack.voltage_v,
-            "resistance": pack.resistance_ohm,
-        }
-        return sizes[self.scale]
-
-    def bounds(self, pack: Pack, leeway: float = 1.0) -> tuple[float, float]:
-        """Return the physical bounds in the parameter's unit.
-
-        Those that are relative to the pack are `leeway` times wider (`LEEWAY`).
-        """
-        factor = self.factor(pack)
-        low, high = self.low * factor, self.high * factor
-        if self.scale != "one":
-            low, high = (low * leeway if low < 0.0 else low / leeway), high * leeway
-        return low, high
-
-    def trials(self, pack: Pack) -> tuple[float, ...]:
-        """Return the values to try for a shape, in the parameter's unit; none for an amplitude."""
-        factor = self.factor(pack)
-        return tuple(value * factor for value in self.grid or ())
-
-
-@dataclass(frozen=True, eq=False)
-class Signals:
-    """Measured signals of one log, shape (n,) each; positive current discharges."""
-
-    time_s: FloatArray
-    current_a: FloatArray
-    voltage_v: FloatArray
-    temperature_c: FloatArray
-
-
-@dataclass(frozen=True)
-class Counting:
-    """How charge becomes SoC: S = S0 − 100·∫(I⁺ + η·I⁻)dt / C."""
-
-    capacity_ah: float
-    initial_soc_pct: float
-    charge_efficiency: float = 1.0
-    """η: part of the charge put in that can be taken out again."""
-
-    def counted(self, current_a: FloatArray) -> FloatArray:
-        """Return I⁺ + η·I⁻ [A], shape (n,): the current whose charge counts."""
-        if self.charge_efficiency == 1.0:
-            return current_a
-        return np.where(current_a < 0.0, self.charge_efficiency * current_a, current_a)
-
-    def counted_at(self, current_a: float) -> float:
-        """Return I⁺ + η·I⁻ [A] of one sample."""
-        return self.charge_efficiency * current_a if current_a < 0.0 else current_a
-
-
-@dataclass(frozen=True, eq=False)
-class PackState:
-    """What an extra voltage may depend on, shape (n,) each, after correction and counting."""
-
-    time_s: FloatArray
-    current_a: FloatArray
-    temperature_c: FloatArray
-    soc_pct: FloatArray
-    drop_v: FloatArray
-    """Σ Rj·I(t − dj) of the voltage model [V]; negative while discharging."""
-    _lagged_a: dict[float, FloatArray] = field(default_factory=dict, init=False, repr=False)
-
-    def lagged_current_a(self, tau_s: float) -> FloatArray:
-        """Return the current behind a first-order lag [A], shape (n,), at rest before the log.
-
-        Many effects and shapes ask for the same lags, which are most of the work on a long log, so
-        each is worked out once. The array is shared: not to be written to.
-        """
-        if tau_s not in self._lagged_a:
-            self._lagged_a[tau_s] = low_passed(
-                self.time_s, self.current_a, tau_s, 0.0, rest_s=BRIDGE_S
-            )
-        return self._lagged_a[tau_s]
-
-    def scaled_drop_v(self, delayed: float, pack: Pack) -> FloatArray:
-        """Return the drop that an effect scales [V], shape (n,) (`DELAYED`)."""
-        now_v = -pack.resistance_ohm * self.current_a
-        return delayed * self.drop_v + (1.0 - delayed) * now_v
-
-
-def scaled_drop_at(drop_v: float, current_a: float, delayed: float, resistance_ohm: float) -> float:
-    """Return the same of one sample, the pack's resistance being `resistance_ohm`."""
-    return delayed * drop_v + (1.0 - delayed) * (-resistance_ohm * current_a)
-
-
-DELAYED: Final = Parameter("delayed", "1", 0.0, 1.0, neutral=None, grid=(1.0, 0.0))
-"""Whether an effect scales the whole drop of the voltage model (1), or only that of the current
-now, over the sum of the resistances (0): contacts and electrolyte answer at once, diffusion not.
-In between it scales a mixture of both."""
 
 
 class Reading(NamedTuple):

@@ -4,15 +4,9 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from cangauge.model.effects.effect import (
-    Effect,
-    FloatArray,
-    OnlineEffect,
-    Pack,
-    PackState,
-    Parameter,
-    Values,
-)
+from cangauge.model.effects.effect import Effect, FloatArray, OnlineEffect, Values
+from cangauge.model.effects.pack_state import PackState
+from cangauge.model.effects.parameter import Pack, Parameter
 from cangauge.model.effects.rc_element import ACTIVATION, OnlineRc, rc_voltage
 from cangauge.model.voltage_model import VoltageModel
 

@@ -4,14 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from cangauge.model.effects.effect import (
-    Counting,
-    Effect,
-    OnlineEffect,
-    Pack,
-    Parameter,
-    Values,
-)
+from cangauge.model.effects.effect import Effect, OnlineEffect, Values
+from cangauge.model.effects.pack_state import Counting
+from cangauge.model.effects.parameter import Pack, Parameter
 from cangauge.model.voltage_model import VoltageModel
 
 

@@ -6,16 +6,10 @@ import math
 from collections.abc import Sequence
 from typing import ClassVar
 
-from cangauge.model.effects.effect import (
-    Effect,
-    FloatArray,
-    OnlineEffect,
-    Pack,
-    PackState,
-    Parameter,
-    Values,
-)
+from cangauge.model.effects.effect import Effect, FloatArray, OnlineEffect, Values
 from cangauge.model.effects.first_order import LowPass, low_passed
+from cangauge.model.effects.pack_state import PackState
+from cangauge.model.effects.parameter import Pack, Parameter
 from cangauge.model.voltage_model import VoltageModel
 
 

@@ -11,13 +11,14 @@ from cangauge.model.effects.core_temperature import CoreTemperature
 from cangauge.model.effects.coulombic_efficiency import CoulombicEfficiency
 from cangauge.model.effects.current_gain import CurrentGain
 from cangauge.model.effects.current_offset import CurrentOffset
-from cangauge.model.effects.effect import LEEWAY, Effect, Pack, Parameter, Values
+from cangauge.model.effects.effect import Effect, Values
 from cangauge.model.effects.entropic_coefficient import EntropicCoefficient
 from cangauge.model.effects.fast_polarization import FastPolarization
 from cangauge.model.effects.hysteresis import Hysteresis
 from cangauge.model.effects.initial_soc import InitialSoc
 from cangauge.model.effects.inner_temperature import InnerTemperature
 from cangauge.model.effects.ocv_shape import OcvShape
+from cangauge.model.effects.parameter import LEEWAY, Pack, Parameter
 from cangauge.model.effects.resistance_asymmetry import ResistanceAsymmetry
 from cangauge.model.effects.resistance_soc import ResistanceSoc
 from cangauge.model.effects.resistance_step import ResistanceStep

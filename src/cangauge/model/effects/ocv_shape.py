@@ -7,15 +7,9 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from cangauge.model.effects.effect import (
-    Effect,
-    FloatArray,
-    OnlineEffect,
-    Pack,
-    PackState,
-    Parameter,
-    Values,
-)
+from cangauge.model.effects.effect import Effect, FloatArray, OnlineEffect, Values
+from cangauge.model.effects.pack_state import PackState
+from cangauge.model.effects.parameter import Pack, Parameter
 from cangauge.model.voltage_model import VoltageModel
 
 CENTRES_PCT: Final = (3.0, 8.0, 14.0, 22.0, 32.0, 43.0, 54.0, 65.0, 76.0, 86.0, 94.0)

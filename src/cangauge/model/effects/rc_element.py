@@ -6,8 +6,10 @@ from collections.abc import Sequence
 
 from cangauge.model.charge import BRIDGE_S
 from cangauge.model.effects.arrhenius import arrhenius, arrhenius_at
-from cangauge.model.effects.effect import FloatArray, OnlineEffect, PackState, Parameter
+from cangauge.model.effects.effect import FloatArray, OnlineEffect
 from cangauge.model.effects.first_order import LowPass
+from cangauge.model.effects.pack_state import PackState
+from cangauge.model.effects.parameter import Parameter
 
 ACTIVATION = Parameter("activation_k", "K", 0.0, 6000.0, neutral=None, grid=(0.0, 3000.0))
 """How the element's resistance rises in the cold; it is the stated one at 25 °C."""

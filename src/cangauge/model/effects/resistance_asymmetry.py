@@ -6,15 +6,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from cangauge.model.effects.effect import (
-    Effect,
-    FloatArray,
-    OnlineEffect,
-    Pack,
-    PackState,
-    Parameter,
-    Values,
-)
+from cangauge.model.effects.effect import Effect, FloatArray, OnlineEffect, Values
+from cangauge.model.effects.pack_state import PackState
+from cangauge.model.effects.parameter import Pack, Parameter
 from cangauge.model.voltage_model import VoltageModel
 
 

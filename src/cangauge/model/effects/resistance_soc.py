@@ -7,17 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from cangauge.model.effects.effect import (
-    DELAYED,
-    Effect,
-    FloatArray,
-    OnlineEffect,
-    Pack,
-    PackState,
-    Parameter,
-    Values,
-    scaled_drop_at,
-)
+from cangauge.model.effects.effect import Effect, FloatArray, OnlineEffect, Values
+from cangauge.model.effects.pack_state import DELAYED, PackState, scaled_drop_at
+from cangauge.model.effects.parameter import Pack, Parameter
 from cangauge.model.voltage_model import VoltageModel
 
 

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
 
 from cangauge.model.effects.arrhenius import inverse_k, inverse_k_at
-from cangauge.model.effects.effect import (
-    DELAYED,
-    WITHIN_C,
-    Effect,
-    FloatArray,
-    OnlineEffect,
-    Pack,
-    PackState,
-    Parameter,
-    Values,
-    scaled_drop_at,
-)
+from cangauge.model.effects.effect import Effect, FloatArray, OnlineEffect, Values
+from cangauge.model.effects.inside import LAG, Inside
+from cangauge.model.effects.pack_state import DELAYED, PackState, scaled_drop_at
+from cangauge.model.effects.parameter import WITHIN_C, Pack, Parameter
 from cangauge.model.voltage_model import VoltageModel
 
 
@@ -27,7 +20,8 @@ class ResistanceTemperature(Effect):
     """A share of the voltage model's drop that follows Arrhenius' law.
 
     It adds nothing at `reference_c`, the middle of the temperatures that the model was identified
-    on when the effect was added.
+    on when the effect was added. It is the cells' inside that resists, which may follow the
+    measured temperature late (`lag_s`, 0: at once).
     """
 
     id = "resistance_temperature"
@@ -39,13 +33,14 @@ class ResistanceTemperature(Effect):
         DELAYED,
         Parameter(
             "reference_c", "°C", *WITHIN_C, neutral=None, from_pack="temperature_c",
-            elsewhere=(-20.0, -10.0, 10.0, 20.0),
+            elsewhere=(-15.0, 15.0),
         ),
+        LAG,
     )  # fmt: skip
     signature = "the drop over the resistance, growing with (T₀ − T)"
     equation = (
         "ΔU = a·ΣRj·I(t − dj)·(exp(B·(1/T − 1/T₀)) − 1), T₀ = reference_c;"
-        " or ΣRj·I in place of ΣRj·I(t − dj)"
+        " or ΣRj·I in place of ΣRj·I(t − dj); τ·dT/dt = T_measured − T, τ = lag_s"
     )
     source = "Waag, Käbitz, Sauer, Applied Energy 102 (2013) 885"
     separated_by = (
@@ -59,7 +54,7 @@ class ResistanceTemperature(Effect):
         """Return the change of the drop [V]."""
         del model
         drop_v = state.scaled_drop_v(values["delayed"], pack)
-        colder = inverse_k(state.temperature_c) - inverse_k_at(values["reference_c"])
+        colder = inverse_k(state.inside_c(values["lag_s"])) - inverse_k_at(values["reference_c"])
         return values["share"] * drop_v * np.expm1(values["activation_k"] * colder)
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
@@ -75,14 +70,20 @@ class _Online(OnlineEffect):
         self._delayed = values["delayed"]
         self._reference_per_k = inverse_k_at(values["reference_c"])
         self._resistance_ohm = resistance_ohm
+        self._inside = Inside(values["lag_s"])
         self._volts = 0.0
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
-        del time_s
         scaled_v = scaled_drop_at(drop_v, current_a, self._delayed, self._resistance_ohm)
-        colder = inverse_k_at(temperature_c) - self._reference_per_k
+        colder = inverse_k_at(self._inside.step(time_s, temperature_c)) - self._reference_per_k
         self._volts = self._share * scaled_v * math.expm1(self._activation_k * colder)
 
     def extra_voltage(self, soc_pct: float) -> float:
         del soc_pct
         return self._volts
+
+    def memory(self) -> list[float]:
+        return self._inside.memory()
+
+    def remember(self, memory: Sequence[float], latest_s: float) -> None:
+        self._inside.remember(memory, latest_s)

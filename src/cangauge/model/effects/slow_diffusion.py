@@ -7,15 +7,9 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from cangauge.model.effects.effect import (
-    Effect,
-    FloatArray,
-    OnlineEffect,
-    Pack,
-    PackState,
-    Parameter,
-    Values,
-)
+from cangauge.model.effects.effect import Effect, FloatArray, OnlineEffect, Values
+from cangauge.model.effects.pack_state import PackState
+from cangauge.model.effects.parameter import Pack, Parameter
 from cangauge.model.effects.rc_element import ACTIVATION, OnlineRc, rc_voltage
 from cangauge.model.voltage_model import VoltageModel
 
@@ -28,9 +22,22 @@ FASTER: Final = 4.0
 SMALLER: Final = 2.0
 """… and has so many times less resistance: diffusion's goes with the root of the time."""
 
+ENDS_PCT: Final = (10.0, 90.0)
+"""The open-circuit voltage's mean slope is that between these."""
+
+STEEPEST: Final = 5.0
+"""No slope counts as more than this many times the mean."""
+
+FLATTEST: Final = 1e-6
+"""And no mean is less [V per %]: a model that does not rise has no slope to follow."""
+
 
 class SlowDiffusion(Effect):
-    """Diffusion in the particles and the electrolyte, slower than the model's last delay."""
+    """Diffusion in the particles and the electrolyte, slower than the model's last delay.
+
+    What diffuses in the particles is charge, and it shows by the slope of the open-circuit voltage
+    (`by_slope` 1); in the electrolyte it shows alike at every SoC (0).
+    """
 
     id = "slow_diffusion"
     family = "dynamics"
@@ -45,10 +52,14 @@ class SlowDiffusion(Effect):
             "spread", "1", 0.0, 1.0, neutral=None, grid=(0.0,), elsewhere=(1.0,), formerly=0.0
         ),
         ACTIVATION,
+        Parameter(
+            "by_slope", "1", 0.0, 1.0, neutral=None, grid=(0.0,), elsewhere=(1.0,), formerly=0.0
+        ),
     )  # fmt: skip
     signature = "low-passed current over 70–2500 s: it decays through a rest after a drive"
     equation = (
-        "ΔU = −R·Σ wₖ·yₖ·exp(B·(1/T − 1/T₂₅)), (τ/4ᵏ)·dyₖ/dt = I − yₖ, wₖ ∝ (spread/2)ᵏ, k = 0…4"
+        "ΔU = −R·f(S)·Σ wₖ·yₖ·exp(B·(1/T − 1/T₂₅)), (τ/4ᵏ)·dyₖ/dt = I − yₖ, wₖ ∝ (spread/2)ᵏ,"
+        " k = 0…4; f = 1 − b + b·U₀′(S)/mean U₀′, b = by_slope"
     )
     source = (
         "Plett, Battery Management Systems vol. I, Artech House 2015, ch. 2; elements spread like"
@@ -63,17 +74,25 @@ class SlowDiffusion(Effect):
         self, state: PackState, values: Values, model: VoltageModel, pack: Pack
     ) -> FloatArray:
         """Return the elements' voltage [V]."""
-        del model, pack
+        del pack
         total = np.zeros_like(state.current_a)
         for ohm, tau_s in _elements(values):
             total += rc_voltage(state, ohm, tau_s, values["activation_k"])
+        if values["by_slope"]:
+            steepness = model.pseudo_ocv_slope(state.soc_pct) / _mean_slope(model)
+            total *= 1.0 + values["by_slope"] * (np.clip(steepness, 0.0, STEEPEST) - 1.0)
         return total
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
         """Return the elements, one sample at a time."""
-        del model, pack
-        return _OnlineElements(
-            [OnlineRc(ohm, tau_s, values["activation_k"]) for ohm, tau_s in _elements(values)]
+        del pack
+        elements = [
+            OnlineRc(ohm, tau_s, values["activation_k"]) for ohm, tau_s in _elements(values)
+        ]
+        return (
+            _OnlineBySlope(elements, values, model)
+            if values["by_slope"]
+            else _OnlineElements(elements)
         )
 
 
@@ -85,6 +104,13 @@ def _elements(values: Values) -> list[tuple[float, float]]:
         for k, weight in enumerate(weights)
         if weight > 0.0
     ]
+
+
+def _mean_slope(model: VoltageModel) -> float:
+    """Return the mean slope of the pseudo-OCV [V per % SoC], positive."""
+    low, high = ENDS_PCT
+    rise_v = model.pseudo_ocv_at(high)[0] - model.pseudo_ocv_at(low)[0]
+    return max(rise_v / (high - low), FLATTEST)
 
 
 class _OnlineElements(OnlineEffect):
@@ -113,3 +139,21 @@ class _OnlineElements(OnlineEffect):
             raise ValueError("not that of so many elements")
         for k, element in enumerate(self._elements):
             element.remember(memory[k * each : (k + 1) * each], latest_s)
+
+
+class _OnlineBySlope(_OnlineElements):
+    """The same, whose voltage follows the slope of the pseudo-OCV."""
+
+    uses_soc = True
+
+    def __init__(self, elements: Sequence[OnlineRc], values: Values, model: VoltageModel) -> None:
+        super().__init__(elements)
+        self._by_slope = values["by_slope"]
+        self._model = model
+        self._mean_slope = _mean_slope(model)
+
+    def extra_voltage(self, soc_pct: float) -> float:
+        """Return the elements' voltage [V]."""
+        steepness = self._model.pseudo_ocv_at(soc_pct)[1] / self._mean_slope
+        share = 1.0 + self._by_slope * (min(max(steepness, 0.0), STEEPEST) - 1.0)
+        return share * super().extra_voltage(soc_pct)

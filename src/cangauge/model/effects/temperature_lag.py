@@ -6,16 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from cangauge.model.effects.effect import (
-    Effect,
-    OnlineEffect,
-    Pack,
-    Parameter,
-    Reading,
-    Signals,
-    Values,
-)
+from cangauge.model.effects.effect import Effect, OnlineEffect, Reading, Values
 from cangauge.model.effects.first_order import LowPass, low_passed
+from cangauge.model.effects.pack_state import Signals
+from cangauge.model.effects.parameter import Pack, Parameter
 from cangauge.model.voltage_model import VoltageModel
 
 SMOOTHING_S = 200.0

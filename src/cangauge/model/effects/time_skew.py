@@ -12,15 +12,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from cangauge.model.effects.effect import (
-    Effect,
-    OnlineEffect,
-    Pack,
-    Parameter,
-    Reading,
-    Signals,
-    Values,
-)
+from cangauge.model.effects.effect import Effect, OnlineEffect, Reading, Values
+from cangauge.model.effects.pack_state import Signals
+from cangauge.model.effects.parameter import Pack, Parameter
 from cangauge.model.voltage_model import VoltageModel
 
 

@@ -5,15 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from cangauge.model.effects.effect import (
-    Effect,
-    OnlineEffect,
-    Pack,
-    Parameter,
-    Reading,
-    Signals,
-    Values,
-)
+from cangauge.model.effects.effect import Effect, OnlineEffect, Reading, Values
+from cangauge.model.effects.pack_state import Signals
+from cangauge.model.effects.parameter import Pack, Parameter
 from cangauge.model.voltage_model import VoltageModel
 
 
