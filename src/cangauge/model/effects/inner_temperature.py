@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 from cangauge.model.effects.effect import Effect, FloatArray, OnlineEffect, Values
-from cangauge.model.effects.first_order import LowPass, low_passed
+from cangauge.model.effects.first_order import LowPass
 from cangauge.model.effects.pack_state import PackState
 from cangauge.model.effects.parameter import Pack, Parameter
 from cangauge.model.voltage_model import VoltageModel
@@ -39,10 +39,8 @@ class InnerTemperature(Effect):
     ) -> FloatArray:
         """Return the additional voltage [V]."""
         del model, pack
-        outside = state.temperature_c
-        inside = low_passed(state.time_s, outside, values["tau_s"], float(outside[0]))
         per_k = values["voltage_v_per_k"] + values["drop_per_k"] * state.drop_v
-        return per_k * (inside - outside)
+        return per_k * (state.inside_c(values["tau_s"]) - state.temperature_c)
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
         """Return the additional voltage at one sample at a time."""
