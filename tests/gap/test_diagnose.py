@@ -100,6 +100,26 @@ def test_says_unknown_of_what_no_effect_is_like(model: ModelFile, references: li
     assert found.verdict.cause == "unknown"
 
 
+def test_finds_both_of_two_causes(model: ModelFile, references: list[Log]) -> None:
+    logs = [FAULTS["resistance_asymmetry"](FAULTS["current_offset"](day(k))) for k in (21, 22)]
+    found = diagnose(logs, model, references)
+    assert {score.effect_id for score in found.verdict.accepted} == {
+        "current_offset",
+        "resistance_asymmetry",
+    }
+
+
+def test_what_the_shape_of_a_large_cause_leaves_is_no_second_cause(
+    model: ModelFile, references: list[Log]
+) -> None:
+    def rising(log: Log) -> Log:  # a step of resistance, but for its quarter of an hour
+        part = np.clip((log.time_s - 900.0) / 900.0, 0.0, 1.0)
+        return replace(log, voltage_v=log.voltage_v - 0.08 * log.current_a * part)
+
+    found = diagnose([rising(day(21)), rising(day(22))], model, references)
+    assert [score.effect_id for score in found.verdict.accepted] == ["resistance_step"]
+
+
 def test_parameter_and_closed_fraction_are_those_put_in(offset: Diagnosis) -> None:
     parameters = offset.candidates[0]["parameters"]["offset_a"]
     low, high = parameters["ci"]
