@@ -120,6 +120,21 @@ def test_what_the_shape_of_a_large_cause_leaves_is_no_second_cause(
     assert [score.effect_id for score in found.verdict.accepted] == ["resistance_step"]
 
 
+def test_a_step_is_found_at_its_moment_in_logs_of_any_length(
+    model: ModelFile, references: list[Log]
+) -> None:
+    short = synthetic_log(
+        hours=0.55, start_pct=80.0, end_pct=62.0, noise_v=0.5, seed=22, name="short"
+    )
+    logs = [FAULTS["resistance_step"](log) for log in (day(21), short)]
+    found = diagnose(logs, model, references)
+    assert found.verdict.cause == "resistance_step"
+    assert found.extension.cause["resistance_step"]["start_s"] == pytest.approx(1400.0, abs=20.0)
+    parameter = found.candidates[0]["parameters"]["step_ohm"]
+    assert parameter["value"] == pytest.approx(0.05, rel=0.1)
+    assert parameter["ci"][0] < 0.05 < parameter["ci"][1]
+
+
 def test_parameter_and_closed_fraction_are_those_put_in(offset: Diagnosis) -> None:
     parameters = offset.candidates[0]["parameters"]["offset_a"]
     low, high = parameters["ci"]

@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 
 from cangauge import __version__
 from cangauge.gap.at_cause import Cause, at_causes, with_causes
+from cangauge.gap.at_moment import at_moment
 from cangauge.gap.bounded import moved, within_bounds
 from cangauge.gap.columns import Candidate, residual
 from cangauge.gap.evidence import gather
@@ -143,8 +144,9 @@ def _refined(
     settled: Settled, model: ExtendedModel, effect: Effect, start: Values
 ) -> tuple[ExtendedModel, dict[str, float]]:
     """Return model and parameters, fitted through the model's own equations from a start."""
-    parameters = (*effect.amplitudes, *effect.shapes)
-    parameters = parameters or effect.parameters
+    start = at_moment(settled.diagnosed, model, effect, start)
+    free = (*effect.amplitudes, *(shape for shape in effect.shapes if not shape.is_moment))
+    parameters = free or effect.parameters
     constants = {p.name: start[p.name] for p in effect.parameters if p not in parameters}
     pack = settled.model.pack  # not the model's, whose structure has taken much of its resistance
     bounds = np.array([parameter.bounds(pack) for parameter in parameters])

@@ -78,6 +78,8 @@ class Parameter:
         difference.
     formerly : float, optional
         What it was before it was a parameter, in units of `scale`: that of a file without it.
+    is_moment : bool
+        Of a shape: a time of the log at which the voltage jumps.
     """
 
     name: str
@@ -90,6 +92,7 @@ class Parameter:
     from_pack: Literal["temperature_c"] | None = None
     elsewhere: tuple[float, ...] = ()
     formerly: float | None = None
+    is_moment: bool = False
 
     def factor(self, pack: Pack) -> float:
         """Return what turns bounds and grid into the parameter's unit for a pack."""

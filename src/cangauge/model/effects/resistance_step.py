@@ -24,7 +24,7 @@ class ResistanceStep(Effect):
     parameters = (
         Parameter("step_ohm", "ohm", -0.4, 2.0, scale="resistance"),
         Parameter(
-            "start_s", "s", 0.0, 1e7, neutral=None,
+            "start_s", "s", 0.0, 1e7, neutral=None, is_moment=True,
             grid=(0.0, 300.0, 600.0, 1200.0, 1800.0, 2700.0, 3600.0, 5400.0, 7200.0),
         ),
     )  # fmt: skip
