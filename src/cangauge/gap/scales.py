@@ -35,7 +35,8 @@ def by_scale(columns: FloatArray) -> list[FloatArray]:
         them are those of the rows.
     """
     n = columns.shape[0]
-    total = np.vstack([np.zeros((1, columns.shape[1])), np.cumsum(columns, axis=0)])
+    total = np.zeros((n + 1, columns.shape[1]))
+    np.cumsum(columns, axis=0, out=total[1:])
     parts: list[list[FloatArray]] = [[] for _ in range(SCALES)]
     parts[-1].append(total[-1:] / np.sqrt(n))
     edges = np.array([0, n])

@@ -184,6 +184,7 @@ def settle(
             error = error_from_references(frame, grams, error, least_trust)
             weights = counting(of_references, of_logs)
             error = with_strays(frame, grams, error, weights, _judged(found, grams, frame))
+        del found  # columns of long references fill hundreds of megabytes, and come once more below
         expected = error if covered or len(grams) == 1 else _beyond_the_references(error)
         say("repairing the structure")
         acting = repaired(model, frame, grams, expected)
