@@ -118,7 +118,7 @@ def test_the_list_names_every_parameter() -> None:
         (("-o", "x.csv", "--ambient-c", "90"), "ambient"),
         (("-o", "x.csv", "--pack", "tank"), "leaf24"),
         (("-o", "x.csv", "--chemistry", "lead"), "nmc"),
-        (("-o", "x.csv", "--plant", "real"), "twin, equation or pybamm"),
+        (("-o", "x.csv", "--plant", "real"), "twin, equation, published or pybamm"),
         (("-o", "x.csv", "--soc", "maybe"), "full or start"),
         (("-o", "x.csv", "--speed", "absent.csv"), "absent.csv"),
         (("-o", "x.csv", "--effect", "gremlins"), "current_offset"),

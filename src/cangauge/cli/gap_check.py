@@ -118,7 +118,8 @@ def gap_check_command(  # noqa: PLR0917 - typer passes options by name
     5 times what a model of training and reference days misses on further clean days.
 
     `simulated` is a pack of the twin's own physics, which the voltage model fits only roughly;
-    `equation` one that obeys the published equation as long as it is healthy.
+    `equation` one that obeys the published equation as long as it is healthy, by a core that the
+    temperature sensor does not see; `published` one whose reported temperature is the core's.
 
     For example:
 

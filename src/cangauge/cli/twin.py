@@ -91,7 +91,7 @@ def twin_command(  # noqa: PLR0917 - typer passes options by name
     plant: Annotated[
         str,
         typer.Option(
-            metavar="twin|equation|pybamm",
+            metavar="twin|equation|published|pybamm",
             help="What simulates the cells; pybamm needs the extra cangauge[pybamm].",
         ),
     ] = "twin",

@@ -78,6 +78,10 @@ TARGETS: Final = (
     Target("equation: first, pairs counted", _of("equation", "effects", "top1_pair"), low=0.95),
     Target("equation: first, strictly", _of("equation", "effects", "top1"), low=0.85),
     Target("equation: false alarms", _of("equation", "healthy", "false_alarms"), high=0.02),
+    # The easiest: little but noise beside the cause.
+    Target("published: first, pairs counted", _of("published", "effects", "top1_pair"), low=0.95),
+    Target("published: first, strictly", _of("published", "effects", "top1"), low=0.85),
+    Target("published: false alarms", _of("published", "healthy", "false_alarms"), high=0.02),
     Target("PyBaMM: first, strictly", _of("pybamm", "effects", "top1"), low=0.70),
     Target("PyBaMM: family", _of("pybamm", "effects", "family"), low=0.90),
     Target("real logs: first, strictly", _of("real", "effects", "top1"), low=0.70),

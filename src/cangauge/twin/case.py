@@ -23,7 +23,6 @@ ANY: Final = "any"
 OUTSIDE: Final = "outside"
 """In place of an effect: one that no diagnosis is expected to know, at random."""
 GAP_IN_FLOORS: Final = (0.5, 5.0)
-_REDRAWS: Final = 12
 _GOOD_ENOUGH: Final = 0.9
 _NEARLY_FULL: Final = 0.8
 
@@ -40,7 +39,7 @@ class CaseOptions:
         Of the pack; at random without.
     climate : {"wide", "mild"}
         Ambient temperature from −10–35 or 10–28 °C.
-    plant_name : {"twin", "equation", "pybamm"}
+    plant_name : {"twin", "equation", "published", "pybamm"}
         What simulates the cells.
     gap_in_floors : tuple of float
         Range of the gap of one effect, in floors, drawn evenly in its logarithm.
@@ -51,6 +50,8 @@ class CaseOptions:
     ambient_c : tuple of float, optional
         Range of the ambient temperature of the diagnosed logs [°C]; without, within that of the
         references. Beyond it the pack's own law of temperature opens a gap, fault or not.
+    draws : int
+        So many times days are drawn until they can show an effect in the wanted size.
     """
 
     n_reference: int = 3
@@ -64,6 +65,7 @@ class CaseOptions:
     floor_v: float | None = None
     hours: float | None = None
     ambient_c: tuple[float, float] | None = None
+    draws: int = 12
 
     def draw_world(self, seed: int) -> World:
         """Return a pack with its clean days."""
@@ -144,7 +146,7 @@ def draw_case(
     """Draw a case without writing it (parameters as in `make_case`).
 
     When the days drawn cannot show an effect in the wanted size (no cold, no low charge …),
-    other days are drawn, up to twelve times; the best are kept.
+    other days are drawn; the best are kept.
     """
     world = options.draw_world(seed) if world is None else world
     rng = np.random.default_rng([seed, 2])
@@ -155,7 +157,7 @@ def draw_case(
     signs = [-1.0 if kind.signed and rng.random() < 0.5 else 1.0 for kind in kinds]
     seeds = [int(rng.integers(2**31)) for _ in kinds]
     attempts = []
-    for _ in range(_REDRAWS):
+    for _ in range(options.draws):
         days = world.draw_days(rng, options.n_logs, options.hours, options.ambient_c)
         healthy = [simulate(world.plant, day) for day in days]
         faults = [

@@ -77,6 +77,9 @@ class Pack:
     core_surface_w_k: float
     surface_ambient_w_k: float
     sensors: Sensors
+    knows_core: bool = False
+    """Whether the gauge adds to the surface's temperature what the core stands above it while the
+    pack is healthy."""
 
     @property
     def one_c_a(self) -> float:

@@ -82,6 +82,9 @@ def simulate(
             break
         core, surface = next_core, next_surface
         cells = plant.electrical(day, condition, current, core)
+    reported = surface
+    if pack.knows_core:
+        reported = surface + (core - surface) / (1.0 + condition.insulation)
     return Truth(
         time_s=day.time_s,
         current_a=current,
@@ -94,7 +97,7 @@ def simulate(
         rows=_until_empty(pack, cells.lowest_v),
         seen_current_a=seen_current(condition, day, day.current_a),
         seen_voltage_v=seen_voltage(condition, day, cells.voltage_v),
-        seen_temperature_c=seen_temperature(pack, condition, day, surface),
+        seen_temperature_c=seen_temperature(pack, condition, day, reported),
     )
 
 

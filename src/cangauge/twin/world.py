@@ -20,7 +20,7 @@ from cangauge.twin.record import Recording, record
 from cangauge.twin.simulate import Truth, expected_voltage, simulate, true_soc_pct
 
 Climate = Literal["wide", "mild"]
-PlantName = Literal["twin", "equation", "pybamm"]
+PlantName = Literal["twin", "equation", "published", "pybamm"]
 _CLIMATES: Final[dict[str, tuple[float, float]]] = {"wide": (-10.0, 35.0), "mild": (10.0, 28.0)}
 
 
@@ -119,7 +119,7 @@ def draw_world(
     n_training : int
         Days to identify the model on: one from full to empty, further ones at random.
     climate : {"wide", "mild"}
-    plant_name : {"twin", "equation", "pybamm"}
+    plant_name : {"twin", "equation", "published", "pybamm"}
         What simulates the cells; `pybamm` needs the extra of that name.
 
     Raises
@@ -188,14 +188,14 @@ def draw_plant(
     pack = draw_pack(rng, kind, chemistry_name)
     if name == "twin":
         return TwinPlant(pack)
-    if name == "equation":
-        return draw_equation_plant(rng, pack)
+    if name in {"equation", "published"}:
+        return draw_equation_plant(rng, pack, knows_core=name == "published")
     if name == "pybamm":
         # An extra, and slow to import.
         from cangauge.twin.pybamm_plant import draw_pybamm_plant  # noqa: PLC0415
 
         return draw_pybamm_plant(rng, pack)
-    raise InputError("no such plant", value=name, cure="use twin, equation or pybamm")
+    raise InputError("no such plant", value=name, cure="use twin, equation, published or pybamm")
 
 
 def record_day(
