@@ -195,7 +195,7 @@ ROUGH_S: Final = {
     "two-effects": 6.0,
     "equation": 6.0,
     "published": 6.0,
-    "pybamm": 75.0,
+    "pybamm": 53.0,
     "real-bmw_i3": 12.0,
     "real-lg_hg2": 25.0,
     "cold-bmw_i3": 60.0,

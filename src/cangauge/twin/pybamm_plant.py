@@ -37,6 +37,7 @@ _POINTS: Final = 501
 _MESH: Final = {"x_n": 6, "x_s": 5, "x_p": 6, "r_n": 14, "r_p": 14}
 _OUTPUT_S: Final = 1.0
 _KEPT: Final = 12
+"""Answers: of three days with and without a fault, and a few more."""
 _CONTACT_SHARE: Final = (0.1, 0.35)
 
 
@@ -48,6 +49,16 @@ class Stoichiometry:
     negative_full: float
     positive_full: float
     positive_empty: float
+
+
+@dataclass(frozen=True)
+class _Cell:
+    """One cell's charge at the start, and how its condition changes PyBaMM's parameters."""
+
+    start: float
+    capacity_factor: float
+    charge_loss: float
+    transfer_slowdown: float
 
 
 class PybammPlant:
@@ -77,7 +88,7 @@ class PybammPlant:
         negative_ah = _number(parameters, import_pybamm().LithiumIonParameters().n.Q_init)
         window = stoichiometry.negative_full - stoichiometry.negative_empty
         self._cell_ah = negative_ah * window
-        self._known: dict[tuple[Any, ...], FloatArray] = {}
+        self._known: dict[tuple[bytes, bytes, bytes, _Cell], FloatArray] = {}
 
     def electrical(
         self, day: Day, condition: Condition, current_a: FloatArray, core_c: FloatArray
@@ -93,20 +104,19 @@ class PybammPlant:
         charge = discharged(day, current_a, condition.charge_loss) / pack.capacity_ah
         start = day.start_soc + condition.start_soc_shift
         soc = start - charge / condition.capacity_factor
-        cell_v = self._cell_v(
-            day, condition, current_a, kelvin, start=start, factor=condition.capacity_factor
+        usual = _Cell(
+            start, condition.capacity_factor, condition.charge_loss, condition.transfer_slowdown
         )
+        cell_v = self._cell_v(day, current_a, kelvin, usual)
         total_v, lowest = pack.cells * cell_v, cell_v
         weak = condition.weak
         if weak is not None:
-            weak_v = self._cell_v(
-                day,
-                condition,
-                current_a,
-                kelvin,
+            lesser = replace(
+                usual,
                 start=start - weak.deficit,
-                factor=condition.capacity_factor * (1.0 - weak.loss),
+                capacity_factor=condition.capacity_factor * (1.0 - weak.loss),
             )
+            weak_v = self._cell_v(day, current_a, kelvin, lesser)
             total_v = total_v + weak.count * (weak_v - cell_v)
             lowest = np.minimum(cell_v, weak_v)
         entropy = pack.chemistry.entropy(soc)
@@ -137,45 +147,28 @@ class PybammPlant:
         )
 
     def _cell_v(
-        self,
-        day: Day,
-        condition: Condition,
-        current_a: FloatArray,
-        kelvin: FloatArray,
-        *,
-        start: float,
-        factor: float,
+        self, day: Day, current_a: FloatArray, kelvin: FloatArray, cell: _Cell
     ) -> FloatArray:
         """Return the voltage of one cell [V]; after PyBaMM's cell is empty, that of an empty.
 
         What sensors do to a log, or parts around the cell, is sized by trying, and leaves the cell
         what it was: the latest answers are kept, since each takes a second.
         """
-        about = (start, factor, condition.charge_loss, condition.transfer_slowdown)
-        key = (day.time_s.tobytes(), current_a.tobytes(), kelvin.tobytes(), *about)
+        key = (day.time_s.tobytes(), current_a.tobytes(), kelvin.tobytes(), cell)
         if key not in self._known:
             if len(self._known) >= _KEPT:
                 self._known.pop(next(iter(self._known)))
-            self._known[key] = self._solved_v(
-                day, condition, current_a, kelvin, start=start, factor=factor
-            )
+            self._known[key] = self._solved_v(day, current_a, kelvin, cell)
         return self._known[key]
 
     def _solved_v(
-        self,
-        day: Day,
-        condition: Condition,
-        current_a: FloatArray,
-        kelvin: FloatArray,
-        *,
-        start: float,
-        factor: float,
+        self, day: Day, current_a: FloatArray, kelvin: FloatArray, cell: _Cell
     ) -> FloatArray:
         pybamm = import_pybamm()
         parameters = self._parameters.copy()
         time_s = day.time_s
         every = max(1, round(_OUTPUT_S / day.step_s))
-        counted = np.where(current_a < 0.0, (1.0 - condition.charge_loss) * current_a, current_a)
+        counted = np.where(current_a < 0.0, (1.0 - cell.charge_loss) * current_a, current_a)
         amperes = counted * self._cell_ah / self.pack.capacity_ah
         coarse_s = time_s[::every]
         # A little beyond the end, where the solver may look.
@@ -188,8 +181,8 @@ class PybammPlant:
             return pybamm.Interpolant(beyond_s, beyond_k, t)
 
         parameters["Ambient temperature [K]"] = ambient
-        self._age(parameters, factor, condition.transfer_slowdown)
-        self._fill(parameters, start)
+        self._age(parameters, cell.capacity_factor, cell.transfer_slowdown)
+        self._fill(parameters, cell.start)
         simulation = pybamm.Simulation(
             pybamm.lithium_ion.SPMe({"thermal": "isothermal"}),
             parameter_values=parameters,
