@@ -25,15 +25,18 @@ NATS, LEAD_NATS, SHARP_LEAD_NATS = 5.0, 5.0, 20.0
 """Log Bayes factors count in full below the first; leads are parts of the best's own factor, or of
 these where it has less."""
 
+DECISIVE_NATS = 8.0
+"""More evidence than this, by how far the effect strays itself, makes a cause no more certain."""
+
 TIED_DECIMALS = 9
 """Effects whose utilities agree to so many decimals are equals."""
 
-WHICH = (0.412, 0.865, 1.468, 1.178, 0.872)
+WHICH = (0.69, 0.759, 0.79, 0.991, 1.338)
 """Weights of an effect's log Bayes factor, its lead (negative), the same without strays, and of
 what it takes away in volts and of the excess (`which_features`)."""
 
-BEST_IS_IT = (-3.667, 0.24, 1.361, 0.222, 0.662, 3.502, 0.748)
-IS_ANOTHER = (-0.782, 0.168, 0.77, -0.009, -0.109, 1.137, 1.51)
+BEST_IS_IT = (-4.321, 0.279, 1.425, 0.267, 0.802, 2.754, 0.603, 1.261, 0.226)
+IS_ANOTHER = (-1.348, 0.077, 0.674, -0.007, 0.231, 0.321, 1.228, 1.836, 0.362)
 """Weights for "the best is it" and "it is another", against "none": of one, and of
 `whether_features`."""
 
@@ -87,7 +90,11 @@ def which_features(compared: Compared) -> FloatArray:
 
 
 def whether_features(compared: Compared, best: Witness, share: float) -> FloatArray:
-    """Return what is weighed of the best effect: one, and six more, shape (7,)."""
+    """Return what is weighed of the best effect: one, and eight more, shape (9,).
+
+    The last two are near zero on nearly all clean logs, on those of packs that the model fits well
+    as on others.
+    """
     gap = compared.before_v / max(compared.expected_v, 1e-9)
     return np.array(
         [
@@ -98,5 +105,7 @@ def whether_features(compared: Compared, best: Witness, share: float) -> FloatAr
             compared.taken_v(best),
             share,
             math.log(min(max(gap, 0.1), 20.0)),
+            min(max(best.own_log_bayes / DECISIVE_NATS, 0.0), 1.0),
+            math.asinh(best.sharp_log_bayes / NATS) / compared.strays,
         ]
     )

@@ -57,6 +57,9 @@ class Compared:
     before_excess: float
     expected_v: float
     """RMS of what such logs would keep without a cause, where these have been [V]."""
+    strays: float = 1.0
+    """By how much squared evidence exceeds, on references left out, what chance would give:
+    geometric mean over the effects (`ErrorModel.strays`)."""
 
     @property
     def found(self) -> float:
@@ -94,10 +97,8 @@ def compare(settled: Settled) -> tuple[Evidence, Compared]:
     evidence = gather(frame, settled.reference_grams, grams, error)
     alone = gather(frame, settled.reference_grams, [], error)
     own = _by_effect(evidence)
-    usual = {}
-    if error.strays:
-        mean = math.exp(float(np.mean(np.log([*error.strays.values()]))))
-        usual = dict.fromkeys(error.strays, mean)
+    strays = math.exp(float(np.mean(np.log([*error.strays.values()])))) if error.strays else 1.0
+    usual = dict.fromkeys(error.strays, strays)
     alike = _by_effect(replace(evidence, error=replace(error, strays=usual)))
     sharp = _by_effect(replace(evidence, error=replace(error, strays={})))
 
@@ -124,6 +125,7 @@ def compare(settled: Settled) -> tuple[Evidence, Compared]:
         clean_v=math.sqrt(error.clean_v2) or error.rmse_v,
         before_excess=excess(evidence, grams, alone.squares),
         expected_v=math.sqrt(sum(expected_v2(gram, alone) for gram in grams) / len(grams)),
+        strays=strays,
     )
 
 

@@ -57,8 +57,9 @@ class ErrorModel:
     trust: float = 1.0
     """Weight of the information that the model file brings: less than 1 where the references
     contradict it."""
-    structure: float = 1.0
-    """How much of its physical range each of `Frame.repairs` may take."""
+    structure: Mapping[str, float] = field(default_factory=dict)
+    """How much of its physical range the structure of each effect may take (`Frame.repairs`); 1
+    where it is not listed."""
 
     @property
     def lasting_v2(self) -> float:
@@ -324,7 +325,10 @@ def _add_priors(precision: FloatArray, right: FloatArray, frame: Frame, error: E
 
 def structure_precision(frame: Frame, error: ErrorModel) -> FloatArray:
     """Return the precision with which each of the repairs' amplitudes is held at none."""
-    return np.diag(prior_precision(frame.bounds_of(frame.repairs))) / error.structure**2
+    repairs = [frame.choices[k] for k in frame.repairs]
+    levels = [error.structure.get(item.effect.id, 1.0) for item in repairs for _ in item.amplitudes]
+    prior = np.diag(prior_precision(frame.bounds_of(frame.repairs)))
+    return np.asarray(prior / np.array(levels) ** 2)
 
 
 def information_of(frame: Frame, error: ErrorModel) -> FloatArray:

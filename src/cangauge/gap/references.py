@@ -14,15 +14,20 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cangauge.gap.columns import LEVELS
 from cangauge.gap.evidence import (
     ErrorModel,
     Frame,
     Gram,
     gather,
     information_of,
-    log_likelihood,
     prior_precision,
+)
+from cangauge.gap.levels import (
+    OWN_LEVELS,
+    STRUCTURE_LEVELS,
+    own_level,
+    own_levels,
+    structure_levels,
 )
 from cangauge.gap.remainder import kept_v2
 from cangauge.gap.scales import SCALES, scale_variances
@@ -36,14 +41,6 @@ KNOWN_LOGS = 0.05
 """What the model file says of the error counts like so much of a reference log. That error was
 judged on logs left out of a fit to a few, so it may be many times too large."""
 
-OWN_LEVELS: tuple[float, ...] = (0.001, *np.logspace(-1.75, -0.5, 6).tolist())
-"""By how much less than is usual logs of one pack may differ, in all ways at once. Not by more: all
-effects together can mimic nearly any error of the model, and what differs from log to log in all
-ways would hide every cause; how far references stray (`with_strays`) guards against those."""
-
-OWN_LEVEL_SPREAD = 1.0
-"""Standard deviation, before references were seen, of that level's logarithm."""
-
 KNOWN_COEFFICIENTS = 2.0
 """So many coefficients are taken to agree with the model file, beside those that are looked at."""
 
@@ -55,15 +52,6 @@ LEAST_TRUST_BEYOND = 0.1
 
 FEW = 2.0
 """Chance on few references: a mean of n squares is taken to be low by this over n."""
-
-STRUCTURE_LEVELS: tuple[float, ...] = (0.001, 0.03, 0.1, 0.3, 1.0)
-"""How much of its physical range the structure that clean logs share may take: a pack that obeys
-the model shows none, and what is looked for in vain costs certainty elsewhere."""
-
-OWN_EACH: tuple[float, ...] = (0.3, 2.0, 4.0)
-OWN_EACH_SPREAD = 1.0
-"""By how much one effect's own may differ more, or less, than that of all, and the standard
-deviation of that level's logarithm before references were seen."""
 
 LEAST = 1e-4
 """No scale's variance is below this part of the largest."""
@@ -90,8 +78,8 @@ def error_from_references(
 
     Expectation maximisation on the variance of every scale, in which what `stated` says counts like
     `KNOWN_LOGS` logs, in turn with the levels of the structure that all share and of all that is a
-    log's own; then the level of each effect's own. Structure and own begin at next to nothing and
-    grow where the references need them.
+    log's own (`levels`); then the level of each effect's own. Structure and own begin at next to
+    nothing and grow where the references need them.
 
     Parameters
     ----------
@@ -101,8 +89,11 @@ def error_from_references(
     stated : ErrorModel
     """
     usual = np.array(stated.own_std)
+    pieces = dict.fromkeys(frame.choices[k].effect.id for k in frame.repairs)
     error = replace(
-        stated, structure=STRUCTURE_LEVELS[0], own_std=tuple((OWN_LEVELS[0] * usual).tolist())
+        stated,
+        structure=dict.fromkeys(pieces, STRUCTURE_LEVELS[0]),
+        own_std=tuple((OWN_LEVELS[0] * usual).tolist()),
     )
     # What all references share comes first, or it is taken for what differs from log to log: under
     # information that is too sure the differences grow until they explain it, and it stays so.
@@ -119,64 +110,9 @@ def error_from_references(
             rmse_v=float(np.sqrt(np.sum(counts * variance) / np.sum(counts))),
         )
         error = replace(error, trust=_trust(frame, grams, error, least_trust))
-        error = replace(error, structure=_structure_level(frame, grams, error))
-        error = replace(error, own_std=_own_level(frame, grams, error, usual))
-    return replace(error, own_std=_own_levels(frame, grams, error))
-
-
-def _structure_level(frame: Frame, grams: Sequence[Gram], error: ErrorModel) -> float:
-    """Return the level of shared structure under which the references are most probable."""
-    return max(
-        STRUCTURE_LEVELS,
-        key=lambda level: log_likelihood(frame, grams, replace(error, structure=level)),
-    )
-
-
-def _own_level(
-    frame: Frame, grams: Sequence[Gram], error: ErrorModel, usual: FloatArray
-) -> tuple[float, ...]:
-    """Return what is usual of a log's own times the level under which the logs are most probable.
-
-    Few logs say little of one way to differ, but much of all ways together.
-    """
-
-    def log_probability(level: float) -> float:
-        found = replace(error, own_std=tuple((level * usual).tolist()))
-        known = -0.5 * (np.log(level) / OWN_LEVEL_SPREAD) ** 2
-        return log_likelihood(frame, grams, found) + float(known)
-
-    return tuple((max(OWN_LEVELS, key=log_probability) * usual).tolist())
-
-
-def _own_levels(frame: Frame, grams: Sequence[Gram], error: ErrorModel) -> tuple[float, ...]:
-    """Return a log's own with a level for every effect, each with the others at theirs."""
-    own_std = np.array(error.own_std)
-    best = log_likelihood(frame, grams, error)
-    for at in _own_by_effect(frame):
-        here = own_std.copy()
-        for level in OWN_EACH:
-            trial = own_std.copy()
-            trial[at] *= level
-            found = replace(error, own_std=tuple(trial.tolist()))
-            known = -0.5 * float(np.log(level) / OWN_EACH_SPREAD) ** 2
-            chance = log_likelihood(frame, grams, found) + known
-            if chance > best:
-                best, here = chance, trial
-        own_std = here
-    return tuple(own_std.tolist())
-
-
-def _own_by_effect(frame: Frame) -> list[NDArray[np.intp]]:
-    """Return where each effect's own amplitudes are, and each of `columns.LEVELS`."""
-    places: dict[str, list[int]] = {}
-    at = 0
-    for k in frame.own:
-        choice = frame.choices[k]
-        of_one = places.setdefault(choice.effect.id, [])
-        of_one += range(at, at + len(choice.amplitudes))
-        at += len(choice.amplitudes)
-    groups = [*places.values(), *([at + k] for k in range(len(LEVELS)))]
-    return [np.array(group, dtype=np.intp) for group in groups]
+        error = replace(error, structure=structure_levels(frame, grams, error))
+        error = replace(error, own_std=own_level(frame, grams, error, usual))
+    return replace(error, own_std=own_levels(frame, grams, error))
 
 
 def with_strays(

@@ -32,6 +32,7 @@ from cangauge.gap.references import (
 )
 from cangauge.gap.structure import repaired
 from cangauge.gap.thinned import thinned
+from cangauge.gap.unstepped import unstepped
 from cangauge.identify.options import FitOptions
 from cangauge.logs.log import Log
 from cangauge.model.effects.effect import Effect
@@ -167,9 +168,9 @@ def settle(
         _check_pack(log, model)
     choices = candidates(effects, model.pack, logs[0].time_s, elsewhere=True)
     say = progress or _silent
-    of_logs = [prepare_log(thinned(log), options) for log in logs]
+    of_logs = [prepare_log(unstepped(thinned(log)), options) for log in logs]
     without_start = replace(options, initial_soc_pct=None)
-    of_references = [prepare_log(thinned(log), without_start) for log in references]
+    of_references = [prepare_log(unstepped(thinned(log)), without_start) for log in references]
     covered = not of_references or temperatures_covered(of_references, of_logs)
     frame = _frame(model_file, choices, has_references=bool(of_references), covered=covered)
     error = error_from_noise(model_file.noise, model_file.rate_hz, frame)
