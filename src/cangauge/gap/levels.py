@@ -27,6 +27,7 @@ from cangauge.gap.evidence import (
 FloatArray = NDArray[np.float64]
 
 STRUCTURE_ROUNDS = 2
+"""So often each piece is looked at beside the others."""
 
 STRUCTURE_LEVELS: tuple[float, ...] = (0.001, 0.03, 0.1, 0.3, 1.0)
 """How much of its physical range a piece of structure may take."""
