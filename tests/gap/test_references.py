@@ -11,7 +11,7 @@ import pytest
 from cangauge.gap.diagnose import diagnose
 from cangauge.gap.extend import library_without
 from cangauge.gap.settle import Settled, settle
-from cangauge.gap.verdict import decide
+from cangauge.gap.verdict import Verdict, decide
 from cangauge.identify.fit import FitOptions, fit
 from cangauge.logs.log import Log
 from cangauge.model.model_file import ModelFile
@@ -108,22 +108,30 @@ def test_where_references_differ_logs_are_taken_to_differ(
     """The same fault is worth little beside references that stray by as much; others lose less."""
     varied = apart(change, references, size)
 
-    def kept(of: str, logs: Sequence[Log]) -> float:
-        """What is left of an effect's evidence."""
-        found = []
-        for known in (references, varied):
-            candidates = decide(settle(logs, model, known, library_without([]))).candidates
-            found += [score.log_bayes_factor for score in candidates if score.effect_id == of]
-        return found[1] / found[0]
+    def beside_both(logs: Sequence[Log]) -> list[Verdict]:
+        """Beside references that are alike, and beside those that differ."""
+        return [
+            decide(settle(logs, model, known, library_without([])))
+            for known in (references, varied)
+        ]
 
-    of_the_same = kept(effect_id, [change(day(seed), size) for seed in (21, 22)])
+    def kept(of: str, verdicts: Sequence[Verdict]) -> float:
+        """What is left of an effect's evidence."""
+        alike, varied = (
+            next(score.log_bayes_factor for score in found.candidates if score.effect_id == of)
+            for found in verdicts
+        )
+        return varied / alike
+
+    of_the_same = kept(effect_id, beside_both([change(day(seed), size) for seed in (21, 22)]))
     assert of_the_same < 0.1
     late = [
         replace(log, current_a=np.interp(log.time_s - 1.0, log.time_s, log.current_a))
         for log in (day(21), day(22))
     ]
-    assert kept("time_skew", late) > 2.0 * max(of_the_same, 0.0)
-    assert decide(settle(late, model, varied, library_without([]))).cause == "time_skew"
+    of_late = beside_both(late)
+    assert kept("time_skew", of_late) > 2.0 * max(of_the_same, 0.0)
+    assert of_late[1].cause == "time_skew"
 
 
 def test_where_references_differ_in_resistance_logs_are_taken_to_differ(

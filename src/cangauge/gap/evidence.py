@@ -367,6 +367,22 @@ def _solver(precision: FloatArray) -> Callable[[FloatArray], FloatArray]:
     return solve
 
 
+def log_integral(precision: FloatArray, right: FloatArray) -> float:
+    """Return ln of the integral over x of exp(right·x − ½ x·precision·x), but for the 2π.
+
+    Parameters
+    ----------
+    precision : array, shape (n, n)
+        Positive definite.
+    right : array, shape (n,)
+    """
+    balance = 1.0 / np.sqrt(np.diag(precision))
+    root = np.linalg.cholesky(precision * balance * balance[:, None])
+    gained = np.linalg.solve(root, balance * right)
+    volume = np.sum(np.log(np.diag(root))) - np.sum(np.log(balance))
+    return float(0.5 * gained @ gained - volume)
+
+
 def prior_precision(bounds: FloatArray) -> FloatArray:
     """Return the precision of amplitudes with these bounds, shape (k, k)."""
     return np.diag((2.0 * PRIOR_SIGMAS / (bounds[:, 1] - bounds[:, 0])) ** 2)

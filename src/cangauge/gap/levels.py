@@ -8,7 +8,7 @@ costs certainty elsewhere, and goes astray where no reference has been.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +20,7 @@ from cangauge.gap.evidence import (
     Frame,
     Gram,
     gather,
+    log_integral,
     log_likelihood,
     structure_precision,
 )
@@ -62,21 +63,33 @@ def structure_levels(frame: Frame, grams: Sequence[Gram], error: ErrorModel) -> 
         prior = structure_precision(frame, replace(error, structure=levels))
         precision = whole.precision.copy()
         precision[at, at] += prior - held
-        balance = 1.0 / np.sqrt(np.diag(precision))
-        root = np.linalg.cholesky(precision * balance * balance[:, None])
-        gained = np.linalg.solve(root, balance * right)
-        volume = np.sum(np.log(np.diag(root))) - np.sum(np.log(balance))
-        return float(0.5 * gained @ gained - volume + 0.5 * np.sum(np.log(prior)))
+        return log_integral(precision, right) + 0.5 * float(np.sum(np.log(prior)))
 
     pieces = list(error.structure)
     if not pieces:
         return {}
-    levels = max((dict.fromkeys(pieces, level) for level in STRUCTURE_LEVELS), key=log_probability)
+    together = [dict.fromkeys(pieces, level) for level in STRUCTURE_LEVELS]
+    best, levels = _most_probable(together, log_probability)
     for _ in range(STRUCTURE_ROUNDS):
+        before = levels
         for piece in pieces:
-            trials = [{**levels, piece: level} for level in STRUCTURE_LEVELS]
-            levels = max(trials, key=log_probability)
+            others = [level for level in STRUCTURE_LEVELS if level != levels[piece]]
+            trials = [{**levels, piece: level} for level in others]
+            chance, trial = _most_probable(trials, log_probability)
+            if chance > best:
+                best, levels = chance, trial
+        if levels == before:
+            break
     return levels
+
+
+def _most_probable(
+    trials: Sequence[dict[str, float]], log_probability: Callable[[dict[str, float]], float]
+) -> tuple[float, dict[str, float]]:
+    """Return the largest log probability, and what has it."""
+    chances = [log_probability(trial) for trial in trials]
+    at = int(np.argmax(chances))
+    return chances[at], trials[at]
 
 
 def own_level(

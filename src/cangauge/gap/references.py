@@ -20,6 +20,7 @@ from cangauge.gap.evidence import (
     Gram,
     gather,
     information_of,
+    log_integral,
     prior_precision,
 )
 from cangauge.gap.levels import (
@@ -207,12 +208,9 @@ def _trust(frame: Frame, grams: Sequence[Gram], error: ErrorModel, least: float)
         precision, toward = found.precision.copy(), right.copy()
         precision[:p, :p] += (trust - error.trust) * whole
         toward[:p] += (trust - error.trust) * whole @ centre
-        balance = 1.0 / np.sqrt(np.diag(precision))
-        balanced, toward = precision * balance * balance[:, None], toward * balance
-        gained = toward @ np.linalg.solve(balanced, toward) - trust * centre @ whole @ centre
-        volume = np.linalg.slogdet(balanced)[1] - 2.0 * np.sum(np.log(balance))
         agreed = KNOWN_COEFFICIENTS * (np.log(trust) - trust)
-        return float(0.5 * (gained - volume + p * np.log(trust) + agreed))
+        held = p * np.log(trust) - trust * centre @ whole @ centre
+        return log_integral(precision, toward) + 0.5 * float(held + agreed)
 
     return max((trust for trust in TRUSTS if trust >= least), key=log_probability)
 

@@ -13,7 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cangauge.gap.bounded import moved, within_bounds
-from cangauge.gap.evidence import ErrorModel, Frame, Gram, gather, structure_precision
+from cangauge.gap.evidence import (
+    ErrorModel,
+    Frame,
+    Gram,
+    gather,
+    log_integral,
+    structure_precision,
+)
 from cangauge.model.extended import ExtendedModel
 
 FloatArray = NDArray[np.float64]
@@ -49,11 +56,8 @@ def needed(frame: Frame, references: Sequence[Gram], error: ErrorModel) -> tuple
     def log_probability(pieces: Sequence[int]) -> float:
         of_pieces = [np.arange(*ends[j]) for j in pieces]
         at = np.concatenate([np.arange(p), *of_pieces])
-        balance = 1.0 / np.sqrt(np.diag(whole.precision)[at])
-        root = np.linalg.cholesky(whole.precision[np.ix_(at, at)] * balance * balance[:, None])
-        gained = np.linalg.solve(root, balance * right[at])
-        volume = np.sum(np.log(np.diag(root))) - np.sum(np.log(balance))
-        return float(0.5 * gained @ gained - volume + 0.5 * np.sum(np.log(prior[at[p:] - p])))
+        held = 0.5 * float(np.sum(np.log(prior[at[p:] - p])))
+        return log_integral(whole.precision[np.ix_(at, at)], right[at]) + held
 
     chosen: list[int] = []
     best = log_probability(chosen)
