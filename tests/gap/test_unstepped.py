@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cangauge.gap.unstepped import unstepped
+from cangauge.gap.unstepped import unstepped, usual_step_k
 from cangauge.logs.log import Log
 
 FloatArray = NDArray[np.float64]
@@ -57,3 +57,9 @@ def test_a_fine_temperature_stays_what_it_is() -> None:
 def test_a_temperature_that_never_changes_stays() -> None:
     log = log_of(np.full(100, 21.0))
     assert unstepped(log) is log
+
+
+@pytest.mark.parametrize("step_c", [0.25, 1.0])
+def test_the_step_is_what_the_report_changes_by_at_once(step_c: float) -> None:
+    assert usual_step_k(log_of(reported(warming(), step_c, 0.03))) == step_c
+    assert usual_step_k(log_of(np.full(100, 21.0))) == 0.0

@@ -9,7 +9,7 @@ import pytest
 
 from cangauge.gap.before_after import LogErrors
 from cangauge.gap.columns import LogTerms, Prepared, prepare_log
-from cangauge.gap.limits import limits
+from cangauge.gap.limits import limits, stepped_temperature
 from cangauge.gap.maps import LEAST_ROWS, OTHER_BINS, SOC_BINS, error_map, even_edges
 from cangauge.gap.moments import MOMENTS, around, worst_moments
 from cangauge.identify.options import FitOptions
@@ -167,3 +167,12 @@ def test_each_limit_has_its_sentence(log: Log, references: int, sentence: str) -
 
 def test_a_given_start_is_a_start() -> None:
     assert "No SoC at the start" not in said(long_log(soc_pct=None), initial_soc_pct=80.0)
+
+
+def test_steps_of_the_temperature_are_told_where_they_hide_as_much_as_the_floor() -> None:
+    words = stepped_temperature(0.5, 0.74, floor_v=0.3)
+    assert "steps of 0.5 K" in words
+    assert "740 mV/K: up to 0.18 V" in words  # half a step, 0.25 K
+    assert stepped_temperature(0.5, -0.74, floor_v=0.3) != ""
+    assert stepped_temperature(0.5, 0.05, floor_v=0.3) == ""
+    assert stepped_temperature(0.0, 0.74, floor_v=0.3) == ""

@@ -16,6 +16,7 @@ from cangauge.identify.fit import FitOptions, fit
 from cangauge.logs.log import Log
 from cangauge.model.model_file import ModelFile
 from cangauge.model.published import CAPACITY_AH
+from cangauge.report.gap_limits import log_limits
 from cangauge.report.gap_report import gap_page
 from cangauge.report.page import Beside, Bullets, Figure, Page, Section, Table, render
 from synthetic import synthetic_log
@@ -186,6 +187,14 @@ def test_a_poor_log_is_told_first_what_it_cannot_show(model: ModelFile) -> None:
                  "One temperature", "A narrow range of SoC", "No reference logs"):  # fmt: skip
         assert said in words
     assert any(tile.label == "Floor: model file" for tile in page.tiles)
+
+
+def test_a_coarse_temperature_is_told_of(model: ModelFile) -> None:
+    log = synthetic_log(hours=0.5, start_pct=70.0, end_pct=60.0, noise_v=0.5, name="coarse")
+    coarse = replace(log, temperature_c=np.round(log.temperature_c))
+    told = [" ".join(log_limits(diagnose([each], model, []))) for each in (log, coarse)]
+    assert "reported in steps" not in told[0]
+    assert "reported in steps of 1 K" in told[1]
 
 
 def test_a_log_too_short_to_judge_on_is_refused(model: ModelFile) -> None:

@@ -22,6 +22,9 @@ REST_C_RATE, REST_PART = 0.02, 0.005
 """Charging or resting for less than this part of the rows counts as never; a current below this
 is rest [1/h]."""
 
+STEPS_PART = 0.5
+"""Half a step of the reported temperature that makes less than this part of the floor is little."""
+
 FEW_REFERENCES = 3
 """Fewer tell hardly how much logs differ without a cause."""
 
@@ -53,6 +56,29 @@ def limits(
         _reference_number(len(references)),
     ]
     return [sentence for sentence in found if sentence]
+
+
+def stepped_temperature(step_k: float, kt_v_per_k: float, floor_v: float) -> str:
+    """Return what a temperature that is reported in steps leaves open; "" if it is little.
+
+    Parameters
+    ----------
+    step_k : float
+        Of the reports [K].
+    kt_v_per_k : float
+        By how much the model's voltage follows the temperature [V/K].
+    floor_v : float
+        The model's error without a cause [V].
+    """
+    half_v = 0.5 * step_k * abs(kt_v_per_k)
+    if half_v < STEPS_PART * floor_v:
+        return ""
+    return (
+        f"The temperature is reported in steps of {step_k:g} K, and the model's voltage follows it"
+        f" by {1e3 * kt_v_per_k:.0f} mV/K: up to {half_v:.2f} V for as long as a report stands. It"
+        " is read between the steps here, as far as they tell; a service cannot look ahead, and its"
+        " SoC errs by so much. A temperature with a finer step shows smaller causes."
+    )
 
 
 def _duration(logs: Sequence[Prepared]) -> str:

@@ -32,7 +32,7 @@ from cangauge.gap.references import (
 )
 from cangauge.gap.structure import repaired
 from cangauge.gap.thinned import thinned
-from cangauge.gap.unstepped import unstepped
+from cangauge.gap.unstepped import unstepped, usual_step_k
 from cangauge.identify.options import FitOptions
 from cangauge.logs.log import Log
 from cangauge.model.effects.effect import Effect
@@ -75,6 +75,8 @@ class Settled:
     acting: ExtendedModel | None = None
     """The model with the structure that references call for, in which effects on the temperature
     are weighed (`columns.log_terms`)."""
+    temperature_step_k: float = 0.0
+    """The coarsest step in which a diagnosed log's temperature is reported [K]."""
 
     @cached_property
     def given_errors_v(self) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...]]:
@@ -216,6 +218,7 @@ def settle(
         given,
         covered,
         acting,
+        max(usual_step_k(log) for log in logs),
     )
 
 

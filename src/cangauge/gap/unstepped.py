@@ -33,7 +33,7 @@ def unstepped(log: Log) -> Log:
     change = np.flatnonzero(np.diff(reported))
     if change.size == 0:
         return log
-    half_step = 0.5 * float(np.median(np.abs(np.diff(reported)[change])))
+    half_step = 0.5 * usual_step_k(log)
     first, last = np.append(0, change + 1), np.append(change, len(log) - 1)
     stands = time_s[last] - time_s[first] >= STANDS_S
     stands[[0, -1]] = True  # before the first change and after the last nothing else is known
@@ -43,6 +43,13 @@ def unstepped(log: Log) -> Log:
     line = np.interp(time_s, knots_s[order], knots_c[order])
     between = np.clip(line, reported - half_step, reported + half_step)
     return replace(log, temperature_c=between)
+
+
+def usual_step_k(log: Log) -> float:
+    """Return by how much a log's reported temperature usually changes at once [K]; 0 if never."""
+    steps = np.abs(np.diff(log.temperature_c))
+    changed = steps > 0.0
+    return float(np.median(steps[changed])) if changed.any() else 0.0
 
 
 def _between(values: FloatArray, change: NDArray[np.intp]) -> FloatArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cangauge.gap.diagnose import Diagnosis
-from cangauge.gap.limits import limits
+from cangauge.gap.limits import limits, stepped_temperature
 from cangauge.gap.verdict import NONE, UNKNOWN
 from cangauge.model.effects.library import LIBRARY
 from cangauge.report.words import number
@@ -52,12 +52,16 @@ def verdict_limit(diagnosis: Diagnosis) -> str:
 def log_limits(diagnosis: Diagnosis) -> list[str]:
     """Return what the logs cannot show, whatever the verdict."""
     settled = diagnosis.settled
-    return limits(
+    steps = stepped_temperature(
+        settled.temperature_step_k, settled.model.model.kt_v_per_k, diagnosis.floor_v
+    )
+    found = limits(
         [terms.prepared for terms in settled.diagnosed],
         [terms.prepared for terms in settled.references],
         settled.model.capacity_ah,
         settled.options.initial_soc_pct,
     )
+    return [*found, steps] if steps else found
 
 
 def _unseen(diagnosis: Diagnosis) -> str:
