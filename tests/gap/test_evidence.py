@@ -15,9 +15,9 @@ from scipy.stats import halfnorm, norm
 from cangauge.gap.columns import Candidate, candidates
 from cangauge.gap.diagnose import diagnose
 from cangauge.gap.evidence import ErrorModel, Evidence, Frame
-from cangauge.gap.scales import SCALES
 from cangauge.gap.scores import PRIOR_PARTS, scores
 from cangauge.identify.fit import FitOptions, fit
+from cangauge.identify.scales import SCALES
 from cangauge.logs.log import Log
 from cangauge.model.effects.first_order import low_passed
 from cangauge.model.effects.library import LIBRARY

@@ -198,8 +198,9 @@ def test_references_that_all_contradict_the_model_file_overrule_it(
 ) -> None:
     """What all of them share is the pack, not a difference from log to log."""
     found = learn([change(log) for log in references])
-    assert found.error.trust < alike.error.trust
-    # Far less, unless it is of a kind that structure takes up: a resistance is, in part.
+    assert found.error.trust <= alike.error.trust
+    # Far less, unless it is of a kind that structure takes up: a resistance is, and then it may be
+    # no less.
     assert found.error.trust < 0.01 or max(found.error.structure.values()) >= 0.1
     # The next level at most.
     assert level_std(found) < 2.0 * level_std(alike)

@@ -18,6 +18,7 @@ from cangauge.identify.effects.judge import Judge, Judged, compare
 from cangauge.identify.effects.linear import linearise, moved_by, residual_of
 from cangauge.identify.effects.prepared import Prepared, prepare_log
 from cangauge.identify.fit import FitOptions, Identification, fit
+from cangauge.identify.voltage_fit import fit_voltage_model, held_out_errors
 from cangauge.logs.log import Log
 from cangauge.model.effects.library import LIBRARY, effect_entries, parse_effects
 from cangauge.model.effects.pack_state import Signals
@@ -232,9 +233,10 @@ def test_no_row_is_judged_by_a_fit_that_saw_it() -> None:
         seen += fold.judge_on
     assert seen.max() == 1
     assert seen.mean() > 0.5
-    plain = fit(trips("dynamics"), OPTIONS)
-    expected = np.concatenate(plain.held_out_error_v)
-    found = judge(ExtendedModel(plain.voltage_model, CAPACITY_AH)).error_v
+    rows = [item.rows for item in logs]
+    plain, _ = fit_voltage_model(rows, OPTIONS, is_held=False)
+    expected = np.concatenate(held_out_errors(rows, OPTIONS, is_held=False))
+    found = judge(ExtendedModel(plain, CAPACITY_AH)).error_v
     np.testing.assert_allclose(found, expected, atol=1e-6)  # exact: without effects it is linear
 
 

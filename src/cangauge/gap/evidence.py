@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from cangauge.gap.columns import LEVELS, Candidate, LogTerms
-from cangauge.gap.scales import by_scale
+from cangauge.identify.scales import by_scale
 
 FloatArray = NDArray[np.float64]
 

@@ -31,7 +31,7 @@ from cangauge.gap.levels import (
     structure_levels,
 )
 from cangauge.gap.remainder import kept_v2
-from cangauge.gap.scales import SCALES, scale_variances
+from cangauge.identify.scales import SCALES, scale_variances
 from cangauge.model.model_file import ModelNoise
 
 FloatArray = NDArray[np.float64]

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from cangauge.gap.columns import LEVELS
 from cangauge.gap.evidence import Evidence, Frame, Gram, without_own
-from cangauge.gap.scales import SCALES
 from cangauge.gap.scores import Score
+from cangauge.identify.scales import SCALES
 
 FloatArray = NDArray[np.float64]
 

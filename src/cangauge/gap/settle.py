@@ -32,9 +32,9 @@ from cangauge.gap.references import (
 )
 from cangauge.gap.structure import repaired
 from cangauge.gap.thinned import thinned
-from cangauge.gap.unstepped import unstepped, usual_step_k
 from cangauge.identify.options import FitOptions
 from cangauge.logs.log import Log
+from cangauge.logs.unstepped import unstepped, usual_step_k
 from cangauge.model.effects.effect import Effect
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import ModelFile

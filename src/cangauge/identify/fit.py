@@ -29,6 +29,9 @@ __all__ = ["FitOptions", "Identification", "fit"]
 FloatArray = NDArray[np.float64]
 Progress = Callable[[str], None]
 
+MOSTLY_KEPT = 0.8
+"""If less of the temperature's coefficient is left, a remark says so."""
+
 
 @dataclass(frozen=True, eq=False)
 class Identification:
@@ -132,16 +135,18 @@ def fit(
     options = replace(options, capacity_ah=capacity)
     rows = prepare(logs, options)
     say(f"fitting {sum(map(len, rows))} rows of {len(rows)} logs")
-    voltage_model, solution = fit_voltage_model(rows, options)
     found = None
     if options.effects:
-        plain = ExtendedModel(voltage_model, capacity)
+        # Beside effects the logs that are left out judge kt too, so it is left free.
+        free, _ = fit_voltage_model(rows, options, is_held=False)
         prepared = [prepare_log(log, options) for log in logs]
-        found = fit_effects(plain, prepared, options.effects, say)
+        found = fit_effects(ExtendedModel(free, capacity), prepared, options.effects, say)
+    if found is not None and found.model.effects:
         voltage_model, solution = found.model.model, found.solution
         fits = evaluate_extended(found.model, prepared)
         held_out = list(found.held_out_error_v)
     else:
+        voltage_model, solution = fit_voltage_model(rows, options)
         say("judging on rows that the fit did not see")
         held_out = held_out_errors(rows, options)
         fits = evaluate(voltage_model, rows)
@@ -194,6 +199,13 @@ def _remarks(model: VoltageModel, solution: Solution, rows: Sequence[FitRows]) -
         remarks.append(
             f"the temperature moves by only {t_hi - t_lo:.1f} K: kt = {model.kt_v_per_k:.3f} V/K"
             " is hardly identified"
+        )
+    held = solution.held
+    if held is not None and held.part < MOSTLY_KEPT:
+        remarks.append(
+            f"the logs tell kt from the open-circuit voltage to ±{held.std_v_per_k:.2f} V/K only:"
+            f" it is {model.kt_v_per_k:.3f} V/K instead of {held.plain_v_per_k:.3f}, held by what"
+            f" is usual (±{held.usual_v_per_k:.2f}); a log at another temperature would tell it"
         )
     if solution.constrained:
         remarks.append("the plain fit's pseudo-OCV would fall somewhere: it was kept rising")

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from cangauge.errors import CangaugeError
+from cangauge.identify.temperature import Held
 
 FloatArray = NDArray[np.float64]
 
@@ -38,6 +39,8 @@ class Solution:
     """Of the scaled columns."""
     constrained: bool
     """Whether the plain solution broke the bounds, so that they had to hold it."""
+    held: Held | None = None
+    """How firmly the temperature's coefficient was held, if it was."""
 
     def part(self, first: int) -> Solution:
         """Return what is known of the first coefficients."""

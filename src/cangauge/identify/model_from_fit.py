@@ -17,7 +17,7 @@ from cangauge.identify.least_squares import Solution
 from cangauge.identify.noise import describe_noise
 from cangauge.identify.options import FitOptions
 from cangauge.identify.rows import FitRows
-from cangauge.identify.voltage_fit import stack
+from cangauge.identify.voltage_fit import KT, stack
 from cangauge.logs.log import Log
 from cangauge.model.effects.library import effect_entries
 from cangauge.model.model_file import (
@@ -83,7 +83,7 @@ def model_from_fit(
             ),
             "noise": _noise(fits, held_out_error_v, options),
             "effects": [] if found is None else effect_entries(found.model.effects),
-            "information": _information(rows, options, names, found),
+            "information": _information(rows, options, names, solution, found),
             "made": _made(logs, options, rows),
         }
     )
@@ -133,14 +133,16 @@ def _information(
     rows: Sequence[FitRows],
     options: FitOptions,
     names: Sequence[str],
+    solution: Solution,
     found: FittedEffects | None,
 ) -> Information:
     """Return the square root of the information that the rows hold on the coefficients.
 
     With effects, what the rows tell of both is shared: the effects' columns come first in the
-    triangular factor, so that what is left to the coefficients is their own.
+    triangular factor, so that what is left to the coefficients is their own. The row that holds kt
+    is one of them.
     """
-    if found is None:
+    if found is None or not found.model.effects:
         columns, volts, _ = stack(rows, options)
         beside = np.empty((volts.size, 0))
     else:
@@ -150,7 +152,12 @@ def _information(
     scale = np.linalg.norm(columns, axis=0)
     scale[scale == 0.0] = 1.0
     first = beside.shape[1]
-    root = np.linalg.qr(np.column_stack([beside, columns / scale, volts])).R[first:, first:]
+    table = np.column_stack([beside, columns / scale, volts])
+    if solution.held is not None:
+        holding = np.zeros(table.shape[1])
+        holding[first + KT] = solution.held.weight / scale[KT]
+        table = np.vstack([table, holding])
+    root = np.linalg.qr(table).R[first:, first:]
     n = columns.shape[1]
     return Information(
         columns=list(names),

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from cangauge.errors import InputError
 from cangauge.identify.charge import counted_soc_pct
 from cangauge.logs.log import Log
+from cangauge.logs.unstepped import unstepped
 from cangauge.model.delay_line import GAP_S, delayed_currents, settled
 
 FloatArray = NDArray[np.float64]
@@ -42,6 +43,9 @@ class FitRows:
     time_s: FloatArray
     voltage_v: FloatArray
     temperature_c: FloatArray
+    """As it was reported [°C]: what an estimator is given."""
+    between_c: FloatArray
+    """Read between the steps of the reports [°C] (`logs.unstepped`): what the cells were at."""
     soc_pct: FloatArray
     """Counted SoC [%]."""
     delayed_current_a: FloatArray
@@ -97,6 +101,7 @@ def fit_rows(
         time_s=log.time_s[keep],
         voltage_v=log.voltage_v[keep],
         temperature_c=log.temperature_c[keep],
+        between_c=unstepped(log).temperature_c[keep],
         soc_pct=soc[keep],
         delayed_current_a=delayed_currents(log.time_s, log.current_a, delay_s, log.time_s[keep]),
         removed={

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from cangauge.identify.held_out import folds
 from cangauge.identify.least_squares import BLOCK_S, Solution, solve
 from cangauge.identify.options import FitOptions
 from cangauge.identify.rows import FitRows, fit_rows
+from cangauge.identify.temperature import Held, how_firmly
 from cangauge.logs.log import Log
 from cangauge.model.voltage_model import (
     BASIS_NAMES,
@@ -29,6 +31,9 @@ SLOPE_CHECKS = 201
 
 REFINED_AT_MOST = 6
 """So often are points added between which it fell."""
+
+KT = len(BASIS_NAMES)
+"""Where the temperature's coefficient is among all."""
 
 SOC_SPAN_AT_LEAST_PCT = 2.0
 """A fit over less SoC than this would be all extrapolation."""
@@ -51,31 +56,54 @@ def prepare(logs: Sequence[Log], options: FitOptions) -> list[FitRows]:
 
 
 def fit_voltage_model(
-    rows: Sequence[FitRows], options: FitOptions, keep: NDArray[np.bool_] | None = None
+    rows: Sequence[FitRows],
+    options: FitOptions,
+    keep: NDArray[np.bool_] | None = None,
+    *,
+    is_held: bool = True,
 ) -> tuple[VoltageModel, Solution]:
-    """Fit the coefficients on the rows (of all logs in order) that `keep` selects."""
+    """Fit the coefficients.
+
+    Parameters
+    ----------
+    rows : sequence of FitRows
+    options : FitOptions
+    keep : array of bool, optional
+        Rows of all logs in order that count; all by default.
+    is_held : bool
+        Whether kt is held as firmly as the rows leave it open (`identify.temperature`).
+
+    Raises
+    ------
+    InputError
+        If the rows cannot identify the model.
+    """
     columns, volts, block = stack(rows, options)
     soc = np.concatenate([item.soc_pct for item in rows])
     temperature = np.concatenate([item.temperature_c for item in rows])
     current = np.concatenate([item.delayed_current_a[:, 0] for item in rows])
+    number = np.repeat(np.arange(len(rows)), [len(item) for item in rows])
     if keep is not None:
-        columns, volts, block = columns[keep], volts[keep], block[keep]
+        columns, volts, block, number = columns[keep], volts[keep], block[keep], number[keep]
         soc, temperature, current = soc[keep], temperature[keep], current[keep]
     _check_identifiable(rows, soc, current, columns.shape)
-    at_least = SLOPE_AT_LEAST * float(np.median(volts))
-    grid = np.linspace(soc.min(), soc.max(), SLOPE_CHECKS)
-    between = np.linspace(soc.min(), soc.max(), SLOPE_POINTS)
-    for _ in range(REFINED_AT_MOST):
-        bounds = np.zeros((grid.size, columns.shape[1]))
-        bounds[:, : len(BASIS_NAMES)] = ocv_basis_slope(grid, options.epsilon)
-        solution = solve(columns, volts, block, bounds, at_least)
-        slope = (
-            ocv_basis_slope(between, options.epsilon) @ solution.coefficients[: len(BASIS_NAMES)]
+    span = float(soc.min()), float(soc.max())
+    solution = _rising(columns, volts, block, span, options.epsilon)
+    if is_held:
+        lengths = np.bincount(number, minlength=len(rows)).tolist()
+        residual_v = volts - columns @ solution.coefficients
+        plain_kt = float(solution.coefficients[KT])
+        held = how_firmly(columns, residual_v, volts, lengths, KT, plain_kt)
+        row = np.zeros(columns.shape[1])
+        row[KT] = held.weight
+        solution = _rising(
+            np.vstack([columns, row]),
+            np.append(volts, 0.0),
+            np.append(block, block.max() + 1),
+            span,
+            options.epsilon,
         )
-        if np.all(slope > 0.0):
-            break
-        # Near empty the curve bends so sharply that it may fall between two points and rise again.
-        grid = np.union1d(grid, between[slope < at_least])
+        solution = _opened(solution, held)
     x = [float(value) for value in solution.coefficients]
     return VoltageModel(
         ocv_v=tuple(x[: len(BASIS_NAMES)]),
@@ -84,13 +112,50 @@ def fit_voltage_model(
         delay_s=options.delay_s,
         epsilon=options.epsilon,
         t_ref_c=options.t_ref_c,
-        soc_range_pct=(float(soc.min()), float(soc.max())),
+        soc_range_pct=span,
         temperature_range_c=(float(temperature.min()), float(temperature.max())),
         current_range_a=(float(current.min()), float(current.max())),
     ), solution
 
 
-def held_out_errors(rows: Sequence[FitRows], options: FitOptions) -> list[FloatArray]:
+def _rising(
+    columns: FloatArray,
+    volts: FloatArray,
+    block: NDArray[np.intp],
+    span_pct: tuple[float, float],
+    epsilon: float,
+) -> Solution:
+    """Return the least-squares solution whose pseudo-OCV rises over a span of SoC."""
+    at_least = SLOPE_AT_LEAST * float(np.median(volts))
+    grid = np.linspace(*span_pct, SLOPE_CHECKS)
+    between = np.linspace(*span_pct, SLOPE_POINTS)
+    for _ in range(REFINED_AT_MOST):
+        bounds = np.zeros((grid.size, columns.shape[1]))
+        bounds[:, : len(BASIS_NAMES)] = ocv_basis_slope(grid, epsilon)
+        solution = solve(columns, volts, block, bounds, at_least)
+        slope = ocv_basis_slope(between, epsilon) @ solution.coefficients[: len(BASIS_NAMES)]
+        if np.all(slope > 0.0):
+            break
+        # Near empty the curve bends so sharply that it may fall between two points and rise again.
+        grid = np.union1d(grid, between[slope < at_least])
+    return solution
+
+
+def _opened(solution: Solution, held: Held) -> Solution:
+    """Return a solution with how far the logs leave the temperature's coefficient open.
+
+    The others move with it: what is taken from kt the pseudo-OCV takes over.
+    """
+    more = max(held.held_std_v_per_k**2 - float(solution.std_error[KT]) ** 2, 0.0)
+    moves = held.others.copy()
+    moves[KT] = 1.0
+    std_error = np.sqrt(solution.std_error**2 + more * moves**2)
+    return replace(solution, std_error=std_error, held=held)
+
+
+def held_out_errors(
+    rows: Sequence[FitRows], options: FitOptions, *, is_held: bool = True
+) -> list[FloatArray]:
     """Return each log's errors [V] under fits that did not see the rows.
 
     NaN where no fold judged a row, or only with a fit that did not see its SoC: how far the
@@ -102,7 +167,7 @@ def held_out_errors(rows: Sequence[FitRows], options: FitOptions) -> list[FloatA
     delayed = np.concatenate([item.delayed_current_a for item in rows])
     errors = np.full(volts.size, np.nan)
     for fitted, left_out in folds(rows):
-        model, _ = fit_voltage_model(rows, options, fitted)
+        model, _ = fit_voltage_model(rows, options, fitted, is_held=is_held)
         lo, hi = model.soc_range_pct
         judged = left_out & (soc > lo - 1.0) & (soc < hi + 1.0)
         errors[judged] = volts[judged] - model.voltage(
@@ -114,7 +179,7 @@ def held_out_errors(rows: Sequence[FitRows], options: FitOptions) -> list[FloatA
 def columns_of(rows: FitRows, epsilon: float, t_ref_c: float) -> FloatArray:
     """Return the model's columns k0 … k7, kt, R1 … Rn on the rows, shape (m, 9 + n)."""
     return np.column_stack(
-        [ocv_basis(rows.soc_pct, epsilon), rows.temperature_c - t_ref_c, rows.delayed_current_a]
+        [ocv_basis(rows.soc_pct, epsilon), rows.between_c - t_ref_c, rows.delayed_current_a]
     )
 
 

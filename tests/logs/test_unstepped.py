@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cangauge.gap.unstepped import unstepped, usual_step_k
 from cangauge.logs.log import Log
+from cangauge.logs.unstepped import unstepped, usual_step_k
 
 FloatArray = NDArray[np.float64]
 

@@ -22,16 +22,21 @@ STANDS_S = 60.0
 temperature between two steps."""
 
 
+STEPPED_PART = 0.5
+"""A temperature that changes at this part of the rows or more is not reported in steps."""
+
+
 def unstepped(log: Log) -> Log:
     """Return a log with the temperature that its reports are the steps of.
 
     Straight lines from change to change, through the middle of what stands in between, and nowhere
     further from the report than half of its usual step: a jump, as after a pause, stays one. Looks
-    ahead, so it is for a diagnosis, not for the service. A temperature that never changes stays.
+    ahead, so it is for a diagnosis or a fit, not for the service. A temperature that never changes
+    stays, and so does one that nearly always does.
     """
     time_s, reported = log.time_s, log.temperature_c
     change = np.flatnonzero(np.diff(reported))
-    if change.size == 0:
+    if not 0 < change.size < STEPPED_PART * len(log):
         return log
     half_step = 0.5 * usual_step_k(log)
     first, last = np.append(0, change + 1), np.append(change, len(log) - 1)

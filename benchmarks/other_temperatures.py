@@ -1,0 +1,111 @@
+"""How far a model of few logs is out at other temperatures, kt free and held.
+
+    python benchmarks/other_temperatures.py --data FOLDER
+
+FOLDER holds `lg_hg2` (drive cycles of a cell, as a pack of 96 × 17) and `bmw_i3` (trips of a car).
+Each model is of one to three logs, or of all; the table gives the median over them of the voltage's
+root mean square error on other logs, within the SoC that the model saw.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from cangauge.errors import InputError
+from cangauge.gapcheck.recorded import (
+    LG_25C,
+    LG_CAPACITY_AH,
+    LG_PARALLEL,
+    LG_SERIES,
+    summer_held_out,
+    summer_training,
+)
+from cangauge.identify.charge import capacity_from_reference
+from cangauge.identify.options import FitOptions
+from cangauge.identify.voltage_fit import fit_voltage_model, prepare
+from cangauge.logs.log import Log
+from cangauge.logs.read import read_log
+from cangauge.model.voltage_model import VoltageModel
+from cangauge.twin.inject import scaled_to_pack, with_start
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+COLDER_AND_WARMER = ("0", "10", "40")
+LOGS_EACH = 5
+ROWS_AT_LEAST = 100
+
+
+def main() -> None:
+    """Fit, judge, print."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the recorded logs")
+    folder = parser.parse_args().data
+    table = Table(title="Voltage error on other logs, median over the models [V]")
+    for heading in ("model of", "judged on", "models", "kt free", "kt held", "held is better in"):
+        table.add_column(heading, justify="right")
+    at_25c = [_pack(folder / "lg_hg2" / f"{name}.parquet") for name in LG_25C]
+    of_cells = FitOptions(capacity_ah=LG_CAPACITY_AH * LG_PARALLEL)
+    others = {
+        each: [_pack(path) for path in sorted((folder / "lg_hg2").glob(f"{each}degC*"))[:LOGS_EACH]]
+        for each in COLDER_AND_WARMER
+    }
+    ones = [[log] for log in at_25c]
+    for each, logs in {"25": at_25c, **others}.items():
+        table.add_row("LG, 1 at 25 °C", f"{each} °C", *judged(ones, logs, of_cells))
+    for each, logs in others.items():
+        table.add_row("LG, 8 at 25 °C", f"{each} °C", *judged([at_25c], logs, of_cells))
+    summer, held_out = summer_training(folder / "bmw_i3"), summer_held_out(folder / "bmw_i3")
+    of_car = FitOptions(capacity_ah=capacity_from_reference(summer))
+    for number in (1, 2, 3, len(summer)):
+        runs = [summer[k : k + number] for k in range(len(summer) - number + 1)]
+        title = f"i3, {number} in summer"
+        table.add_row(title, "other summer trips", *judged(runs, held_out, of_car))
+    Console().print(table)
+
+
+def judged(
+    models: Sequence[Sequence[Log]], logs: Sequence[Log], options: FitOptions
+) -> tuple[str, ...]:
+    """Return number of models, median error with kt free and held, and how often that is better."""
+    found = []
+    for training in models:
+        rows = prepare(training, options)
+        try:
+            two = [fit_voltage_model(rows, options, is_held=held)[0] for held in (False, True)]
+        except InputError:  # too little SoC
+            continue
+        found.append([error_v([log for log in logs if log not in training], options, model)
+                      for model in two])  # fmt: skip
+    free, held = np.array(found).T
+    return (
+        str(len(found)),
+        f"{np.median(free):.2f}",
+        f"{np.median(held):.2f}",
+        f"{np.sum(held < free)} of {len(found)}",
+    )
+
+
+def error_v(logs: Sequence[Log], options: FitOptions, model: VoltageModel) -> float:
+    """Return the root mean square error over logs [V], each counting the same."""
+    squares = []
+    low, high = model.soc_range_pct
+    for rows in itertools.chain.from_iterable(prepare([log], options) for log in logs):
+        inside = (rows.soc_pct >= low) & (rows.soc_pct <= high)
+        if inside.sum() >= ROWS_AT_LEAST:
+            volts = model.voltage(rows.soc_pct, rows.temperature_c, rows.delayed_current_a)
+            squares.append(np.mean((rows.voltage_v - volts)[inside] ** 2))
+    return float(np.sqrt(np.mean(squares))) if squares else float("nan")
+
+
+def _pack(path: Path) -> Log:
+    return with_start(scaled_to_pack(read_log(path), series=LG_SERIES, parallel=LG_PARALLEL), 100.0)
+
+
+if __name__ == "__main__":
+    main()
