@@ -4,7 +4,7 @@
 
 FOLDER holds `lg_hg2` (drive cycles of a cell, as a pack of 96 × 17) and `bmw_i3` (trips of a car).
 Each model is of one to three logs, or of all; the table gives the median over them of the voltage's
-root mean square error on other logs, within the SoC that the model saw.
+root mean square error on other logs, within the SoC that the model saw, and the range of kt.
 """
 
 from __future__ import annotations
@@ -47,7 +47,10 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the recorded logs")
     folder = parser.parse_args().data
     table = Table(title="Voltage error on other logs, median over the models [V]")
-    for heading in ("model of", "judged on", "models", "kt free", "kt held", "held is better in"):
+    for heading in (
+        "model of", "judged on", "models", "kt free", "kt held", "held is better in",
+        "kt free [V/K]", "kt held [V/K]",
+    ):  # fmt: skip
         table.add_column(heading, justify="right")
     at_25c = [_pack(folder / "lg_hg2" / f"{name}.parquet") for name in LG_25C]
     of_cells = FitOptions(capacity_ah=LG_CAPACITY_AH * LG_PARALLEL)
@@ -72,14 +75,15 @@ def main() -> None:
 def judged(
     models: Sequence[Sequence[Log]], logs: Sequence[Log], options: FitOptions
 ) -> tuple[str, ...]:
-    """Return number of models, median error with kt free and held, and how often that is better."""
-    found = []
+    """Return the cells of a row of the table, from the number of models on."""
+    found, kt = [], []
     for training in models:
         rows = prepare(training, options)
         try:
             two = [fit_voltage_model(rows, options, is_held=held)[0] for held in (False, True)]
         except InputError:  # too little SoC
             continue
+        kt.append([model.kt_v_per_k for model in two])
         found.append([error_v([log for log in logs if log not in training], options, model)
                       for model in two])  # fmt: skip
     free, held = np.array(found).T
@@ -88,6 +92,7 @@ def judged(
         f"{np.median(free):.2f}",
         f"{np.median(held):.2f}",
         f"{np.sum(held < free)} of {len(found)}",
+        *(f"{min(each):.2f} … {max(each):.2f}" for each in zip(*kt, strict=True)),
     )
 
 

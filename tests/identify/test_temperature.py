@@ -68,6 +68,18 @@ def test_what_the_model_lacks_is_not_taken_for_the_temperature() -> None:
     assert found.model.coefficients["kt"].std_error > 0.03
 
 
+@pytest.mark.parametrize("constant_c", [20.0, 27.0])
+def test_a_temperature_that_never_moves_tells_nothing(constant_c: float) -> None:
+    """Any coefficient would do for the fit, and tens of millions of volts per kelvin did."""
+    log = synthetic_log(noise_v=0.3)
+    log = at_temperature(log, np.full(len(log), constant_c), PUBLISHED)
+    found = fit([log], OPTIONS)
+    assert abs(found.voltage_model.kt_v_per_k) < 1e-3
+    assert found.voltage_rmse_v == pytest.approx(0.3, rel=0.05)
+    assert any("kt from the open-circuit voltage" in remark for remark in found.remarks)
+    assert 0.05 < found.model.coefficients["kt"].std_error < 0.2
+
+
 @pytest.mark.parametrize("step_k", [0.25, 0.5, 1.0])
 def test_a_temperature_in_steps_is_read_between_them(step_k: float) -> None:
     """By the reports alone, kt would be found too small: no voltage jumps when a report does."""

@@ -195,17 +195,17 @@ def _remarks(model: VoltageModel, solution: Solution, rows: Sequence[FitRows]) -
             f"the logs cover {lo:.0f}–{hi:.0f} % SoC; beyond, the pseudo-OCV goes on as a line"
         )
     t_lo, t_hi = model.temperature_range_c
-    if t_hi - t_lo < 3.0:
-        remarks.append(
-            f"the temperature moves by only {t_hi - t_lo:.1f} K: kt = {model.kt_v_per_k:.3f} V/K"
-            " is hardly identified"
-        )
     held = solution.held
     if held is not None and held.part < MOSTLY_KEPT:
         remarks.append(
-            f"the logs tell kt from the open-circuit voltage to ±{held.std_v_per_k:.2f} V/K only:"
-            f" it is {model.kt_v_per_k:.3f} V/K instead of {held.plain_v_per_k:.3f}, held by what"
-            f" is usual (±{held.usual_v_per_k:.2f}); a log at another temperature would tell it"
+            f"the logs ({t_lo:.1f} … {t_hi:.1f} °C) tell kt from the open-circuit voltage to"
+            f" ±{held.std_v_per_k:.2g} V/K only: it is {model.kt_v_per_k:.3f} V/K, held by what is"
+            f" usual (±{held.usual_v_per_k:.2g}); a log at another temperature would tell it"
+        )
+    elif t_hi - t_lo < 3.0:
+        remarks.append(
+            f"the temperature moves by only {t_hi - t_lo:.1f} K: kt = {model.kt_v_per_k:.3f} V/K"
+            " is hardly identified"
         )
     if solution.constrained:
         remarks.append("the plain fit's pseudo-OCV would fall somewhere: it was kept rising")

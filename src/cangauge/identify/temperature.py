@@ -2,10 +2,10 @@
 
 Over one discharge the temperature rises as the charge falls, and what the model lacks changes as
 slowly as both. Plain least squares then finds any coefficient that makes the residual a little
-smaller, and is sure of it: one drive of an LG cell at 25 °C gives −1.6 V/K for a pack of 96, and
-an error of 40 V at 10 °C. Cells have tenths of a millivolt per kelvin. So the residual is weighed
-time scale by time scale, slow errors as likely as the faster ones let expect, and the coefficient
-is held near zero by what is usual, as firmly as the logs leave it open.
+smaller, and is sure of it: volts per kelvin for a pack of 96 cells, of which each has tenths of a
+millivolt per kelvin (`benchmarks/other_temperatures.py`). So the residual is weighed time scale by
+time scale, slow errors as likely as the faster ones let expect, and the coefficient is held near
+zero by what is usual, as firmly as the logs leave it open.
 """
 
 from __future__ import annotations
@@ -52,10 +52,18 @@ class Held:
     others: FloatArray
     """By how much the other coefficients move with it, shape (p,), 0 for itself [per V/K]."""
 
+    residual_std_v: float
+    """Of plain least squares [V]."""
+
     @property
     def weight(self) -> float:
-        """Weight of a row that says 0 V/K, beside which least squares leaves `part`."""
-        return float(np.sqrt((1.0 / self.part - 1.0) * (self.own @ self.own)))
+        """Weight of a row that says 0 V/K, beside which least squares leaves `part`.
+
+        At least what it would be with white errors: a temperature that never moves has no own
+        part, and nothing else would keep its coefficient from being anything.
+        """
+        leaves = float(np.sqrt((1.0 / self.part - 1.0) * (self.own @ self.own)))
+        return max(leaves, self.residual_std_v / self.usual_v_per_k)
 
     @property
     def part(self) -> float:
@@ -112,6 +120,7 @@ def how_firmly(  # noqa: PLR0917 - arrays of the same rows, in the order of the 
         usual_v_per_k=USUAL_PART_PER_K * float(np.median(volts)),
         own=own,
         others=others,
+        residual_std_v=float(np.sqrt(np.mean(residual_v**2))),
     )
 
 
