@@ -298,11 +298,8 @@ def log_likelihood(frame: Frame, references: Sequence[Gram], error: ErrorModel) 
         squares += float(products[-1, -1])
         volume += own_volume + float(log.counts @ np.log(error.scale_v2))
     squares += _add_priors(precision, right, frame, error)
-    balance = 1.0 / np.sqrt(np.diag(precision))
-    volume += float(np.linalg.slogdet(precision * balance * balance[:, None])[1])
-    volume -= 2.0 * float(np.sum(np.log(balance)))
     volume -= float(np.sum(np.log(structure_precision(frame, error))))
-    return -0.5 * (squares - float(right @ _solver(precision)(right)) + volume)
+    return log_integral(precision, right) - 0.5 * (squares + volume)
 
 
 def _add_priors(precision: FloatArray, right: FloatArray, frame: Frame, error: ErrorModel) -> float:

@@ -77,7 +77,7 @@ def stepped_temperature(step_k: float, kt_v_per_k: float, floor_v: float) -> str
         f"The temperature is reported in steps of {step_k:g} K, and the model's voltage follows it"
         f" by {1e3 * kt_v_per_k:.0f} mV/K: up to {half_v:.2f} V for as long as a report stands. It"
         " is read between the steps here, as far as they tell; a service cannot look ahead, and its"
-        " SoC errs by so much. A temperature with a finer step shows smaller causes."
+        " voltage model errs by so much. A temperature with a finer step shows smaller causes."
     )
 
 

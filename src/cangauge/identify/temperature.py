@@ -41,8 +41,6 @@ JITTER = 1e-9
 class Held:
     """How firmly the temperature's coefficient is held at zero."""
 
-    plain_v_per_k: float
-    """By plain least squares [V/K]."""
     std_v_per_k: float
     """How far the logs leave it open [V/K]."""
     usual_v_per_k: float
@@ -77,13 +75,12 @@ class Held:
         return self.std_v_per_k * float(np.sqrt(self.part))
 
 
-def how_firmly(  # noqa: PLR0917 - arrays of the same rows, in the order of the problem
+def how_firmly(
     columns: FloatArray,
     residual_v: FloatArray,
     volts: FloatArray,
     lengths: Sequence[int],
     at: int,
-    plain_v_per_k: float,
 ) -> Held:
     """Return how firmly the logs let the temperature's coefficient be held.
 
@@ -97,8 +94,6 @@ def how_firmly(  # noqa: PLR0917 - arrays of the same rows, in the order of the 
         Rows of each log.
     at : int
         Which column is the temperature's.
-    plain_v_per_k : float
-        Its coefficient by plain least squares [V/K].
     """
     scale = np.sqrt(np.mean(columns**2, axis=0))
     scale[scale == 0.0] = 1.0
@@ -115,7 +110,6 @@ def how_firmly(  # noqa: PLR0917 - arrays of the same rows, in the order of the 
     variance_of = float(np.linalg.inv(total)[at, at])
     own, others = _beside(columns, at)
     return Held(
-        plain_v_per_k=plain_v_per_k,
         std_v_per_k=float(np.sqrt(variance_of)) / float(scale[at]),
         usual_v_per_k=USUAL_PART_PER_K * float(np.median(volts)),
         own=own,

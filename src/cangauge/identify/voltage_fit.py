@@ -92,8 +92,7 @@ def fit_voltage_model(
     if is_held:
         lengths = np.bincount(number, minlength=len(rows)).tolist()
         residual_v = volts - columns @ solution.coefficients
-        plain_kt = float(solution.coefficients[KT])
-        held = how_firmly(columns, residual_v, volts, lengths, KT, plain_kt)
+        held = how_firmly(columns, residual_v, volts, lengths, KT)
         row = np.zeros(columns.shape[1])
         row[KT] = held.weight
         solution = _rising(
