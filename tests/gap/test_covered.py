@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cangauge.gap.covered import inside_charge, temperatures_covered
+from cangauge.gap.covered import BEYOND_WEIGHT, charge_weight, temperatures_covered
 from cangauge.model.effects.candidate import candidates
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.effects.parameter import Pack
@@ -43,11 +43,12 @@ def at_charge(*soc_pct: float) -> Any:
     return SimpleNamespace(rows=SimpleNamespace(soc_pct=np.array(soc_pct)))
 
 
-def test_a_pseudo_ocv_is_known_where_references_have_been() -> None:
+def test_a_pseudo_ocv_is_known_best_where_references_have_been() -> None:
     references = [at_charge(40.0, 50.0), at_charge(70.0, 60.0)]
-    inside = inside_charge(at_charge(36.0, 38.0, 55.0, 72.0, 74.0), references)
-    assert inside.tolist() == [False, True, True, True, False]
-    assert inside_charge(at_charge(10.0, 90.0), []).all()
+    log = at_charge(20.0, 36.0, 38.0, 55.0, 72.0, 74.0, 92.0)
+    weight = charge_weight(log, references, (30.0, 90.0))
+    assert weight.tolist() == [0.0, BEYOND_WEIGHT, 1.0, 1.0, 1.0, BEYOND_WEIGHT, 0.0]
+    assert np.all(charge_weight(at_charge(10.0, 90.0), [], (30.0, 80.0)) == 1.0)
 
 
 def test_a_diagnosis_tries_spread_diffusion_and_a_fit_does_not() -> None:

@@ -31,12 +31,12 @@ DECISIVE_NATS = 8.0
 TIED_DECIMALS = 9
 """Effects whose utilities agree to so many decimals are equals."""
 
-WHICH = (0.69, 0.759, 0.79, 0.991, 1.338)
+WHICH = (0.696, 0.805, 0.792, 0.956, 1.358)
 """Weights of an effect's log Bayes factor, its lead (negative), the same without strays, and of
 what it takes away in volts and of the excess (`which_features`)."""
 
-BEST_IS_IT = (-4.321, 0.279, 1.425, 0.267, 0.802, 2.754, 0.603, 1.261, 0.226)
-IS_ANOTHER = (-1.348, 0.077, 0.674, -0.007, 0.231, 0.321, 1.228, 1.836, 0.362)
+BEST_IS_IT = (-4.193, 0.297, 1.281, 0.244, 0.861, 2.616, 0.647, 1.113, 0.219)
+IS_ANOTHER = (-1.43, 0.046, 0.717, 0.007, 0.219, 0.293, 1.294, 1.794, 0.353)
 """Weights for "the best is it" and "it is another", against "none": of one, and of
 `whether_features`."""
 

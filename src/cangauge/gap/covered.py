@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from cangauge.gap.columns import Prepared
 
+FloatArray = NDArray[np.float64]
+
 COVERED_K, COVERED_PCT = 3.0, 3.0
 """References cover temperatures and SoC up to this far outside their own [K, %]."""
 
@@ -16,6 +18,11 @@ COLDER_PART, WARMER_PART = 0.2, 0.5
 """Nor are temperatures foreign that lie below or above by less than these parts of the range that
 references have: how the pack follows the temperature, they have shown. In the cold resistance
 grows ever faster. (On trips that the check is made of, winter is 0.3 below summer.)"""
+
+BEYOND_WEIGHT = 0.3
+"""Weight of a row at a charge that no reference has been at. How a pseudo-OCV goes on beyond the
+charge that it was taught again, nobody has seen: its error there is expected to be as many times
+larger."""
 
 LEAST_COUNT = 0.1
 """A reference that went where no other has been still counts so much."""
@@ -31,9 +38,30 @@ def temperatures_covered(references: Sequence[Prepared], diagnosed: Sequence[Pre
     return bool(np.mean((asked >= low) & (asked <= high)) > 0.5)
 
 
-def inside_charge(item: Prepared, references: Sequence[Prepared]) -> NDArray[np.bool_]:
-    """Return which rows of a log are at a charge that references have been at, shape (m,)."""
-    return _inside(item, references, "soc_pct", COVERED_PCT)
+def charge_weight(
+    item: Prepared, references: Sequence[Prepared], taught_pct: tuple[float, float]
+) -> FloatArray:
+    """Return how much each row of a log tells by where it is charged, shape (m,).
+
+    Parameters
+    ----------
+    item : Prepared
+    references : sequence of Prepared
+    taught_pct : tuple of float
+        SoC that the model was fitted on, low and high [%].
+
+    Returns
+    -------
+    array of shape (m,)
+        1 where references have been; `BEYOND_WEIGHT` where only the model's own logs have; 0 where
+        the pseudo-OCV's formula goes on by itself. All 1 without references.
+    """
+    soc_pct = item.rows.soc_pct
+    if not references:
+        return np.ones(soc_pct.size)
+    taught = (soc_pct >= taught_pct[0]) & (soc_pct <= taught_pct[1])
+    beyond = np.where(taught, BEYOND_WEIGHT, 0.0)
+    return np.where(_inside(item, references, "soc_pct", COVERED_PCT), 1.0, beyond)
 
 
 def counting(references: Sequence[Prepared], diagnosed: Sequence[Prepared]) -> list[float]:
@@ -56,7 +84,8 @@ def counting(references: Sequence[Prepared], diagnosed: Sequence[Prepared]) -> l
 def _part_inside(item: Prepared, others: Sequence[Prepared]) -> float:
     """Return the part of a log's rows within the temperatures and SoC of others [-]."""
     warm = _inside(item, others, "temperature_c", COVERED_K)
-    return float(np.mean(warm & inside_charge(item, others)))
+    charged = _inside(item, others, "soc_pct", COVERED_PCT)
+    return float(np.mean(warm & charged))
 
 
 def _inside(

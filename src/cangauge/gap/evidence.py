@@ -102,7 +102,7 @@ class Gram:
     products: FloatArray
     """One matrix a scale, shape (SCALES, columns, columns)."""
     counts: FloatArray
-    """Coefficients of each scale, shape (SCALES,)."""
+    """Coefficients of each scale, shape (SCALES,); fewer, if rows count less."""
 
     def weakened(self, factor: float) -> Gram:
         """Return the products as if the errors' variance were `factor` times larger."""
@@ -113,14 +113,27 @@ class Gram:
         return np.asarray(np.tensordot(1.0 / np.array(error.scale_v2), self.products, axes=1))
 
 
-def gram_of(terms: LogTerms, scale: FloatArray, keep: NDArray[np.bool_] | None = None) -> Gram:
-    """Return a log's products, baseline columns divided by `scale`; of some rows if asked."""
+def gram_of(terms: LogTerms, scale: FloatArray, weight: FloatArray | None = None) -> Gram:
+    """Return a log's products, baseline columns divided by `scale`.
+
+    Parameters
+    ----------
+    terms : LogTerms
+    scale : array of shape (p,)
+    weight : array of shape (m,), optional
+        Weight of each row: one of a half counts as one whose error is twice as large. Rows of
+        weight 0 are as if they had not been recorded.
+    """
     columns = np.column_stack([terms.baseline / scale, *terms.effects, terms.own, terms.residual_v])
-    if keep is not None:
-        columns = columns[keep]
+    part = 1.0
+    if weight is not None:
+        keep = weight > 0.0
+        columns = columns[keep] * weight[keep, None]
+        part = float(np.mean(weight[keep] ** 2))
     parts = by_scale(columns)
     return Gram(
-        np.stack([part.T @ part for part in parts]), np.array([float(len(part)) for part in parts])
+        np.stack([each.T @ each for each in parts]),
+        part * np.array([float(len(each)) for each in parts]),
     )
 
 

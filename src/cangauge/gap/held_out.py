@@ -143,7 +143,7 @@ def _folds(
         mine = (block % FOLDS == fold) & (block < block[-1])
         core = mine & (since >= GUARD_S) & (since < BLOCK_S - GUARD_S)
         if core.any():
-            rest = gram_of(terms, settled.frame.scale, ~mine)
+            rest = gram_of(terms, settled.frame.scale, 1.0 - mine)
             folds.append(([rest.weakened(settled.hardness(terms))], [(0, core)]))
     return folds
 

@@ -21,7 +21,7 @@ from cangauge.gap.columns import (
     prepare_log,
     residual,
 )
-from cangauge.gap.covered import counting, inside_charge, temperatures_covered
+from cangauge.gap.covered import charge_weight, counting, temperatures_covered
 from cangauge.gap.evidence import ErrorModel, Frame, Gram, gather, gram_of
 from cangauge.gap.references import (
     LEAST_TRUST_BEYOND,
@@ -55,7 +55,8 @@ ALWAYS_OF_TEMPERATURE = frozenset({"charge_transfer", "inner_temperature"})
 """Structure that follows the temperature whatever its shape."""
 
 LEAST_INSIDE = 0.2
-"""A log is judged where references have been, if that is at least this part of it."""
+"""A log is judged where references or the model's own logs have been as charged, if that is at
+least this part of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,19 +102,20 @@ class Settled:
 
     @cached_property
     def judged_grams(self) -> tuple[Gram, ...]:
-        """Products of the diagnosed logs where references have been at the same charge.
+        """Products of the diagnosed logs, less of them where references have not been as charged.
 
         How a pseudo-OCV goes on beyond the charge that it was taught, nobody has seen: what shows
-        there may be the cause or the model. Without any such rows, those of all.
+        there may be the cause or the model. Without enough of other rows, those of all.
         """
+        prepared = [item.prepared for item in self.references]
         grams = []
         for terms, gram in zip(self.diagnosed, self.diagnosed_grams, strict=True):
-            keep = inside_charge(terms.prepared, [item.prepared for item in self.references])
-            if keep.all():
+            weight = charge_weight(terms.prepared, prepared, self.as_given.model.soc_range_pct)
+            if np.all(weight == 1.0):
                 grams.append(gram)
-            elif np.mean(keep) >= LEAST_INSIDE:
-                inside = gram_of(terms, self.frame.scale, keep)
-                grams.append(inside.weakened(self.hardness(terms)))
+            elif np.mean(weight > 0.0) >= LEAST_INSIDE:
+                judged = gram_of(terms, self.frame.scale, weight)
+                grams.append(judged.weakened(self.hardness(terms)))
         return tuple(grams) or self.diagnosed_grams
 
     def hardness(self, terms: LogTerms) -> float:
@@ -186,7 +188,7 @@ def settle(
             least_trust = 0.0 if covered else LEAST_TRUST_BEYOND
             error = error_from_references(frame, grams, error, least_trust)
             weights = counting(of_references, of_logs)
-            error = with_strays(frame, grams, error, weights, _judged(found, grams, frame))
+            error = with_strays(frame, grams, error, weights, _judged(found, grams, frame, given))
         del found  # columns of long references fill hundreds of megabytes, and come once more below
         expected = error if covered or len(grams) == 1 else _beyond_the_references(error)
         say("repairing the structure")
@@ -201,7 +203,7 @@ def settle(
         reference_terms = _reference_terms(of_references, model, frame, acting)
         if len(grams) > 1:
             grams = _grams(reference_terms, frame)
-            judged = _judged(reference_terms, grams, frame)
+            judged = _judged(reference_terms, grams, frame, given)
             error = farther(error, with_strays(frame, grams, error, weights, judged))
             error = error if covered else _beyond_the_references(error)
     diagnosed = []
@@ -226,14 +228,16 @@ def _grams(references: Sequence[LogTerms], frame: Frame) -> list[Gram]:
     return [gram_of(terms, frame.scale) for terms in references]
 
 
-def _judged(references: Sequence[LogTerms], grams: Sequence[Gram], frame: Frame) -> list[Gram]:
-    """Return each reference's products where others have been, as diagnosed logs are judged."""
+def _judged(
+    references: Sequence[LogTerms], grams: Sequence[Gram], frame: Frame, model: ExtendedModel
+) -> list[Gram]:
+    """Return each reference's products as if it were diagnosed beside the others."""
     found = []
     for terms, gram in zip(references, grams, strict=True):
         others = [other.prepared for other in references if other is not terms]
-        keep = inside_charge(terms.prepared, others)
-        whole = keep.all() or np.mean(keep) < LEAST_INSIDE
-        found.append(gram if whole else gram_of(terms, frame.scale, keep))
+        weight = charge_weight(terms.prepared, others, model.model.soc_range_pct)
+        whole = bool(np.all(weight == 1.0)) or np.mean(weight > 0.0) < LEAST_INSIDE
+        found.append(gram if whole else gram_of(terms, frame.scale, weight))
     return found
 
 
