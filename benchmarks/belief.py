@@ -3,9 +3,9 @@
     cangauge gap-check --protocol simulated --per-effect 5 --healthy 150 --seed 32 --keep cases
     python benchmarks/belief.py cases…
 
-The weights in use were learned from 702 cases of seed 41: `simulated` (--per-effect 6 --healthy
-60), `equation` (6, 30), `real-bmw_i3` (3, 12), and `published` with fine (4, 40) and with coarse
-temperature sensors throughout (6, 60), as no command draws them.
+The weights in use were learned from 746 cases of seed 41: `simulated` (--per-effect 6 --healthy
+60), `equation` (6, 30), `real-bmw_i3` (3, 12), `real-lg_hg2` (2, 4), and `published` with fine (4,
+40) and with coarse temperature sensors throughout (6, 60), as no command draws them.
 
 Only cases of development seeds are taken. Each faulty one counts a second time, a little, with its
 cause out of the comparison, and so do those whose cause is outside the library: then no effect is
@@ -39,7 +39,7 @@ from cangauge.model.model_file import load_model
 
 FloatArray = NDArray[np.float64]
 
-OUTSIDE_COUNTS = 0.65
+OUTSIDE_COUNTS = 0.75
 """A case without the right effect counts so much: a cause is more often in the library than not.
 The more, the less is named with certainty, rightly or not."""
 

@@ -75,7 +75,7 @@ def test_of_equals_the_one_that_leaves_less_is_first_whatever_their_order() -> N
 
 def test_of_two_with_like_evidence_the_one_that_takes_the_volts_away_is_believed() -> None:
     """Evidence counts what is certain; a cause must also be large enough."""
-    small, large = witness("small", 50.0, 1.4, 500.0), witness("large", 48.0, 0.5, 500.0)
+    small, large = witness("small", 50.0, 1.4, 500.0), witness("large", 49.5, 0.5, 500.0)
     belief = believe(compared(small, large))
     assert [each.score.effect_id for each in belief.witnesses] == ["large", "small"]
 
@@ -94,7 +94,7 @@ def test_more_evidence_that_explains_more_leaves_less_to_chance() -> None:
     assert (np.diff([belief.none for belief in beliefs]) < 0.0).all()
     assert (np.diff([belief.best for belief in beliefs]) > 0.0).all()
     assert beliefs[0].none > 10.0 * beliefs[-1].none
-    assert beliefs[-1].best > 0.7
+    assert beliefs[-1].best > 0.6
 
 
 def test_two_that_cannot_be_told_apart_share() -> None:

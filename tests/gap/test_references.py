@@ -46,6 +46,10 @@ def with_fast_polarization(log: Log, ohm: float) -> Log:
     return replace(log, voltage_v=log.voltage_v - ohm * follows)
 
 
+def with_late_current(log: Log, late_s: float) -> Log:
+    return replace(log, current_a=np.interp(log.time_s - late_s, log.time_s, log.current_a))
+
+
 @pytest.fixture(scope="module")
 def model() -> ModelFile:
     logs = [synthetic_log(noise_v=0.5, seed=seed) for seed in (1, 2, 3)]
@@ -242,3 +246,19 @@ def test_only_the_structure_that_references_show_may_take_much(
     found = learn(lagging).error.structure
     assert found["fast_polarization"] >= 0.03
     assert max(found[name] for name in ("hysteresis", "ocv_shape", "resistance_asymmetry")) < 0.01
+
+
+def test_what_all_references_share_is_not_what_logs_differ_by(model: ModelFile) -> None:
+    # All of a pack's currents are late. If references took that as each its own, a log that is
+    # not could be as much its own.
+    def drive(seed: int, late_s: float) -> Log:
+        log = synthetic_log(
+            hours=0.5, rate_hz=5.0, start_pct=85.0, end_pct=68.0, noise_v=0.3, seed=seed
+        )
+        return with_late_current(log, late_s)
+
+    references = [drive(seed, 0.3) for seed in (11, 12, 13)]
+    logs = [drive(seed, 0.05) for seed in (21, 22)]
+    best = decide(settle(logs, model, references, library_without([]))).candidates[0]
+    assert best.effect_id == "time_skew"
+    assert best.log_bayes_factor > 100.0

@@ -21,9 +21,14 @@ from cangauge.gap.compared import Compared, Witness
 
 FloatArray = NDArray[np.float64]
 
-NATS, LEAD_NATS, SHARP_LEAD_NATS = 5.0, 5.0, 20.0
-"""Log Bayes factors count in full below the first; leads are parts of the best's own factor, or of
-these where it has less."""
+NATS, SHARP_LEAD_NATS = 5.0, 20.0
+"""Log Bayes factors count in full below the first; a lead where references would not stray is a
+part of the best's own factor, or of the second where it has less."""
+
+CLEAR_NATS, TOLD_NATS = 2.0, 100.0
+"""Other leads count in nats, up to the first: how far references stray is known from a few. And
+less where the best has more evidence than the second: no shape of an effect is quite that of the
+pack, and a hundredth of the evidence tells none from another."""
 
 DECISIVE_NATS = 8.0
 """More evidence than this, by how far the effect strays itself, makes a cause no more certain."""
@@ -31,12 +36,13 @@ DECISIVE_NATS = 8.0
 TIED_DECIMALS = 9
 """Effects whose utilities agree to so many decimals are equals."""
 
-WHICH = (0.696, 0.805, 0.792, 0.956, 1.358)
-"""Weights of an effect's log Bayes factor, its lead (negative), the same without strays, and of
-what it takes away in volts and of the excess (`which_features`)."""
+WHICH = (0.579, 0.302, 0.896, 1.012, 0.61, 0.454)
+"""Weights of an effect's log Bayes factor, its lead (negative) without strays, what it takes away
+in volts and of the excess, and its lead as far as references stray on the whole and in this very
+effect (`which_features`)."""
 
-BEST_IS_IT = (-4.193, 0.297, 1.281, 0.244, 0.861, 2.616, 0.647, 1.113, 0.219)
-IS_ANOTHER = (-1.43, 0.046, 0.717, 0.007, 0.219, 0.293, 1.294, 1.794, 0.353)
+BEST_IS_IT = (-4.012, 0.286, 1.189, 0.217, 0.87, 2.732, 0.584, 1.029, 0.178)
+IS_ANOTHER = (-1.3, 0.06, 0.62, -0.061, 0.166, 0.79, 1.305, 1.614, 0.338)
 """Weights for "the best is it" and "it is another", against "none": of one, and of
 `whether_features`."""
 
@@ -75,18 +81,27 @@ def ranked(compared: Compared, which: FloatArray) -> tuple[tuple[Witness, ...], 
 
 
 def which_features(compared: Compared) -> FloatArray:
-    """Return what is weighed of each effect, shape (effects, 5)."""
+    """Return what is weighed of each effect, shape (effects, 6)."""
+    own = np.array([witness.own_log_bayes for witness in compared.witnesses])
     alike = np.array([witness.score.log_bayes_factor for witness in compared.witnesses])
     sharp = np.array([witness.sharp_log_bayes for witness in compared.witnesses])
     return np.column_stack(
         [
             np.arcsinh(alike / NATS),
-            (alike - alike.max()) / max(float(alike.max()), LEAD_NATS),
             (sharp - sharp.max()) / max(float(sharp.max()), SHARP_LEAD_NATS),
             [compared.taken_v(witness) for witness in compared.witnesses],
             [compared.taken_excess(witness) for witness in compared.witnesses],
+            -_lead(alike),
+            -_lead(own),
         ]
     )
+
+
+def _lead(log_bayes: FloatArray) -> FloatArray:
+    """Return by how much the best is ahead of each, at most `CLEAR_NATS`."""
+    best = float(log_bayes.max())
+    lead = (best - log_bayes) / (1.0 + max(best, 0.0) / TOLD_NATS)
+    return np.asarray(np.minimum(lead, CLEAR_NATS))
 
 
 def whether_features(compared: Compared, best: Witness, share: float) -> FloatArray:

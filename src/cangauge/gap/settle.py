@@ -276,12 +276,13 @@ def _frame(
     covered: bool,
 ) -> Frame:
     # References that were never so cold cannot have shown what resistance does there.
-    found: dict[tuple[object, ...], int] = {}
-    for k, choice in enumerate(choices if has_references else ()):
-        if choice.effect.is_structure and (covered or not _follows_temperature(choice)):
-            # The first of one shape: that which an effect does when it is small.
-            found.setdefault((choice.effect.id, *choice.shape.items()), k)
-    repairs = tuple(found.values())
+    repairs = tuple(
+        k
+        for k, choice in enumerate(choices)
+        if has_references
+        and choice.effect.is_structure
+        and (covered or not _follows_temperature(choice))
+    )
     own, own_prior = _own(choices, model_file)
     information = model_file.information
     root, scale = None, np.ones(9 + len(model_file.delays_s))
@@ -299,17 +300,19 @@ def _own(choices: Sequence[Candidate], model_file: ModelFile) -> tuple[tuple[int
 
     At their usual shapes: what little logs differ by has no more of a shape than that.
     """
-    by_effect: dict[str, list[int]] = {}
+    by_effect: dict[str, dict[tuple[object, ...], int]] = {}
     for k, choice in enumerate(choices):
-        if not choice.effect.is_cause or not choice.is_usual:
-            continue
-        by_effect.setdefault(choice.effect.id, []).append(k)
+        if choice.effect.is_cause and choice.is_usual:
+            # The first of one shape is what an effect does when it is small. What it does when it
+            # is large differs from log to log by a cause alone.
+            of_one = by_effect.setdefault(choice.effect.id, {})
+            of_one.setdefault(tuple(choice.shape.items()), k)
     noise = model_file.noise
     constant_v = max(noise.lasting_std_v, 0.25 * math.hypot(noise.fast_std_v, noise.slow_std_v))
     own: list[int] = []
     stds: list[float] = []
     for effect_id, of_one in by_effect.items():
-        for k in of_one:
+        for k in of_one.values():
             widths = choices[k].bounds[:, 1] - choices[k].bounds[:, 0]
             usual = {"voltage_offset": [constant_v], "initial_soc": [SOC_STD_PCT]}.get(
                 effect_id, (OWN_PART * widths).tolist()

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cangauge.gap.bounded import moved, within_bounds
+from cangauge.gap.columns import Candidate
 from cangauge.gap.evidence import (
     ErrorModel,
     Frame,
@@ -83,11 +84,17 @@ def with_pieces(model: ExtendedModel, frame: Frame, amplitudes: FloatArray) -> E
         Of all pieces, in order, beside the neutral ones.
     """
     at = 0
+    totals: dict[tuple[object, ...], tuple[Candidate, FloatArray]] = {}
     for k in frame.repairs:
         choice = frame.choices[k]
+        amplitude = amplitudes[at : at + len(choice.amplitudes)]
+        at += amplitude.size
+        # Columns of one shape differ in how large the effect is that they were taken of.
+        key = (choice.effect.id, *choice.shape.items())
+        totals[key] = (choice, amplitude + (totals[key][1] if key in totals else 0.0))
+    for choice, total in totals.values():
         low, high = choice.bounds[:, 0], choice.bounds[:, 1]
-        amplitude = np.clip(amplitudes[at : at + low.size], low, high)
-        at += low.size
+        amplitude = np.clip(total, low, high)
         if np.any(np.abs(amplitude) > NEGLIGIBLE * (high - low)):
             # The pack's sizes move with the coefficients, and a file must agree with them.
             values = choice.effect.within(choice.values(amplitude), model.pack)
