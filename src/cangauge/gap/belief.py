@@ -28,7 +28,8 @@ part of the best's own factor, or of the second where it has less."""
 CLEAR_NATS, TOLD_NATS = 2.0, 100.0
 """Other leads count in nats, up to the first: how far references stray is known from a few. And
 less where the best has more evidence than the second: no shape of an effect is quite that of the
-pack, and a hundredth of the evidence tells none from another."""
+pack, and a hundredth of the evidence tells none from another. Both chosen on the cases that the
+weights are learned from, of six pairs that were tried."""
 
 DECISIVE_NATS = 8.0
 """More evidence than this, by how far the effect strays itself, makes a cause no more certain."""
