@@ -55,7 +55,8 @@ class LogTerms:
 
     prepared: Prepared
     residual_v: FloatArray
-    """Of the model as it is, shape (m,)."""
+    """What the columns are to explain, shape (m,): of the model as it is or, so that they are exact
+    where the structure acts, of the acting one and what they say that its structure does."""
     baseline: FloatArray
     """Columns of the voltage model's coefficients, shape (m, 9 + delays)."""
     own: FloatArray
@@ -88,8 +89,9 @@ def log_terms(
     model : ExtendedModel
     choices : sequence of Candidate
     acting : ExtendedModel, optional
-        The model with the structure that references call for. A temperature that is wrong shows
-        through all that follows the temperature, and in `model` that is one coefficient.
+        The model with the structure that references call for, whose residual the columns keep. A
+        temperature that is wrong shows through all that follows the temperature, and in `model`
+        that is one coefficient.
     """
     voltage_model = model.model
     rows = prepared.rows
@@ -107,11 +109,9 @@ def log_terms(
     if acting is not None:
         smooth_acting = as_modelled(prepared, acting)
         here_acting = residual(smooth_acting, acting)
-    return LogTerms(
-        prepared=prepared,
-        residual_v=residual(prepared, model),
-        # Effects that the model has already may scale what its coefficients multiply.
-        baseline=coefficient_columns(model, [prepared], predictions(model, [prepared]))
+    # Effects that the model has already may scale what its coefficients multiply.
+    baseline = (
+        coefficient_columns(model, [prepared], predictions(model, [prepared]))
         if model.effects
         else np.column_stack(
             [
@@ -119,12 +119,38 @@ def log_terms(
                 rows.temperature_c - voltage_model.t_ref_c,
                 rows.delayed_current_a,
             ]
-        ),
-        own=own,
-        effects=tuple(
-            effect_columns(smooth_acting, acting, choice, here_acting)
-            if acting is not None and choice.effect.family == "thermal"
-            else effect_columns(smooth, model, choice, here, state)
-            for choice in choices
-        ),
+        )
     )
+    effects = tuple(
+        effect_columns(smooth_acting, acting, choice, here_acting)
+        if acting is not None and choice.effect.family == "thermal"
+        else effect_columns(smooth, model, choice, here, state)
+        for choice in choices
+    )
+    residual_v = residual(prepared, model)
+    if acting is not None:
+        change = acting.model.coefficients - voltage_model.coefficients
+        explained_v = baseline @ change + _structure_v(model, acting, choices, effects)
+        residual_v = residual(prepared, acting) + explained_v
+    return LogTerms(prepared, residual_v, baseline, own, effects)
+
+
+def _structure_v(
+    model: ExtendedModel,
+    acting: ExtendedModel,
+    choices: Sequence[Candidate],
+    columns: Sequence[FloatArray],
+) -> FloatArray:
+    """Return what the columns say that the acting model's structure does, shape (m,) [V]."""
+    volts = np.zeros(columns[0].shape[0])
+    for effect, values in acting.effects[len(model.effects) :]:
+        # Shapes are relative to the capacity at most, which coefficients leave alone.
+        at = next(
+            k
+            for k, choice in enumerate(choices)
+            if choice.effect.id == effect.id
+            and all(values[name] == value for name, value in choice.shape.items())
+        )
+        amplitudes = [values[name] for name in choices[at].amplitudes]
+        volts += columns[at] @ (np.array(amplitudes) - choices[at].neutral)
+    return volts

@@ -176,19 +176,6 @@ def with_strays(
     return replace(error, strays=worth, clean_v2=float(np.average(kept, weights=weights)))
 
 
-def farther(one: ErrorModel, other: ErrorModel) -> ErrorModel:
-    """Return the error whose effects stray as far as in that of the two where they stray farther.
-
-    A reference seen through the model as given, and through the one that the references teach, is
-    two chances to find how far the model strays.
-    """
-    return replace(
-        one,
-        strays={key: max(value, other.strays[key]) for key, value in one.strays.items()},
-        clean_v2=max(one.clean_v2, other.clean_v2),
-    )
-
-
 def _trust(frame: Frame, grams: Sequence[Gram], error: ErrorModel, least: float) -> float:
     """Return how far the references bear out the model file's information (`ErrorModel.trust`).
 

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cangauge.errors import InputError
-from cangauge.gap.bounded import moved, within_bounds
 from cangauge.gap.columns import (
     Candidate,
     LogTerms,
@@ -22,15 +21,14 @@ from cangauge.gap.columns import (
     residual,
 )
 from cangauge.gap.covered import charge_weight, counting, temperatures_covered
-from cangauge.gap.evidence import ErrorModel, Frame, Gram, gather, gram_of
+from cangauge.gap.evidence import ErrorModel, Frame, Gram, gram_of
+from cangauge.gap.learned import learn, reference_grams, reference_terms
 from cangauge.gap.references import (
     LEAST_TRUST_BEYOND,
     error_from_noise,
     error_from_references,
-    farther,
     with_strays,
 )
-from cangauge.gap.structure import repaired
 from cangauge.gap.thinned import thinned
 from cangauge.identify.options import FitOptions
 from cangauge.logs.log import Log
@@ -74,8 +72,8 @@ class Settled:
     covered: bool = True
     """Whether references have been at the diagnosed logs' temperatures."""
     acting: ExtendedModel | None = None
-    """The model with the structure that references call for, in which effects on the temperature
-    are weighed (`columns.log_terms`)."""
+    """The model with the structure that references call for, about which all columns are linear
+    (`columns.log_terms`)."""
     temperature_step_k: float = 0.0
     """The coarsest step in which a diagnosed log's temperature is reported [K]."""
 
@@ -179,32 +177,22 @@ def settle(
     frame = _frame(model_file, choices, has_references=bool(of_references), covered=covered)
     error = error_from_noise(model_file.noise, model_file.rate_hz, frame)
     acting: ExtendedModel | None = None
-    reference_terms: tuple[LogTerms, ...] = ()
+    terms_of_references: tuple[LogTerms, ...] = ()
     if of_references:
         say("learning from the references")
-        found = _reference_terms(of_references, model, frame)
-        grams = _grams(found, frame)
+        grams = reference_grams(reference_terms(of_references, model, frame), frame)
         if len(grams) > 1:
             least_trust = 0.0 if covered else LEAST_TRUST_BEYOND
             error = error_from_references(frame, grams, error, least_trust)
-            weights = counting(of_references, of_logs)
-            error = with_strays(frame, grams, error, weights, _judged(found, grams, frame, given))
-        del found  # columns of long references fill hundreds of megabytes, and come once more below
         expected = error if covered or len(grams) == 1 else _beyond_the_references(error)
         say("repairing the structure")
-        acting = repaired(model, frame, grams, expected)
-        solution, _ = within_bounds(gather(frame, grams, [], expected), model.model, [])
-        change = solution[: frame.scale.size]
-        learned = moved(model.model, change)
-        if learned is not None:
-            # Columns follow the model: resistances, slope and kt as the references know them.
-            model = replace(model, model=learned)
-            frame = replace(frame, centre=-change * frame.scale)
-        reference_terms = _reference_terms(of_references, model, frame, acting)
+        learned = learn(of_references, model, frame, grams, expected)
+        model, acting, frame = learned.model, learned.acting, learned.frame
+        terms_of_references = learned.references
         if len(grams) > 1:
-            grams = _grams(reference_terms, frame)
-            judged = _judged(reference_terms, grams, frame, given)
-            error = farther(error, with_strays(frame, grams, error, weights, judged))
+            judged = _judged(learned.references, learned.grams, frame, given)
+            weights = counting(of_references, of_logs)
+            error = with_strays(frame, learned.grams, error, weights, judged)
             error = error if covered else _beyond_the_references(error)
     diagnosed = []
     for item in of_logs:
@@ -215,17 +203,13 @@ def settle(
         options,
         frame,
         error,
-        reference_terms,
+        terms_of_references,
         tuple(diagnosed),
         given,
         covered,
         acting,
         max(usual_step_k(log) for log in logs),
     )
-
-
-def _grams(references: Sequence[LogTerms], frame: Frame) -> list[Gram]:
-    return [gram_of(terms, frame.scale) for terms in references]
 
 
 def _judged(
@@ -239,19 +223,6 @@ def _judged(
         whole = bool(np.all(weight == 1.0)) or np.mean(weight > 0.0) < LEAST_INSIDE
         found.append(gram if whole else gram_of(terms, frame.scale, weight))
     return found
-
-
-def _reference_terms(
-    references: Sequence[Prepared],
-    model: ExtendedModel,
-    frame: Frame,
-    acting: ExtendedModel | None = None,
-) -> tuple[LogTerms, ...]:
-    wanted = tuple(dict.fromkeys(frame.shown))  # structure may be a log's own as well
-    at = [wanted.index(k) for k in frame.shown]
-    choices = [frame.choices[k] for k in wanted]
-    found = [log_terms(item, model, choices, acting) for item in references]
-    return tuple(replace(terms, effects=tuple(terms.effects[k] for k in at)) for terms in found)
 
 
 def _terms(

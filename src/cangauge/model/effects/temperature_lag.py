@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import ClassVar
 
 from cangauge.model.effects.effect import Effect, OnlineEffect, Reading, Values
 from cangauge.model.effects.first_order import LowPass, low_passed
@@ -23,6 +24,7 @@ class TemperatureLag(Effect):
 
     id = "temperature_lag"
     family = "thermal"
+    is_structure: ClassVar[bool] = True
     parameters = (Parameter("tau_s", "s", 0.0, 2000.0),)
     signature = "kt·τ·dT/dt: while the pack warms or cools, gone when it is even"
     equation = "T = T_measured + τ·dT_measured/dt, the derivative smoothed over 200 s"
