@@ -26,6 +26,9 @@ SINGULAR = 1e-11
 BLOCK_S = 300.0
 """Residuals further apart than this count as independent in the standard errors [s]."""
 
+FEASIBLE = 1e-9
+"""A bound is missed by more than this, relative to its value and to one."""
+
 
 @dataclass(frozen=True, eq=False)
 class Solution:
@@ -114,19 +117,31 @@ def nearest_rising(
 
 
 def _nearest(z: FloatArray, bounds: FloatArray, at_least: FloatArray) -> FloatArray:
-    """Return the point nearest to z with bounds·point ≥ at_least."""
+    """Return the point nearest to z with bounds·point ≥ at_least.
+
+    Few of the bounds matter: those that are missed, and those that are missed then.
+    """
     length = np.linalg.norm(bounds, axis=1)
     # What no kept direction moves cannot be bounded.
     moves = length > 0.0
-    bounds, at_least, length = bounds[moves], at_least[moves], length[moves]
+    bounds, at_least = bounds[moves] / length[moves, None], at_least[moves] / length[moves]
+    enough = at_least - FEASIBLE * (1.0 + np.abs(at_least))
+    point, held = z, np.zeros(at_least.size, dtype=bool)
+    while np.any(missed := (bounds @ point < enough) & ~held):
+        held |= missed
+        point = _nearest_within(z, bounds[held], at_least[held])
+    return point
+
+
+def _nearest_within(z: FloatArray, bounds: FloatArray, at_least: FloatArray) -> FloatArray:
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     solution = clarabel.DefaultSolver(
         sparse.csc_matrix(np.eye(z.size)),
         -z,
-        sparse.csc_matrix(-bounds / length[:, None]),
-        -at_least / length,
-        [clarabel.NonnegativeConeT(length.size)],
+        sparse.csc_matrix(-bounds),
+        -at_least,
+        [clarabel.NonnegativeConeT(at_least.size)],
         settings,
     ).solve()
     if str(solution.status) not in {"Solved", "AlmostSolved"}:
