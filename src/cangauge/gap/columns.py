@@ -127,11 +127,10 @@ def log_terms(
         else effect_columns(smooth, model, choice, here, state)
         for choice in choices
     )
-    residual_v = residual(prepared, model)
+    residual_v = residual(prepared, acting or model)
     if acting is not None:
         change = acting.model.coefficients - voltage_model.coefficients
-        explained_v = baseline @ change + _structure_v(model, acting, choices, effects)
-        residual_v = residual(prepared, acting) + explained_v
+        residual_v += baseline @ change + _structure_v(model, acting, choices, effects)
     return LogTerms(prepared, residual_v, baseline, own, effects)
 
 
