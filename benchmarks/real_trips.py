@@ -19,7 +19,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -187,8 +187,31 @@ def _reference(trip: Log) -> np.ndarray:
     return trip.soc_pct
 
 
-def judge(folder: Path, console: Console, effects: tuple[str, ...] = ()) -> dict[str, object]:
-    """Do the whole comparison and return its figures."""
+CHAINS = {
+    "chain": (0.0, 0.0, True),
+    "chain_offset": (OFFSET_A, 0.0, True),
+    "chain_capacity_high": (0.0, CAPACITY_ERROR, True),
+    "chain_capacity_low": (0.0, -CAPACITY_ERROR, True),
+    # The charge between trips counted with the wrong capacity too, as a gauge awake would.
+    "chain_capacity_high_counted": (0.0, CAPACITY_ERROR, False),
+    "chain_capacity_low_counted": (0.0, -CAPACITY_ERROR, False),
+}
+"""What is wrong in each chain: the current's offset [A], the capacity (relative), and whether each
+method is told the SoC of the seams."""
+
+UNCHECKED = {"chain", "chain_capacity_high_counted", "chain_capacity_low_counted"}
+"""Nothing wrong; and the other protocol. Shown beside, without a target."""
+
+CHECKED = {name: wrong for name, wrong in CHAINS.items() if name not in UNCHECKED}
+
+
+def judge(
+    folder: Path,
+    console: Console,
+    effects: tuple[str, ...] = (),
+    chains: Mapping[str, tuple[float, float, bool]] = CHAINS,
+) -> dict[str, object]:
+    """Do the whole comparison, or with some of the chains alone, and return its figures."""
     console.print("reading 22 trips, fitting 11 of them …")
     began = time.perf_counter()
     identification = identify(read_trips(folder, TRAINING), effects, console.print)
@@ -230,15 +253,7 @@ def judge(folder: Path, console: Console, effects: tuple[str, ...] = ()) -> dict
         )
     result["trips"] = trips
     cases = {name: pooled([trip["cases"][name] for trip in trips]) for name in trips[0]["cases"]}
-    for name, offset_a, error, told in (
-        ("chain", 0.0, 0.0, True),
-        ("chain_offset", OFFSET_A, 0.0, True),
-        ("chain_capacity_high", 0.0, CAPACITY_ERROR, True),
-        ("chain_capacity_low", 0.0, -CAPACITY_ERROR, True),
-        # The charge between trips counted with the wrong capacity too, as a gauge awake would.
-        ("chain_capacity_high_counted", 0.0, CAPACITY_ERROR, False),
-        ("chain_capacity_low_counted", 0.0, -CAPACITY_ERROR, False),
-    ):
+    for name, (offset_a, error, told) in chains.items():
         console.print(f"estimating the {name.replace('_', ' ')} …")
         capacity_ah = model.capacity_ah * (1.0 + error)
         samples, soc = chain(tests, capacity_ah if told else model.capacity_ah, offset_a)
@@ -305,8 +320,8 @@ def checks(result: dict[str, object]) -> list[dict[str, object]]:
         bound = limit(result) if callable(limit) else limit
         rows.append(_check(name, unit, value(result), "≤", bound))
     for case, item in result["cases"].items():
-        if case == "chain" or case.endswith("counted"):
-            continue  # nothing wrong; and the other protocol, shown beside
+        if case in UNCHECKED:
+            continue
         rows.append(_check(f"{case}: 2σ coverage", "", item.cover_2sigma, "≥", 0.90))
         rows.append(_check(f"{case}: 2σ coverage", "", item.cover_2sigma, "≤", 0.99))
         ratio = item.mean_std_pct / item.rmse_pct

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from real_trips import checks, judge
+from real_trips import CHECKED, checks, judge
 
 pytestmark = [pytest.mark.real, pytest.mark.slow]
 
 
 def test_every_target_is_met_by_the_one_model(shared_data: Path) -> None:
-    repaired = judge(shared_data / "bmw_i3", Console(quiet=True), ("auto",))
+    repaired = judge(shared_data / "bmw_i3", Console(quiet=True), ("auto",), CHECKED)
     assert repaired["effects"]
     assert [row for row in checks(repaired) if not row["met"]] == []

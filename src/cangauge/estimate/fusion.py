@@ -62,6 +62,9 @@ LASTING_TIME_S = 7200.0
 RESTED_BIAS = 0.6
 """The bias after a long rest, in units of its standard deviation while driving."""
 
+ROUNDING = 1e-6
+"""So far may the correlations of a covariance be from those of one."""
+
 
 @dataclass(frozen=True)
 class Measurement:
@@ -318,13 +321,12 @@ class Fusion:
 
 def is_covariance(matrix: FloatArray) -> bool:
     """Whether a matrix is finite, symmetric and positive semi-definite, to rounding."""
-    if not np.all(np.isfinite(matrix)):
-        return False
     variance = np.diag(matrix)
-    if np.any(variance < 0.0):
+    if not (np.isfinite(matrix).all() and (variance >= 0.0).all()):
         return False
     scale = np.sqrt(np.where(variance > 0.0, variance, 1.0))
     correlation = matrix / np.outer(scale, scale)
-    if not np.allclose(correlation, correlation.T, rtol=0.0, atol=1e-6):
+    # Asked after every voltage: `np.allclose` takes four times as long as the eigenvalues.
+    if np.abs(correlation - correlation.T).max() > ROUNDING:
         return False
-    return bool(np.linalg.eigvalsh(correlation)[0] > -1e-6)
+    return bool(np.linalg.eigvalsh(correlation)[0] > -ROUNDING)
