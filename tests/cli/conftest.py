@@ -13,6 +13,7 @@ import typer
 from cangauge.cli.app import main
 from cangauge.cli.estimate import estimate_command
 from cangauge.cli.fit import fit_command
+from cangauge.cli.gap import gap_command
 from cangauge.identify.fit import fit
 from cangauge.logs.canonical import write_log
 from cangauge.model.model_file import model_json
@@ -21,6 +22,7 @@ from synthetic import synthetic_log
 app = typer.Typer()
 app.command("fit")(fit_command)
 app.command("estimate")(estimate_command)
+app.command("gap")(gap_command)
 
 
 @dataclass

@@ -13,7 +13,9 @@ from cangauge.errors import InputError
 from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import estimate_log
 from cangauge.gap.diagnose import Diagnosis, diagnose, in_words
-from cangauge.gap.extend import model_file_of
+from cangauge.gap.extend import library_without, model_file_of
+from cangauge.gap.settle import settle
+from cangauge.gap.soc_error import soc_mae_pct
 from cangauge.identify.fit import FitOptions, fit
 from cangauge.logs.log import Log
 from cangauge.model.model_file import ModelFile, load_model, model_json
@@ -202,6 +204,53 @@ def test_without_references_the_models_noise_is_the_floor(model: ModelFile) -> N
     found = diagnose([day(21)], model, [])
     assert found.floor_v == model.noise.voltage_rmse_v
     assert found.verdict.cause == "none"
+
+
+def test_without_references_nothing_is_said_of_them(model: ModelFile) -> None:
+    found = diagnose([day(21)], model, [])
+    assert in_words(found).startswith("No gap beyond what the model file states (")
+
+
+def test_refuses_where_nothing_tells_how_well_the_model_is_known(model: ModelFile) -> None:
+    with pytest.raises(InputError, match="--reference"):
+        diagnose([day(21)], model.model_copy(update={"information": None}), [])
+
+
+def test_coefficients_are_known_by_their_names(offset: Diagnosis, model: ModelFile) -> None:
+    shuffled = model.model_copy(update={"coefficients": dict(sorted(model.coefficients.items()))})
+    assert list(shuffled.coefficients) != list(model.coefficients)
+    one, other = (model_file_of(offset.extension, given, 0.5) for given in (model, shuffled))
+    assert one.coefficients == other.coefficients
+
+
+def test_the_extended_models_noise_agrees_with_itself(offset: Diagnosis, model: ModelFile) -> None:
+    for times in (0.5, 8.0):
+        noise = model_file_of(offset.extension, model, times * model.noise.voltage_rmse_v).noise
+        assert noise.fast_std_v == pytest.approx(times * model.noise.fast_std_v)
+        assert noise.voltage_mae_pct == pytest.approx(times * model.noise.voltage_mae_pct)
+
+
+def test_a_soc_at_some_rows_is_compared_with_if_it_is_told_all_along(model: ModelFile) -> None:
+    log = day(40)
+    assert log.soc_pct is not None
+    rows = np.arange(len(log))
+    slow, first = (np.where(keep, log.soc_pct, np.nan) for keep in (rows % 30 == 7, rows < 900))
+    assert soc_mae_pct([replace(log, soc_pct=slow)], model) == pytest.approx(
+        soc_mae_pct([log], model), rel=0.1
+    )
+    assert soc_mae_pct([replace(log, soc_pct=first)], model) is None
+
+
+def test_steps_of_a_fast_logs_temperature_are_read_between(model: ModelFile) -> None:
+    """Found in the reports: means over parts of a second would blur them first."""
+    fast = synthetic_log(hours=1.0, rate_hz=100.0, start_pct=80.0, end_pct=70.0)
+    warming_c = 20.0 + 3.0 * (1.0 - np.exp(-fast.time_s / 1500.0)) + 0.2 * np.sin(fast.time_s / 400)
+    coarse = replace(fast, temperature_c=np.floor(warming_c + 0.5))
+    settled = settle([coarse], model, [], library_without([]))
+    seen = settled.diagnosed[0].prepared.log
+    error_k = seen.temperature_c - np.interp(seen.time_s, fast.time_s, warming_c)
+    assert np.sqrt(np.mean(error_k**2)) < 0.13
+    assert settled.temperature_step_k == 1.0
 
 
 def test_refuses_a_log_of_another_pack(model: ModelFile, references: list[Log]) -> None:

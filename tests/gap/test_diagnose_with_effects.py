@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cangauge.gap.columns import candidates, log_terms
 from cangauge.gap.diagnose import diagnose
 from cangauge.gap.extend import model_file_of
 from cangauge.gap.settle import _over_all_temperatures
@@ -52,6 +53,21 @@ def test_widened_temperatures_leave_the_effects_where_they_were(model: ModelFile
     wider = _over_all_temperatures(given, [day(6, -12.0)])
     assert wider.model.temperature_range_c[0] < given.model.temperature_range_c[0] - 10.0
     assert np.array_equal(residual(inside, wider), residual(inside, given))
+
+
+def test_structure_is_told_from_the_effects_that_the_model_has() -> None:
+    """Effects stand in the library's order: the last one need not be the one that was added."""
+    plain = ExtendedModel(TRUTH.model, CAPACITY_AH)
+    own = {"ohm": 0.02, "tau_s": 312.7, "spread": 0.0, "activation_k": 0.0, "by_slope": 0.0}
+    given = plain.with_effect(LIBRARY["slow_diffusion"], own)
+    item = prepare_log(day(5, 18.0), OPTIONS)
+    (piece, *_) = candidates([LIBRARY["resistance_soc"]], given.pack, item.log.time_s)
+    amount = 0.1 * piece.bounds[:, 1]
+    acting = given.with_effect(piece.effect, piece.values(amount))
+    assert acting.effects[0][0].id == "resistance_soc"
+    terms = log_terms(item, given, [piece], acting)
+    expected = residual(item, acting) + terms.effects[0] @ amount
+    np.testing.assert_allclose(terms.residual_v, expected, atol=1e-9)
 
 
 def test_a_fault_is_named_beside_effects_that_the_model_has(model: ModelFile) -> None:

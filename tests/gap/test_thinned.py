@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -37,6 +39,15 @@ def test_a_fast_log_keeps_its_charge_and_what_goes_with_what(rate_hz: float) -> 
     assert few.soc_pct is not None
     assert log.soc_pct is not None
     assert few.soc_pct[0] == log.soc_pct[0]
+
+
+def test_a_soc_that_comes_more_slowly_than_the_current_is_kept() -> None:
+    log = drive(100.0)
+    told = np.where(np.arange(len(log)) % 100 == 3, log.soc_pct, np.nan)
+    few = thinned(replace(log, soc_pct=told))
+    assert few.soc_pct is not None
+    assert np.isfinite(few.soc_pct).sum() == np.isfinite(told).sum()
+    assert few.first_soc() == (0, told[3])
 
 
 def test_a_log_of_one_row_is_left_to_those_who_say_what_is_wrong_with_it() -> None:

@@ -12,6 +12,7 @@ from cangauge.gap.columns import LogTerms, Prepared, prepare_log
 from cangauge.gap.limits import limits, stepped_temperature
 from cangauge.gap.maps import LEAST_ROWS, OTHER_BINS, SOC_BINS, error_map, even_edges
 from cangauge.gap.moments import MOMENTS, around, worst_moments
+from cangauge.gap.where import places
 from cangauge.identify.options import FitOptions
 from cangauge.logs.log import Log
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
@@ -163,6 +164,26 @@ def test_a_short_log_of_one_temperature_and_little_soc_is_called_so() -> None:
 )  # fmt: skip
 def test_each_limit_has_its_sentence(log: Log, references: int, sentence: str) -> None:
     assert sentence in said(log, references)
+
+
+def test_a_reference_without_a_soc_is_told() -> None:
+    known = [prepared(long_log()), prepared(long_log(soc_pct=None, name="silent"))]
+    words = " ".join(limits([prepared(long_log())], known, CAPACITY_AH))
+    assert "No SoC at the start of the reference silent: 100 % was assumed" in words
+
+
+def test_a_temperature_of_another_place_is_told() -> None:
+    log, known = [prepared(long_log())], [prepared(long_log())] * 3
+    assert limits(log, known, CAPACITY_AH, None, "room") == limits(log, known, CAPACITY_AH)
+    words = " ".join(limits(log, known, CAPACITY_AH, None, "pack"))
+    assert "measured on pack, that of these logs on room" in words
+
+
+def test_time_is_that_since_the_logs_start() -> None:
+    item = terms(long_log())
+    spans = [p for p in places([item], [np.ones(len(item.prepared.rows))], CAPACITY_AH)
+             if p.axis == "time"]  # fmt: skip
+    assert spans[-1].high == pytest.approx(item.prepared.log.duration_s, abs=2.0)
 
 
 def test_a_given_start_is_a_start() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,12 @@ import pytest
 from cangauge.errors import InputError
 from cangauge.gap.diagnose import Diagnosis, diagnose
 from cangauge.gap.moments import MOMENTS
+from cangauge.gap.where import Place
 from cangauge.identify.fit import FitOptions, fit
 from cangauge.logs.log import Log
 from cangauge.model.model_file import ModelFile
 from cangauge.model.published import CAPACITY_AH
-from cangauge.report.gap_limits import log_limits
+from cangauge.report.gap_maps import share_figures
 from cangauge.report.gap_report import gap_page
 from cangauge.report.page import Beside, Bullets, Figure, Page, Section, Table, render
 from synthetic import synthetic_log
@@ -154,6 +156,19 @@ def test_shares_have_intervals(page: Page) -> None:
         assert all(low <= high for low, high in zip(data["low"], data["high"], strict=True))
 
 
+def test_shares_of_a_cells_currents_have_names_of_their_own() -> None:
+    edges = [-1.2, -0.06, 0.06, 1.5, 2.9]
+    places = [
+        Place("current", low, high, "A", 0.25, 0.1, (0.2, 0.3)) for low, high in pairwise(edges)
+    ]
+    (row,) = share_figures(places)
+    assert isinstance(row, Beside)
+    (figure,) = row.figures
+    names = figure.plot.y_range.factors
+    assert len(set(names)) == len(names)
+    assert "−0.06 … 0.06" in names
+
+
 def test_every_figure_has_units_and_a_sentence(page: Page) -> None:
     for each in figures(page):
         assert each.see.endswith("."), each.title
@@ -192,7 +207,7 @@ def test_a_poor_log_is_told_first_what_it_cannot_show(model: ModelFile) -> None:
 def test_a_coarse_temperature_is_told_of(model: ModelFile) -> None:
     log = synthetic_log(hours=0.5, start_pct=70.0, end_pct=60.0, noise_v=0.5, name="coarse")
     coarse = replace(log, temperature_c=np.round(log.temperature_c))
-    told = [" ".join(log_limits(diagnose([each], model, []))) for each in (log, coarse)]
+    told = [" ".join(diagnose([each], model, []).limits) for each in (log, coarse)]
     assert "reported in steps" not in told[0]
     assert "reported in steps of 1 K" in told[1]
 

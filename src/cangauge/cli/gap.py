@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from cangauge.atomic import atomic_path
 from cangauge.cli.inputs import (
@@ -16,17 +15,20 @@ from cangauge.cli.inputs import (
     MapOption,
     ReportOption,
     TemperatureOption,
+    TemperatureSourceOption,
     VehicleOption,
     check_outputs,
     load_log,
     within,
 )
-from cangauge.cli.output import console, emit_json, note
+from cangauge.cli.output import emit_json, note
+from cangauge.cli.tables import print_table
 from cangauge.errors import InputError
 from cangauge.gap.diagnose import Diagnosis, diagnose, in_words
 from cangauge.gap.extend import model_file_of
 from cangauge.logs.log import Log
 from cangauge.model.model_file import ModelFile, load_model, model_json
+from cangauge.report.words import NONE_KNOWN, number
 
 SHOWN = 5
 SHORTEST_S = 300.0
@@ -41,14 +43,21 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     model: Annotated[Path, typer.Option("-m", "--model", metavar="MODEL", help="Model file.")],
     reference: Annotated[
         list[Path] | None,
-        typer.Option(metavar="LOG", help="A log on which the model is good; repeat it."),
+        typer.Option(
+            metavar="LOG",
+            help="A log on which the model is good; repeat it. It tells its SoC (soc_pct), at least"
+            " at its start, or starts full.",
+        ),
     ] = None,
     initial_soc: Annotated[
         float | None,
         typer.Option(metavar="P", help="SoC at each diagnosed log's first row [%]."),
     ] = None,
     capacity_ah: Annotated[
-        float | None, typer.Option(metavar="A", help="Capacity instead of the model's [Ah].")
+        float | None,
+        typer.Option(
+            metavar="A", help="Capacity instead of the model's, for all logs and --extended [Ah]."
+        ),
     ] = None,
     extended: Annotated[
         Path | None, typer.Option(metavar="MODEL", help="Write the extended model here.")
@@ -57,6 +66,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     dbc: DbcOption = None,
     map_file: MapOption = None,
     temperature: TemperatureOption = None,
+    temperature_source: TemperatureSourceOption = None,
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:
@@ -64,7 +74,9 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
 
     The verdict is an effect, `none` (no gap beyond what the references show) or `unknown` (a gap
     of which no effect in the library is likely to be the cause). It is early work: the README says
-    how often it is right. Give at least three references, more are better.
+    how often it is right. Give at least three references, more are better; without any, the error
+    that the model file states is what is expected of logs without a cause. Logs of 10 minutes and
+    more can be judged, better of an hour, with changing load and SoC. Positive current discharges.
 
     For example:
 
@@ -72,6 +84,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     --reference mild3.csv --report gap.html --extended cold.json`
     """
     given = list(reference or [])
+    _check_apart(logs, given)
     check_outputs([report, extended], [*logs, *given, model])
     model_file = load_model(model)
     if initial_soc is not None:
@@ -86,7 +99,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
             dbc=dbc,
             map_file=map_file,
             temperature_c=temperature,
-            temperature_source=None,
+            temperature_source=temperature_source,
             refuse_turned=True,
         )
 
@@ -111,6 +124,18 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
             note(f"wrote {written}")
 
 
+def _check_apart(logs: list[Path], references: list[Path]) -> None:
+    known = {path.resolve() for path in references}
+    for path in logs:
+        if path.resolve() in known:
+            raise InputError(
+                "is a LOG and a reference: what it shows would be clean and a gap at once",
+                source=path,
+                field="--reference",
+                cure="give it as one of them",
+            )
+
+
 def _with_capacity(model: ModelFile, capacity_ah: float) -> ModelFile:
     within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
     return model.model_copy(update={"capacity_ah": capacity_ah})
@@ -128,17 +153,22 @@ def _long_enough(log: Log) -> Log:
 
 
 def _show(found: Diagnosis) -> None:
-    note(in_words(found))
-    table = Table(title="Candidates")
-    for heading in ("effect", "probability", "log evidence", "error left out [V]", "closed"):
-        table.add_column(heading, justify="right")
+    typer.echo(in_words(found))
+    rows = []
     for item in found.candidates[:SHOWN]:
-        rmse, closed = item["rmse_v"], item["closed_fraction"]
-        table.add_row(
-            str(item["effect"]),
-            f"{item['probability']:.2f}",
-            f"{item['log_bayes_factor']:.1f}",
-            "–" if rmse is None else f"{rmse:.2f}",
-            "–" if closed is None else f"{100.0 * closed:.0f} %",
+        closed = item["closed_fraction"]
+        rows.append(
+            [
+                str(item["effect"]),
+                f"{item['probability']:.2f}",
+                number(item["log_bayes_factor"], 1),
+                number(item["rmse_v"], 2),
+                NONE_KNOWN if closed is None else f"{100.0 * closed:.0f} %",
+            ]
         )
-    console.print(table)
+    headings = ["effect", "probability", "evidence [ln]", "left [V]", "closed"]
+    print_table("Candidates; error left, and gap closed, on rows held out", headings, rows)
+    if found.limits:
+        typer.echo("What these logs cannot show:")
+    for sentence in found.limits:
+        typer.echo(f"- {sentence}")

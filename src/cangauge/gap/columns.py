@@ -33,7 +33,6 @@ __all__ = [
     "LogTerms",
     "Prepared",
     "candidates",
-    "effect_columns",
     "log_terms",
     "prepare_log",
     "residual",
@@ -142,7 +141,10 @@ def _structure_v(
 ) -> FloatArray:
     """Return what the columns say that the acting model's structure does, shape (m,) [V]."""
     volts = np.zeros(columns[0].shape[0])
-    for effect, values in acting.effects[len(model.effects) :]:
+    added = list(acting.effects)
+    for given in model.effects:
+        added.remove(given)  # they stand in the library's order, not in that of being added
+    for effect, values in added:
         # Shapes are relative to the capacity at most, which coefficients leave alone.
         at = next(
             k

@@ -40,7 +40,8 @@ class Witness:
     sharp_log_bayes: float
     """Log Bayes factor as if the references did not stray at all."""
     left_v: float
-    """RMS of what the logs keep with it, what is each log's own not taken off [V]."""
+    """RMS of what the logs keep with it, what is each log's own not taken off, as if they were
+    driven no harder than the references (`Settled.hardness`) [V]."""
     left_excess: float
     """What it leaves of the excess (`remainder.excess`)."""
 
@@ -51,7 +52,7 @@ class Compared:
 
     witnesses: tuple[Witness, ...]
     before_v: float
-    """RMS of what the logs keep with the model as the references know it [V]."""
+    """RMS of what the logs keep with the model as the references know it, likewise [V]."""
     clean_v: float
     """The same of references left out [V]."""
     before_excess: float

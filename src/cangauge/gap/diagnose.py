@@ -27,6 +27,7 @@ from cangauge.gap.held_out import (
     judge,
     rms,
 )
+from cangauge.gap.limits import limits, stepped_temperature
 from cangauge.gap.moments import Moment, worst_moments
 from cangauge.gap.settle import Settled, settle
 from cangauge.gap.soc_error import soc_mae_pct
@@ -63,6 +64,22 @@ class Diagnosis:
     observability: tuple[dict[str, object], ...]
     extension: Extension
 
+    @property
+    def limits(self) -> list[str]:
+        """What these logs cannot show, whatever the verdict, a sentence each."""
+        settled = self.settled
+        found = limits(
+            [terms.prepared for terms in settled.diagnosed],
+            [terms.prepared for terms in settled.references],
+            settled.model.capacity_ah,
+            settled.options.initial_soc_pct,
+            settled.temperature_source,
+        )
+        steps = stepped_temperature(
+            settled.temperature_step_k, settled.model.model.kt_v_per_k, self.floor_v
+        )
+        return [*found, steps] if steps else found
+
     def to_dict(self, extended_model: str | None = None) -> dict[str, Any]:
         """Return the object that `cangauge gap --json` prints."""
         verdict = self.verdict
@@ -96,6 +113,7 @@ class Diagnosis:
                 "candidates": list(self.candidates),
             },
             "observability": list(self.observability),
+            "limits": self.limits,
             "extended_model": extended_model,
         }
 
@@ -139,19 +157,19 @@ def diagnose(
         initial_soc_pct=initial_soc_pct,
         progress=progress,
     )
-    say("weighing the evidence")
-    verdict = decide(settled)
-    accepted = [score.effect_id for score in verdict.accepted]
-    say("judging on rows left out")
     held_out = folds(settled)
-    judged = judge(settled, held_out, accepted)
-    if not judged:
+    if not held_out:
         raise InputError(
             f"{logs[0].duration_s:.0f} s are too short to leave rows out and judge on them:"
             " nothing can be concluded",
             source=logs[0].source or logs[0].name,
             cure="give a log of at least 10 min, better half an hour with changing load and SoC",
         )
+    say("weighing the evidence")
+    verdict = decide(settled)
+    accepted = [score.effect_id for score in verdict.accepted]
+    say("judging on rows left out")
+    judged = judge(settled, held_out, accepted)
     floor = _floor_v(settled, model_file)
     baseline = rms(np.concatenate([item.baseline_v for item in judged]))
     extended = rms(np.concatenate([item.extended_v for item in judged]))
@@ -222,18 +240,18 @@ def _floor_v(settled: Settled, model_file: ModelFile) -> float:
 def _observability(settled: Settled) -> list[dict[str, object]]:
     """Return how much of each effect's physical range these logs could show.
 
-    `visible` is 1 less the smallest amplitude that would be accepted, in parts of the bounds.
+    `visible` is 1 less the smallest amplitude that would have the evidence of `ACCEPT_LOG_BAYES`,
+    as far as references stray, in parts of the bounds.
     """
-    evidence = gather(
-        settled.frame, settled.reference_grams, settled.diagnosed_grams, settled.error
-    )
+    evidence = gather(settled.frame, settled.reference_grams, settled.judged_grams, settled.error)
     best: dict[str, float] = {}
     needs: dict[str, str] = {}
     for k, choice in enumerate(settled.frame.choices):
         if not choice.effect.is_cause:
             continue
         at = evidence.of(k)
-        information = np.diag(evidence.curvature[at, at])
+        strays = settled.error.strays.get(choice.effect.id, 1.0)
+        information = np.diag(evidence.curvature[at, at]) / strays
         reach = np.abs(choice.bounds).max(axis=1)
         smallest = np.sqrt(2.0 * (ACCEPT_LOG_BAYES + 2.0) / np.maximum(information, 1e-30)) / reach
         visible = float(np.clip(1.0 - smallest.min(), 0.0, 1.0))
@@ -247,13 +265,14 @@ def _observability(settled: Settled) -> list[dict[str, object]]:
 
 def in_words(diagnosis: Diagnosis) -> str:
     """Return the verdict in one sentence."""
-    verdict = diagnosis.verdict
-    floor = "references show" if diagnosis.settled.references else "the model file states"
+    verdict, references = diagnosis.verdict, diagnosis.settled.references
+    floor = "references show" if references else "the model file states"
     gap = f"{diagnosis.baseline_rmse_v:.2f} V where {floor} {diagnosis.floor_v:.2f} V"
     if verdict.cause == NONE:
-        if diagnosis.settled.references and diagnosis.baseline_rmse_v > diagnosis.floor_v:
+        if references and diagnosis.baseline_rmse_v > diagnosis.floor_v:
             gap += f", {diagnosis.extended_rmse_v:.2f} V with what they teach"
-        return f"No gap beyond what the references show or explain ({gap})."
+        beyond = "references show or explain" if references else "model file states"
+        return f"No gap beyond what the {beyond} ({gap})."
     if verdict.cause == UNKNOWN:
         return f"A gap ({gap}) that no effect in the library is likely to be the cause of."
     alike = (

@@ -173,7 +173,7 @@ def _refined(
     return model.with_effect(effect, values), values
 
 
-def model_file_of(extension: Extension, given: ModelFile, floor_v: float) -> ModelFile:
+def model_file_of(extension: Extension, given: ModelFile, error_v: float) -> ModelFile:
     """Return the extended model as a model file that estimator and service run.
 
     Parameters
@@ -181,24 +181,25 @@ def model_file_of(extension: Extension, given: ModelFile, floor_v: float) -> Mod
     extension : Extension
     given : ModelFile
         The model that was diagnosed.
-    floor_v : float
-        Error that is left on rows held out [V].
+    error_v : float
+        RMS error that is left on rows held out [V]; all parts of the noise are scaled to it.
     """
     model = extension.model
-    values = [*model.model.ocv_v, model.model.kt_v_per_k, *model.model.resistance_ohm]
     coefficients = {
-        name: item.model_copy(update={"value": value, "std_error": None})
-        for (name, item), value in zip(given.coefficients.items(), values, strict=True)
+        name: given.coefficients[name].model_copy(update={"value": value, "std_error": None})
+        for name, value in zip(
+            given.coefficient_names, model.model.coefficients.tolist(), strict=True
+        )
     }
     noise = given.noise
-    shrink = min(floor_v / noise.voltage_rmse_v, 1.0) if noise.voltage_rmse_v > 0.0 else 1.0
-    smaller = noise.model_copy(
+    ratio = error_v / noise.voltage_rmse_v if noise.voltage_rmse_v > 0.0 else 1.0
+    scaled = noise.model_copy(
         update={
-            "fast_std_v": shrink * noise.fast_std_v,
-            "slow_std_v": shrink * noise.slow_std_v,
-            "lasting_std_v": shrink * noise.lasting_std_v,
-            "voltage_rmse_v": floor_v,
-            "voltage_mae_pct": shrink * noise.voltage_mae_pct,
+            "fast_std_v": ratio * noise.fast_std_v,
+            "slow_std_v": ratio * noise.slow_std_v,
+            "lasting_std_v": ratio * noise.lasting_std_v,
+            "voltage_rmse_v": error_v,
+            "voltage_mae_pct": ratio * noise.voltage_mae_pct,
             "judged_on": "logs left out by `cangauge gap`",
         }
     )
@@ -223,7 +224,7 @@ def model_file_of(extension: Extension, given: ModelFile, floor_v: float) -> Mod
                 current_a=model.model.current_range_a,
             ),
             "effects": effect_entries(_merged(kept, model.pack)),
-            "noise": smaller,
+            "noise": scaled,
             "information": None,
             "made": made,
         }

@@ -1,7 +1,7 @@
 """How far the gap shrinks, on rows that the fit of the effect did not see.
 
-Several logs: each is left out in turn. One log: blocks of 240 s, every fourth left out with 60 s
-on either side, the last block never.
+Several logs: each is left out in turn. One log: blocks of 240 s, every fourth left out in turn, the
+last one never; the middle 120 s of those left out judge, with 60 s on either side.
 """
 
 from __future__ import annotations

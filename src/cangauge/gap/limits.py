@@ -11,6 +11,7 @@ import numpy as np
 
 from cangauge.gap.columns import Prepared
 from cangauge.gap.covered import COVERED_K, COVERED_PCT
+from cangauge.logs.log import TemperatureSource
 
 SHORT_S = 600.0
 """In a shorter log little builds up [s]."""
@@ -34,6 +35,7 @@ def limits(
     references: Sequence[Prepared],
     capacity_ah: float,
     initial_soc_pct: float | None = None,
+    temperature_source: TemperatureSource = "unknown",
 ) -> list[str]:
     """Return what these logs cannot show and why; nothing for logs without such limits.
 
@@ -46,12 +48,16 @@ def limits(
         Of the model [Ah].
     initial_soc_pct : float, optional
         SoC at each diagnosed log's first row, if it was given [%].
+    temperature_source : str
+        What the model's temperature was measured on.
     """
     found = [
         _duration(logs),
         _temperature(logs, references),
         _soc(logs, references),
+        _source([*logs, *references], temperature_source),
         _start(logs, initial_soc_pct),
+        _reference_start(references),
         _charging(logs, capacity_ah),
         _reference_number(len(references)),
     ]
@@ -130,8 +136,8 @@ def _soc(logs: Sequence[Prepared], references: Sequence[Prepared]) -> str:
             sentences.append(
                 f"SoC of {low:.0f} … {high:.0f} % where the references have"
                 f" {known[0]:.0f} … {known[1]:.0f} %: outside it the model's own OCV may be wrong,"
-                " and that cannot be told safely from a cause. Logs are judged inside it as far as"
-                " they have been there."
+                " and that cannot be told safely from a cause. Rows there count less, and not at"
+                " all where the model's own logs have not been either."
             )
     return " ".join(sentences)
 
@@ -144,6 +150,28 @@ def _start(logs: Sequence[Prepared], initial_soc_pct: float | None) -> str:
         f"No SoC at the start of {', '.join(names)}: 100 % was assumed. If that is wrong, it looks"
         " like initial_soc, voltage_offset or capacity, and none of these can be concluded; give"
         " the SoC with --initial-soc."
+    )
+
+
+def _reference_start(references: Sequence[Prepared]) -> str:
+    names = [item.log.name for item in references if item.log.first_soc() is None]
+    if not names:
+        return ""
+    return (
+        f"No SoC at the start of the reference{'s' if len(names) > 1 else ''} {', '.join(names)}:"
+        " 100 % was assumed. If that is wrong, what is learned of the clean pack is wrong; give"
+        " references with soc_pct, one value is enough."
+    )
+
+
+def _source(logs: Sequence[Prepared], of_model: TemperatureSource) -> str:
+    others = sorted({item.log.temperature_source for item in logs} - {of_model, "unknown"})
+    if of_model == "unknown" or not others:
+        return ""
+    return (
+        f"The model's temperature was measured on {of_model}, that of these logs on"
+        f" {', '.join(others)}: what the temperature does to voltage and resistance cannot be"
+        " concluded, because it is another temperature."
     )
 
 

@@ -88,6 +88,8 @@ def error_from_references(
     grams : sequence of Gram
         Of the references, two at least.
     stated : ErrorModel
+    least_trust : float
+        The model file is trusted at least so far.
     """
     usual = np.array(stated.own_std)
     pieces = dict.fromkeys(frame.choices[k].effect.id for k in frame.repairs)

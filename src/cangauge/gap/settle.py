@@ -31,7 +31,7 @@ from cangauge.gap.references import (
 )
 from cangauge.gap.thinned import thinned
 from cangauge.identify.options import FitOptions
-from cangauge.logs.log import Log
+from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.unstepped import unstepped, usual_step_k
 from cangauge.model.effects.effect import Effect
 from cangauge.model.extended import ExtendedModel
@@ -53,8 +53,8 @@ ALWAYS_OF_TEMPERATURE = frozenset({"charge_transfer", "inner_temperature"})
 """Structure that follows the temperature whatever its shape."""
 
 LEAST_INSIDE = 0.2
-"""A log is judged where references or the model's own logs have been as charged, if that is at
-least this part of it."""
+"""Rows where neither references nor the model's own logs have been as charged do not count, if the
+others are at least this part of a log."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +62,8 @@ class Settled:
     """The common ground of a diagnosis."""
 
     model: ExtendedModel
+    """As given, with the references' coefficients and without their structure: all columns but
+    those of temperatures are of it."""
     options: FitOptions
     frame: Frame
     error: ErrorModel
@@ -76,6 +78,8 @@ class Settled:
     (`columns.log_terms`)."""
     temperature_step_k: float = 0.0
     """The coarsest step in which a diagnosed log's temperature is reported [K]."""
+    temperature_source: TemperatureSource = "unknown"
+    """What the model's temperature was measured on."""
 
     @cached_property
     def given_errors_v(self) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...]]:
@@ -154,7 +158,8 @@ def settle(
     Raises
     ------
     InputError
-        If a log gives no rows or does not match the model's pack.
+        If a log gives no rows or does not match the model's pack, or if neither references nor the
+        model file tell how well the model is known.
     """
     given = model_file.extended_model()
     model = _over_all_temperatures(given, [*logs, *references])
@@ -166,13 +171,22 @@ def settle(
         epsilon=model_file.epsilon,
         t_ref_c=model_file.t_ref_c,
     )
+    if not references and model_file.information is None:
+        raise InputError(
+            "tells nothing of how well its coefficients are known, and there are no references:"
+            " no error can be told from a cause",
+            source=model_file.name,
+            field="information",
+            cure="give logs on which the model is good with --reference",
+        )
     for log in (*logs, *references):
         _check_pack(log, model)
     choices = candidates(effects, model.pack, logs[0].time_s, elsewhere=True)
     say = progress or _silent
-    of_logs = [prepare_log(unstepped(thinned(log)), options) for log in logs]
+    # Steps are found in the reports, before means blur them.
+    of_logs = [prepare_log(thinned(unstepped(log)), options) for log in logs]
     without_start = replace(options, initial_soc_pct=None)
-    of_references = [prepare_log(unstepped(thinned(log)), without_start) for log in references]
+    of_references = [prepare_log(thinned(unstepped(log)), without_start) for log in references]
     covered = not of_references or temperatures_covered(of_references, of_logs)
     frame = _frame(model_file, choices, has_references=bool(of_references), covered=covered)
     error = error_from_noise(model_file.noise, model_file.rate_hz, frame)
@@ -199,16 +213,17 @@ def settle(
         say(f"weighing {item.log.name} against every effect")
         diagnosed.append(_terms(item, model, effects, choices, acting))
     return Settled(
-        model,
-        options,
-        frame,
-        error,
-        terms_of_references,
-        tuple(diagnosed),
-        given,
-        covered,
-        acting,
-        max(usual_step_k(log) for log in logs),
+        model=model,
+        options=options,
+        frame=frame,
+        error=error,
+        references=terms_of_references,
+        diagnosed=tuple(diagnosed),
+        as_given=given,
+        covered=covered,
+        acting=acting,
+        temperature_step_k=max(usual_step_k(log) for log in logs),
+        temperature_source=model_file.temperature_source,
     )
 
 

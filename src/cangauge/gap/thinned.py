@@ -23,8 +23,8 @@ def thinned(log: Log) -> Log:
     """Return a log with no more rows than a diagnosis can use.
 
     The means of all signals over a stretch stand at the mean of its times, so nothing is late
-    against another and the charge stays; pauses stay pauses. The reference SoC is that of the
-    first sample of each stretch.
+    against another and the charge stays; pauses stay pauses. The reference SoC is the first that
+    each stretch tells: it may come more slowly than the current.
     """
     if len(log) < 2 or float(np.median(np.diff(log.time_s))) * 2.0 * ENOUGH_HZ > 1.0:
         return log
@@ -41,5 +41,14 @@ def thinned(log: Log) -> Log:
         current_a=mean(log.current_a),
         voltage_v=mean(log.voltage_v),
         temperature_c=mean(log.temperature_c),
-        soc_pct=None if log.soc_pct is None else log.soc_pct[first],
+        soc_pct=None if log.soc_pct is None else _first_known(log.soc_pct, first),
     )
+
+
+def _first_known(values: FloatArray, first: NDArray[np.intp]) -> FloatArray:
+    """Return the first finite value of each stretch, NaN where there is none."""
+    known = np.flatnonzero(np.isfinite(values))
+    found = np.full(first.size, np.nan)
+    stretch, at = np.unique(np.searchsorted(first, known, side="right") - 1, return_index=True)
+    found[stretch] = values[known[at]]
+    return found

@@ -54,7 +54,8 @@ FURTHER_PART = 0.05
 there is of it, the more is left that looks like another. Chosen on development cases: of 14 false
 seconds beside a right first nine had less, of five true ones one."""
 
-FURTHER_AT_MOST = 2
+MOST_ACCEPTED = 2
+"""Causes, the first one included."""
 
 OF_TEMPERATURE = ("resistance_temperature",)
 EXPECTED_TIMES = 1.6
@@ -159,7 +160,7 @@ def _chances(belief: Belief) -> dict[str, float]:
 def _accepted(evidence: Evidence, best: Score, alike: Sequence[str]) -> tuple[Score, ...]:
     accepted = [best]
     enough = max(FURTHER_LOG_BAYES, FURTHER_PART * best.log_bayes_factor)
-    while len(accepted) < FURTHER_AT_MOST:
+    while len(accepted) < MOST_ACCEPTED:
         rest = scores(
             condition_on(evidence, [k for score in accepted for k in score.candidates]),
             leave_out=[*(score.effect_id for score in accepted), *alike],

@@ -87,7 +87,9 @@ def _axes(
     yield "current", "A", current, np.array([ends[0], *inside, ends[1]])
     resting = (np.abs(current) < REST_C_RATE * capacity_ah).astype(np.float64)
     yield "rest", "1 = rest", resting, np.array([0.0, 0.5, 1.0])
-    passed = np.concatenate([item.time_s - item.time_s[0] for item in rows])
+    passed = np.concatenate(
+        [terms.prepared.rows.time_s - terms.prepared.log.time_s[0] for terms in logs]
+    )
     yield "time", "s", passed, np.linspace(0.0, float(passed.max()) + 1e-9, 6)
 
 

@@ -85,9 +85,6 @@ def describe_noise(residuals: Sequence[tuple[FloatArray, FloatArray]], rate_hz: 
     )
     variance, _ = nnls(columns * weight[:, None], covariance * weight)
     times = np.array([0.0, *TIME_CONSTANTS_S])
-    few = _few_logs(len(residuals))
-    slow = (times > SLOW_S) & (times < LASTING_S)
-    fast = times <= SLOW_S
     slow = (times > SLOW_S) & (times < LASTING_S)
     fast = times <= SLOW_S
     slow_v2, lasting_v2 = float(variance[slow].sum()), float(variance[-1])

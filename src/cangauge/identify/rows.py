@@ -82,8 +82,8 @@ def fit_rows(
             f"the SoC counted with {capacity_ah:.2f} Ah runs from {high:.1f} to {low:.1f} %",
             source=where,
             field="soc_pct",
-            cure="check --capacity-ah, --initial-soc and the sign of current (positive must"
-            " discharge; `cangauge inspect` finds it)",
+            cure="check --capacity-ah, the SoC at the start (soc_pct, --initial-soc) and the sign"
+            " of current (positive must discharge; `cangauge inspect` finds it)",
         )
     ticks = decimate(log.time_s, rate_hz)
     running = running_rows(log.time_s, log.voltage_v)[ticks]

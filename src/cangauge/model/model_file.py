@@ -152,7 +152,7 @@ class ModelFile(_Strict):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        wanted = {*BASIS_NAMES, "kt", *resistance_names(len(self.delays_s))}
+        wanted = set(self.coefficient_names)
         given = set(self.coefficients)
         if given != wanted:
             missing, extra = sorted(wanted - given), sorted(given - wanted)
@@ -162,7 +162,15 @@ class ModelFile(_Strict):
             raise ValueError(
                 f"coefficients: {'; '.join(words)} ({count} delays_s need R1 … R{count})"
             )
+        if self.information is not None and self.information.columns != self.coefficient_names:
+            names = ", ".join(self.coefficient_names)
+            raise ValueError(f"information: its columns must be {names}, in this order")
         return self
+
+    @property
+    def coefficient_names(self) -> list[str]:
+        """Names of the coefficients in the order of a solution: k0 … k7, kt, R1 … Rn."""
+        return [*BASIS_NAMES, "kt", *resistance_names(len(self.delays_s))]
 
     def voltage_model(self) -> VoltageModel:
         """Return the voltage model that the file describes.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from cangauge.gap.diagnose import Diagnosis
-from cangauge.gap.limits import limits, stepped_temperature
 from cangauge.gap.verdict import NONE, UNKNOWN
 from cangauge.model.effects.library import LIBRARY
 from cangauge.report.words import number
@@ -28,9 +27,10 @@ def verdict_limit(diagnosis: Diagnosis) -> str:
         )
     if verdict.cause == UNKNOWN:
         best = verdict.candidates[0].effect_id
+        floor = "references" if diagnosis.settled.references else "the model file states"
         return (
             f"No cause can be named: the gap is real ({number(diagnosis.baseline_rmse_v, 2, 'V')},"
-            f" references {number(diagnosis.floor_v, 2, 'V')}), but no effect of the library is"
+            f" {floor} {number(diagnosis.floor_v, 2, 'V')}), but no effect of the library is"
             f" likely enough to be the cause; the best one, {best}, takes"
             f" {100.0 * verdict.explained:.0f} % of it away. The cause is not in the library, or"
             " several act at once, or the model is not of this pack."
@@ -49,23 +49,8 @@ def verdict_limit(diagnosis: Diagnosis) -> str:
     return " ".join(words)
 
 
-def log_limits(diagnosis: Diagnosis) -> list[str]:
-    """Return what the logs cannot show, whatever the verdict."""
-    settled = diagnosis.settled
-    steps = stepped_temperature(
-        settled.temperature_step_k, settled.model.model.kt_v_per_k, diagnosis.floor_v
-    )
-    found = limits(
-        [terms.prepared for terms in settled.diagnosed],
-        [terms.prepared for terms in settled.references],
-        settled.model.capacity_ah,
-        settled.options.initial_soc_pct,
-    )
-    return [*found, steps] if steps else found
-
-
 def _unseen(diagnosis: Diagnosis) -> str:
     names = [str(item["effect"]) for item in diagnosis.observability if item["visible"] == 0.0]
     if not names:
         return " Smaller causes than the last table says would stay unseen."
-    return f" These logs would not show {', '.join(names)} at any size that physics allows."
+    return f" These logs would hardly show {', '.join(names)} at any size that physics allows."

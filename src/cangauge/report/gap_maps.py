@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -145,11 +146,12 @@ def _map_words(each: ErrorMap, unit: str) -> str:
 def _range(each: ErrorMap, up: int, unit: str) -> str:
     """Return what a bin of the second quantity holds, in words."""
     low, high = float(each.edges[up]), float(each.edges[up + 1])
+    digits = digits_of(high - low)
     if each.tails and up == each.edges.size - 2:
-        return f"over {number(low, 0, unit)}"
+        return f"over {number(low, digits, unit)}"
     if each.tails and up == 0:
-        return f"below {number(high, 0, unit)}"
-    return span(low, high, 0, unit)
+        return f"below {number(high, digits, unit)}"
+    return span(low, high, digits, unit)
 
 
 def share_figures(places: Sequence[Place]) -> list[Block]:
@@ -170,7 +172,8 @@ def share_figures(places: Sequence[Place]) -> list[Block]:
 
 
 def _share_bars(places: Sequence[Place]) -> Plot:
-    names = [place_range(place) for place in places]
+    digits = _digits(places)
+    names = [place_range(place, digits) for place in places]
     plot = plane(
         ("share of the squared error", ""),
         "@name: @share{0.0} % (@low{0.0} … @high{0.0} %), RMS @rms{0.00} V there",
@@ -210,14 +213,24 @@ def _share_bars(places: Sequence[Place]) -> Plot:
 def _share_words(places: Sequence[Place], unit: str) -> str:
     most = max(places, key=lambda place: place.share)
     low, high = most.ci
-    where = f"{place_range(most)} {unit}".rstrip()
+    where = f"{place_range(most, _digits(places))} {unit}".rstrip()
     return (
         f"Most lies at {where}: {100.0 * most.share:.0f} % (95 % interval"
         f" {100.0 * low:.0f} … {100.0 * high:.0f} %), {most.rmse_v:.2f} V RMS there."
     )
 
 
-def place_range(place: Place) -> str:
+def _digits(places: Sequence[Place]) -> int:
+    """Return with how many digits the narrowest place has two ends: a cell has few amperes."""
+    return digits_of(min(place.high - place.low for place in places))
+
+
+def digits_of(width: float) -> int:
+    """Return how many digits tell edges that are so far apart."""
+    return max(0, math.ceil(math.log10(2.0 / max(width, 1e-6))))
+
+
+def place_range(place: Place, digits: int) -> str:
     """Return a place's range in words, in the unit of `AXES`."""
     if place.axis == "rest":
         return "rest" if place.low > 0.0 else "drive"
@@ -225,4 +238,4 @@ def place_range(place: Place) -> str:
         return span(place.low / 60.0, place.high / 60.0, 0 if place.high > MINUTES_FROM_S else 1)
     if place.axis == "timescale" and place.high >= LONGEST_S:
         return f"over {number(place.low, 0)}"
-    return span(place.low, place.high, 0)
+    return span(place.low, place.high, digits)

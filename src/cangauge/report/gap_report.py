@@ -12,7 +12,7 @@ from cangauge.gap.verdict import NONE, UNKNOWN
 from cangauge.model.effects.library import LIBRARY
 from cangauge.report.bars import bars
 from cangauge.report.figures import BLUE, GREY
-from cangauge.report.gap_limits import log_limits, verdict_limit
+from cangauge.report.gap_limits import verdict_limit
 from cangauge.report.gap_maps import map_figures, share_figures
 from cangauge.report.gap_moments import moment_figures
 from cangauge.report.gap_shrink import shrink_figures
@@ -59,7 +59,7 @@ def gap_page(diagnosis: Diagnosis) -> Page:
         Section("How much of each effect these logs can show", _observability(diagnosis)),
         Section("How it was done", [Bullets(_method(diagnosis, names))]),
     ]
-    open_question, cannot = verdict_limit(diagnosis), log_limits(diagnosis)
+    open_question, cannot = verdict_limit(diagnosis), diagnosis.limits
     if open_question or cannot:
         said = [open_question] if open_question else []
         sections.insert(0, Section("What these logs cannot show", [Bullets([*said, *cannot])]))
@@ -216,7 +216,8 @@ def _observability(diagnosis: Diagnosis) -> list[Block]:
         Table(
             ["effect", "visible part of its physical range", "what would show or separate it"],
             rows,
-            note="0 %: even at its physical limit the effect would not be accepted on these logs.",
+            note="0 %: even at its physical limit the effect would show little on these logs beside"
+            " what references without it show.",
         )
     ]
 

@@ -1,0 +1,91 @@
+"""`cangauge gap`: its JSON, its files, what it tells people, its refusals."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cangauge.logs.canonical import write_log
+from cangauge.logs.log import Log
+from cangauge.model.model_file import load_model
+from synthetic import synthetic_log
+
+Run = Callable[..., object]
+
+
+def day(seed: int) -> Log:
+    return synthetic_log(
+        hours=0.6, start_pct=85.0, end_pct=65.0, noise_v=0.5, seed=seed, name=f"day {seed}"
+    )
+
+
+@pytest.fixture(scope="module")
+def days(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with three clean days and one on which the voltage reads 6 V too much."""
+    folder = tmp_path_factory.mktemp("days")
+    for seed in (11, 12, 13):
+        write_log(day(seed), folder / f"good{seed}.parquet")
+    log = day(21)
+    write_log(replace(log, voltage_v=log.voltage_v + 6.0), folder / "trip.csv")
+    return folder
+
+
+def references(days: Path) -> list[object]:
+    return [
+        word for path in sorted(days.glob("good*.parquet")) for word in ("--reference", path)
+    ]  # fmt: skip
+
+
+def test_json_report_and_a_model_that_runs(
+    run: Run, made: Path, days: Path, tmp_path: Path
+) -> None:
+    better, page = tmp_path / "better.json", tmp_path / "gap.html"
+    ran = run(
+        "gap", days / "trip.csv", "-m", made / "model.json", *references(days),
+        "--json", "--extended", better, "--report", page,
+    )  # fmt: skip
+    assert ran.code == 0
+    found = json.loads(ran.out)
+    assert "voltage_offset" in {found["cause"]["verdict"], *found["cause"]["ambiguous_with"]}
+    assert found["extended_model"] == str(better)
+    assert isinstance(found["limits"], list)
+    assert "What these logs cannot show" in page.read_text(encoding="utf-8") or not found["limits"]
+    assert [entry["id"] for entry in load_model(better).effects]
+    ran = run("estimate", days / "trip.csv", "-m", better, "-o", tmp_path / "soc.csv")
+    assert ran.code == 0
+
+
+def test_people_are_told_the_verdict_and_what_the_logs_cannot_show(
+    run: Run, made: Path, days: Path
+) -> None:
+    ran = run("gap", days / "good11.parquet", "-m", made / "model.json")
+    assert ran.code == 0
+    for text in (
+        "No gap beyond what the model file states", "probability", "left [V]",
+        "What these logs cannot show:", "- No reference logs: whether",
+    ):  # fmt: skip
+        assert text in ran.out
+
+
+def test_a_log_that_is_its_own_reference_is_refused(run: Run, made: Path, days: Path) -> None:
+    ran = run(
+        "gap", days / "trip.csv", "-m", made / "model.json", *references(days),
+        "--reference", days / "trip.csv", "--extended", days / "never.json",
+    )  # fmt: skip
+    assert ran.code == 2
+    assert "trip.csv" in ran.err
+    assert "is a LOG and a reference" in ran.err
+    assert not (days / "never.json").exists()
+
+
+def test_a_minute_of_data_concludes_nothing(run: Run, made: Path, tmp_path: Path) -> None:
+    log = day(21)
+    write_log(log.rows(np.arange(60)), tmp_path / "stub.csv")
+    ran = run("gap", tmp_path / "stub.csv", "-m", made / "model.json")
+    assert ran.code == 2
+    assert "nothing can be concluded" in ran.err
