@@ -92,11 +92,30 @@ class Evidence:
 
 
 @dataclass(frozen=True, eq=False)
+class Layout:
+    """Where a log's columns are in its products (`Gram`), as indices."""
+
+    coefficients: NDArray[np.intp]
+    structure: NDArray[np.intp]
+    effects: NDArray[np.intp]
+    """Amplitudes of all candidates, those of structure and own among them; none of a reference."""
+    own: NDArray[np.intp]
+    """What is each log's own: amplitudes of `Frame.own`, then `columns.LEVELS`."""
+    residual: int
+
+    @property
+    def shared(self) -> NDArray[np.intp]:
+        """What all logs share, in the order of a solution."""
+        return np.concatenate((self.coefficients, self.structure))
+
+
+@dataclass(frozen=True, eq=False)
 class Gram:
     """Products of a log's columns with each other: all that linear models need of its rows.
 
     Columns: baseline (p), amplitudes (of all candidates; of a reference: of the repairs, then of
-    what is each log's own), `columns.LEVELS`, residual.
+    what is each log's own), `columns.LEVELS`, residual; `Frame.diagnosed` and `Frame.reference`
+    tell where.
     """
 
     products: FloatArray
@@ -183,6 +202,33 @@ class Frame:
                         found.append((a, b))
         return tuple(found)
 
+    @cached_property
+    def diagnosed(self) -> Layout:
+        """Where the columns of a log are that is diagnosed: those of all candidates."""
+        p, amplitudes = self.scale.size, int(self.first[-1])
+        end = p + amplitudes
+        return Layout(
+            coefficients=np.arange(p),
+            structure=p + self.amplitudes_of(self.repairs),
+            effects=p + np.arange(amplitudes),
+            own=np.concatenate((p + self.amplitudes_of(self.own), end + np.arange(len(LEVELS)))),
+            residual=end + len(LEVELS),
+        )
+
+    @cached_property
+    def reference(self) -> Layout:
+        """Where the columns of a reference are: those of `shown` alone."""
+        p = self.scale.size
+        shared = p + self.amplitudes_of(self.repairs).size
+        end = shared + self.amplitudes_of(self.own).size + len(LEVELS)
+        return Layout(
+            coefficients=np.arange(p),
+            structure=np.arange(p, shared),
+            effects=np.zeros(0, dtype=np.intp),
+            own=np.arange(shared, end),
+            residual=end,
+        )
+
     @property
     def shown(self) -> tuple[int, ...]:
         """Candidates whose columns are wanted of references too: repairs, then own."""
@@ -216,8 +262,7 @@ def gather(
         Logs without and with the effect in question.
     error : ErrorModel
     """
-    p, amplitudes = frame.scale.size, int(frame.first[-1])
-    shared = p + frame.amplitudes_of(frame.repairs).size
+    amplitudes, shared = int(frame.first[-1]), frame.reference.shared.size
     effects = shared + np.arange(amplitudes)
     precision, right = np.zeros((shared, shared)), np.zeros(shared)
     cross = np.zeros((shared, amplitudes))
@@ -267,19 +312,10 @@ def without_own(
     volume : float
         ln det of their precision over that of their prior.
     """
-    p = frame.scale.size
-    repairs, varying = frame.amplitudes_of(frame.repairs), frame.amplitudes_of(frame.own)
     weighed = log.weighed(error)
-    levels = weighed.shape[0] - 1 - len(LEVELS) + np.arange(len(LEVELS))
-    last = [weighed.shape[0] - 1]
-    if is_reference:
-        shared = np.arange(p + repairs.size)
-        kept = np.concatenate((shared, last))
-        own = np.concatenate((shared.size + np.arange(varying.size), levels))
-    else:
-        every = p + np.arange(int(frame.first[-1]))
-        kept = np.concatenate((np.arange(p), p + repairs, every, last))
-        own = np.concatenate((p + varying, levels))
+    layout = frame.reference if is_reference else frame.diagnosed
+    own = layout.own
+    kept = np.concatenate((layout.shared, layout.effects, [layout.residual]))
     # In units of how much logs differ, so that the prior is 1.
     std = np.array(error.own_std)
     block = weighed[np.ix_(own, own)] * std * std[:, None]
@@ -300,8 +336,7 @@ def log_likelihood(frame: Frame, references: Sequence[Gram], error: ErrorModel) 
     references : sequence of Gram
     error : ErrorModel
     """
-    p = frame.scale.size
-    shared = p + frame.amplitudes_of(frame.repairs).size
+    shared = frame.reference.shared.size
     precision, right, squares = np.zeros((shared, shared)), np.zeros(shared), 0.0
     volume = 0.0
     for log in references:

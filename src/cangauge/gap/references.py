@@ -207,8 +207,7 @@ def _trust(frame: Frame, grams: Sequence[Gram], error: ErrorModel, least: float)
 def _left_out(frame: Frame, grams: Sequence[Gram], number: int, error: ErrorModel) -> FloatArray:
     """Return the expected squares of one reference's error, summed over each scale [V²]."""
     others = gather(frame, [gram for k, gram in enumerate(grams) if k != number], [], error)
-    shared = others.mean.size
-    own = np.arange(shared, shared + len(error.own_std))
+    shared, own = others.mean.size, frame.reference.own
     prior = np.zeros((shared + own.size, shared + own.size))
     prior[:shared, :shared] = others.precision
     prior[own, own] = np.array(error.own_std) ** -2.0

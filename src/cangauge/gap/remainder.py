@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cangauge.gap.columns import LEVELS
 from cangauge.gap.evidence import Evidence, Frame, Gram, without_own
 from cangauge.gap.scores import Score
 from cangauge.identify.scales import SCALES
@@ -34,8 +33,7 @@ def left_over(
         Of all of them, in order.
     """
     frame = evidence.frame
-    p, repairs = frame.scale.size, frame.amplitudes_of(frame.repairs)
-    varying, at = frame.amplitudes_of(frame.own), frame.amplitudes_of(chosen)
+    layout, at = frame.diagnosed, frame.amplitudes_of(chosen)
     solution = evidence.mean - evidence.per_amplitude[:, at] @ amplitude
     known = np.zeros(solution.size + int(frame.first[-1]) + 1)
     known[: solution.size] = -solution
@@ -46,13 +44,11 @@ def left_over(
         _, follows, _ = without_own(log, frame, evidence.error, is_reference=False)
         mine = follows @ known
         weights = np.zeros(log.products.shape[1])
-        weights[:p] = -solution[:p]
-        # A candidate may be a repair, a log's own and the cause at once.
-        weights[p + repairs] -= solution[p:]
-        weights[p + varying] -= mine[: varying.size]
-        weights[p + at] -= amplitude
-        weights[-1 - len(LEVELS) : -1] = -mine[varying.size :]
-        weights[-1] = 1.0
+        # A candidate may be structure, a log's own and the cause at once.
+        weights[layout.shared] -= solution
+        weights[layout.own] -= mine
+        weights[layout.effects[at]] -= amplitude
+        weights[layout.residual] = 1.0
         total += (log.products @ weights) @ weights
     return total
 
@@ -78,13 +74,12 @@ def kept_v2(
     chosen, amplitude : optional
         Candidates and all their amplitudes.
     """
-    p, repairs = frame.scale.size, frame.amplitudes_of(frame.repairs)
+    layout = frame.diagnosed
     weights = np.zeros(log.products.shape[1])
-    weights[:p] = -solution[:p]
-    weights[p + repairs] -= solution[p:]
+    weights[layout.shared] -= solution
     if amplitude is not None:
-        weights[p + frame.amplitudes_of(chosen)] -= amplitude
-    weights[-1] = 1.0
+        weights[layout.effects[frame.amplitudes_of(chosen)]] -= amplitude
+    weights[layout.residual] = 1.0
     return float(np.sum((log.products @ weights) @ weights) / np.sum(log.counts))
 
 
@@ -101,12 +96,8 @@ def expected_v2(log: Gram, alone: Evidence) -> float:
     alone : Evidence
         Of the references alone.
     """
-    frame, error = alone.frame, alone.error
-    p, repairs = frame.scale.size, frame.amplitudes_of(frame.repairs)
-    columns = log.products.shape[1]
-    shared = np.concatenate((np.arange(p), p + repairs))
-    levels = columns - 1 - len(LEVELS) + np.arange(len(LEVELS))
-    own = np.concatenate((p + frame.amplitudes_of(frame.own), levels))
+    error, layout = alone.error, alone.frame.diagnosed
+    shared, own = layout.shared, layout.own
     products = log.products.sum(axis=0)
     balance = 1.0 / np.sqrt(np.diag(alone.precision))
     spread = np.linalg.inv(alone.precision * balance * balance[:, None])
