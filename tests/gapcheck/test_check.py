@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from cangauge.cli.app import main
-from cangauge.gapcheck.check import draw_all, drawn_before
+from cangauge.gapcheck.check import diagnose_tasks, draw_all, drawn_before, outcomes_of
 from cangauge.gapcheck.plan import EFFECTS, Sizes, plan
 
 SIZES = {"simulated": Sizes(per_effect=1, healthy=1, effects=1)}
@@ -102,7 +102,8 @@ def test_a_check_that_was_stopped_is_scored_as_far_as_it_came(
 ) -> None:  # fmt: skip
     path = kept / "answers.jsonl"
     before = path.read_text()
-    path.write_text("".join(before.splitlines(keepends=True)[:3]))
+    # Stopped while it wrote the last line.
+    path.write_text("".join(before.splitlines(keepends=True)[:3]) + '{"task": "task_0')
     monkeypatch.setattr(
         sys, "argv", ["cangauge", "gap-check", "--cases", str(kept), "--score-only", "--json"]
     )
@@ -115,6 +116,26 @@ def test_a_check_that_was_stopped_is_scored_as_far_as_it_came(
     said = capsys.readouterr()
     assert len(json.loads(said.out)["cases"]) == 3
     assert "3 of 4" in said.err
+
+
+def test_another_diagnosis_of_kept_cases_puts_the_answers_aside(
+    kept: Path, ran: dict[str, Any]
+) -> None:
+    path = kept / "answers.jsonl"
+    before = path.read_text()
+    assert diagnose_tasks(drawn_before(kept), (), 1, nothing) == {}
+    aside = kept / "answers-1.jsonl"
+    assert aside.read_text() == before
+    assert not path.read_text()
+    aside.rename(path)
+
+
+def test_cases_that_could_not_be_drawn_count_where_they_are_asked_for(tmp_path: Path) -> None:
+    groups = plan({"real-lg_hg2": Sizes(healthy=1)}, seed=1, final=False)
+    drawn = draw_all(groups, tmp_path, data=None, jobs=1, open_set=0, about=ABOUT, progress=nothing)
+    assert len(outcomes_of(drawn, (), {})) == 1
+    assert len(outcomes_of(drawn, (), {}, ["real-lg_hg2"])) == 1
+    assert not outcomes_of(drawn, (), {}, ["simulated"])
 
 
 def test_a_changed_label_is_refused(kept: Path, ran: dict[str, Any]) -> None:
@@ -154,6 +175,8 @@ def test_what_cannot_be_drawn_is_listed_as_a_crash(tmp_path: Path) -> None:
         (("--protocol", "real-lg_hg2"), "--data"),
         (("--final", "--seed", "3"), "final seeds are fixed"),
         (("--cases", "nowhere"), "no cases"),
+        (("--cases", "nowhere", "--protocol", "imagined"), "no such protocol"),
+        (("--cases", "nowhere", "--per-effect", "2"), "drawn already"),
         (("--score-only",), "--cases"),
     ],
 )

@@ -15,7 +15,7 @@ from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import estimate_log
 from cangauge.identify.effects.ids import CLEAN, REFUSED, parse_ids
 from cangauge.identify.effects.judge import Judge, Judged, compare
-from cangauge.identify.effects.linear import linearise, moved_by, residual_of
+from cangauge.identify.effects.linear import free_of, linearise, moved_by, residual_of
 from cangauge.identify.effects.prepared import Prepared, prepare_log
 from cangauge.identify.fit import FitOptions, Identification, fit
 from cangauge.identify.voltage_fit import fit_voltage_model, held_out_errors
@@ -299,3 +299,11 @@ def test_one_short_log_shows_no_effect() -> None:
     with pytest.raises(InputError, match="can be held out") as error:
         fit([short], replace(OPTIONS, effects=("auto",)))
     assert "--effects" in str(error.value)
+
+
+@pytest.mark.parametrize("skew_s", [-1.5, 1.5])
+def test_a_skew_of_either_sign_can_be_refined_both_ways(skew_s: float) -> None:
+    model = ExtendedModel(TRUTH, CAPACITY_AH, ((LIBRARY["time_skew"], {"skew_s": skew_s}),))
+    (free,) = free_of(model)
+    low, high = free.in_one_step()
+    assert low < 0.0 < high

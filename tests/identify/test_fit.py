@@ -158,6 +158,38 @@ def test_noise_tells_fast_from_slow() -> None:
     assert noise.lasting_std_v < 0.4
 
 
+@pytest.mark.parametrize("rate_hz", [1.0, 0.5, 0.1])
+def test_white_noise_is_white_at_every_rate(rate_hz: float) -> None:
+    rng = np.random.default_rng(3)
+    logs = [(np.arange(4000.0) / rate_hz, rng.normal(0.0, 0.5, 4000)) for _ in range(3)]
+    noise = describe_noise(logs, rate_hz)
+    assert noise.fast_std_v == pytest.approx(0.5, rel=0.1)
+    assert noise.fast_time_s < 0.15 / rate_hz  # a part of the time between two rows
+
+
+def test_a_log_without_which_the_others_identify_nothing_judges_nothing() -> None:
+    long = synthetic_log(hours=1.1, start_pct=95.0, end_pct=10.0, noise_v=0.5, name="long")
+    short = [
+        synthetic_log(hours=0.05, start_pct=60.0, end_pct=59.0, noise_v=0.5, seed=seed)
+        for seed in (2, 3)
+    ]
+    found = fit([long, *short], FitOptions(capacity_ah=CAPACITY_AH))
+    of_long, *of_short = found.held_out_error_v
+    assert np.isnan(of_long).all()
+    assert all(np.isfinite(errors).any() for errors in of_short)
+
+
+def test_capacity_counts_from_the_row_that_tells_the_soc() -> None:
+    whole = synthetic_log(hours=1.5, end_pct=0.5)
+    assert whole.soc_pct is not None
+    at = 300
+    told = np.full(len(whole), np.nan)
+    told[at] = 100.0
+    late = capacity_from_full_discharge([replace(whole, soc_pct=told)], None)
+    out_ah = discharged_ah(whole.time_s, whole.current_a)
+    assert late == pytest.approx(out_ah[-1] - out_ah[at])
+
+
 def test_trapezoidal_charge_on_irregular_steps() -> None:
     time_s = np.array([0.0, 1.0, 4.0, 10.0])
     current_a = np.array([0.0, 2.0, 8.0, 8.0])

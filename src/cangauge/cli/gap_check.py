@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -94,7 +94,8 @@ def gap_check_command(  # noqa: PLR0917 - typer passes options by name
         Path | None, typer.Option(metavar="FOLDER", help="Keep cases and answers here.")
     ] = None,
     cases: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Diagnose cases that --keep kept.")
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Diagnose cases that --keep kept, and draw none."),
     ] = None,
     score_only: Annotated[
         bool, typer.Option("--score-only", help="With --cases: score the answers kept there.")
@@ -147,7 +148,14 @@ def gap_check_command(  # noqa: PLR0917 - typer passes options by name
                 open_set=open_set_of(part, per_effect) if _wants(protocol, OPEN_SET) else 0,
             )  # fmt: skip
         else:
-            _refuse_with_cases(seed, final, keep)
+            _check_protocols(protocol)
+            _refuse_with_cases(
+                {
+                    "--seed": seed is not None, "--final": final, "--keep": keep is not None,
+                    "--per-effect": per_effect is not None, "--healthy": healthy is not None,
+                    "--data": data is not None,
+                }
+            )  # fmt: skip
             drawn = drawn_before(cases)
         note(f"sealed causes: SHA-256 {drawn.sha256}")
         if drawn.about["final"]:
@@ -162,7 +170,8 @@ def gap_check_command(  # noqa: PLR0917 - typer passes options by name
             bar = progress.add_task("diagnosing", total=len(tasks))
             answers = diagnose_tasks(drawn, tasks, jobs, lambda n: progress.advance(bar, n))
         seconds = time.perf_counter() - began
-        outcomes = outcomes_of(drawn, tasks, answers)
+        # A sample is of what could be drawn.
+        outcomes = outcomes_of(drawn, tasks, answers, protocol if at_most is None else ())
         wanted = sum(task.wants_model for task in tasks)
         bar = progress.add_task("extended models", total=wanted, visible=wanted > 0)
         later = later_of(drawn, tasks, answers, lambda n: progress.advance(bar, n))
@@ -234,9 +243,9 @@ def _wants(protocol: Sequence[str] | None, name: str) -> bool:
     return protocol is None or name in protocol
 
 
-def _refuse_with_cases(seed: int | None, final: bool, keep: Path | None) -> None:
-    for option, given in (("--seed", seed is not None), ("--final", final), ("--keep", keep)):
-        if given:
+def _refuse_with_cases(given: Mapping[str, bool]) -> None:
+    for option, is_given in given.items():
+        if is_given:
             raise InputError("these cases are drawn already", field=option, cure="leave it out")
 
 
@@ -260,12 +269,7 @@ def _sizes(
     table = {"full": FULL, "small": SMALL}.get(part)
     if table is None:
         raise InputError("no such part", field="--part", value=part, cure="use full or small")
-    for name in protocol or ():
-        if name not in PROTOCOLS:
-            raise InputError(
-                "no such protocol", field="--protocol", value=name,
-                cure=f"use {', '.join(PROTOCOLS)}",
-            )  # fmt: skip
+    _check_protocols(protocol)
     sizes = {}
     for name in table:
         if protocol is None and part == "small" and name in NEEDS_DATA:
@@ -283,6 +287,15 @@ def _sizes(
     if not any(item.cases for item in sizes.values()):
         raise InputError("nothing to check", field="--protocol", cure="ask for more cases")
     return sizes
+
+
+def _check_protocols(protocol: Sequence[str] | None) -> None:
+    for name in protocol or ():
+        if name not in PROTOCOLS:
+            raise InputError(
+                "no such protocol", field="--protocol", value=name,
+                cure=f"use {', '.join(PROTOCOLS)}",
+            )  # fmt: skip
 
 
 def _can_run(name: str, data: Path | None, *, asked: bool) -> bool:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -170,6 +171,8 @@ def diagnose_tasks(
 ) -> dict[str, dict[str, Any]]:
     """Return the answer to each task by its id; nothing here opens the sealed file.
 
+    Answers that an earlier run kept are put aside as `answers-1.jsonl`, `answers-2.jsonl`, …
+
     Parameters
     ----------
     drawn : Drawn
@@ -181,8 +184,11 @@ def diagnose_tasks(
         Called with the number of answers that came.
     """
     answers = {}
+    path = drawn.folder / ANSWERS
+    if path.exists():
+        path.rename(_free_name(path))
     # Line by line, so that a long check that is stopped can be scored as far as it came.
-    with (drawn.folder / ANSWERS).open("w", encoding="utf-8") as file:
+    with path.open("w", encoding="utf-8") as file:
         for task, answer in diagnose_all(tasks, drawn.folder / OPEN, jobs):
             answers[task.id] = answer
             file.write(json.dumps({"task": task.id, **answer}) + "\n")
@@ -207,16 +213,35 @@ def answers_before(drawn: Drawn) -> dict[str, dict[str, Any]]:
             source=drawn.folder,
             cure="leave out --score-only",
         ) from error
-    found = [json.loads(line) for line in text.splitlines()]
+    # The last line may have been cut off when the check was stopped.
+    whole = text[: text.rfind("\n") + 1]
+    found = [json.loads(line) for line in whole.splitlines()]
     return {item.pop("task"): item for item in found}
 
 
+def _free_name(path: Path) -> Path:
+    numbered = (path.with_name(f"{path.stem}-{k}{path.suffix}") for k in itertools.count(1))
+    return next(name for name in numbered if not name.exists())
+
+
 def outcomes_of(
-    drawn: Drawn, tasks: Sequence[Task], answers: dict[str, dict[str, Any]]
+    drawn: Drawn,
+    tasks: Sequence[Task],
+    answers: dict[str, dict[str, Any]],
+    undrawn_of: Collection[str] | None = None,
 ) -> list[Outcome]:
     """Unseal the causes and return what each answer is worth.
 
     Cases that could not be drawn or diagnosed are crashes.
+
+    Parameters
+    ----------
+    drawn : Drawn
+    tasks : sequence of Task
+    answers : dict
+        By the task's id.
+    undrawn_of : collection of str, optional
+        Protocols whose cases that could not be drawn count; all by default.
 
     Raises
     ------
@@ -230,7 +255,7 @@ def outcomes_of(
         if task.id in answers
     ]
     for name, label in labels.items():
-        if "failed" in label:
+        if "failed" in label and (undrawn_of is None or label["protocol"] in undrawn_of):
             task = Task(f"undrawn_{name}", name, label["protocol"])
             outcomes.append(outcome_of(task, label, {"error": label["failed"]}))
     return outcomes

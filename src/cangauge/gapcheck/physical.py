@@ -53,9 +53,6 @@ CAUSES: Final[Mapping[str, tuple[str, int]]] = {
 }
 """Protocol → the effect that is there, and how many cases."""
 
-WANTS_MODEL: Final = frozenset({"cold-bmw_i3"})
-"""Protocols whose extended model is judged on further logs."""
-
 
 @dataclass(frozen=True, eq=False)
 class PhysicalCase:

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from cangauge.gapcheck.outcome import LEAST_GAP
 from cangauge.report.words import NONE_KNOWN, number
 
 Entry = tuple[str, Mapping[str, Any]]
@@ -139,8 +140,8 @@ def _print_protocol(name: str, items: Mapping[str, Any], console: Console) -> No
     console.print(table)
     if items.get("below_range"):
         console.print(
-            f"{items['below_range']} more have a gap below 0.45 floors, since physics allows no"
-            " larger one on their days; they are not counted above."
+            f"{items['below_range']} of them have a gap below {LEAST_GAP} floors, since physics"
+            " allows no larger one on their days; they are in no share of effects."
         )
     if "by_gap" in items:
         table = _table("by size of the gap", "floors", "cases", "found", "strictly", "with pairs")

@@ -4,7 +4,7 @@
 answer a line to stdout:
 
     {"model": PATH, "logs": [PATH…], "references": [PATH…], "leave_out": [EFFECT…],
-     "extended": PATH or null, "initial_soc_pct": number or null}
+     "extended": PATH or null}
 
     {"seconds": s, "peak_mib": MiB or null, "result": {"gap": …, "cause": …}}  or  {"error": text}
 
@@ -42,7 +42,6 @@ def answer(request: dict[str, Any]) -> dict[str, Any]:
             model,
             [read_log(Path(path)) for path in request["references"]],
             leave_out=request.get("leave_out", ()),
-            initial_soc_pct=request.get("initial_soc_pct"),
         )
         if request.get("extended") is not None:
             better = model_file_of(found.extension, model, found.extended_rmse_v)

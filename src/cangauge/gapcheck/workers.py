@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
@@ -62,6 +63,7 @@ class _Worker:
         if process.stdin is None or process.stdout is None:  # both are pipes
             return {"error": "the diagnosing process has no pipes"}
         late = threading.Timer(LONGEST_S, process.kill)
+        began = time.perf_counter()
         late.start()
         try:
             process.stdin.write(json.dumps(request) + "\n")
@@ -74,7 +76,8 @@ class _Worker:
         if not line:
             code = process.wait()
             self.process = None
-            return {"error": f"the diagnosing process ended with code {code}"}
+            seconds = time.perf_counter() - began
+            return {"error": f"the diagnosing process ended with code {code}", "seconds": seconds}
         found: dict[str, Any] = json.loads(line)
         return found
 
@@ -165,7 +168,8 @@ def diagnose_all(
                 if task.wants_model and "error" not in found:
                     text = (home / "extended.json").read_text(encoding="utf-8")
                     found["extended_model"] = json.loads(text)
-            except OSError as error:  # a kept case whose files are gone, a full disk
+            # A kept case whose files are gone, a full disk, an answer that was cut off.
+            except (OSError, ValueError) as error:
                 return {"error": f"{type(error).__name__}: {error}"}
             else:
                 return found

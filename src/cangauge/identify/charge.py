@@ -103,7 +103,9 @@ def _whole_capacity_ah(log: Log, initial_soc_pct: float | None) -> float | None:
         if last > EMPTY_PCT:
             return None
         return float(100.0 * (out[last_row] - out[first_row]) / (first - last))
-    return float(out[-1] * 100.0 / first) if _ends_in_the_knee(log, out) else None
+    if not _ends_in_the_knee(log, out):
+        return None
+    return float(100.0 * (out[-1] - out[first_row]) / first)
 
 
 def _ends_in_the_knee(log: Log, out_ah: FloatArray) -> bool:

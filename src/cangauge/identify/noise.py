@@ -73,8 +73,8 @@ def describe_noise(residuals: Sequence[tuple[FloatArray, FloatArray]], rate_hz: 
         on_grid, present = _on_grid(time_s, error_v, rate_hz)
         for k, lag in enumerate(lags):
             shift = round(lag * rate_hz)
-            if shift >= on_grid.size:
-                continue
+            if shift >= on_grid.size or (lag > 0.0 and shift == 0):
+                continue  # longer than the log, or shorter than a row lasts
             both = present[shift:] & present[: on_grid.size - shift]
             total[k] += float(on_grid[shift:][both] @ on_grid[: on_grid.size - shift][both])
             count[k] += float(both.sum())

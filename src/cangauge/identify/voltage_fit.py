@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cangauge.errors import InputError
+from cangauge.errors import CangaugeError, InputError
 from cangauge.identify.held_out import folds
 from cangauge.identify.least_squares import BLOCK_S, Solution, solve
 from cangauge.identify.options import FitOptions
@@ -157,7 +157,8 @@ def held_out_errors(
 ) -> list[FloatArray]:
     """Return each log's errors [V] under fits that did not see the rows.
 
-    NaN where no fold judged a row, or only with a fit that did not see its SoC: how far the
+    NaN where no fold judged a row, where what it left identifies no model, or where its fit did not
+    see the row's SoC: how far the
     model can be trusted beyond its range is another question (the estimate is flagged there).
     """
     volts = np.concatenate([item.voltage_v for item in rows])
@@ -166,7 +167,10 @@ def held_out_errors(
     delayed = np.concatenate([item.delayed_current_a for item in rows])
     errors = np.full(volts.size, np.nan)
     for fitted, left_out in folds(rows):
-        model, _ = fit_voltage_model(rows, options, fitted, is_held=is_held)
+        try:
+            model, _ = fit_voltage_model(rows, options, fitted, is_held=is_held)
+        except CangaugeError:
+            continue  # the other logs alone identify no model: nothing judges these rows
         lo, hi = model.soc_range_pct
         judged = left_out & (soc > lo - 1.0) & (soc < hi + 1.0)
         errors[judged] = volts[judged] - model.voltage(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from cangauge.gapcheck.outcome import LEAST_GAP
 from cangauge.gapcheck.tables import entries_of, limits, measured, percent
 from cangauge.report.check_figures import confusion_figure, gap_figure, reliability_figure
 from cangauge.report.page import (
@@ -86,8 +87,9 @@ def _protocol(items: Result) -> list[Block]:
     if items.get("below_range"):
         blocks.append(
             Paragraph(
-                f"{items['below_range']} more cases have a gap below 0.45 floors, since physics"
-                " allows no larger one on their days. They are not counted above."
+                f"{items['below_range']} of {items['cases']} cases have a gap below {LEAST_GAP}"
+                " floors, since physics allows no larger one on their days. They are in no share of"
+                " effects."
             )
         )
     if items["confusion"]:

@@ -29,14 +29,12 @@ class Scaled:
         RMS gap over all days [V].
     limited : bool
         Whether the physical limits of the size kept it from what was wanted.
-    tries : int
     """
 
     fault: Fault
     wanted_v: float
     reached_v: float
     limited: bool
-    tries: int
 
 
 def rms_gap_v(
@@ -119,10 +117,8 @@ def find_size(
     best: tuple[float, float, float] | None = None
     at = 0.5 * (low + high)
     slope = 1.0
-    tries = 0
     previous: tuple[float, float] | None = None
-    while tries < _MAX_TRIES:
-        tries += 1
+    for _ in range(_MAX_TRIES):
         gap = gap_of(fault.sized(sign * float(np.exp(at))))
         level = float(np.log(max(gap, 1e-9)))
         away = abs(level - target)
@@ -143,13 +139,12 @@ def find_size(
         step_to = at + (target - level) / slope if np.isfinite(level) else low
         at = _inside(step_to, below, above, low, high)
     if best is None:  # even the smallest size stops the car
-        return Scaled(fault.sized(0.0), wanted_v, 0.0, limited=True, tries=tries)
+        return Scaled(fault.sized(0.0), wanted_v, 0.0, limited=True)
     return Scaled(
         fault.sized(sign * float(np.exp(best[1]))),
         wanted_v,
         best[2],
         limited=best[0] > 2.0 * TOLERANCE,
-        tries=tries,
     )
 
 

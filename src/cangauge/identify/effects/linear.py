@@ -60,8 +60,9 @@ class Free:
         """Return how far one step may change it."""
         low, high = self.low - self.value, self.high - self.value
         if self.is_shape:
-            low = max(low, (SHAPE_WITHIN[0] - 1.0) * self.value)
-            high = min(high, (SHAPE_WITHIN[1] - 1.0) * self.value)
+            # A skew may be negative: then more of it is less.
+            least, most = sorted((part - 1.0) * self.value for part in SHAPE_WITHIN)
+            low, high = max(low, least), min(high, most)
         return min(low, 0.0), max(high, 0.0)
 
 
