@@ -191,9 +191,7 @@ class Estimator:
         if math.isfinite(sample.temperature_c):
             self._temperature_c = sample.temperature_c
         if not self._is_plain:
-            self._online.advance(
-                time_s, current_a, self._known_temperature_c(), self._line.currents()
-            )
+            self._online.advance(time_s, current_a, self._temperature_c, self._line.currents())
         tick = math.floor((time_s - self._first_s) * self._file.rate_hz + 1e-6)
         if tick > self._tick:
             self._tick = tick

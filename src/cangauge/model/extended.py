@@ -7,6 +7,7 @@ last bit.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -273,15 +274,21 @@ class OnlineExtendedModel:
         Parameters
         ----------
         time_s, current_a, temperature_c : float
-            Time [s], current [A] and temperature [°C], the last one that was known.
+            Time [s], current [A] and temperature [°C], the last one that was known. NaN before the
+            first: effects take the reference temperature, and those that follow it late wait, or
+            they would follow from a temperature that never was.
         delayed_current_a : sequence of floats
             Current at each delay, from the delay line of corrected currents [A].
         """
         drop_v = 0.0
         for resistance, current in zip(self.model.resistance_ohm, delayed_current_a, strict=True):
             drop_v += resistance * current
+        is_known = math.isfinite(temperature_c)
         for effect in self._effects:
-            effect.advance(time_s, current_a, temperature_c, drop_v)
+            if is_known:
+                effect.advance(time_s, current_a, temperature_c, drop_v)
+            elif not effect.follows_temperature:
+                effect.advance(time_s, current_a, self.model.t_ref_c, drop_v)
         self._beside_soc_v = sum((item.extra_voltage(0.0) for item in self._beside_soc), 0.0)
 
     def memory(self) -> list[list[float]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -152,3 +153,28 @@ def test_newton_finds_a_root_with_all_effects_at_once(
     assert 0.0 <= found.soc_pct <= 100.0
     if found.inside:
         assert online.pseudo_ocv_at(found.soc_pct)[0] == pytest.approx(wanted, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("effect_id", "values"),
+    [
+        ("inner_temperature", {"voltage_v_per_k": 0.05, "tau_s": 3600.0}),
+        ("resistance_temperature", {"lag_s": 1800.0}),
+        ("entropic_coefficient", {"slope_v_per_k": 1e-3, "lag_s": 1800.0}),
+    ],
+)
+def test_what_follows_the_temperature_begins_with_the_first_that_is_known(
+    effect_id: str, values: dict[str, float]
+) -> None:
+    """A car tells its temperature more rarely than its current: the first samples have none."""
+    extended = ExtendedModel(
+        MODEL, CAPACITY_AH, ((LIBRARY[effect_id], {**middle(LIBRARY[effect_id]), **values}),)
+    )
+    late, known = extended.online(), extended.online()
+    for time_s in range(60):
+        current = [80.0] * 4
+        late.advance(float(time_s), 80.0, math.nan if time_s < 5 else 0.0, current)
+        assert math.isfinite(late.pseudo_ocv_at(70.0)[0])
+        if time_s >= 5:
+            known.advance(float(time_s), 80.0, 0.0, current)
+    assert late.pseudo_ocv_at(70.0) == known.pseudo_ocv_at(70.0)

@@ -67,6 +67,9 @@ class OnlineEffect:
     uses_soc: ClassVar[bool] = False
     """Whether `extra_voltage` depends on the SoC that it is asked for."""
 
+    follows_temperature: bool = False
+    """Whether it follows the temperature late: then it begins with the first one that is known."""
+
     def correct(self, reading: Reading) -> Sequence[Reading]:
         """Return what perfect sensors would have shown, as far as it is known by now.
 

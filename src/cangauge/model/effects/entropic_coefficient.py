@@ -66,6 +66,7 @@ class _Online(OnlineEffect):
         self._slope = values["slope_v_per_k"]
         self._curve = values["curve_v_per_k"]
         self._inside = Inside(values["lag_s"])
+        self.follows_temperature = self._inside.is_late
         self._t_ref_c = t_ref_c
         self._warmer = 0.0
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -49,6 +48,8 @@ class InnerTemperature(Effect):
 
 
 class _Online(OnlineEffect):
+    follows_temperature = True
+
     def __init__(self, voltage_v_per_k: float, drop_per_k: float, tau_s: float) -> None:
         self._voltage_v_per_k = voltage_v_per_k
         self._drop_per_k = drop_per_k
@@ -57,8 +58,6 @@ class _Online(OnlineEffect):
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         del current_a
-        if math.isnan(temperature_c):
-            return
         away = self._inside.step(time_s, temperature_c) - temperature_c
         self._volts = (self._voltage_v_per_k + self._drop_per_k * drop_v) * away
 

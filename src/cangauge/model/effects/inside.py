@@ -21,6 +21,11 @@ class Inside:
     def __init__(self, lag_s: float) -> None:
         self._lag = LowPass(lag_s) if lag_s > AT_ONCE_S else None
 
+    @property
+    def is_late(self) -> bool:
+        """Whether it follows late."""
+        return self._lag is not None
+
     def step(self, time_s: float, measured_c: float) -> float:
         """Take one sample and return the temperature inside [°C]."""
         return measured_c if self._lag is None else self._lag.step(time_s, measured_c)

@@ -71,6 +71,7 @@ class _Online(OnlineEffect):
         self._reference_per_k = inverse_k_at(values["reference_c"])
         self._resistance_ohm = resistance_ohm
         self._inside = Inside(values["lag_s"])
+        self.follows_temperature = self._inside.is_late
         self._volts = 0.0
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
