@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cangauge.errors import CangaugeError, InputError
-from cangauge.identify.held_out import folds
+from cangauge.errors import InputError
+from cangauge.identify.held_out import LOGS_AT_LEAST, folds
 from cangauge.identify.least_squares import BLOCK_S, Solution, solve
 from cangauge.identify.options import FitOptions
 from cangauge.identify.rows import FitRows, fit_rows
@@ -157,25 +157,38 @@ def held_out_errors(
 ) -> list[FloatArray]:
     """Return each log's errors [V] under fits that did not see the rows.
 
-    NaN where no fold judged a row, where what it left identifies no model, or where its fit did not
-    see the row's SoC: how far the
-    model can be trusted beyond its range is another question (the estimate is flagged there).
+    NaN where no fold judged a row, or only with a fit that did not see its SoC: how far the
+    model can be trusted beyond its range is another question (the estimate is flagged there). NaN
+    too for a whole log without which the others identify no model.
+
+    Raises
+    ------
+    InputError
+        If a fold cannot be fitted, or none leaves logs that identify a model.
     """
     volts = np.concatenate([item.voltage_v for item in rows])
     soc = np.concatenate([item.soc_pct for item in rows])
     temperature = np.concatenate([item.temperature_c for item in rows])
     delayed = np.concatenate([item.delayed_current_a for item in rows])
     errors = np.full(volts.size, np.nan)
+    refused: InputError | None = None
     for fitted, left_out in folds(rows):
+        shape = int(fitted.sum()), KT + 1 + delayed.shape[1]
         try:
-            model, _ = fit_voltage_model(rows, options, fitted, is_held=is_held)
-        except CangaugeError:
-            continue  # the other logs alone identify no model: nothing judges these rows
+            _check_identifiable(rows, soc[fitted], delayed[fitted, 0], shape)
+        except InputError as error:
+            if len(rows) < LOGS_AT_LEAST:
+                raise  # a log that identifies a model does so without any of its blocks
+            refused = error
+            continue
+        model, _ = fit_voltage_model(rows, options, fitted, is_held=is_held)
         lo, hi = model.soc_range_pct
         judged = left_out & (soc > lo - 1.0) & (soc < hi + 1.0)
         errors[judged] = volts[judged] - model.voltage(
             soc[judged], temperature[judged], delayed[judged]
         )
+    if refused is not None and not np.isfinite(errors).any():
+        raise refused
     return np.split(errors, np.cumsum([len(item) for item in rows])[:-1])
 
 
