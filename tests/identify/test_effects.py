@@ -223,8 +223,22 @@ def test_columns_are_the_residuals_derivative() -> None:
     assert np.abs(moved - expected).max() < 0.02 * scale
 
 
-def test_no_row_is_judged_by_a_fit_that_saw_it() -> None:
+def test_kt_stays_physical_where_the_temperature_never_moves() -> None:
+    noise = np.random.default_rng(8)
+    still = [
+        replace(log, temperature_c=20.0 + noise.normal(0.0, 0.002, len(log)))
+        for log in trips("dynamics")
+    ]
+    result = fit(still, replace(OPTIONS, effects=("fast_polarization",)))
+    kt = result.model.coefficients["kt"]
+    assert abs(kt.value) < 3.0  # 8 mV/K a cell; a kelvin of noise would else pay for any
+    assert kt.std_error is not None
+    assert kt.std_error < 3.0
+
+
+def test_no_row_is_judged_by_a_fit_that_saw_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """A log that is spoilt must not change what the folds without it say of the others."""
+    monkeypatch.setattr("cangauge.identify.effects.linear.KT_WITHIN_PER_K", math.inf)
     logs = of_trips("dynamics")
     judge = Judge(logs)
     seen = np.zeros(judge.unit.size, dtype=int)

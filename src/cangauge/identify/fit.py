@@ -137,7 +137,8 @@ def fit(
     say(f"fitting {sum(map(len, rows))} rows of {len(rows)} logs")
     found = None
     if options.effects:
-        # Beside effects the logs that are left out judge kt too, so it is left free.
+        # Beside effects the logs that are left out judge kt too, so it is left free, but for what
+        # keeps it from being anything where the temperature never moves.
         free, _ = fit_voltage_model(rows, options, is_held=False)
         prepared = [prepare_log(log, options) for log in logs]
         found = fit_effects(ExtendedModel(free, capacity), prepared, options.effects, say)

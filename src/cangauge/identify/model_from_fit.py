@@ -153,10 +153,11 @@ def _information(
     scale[scale == 0.0] = 1.0
     first = beside.shape[1]
     table = np.column_stack([beside, columns / scale, volts])
-    if solution.held is not None:
-        holding = np.zeros(table.shape[1])
-        holding[first + KT] = solution.held.weight / scale[KT]
-        table = np.vstack([table, holding])
+    held = solution.held
+    weight = held.weight if held is not None else found.linear.kt_weight if found else 0.0
+    holding = np.zeros(table.shape[1])
+    holding[first + KT] = weight / scale[KT]
+    table = np.vstack([table, holding])
     root = np.linalg.qr(table).R[first:, first:]
     n = columns.shape[1]
     return Information(

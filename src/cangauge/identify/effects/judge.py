@@ -189,11 +189,13 @@ class Judge:
         """
         p = linear.columns.shape[1]
         table = np.column_stack([linear.columns, *extra, linear.residual_v])
+        holding = np.zeros((1, table.shape[1]))
+        holding[:, [*range(p), -1]] = linear.holding
         first = p + np.cumsum([0, *(columns.shape[1] for columns in extra)])
         choices = [np.arange(0), *(np.arange(a, b) for a, b in itertools.pairwise(first))]
         squares = np.full((len(choices), self.unit.size), np.nan)
         for fold in self.folds:
-            compact = np.linalg.qr(table[fold.fit_on]).R
+            compact = np.linalg.qr(np.vstack([table[fold.fit_on], holding])).R
             rows = table[fold.judge_on]
             span = spanning(linear.model, linear.here, fold.fit_on).model.soc_range_pct
             limits = linear.limits(span)

@@ -42,6 +42,12 @@ CONVERGED, ROUGHLY_CONVERGED = 1e-5, 1e-3
 """The steps end when the sum of squares falls by less than this part; roughly, in a search."""
 
 
+KT_WITHIN_PER_K = 2.5e-3
+"""How large kt may well be, in parts of the voltage [1/K]: 10 mV/K a cell, more than the published
+one. The logs that are left out judge it; but a temperature that never moves says nothing of it, and
+it could be anything."""
+
+
 @dataclass(frozen=True)
 class Free:
     """One number of an effect that is fitted."""
@@ -78,6 +84,17 @@ class Linear:
     """Of the voltage model's coefficients, then of `free`, shape (n, p)."""
     residual_v: FloatArray
     """Shape (n,)."""
+    kt_weight: float
+    """Weight of a row that says kt is 0 V/K [K] (`KT_WITHIN_PER_K`)."""
+
+    @property
+    def holding(self) -> FloatArray:
+        """The row that holds kt, of [columns | residual], shape (1, p + 1)."""
+        kt = len(BASIS_NAMES)
+        row = np.zeros((1, self.columns.shape[1] + 1))
+        row[0, kt] = self.kt_weight
+        row[0, -1] = -self.kt_weight * self.model.model.kt_v_per_k
+        return row
 
     def limits(self, soc_range_pct: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
         """Return matrix and lower limits of what a change must respect, (m, p) and (m,)."""
@@ -137,8 +154,10 @@ def residual_of(model: ExtendedModel, logs: Sequence[Prepared]) -> FloatArray:
     return np.concatenate([item.residual_v for item in predictions(model, logs)])
 
 
-def linearise(model: ExtendedModel, logs: Sequence[Prepared]) -> Linear:
-    """Return the residual of the logs near a model."""
+def linearise(
+    model: ExtendedModel, logs: Sequence[Prepared], kt_weight: float | None = None
+) -> Linear:
+    """Return the residual of the logs near a model; kt is held by the model's errors there."""
     here = predictions(model, logs)
     residual_v = np.concatenate([item.residual_v for item in here])
     columns = [coefficient_columns(model, logs, here)]
@@ -146,7 +165,16 @@ def linearise(model: ExtendedModel, logs: Sequence[Prepared]) -> Linear:
     for item in free:
         moved = _with_value(model, item, item.value + item.step)
         columns.append((residual_v - residual_of(moved, logs)) / item.step)
-    return Linear(model, tuple(here), free, np.column_stack(columns), residual_v)
+    if kt_weight is None:
+        kt_weight = _kt_weight(model, here)
+    return Linear(model, tuple(here), free, np.column_stack(columns), residual_v, kt_weight)
+
+
+def _kt_weight(model: ExtendedModel, here: Sequence[Prediction]) -> float:
+    """Return the weight of a row that holds kt at 0, errors taken as white [K]."""
+    residual_v = np.concatenate([item.residual_v for item in here])
+    within_v_per_k = KT_WITHIN_PER_K * model.pack.voltage_v
+    return float(np.sqrt(np.mean(residual_v**2))) / within_v_per_k
 
 
 def coefficient_columns(
@@ -237,7 +265,8 @@ def step_on(linear: Linear, keep: Mask | None = None) -> FloatArray:
         Rows to fit; all by default.
     """
     table = np.column_stack([linear.columns, linear.residual_v])
-    compact = np.linalg.qr(table if keep is None else table[keep]).R
+    kept = table if keep is None else table[keep]
+    compact = np.linalg.qr(np.vstack([kept, linear.holding])).R
     return best_change(compact, linear.limits(linear.model.model.soc_range_pct))
 
 
@@ -251,13 +280,14 @@ def refine(
     model: ExtendedModel, logs: Sequence[Prepared], converged: float = CONVERGED
 ) -> ExtendedModel:
     """Return the model fitted to the logs on its own equations, its ranges those of the logs."""
-    model, square = _ranged(model, logs)
+    weight = _kt_weight(model, predictions(model, logs))
+    model, square = _ranged(model, logs, weight)
     for _ in range(STEPS_AT_MOST):
-        linear = linearise(model, logs)
+        linear = linearise(model, logs, weight)
         change = step_on(linear)
         for _halving in range(HALVINGS_AT_MOST):
             try:
-                trial, now = _ranged(moved_by(linear, change), logs)
+                trial, now = _ranged(moved_by(linear, change), logs, weight)
             except InputError:
                 now = np.inf
             if now < square:
@@ -271,10 +301,13 @@ def refine(
     return model
 
 
-def _ranged(model: ExtendedModel, logs: Sequence[Prepared]) -> tuple[ExtendedModel, float]:
+def _ranged(
+    model: ExtendedModel, logs: Sequence[Prepared], kt_weight: float
+) -> tuple[ExtendedModel, float]:
     """Return the model with the ranges of the logs, and its sum of squares [V²]."""
     here = predictions(model, logs)
-    return spanning(model, here), float(sum(item.residual_v @ item.residual_v for item in here))
+    square = float(sum(item.residual_v @ item.residual_v for item in here))
+    return spanning(model, here), square + (kt_weight * model.model.kt_v_per_k) ** 2
 
 
 def solution_at(linear: Linear, block: NDArray[np.intp]) -> Solution:
@@ -293,8 +326,11 @@ def solution_at(linear: Linear, block: NDArray[np.intp]) -> Solution:
         Coefficients of the voltage model, then the values of `linear.free`.
     """
     limits = linear.limits(linear.model.model.soc_range_pct)
-    found = solve(linear.columns, linear.residual_v, block, *limits)
-    plain = solve(linear.columns, linear.residual_v, block, None, 0.0).coefficients
+    columns = np.vstack([linear.columns, linear.holding[:, :-1]])
+    residual_v = np.append(linear.residual_v, linear.holding[0, -1])
+    block = np.append(block, block.max() + 1)
+    found = solve(columns, residual_v, block, *limits)
+    plain = solve(columns, residual_v, block, None, 0.0).coefficients
     falls = bool(np.any((limits[0] @ plain - limits[1])[:SLOPE_CHECKS] < 0.0))
     at = np.concatenate((linear.model.model.coefficients, [item.value for item in linear.free]))
     return replace(found, coefficients=at, constrained=falls)
