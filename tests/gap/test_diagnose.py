@@ -183,6 +183,10 @@ def test_json_has_the_contracts_keys(offset: Diagnosis) -> None:
     assert {"verdict", "probability", "ambiguous_with", "accepted", "candidates"} <= set(
         found["cause"]
     )
+    cause = found["cause"]
+    chances = [item["probability"] for item in cause["candidates"]]
+    answers = [*chances, cause["probability_unknown"], cause["probability_none"]]
+    assert sum(answers) == pytest.approx(1.0)
     assert {item["axis"] for item in found["where"]} == {
         "soc", "temperature", "current", "rest", "time", "timescale",
     }  # fmt: skip

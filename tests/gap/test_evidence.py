@@ -14,7 +14,8 @@ from scipy.stats import halfnorm, norm
 
 from cangauge.gap.columns import Candidate, candidates
 from cangauge.gap.diagnose import diagnose
-from cangauge.gap.evidence import ErrorModel, Evidence, Frame
+from cangauge.gap.evidence import ErrorModel, Evidence
+from cangauge.gap.frame import Frame
 from cangauge.gap.scores import PRIOR_PARTS, scores
 from cangauge.identify.fit import FitOptions, fit
 from cangauge.identify.scales import SCALES

@@ -66,6 +66,18 @@ def test_references_that_the_structure_explains_do_not_stray(model: ModelFile) -
     assert np.exp(np.mean(np.log(strays))) < 2.0
 
 
+def test_a_reference_has_its_own_moments(model: ModelFile) -> None:
+    """A moment is a part of a log's length: a short reference has all that a long log has."""
+    short = synthetic_log(hours=0.3, start_pct=80.0, end_pct=70.0, noise_v=NOISE_V, seed=14)
+    references = [day(11), day(12), short]
+    settled = settle([synthetic_log(hours=2.0, seed=5)], model, references, library_without([]))
+    frame = settled.frame
+    moments = [k for k, at in enumerate(frame.shown) if "start_s" in frame.choices[at].shape]
+    assert moments
+    for terms in settled.references:
+        assert all(np.any(terms.effects[k] != 0.0) for k in moments)
+
+
 def test_where_no_step_does_the_most_probable_is_taken(
     model: ModelFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:

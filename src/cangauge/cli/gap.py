@@ -26,6 +26,7 @@ from cangauge.cli.tables import print_table
 from cangauge.errors import InputError
 from cangauge.gap.diagnose import Diagnosis, diagnose, in_words
 from cangauge.gap.extend import model_file_of
+from cangauge.gap.verdict import NONE, UNKNOWN
 from cangauge.logs.log import Log
 from cangauge.model.model_file import ModelFile, load_model, model_json
 from cangauge.report.words import NONE_KNOWN, number
@@ -166,6 +167,9 @@ def _show(found: Diagnosis) -> None:
                 NONE_KNOWN if closed is None else f"{100.0 * closed:.0f} %",
             ]
         )
+    for answer in (UNKNOWN, NONE):
+        chance = f"{found.verdict.chances[answer]:.2f}"
+        rows.append([answer, chance, NONE_KNOWN, NONE_KNOWN, NONE_KNOWN])
     headings = ["effect", "probability", "evidence [ln]", "left [V]", "closed"]
     print_table("Candidates; error left, and gap closed, on rows held out", headings, rows)
     if found.limits:

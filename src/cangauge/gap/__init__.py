@@ -5,6 +5,7 @@ What follows what, and where::
     diagnose       logs, model file, references → Diagnosis: all of the below
       settle       → Settled: everything that is the same for all verdicts
         columns      a log → LogTerms: its residual, and how that moves with every amplitude
+        frame        the candidates: which are structure, which a log's own, where their columns are
         evidence     LogTerms → Gram (products, by time scale) → Evidence (all but effects
                      integrated out)
         references   references → ErrorModel: error by time scale, how much logs differ, how far

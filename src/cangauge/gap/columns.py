@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cangauge.errors import InputError
 from cangauge.identify.effects.linear import coefficient_columns, predictions
 from cangauge.identify.effects.prepared import (
     Prepared,
@@ -25,6 +26,7 @@ from cangauge.identify.effects.prepared import (
 from cangauge.model.charge import BRIDGE_S
 from cangauge.model.effects.candidate import Candidate, candidates
 from cangauge.model.effects.first_order import low_passed
+from cangauge.model.effects.parameter import Pack
 from cangauge.model.extended import ExtendedModel
 
 __all__ = [
@@ -34,6 +36,7 @@ __all__ = [
     "Prepared",
     "candidates",
     "log_terms",
+    "own_choices",
     "prepare_log",
     "residual",
 ]
@@ -131,6 +134,21 @@ def log_terms(
         change = acting.model.coefficients - voltage_model.coefficients
         residual_v += baseline @ change + _structure_v(model, acting, choices, effects)
     return LogTerms(prepared, residual_v, baseline, own, effects)
+
+
+def own_choices(choices: Sequence[Candidate], pack: Pack, prepared: Prepared) -> list[Candidate]:
+    """Return the candidates as they are on one log: a moment is a part of its length.
+
+    Raises
+    ------
+    InputError
+        If they are not as many.
+    """
+    effects = list(dict.fromkeys(choice.effect for choice in choices))
+    own = candidates(effects, pack, prepared.log.time_s, elsewhere=True)
+    if [each.effect.id for each in own] != [each.effect.id for each in choices]:
+        raise InputError("the effects' shapes differ between logs", source=prepared.log.source)
+    return own
 
 
 def _structure_v(

@@ -100,6 +100,8 @@ class Diagnosis:
             "cause": {
                 "verdict": verdict.cause,
                 "probability": verdict.probability,
+                "probability_unknown": verdict.chances[UNKNOWN],
+                "probability_none": verdict.chances[NONE],
                 "ambiguous_with": list(verdict.ambiguous_with),
                 "explained_fraction": verdict.explained,
                 "accepted": [

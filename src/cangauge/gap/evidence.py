@@ -18,13 +18,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from cangauge.gap.columns import LEVELS, Candidate, LogTerms
+from cangauge.gap.columns import LogTerms
+from cangauge.gap.frame import Frame
 from cangauge.identify.scales import by_scale
 
 FloatArray = NDArray[np.float64]
@@ -92,24 +92,6 @@ class Evidence:
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
-    """Where a log's columns are in its products (`Gram`), as indices."""
-
-    coefficients: NDArray[np.intp]
-    structure: NDArray[np.intp]
-    effects: NDArray[np.intp]
-    """Amplitudes of all candidates, those of structure and own among them; none of a reference."""
-    own: NDArray[np.intp]
-    """What is each log's own: amplitudes of `Frame.own`, then `columns.LEVELS`."""
-    residual: int
-
-    @property
-    def shared(self) -> NDArray[np.intp]:
-        """What all logs share, in the order of a solution."""
-        return np.concatenate((self.coefficients, self.structure))
-
-
-@dataclass(frozen=True, eq=False)
 class Gram:
     """Products of a log's columns with each other: all that linear models need of its rows.
 
@@ -154,100 +136,6 @@ def gram_of(terms: LogTerms, scale: FloatArray, weight: FloatArray | None = None
         np.stack([each.T @ each for each in parts]),
         part * np.array([float(len(each)) for each in parts]),
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """What all evidence of one diagnosis shares."""
-
-    choices: tuple[Candidate, ...]
-    prior_root: FloatArray | None
-    """Square root of the coefficients' information, shape (p, p), in scaled columns."""
-    scale: FloatArray
-    """Scale of the baseline's columns, shape (p,)."""
-    repairs: tuple[int, ...] = ()
-    """Candidates that clean logs show too; all logs share their amplitudes."""
-    own: tuple[int, ...] = ()
-    """Candidates by which logs may differ without a cause: every effect, a little."""
-    own_prior: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """How much so before references were seen, as standard deviations: of the amplitudes of `own`,
-    then of `columns.LEVELS`."""
-    centre: FloatArray | None = None
-    """Where the information holds the coefficients, in scaled columns, shape (p,); 0 if None."""
-
-    @cached_property
-    def first(self) -> NDArray[np.intp]:
-        """Index of each candidate's first amplitude, one more than candidates."""
-        widths = [len(choice.amplitudes) for choice in self.choices]
-        return np.concatenate(([0], np.cumsum(widths))).astype(np.intp)
-
-    @cached_property
-    def neighbours(self) -> tuple[tuple[int, int], ...]:
-        """Pairs of candidates next to each other in one shape: what lies in between is a mixture.
-
-        A time constant between two of the grid, or a spread of them, is none of the grid's.
-        """
-        found = []
-        for a, one in enumerate(self.choices):
-            values = _shape_values(self.choices, one.effect.id)
-            for b in range(a + 1, len(self.choices)):
-                other = self.choices[b]
-                if other.effect.id != one.effect.id:
-                    break
-                differ = [name for name in one.shape if one.shape[name] != other.shape[name]]
-                if len(differ) == 1:
-                    grid = values[differ[0]]
-                    places = grid.index(one.shape[differ[0]]), grid.index(other.shape[differ[0]])
-                    if abs(places[0] - places[1]) == 1:
-                        found.append((a, b))
-        return tuple(found)
-
-    @cached_property
-    def diagnosed(self) -> Layout:
-        """Where the columns of a log are that is diagnosed: those of all candidates."""
-        p, amplitudes = self.scale.size, int(self.first[-1])
-        end = p + amplitudes
-        return Layout(
-            coefficients=np.arange(p),
-            structure=p + self.amplitudes_of(self.repairs),
-            effects=p + np.arange(amplitudes),
-            own=np.concatenate((p + self.amplitudes_of(self.own), end + np.arange(len(LEVELS)))),
-            residual=end + len(LEVELS),
-        )
-
-    @cached_property
-    def reference(self) -> Layout:
-        """Where the columns of a reference are: those of `shown` alone."""
-        p = self.scale.size
-        shared = p + self.amplitudes_of(self.repairs).size
-        end = shared + self.amplitudes_of(self.own).size + len(LEVELS)
-        return Layout(
-            coefficients=np.arange(p),
-            structure=np.arange(p, shared),
-            effects=np.zeros(0, dtype=np.intp),
-            own=np.arange(shared, end),
-            residual=end,
-        )
-
-    @property
-    def shown(self) -> tuple[int, ...]:
-        """Candidates whose columns are wanted of references too: repairs, then own."""
-        return (*self.repairs, *self.own)
-
-    def amplitudes_of(self, chosen: Sequence[int]) -> NDArray[np.intp]:
-        """Return the indices of some candidates' amplitudes."""
-        parts = [np.arange(self.first[k], self.first[k + 1]) for k in chosen]
-        return np.concatenate([np.zeros(0, dtype=np.intp), *parts])
-
-    def bounds_of(self, chosen: Sequence[int]) -> FloatArray:
-        """Return the bounds of some candidates' amplitudes, shape (…, 2)."""
-        return np.vstack([np.zeros((0, 2)), *(self.choices[k].bounds for k in chosen)])
-
-
-def _shape_values(choices: Sequence[Candidate], effect_id: str) -> dict[str, list[float]]:
-    """Return each shape's values on an effect's grid, ascending."""
-    shapes = [choice.shape for choice in choices if choice.effect.id == effect_id]
-    return {name: sorted({shape[name] for shape in shapes}) for name in shapes[0]}
 
 
 def gather(
@@ -423,7 +311,7 @@ def log_integral(precision: FloatArray, right: FloatArray) -> float:
     """
     balance = 1.0 / np.sqrt(np.diag(precision))
     root = np.linalg.cholesky(precision * balance * balance[:, None])
-    gained = np.linalg.solve(root, balance * right)
+    gained = solve_triangular(root, balance * right, lower=True, check_finite=False)
     volume = np.sum(np.log(np.diag(root))) - np.sum(np.log(balance))
     return float(0.5 * gained @ gained - volume)
 

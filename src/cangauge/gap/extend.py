@@ -168,8 +168,16 @@ def _refined(
 
     begin = (np.array([start[parameter.name] for parameter in parameters]) - centre) / scale
     begin = np.clip(begin, low + 1e-9, high - 1e-9)
-    found = least_squares(errors, begin, bounds=(low, high), diff_step=1e-3, max_nfev=12)
-    values = values_of(found.x)
+    # Differences are taken over a part of the value, which is nothing where a value is 0.
+    away = 1.0 - low
+    found = least_squares(
+        lambda shifted: errors(shifted - away),
+        begin + away,
+        bounds=(low + away, high + away),
+        diff_step=1e-3,
+        max_nfev=12,
+    )
+    values = values_of(found.x - away)
     return model.with_effect(effect, values), values
 
 

@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cangauge.gap.bounded import moved, within_bounds
-from cangauge.gap.columns import LogTerms, Prepared, log_terms
-from cangauge.gap.evidence import ErrorModel, Frame, Gram, gather, gram_of, log_likelihood
+from cangauge.gap.columns import LogTerms, Prepared, log_terms, own_choices
+from cangauge.gap.evidence import ErrorModel, Gram, gather, gram_of, log_likelihood
+from cangauge.gap.frame import Frame
 from cangauge.gap.structure import WORTH_IT, repaired
 from cangauge.model.extended import ExtendedModel
 
@@ -110,8 +111,10 @@ def reference_terms(
     """Return the references' columns, of the candidates in `Frame.shown`."""
     wanted = tuple(dict.fromkeys(frame.shown))  # structure may be a log's own as well
     at = [wanted.index(k) for k in frame.shown]
-    choices = [frame.choices[k] for k in wanted]
-    found = [log_terms(item, model, choices, acting) for item in references]
+    found = []
+    for item in references:
+        choices = own_choices(frame.choices, model.pack, item)
+        found.append(log_terms(item, model, [choices[k] for k in wanted], acting))
     return tuple(replace(terms, effects=tuple(terms.effects[k] for k in at)) for terms in found)
 
 

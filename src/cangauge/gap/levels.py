@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from cangauge.gap.columns import LEVELS
 from cangauge.gap.evidence import (
     ErrorModel,
-    Frame,
     Gram,
     gather,
     log_integral,
     log_likelihood,
     structure_precision,
 )
+from cangauge.gap.frame import Frame
 
 FloatArray = NDArray[np.float64]
 

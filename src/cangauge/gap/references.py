@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from cangauge.gap.evidence import (
     ErrorModel,
-    Frame,
     Gram,
     gather,
     information_of,
     log_integral,
     prior_precision,
 )
+from cangauge.gap.frame import Frame
 from cangauge.gap.levels import (
     OWN_LEVELS,
     STRUCTURE_LEVELS,

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cangauge.gap.evidence import Evidence, Frame, Gram, without_own
+from cangauge.gap.evidence import Evidence, Gram, without_own
+from cangauge.gap.frame import Frame
 from cangauge.gap.scores import Score
 from cangauge.identify.scales import SCALES
 

@@ -14,14 +14,15 @@ from cangauge.errors import InputError
 from cangauge.gap.columns import (
     Candidate,
     LogTerms,
-    Prepared,
     candidates,
     log_terms,
+    own_choices,
     prepare_log,
     residual,
 )
 from cangauge.gap.covered import charge_weight, counting, temperatures_covered
-from cangauge.gap.evidence import ErrorModel, Frame, Gram, gram_of
+from cangauge.gap.evidence import ErrorModel, Gram, gram_of
+from cangauge.gap.frame import Frame
 from cangauge.gap.learned import learn, reference_grams, reference_terms
 from cangauge.gap.references import (
     LEAST_TRUST_BEYOND,
@@ -211,7 +212,7 @@ def settle(
     diagnosed = []
     for item in of_logs:
         say(f"weighing {item.log.name} against every effect")
-        diagnosed.append(_terms(item, model, effects, choices, acting))
+        diagnosed.append(log_terms(item, model, own_choices(choices, model.pack, item), acting))
     return Settled(
         model=model,
         options=options,
@@ -238,20 +239,6 @@ def _judged(
         whole = bool(np.all(weight == 1.0)) or np.mean(weight > 0.0) < LEAST_INSIDE
         found.append(gram if whole else gram_of(terms, frame.scale, weight))
     return found
-
-
-def _terms(
-    prepared: Prepared,
-    model: ExtendedModel,
-    effects: Sequence[Effect],
-    choices: Sequence[Candidate],
-    acting: ExtendedModel | None,
-) -> LogTerms:
-    # A shape may depend on the log (a moment as a part of its length), so each has its own list.
-    own = candidates(effects, model.pack, prepared.log.time_s, elsewhere=True)
-    if len(own) != len(choices):
-        raise InputError("the effects' shapes differ between logs", source=prepared.log.source)
-    return log_terms(prepared, model, own, acting)
 
 
 def _frame(

@@ -16,12 +16,12 @@ from cangauge.gap.bounded import moved, within_bounds
 from cangauge.gap.columns import Candidate
 from cangauge.gap.evidence import (
     ErrorModel,
-    Frame,
     Gram,
     gather,
     log_integral,
     structure_precision,
 )
+from cangauge.gap.frame import Frame
 from cangauge.model.extended import ExtendedModel
 
 FloatArray = NDArray[np.float64]

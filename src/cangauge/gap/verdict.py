@@ -38,7 +38,7 @@ SEEN_BELOW = 0.17
 """Something is there if `none` has less than this probability."""
 
 NAMED_FROM = 0.2
-"""And it is named if the best effect is it with this probability, given that something is there."""
+"""And it is named if the best effect is it with this probability."""
 
 ALIKE_FROM = 0.5
 """Effects that are at least so likely, in parts of the best, are not told from it."""
@@ -91,7 +91,7 @@ def decide(settled: Settled) -> Verdict:
     if settled.error.strays:
         chances = _chances(belief)
         seen = belief.none < SEEN_BELOW
-        named = seen and belief.best >= NAMED_FROM * (1.0 - belief.none)
+        named = seen and belief.best >= NAMED_FROM
     else:
         something = compared.found >= ACCEPT_LOG_BAYES
         named = something and explained >= EXPLAINED_AT_LEAST
