@@ -215,7 +215,7 @@ def judge(cases: Sequence[Case]) -> None:
             names, shares, features = ranked(case, which)
             logits = np.array([0.0, *(whether @ features)])
             none, best, _ = np.exp(logits - logits.max()) / np.exp(logits - logits.max()).sum()
-            verdict = names[0] if best >= NAMED_FROM * (1.0 - none) else "unknown"
+            verdict = names[0] if best >= NAMED_FROM else "unknown"
             verdict = verdict if none < SEEN_BELOW else "none"
             pair = names[1] if shares[1] >= ALIKE_FROM * shares[0] > shares[2] else ""
             right = names[0] == case.truth

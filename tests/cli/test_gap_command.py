@@ -70,6 +70,8 @@ def test_people_are_told_the_verdict_and_what_the_logs_cannot_show(
         "What these logs cannot show:", "- No reference logs: whether",
     ):  # fmt: skip
         assert text in ran.out
+    table = {line.split()[0] for line in ran.out.splitlines() if line.strip()}
+    assert {"unknown", "none"} <= table
 
 
 def test_a_log_that_is_its_own_reference_is_refused(run: Run, made: Path, days: Path) -> None:

@@ -120,7 +120,7 @@ NAMED: Final[tuple[FaultKind, ...]] = (
         signed=True, physical=True, says="the voltage sensor reads (1 + x) of the voltage",
     ),
     FaultKind(
-        "temperature_lag", "thermal", "lag_s", "s", _span(40.0, 3000.0),
+        "temperature_lag", "thermal", "lag_s", "s", _span(40.0, 2000.0),
         lambda c, _p, x, _s, _r: replace(c, temperature_lag_s=x),
         says="the temperature sensor sits in a pocket: two lags of x/2 in a row",
     ),
@@ -187,13 +187,13 @@ NAMED: Final[tuple[FaultKind, ...]] = (
         says="a finite Warburg element of x Ω with minutes of delay",
     ),
     FaultKind(
-        "hysteresis", "equilibrium", "half_width_v", "V", _volts(2e-4, 0.02),
+        "hysteresis", "equilibrium", "half_width_v", "V", _volts(2e-4, 0.01),
         lambda c, _p, x, s, _r: replace(c, hysteresis_v=x, hysteresis_reach=s["reach"]),
         shape={"reach": Span(0.005, 0.08, logarithmic=True)},
         says="the open-circuit voltage is x V lower after discharge, x V higher after charge",
     ),
     FaultKind(
-        "entropic_coefficient", "equilibrium", "bend_mv_k", "mV/K", _span(0.01, 2.0), _entropy,
+        "entropic_coefficient", "equilibrium", "bend_mv_k", "mV/K", _span(0.01, 0.5), _entropy,
         says="dU/dT of a cell differs by a smooth curve of RMS x over the charge",
     ),
     FaultKind(

@@ -22,7 +22,12 @@ class WeakCell(Effect):
     parameters = (
         Parameter("fraction", "1", 0.0, 0.15),
         Parameter(
-            "deficit_pct", "%", 2.0, 40.0, neutral=None, grid=(4.0, 7.0, 11.0, 16.0, 23.0, 33.0)
+            "deficit_pct",
+            "%",
+            2.0,
+            65.0,
+            neutral=None,
+            grid=(4.0, 7.0, 11.0, 16.0, 23.0, 33.0, 48.0),
         ),
     )
     signature = "the knee near empty comes early, by the share of the weak cells"
