@@ -34,7 +34,7 @@ LARGE = 1.5
 UNSURE = 0.5
 """Nor is any effect given more than this probability there."""
 
-SEEN_BELOW = 0.17
+SEEN_BELOW = 0.1
 """Something is there if `none` has less than this probability."""
 
 NAMED_FROM = 0.2
