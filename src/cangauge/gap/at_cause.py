@@ -109,7 +109,7 @@ def _terms_at(
     terms: LogTerms, settled: Settled, causes: Sequence[Cause], *, tangents: bool = True
 ) -> LogTerms:
     """Return a diagnosed log's terms with the causes in its residual, and their tangents there."""
-    prepared, acting = terms.prepared, settled.acting or settled.model
+    prepared, acting = terms.prepared.remembering(), settled.acting or settled.model
     changed = residual(prepared, with_causes(acting, causes)) - residual(prepared, acting)
     effects = list(terms.effects)
     if tangents:

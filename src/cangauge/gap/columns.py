@@ -23,9 +23,7 @@ from cangauge.identify.effects.prepared import (
     residual,
     state_of,
 )
-from cangauge.model.charge import BRIDGE_S
 from cangauge.model.effects.candidate import Candidate, candidates
-from cangauge.model.effects.first_order import low_passed
 from cangauge.model.effects.parameter import Pack
 from cangauge.model.extended import ExtendedModel
 
@@ -97,20 +95,22 @@ def log_terms(
     """
     voltage_model = model.model
     rows = prepared.rows
+    remembering = prepared.remembering()  # until all columns are there
     current = prepared.log.current_a
-    slow = low_passed(prepared.log.time_s, current, OWN_SLOW_S, 0.0, rest_s=BRIDGE_S)
+    slow = remembering.signals.history.lagged_a(OWN_SLOW_S)
     own = np.column_stack(
         [
             -model.pack.resistance_ohm * slow[prepared.at],
             -model.pack.resistance_ohm * current[prepared.at],
         ]
     )
-    smooth = as_modelled(prepared, model)
+    smooth = as_modelled(remembering, model)
     here = residual(smooth, model)
     state = state_of(smooth, model)
     if acting is not None:
-        smooth_acting = as_modelled(prepared, acting)
+        smooth_acting = as_modelled(remembering, acting)
         here_acting = residual(smooth_acting, acting)
+        state_acting = state_of(smooth_acting, acting)
     # Effects that the model has already may scale what its coefficients multiply.
     baseline = (
         coefficient_columns(model, [prepared], predictions(model, [prepared]))
@@ -124,12 +124,12 @@ def log_terms(
         )
     )
     effects = tuple(
-        effect_columns(smooth_acting, acting, choice, here_acting)
+        effect_columns(smooth_acting, acting, choice, here_acting, state_acting)
         if acting is not None and choice.effect.family == "thermal"
         else effect_columns(smooth, model, choice, here, state)
         for choice in choices
     )
-    residual_v = residual(prepared, acting or model)
+    residual_v = residual(remembering, acting or model)
     if acting is not None:
         change = acting.model.coefficients - voltage_model.coefficients
         residual_v += baseline @ change + _structure_v(model, acting, choices, effects)

@@ -123,14 +123,15 @@ class ExtendedModel:
         """
         corrected = self.corrected(signals)
         soc = self.counted_soc(corrected, initial_soc_pct, anchor_row=anchor_row)
-        time, current = corrected.time_s, corrected.current_a
-        volts = self.model.voltage(
-            soc[at_rows],
-            corrected.temperature_c[at_rows],
-            delayed_currents(time, current, self.model.delay_s, time[at_rows]),
-        )
-        if self.effects:
-            volts = volts + self.extra_voltage(self.state(corrected, soc))[at_rows]
+        state = self.state(corrected, soc) if self.effects else None
+        if state is not None:
+            delayed = state.history.delayed_a(self.model.delay_s)[at_rows]
+        else:  # rows are few where a log is fast
+            time = corrected.time_s
+            delayed = delayed_currents(time, corrected.current_a, self.model.delay_s, time[at_rows])
+        volts = self.model.voltage(soc[at_rows], corrected.temperature_c[at_rows], delayed)
+        if state is not None:
+            volts = volts + self.extra_voltage(state)[at_rows]
         return Prediction(at_rows, volts, corrected, soc)
 
     def corrected(self, signals: Signals) -> Signals:
@@ -151,20 +152,25 @@ class ExtendedModel:
     ) -> FloatArray:
         """Return the SoC counted from corrected signals [%], shape (n,)."""
         counting = self.counting(initial_soc_pct)
-        out = discharged_ah(corrected.time_s, counting.counted(corrected.current_a))
+        counted = counting.counted(corrected.current_a)
+        if counted is corrected.current_a:
+            out = corrected.history.out_ah
+        else:
+            out = discharged_ah(corrected.time_s, counted)
         moved = 100.0 * (out - out[anchor_row]) / counting.capacity_ah
         return np.asarray(counting.initial_soc_pct - moved)
 
     def state(self, corrected: Signals, soc_pct: FloatArray) -> PackState:
         """Return what extra voltages depend on, for all rows of corrected signals."""
-        time, current = corrected.time_s, corrected.current_a
-        delayed = delayed_currents(time, current, self.model.delay_s, time)
+        history = corrected.history
+        delayed = history.delayed_a(self.model.delay_s)
         return PackState(
-            time_s=time,
-            current_a=current,
+            time_s=corrected.time_s,
+            current_a=corrected.current_a,
             temperature_c=corrected.temperature_c,
             soc_pct=soc_pct,
             drop_v=delayed @ np.array(self.model.resistance_ohm),
+            remembered=history,
         )
 
     def extra_voltage(self, state: PackState) -> FloatArray:

@@ -491,12 +491,12 @@ def test_lag_solves_its_equation_on_a_ramp() -> None:
 
 def test_a_lag_is_worked_out_once_for_a_current_and_anew_for_another() -> None:
     state = steady(600.0, 30.0)
-    first = state.lagged_current_a(50.0)
-    assert state.lagged_current_a(50.0) is first
+    first = state.history.lagged_a(50.0)
+    assert state.history.lagged_a(50.0) is first
     np.testing.assert_array_equal(first, low_passed(state.time_s, state.current_a, 50.0, 0.0))
     doubled = with_current(state, 2.0 * state.current_a)
-    np.testing.assert_allclose(doubled.lagged_current_a(50.0), 2.0 * first)
-    assert abs(state.lagged_current_a(100.0)[-1]) < abs(first[-1])
+    np.testing.assert_allclose(doubled.history.lagged_a(50.0), 2.0 * first)
+    assert abs(state.history.lagged_a(100.0)[-1]) < abs(first[-1])
 
 
 @given(st.lists(st.floats(0.0, 2000.0), min_size=1, max_size=80), st.integers(0, 1000))

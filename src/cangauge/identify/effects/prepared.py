@@ -34,12 +34,12 @@ class Prepared:
     """Index of the rows in the log, shape (m,)."""
     initial_soc_pct: float
     """SoC at the log's first sample [%]."""
+    signals: Signals
+    """The log's signals at its own rate."""
 
-    @property
-    def signals(self) -> Signals:
-        """The log's signals at its own rate."""
-        log = self.log
-        return Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
+    def remembering(self) -> Prepared:
+        """Return the same, with the current's history kept as long as it: quicker, and larger."""
+        return replace(self, signals=self.signals.remembering())
 
 
 def prepare_log(log: Log, options: FitOptions) -> Prepared:
@@ -60,7 +60,8 @@ def prepare_log(log: Log, options: FitOptions) -> Prepared:
     at = np.searchsorted(log.time_s, rows.time_s)
     out_ah = discharged_ah(log.time_s, log.current_a)
     first = float(rows.soc_pct[0] + 100.0 * out_ah[at[0]] / (options.capacity_ah or np.nan))
-    return Prepared(log, rows, at, first)
+    signals = Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
+    return Prepared(log, rows, at, first, signals)
 
 
 def residual(prepared: Prepared, model: ExtendedModel) -> FloatArray:
@@ -112,8 +113,9 @@ def effect_columns(
 
 
 def as_modelled(prepared: Prepared, model: ExtendedModel) -> Prepared:
-    """Return the log with the model's voltage in place of the measured one."""
-    everywhere = np.arange(len(prepared.log))
-    prediction = model.predict(prepared.signals, prepared.initial_soc_pct, everywhere)
-    volts = prepared.log.voltage_v - prediction.residual_v
-    return replace(prepared, log=replace(prepared.log, voltage_v=volts))
+    """Return the log's signals with the model's voltage in place of the measured one."""
+    signals = prepared.signals
+    everywhere = np.arange(signals.time_s.size)
+    prediction = model.predict(signals, prepared.initial_soc_pct, everywhere)
+    volts = signals.voltage_v - prediction.residual_v
+    return replace(prepared, signals=replace(signals, voltage_v=volts))

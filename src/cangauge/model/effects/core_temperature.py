@@ -50,8 +50,7 @@ class CoreTemperature(Effect):
 
     def correct(self, signals: Signals, values: Values, pack: Pack) -> Signals:
         """Return the signals with the core's temperature."""
-        heat = (signals.current_a / pack.capacity_ah) ** 2
-        above = low_passed(signals.time_s, heat, values["tau_s"], 0.0, rest_s=BRIDGE_S)
+        above = signals.history.lagged_a2(values["tau_s"]) / pack.capacity_ah**2
         outside = signals.temperature_c
         core = outside + values["rise_k"] * above
         if values["late"]:

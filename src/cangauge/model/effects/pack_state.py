@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cangauge.model.charge import BRIDGE_S
+from cangauge.model.effects.current_history import CurrentHistory, history_of
 from cangauge.model.effects.first_order import low_passed
 from cangauge.model.effects.parameter import Pack, Parameter
+from cangauge.model.voltage_model import VoltageModel
 
 FloatArray = NDArray[np.float64]
 
@@ -26,6 +28,17 @@ class Signals:
     current_a: FloatArray
     voltage_v: FloatArray
     temperature_c: FloatArray
+    remembered: CurrentHistory | None = None
+    """The current's history, of use as long as it is the same current."""
+
+    @property
+    def history(self) -> CurrentHistory:
+        """The current's history: what is remembered of it, or a new one."""
+        return history_of(self.time_s, self.current_a, self.remembered)
+
+    def remembering(self) -> Signals:
+        """Return the signals with a history that lasts as long as the current does."""
+        return replace(self, remembered=CurrentHistory(self.time_s, self.current_a))
 
 
 @dataclass(frozen=True)
@@ -58,20 +71,15 @@ class PackState:
     soc_pct: FloatArray
     drop_v: FloatArray
     """Σ Rj·I(t − dj) of the voltage model [V]; negative while discharging."""
-    _lagged_a: dict[float, FloatArray] = field(default_factory=dict, init=False, repr=False)
+    remembered: CurrentHistory | None = None
+    """The history of that current, where it is known already."""
     _inside_c: dict[float, FloatArray] = field(default_factory=dict, init=False, repr=False)
+    _slopes: dict[VoltageModel, FloatArray] = field(default_factory=dict, init=False, repr=False)
 
-    def lagged_current_a(self, tau_s: float) -> FloatArray:
-        """Return the current behind a first-order lag [A], shape (n,), at rest before the log.
-
-        Many effects and shapes ask for the same lags, which are most of the work on a long log, so
-        each is worked out once. The array is shared: not to be written to.
-        """
-        if tau_s not in self._lagged_a:
-            self._lagged_a[tau_s] = low_passed(
-                self.time_s, self.current_a, tau_s, 0.0, rest_s=BRIDGE_S
-            )
-        return self._lagged_a[tau_s]
+    @cached_property
+    def history(self) -> CurrentHistory:
+        """The current's history."""
+        return history_of(self.time_s, self.current_a, self.remembered)
 
     def inside_c(self, lag_s: float) -> FloatArray:
         """Return the temperature of cells that follow the measured one late [°C], shape (n,).
@@ -86,6 +94,12 @@ class PackState:
                 else measured
             )
         return self._inside_c[lag_s]
+
+    def ocv_slope(self, model: VoltageModel) -> FloatArray:
+        """Return the slope of a model's pseudo-OCV [V per %], shape (n,); kept as well."""
+        if model not in self._slopes:
+            self._slopes[model] = model.pseudo_ocv_slope(self.soc_pct)
+        return self._slopes[model]
 
     def scaled_drop_v(self, delayed: float, pack: Pack) -> FloatArray:
         """Return the drop that an effect scales [V], shape (n,) (`DELAYED`)."""

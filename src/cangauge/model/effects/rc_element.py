@@ -17,7 +17,7 @@ ACTIVATION = Parameter("activation_k", "K", 0.0, 6000.0, neutral=None, grid=(0.0
 
 def rc_voltage(state: PackState, ohm: float, tau_s: float, activation_k: float = 0.0) -> FloatArray:
     """Return −R(T)·(lagged current) [V], shape (n,), at rest before the first sample."""
-    lagged = state.lagged_current_a(tau_s)
+    lagged = state.history.lagged_a(tau_s)
     if activation_k:
         lagged = lagged * arrhenius(state.temperature_c, activation_k)
     return -ohm * lagged

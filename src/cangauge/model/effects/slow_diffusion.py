@@ -79,7 +79,7 @@ class SlowDiffusion(Effect):
         for ohm, tau_s in _elements(values):
             total += rc_voltage(state, ohm, tau_s, values["activation_k"])
         if values["by_slope"]:
-            steepness = model.pseudo_ocv_slope(state.soc_pct) / _mean_slope(model)
+            steepness = state.ocv_slope(model) / _mean_slope(model)
             total *= 1.0 + values["by_slope"] * (np.clip(steepness, 0.0, STEEPEST) - 1.0)
         return total
 
