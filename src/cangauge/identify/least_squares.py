@@ -134,13 +134,17 @@ def _nearest(z: FloatArray, bounds: FloatArray, at_least: FloatArray) -> FloatAr
 
 
 def _nearest_within(z: FloatArray, bounds: FloatArray, at_least: FloatArray) -> FloatArray:
+    # From z on and in units of what is missed most: the solver's tolerances suit numbers about 1,
+    # and at a hundred it may stop short.
+    missed = at_least - bounds @ z
+    unit = float(np.abs(missed).max())
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     solution = clarabel.DefaultSolver(
         sparse.csc_matrix(np.eye(z.size)),
-        -z,
+        np.zeros(z.size),
         sparse.csc_matrix(-bounds),
-        -at_least,
+        -missed / unit,
         [clarabel.NonnegativeConeT(at_least.size)],
         settings,
     ).solve()
@@ -149,7 +153,7 @@ def _nearest_within(z: FloatArray, bounds: FloatArray, at_least: FloatArray) -> 
             f"the fit under a rising pseudo-OCV found no solution ({solution.status}):"
             " is the sign of current right, and does the log move over some SoC?"
         )
-    return np.array(solution.x)
+    return z + unit * np.array(solution.x)
 
 
 def _clustered_std_error(

@@ -154,7 +154,11 @@ def _information(
     first = beside.shape[1]
     table = np.column_stack([beside, columns / scale, volts])
     held = solution.held
-    weight = held.weight if held is not None else found.linear.kt_weight if found else 0.0
+    weight = 0.0
+    if held is not None:
+        weight = held.weight
+    elif found is not None:
+        weight = found.linear.kt_weight
     holding = np.zeros(table.shape[1])
     holding[first + KT] = weight / scale[KT]
     table = np.vstack([table, holding])

@@ -280,14 +280,16 @@ def refine(
     model: ExtendedModel, logs: Sequence[Prepared], converged: float = CONVERGED
 ) -> ExtendedModel:
     """Return the model fitted to the logs on its own equations, its ranges those of the logs."""
-    weight = _kt_weight(model, predictions(model, logs))
-    model, square = _ranged(model, logs, weight)
+    here = predictions(model, logs)
+    weight = _kt_weight(model, here)
+    model, square = _ranged(model, here, weight)
     for _ in range(STEPS_AT_MOST):
         linear = linearise(model, logs, weight)
         change = step_on(linear)
         for _halving in range(HALVINGS_AT_MOST):
             try:
-                trial, now = _ranged(moved_by(linear, change), logs, weight)
+                trial = moved_by(linear, change)
+                trial, now = _ranged(trial, predictions(trial, logs), weight)
             except InputError:
                 now = np.inf
             if now < square:
@@ -302,10 +304,9 @@ def refine(
 
 
 def _ranged(
-    model: ExtendedModel, logs: Sequence[Prepared], kt_weight: float
+    model: ExtendedModel, here: Sequence[Prediction], kt_weight: float
 ) -> tuple[ExtendedModel, float]:
     """Return the model with the ranges of the logs, and its sum of squares [V²]."""
-    here = predictions(model, logs)
     square = float(sum(item.residual_v @ item.residual_v for item in here))
     return spanning(model, here), square + (kt_weight * model.model.kt_v_per_k) ** 2
 
