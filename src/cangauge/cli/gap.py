@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -29,7 +30,8 @@ from cangauge.gap.extend import model_file_of
 from cangauge.gap.verdict import NONE, UNKNOWN
 from cangauge.logs.log import Log
 from cangauge.model.model_file import ModelFile, load_model, model_json
-from cangauge.report.words import NONE_KNOWN, number
+from cangauge.report.gap_limits import verdict_limit
+from cangauge.report.words import NONE_KNOWN, number, significant
 
 SHOWN = 5
 SHORTEST_S = 300.0
@@ -125,6 +127,19 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
             note(f"wrote {written}")
 
 
+def _with_units(parameters: Mapping[str, dict[str, Any]]) -> str:
+    """Return parameters with their 95 % intervals, where they have any."""
+    said = []
+    for name, told in parameters.items():
+        unit = "" if told["unit"] == "1" else f" {told['unit']}"
+        within = ""
+        if told["ci"] is not None:
+            low, high = (significant(value, 3) for value in told["ci"])
+            within = f" ({low} … {high})"
+        said.append(f"{name} {significant(told['value'], 3)}{unit}{within}")
+    return ", ".join(said)
+
+
 def _check_apart(logs: list[Path], references: list[Path]) -> None:
     known = {path.resolve() for path in references}
     for path in logs:
@@ -147,14 +162,16 @@ def _long_enough(log: Log) -> Log:
         raise InputError(
             f"{log.duration_s:.0f} s of data show nothing but the start: nothing can be concluded",
             source=log.source or log.name,
-            cure=f"give a log of at least {SHORTEST_S:.0f} s, better half an hour with changing"
-            " load and SoC",
+            cure=f"give a log of at least {SHORTEST_S / 60.0:.0f} min, better half an hour with"
+            " changing load and SoC",
         )
     return log
 
 
 def _show(found: Diagnosis) -> None:
     typer.echo(in_words(found))
+    if open_question := verdict_limit(found):
+        typer.echo(open_question)
     rows = []
     for item in found.candidates[:SHOWN]:
         closed = item["closed_fraction"]
@@ -172,6 +189,9 @@ def _show(found: Diagnosis) -> None:
         rows.append([answer, chance, NONE_KNOWN, NONE_KNOWN, NONE_KNOWN])
     headings = ["effect", "probability", "evidence [ln]", "left [V]", "closed"]
     print_table("Candidates; error left, and gap closed, on rows held out", headings, rows)
+    for item in found.candidates:
+        if item["effect"] in found.extension.cause:
+            typer.echo(f"{item['effect']}: {_with_units(item['parameters'])}")
     if found.limits:
         typer.echo("What these logs cannot show:")
     for sentence in found.limits:

@@ -27,16 +27,26 @@ from cangauge.gap.held_out import (
     judge,
     rms,
 )
-from cangauge.gap.limits import limits, stepped_temperature
+from cangauge.gap.limits import limits, reference_fit, stepped_temperature, worse_with
 from cangauge.gap.moments import Moment, worst_moments
 from cangauge.gap.settle import Settled, settle
 from cangauge.gap.soc_error import soc_mae_pct
-from cangauge.gap.verdict import ACCEPT_LOG_BAYES, NONE, UNKNOWN, Verdict, decide
+from cangauge.gap.verdict import (
+    ACCEPT_LOG_BAYES,
+    NONE,
+    OF_TEMPERATURE,
+    UNKNOWN,
+    Verdict,
+    decide,
+)
 from cangauge.gap.where import Place, places
 from cangauge.logs.log import Log
 from cangauge.model.model_file import ModelFile
 
 FloatArray = NDArray[np.float64]
+
+EVEN = 0.5
+"""A verdict with less is as likely wrong as right."""
 
 SHOWN = 6
 """So many candidates are judged on rows held out and listed in full."""
@@ -51,6 +61,8 @@ class Diagnosis:
     baseline_rmse_v: float
     extended_rmse_v: float
     floor_v: float
+    stated_v: float
+    """RMS error that the model file states [V]."""
     explainable_v: float | None
     """What the most flexible structure of the references leaves of one that is left out [V]."""
     baseline_soc_mae_pct: float | None
@@ -78,7 +90,16 @@ class Diagnosis:
         steps = stepped_temperature(
             settled.temperature_step_k, settled.model.model.kt_v_per_k, self.floor_v
         )
-        return [*found, steps] if steps else found
+        misses = {
+            terms.prepared.log.name: rms(errors)
+            for terms, errors in zip(settled.references, settled.given_errors_v[0], strict=True)
+        }
+        fit = reference_fit(misses, self.stated_v, settled.as_given.pack.voltage_v)
+        worse = ""
+        if self.extension.cause:
+            worse = worse_with(self.baseline_rmse_v, self.extended_rmse_v)
+        said = [*settled.left_out, worse, fit, *found, steps]
+        return [sentence for sentence in said if sentence]
 
     def to_dict(self, extended_model: str | None = None) -> dict[str, Any]:
         """Return the object that `cangauge gap --json` prints."""
@@ -188,6 +209,7 @@ def diagnose(
         baseline_rmse_v=baseline,
         extended_rmse_v=extended,
         floor_v=floor,
+        stated_v=model_file.noise.voltage_rmse_v,
         explainable_v=float(np.sqrt(clean_v2)) if clean_v2 > 0.0 else None,
         baseline_soc_mae_pct=soc_mae_pct(logs, model_file),
         extended_soc_mae_pct=soc_mae_pct(logs, better),
@@ -274,6 +296,9 @@ def in_words(diagnosis: Diagnosis) -> str:
         if references and diagnosis.baseline_rmse_v > diagnosis.floor_v:
             gap += f", {diagnosis.extended_rmse_v:.2f} V with what they teach"
         beyond = "references show or explain" if references else "model file states"
+        if verdict.probability < EVEN:
+            chance = f"that there is none has a probability of {verdict.probability:.2f}"
+            return f"No gap that is certain beyond what the {beyond} ({gap}); {chance}."
         return f"No gap beyond what the {beyond} ({gap})."
     if verdict.cause == UNKNOWN:
         return f"A gap ({gap}) that no effect in the library is likely to be the cause of."
@@ -282,9 +307,17 @@ def in_words(diagnosis: Diagnosis) -> str:
         if verdict.ambiguous_with
         else ""
     )
+    after = f"with it {diagnosis.extended_rmse_v:.2f} V on rows left out"
+    if diagnosis.extended_rmse_v > diagnosis.baseline_rmse_v:
+        after += ", more than without"
+    healthy = ""
+    if not diagnosis.settled.covered and verdict.cause in OF_TEMPERATURE:
+        healthy = (
+            " No reference has these temperatures, and there healthy cells do so as well: it tells"
+            " no fault."
+        )
     return (
-        f"{gap}: {verdict.cause} (probability {verdict.probability:.2f}{alike});"
-        f" with it {diagnosis.extended_rmse_v:.2f} V on rows left out."
+        f"{gap}: {verdict.cause} (probability {verdict.probability:.2f}{alike}); {after}.{healthy}"
     )
 
 

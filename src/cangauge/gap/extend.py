@@ -161,9 +161,11 @@ def _refined(
         values = (centre + unit * scale).tolist()
         return {p.name: value for p, value in zip(parameters, values, strict=True)} | constants
 
+    logs = [terms.prepared.remembering() for terms in settled.diagnosed]
+
     def errors(unit: FloatArray) -> FloatArray:
         trial = model.with_effect(effect, values_of(unit))
-        volts = [residual(terms.prepared, trial) for terms in settled.diagnosed]
+        volts = [residual(log, trial) for log in logs]
         return np.concatenate([*volts, prior * unit])
 
     begin = (np.array([start[parameter.name] for parameter in parameters]) - centre) / scale

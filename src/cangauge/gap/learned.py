@@ -58,10 +58,10 @@ def learn(
     wanted, most = log_likelihood(frame, grams, error) - WORTH_IT, -np.inf
     # The coefficients first: a rise is as much too large in the columns as kt is too small.
     last = found = _moved(references, Learned(model, None, frame, (), tuple(grams)), error)
-    for _ in range(MOST_STEPS):
+    for left in reversed(range(MOST_STEPS)):
         step = _step(references, last, error)
         here = log_likelihood(step.frame, step.grams, error)
-        if here >= wanted:
+        if here >= wanted or (here > most and left == 0):
             return step
         last = replace(step, references=())
         del step  # columns of long references fill hundreds of megabytes: one set at a time

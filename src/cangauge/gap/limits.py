@@ -5,13 +5,14 @@ Each limit is a sentence: what the logs are like, and what can therefore not be 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from cangauge.gap.columns import Prepared
 from cangauge.gap.covered import COVERED_K, COVERED_PCT
 from cangauge.logs.log import TemperatureSource
+from cangauge.model.charge import BRIDGE_S
 
 SHORT_S = 600.0
 """In a shorter log little builds up [s]."""
@@ -25,6 +26,10 @@ is rest [1/h]."""
 
 STEPS_PART = 0.5
 """Half a step of the reported temperature that makes less than this part of the floor is little."""
+
+MISSED_PART, ODD_TIMES, STATED_TIMES = 0.005, 3.0, 5.0
+"""A reference is missed by more than this part of the voltage, and by so many times what the others
+are, or what the model file states."""
 
 FEW_REFERENCES = 3
 """Fewer tell hardly how much logs differ without a cause."""
@@ -55,6 +60,7 @@ def limits(
         _duration(logs),
         _temperature(logs, references),
         _soc(logs, references),
+        _pauses(logs),
         _source([*logs, *references], temperature_source),
         _start(logs, initial_soc_pct),
         _reference_start(references),
@@ -84,6 +90,69 @@ def stepped_temperature(step_k: float, kt_v_per_k: float, floor_v: float) -> str
         f" by {1e3 * kt_v_per_k:.0f} mV/K: up to {half_v:.2f} V for as long as a report stands. It"
         " is read between the steps here, as far as they tell; a service cannot look ahead, and its"
         " voltage model errs by so much. A temperature with a finer step shows smaller causes."
+    )
+
+
+def reference_fit(misses_v: Mapping[str, float], stated_v: float, voltage_v: float) -> str:
+    """Return what references mean that the model does not fit; "" where it does.
+
+    Parameters
+    ----------
+    misses_v : mapping of str to float
+        The given model's RMS error on each reference [V].
+    stated_v : float
+        What the model file states of itself [V].
+    voltage_v : float
+        The pack's usual voltage [V].
+    """
+    if not misses_v:
+        return ""
+    worst = max(misses_v, key=lambda name: misses_v[name])
+    others = [volts for name, volts in misses_v.items() if name != worst]
+    part = misses_v[worst] / voltage_v
+    if others and part > MISSED_PART and misses_v[worst] > ODD_TIMES * float(np.median(others)):
+        return (
+            f"The model misses the reference {worst} by {misses_v[worst]:.1f} V"
+            f" ({100.0 * part:.0f} % of the voltage), the others by {np.median(others):.2f} V: is"
+            " it a log of this pack, with the right SoC at its start? What is learned from it can"
+            " hide a cause."
+        )
+    usual = float(np.median([*misses_v.values()]))
+    if usual > MISSED_PART * voltage_v and usual > STATED_TIMES * stated_v:
+        return (
+            f"The model misses its references by {usual:.2f} V where its file states"
+            f" {stated_v:.2f} V. If the capacity, the SoC at their start or the pack is wrong, a"
+            " cause can hide behind that."
+        )
+    return ""
+
+
+def worse_with(baseline_v: float, extended_v: float) -> str:
+    """Return that an extended model is no better on rows left out [V]; "" where it is."""
+    if extended_v <= baseline_v:
+        return ""
+    return (
+        f"On rows left out the extended model errs by {extended_v:.2f} V, the given one by"
+        f" {baseline_v:.2f} V: do not run it, and do not take the cause for found."
+    )
+
+
+def _pauses(logs: Sequence[Prepared]) -> str:
+    found = []
+    for item in logs:
+        time_s = item.log.time_s
+        steps = np.diff(time_s)
+        at = int(np.argmax(steps))
+        if steps[at] > BRIDGE_S:
+            after_h = (time_s[at] - time_s[0]) / 3600.0
+            found.append(f"{item.log.name} ({steps[at] / 60.0:.0f} min, {after_h:.1f} h in)")
+    if not found:
+        return ""
+    return (
+        f"Nothing was recorded for a while: {', '.join(found)}. The pack is taken to have rested;"
+        " charge that moved meanwhile looks like initial_soc, capacity or an error of the voltage,"
+        " and none of these can be concluded. Give the parts as logs of their own, each with its"
+        " SoC."
     )
 
 

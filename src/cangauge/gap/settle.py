@@ -30,6 +30,7 @@ from cangauge.gap.references import (
     error_from_references,
     with_strays,
 )
+from cangauge.gap.sound import sound
 from cangauge.gap.thinned import thinned
 from cangauge.identify.options import FitOptions
 from cangauge.logs.log import Log, TemperatureSource
@@ -81,6 +82,8 @@ class Settled:
     """The coarsest step in which a diagnosed log's temperature is reported [K]."""
     temperature_source: TemperatureSource = "unknown"
     """What the model's temperature was measured on."""
+    left_out: tuple[str, ...] = ()
+    """Rows that no pack makes, a sentence each."""
 
     @cached_property
     def given_errors_v(self) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...]]:
@@ -159,8 +162,8 @@ def settle(
     Raises
     ------
     InputError
-        If a log gives no rows or does not match the model's pack, or if neither references nor the
-        model file tell how well the model is known.
+        If a log gives no rows, does not match the model's pack, has a dead channel or is given
+        twice, or if neither references nor the model file tell how well the model is known.
     """
     given = model_file.extended_model()
     model = _over_all_temperatures(given, [*logs, *references])
@@ -180,8 +183,7 @@ def settle(
             field="information",
             cure="give logs on which the model is good with --reference",
         )
-    for log in (*logs, *references):
-        _check_pack(log, model)
+    logs, references, left_out = sound(logs, references, model)
     choices = candidates(effects, model.pack, logs[0].time_s, elsewhere=True)
     say = progress or _silent
     # Steps are found in the reports, before means blur them.
@@ -225,6 +227,7 @@ def settle(
         acting=acting,
         temperature_step_k=max(usual_step_k(log) for log in logs),
         temperature_source=model_file.temperature_source,
+        left_out=tuple(left_out),
     )
 
 
@@ -323,19 +326,6 @@ def _beyond_the_references(error: ErrorModel) -> ErrorModel:
     scales are given the variance of the slowest.
     """
     return replace(error, scale_v2=(error.lasting_v2,) * len(error.scale_v2), strays={})
-
-
-def _check_pack(log: Log, model: ExtendedModel) -> None:
-    usual = model.pack.voltage_v
-    median = float(np.median(log.voltage_v))
-    if not 0.7 * usual <= median <= 1.4 * usual:
-        raise InputError(
-            f"the model's pack has about {usual:.0f} V",
-            source=log.source or log.name,
-            field="voltage_v",
-            value=round(median, 1),
-            cure="nothing can be concluded from a log of another pack: give its own model",
-        )
 
 
 def _mean_square(terms: LogTerms) -> float:

@@ -31,8 +31,8 @@ EXPLAINED_AT_LEAST = 0.4
 LARGE = 1.5
 """A gap of so many times what clean logs keep is there, explained or not."""
 
-UNSURE = 0.5
-"""Nor is any effect given more than this probability there."""
+UNSURE = 0.45
+"""Nor is any effect given more than this probability there: less than an even chance."""
 
 SEEN_BELOW = 0.1
 """Something is there if `none` has less than this probability."""
@@ -94,9 +94,12 @@ def decide(settled: Settled) -> Verdict:
         named = seen and belief.best >= NAMED_FROM
     else:
         something = compared.found >= ACCEPT_LOG_BAYES
-        named = something and explained >= EXPLAINED_AT_LEAST
+        explains = something and explained >= EXPLAINED_AT_LEAST
+        chances = _chances(_unsure(belief, named=explains))
+        # No name where `none` or `unknown` is likelier than all effects together.
+        some = 1.0 - chances[UNKNOWN] - chances[NONE]
+        named = explains and some >= max(chances[UNKNOWN], chances[NONE])
         seen = named or (something and compared.before_v >= LARGE * compared.clean_v)
-        chances = _chances(_unsure(belief, named=named))
     candidates = tuple(witness.score for witness in belief.witnesses)
     if not named:
         cause = UNKNOWN if seen else NONE

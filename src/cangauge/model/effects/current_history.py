@@ -18,6 +18,9 @@ from cangauge.model.effects.first_order import low_passed
 
 FloatArray = NDArray[np.float64]
 
+MOST_LAGS = 64
+"""No more are kept: all shapes of all effects ask for some fifty."""
+
 
 @dataclass(frozen=True, eq=False)
 class CurrentHistory:
@@ -34,6 +37,8 @@ class CurrentHistory:
     def lagged_a(self, tau_s: float) -> FloatArray:
         """Return the current behind a first-order lag [A], shape (n,), at rest before the log."""
         if tau_s not in self._lagged_a:
+            while len(self._lagged_a) >= MOST_LAGS:  # a fit asks for ever new ones
+                del self._lagged_a[next(iter(self._lagged_a))]
             self._lagged_a[tau_s] = low_passed(
                 self.time_s, self.current_a, tau_s, 0.0, rest_s=BRIDGE_S
             )
