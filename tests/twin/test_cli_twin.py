@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from cangauge.cli.twin import twin_command
 from cangauge.errors import InputError
+from cangauge.identify.charge import capacity_from_full_discharge
 from cangauge.logs.read import read_log
 from cangauge.twin.effect_option import parse_effect
 from cangauge.twin.pack import Pack
@@ -164,3 +165,11 @@ def test_what_is_no_speed_trace_is_refused(content: str, tmp_path: Path) -> None
     path.write_text(content)
     with pytest.raises(InputError, match=r"speed\.csv"):
         read_speed(path)
+
+
+def test_a_whole_discharge_gives_a_fit_its_capacity(tmp_path: Path) -> None:
+    """It ended at 2.03 % SoC, which a fit does not take for empty."""
+    path = tmp_path / "full.parquet"
+    told = run("--seed", "1", "--discharge", "--hours", "1", "-o", str(path))
+    found = capacity_from_full_discharge([read_log(path)], None)
+    assert found == pytest.approx(told["capacity_ah"], rel=0.01)

@@ -31,6 +31,9 @@ from cangauge.twin.world import PlantName, draw_plant, record_day, rms
 DEFAULT_GAP = 0.003
 """Gap of an effect whose size is not given, as a part of the nominal voltage."""
 
+EMPTY = 0.015
+"""State of charge at which a whole discharge ends: a fit takes 2 % and less for empty."""
+
 
 def twin_command(  # noqa: PLR0917 - typer passes options by name
     output: Annotated[
@@ -145,7 +148,7 @@ def twin_command(  # noqa: PLR0917 - typer passes options by name
             hours=2.5 if hours is None and discharge else _hours(hours),
             ambient_c=_ambient(ambient_c),
             start_soc=_start(start_soc, discharge=discharge),
-            end_soc=0.02 if end_soc is None and discharge else _share(end_soc, "--end-soc"),
+            end_soc=EMPTY if end_soc is None and discharge else _share(end_soc, "--end-soc"),
             speed_ms=None if speed is None else read_speed(speed),
             discharge=discharge,
         )

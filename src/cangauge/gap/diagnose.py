@@ -296,7 +296,7 @@ def in_words(diagnosis: Diagnosis) -> str:
         if references and diagnosis.baseline_rmse_v > diagnosis.floor_v:
             gap += f", {diagnosis.extended_rmse_v:.2f} V with what they teach"
         beyond = "references show or explain" if references else "model file states"
-        if verdict.probability < EVEN:
+        if verdict.probability < EVEN or not diagnosis.settled.covered:
             chance = f"that there is none has a probability of {verdict.probability:.2f}"
             return f"No gap that is certain beyond what the {beyond} ({gap}); {chance}."
         return f"No gap beyond what the {beyond} ({gap})."

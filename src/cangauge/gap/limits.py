@@ -183,8 +183,8 @@ def _temperature(logs: Sequence[Prepared], references: Sequence[Prepared]) -> st
         known = _range([item.rows.temperature_c for item in references])
         if low < known[0] - COVERED_K or high > known[1] + COVERED_K:
             sentences.append(
-                f"Temperatures of {low:.0f} … {high:.0f} °C where the references have"
-                f" {known[0]:.0f} … {known[1]:.0f} °C: what the temperature alone does to a pack"
+                f"Temperatures of {low:.1f} … {high:.1f} °C where the references have"
+                f" {known[0]:.1f} … {known[1]:.1f} °C: what the temperature alone does to a pack"
                 " without a fault is not known there, and cannot be told safely from a cause."
             )
     return " ".join(sentences)

@@ -83,8 +83,8 @@ def capacity_from_full_discharge(logs: Sequence[Log], initial_soc_pct: float | N
         if capacity is not None:
             return capacity
     raise InputError(
-        f"no log runs from {FULL_PCT:.0f} % or more to {EMPTY_PCT:.0f} % or less, so none gives"
-        " the capacity",
+        f"no log runs from full to empty ({FULL_PCT:.0f} % or more to {EMPTY_PCT:.0f} % or less),"
+        " so none gives the capacity",
         source=logs[0].source or logs[0].name,
         field="capacity_ah",
         cure="give it with --capacity-ah A, or --capacity-ah from-soc to take the charge per"

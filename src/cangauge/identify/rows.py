@@ -78,8 +78,10 @@ def fit_rows(
     soc = counted_soc_pct(log, capacity_ah, initial_soc_pct)
     low, high = float(soc.min()), float(soc.max())
     if low < -SOC_TOLERANCE_PCT or high > 100.0 + SOC_TOLERANCE_PCT:
+        assumed = initial_soc_pct is None and log.first_soc() is None
+        start = " from an assumed start at 100 %" if assumed else ""
         raise InputError(
-            f"the SoC counted with {capacity_ah:.2f} Ah runs from {high:.1f} to {low:.1f} %",
+            f"the SoC counted with {capacity_ah:.2f} Ah{start} runs from {high:.1f} to {low:.1f} %",
             source=where,
             field="soc_pct",
             cure="check --capacity-ah, the SoC at the start (soc_pct, --initial-soc) and the sign"
