@@ -156,7 +156,7 @@ def test_a_short_log_of_one_temperature_and_little_soc_is_called_so() -> None:
         (long_log(), 0, "No reference logs"),
         (long_log(), 2, "Only 2 reference logs"),
         (replace(long_log(), temperature_c=long_log().temperature_c - 15.0), 3,
-         "Temperatures of 0 … 18 °C where the references have 15 … 33 °C"),
+         "Temperatures of 0.3 … 18.0 °C where the references have 15.3 … 33.0 °C"),
         (replace(long_log(), soc_pct=long_log().soc_pct - 20.0), 3, "SoC of 30 … 60 % where"),
         (replace(long_log(), current_a=np.maximum(long_log().current_a, 2.0)), 3,
          "The pack is never charged"),
