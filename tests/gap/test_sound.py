@@ -138,12 +138,12 @@ def test_where_no_reference_has_been_no_effect_is_likelier_than_not(
 
 
 def test_references_that_the_model_misses_are_told() -> None:
-    fine = {"a": 0.5, "b": 0.6, "c": 0.55}
+    fine = [("a", 0.5), ("b", 0.6), ("c", 0.55)]
     assert reference_fit(fine, 0.4, 360.0) == ""
-    assert reference_fit({}, 0.4, 360.0) == ""
-    odd = reference_fit(fine | {"other": 41.8}, 0.4, 360.0)
+    assert reference_fit([], 0.4, 360.0) == ""
+    odd = reference_fit([("other", 41.8), *fine], 0.4, 360.0)
     assert "the reference other by 41.8 V (12 % of the voltage), the others by 0.55 V" in odd
-    all_off = reference_fit({"a": 2.9, "b": 2.7}, 0.44, 360.0)
+    all_off = reference_fit([("same", 2.9), ("same", 2.7)], 0.44, 360.0)
     assert "by 2.80 V where its file states 0.44 V" in all_off
 
 

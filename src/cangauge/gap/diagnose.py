@@ -90,10 +90,10 @@ class Diagnosis:
         steps = stepped_temperature(
             settled.temperature_step_k, settled.model.model.kt_v_per_k, self.floor_v
         )
-        misses = {
-            terms.prepared.log.name: rms(errors)
+        misses = [
+            (terms.prepared.log.name, rms(errors))
             for terms, errors in zip(settled.references, settled.given_errors_v[0], strict=True)
-        }
+        ]
         fit = reference_fit(misses, self.stated_v, settled.as_given.pack.voltage_v)
         worse = ""
         if self.extension.cause:

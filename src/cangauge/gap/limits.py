@@ -5,7 +5,7 @@ Each limit is a sentence: what the logs are like, and what can therefore not be 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -93,31 +93,31 @@ def stepped_temperature(step_k: float, kt_v_per_k: float, floor_v: float) -> str
     )
 
 
-def reference_fit(misses_v: Mapping[str, float], stated_v: float, voltage_v: float) -> str:
+def reference_fit(misses: Sequence[tuple[str, float]], stated_v: float, voltage_v: float) -> str:
     """Return what references mean that the model does not fit; "" where it does.
 
     Parameters
     ----------
-    misses_v : mapping of str to float
-        The given model's RMS error on each reference [V].
+    misses : sequence of (str, float)
+        Each reference's name, and the given model's RMS error on it [V].
     stated_v : float
         What the model file states of itself [V].
     voltage_v : float
         The pack's usual voltage [V].
     """
-    if not misses_v:
+    if not misses:
         return ""
-    worst = max(misses_v, key=lambda name: misses_v[name])
-    others = [volts for name, volts in misses_v.items() if name != worst]
-    part = misses_v[worst] / voltage_v
-    if others and part > MISSED_PART and misses_v[worst] > ODD_TIMES * float(np.median(others)):
+    *others, (name, worst_v) = sorted(misses, key=lambda miss: miss[1])
+    others_v = float(np.median([volts for _, volts in others])) if others else worst_v
+    part = worst_v / voltage_v
+    if part > MISSED_PART and worst_v > ODD_TIMES * others_v:
         return (
-            f"The model misses the reference {worst} by {misses_v[worst]:.1f} V"
-            f" ({100.0 * part:.0f} % of the voltage), the others by {np.median(others):.2f} V: is"
+            f"The model misses the reference {name} by {worst_v:.1f} V"
+            f" ({100.0 * part:.0f} % of the voltage), the others by {others_v:.2f} V: is"
             " it a log of this pack, with the right SoC at its start? What is learned from it can"
             " hide a cause."
         )
-    usual = float(np.median([*misses_v.values()]))
+    usual = float(np.median([volts for _, volts in misses]))
     if usual > MISSED_PART * voltage_v and usual > STATED_TIMES * stated_v:
         return (
             f"The model misses its references by {usual:.2f} V where its file states"
@@ -133,7 +133,7 @@ def worse_with(baseline_v: float, extended_v: float) -> str:
         return ""
     return (
         f"On rows left out the extended model errs by {extended_v:.2f} V, the given one by"
-        f" {baseline_v:.2f} V: do not run it, and do not take the cause for found."
+        f" {baseline_v:.2f} V: do not run it. The cause may be the right one; its size is not."
     )
 
 

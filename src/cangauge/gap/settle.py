@@ -166,6 +166,7 @@ def settle(
         twice, or if neither references nor the model file tell how well the model is known.
     """
     given = model_file.extended_model()
+    logs, references, left_out = sound(logs, references, given)
     model = _over_all_temperatures(given, [*logs, *references])
     options = FitOptions(
         capacity_ah=model_file.capacity_ah,
@@ -183,7 +184,6 @@ def settle(
             field="information",
             cure="give logs on which the model is good with --reference",
         )
-    logs, references, left_out = sound(logs, references, model)
     choices = candidates(effects, model.pack, logs[0].time_s, elsewhere=True)
     say = progress or _silent
     # Steps are found in the reports, before means blur them.
