@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -121,7 +122,39 @@ def test_a_log_of_another_pack_gets_no_name(model: ModelFile, references: list[L
     assert diagnose([other], model, references).verdict.cause == "unknown"
 
 
-def test_where_no_reference_has_been_no_effect_is_likelier_than_not(
+def late(log: Log) -> Log:
+    return replace(log, current_a=np.interp(log.time_s - 1.0, log.time_s, log.current_a))
+
+
+def stepped(log: Log) -> Log:
+    return replace(log, voltage_v=log.voltage_v - 0.08 * log.current_a * (log.time_s > 1400.0))
+
+
+def asymmetric(log: Log) -> Log:
+    return replace(log, voltage_v=log.voltage_v - 0.1 * np.minimum(log.current_a, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("fault", "cause"),
+    [
+        (late, "time_skew"),
+        (stepped, "resistance_step"),
+        (asymmetric, "resistance_asymmetry"),
+    ],
+)
+def test_where_no_reference_has_been_a_clear_cause_is_named_without_being_certain(
+    model: ModelFile, references: list[Log], fault: Callable[[Log], Log], cause: str
+) -> None:
+    log = fault(day(21))
+    colder_v = model.extended_model().model.kt_v_per_k * -20.0
+    cold = replace(log, voltage_v=log.voltage_v + colder_v, temperature_c=log.temperature_c - 20.0)
+    verdict = diagnose([cold], model, references).verdict
+    assert verdict.cause == cause
+    assert verdict.probability < 0.5
+    assert sum(verdict.chances.values()) == pytest.approx(1.0)
+
+
+def test_where_no_reference_has_been_resistance_in_the_cold_tells_no_fault(
     model: ModelFile, references: list[Log]
 ) -> None:
     log = day(21)
@@ -133,7 +166,6 @@ def test_where_no_reference_has_been_no_effect_is_likelier_than_not(
     )
     found = diagnose([cold], model, references)
     assert found.verdict.cause == "resistance_temperature"
-    assert found.verdict.probability < 0.5
     assert "it tells no fault" in in_words(found)
 
 

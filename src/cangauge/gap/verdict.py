@@ -95,10 +95,11 @@ def decide(settled: Settled) -> Verdict:
     else:
         something = compared.found >= ACCEPT_LOG_BAYES
         explains = something and explained >= EXPLAINED_AT_LEAST
-        chances = _chances(_unsure(belief, named=explains))
         # No name where `none` or `unknown` is likelier than all effects together.
-        some = 1.0 - chances[UNKNOWN] - chances[NONE]
-        named = explains and some >= max(chances[UNKNOWN], chances[NONE])
+        believed = _chances(belief)
+        some = 1.0 - believed[UNKNOWN] - believed[NONE]
+        named = explains and some >= max(believed[UNKNOWN], believed[NONE])
+        chances = _chances(_unsure(belief, named=explains))
         seen = named or (something and compared.before_v >= LARGE * compared.clean_v)
     candidates = tuple(witness.score for witness in belief.witnesses)
     if not named:
@@ -137,7 +138,9 @@ def _unsure(belief: Belief, *, named: bool) -> Belief:
         none = max(belief.none, 1.0 - UNSURE)
         return replace(belief, none=none, best=min(belief.best, 0.5 * (1.0 - none)))
     best = min(belief.best, UNSURE)
-    return replace(belief, best=best, none=min(belief.none, 0.5 * (1.0 - best)))
+    # What is taken from it is that healthy logs may be so there.
+    none = belief.none + belief.best - best
+    return replace(belief, best=best, none=min(none, 0.5 * (1.0 - best)))
 
 
 def _chances(belief: Belief) -> dict[str, float]:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from cangauge.gap.diagnose import Diagnosis
+from cangauge.gap.diagnose import EVEN, Diagnosis
 from cangauge.gap.verdict import NONE, UNKNOWN
 from cangauge.model.effects.library import LIBRARY
 from cangauge.report.words import number
-
-LIKELY = 0.5
 
 
 def verdict_limit(diagnosis: Diagnosis) -> str:
@@ -36,7 +34,7 @@ def verdict_limit(diagnosis: Diagnosis) -> str:
             " several act at once, or the model is not of this pack."
         )
     words = []
-    if verdict.probability < LIKELY:
+    if verdict.probability < EVEN:
         words.append(
             f"{verdict.cause} is the likeliest cause, yet with a probability of only"
             f" {verdict.probability:.2f}: do not act on it alone."
