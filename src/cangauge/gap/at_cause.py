@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cangauge.gap.by_charge import variance_by_charge
 from cangauge.gap.columns import LogTerms, residual
-from cangauge.gap.evidence import gather, gram_of, prior_precision
+from cangauge.gap.evidence import Gram, gather, gram_of, prior_precision
 from cangauge.gap.settle import Settled
 from cangauge.identify.effects.prepared import as_modelled
 from cangauge.model.effects.candidate import STEP, Candidate
@@ -73,6 +74,11 @@ def at_causes(settled: Settled, causes: Sequence[Cause]) -> AtCause:
     settled : Settled
     causes : sequence of Cause
         Where to begin, one at least.
+
+    Notes
+    -----
+    An amplitude is known as well as chance and its tangent let it be, or as well as the bands of
+    SoC agree on it, whichever is less (`by_charge`).
     """
     frame, error = settled.frame, settled.error
     at = frame.amplitudes_of([cause.candidate for cause in causes])
@@ -85,24 +91,46 @@ def at_causes(settled: Settled, causes: Sequence[Cause]) -> AtCause:
         ]
     )
     worth = 1.0 / np.sqrt(strays)
+
+    def solved(grams: Sequence[Gram], here: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return how far to go from here, and the precision of where that is."""
+        evidence = gather(frame, settled.reference_grams, grams, error)
+        total = evidence.curvature[np.ix_(at, at)] * worth * worth[:, None] + prior
+        return np.linalg.solve(total, evidence.gradient[at] / strays - prior @ here), total
+
     found = tuple(causes)
+    factors = [settled.hardness(terms) for terms in settled.diagnosed]
     for _ in range(ROUNDS):
         diagnosed = [_terms_at(terms, settled, found) for terms in settled.diagnosed]
         grams = [
-            gram_of(terms, frame.scale).weakened(settled.hardness(terms)) for terms in diagnosed
+            gram_of(terms, frame.scale).weakened(factor)
+            for terms, factor in zip(diagnosed, factors, strict=True)
         ]
-        evidence = gather(frame, settled.reference_grams, grams, error)
         here = np.concatenate([cause.amplitude for cause in found])
-        total = evidence.curvature[np.ix_(at, at)] * worth * worth[:, None] + prior
-        step = np.linalg.solve(total, evidence.gradient[at] / strays - prior @ here)
+        step, total = solved(grams, here)
         ends = np.cumsum([0, *(len(cause.choice.amplitudes) for cause in found)])
         found = tuple(
             cause.moved((here + step)[ends[k] : ends[k + 1]]) for k, cause in enumerate(found)
         )
+    differing = variance_by_charge(
+        diagnosed, frame.scale, factors, lambda grams: solved(grams, here)[0]
+    )
     diagnosed = [_terms_at(terms, settled, found, tangents=False) for terms in settled.diagnosed]
     of_tangents = TANGENT_STD * np.concatenate([cause.amplitude for cause in found])
-    covariance = np.linalg.inv(total) + np.diag(of_tangents**2)
+    covariance = np.asarray(np.linalg.inv(total) + np.diag(of_tangents**2))
+    covariance += np.diag(np.maximum(differing - np.diag(covariance), 0.0))
     return AtCause(found, covariance, replace(settled, diagnosed=tuple(diagnosed)))
+
+
+def squares(settled: Settled, causes: Sequence[Cause]) -> float:
+    """Return the weighed squares that the diagnosed logs keep with some causes."""
+    grams = [
+        gram_of(_terms_at(terms, settled, causes, tangents=False), settled.frame.scale).weakened(
+            settled.hardness(terms)
+        )
+        for terms in settled.diagnosed
+    ]
+    return gather(settled.frame, settled.reference_grams, grams, settled.error).squares
 
 
 def _terms_at(

@@ -22,8 +22,9 @@ TRIED = 100
 """Moments that are tried, spread over the longest log; then as many between the best one's
 neighbours."""
 
-LEAST_V2 = 1e-12
-"""Mean square below which a column is nothing but rounding [V²]."""
+LEAST_PART = 0.02
+"""A jump that leaves less than this part of its column's square beside what is known, if it were
+there all along, has next to no rows before or after it: it is a row that is wrong, not a jump."""
 
 
 def at_moment(
@@ -61,18 +62,22 @@ def _best(
         ]
     )
 
-    def taken_v2(moment_s: float) -> float:
+    def columns_of(moment_s: float) -> list[FloatArray]:
         trial = {**values, name: moment_s}
         columns = []
-        for basis, terms, state in zip(known, logs, states, strict=True):
+        for terms, state in zip(logs, states, strict=True):
             extra_v = effect.extra_voltage(state, trial, model.model, model.pack)
             rows = terms.prepared.at
-            columns.append(
-                _beside(basis, np.zeros(rows.size) if extra_v is None else extra_v[rows])
-            )
-        column = np.concatenate(columns)
+            columns.append(np.zeros(rows.size) if extra_v is None else extra_v[rows])
+        return columns
+
+    least_v2 = LEAST_PART * float(np.sum(np.concatenate(columns_of(0.0)) ** 2))
+
+    def taken_v2(moment_s: float) -> float:
+        beside = [_beside(*pair) for pair in zip(known, columns_of(moment_s), strict=True)]
+        column = np.concatenate(beside)
         square = float(column @ column)
-        return float(column @ left_v) ** 2 / square if square > LEAST_V2 * column.size else 0.0
+        return float(column @ left_v) ** 2 / square if square > least_v2 else 0.0
 
     longest_s = max(float(np.ptp(terms.prepared.log.time_s)) for terms in logs)
     apart_s = longest_s / TRIED

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from cangauge import __version__
-from cangauge.gap.at_cause import Cause, at_causes, with_causes
+from cangauge.gap.at_cause import Cause, at_causes, squares, with_causes
 from cangauge.gap.at_moment import at_moment
 from cangauge.gap.bounded import moved, within_bounds
 from cangauge.gap.columns import Candidate, residual
@@ -20,7 +20,7 @@ from cangauge.gap.settle import Settled
 from cangauge.gap.structure import needed, with_pieces
 from cangauge.model.effects.effect import Effect, Values
 from cangauge.model.effects.library import LIBRARY, effect_entries, one_of
-from cangauge.model.effects.parameter import Pack
+from cangauge.model.effects.parameter import LEEWAY, Pack
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Made, ModelFile, Ranges
 
@@ -83,8 +83,19 @@ def _begin(few: Settled, accepted: Sequence[Score]) -> list[Cause]:
     for score in accepted:
         choices = [few.frame.choices[k] for k in score.candidates]
         start = mixed(choices, [next(rest) for _ in choices])
-        model, values = _refined(few, model, choices[0].effect, start)
-        causes.append(Cause(score.candidates[0], choices[0], values))
+        effect = choices[0].effect
+        # A moment is sought beside what the linear solution made of the model, which may have taken
+        # a late jump for a resistance, and beside what references know.
+        moments = [
+            at_moment(few.diagnosed, beside, effect, start)
+            for beside in (model, few.acting or few.model)
+        ]
+        starts = [values for k, values in enumerate(moments) if values not in moments[:k]]
+        refined = [_refined(few, model, effect, values) for values in starts]
+        trials = [Cause(score.candidates[0], choices[0], values) for _, values in refined]
+        best = 0 if len(trials) == 1 else int(np.argmin([squares(few, [c]) for c in trials]))
+        model = refined[best][0]
+        causes.append(trials[best])
     return causes
 
 
@@ -144,7 +155,6 @@ def _refined(
     settled: Settled, model: ExtendedModel, effect: Effect, start: Values
 ) -> tuple[ExtendedModel, dict[str, float]]:
     """Return model and parameters, fitted through the model's own equations from a start."""
-    start = at_moment(settled.diagnosed, model, effect, start)
     free = (*effect.amplitudes, *(shape for shape in effect.shapes if not shape.is_moment))
     parameters = free or effect.parameters
     constants = {p.name: start[p.name] for p in effect.parameters if p not in parameters}
@@ -286,10 +296,12 @@ def cause_parameters(
         for k, name in enumerate(first.amplitudes):
             of_one = np.arange(k, score.amplitude.size, size)
             std[name] = float(np.sqrt(np.sum(score.covariance[np.ix_(of_one, of_one)])))
-    units = {parameter.name: parameter.unit for parameter in first.effect.parameters}
+    named = {parameter.name: parameter for parameter in first.effect.parameters}
+    units = {name: parameter.unit for name, parameter in named.items()}
     result: dict[str, dict[str, object]] = {}
-    for k, name in enumerate(first.amplitudes):
-        low, high = first.neutral[k] + first.bounds[k]
+    for name in first.amplitudes:
+        # What a bound is relative to is read off the model: an interval may go beyond it.
+        low, high = named[name].bounds(settled.model.pack, LEEWAY)
         away = 1.96 * std[name]
         interval = [max(values[name] - away, low), min(values[name] + away, high)]
         result[name] = {"value": values[name], "ci": interval, "unit": units[name]}

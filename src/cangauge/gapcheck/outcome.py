@@ -17,6 +17,9 @@ FAMILY: Final = {kind.id: kind.family for kind in fault_kinds()}
 LEAST_GAP: Final = 0.45
 """A gap below this many floors is out of the check's range: physics allowed no larger one."""
 
+ROUNDING: Final = 1e-9
+"""Part of a true value by which the twin's and the library's units may round it apart."""
+
 
 @dataclass(frozen=True)
 class Covered:
@@ -31,8 +34,9 @@ class Covered:
 
     @property
     def holds(self) -> bool:
-        """Whether it does."""
-        return self.low <= self.true <= self.high
+        """Whether it does, but for rounding: the truth may be at a bound, where intervals end."""
+        rounding = ROUNDING * abs(self.true)
+        return self.low - rounding <= self.true <= self.high + rounding
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 FloatArray = NDArray[np.float64]
 
@@ -37,26 +38,41 @@ def by_scale(columns: FloatArray) -> list[FloatArray]:
     n = columns.shape[0]
     total = np.zeros((n + 1, columns.shape[1]))
     np.cumsum(columns, axis=0, out=total[1:])
-    parts: list[list[FloatArray]] = [[] for _ in range(SCALES)]
-    parts[-1].append(total[-1:] / np.sqrt(n))
+    differences, counts = _differences(n)
+    coefficients = np.empty_like(total[1:])
+    coefficients[:-1] = differences @ total
+    coefficients[-1] = total[-1] / np.sqrt(n)
+    return np.split(coefficients, np.cumsum(counts)[:-1])
+
+
+def _differences(n: int) -> tuple[sparse.csr_array, NDArray[np.intp]]:
+    """Return what makes coefficients of sums up to each row, and how many there are of each scale.
+
+    The finest scale first; all but the log's mean, shape (n − 1, n + 1).
+    """
     edges = np.array([0, n])
+    stretches = []
     while True:
-        left, right = edges[:-1], edges[1:]
-        split = right - left > 1
+        first, end = edges[:-1], edges[1:]
+        split = end - first > 1
         if not split.any():
             break
-        a, b = left[split], right[split]
+        first, end = first[split], end[split]
         # At the largest power of two inside, so that stretches have the same lengths in all logs.
-        m = a + 2 ** np.ceil(np.log2(b - a) - 1.0).astype(np.intp)
-        first, second = (m - a).astype(float), (b - m).astype(float)
-        gain = np.sqrt(first * second / (first + second))[:, None]
-        change = (total[b] - total[m]) / second[:, None] - (total[m] - total[a]) / first[:, None]
-        scale = np.minimum(np.rint(np.log2(first + second)).astype(np.intp) - 1, SCALES - 1)
-        for j in np.unique(scale):
-            parts[j].append((gain * change)[scale == j])
-        edges = np.unique(np.concatenate((edges, m)))
-    empty = np.zeros((0, columns.shape[1]))
-    return [np.vstack([empty, *part]) for part in parts]
+        middle = first + 2 ** np.ceil(np.log2(end - first) - 1.0).astype(np.intp)
+        stretches.append(np.stack([first, middle, end]))
+        edges = np.unique(np.concatenate((edges, middle)))
+    first, middle, end = np.hstack([np.zeros((3, 0), dtype=np.intp), *stretches])
+    scale = np.minimum(np.rint(np.log2(end - first)).astype(np.intp) - 1, SCALES - 1)
+    order = np.argsort(scale, kind="stable")
+    first, middle, end = first[order], middle[order], end[order]
+    left, right = (middle - first).astype(float), (end - middle).astype(float)
+    gain = np.sqrt(left * right / (left + right))
+    weights = np.concatenate((gain / left, -gain / left - gain / right, gain / right))
+    at = (np.tile(np.arange(first.size), 3), np.concatenate((first, middle, end)))
+    counts = np.bincount(scale, minlength=SCALES)
+    counts[-1] += 1  # the mean
+    return sparse.csr_array((weights, at), shape=(first.size, n + 1)), counts
 
 
 def scale_variances(

@@ -55,17 +55,33 @@ def scaled_soc(soc_pct: ArrayLike, epsilon: float) -> FloatArray:
 def ocv_basis(soc_pct: ArrayLike, epsilon: float) -> FloatArray:
     """Return the pseudo-OCV's columns, shape (n, 8), for SoC [%] of shape (n,)."""
     s = np.atleast_1d(scaled_soc(soc_pct, epsilon))
-    r = 1.0 / s
-    return np.column_stack([np.ones_like(s), r, r**2, r**3, r**4, s, np.log(s), np.log1p(-s)])
+    # Each column in one piece of memory: several times as fast as row by row.
+    basis = np.empty((8, s.size))
+    one, r, r2, r3, r4, linear, of_empty, of_full = basis
+    one[:], linear[:] = 1.0, s
+    np.divide(1.0, s, out=r)
+    np.multiply(r, r, out=r2)
+    np.multiply(r2, r, out=r3)
+    np.multiply(r2, r2, out=r4)
+    np.log(s, out=of_empty)
+    np.log1p(-s, out=of_full)
+    return basis.T
 
 
 def ocv_basis_slope(soc_pct: ArrayLike, epsilon: float) -> FloatArray:
     """Return the derivative of `ocv_basis` by SoC [1/%], shape (n, 8)."""
     s = np.atleast_1d(scaled_soc(soc_pct, epsilon))
-    r = 1.0 / s
-    zero, one = np.zeros_like(s), np.ones_like(s)
-    by_s = [zero, -(r**2), -2.0 * r**3, -3.0 * r**4, -4.0 * r**5, one, r, -1.0 / (1.0 - s)]
-    return np.column_stack(by_s) * ((1.0 - 2.0 * epsilon) / 100.0)
+    gain = (1.0 - 2.0 * epsilon) / 100.0
+    slope = np.empty((8, s.size))
+    constant, r, r2, r3, r4, linear, of_empty, of_full = slope
+    constant[:], linear[:] = 0.0, gain
+    np.divide(gain, s, out=of_empty)
+    np.divide(-gain, 1.0 - s, out=of_full)
+    power = 1.0 / s
+    for order, column in enumerate((r, r2, r3, r4), start=1):
+        power /= s
+        np.multiply(-order * gain, power, out=column)
+    return slope.T
 
 
 @dataclass(frozen=True)
