@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from os import PathLike
+from typing import Any
 
 
 class CangaugeError(Exception):
     """Anything that cangauge reports in one clear line instead of a traceback (exit code 1)."""
 
     exit_code = 1
+    told = False
+    """Whether stderr has it already, as an event: then nobody else tells it there."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the message and its parts for `--json`; None is a part that is not known."""
+        parts = dict.fromkeys(("source", "field", "value", "cure"))
+        return {"message": str(self), **parts}
 
 
 class InputError(CangaugeError):
@@ -46,6 +54,16 @@ class InputError(CangaugeError):
         self.cure = cure
         super().__init__(self._line())
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the message and its parts for `--json`; None is a part that is not known."""
+        return {
+            "message": str(self),
+            "source": self.source,
+            "field": self.field and _short(self.field),
+            "value": _plain(self.value),
+            "cure": self.cure and _short(self.cure, _LONGEST_PROBLEM),
+        }
+
     def _line(self) -> str:
         field = None if self.field is None else _short(self.field)
         source = None if self.source is None else _short(self.source, _LONGEST_PATH)
@@ -78,3 +96,14 @@ def _shown(value: object) -> str:
     except (ValueError, RecursionError):  # a number of more than 4300 digits; lists in lists in …
         return f"a huge {type(value).__name__}"
     return _short(text)
+
+
+def _plain(value: object) -> bool | float | str | None:
+    """Return a number or a text as it is, anything else as the message quotes it."""
+    if hasattr(value, "tolist"):  # numpy's
+        value = value.tolist()
+    if value is None or isinstance(value, bool | float):
+        return value
+    if isinstance(value, int) and value.bit_length() <= 64:
+        return value
+    return _short(value) if isinstance(value, str) else _shown(value)

@@ -15,8 +15,9 @@ from typer.core import TyperGroup
 from typer.main import get_command as made_of
 
 from cangauge import __version__
+from cangauge.cli.failure import emit_failure
 from cangauge.cli.output import note
-from cangauge.cli.usage import UsageError, usage_line
+from cangauge.cli.usage import UsageError, usage_dict, usage_line
 from cangauge.errors import CangaugeError
 from cangauge.threads import one_thread
 
@@ -87,12 +88,18 @@ def main() -> None:
     try:
         code = app(standalone_mode=False)
     except CangaugeError as error:
-        note(f"error: {error}")
+        if not error.told:
+            note(f"error: {error}")
+        emit_failure(error.to_dict(), error.exit_code)
         sys.exit(error.exit_code)
     except UsageError as error:
         if told := usage_line(error):
             note(told)
+        emit_failure(usage_dict(error), 2)
         sys.exit(2)
+    except Exception as error:  # a mistake of ours: Python tells where, and exits with 1
+        emit_failure(CangaugeError(f"{type(error).__name__}: {error}").to_dict(), 1)
+        raise
     if code == 130:  # what typer makes of Ctrl-C
         note("stopped")
     sys.exit(code or 0)

@@ -50,7 +50,10 @@ TemperatureSourceOption = Annotated[
     ),
 ]
 JsonOption = Annotated[
-    bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else there.")
+    bool,
+    typer.Option(
+        "--json", help="Print one JSON object on stdout and nothing else there, also of an error."
+    ),
 ]
 ReportOption = Annotated[
     Path | None,

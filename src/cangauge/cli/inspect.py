@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from cangauge.cli.inputs import JsonOption
 from cangauge.cli.output import emit_json
 from cangauge.errors import InputError
 from cangauge.inspect.analysis import LogInspection, inspect_log
@@ -47,9 +48,7 @@ def inspect_command(  # noqa: PLR0917  # typer fills the arguments by name
         float | None,
         typer.Option(help="Constant temperature [°C], where the file holds none.", metavar="T"),
     ] = None,
-    json_output: Annotated[
-        bool, typer.Option("--json", help="One JSON object on stdout, nothing else.")
-    ] = False,
+    json_output: JsonOption = False,
 ) -> None:
     """Tell what a log or capture holds, and find the sign of current from the data.
 

@@ -22,7 +22,13 @@ def note(text: str) -> None:
 
 def emit_json(result: Mapping[str, Any]) -> None:
     """Print exactly one JSON object on stdout; NaN and infinities become null."""
-    sys.stdout.write(json.dumps(_plain(result), ensure_ascii=False) + "\n")
+    plain = _plain(result)
+    text = json.dumps(plain, ensure_ascii=False)
+    try:
+        text.encode(sys.stdout.encoding or "utf-8")
+    except UnicodeEncodeError:  # a terminal of few letters, a file name that is no text
+        text = json.dumps(plain)
+    sys.stdout.write(text + "\n")
     sys.stdout.flush()
 
 

@@ -247,10 +247,10 @@ def _failures_logged(log_format: LogFormat) -> Iterator[None]:
     try:
         yield
     except CangaugeError as error:
-        if log_format != "json":
-            raise
-        emit(_LOG, logging.ERROR, "service.failed", str(error), exit_code=error.exit_code)
-        raise typer.Exit(error.exit_code) from error
+        if log_format == "json":
+            emit(_LOG, logging.ERROR, "service.failed", str(error), exit_code=error.exit_code)
+            error.told = True
+        raise
 
 
 def _text(path: Path | None) -> str | None:
