@@ -1,4 +1,7 @@
-"""Units: those that headers state are converted, those that values betray are refused."""
+"""Units: those that headers state are converted, those that values betray are refused.
+
+So is a voltage that has changed places with the temperature: its values look like kelvin.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ import numpy as np
 
 from cangauge.errors import InputError
 from cangauge.limits import MAX_LOG_SPAN_S, MAX_STAMP_S
+from cangauge.logs.follow import follows_current
 from cangauge.logs.log import FloatArray
 
 # Spelling (lower case, without blanks) -> (factor, offset) to the unit of the canonical log.
@@ -46,6 +50,7 @@ MAX_RATE_HZ: Final = 2000.0
 COLDEST_C: Final = -60.0
 HOTTEST_C: Final = 120.0
 UNUSUALLY_HOT_C: Final = 62.0
+ZERO_C_IN_K: Final = 273.15
 MAX_HOURS_AT_PEAK: Final = 100.0
 """A charge larger than this many hours of the largest current is no battery's."""
 
@@ -124,11 +129,13 @@ def refuse_wrong_units(
         )
 
     _check_time(values, refuse)
+    # First: a temperature below 1 °C in place of the voltage looks like kilovolts or turned.
+    _check_swapped(values, labels.get("voltage_v", "voltage_v"), refuse)
     _check_voltage(values["voltage_v"], refuse)
     _check_current(values["current_a"], refuse)
     if "soc_pct" in values:
         _check_soc(values["soc_pct"], refuse)
-    return _check_temperature(values["temperature_c"], refuse)
+    return _check_temperature(values, refuse)
 
 
 def _check_time(values: dict[str, FloatArray], refuse: _Refuse) -> None:
@@ -190,6 +197,37 @@ def _check_span(time: FloatArray, refuse: _Refuse) -> None:
     )
 
 
+def _check_swapped(values: dict[str, FloatArray], voltage_label: str, refuse: _Refuse) -> None:
+    temperature = float(np.median(values["temperature_c"]))
+    if temperature <= HOTTEST_C or not _maybe_temperature(values["voltage_v"]):
+        return
+    temperature_follows, voltage_follows = _followers(values)
+    swapped = temperature_follows and not voltage_follows
+    if not temperature_follows and not voltage_follows:
+        # The range tells, where it is no battery's in kelvin either. What never varies is a code.
+        in_kelvin = COLDEST_C <= temperature - ZERO_C_IN_K <= UNUSUALLY_HOT_C
+        varies = float(np.ptp(values["temperature_c"])) > 0.0
+        swapped = varies and not in_kelvin and temperature <= MAX_VOLTAGE_V
+    if swapped:
+        raise refuse(
+            "temperature_c",
+            f"it looks like a pack's voltage, and {voltage_label} like a temperature",
+            temperature,
+            "the two columns (or signals) look swapped: exchange them",
+        )
+
+
+def _maybe_temperature(values: FloatArray) -> bool:
+    return bool(COLDEST_C <= np.median(values) <= UNUSUALLY_HOT_C)
+
+
+def _followers(values: dict[str, FloatArray]) -> tuple[bool, bool]:
+    """Whether the temperature follows the current, and whether the voltage does."""
+    current = values["current_a"]
+    temperature, voltage = values["temperature_c"], values["voltage_v"]
+    return follows_current(current, temperature), follows_current(current, voltage)
+
+
 def _check_voltage(voltage: FloatArray, refuse: _Refuse) -> None:
     middle = float(np.median(voltage))
     if middle > MAX_VOLTAGE_V:
@@ -229,10 +267,23 @@ def _check_current(current: FloatArray, refuse: _Refuse) -> None:
         )
 
 
-def _check_temperature(temperature: FloatArray, refuse: _Refuse) -> tuple[str, ...]:
+def _check_temperature(values: dict[str, FloatArray], refuse: _Refuse) -> tuple[str, ...]:
+    temperature = values["temperature_c"]
     middle = float(np.median(temperature))
-    if 200.0 <= middle <= 400.0:
-        raise refuse("temperature_c", "temperature looks like kelvin", middle, "subtract 273.15")
+    if middle > HOTTEST_C:
+        follows, voltage_follows = _followers(values)
+        if follows:
+            raise refuse(
+                "temperature_c",
+                "it moves when the current does, as a voltage",
+                middle,
+                "check which column (or signal) is the temperature",
+            )
+        if 200.0 <= middle <= 400.0:
+            cure = "subtract 273.15"
+            if not voltage_follows and _maybe_temperature(values["voltage_v"]):
+                cure += ", or exchange it with the voltage if these two are swapped"
+            raise refuse("temperature_c", "temperature looks like kelvin", middle, cure)
     if not COLDEST_C <= middle <= HOTTEST_C:
         raise refuse(
             "temperature_c", "this is no battery's temperature in °C", middle, "give it in °C"
