@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from days import day, late
 
 from cangauge.errors import InputError
 from cangauge.estimate.estimator import EstimatorSettings
@@ -16,35 +17,10 @@ from cangauge.gap.diagnose import Diagnosis, diagnose, in_words
 from cangauge.gap.extend import library_without, model_file_of
 from cangauge.gap.settle import settle
 from cangauge.gap.soc_error import soc_mae_pct
-from cangauge.identify.fit import FitOptions, fit
 from cangauge.logs.log import Log
 from cangauge.model.model_file import ModelFile, load_model, model_json
-from cangauge.model.published import CAPACITY_AH
 from cangauge.report.gap_report import gap_report
 from synthetic import synthetic_log
-
-
-def day(seed: int) -> Log:
-    return synthetic_log(
-        hours=0.8,
-        start_pct=85.0,
-        end_pct=60.0,
-        noise_v=0.5,
-        seed=seed,
-        name=f"day {seed}",
-    )
-
-
-@pytest.fixture(scope="module")
-def model() -> ModelFile:
-    logs = [synthetic_log(noise_v=0.5, seed=seed) for seed in (1, 2, 3)]
-    return fit(logs, FitOptions(capacity_ah=CAPACITY_AH)).model
-
-
-@pytest.fixture(scope="module")
-def references() -> list[Log]:
-    return [day(seed) for seed in (11, 12, 13)]
-
 
 FAULTS = {
     "current_offset": lambda log: replace(log, current_a=log.current_a + 4.0),
@@ -56,9 +32,7 @@ FAULTS = {
         log, voltage_v=log.voltage_v - 0.05 * log.current_a * (log.time_s > 1400.0)
     ),
     "initial_soc": lambda log: replace(log, soc_pct=log.soc_pct + 5.0),
-    "time_skew": lambda log: replace(
-        log, current_a=np.interp(log.time_s - 1.0, log.time_s, log.current_a)
-    ),
+    "time_skew": late,
 }
 
 

@@ -12,10 +12,8 @@ from cangauge.gap.diagnose import diagnose
 from cangauge.gap.extend import library_without
 from cangauge.gap.settle import Settled, settle
 from cangauge.gap.verdict import Verdict, decide
-from cangauge.identify.fit import FitOptions, fit
 from cangauge.logs.log import Log
 from cangauge.model.model_file import ModelFile
-from cangauge.model.published import CAPACITY_AH
 from synthetic import synthetic_log
 
 
@@ -48,12 +46,6 @@ def with_fast_polarization(log: Log, ohm: float) -> Log:
 
 def with_late_current(log: Log, late_s: float) -> Log:
     return replace(log, current_a=np.interp(log.time_s - late_s, log.time_s, log.current_a))
-
-
-@pytest.fixture(scope="module")
-def model() -> ModelFile:
-    logs = [synthetic_log(noise_v=0.5, seed=seed) for seed in (1, 2, 3)]
-    return fit(logs, FitOptions(capacity_ah=CAPACITY_AH)).model
 
 
 @pytest.fixture(scope="module")

@@ -7,34 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from days import day, late
 
 from cangauge.errors import InputError
 from cangauge.gap.diagnose import diagnose, in_words
 from cangauge.gap.limits import reference_fit, worse_with
 from cangauge.gap.sound import sound
 from cangauge.gap.spikes import FEW, without_spikes
-from cangauge.identify.fit import FitOptions, fit
 from cangauge.logs.log import Log
 from cangauge.model.model_file import ModelFile
-from cangauge.model.published import CAPACITY_AH
-from synthetic import synthetic_log
-
-
-def day(seed: int) -> Log:
-    return synthetic_log(
-        hours=0.8, start_pct=85.0, end_pct=60.0, noise_v=0.5, seed=seed, name=f"day {seed}"
-    )
-
-
-@pytest.fixture(scope="module")
-def model() -> ModelFile:
-    logs = [synthetic_log(noise_v=0.5, seed=seed) for seed in (1, 2, 3)]
-    return fit(logs, FitOptions(capacity_ah=CAPACITY_AH)).model
-
-
-@pytest.fixture(scope="module")
-def references() -> list[Log]:
-    return [day(seed) for seed in (11, 12, 13)]
 
 
 def with_row(log: Log, channel: str, row: int, value: float) -> Log:
@@ -120,10 +101,6 @@ def test_a_log_of_another_pack_gets_no_name(model: ModelFile, references: list[L
     log = day(21)
     other = replace(log, voltage_v=1.13 * log.voltage_v, temperature_c=log.temperature_c - 15.0)
     assert diagnose([other], model, references).verdict.cause == "unknown"
-
-
-def late(log: Log) -> Log:
-    return replace(log, current_a=np.interp(log.time_s - 1.0, log.time_s, log.current_a))
 
 
 def stepped(log: Log) -> Log:
