@@ -45,7 +45,7 @@ from cangauge.gapcheck.targets import judge_targets
 from cangauge.report.words import duration
 from cangauge.twin.pybamm_plant import import_pybamm
 
-FINAL_SEED = 7
+FINAL_SEED = 8
 """Raised for each release's check: what one has shown may have shaped the next method."""
 
 PROTOCOLS = (*FULL, OPEN_SET)
