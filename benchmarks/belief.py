@@ -1,4 +1,4 @@
-"""Learn the weights of `cangauge.gap.belief` from cases whose cause is known, and print them.
+"""Learn the weights of `cangauge.diagnosis.posterior` from labelled cases, and print them.
 
     cangauge gap-check --protocol simulated --per-effect 5 --healthy 150 --seed 32 --keep cases
     python benchmarks/belief.py cases…
@@ -29,14 +29,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from cangauge.gap import belief
-from cangauge.gap.compared import Compared, compare
-from cangauge.gap.diagnose import library_without
-from cangauge.gap.settle import settle
-from cangauge.gap.verdict import ALIKE_FROM, NAMED_FROM, SEEN_BELOW
-from cangauge.gapcheck.outcome import LEAST_GAP
+from cangauge.diagnosis import posterior as belief
+from cangauge.diagnosis.extended_model import library_without
+from cangauge.diagnosis.posterior import ALIKE_FROM, NAMED_FROM, SEEN_BELOW, Compared, compare
+from cangauge.diagnosis.problem import settle
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import load_model
+from cangauge.validation.score import LEAST_GAP
 
 FloatArray = NDArray[np.float64]
 

@@ -35,19 +35,19 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from cangauge.bus.encode import FrameEncoder
+from cangauge._resources import shared_file
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.vehicle import load_vehicle
-from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import estimate_log
-from cangauge.estimate.types import Sample
+from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimate.validity import Sample
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import load_model
-from cangauge.replay.pace import Pacer
-from cangauge.service.gauge import Gauge, GaugeSettings
-from cangauge.service.record import Recorder
-from cangauge.share import shared_file
+from cangauge.replay.player import Pacer
+from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.recording import Recorder
 
 RATE = 4000
 """Frames a second of a saturated 500 kbit/s bus."""

@@ -25,22 +25,21 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from cangauge.bus.connection import BusPort
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.publish import standard_filter
-from cangauge.bus.receive import BusPort
 from cangauge.bus.vehicle import Vehicle, load_vehicle
-from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import run_estimator, samples_of
-from cangauge.estimate.types import Estimate
+from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimate.validity import Estimate
 from cangauge.logs.log import Log
 from cangauge.model.model_file import ModelFile
-from cangauge.replay.bound import quantisation_bound
 from cangauge.replay.player import ReplaySettings, play
-from cangauge.replay.steps import LogSource
+from cangauge.replay.steps import LogSource, quantisation_bound
 from cangauge.service.capture_estimate import estimate_capture
-from cangauge.service.gauge import Gauge, GaugeSettings
 from cangauge.service.loop import LoopSettings, Outputs, serve
-from cangauge.service.record import Recorder
+from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.recording import Recorder
 from real_trips import DATA, JUDGED_S, TEST, TRAINING, identify, read_trips
 
 NUMBERS = ("soc_pct", "soc_std_pct", "soc_newton_pct", "soc_coulomb_pct", "residual_v")

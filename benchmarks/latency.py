@@ -37,13 +37,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from cangauge.bus.encode import FrameEncoder
+from cangauge._resources import shared_file
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import load_vehicle
-from cangauge.estimate.types import Sample
-from cangauge.replay.pace import Pacer
-from cangauge.share import shared_file
+from cangauge.estimate.validity import Sample
+from cangauge.replay.player import Pacer
 from faults.line import udp
 
 SOC_DETAIL_ID: Final = 0x5A1

@@ -19,7 +19,13 @@ from rich.console import Console
 from rich.table import Table
 
 from cangauge.errors import InputError
-from cangauge.gapcheck.recorded import (
+from cangauge.identify.rows import FitOptions
+from cangauge.identify.voltage_fit import fit_voltage_model, prepare
+from cangauge.logs.log import Log
+from cangauge.logs.read import read_log
+from cangauge.model.charge import capacity_from_reference
+from cangauge.model.voltage_model import VoltageModel
+from cangauge.validation.cases import (
     LG_25C,
     LG_CAPACITY_AH,
     LG_PARALLEL,
@@ -27,13 +33,7 @@ from cangauge.gapcheck.recorded import (
     summer_held_out,
     summer_training,
 )
-from cangauge.identify.charge import capacity_from_reference
-from cangauge.identify.options import FitOptions
-from cangauge.identify.voltage_fit import fit_voltage_model, prepare
-from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
-from cangauge.model.voltage_model import VoltageModel
-from cangauge.twin.inject import scaled_to_pack, with_start
+from cangauge.validation.twin.recorded import scaled_to_pack, with_start
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 COLDER_AND_WARMER = ("0", "10", "40")

@@ -21,8 +21,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from cangauge.estimate.estimator import Estimator, EstimatorSettings
+from cangauge.estimate.estimator import Estimator
 from cangauge.estimate.offline import samples_of
+from cangauge.estimate.settings import EstimatorSettings
 from cangauge.logs.log import Log
 from cangauge.model.model_file import ModelFile
 from real_trips import DATA, TEST, TRAINING, identify, read_trips

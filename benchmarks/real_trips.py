@@ -27,16 +27,16 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import EstimateTable, run_estimator, samples_of
-from cangauge.estimate.types import Sample
-from cangauge.identify.charge import capacity_from_reference
-from cangauge.identify.effects.prepared import prepare_log
-from cangauge.identify.evaluate import LogFit, evaluate, evaluate_extended
-from cangauge.identify.fit import FitOptions, Identification, fit
+from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimate.validity import Sample
+from cangauge.identify.fit import Identification, LogFit, evaluate, evaluate_extended, fit
+from cangauge.identify.linearized import prepare_log
+from cangauge.identify.rows import FitOptions
 from cangauge.identify.voltage_fit import prepare
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
+from cangauge.model.charge import capacity_from_reference
 from cangauge.model.model_file import ModelFile
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "bmw_i3"

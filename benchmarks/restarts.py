@@ -38,17 +38,17 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cangauge.bus.encode import FrameEncoder
+from cangauge._resources import shared_file
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.publish import FrameIds, SocEstimate, SocReader
 from cangauge.bus.vehicle import load_vehicle
-from cangauge.estimate.estimator import EstimatorSettings
-from cangauge.estimate.types import Estimate, Reason, Sample
+from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimate.validity import Estimate, Reason, Sample
 from cangauge.model.model_file import ModelFile, load_model
-from cangauge.service.gauge import Gauge, GaugeSettings
-from cangauge.service.state_keeper import StateKeeper, StateSettings
-from cangauge.service.upkeep import CHECKPOINT_EVERY_S, FIRST_CHECKPOINT_S
-from cangauge.share import shared_file
+from cangauge.service.loop import CHECKPOINT_EVERY_S, FIRST_CHECKPOINT_S
+from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.state import StateKeeper, StateSettings
 
 EVERY_S = CHECKPOINT_EVERY_S
 RATE_HZ = 10

@@ -25,7 +25,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from cangauge.atomic import atomic_path
+from cangauge._io import atomic_path
 from cangauge.errors import CangaugeError, InputError
 from cangauge.model.charge import discharged_ah
 from cangauge.model.delay_line import delayed_currents

@@ -19,16 +19,16 @@ from typing import Any, Self
 import can
 import pytest
 
+from cangauge._resources import shared_file
+from cangauge.bus.connection import BusPort
 from cangauge.bus.open import BusAddress, open_bus
-from cangauge.bus.receive import BusPort
 from cangauge.bus.vehicle import Vehicle, load_vehicle
 from cangauge.cli.app import main
-from cangauge.estimate.types import Estimate
+from cangauge.estimate.validity import Estimate
 from cangauge.logs.log import Log
 from cangauge.model.model_file import ModelFile, load_model
-from cangauge.service.gauge import Gauge, GaugeSettings
 from cangauge.service.loop import LoopSettings, Outputs, RunSummary, serve
-from cangauge.share import shared_file
+from cangauge.service.pipeline import Gauge, GaugeSettings
 from synthetic import synthetic_log
 
 COMMAND = "import sys; from cangauge.cli.app import main; main()"

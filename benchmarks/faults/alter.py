@@ -16,7 +16,7 @@ import can
 
 from cangauge.bus.protection import ProtectionRule
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimate.types import Sample
+from cangauge.estimate.validity import Sample
 from faults.drive import ROLES, Event, FrameChange, Profile, ValueChange, altered
 
 NOT_AVAILABLE: Final = {

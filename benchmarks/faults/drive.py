@@ -11,12 +11,12 @@ from typing import Final
 
 import can
 
-from cangauge.bus.encode import FrameEncoder
+from cangauge._resources import shared_file
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.offline import samples_of
-from cangauge.estimate.types import Sample
+from cangauge.estimate.validity import Sample
 from cangauge.logs.read import read_log
-from cangauge.share import shared_file
 
 LOG: Final = "leaf2012_reconstruction_10min.parquet"
 ROLES: Final = ("current", "voltage", "temperature")

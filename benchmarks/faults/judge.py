@@ -22,7 +22,7 @@ from typing import Final
 
 import numpy as np
 
-from cangauge.logs.log import FloatArray
+from cangauge._typing import FloatArray
 
 WITHIN_PCT: Final = 1.0
 SILENT_S: Final = 3.0

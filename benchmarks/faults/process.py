@@ -27,7 +27,7 @@ PRELOAD: Final = [
     "faults.process",
     "cangauge.cli.app",
     "cangauge.cli.run",
-    "cangauge.estimate.fusion",
+    "cangauge.estimate.ekf",
     "can.interfaces.udp_multicast",
     "can.interfaces.socketcan",
 ]

@@ -13,11 +13,11 @@ from typing import Final
 import can
 import cantools
 
+from cangauge._resources import shared_file
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle, load_vehicle
 from cangauge.errors import CangaugeError
-from cangauge.replay.pace import Pacer
-from cangauge.share import shared_file
+from cangauge.replay.player import Pacer
 from faults.drive import ROLES, Event, events
 from faults.fault import Action, Fault
 from faults.judge import RECOVERED_SHARE, Seen, Told

@@ -14,7 +14,7 @@ from pathlib import Path
 from random import Random
 from typing import Any, Final
 
-from cangauge.share import shared_file
+from cangauge._resources import shared_file
 from faults.drive import Profile, initial_soc_pct
 from faults.line import Line
 from faults.process import Process, Target, cangauge

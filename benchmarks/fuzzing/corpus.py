@@ -16,13 +16,13 @@ import can
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cangauge.bus.encode import FrameEncoder
+from cangauge._resources import shared_file
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import load_vehicle
-from cangauge.estimate.types import Sample
+from cangauge.estimate.validity import Sample
+from cangauge.model.effects.base import Pack, Parameter
 from cangauge.model.effects.library import LIBRARY, effect_entries
-from cangauge.model.effects.parameter import Pack, Parameter
 from cangauge.model.model_file import load_model
-from cangauge.share import shared_file
 
 ROWS = 12
 

@@ -18,26 +18,27 @@ from typing import Any
 
 import can
 
-from cangauge.bus.capture_inspect import inspect_capture
+from cangauge._resources import shared_file
 from cangauge.bus.capture_log import capture_to_log
-from cangauge.bus.captures import is_capture, open_capture
+from cangauge.bus.captures.capture import is_capture, open_capture
 from cangauge.bus.database import load_dbc
-from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import GENERIC_RULE
 from cangauge.bus.publish import SocPublisher, SocReader
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle, load_vehicle
-from cangauge.estimate.estimator import Estimator, EstimatorSettings
+from cangauge.estimate.estimator import Estimator
 from cangauge.estimate.offline import estimate_log
-from cangauge.estimate.types import Estimate, Sample
-from cangauge.inspect.analysis import inspect_log
+from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimate.validity import Estimate, Sample
+from cangauge.inspect.capture import inspect_capture
+from cangauge.inspect.log import inspect_log
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import ModelFile, load_model
 from cangauge.service.config import load_config
-from cangauge.service.stream import EstimateStream
-from cangauge.share import shared_file
-from cangauge.twin.schedule import read_speed
+from cangauge.service.pipeline import EstimateStream
+from cangauge.validation.twin.day import read_speed
 from fuzzing import corpus
 from fuzzing.mutate import json_bytes, mutate, mutate_json
 from fuzzing.target import FindingError, Target, refusable
@@ -359,7 +360,7 @@ def _run_model(data: bytes) -> bool:
 def _state_target() -> Target | None:
     """Return the target of state files, where this release keeps any."""
     try:
-        from cangauge.service import state_file  # noqa: PLC0415
+        from cangauge.service import state as state_file  # noqa: PLC0415
     except ImportError:
         return None
     return Target("state", lambda rng: _make_state(rng, state_file), _runs_state(state_file), 0.05)

@@ -8,11 +8,11 @@ from dataclasses import replace
 import can
 import pytest
 
-from cangauge.bus.decode import SampleAssembler
-from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.decoder import SampleAssembler
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import LEAF_RULE
 from cangauge.bus.vehicle import EXTENDED, Vehicle, load_vehicle
-from cangauge.estimate.types import Sample
+from cangauge.estimate.validity import Sample
 
 CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID, SOC_ID = 0x400, 0x401, 0x402, 0x403
 

@@ -9,15 +9,15 @@ import can
 import numpy as np
 import pytest
 
-from cangauge.bus.capture_inspect import inspect_capture
 from cangauge.bus.capture_log import capture_samples, capture_to_log
-from cangauge.bus.decode import SampleAssembler
-from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.decoder import SampleAssembler
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import LEAF_RULE
 from cangauge.bus.time_source import ClockFrames, ReceiveTime
 from cangauge.bus.vehicle import Vehicle, load_vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.types import Sample
+from cangauge.estimate.validity import Sample
+from cangauge.inspect.capture import inspect_capture
 
 CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID = 0x400, 0x401, 0x402
 

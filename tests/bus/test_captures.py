@@ -11,7 +11,7 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.captures import is_capture, open_capture, read_capture
+from cangauge.bus.captures.capture import is_capture, open_capture, read_capture
 from cangauge.errors import InputError
 
 SPACED = (

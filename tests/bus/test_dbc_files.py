@@ -11,11 +11,10 @@ from cantools.database.can import Database
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cangauge.bus.e2e_rule import E2eRule
-from cangauge.bus.protection import CRC_ONLY_RULE, GENERIC_RULE, LEAF_RULE
-from cangauge.bus.signal_codec import signal_codec
-from cangauge.estimate.types import Reason, Status
-from cangauge.share import shared_file
+from cangauge._resources import shared_file
+from cangauge.bus.database import signal_codec
+from cangauge.bus.protection import CRC_ONLY_RULE, GENERIC_RULE, LEAF_RULE, E2eRule
+from cangauge.estimate.validity import Reason, Status
 
 FILES = ("nissan_leaf.dbc", "generic_pack.dbc", "soc_estimate.dbc")
 

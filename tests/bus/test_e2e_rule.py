@@ -9,13 +9,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cangauge.bus.counter_rule import CounterRule
-from cangauge.bus.e2e_rule import PROFILES, E2eRule
+from cangauge.bus.database import Field
 from cangauge.bus.mapping import CheckMap, MessageMap
-from cangauge.bus.overrides import Overrides
-from cangauge.bus.protection import LEAF_RULE, FrameChecker, Protection, Verdict
-from cangauge.bus.signal_codec import Field
-from cangauge.bus.vehicle import Vehicle, load_vehicle
+from cangauge.bus.protection import (
+    LEAF_RULE,
+    PROFILES,
+    CounterRule,
+    E2eRule,
+    FrameChecker,
+    Protection,
+    Verdict,
+)
+from cangauge.bus.vehicle import Overrides, Vehicle, load_vehicle
 from cangauge.errors import InputError
 
 IDS = bytes(range(0x40, 0x50))

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cangauge.bus.decode import SampleAssembler
-from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.decoder import SampleAssembler
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle, load_vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.types import Sample
+from cangauge.estimate.validity import Sample
 from cangauge.logs.log import Log
 
 VEHICLES = {

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from cangauge._io import MAX_DBC_BYTES
 from cangauge.bus.database import load_dbc
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.errors import InputError
-from cangauge.limits import MAX_DBC_BYTES
 
 GOOD = 'BO_ 256 M: 8 X\n SG_ s : 0|8@1+ (1,0) [0|0] "A" X\n'
 

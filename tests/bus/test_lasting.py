@@ -14,10 +14,10 @@ import can
 import pytest
 from can.typechecking import CanFilter
 
-from cangauge.bus import lasting
-from cangauge.bus.lasting import FIRST_PAUSE_S, LONGEST_PAUSE_S, LastingPort
+from cangauge.bus import reconnect as lasting
 from cangauge.bus.open import BusAddress, DriverMissingError, open_bus
 from cangauge.bus.publish import standard_filter
+from cangauge.bus.reconnect import FIRST_PAUSE_S, LONGEST_PAUSE_S, LastingPort
 from cangauge.errors import InputError
 from live import BrokenBus, network_down, unpack_error
 

@@ -7,8 +7,8 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cangauge.bus.pairing import Pairing
-from cangauge.estimate.types import Sample
+from cangauge.bus.decoder import Pairing
+from cangauge.estimate.validity import Sample
 
 WITHIN_S = 0.020
 

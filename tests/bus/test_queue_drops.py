@@ -11,10 +11,8 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.interface_facts import interface_facts
+from cangauge.bus.connection import BusPort, interface_facts, queue_drops
 from cangauge.bus.open import BusAddress, bus_address, open_bus
-from cangauge.bus.queue_drops import queue_drops
-from cangauge.bus.receive import BusPort
 
 linux_only = pytest.mark.skipif(sys.platform != "linux", reason="the count is Linux's")
 

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cangauge.bus.capture_inspect import inspect_capture
+from cangauge._resources import shared_file
 from cangauge.bus.capture_log import capture_samples, capture_to_log
-from cangauge.bus.captures import is_capture, open_capture
+from cangauge.bus.captures.capture import is_capture, open_capture
 from cangauge.bus.database import load_dbc
-from cangauge.bus.decode import SampleAssembler
+from cangauge.bus.decoder import SampleAssembler
 from cangauge.bus.protection import LEAF_RULE
 from cangauge.bus.vehicle import Vehicle, load_vehicle
-from cangauge.share import shared_file
+from cangauge.inspect.capture import inspect_capture
 
 pytestmark = pytest.mark.real
 

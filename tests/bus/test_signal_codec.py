@@ -11,7 +11,7 @@ from cantools.database.can import Database, Message
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from cangauge.bus.signal_codec import SignalCodec, signal_codec
+from cangauge.bus.database import SignalCodec, signal_codec
 from cangauge.errors import InputError
 
 

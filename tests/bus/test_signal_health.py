@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cangauge.bus.signal_checks import SignalChecks
-from cangauge.bus.signal_health import Fault, SignalHealth, Trust
+from cangauge.bus.plausibility import Fault, SignalChecks, SignalHealth, Trust
 
 NAN = math.nan
 

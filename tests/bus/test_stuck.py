@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 
 import pytest
 
-from cangauge.bus.stuck import Pack, StuckPair
+from cangauge.bus.plausibility import Pack, StuckPair
 
 PACK = Pack(resistance_ohm=0.1, error_std_v=0.5, capacity_ah=50.0, usual_v=370.0)
 RATE_HZ = 10.0

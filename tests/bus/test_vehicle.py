@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.bus.presets import PRESETS
 from cangauge.bus.protection import LEAF_RULE
-from cangauge.bus.vehicle import Vehicle, load_vehicle
+from cangauge.bus.vehicle import PRESETS, Vehicle, load_vehicle
 from cangauge.errors import InputError
 
 DBC = """VERSION ""

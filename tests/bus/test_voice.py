@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cangauge.bus.voice import Voice
+from cangauge._logging import Voice
 
 
 class Clock:

@@ -11,10 +11,9 @@ from pathlib import Path
 import can
 import pytest
 
+from cangauge.bus.connection import AT_ONCE, BusError, BusPort, NothingWaitsError, waiting_frames
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.publish import standard_filter
-from cangauge.bus.receive import AT_ONCE, BusError, BusPort
-from cangauge.bus.waiting import NothingWaitsError, waiting_frames
 from live import BrokenBus, network_down, same_frames, unpack_error
 
 FILTERS = [

@@ -9,10 +9,10 @@ import sys
 import pytest
 import typer
 
+from cangauge._resources import THREADS
 from cangauge.cli.app import COMMANDS, app
-from cangauge.threads import THREADS
 
-SLOW_TO_IMPORT = ("bokeh", "pyarrow", "clarabel", "cangauge.gap", "cangauge.report.page")
+SLOW_TO_IMPORT = ("bokeh", "pyarrow", "clarabel", "cangauge.diagnosis", "cangauge.report.page")
 
 
 @pytest.mark.parametrize("name", COMMANDS)

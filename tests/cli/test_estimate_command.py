@@ -14,11 +14,11 @@ import pyarrow.csv
 import pyarrow.parquet
 import pytest
 
-from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import load_vehicle
-from cangauge.cli.estimate_file import write_estimates
-from cangauge.estimate.estimator import EstimatorSettings
+from cangauge.cli.estimate import write_estimates
 from cangauge.estimate.offline import estimate_log, samples_of
+from cangauge.estimate.settings import EstimatorSettings
 from cangauge.logs.canonical import write_log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import load_model

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from cangauge.estimate.anchors import FullCharge, LongRest
-from cangauge.estimate.estimator import Estimator, EstimatorSettings
+from cangauge.estimate.estimator import Estimator
+from cangauge.estimate.settings import EstimatorSettings, FullCharge, LongRest
 from cangauge.estimate.state import EstimatorState
-from cangauge.estimate.types import Estimate, Reason, Sample, Status
+from cangauge.estimate.validity import Estimate, Reason, Sample, Status
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import ModelFile
 from cangauge.model.published import leaf_2012_model_file

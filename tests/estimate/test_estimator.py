@@ -10,14 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cangauge.errors import InputError
-from cangauge.estimate.coulomb import CoulombCounter
-from cangauge.estimate.estimator import Estimator, EstimatorSettings
+from cangauge.estimate.counting import CoulombCounter
+from cangauge.estimate.estimator import Estimator
 from cangauge.estimate.offline import estimate_log, run_estimator, samples_of
-from cangauge.estimate.types import Reason, Sample, Status
-from cangauge.identify.fit import FitOptions, fit
-from cangauge.model.inverse import soc_from_ocv
+from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimate.validity import Reason, Sample, Status
+from cangauge.identify.fit import fit
+from cangauge.identify.rows import FitOptions
 from cangauge.model.model_file import ModelFile
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
+from cangauge.model.voltage_model import soc_from_ocv
 from synthetic import synthetic_log
 
 

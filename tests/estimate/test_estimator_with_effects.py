@@ -7,13 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import estimate_log
+from cangauge.estimate.settings import EstimatorSettings
 from cangauge.logs.log import Log
-from cangauge.model.effects.effect import Effect
+from cangauge.model.effects.base import Effect, Pack, Signals
 from cangauge.model.effects.library import LIBRARY, effect_entries
-from cangauge.model.effects.pack_state import Signals
-from cangauge.model.effects.parameter import Pack
 from cangauge.model.model_file import ModelFile
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
 from synthetic import synthetic_log

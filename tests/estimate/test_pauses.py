@@ -9,12 +9,11 @@ from typing import Any
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.estimate.anchors import FullCharge, LongRest
-from cangauge.estimate.clock import SET_BACK_SAMPLES
-from cangauge.estimate.estimator import Estimator, EstimatorSettings
+from cangauge.estimate.counting import SET_BACK_SAMPLES, moved_log_odds
+from cangauge.estimate.estimator import Estimator
 from cangauge.estimate.offline import samples_of
-from cangauge.estimate.pause import moved_log_odds
-from cangauge.estimate.types import Estimate, Reason, Sample
+from cangauge.estimate.settings import EstimatorSettings, FullCharge, LongRest
+from cangauge.estimate.validity import Estimate, Reason, Sample
 from cangauge.model.published import leaf_2012_model, leaf_2012_model_file
 from synthetic import synthetic_log
 

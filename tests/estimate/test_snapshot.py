@@ -12,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cangauge.errors import InputError
-from cangauge.estimate.anchors import FullCharge, LongRest
-from cangauge.estimate.estimator import Estimator, EstimatorSettings
+from cangauge.estimate.estimator import Estimator
 from cangauge.estimate.offline import samples_of
+from cangauge.estimate.settings import EstimatorSettings, FullCharge, LongRest
 from cangauge.estimate.state import EstimatorState
-from cangauge.estimate.types import Estimate, Reason, Sample
+from cangauge.estimate.validity import Estimate, Reason, Sample
+from cangauge.model.effects.base import Pack
 from cangauge.model.effects.library import LIBRARY, effect_entries
-from cangauge.model.effects.parameter import Pack
 from cangauge.model.model_file import ModelFile
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
 from synthetic import synthetic_log

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from cangauge.estimate.estimator import Estimator, EstimatorSettings
+from cangauge.estimate.estimator import Estimator
 from cangauge.estimate.offline import samples_of
-from cangauge.estimate.types import Estimate, Reason, Sample
+from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimate.validity import Estimate, Reason, Sample
 from cangauge.model.model_file import ModelFile
 from live import leaf_model, short_log
 

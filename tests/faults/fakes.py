@@ -16,8 +16,8 @@ from typing import Any
 import can
 import cantools
 
-from cangauge.estimate.types import Status
-from cangauge.share import shared_file
+from cangauge._resources import shared_file
+from cangauge.estimate.validity import Status
 
 AGE_S = 2.0
 """Older input is missed [s]; the last words of a run are shorter."""

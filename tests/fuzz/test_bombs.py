@@ -22,10 +22,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from cangauge.bus.capture_inspect import inspect_capture
-from cangauge.bus.captures import read_capture
+from cangauge.bus.captures.capture import read_capture
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.errors import InputError
+from cangauge.inspect.capture import inspect_capture
 from cangauge.logs.read import read_log
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import load_model

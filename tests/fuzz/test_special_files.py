@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.bus.captures import is_capture, open_capture
+from cangauge.bus.captures.capture import is_capture, open_capture
 from cangauge.bus.database import load_dbc
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.errors import InputError
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import load_model
 from cangauge.service.config import load_config
-from cangauge.twin.schedule import read_speed
+from cangauge.validation.twin.day import read_speed
 
 READERS: dict[str, Callable[[Path], object]] = {
     "log": read_log,

@@ -13,14 +13,14 @@ from pathlib import Path
 import pytest
 
 from cangauge.bus.capture_log import capture_to_log
-from cangauge.bus.captures import read_capture
+from cangauge.bus.captures.capture import read_capture
 from cangauge.bus.database import load_dbc
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.errors import InputError
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import load_model
 from cangauge.service.config import load_config
-from cangauge.twin.schedule import read_speed
+from cangauge.validation.twin.day import read_speed
 from fuzzing import corpus
 
 LOGS = ("log.parquet", "checked.parquet", "leaf.zip", "log.csv.gz", "utf16.csv")

@@ -11,17 +11,24 @@ import numpy as np
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import estimate_log
-from cangauge.identify.effects.ids import CLEAN, REFUSED, parse_ids
-from cangauge.identify.effects.judge import Judge, Judged, compare
-from cangauge.identify.effects.linear import free_of, linearise, moved_by, residual_of
-from cangauge.identify.effects.prepared import Prepared, prepare_log
-from cangauge.identify.fit import FitOptions, Identification, fit
+from cangauge.estimate.settings import EstimatorSettings
+from cangauge.identify.cross_validation import Judge, Judged, compare
+from cangauge.identify.effect_search import CLEAN, REFUSED, parse_ids
+from cangauge.identify.fit import Identification, fit
+from cangauge.identify.linearized import (
+    Prepared,
+    free_of,
+    linearise,
+    moved_by,
+    prepare_log,
+    residual_of,
+)
+from cangauge.identify.rows import FitOptions
 from cangauge.identify.voltage_fit import fit_voltage_model, held_out_errors
 from cangauge.logs.log import Log
+from cangauge.model.effects.base import Signals
 from cangauge.model.effects.library import LIBRARY, effect_entries, parse_effects
-from cangauge.model.effects.pack_state import Signals
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 from synthetic import synthetic_log
@@ -238,7 +245,7 @@ def test_kt_stays_physical_where_the_temperature_never_moves() -> None:
 
 def test_no_row_is_judged_by_a_fit_that_saw_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """A log that is spoilt must not change what the folds without it say of the others."""
-    monkeypatch.setattr("cangauge.identify.effects.linear.KT_WITHIN_PER_K", math.inf)
+    monkeypatch.setattr("cangauge.identify.linearized.KT_WITHIN_PER_K", math.inf)
     logs = of_trips("dynamics")
     judge = Judge(logs)
     seen = np.zeros(judge.unit.size, dtype=int)

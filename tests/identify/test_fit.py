@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.identify.charge import capacity_from_full_discharge, capacity_from_reference
 from cangauge.identify.delays import search_delays
-from cangauge.identify.fit import FitOptions, fit
-from cangauge.identify.least_squares import solve
-from cangauge.identify.noise import describe_noise
+from cangauge.identify.fit import describe_noise, fit
+from cangauge.identify.rows import FitOptions
+from cangauge.inference.least_squares import solve
 from cangauge.logs.log import Log
-from cangauge.model.charge import discharged_ah
+from cangauge.model.charge import (
+    capacity_from_full_discharge,
+    capacity_from_reference,
+    discharged_ah,
+)
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 from cangauge.model.voltage_model import VoltageModel
 from synthetic import synthetic_log

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from cangauge.identify.least_squares import nearest_rising
+from cangauge.inference.least_squares import nearest_rising
 
 FloatArray = NDArray[np.float64]
 

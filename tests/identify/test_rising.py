@@ -7,9 +7,10 @@ import pytest
 
 from cangauge.errors import InputError
 from cangauge.identify import voltage_fit
-from cangauge.identify.fit import FitOptions, fit
+from cangauge.identify.fit import fit
+from cangauge.identify.rows import FitOptions
 from cangauge.model.voltage_model import SLOPE_POINTS
-from cangauge.twin.world import draw_world
+from cangauge.validation.twin.world import draw_world
 
 
 def test_a_curve_that_falls_between_two_points_is_held_there_as_well(

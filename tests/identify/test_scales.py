@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cangauge.identify.scales import SCALES, by_scale, scale_variances
+from cangauge.inference.time_scales import SCALES, by_scale, scale_variances
 
 FloatArray = NDArray[np.float64]
 ROWS = 2048

@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cangauge.gapcheck.recorded import LG_CAPACITY_AH, LG_PARALLEL, LG_SERIES
-from cangauge.identify.fit import FitOptions, fit
+from cangauge.identify.fit import fit
+from cangauge.identify.rows import FitOptions
 from cangauge.identify.voltage_fit import fit_voltage_model, prepare
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.effects.first_order import low_passed
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 from cangauge.model.voltage_model import VoltageModel
-from cangauge.twin.inject import scaled_to_pack, with_start
+from cangauge.validation.cases import LG_CAPACITY_AH, LG_PARALLEL, LG_SERIES
+from cangauge.validation.twin.recorded import scaled_to_pack, with_start
 from synthetic import synthetic_log
 
 OPTIONS = FitOptions(capacity_ah=CAPACITY_AH)

@@ -79,7 +79,7 @@ def test_a_log_needs_no_vehicle(path: Path, option: str) -> None:
 def test_a_capture_is_inspected_with_and_without_a_vehicle(
     shared_data: Path, options: list[str]
 ) -> None:
-    pytest.importorskip("cangauge.bus.capture_inspect")
+    pytest.importorskip("cangauge.inspect.capture")
     capture = str(shared_data / "leaf_can" / "ZE0_Shift_P_D_ECO_N.log.gz")
     result = CliRunner().invoke(app, [capture, *options, "--json"])
     assert result.exit_code == 0, result.exception

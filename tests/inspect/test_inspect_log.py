@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cangauge.cli.output import _plain
-from cangauge.inspect.analysis import LogInspection, inspect_log
 from cangauge.inspect.channels import quantum_of
+from cangauge.inspect.log import LogInspection, inspect_log
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 

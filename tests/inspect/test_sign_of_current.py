@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cangauge.errors import InputError
-from cangauge.inspect.sign import (
+from cangauge.logs.log import Log
+from cangauge.logs.read import read_log
+from cangauge.logs.sign import (
     correlation,
     current_steps,
     require_discharge_positive,
     sign_of_current,
 )
-from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 
 
 def drive(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.atomic import atomic_path, check_writable, write_text_atomic
+from cangauge._io import atomic_path, check_writable, write_text_atomic
 from cangauge.errors import CangaugeError, InputError
 
 

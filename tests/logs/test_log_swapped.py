@@ -10,9 +10,9 @@ import pytest
 
 from cangauge.errors import InputError
 from cangauge.logs.canonical import write_log
-from cangauge.logs.follow import follows_current
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
+from cangauge.logs.units import follows_current
 from synthetic import synthetic_log
 
 

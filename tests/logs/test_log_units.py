@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cangauge.errors import InputError
-from cangauge.logs.assemble import Draft
-from cangauge.logs.content import Content
+from cangauge.logs.draft import Draft
+from cangauge.logs.file_content import Content
 from cangauge.logs.units import convert
 
 

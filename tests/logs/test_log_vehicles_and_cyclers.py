@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.inspect.sign import charge_ah
 from cangauge.logs.read import read_log
+from cangauge.logs.sign import charge_ah
 
 
 def test_i3_current_is_turned_and_soc_may_end_early(

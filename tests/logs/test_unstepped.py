@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cangauge.logs.log import Log
-from cangauge.logs.unstepped import unstepped, usual_step_k
+from cangauge.logs.resample import unstepped, usual_step_k
 
 FloatArray = NDArray[np.float64]
 

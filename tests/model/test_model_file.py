@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.identify.fit import FitOptions, fit
+from cangauge.identify.fit import fit
+from cangauge.identify.rows import FitOptions
 from cangauge.model.model_file import ModelFile, load_model, model_json
 from synthetic import synthetic_log
 

@@ -7,10 +7,10 @@ from functools import cache
 import numpy as np
 import pytest
 
+from cangauge._resources import shared_file
 from cangauge.identify.fit import Identification, fit
 from cangauge.logs.read import read_log
 from cangauge.model import published
-from cangauge.share import shared_file
 
 MODEL = published.leaf_2012_model()
 

@@ -11,13 +11,13 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from cangauge.identify.energy import energy_balance
+from cangauge._resources import shared_file
+from cangauge.identify.fit import energy_balance
 from cangauge.identify.rows import FitRows, decimate, fit_rows
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model import published
 from cangauge.model.charge import discharged_ah
-from cangauge.share import shared_file
 
 VARIANTS = ("white", "correlated")
 FILES = tuple(f"leaf2012_reconstruction_{name}.parquet" for name in (*VARIANTS, "10min"))

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from cangauge.replay.pace import Pacer
+from cangauge.replay.player import Pacer
 from live import never
 
 

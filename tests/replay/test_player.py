@@ -15,21 +15,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.connection import BusPort
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.publish import FrameIds, SocPublisher, standard_filter
-from cangauge.bus.receive import BusPort
 from cangauge.bus.time_source import is_clock
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.errors import CangaugeError, InputError
-from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import run_estimator, samples_of
-from cangauge.replay.bound import quantisation_bound
+from cangauge.estimate.settings import EstimatorSettings
 from cangauge.replay.player import ReplaySettings, ReplayState, play
-from cangauge.replay.steps import CaptureSource, LogSource
-from cangauge.service.gauge import GaugeSettings
-from cangauge.service.record import Recorder
-from cangauge.service.stream import NOTHING_YET
+from cangauge.replay.steps import CaptureSource, LogSource, quantisation_bound
+from cangauge.service.pipeline import NOTHING_YET, GaugeSettings
+from cangauge.service.recording import Recorder
 from live import (
     Service,
     collect,

@@ -13,8 +13,8 @@ from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.errors import InputError
 from cangauge.replay.steps import CaptureSource, LogSource
-from cangauge.service.record import Recorder
-from cangauge.service.stream import NOTHING_YET
+from cangauge.service.pipeline import NOTHING_YET
+from cangauge.service.recording import Recorder
 from live import short_log
 
 

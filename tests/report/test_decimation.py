@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cangauge.report.decimate import envelope, every, extremes
+from cangauge.report.charts import envelope, every, extremes
 
 VALUES = st.one_of(st.floats(-1e6, 1e6), st.just(float("nan")))
 SERIES = arrays(np.float64, st.integers(0, 400), elements=VALUES)

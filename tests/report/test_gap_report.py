@@ -10,16 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cangauge.diagnosis.diagnose import Diagnosis, diagnose
+from cangauge.diagnosis.error_breakdown import MOMENTS, Place
 from cangauge.errors import InputError
-from cangauge.gap.diagnose import Diagnosis, diagnose
-from cangauge.gap.moments import MOMENTS
-from cangauge.gap.where import Place
-from cangauge.identify.fit import FitOptions, fit
+from cangauge.identify.fit import fit
+from cangauge.identify.rows import FitOptions
 from cangauge.logs.log import Log
 from cangauge.model.model_file import ModelFile
 from cangauge.model.published import CAPACITY_AH
-from cangauge.report.gap_maps import share_figures
-from cangauge.report.gap_report import gap_page
+from cangauge.report.diagnosis import gap_page, share_figures
 from cangauge.report.page import Beside, Bullets, Figure, Page, Section, Table, render
 from synthetic import synthetic_log
 

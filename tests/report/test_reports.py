@@ -12,15 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import estimate_log
+from cangauge.estimate.settings import EstimatorSettings
 from cangauge.identify.fit import Identification, fit
 from cangauge.logs.log import Log
-from cangauge.report.estimate_report import estimate_page, estimate_report
-from cangauge.report.fit_report import fit_page, fit_report
+from cangauge.report.charts import Recording, Timeline
+from cangauge.report.estimate import estimate_page, estimate_report
+from cangauge.report.fit import fit_page, fit_report
 from cangauge.report.page import Beside, Bullets, Figure, Page, Section, Table, Tile, render
-from cangauge.report.recorded import Recording
-from cangauge.report.timeline import Timeline
 from synthetic import synthetic_log
 
 FIT_FIGURES = [

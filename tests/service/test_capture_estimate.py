@@ -8,16 +8,16 @@ import can
 import numpy as np
 import pytest
 
-from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.offline import samples_of
-from cangauge.estimate.types import Estimate
-from cangauge.service import record
+from cangauge.estimate.validity import Estimate
+from cangauge.service import recording as record
 from cangauge.service.capture_estimate import estimate_capture
-from cangauge.service.gauge import Gauge, GaugeSettings
-from cangauge.service.record import Recorder
+from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.recording import Recorder
 from live import leaf_model, short_log
 
 NUMBERS = ("soc_pct", "soc_std_pct", "soc_newton_pct", "voltage_model_v", "residual_v")

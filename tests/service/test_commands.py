@@ -14,12 +14,12 @@ import pyarrow.csv
 import pyarrow.parquet
 import pytest
 
-from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.estimate.offline import samples_of
 from cangauge.logs.canonical import write_log
 from cangauge.service.capture_estimate import estimate_capture
-from cangauge.service.record import Recorder
+from cangauge.service.recording import Recorder
 from live import Command, in_process, leaf_model, leaf_model_path, run_to_end, short_log
 
 pytestmark = pytest.mark.slow

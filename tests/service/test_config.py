@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.bus.e2e_rule import E2eRule
-from cangauge.bus.protection import GENERIC_RULE
+from cangauge.bus.protection import GENERIC_RULE, E2eRule
 from cangauge.errors import InputError
 from cangauge.service.config import load_config
 

@@ -21,10 +21,9 @@ from prometheus_client.parser import text_string_to_metric_families
 from watched import Watched
 
 from cangauge.errors import CangaugeError, InputError
-from cangauge.service.address import http_address
-from cangauge.service.endpoint import MAX_CLIENTS, Endpoint
+from cangauge.service.config import http_address
+from cangauge.service.http import MAX_CLIENTS, Endpoint, default_path, open_unix, served_sockets
 from cangauge.service.status_client import NotRunningError, fetch_status, find_socket
-from cangauge.service.status_socket import default_path, open_unix, served_sockets
 from live import in_process
 
 TOKEN = "a-token-of-some-length"  # noqa: S105 - made up

@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from cangauge.events import LogFormat, Pace, RepeatFilter, emit, logging_to, speaker
+from cangauge._logging import LogFormat, Pace, RepeatFilter, emit, logging_to, speaker
 
 LOG = logging.getLogger("cangauge.test")
 

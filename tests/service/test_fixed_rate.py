@@ -9,15 +9,15 @@ from types import SimpleNamespace
 import can
 import pytest
 
-from cangauge.bus.encode import FrameEncoder
-from cangauge.bus.interface_facts import UNKNOWN_INTERFACE, InterfaceFacts, Stamps
+from cangauge.bus.connection import UNKNOWN_INTERFACE, InterfaceFacts, Stamps
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.publish import SocDetail, SocEstimate, SocReader
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.types import Reason, Sample, Status
+from cangauge.estimate.validity import Reason, Sample, Status
 from cangauge.service import loop
-from cangauge.service.gauge import Gauge, GaugeSettings
 from cangauge.service.loop import LoopSettings, Outputs, serve
+from cangauge.service.pipeline import Gauge, GaugeSettings
 from live import leaf_model, never
 
 

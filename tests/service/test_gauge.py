@@ -7,16 +7,16 @@ import math
 import can
 import pytest
 
-from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.publish import FrameIds, SocDetail, SocEstimate, SocReader
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle, load_vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import run_estimator, samples_of
-from cangauge.estimate.types import Estimate, Reason, Status
+from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimate.validity import Estimate, Reason, Status
 from cangauge.logs.log import Log
-from cangauge.service.gauge import Gauge, GaugeSettings
+from cangauge.service.pipeline import Gauge, GaugeSettings
 from live import leaf_model, short_log
 
 START = EstimatorSettings(initial_soc_pct=80.0)

@@ -10,15 +10,14 @@ from dataclasses import dataclass
 import can
 import pytest
 
-from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import GENERIC_RULE
 from cangauge.bus.publish import SocEstimate, SocReader
 from cangauge.bus.vehicle import BoundSignal, Vehicle, load_vehicle
-from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import samples_of
-from cangauge.estimate.types import Estimate, Reason, Sample, Status
-from cangauge.service.gauge import Gauge, GaugeSettings
-from cangauge.service.stream import EstimateStream
+from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimate.validity import Estimate, Reason, Sample, Status
+from cangauge.service.pipeline import EstimateStream, Gauge, GaugeSettings
 from live import leaf_model, short_log
 
 START = EstimatorSettings(initial_soc_pct=80.0)

@@ -10,17 +10,17 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.connection import BusError, BusPort
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.publish import SocDetail, SocEstimate, SocReader
-from cangauge.bus.receive import BusError, BusPort
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.estimate.offline import samples_of
-from cangauge.estimate.types import Reason, Status
+from cangauge.estimate.validity import Reason, Status
 from cangauge.service.capture_estimate import estimate_capture
-from cangauge.service.gauge import Gauge, GaugeSettings
 from cangauge.service.loop import LoopSettings
-from cangauge.service.record import Recorder
+from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.recording import Recorder
 from live import (
     BrokenBus,
     Service,

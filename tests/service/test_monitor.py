@@ -10,10 +10,9 @@ import time
 import pytest
 from watched import StandInPort, Watched
 
-from cangauge.estimate.types import Reason, Status
-from cangauge.service.histogram import BOUNDS_S, Histogram
-from cangauge.service.notify import Notifier
-from cangauge.service.snapshot import as_json
+from cangauge.estimate.validity import Reason, Status
+from cangauge.service.status import BOUNDS_S, Histogram, as_json
+from cangauge.service.systemd import Notifier
 
 
 class CountingNotifier(Notifier):

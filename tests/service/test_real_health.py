@@ -11,14 +11,14 @@ import can
 import pytest
 
 from cangauge.bus.capture_log import open_vehicle_capture
-from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import LEAF_RULE
 from cangauge.bus.vehicle import load_vehicle
-from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import run_estimator, samples_of
-from cangauge.estimate.types import Estimate, Reason, Status
+from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimate.validity import Estimate, Reason, Status
 from cangauge.logs.read import read_log
-from cangauge.service.stream import EstimateStream
+from cangauge.service.pipeline import EstimateStream
 from live import leaf_model
 
 pytestmark = pytest.mark.real

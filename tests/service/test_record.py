@@ -17,18 +17,18 @@ import can
 import numpy as np
 import pytest
 
-from cangauge.bus.captures import is_capture, open_capture
-from cangauge.bus.captures.parts import all_parts, part_path, parts_of_run, run_path
-from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.captures.capture import is_capture, open_capture
+from cangauge.bus.captures.files import all_parts, part_path, parts_of_run, run_path
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.offline import samples_of
 from cangauge.replay.steps import CaptureSource
-from cangauge.service import record_file
+from cangauge.service import async_writer as record_file
+from cangauge.service.async_writer import DiskWriter, RecordFile
 from cangauge.service.capture_estimate import estimate_capture
-from cangauge.service.gauge import Gauge
-from cangauge.service.record import Recorder, RecordLimits
-from cangauge.service.record_file import DiskWriter, RecordFile
+from cangauge.service.pipeline import Gauge
+from cangauge.service.recording import Recorder, RecordLimits
 from live import in_process, leaf_model, leaf_model_path, short_log, waits
 
 FORMATS = [".log", ".csv", ".log.gz", ".blf", ".mf4"]
@@ -315,7 +315,7 @@ def test_a_disk_that_hangs_does_not_hold_the_loop_or_the_end(
 
 CHILD = """
 import sys, time, can
-from cangauge.service.record import Recorder
+from cangauge.service.recording import Recorder
 with Recorder(sys.argv[1]) as recorder:
     for number in range(100_000):
         recorder.write(can.Message(

@@ -9,17 +9,17 @@ from pathlib import Path
 import can
 import pytest
 
+from cangauge._resources import shared_file
 from cangauge.bus.database import load_dbc
-from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.estimate.offline import samples_of
-from cangauge.estimate.types import Reason
+from cangauge.estimate.validity import Reason
 from cangauge.model.model_file import load_model
 from cangauge.service.config import load_config
-from cangauge.service.gauge import Gauge
 from cangauge.service.loop import LoopSettings
-from cangauge.service.reload import Reloader
-from cangauge.share import shared_file
+from cangauge.service.pipeline import Gauge
+from cangauge.service.run import Reloader
 from live import leaf_model_path, short_log
 
 MAP = """

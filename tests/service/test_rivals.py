@@ -8,13 +8,12 @@ import time
 import can
 import pytest
 
-from cangauge.bus.interface_facts import interface_facts
+from cangauge.bus.connection import BusPort, interface_facts
 from cangauge.bus.open import bus_address, open_bus
 from cangauge.bus.publish import FrameIds
-from cangauge.bus.receive import BusPort
 from cangauge.bus.vehicle import load_vehicle
-from cangauge.service.gauge import Gauge, GaugeSettings
-from cangauge.service.rivals import AGAIN_S, Rivals
+from cangauge.service.loop import AGAIN_S, Rivals
+from cangauge.service.pipeline import Gauge, GaugeSettings
 from live import Service, leaf_model, virtual_service, waits
 
 OTHER_IDS = GaugeSettings(ids=FrameIds(soc_estimate=0x5B0, soc_detail=0x5B1))

@@ -9,15 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.connection import BusPort
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.publish import SocEstimate, SocReader, standard_filter
-from cangauge.bus.receive import BusPort
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.estimate.offline import samples_of
-from cangauge.estimate.types import Reason, Status
+from cangauge.estimate.validity import Reason, Status
 from cangauge.service.loop import LoopSettings
-from cangauge.service.state_file import read_state
+from cangauge.service.state import read_state
 from live import (
     Command,
     collect,

@@ -17,17 +17,23 @@ from typing import Any
 
 import pytest
 
-from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import load_vehicle
-from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import samples_of
-from cangauge.estimate.types import Estimate, Reason, Sample, Status
+from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimate.validity import Estimate, Reason, Sample, Status
 from cangauge.model.model_file import ModelFile
-from cangauge.service import state_keeper
-from cangauge.service.gauge import Gauge, GaugeSettings
-from cangauge.service.state_file import StateContent, read_state
-from cangauge.service.state_keeper import FILE_NAME, StateKeeper, StateSettings, state_path
+from cangauge.service import state as state_keeper
+from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.state import (
+    FILE_NAME,
+    StateContent,
+    StateKeeper,
+    StateSettings,
+    read_state,
+    state_path,
+)
 from live import leaf_model, short_log
 
 MODEL = leaf_model()

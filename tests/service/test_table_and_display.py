@@ -12,15 +12,15 @@ import pyarrow.parquet
 import pytest
 from rich.console import Console
 
-from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import samples_of
-from cangauge.estimate.types import Estimate, Reason, Status
-from cangauge.service.display import LiveLine, live_text
-from cangauge.service.gauge import Gauge, GaugeSettings
-from cangauge.service.table import EstimateWriter
+from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimate.validity import Estimate, Reason, Status
+from cangauge.service.estimate_table import EstimateWriter
+from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.run import LiveLine, live_text
 from live import leaf_model, short_log
 
 ROW = Estimate(

@@ -7,13 +7,12 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from cangauge.bus.encode import FrameEncoder
-from cangauge.bus.receive import BusError, BusPort
+from cangauge.bus.connection import BusError, BusPort
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.errors import CangaugeError
 from cangauge.estimate.offline import samples_of
-from cangauge.service.loop import LoopSettings, Outputs, serve
-from cangauge.service.upkeep import Upkeep
+from cangauge.service.loop import LoopSettings, Outputs, Upkeep, serve
 from live import BrokenBus, network_down, short_log, virtual_port, virtual_service
 
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import load_vehicle
-from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import samples_of
-from cangauge.service.gauge import Gauge, GaugeSettings
-from cangauge.service.monitor import Monitor
-from cangauge.service.notify import Notifier
-from cangauge.service.snapshot import Identity
+from cangauge.estimate.settings import EstimatorSettings
+from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.status import Identity, Monitor
+from cangauge.service.systemd import Notifier
 from live import leaf_model, short_log
 
 IDENTITY = Identity(

@@ -18,18 +18,18 @@ from typing import Self
 import can
 import pytest
 
-from cangauge.bus.encode import FrameEncoder
-from cangauge.bus.lasting import LONGEST_PAUSE_S, LastingPort
+from cangauge.bus.connection import BusPort
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, has_socketcan, open_bus
 from cangauge.bus.publish import SocDetail, SocEstimate, SocReader, standard_filter
-from cangauge.bus.receive import BusPort
+from cangauge.bus.reconnect import LONGEST_PAUSE_S, LastingPort
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import samples_of
-from cangauge.estimate.types import Reason, Status
-from cangauge.service.gauge import Gauge, GaugeSettings
+from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimate.validity import Reason, Status
 from cangauge.service.loop import LoopSettings
+from cangauge.service.pipeline import Gauge, GaugeSettings
 from live import Command, Service, leaf_model, leaf_model_path, short_log, waits
 
 pytestmark = pytest.mark.socketcan

@@ -14,22 +14,20 @@ import can
 import numpy as np
 import pytest
 
-from cangauge.bus.encode import FrameEncoder
+from cangauge.bus.connection import BusPort, NothingWaitsError, waiting_frames
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, has_socketcan, open_bus
 from cangauge.bus.publish import FrameIds, SocEstimate, SocReader, standard_filter
-from cangauge.bus.receive import BusPort
 from cangauge.bus.vehicle import load_vehicle
-from cangauge.bus.waiting import NothingWaitsError, waiting_frames
 from cangauge.errors import InputError
-from cangauge.estimate.estimator import EstimatorSettings
 from cangauge.estimate.offline import run_estimator, samples_of
-from cangauge.replay.bound import quantisation_bound
+from cangauge.estimate.settings import EstimatorSettings
 from cangauge.replay.player import ReplaySettings, play
-from cangauge.replay.steps import CaptureSource, LogSource
+from cangauge.replay.steps import CaptureSource, LogSource, quantisation_bound
 from cangauge.service.capture_estimate import estimate_capture
-from cangauge.service.gauge import Gauge, GaugeSettings
 from cangauge.service.loop import LoopSettings
-from cangauge.service.record import Recorder
+from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.recording import Recorder
 from live import (
     Command,
     Service,

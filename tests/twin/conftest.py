@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cangauge.twin.day import Day, draw_day
-from cangauge.twin.pack import Pack, draw_pack
-from cangauge.twin.plant import TwinPlant
+from cangauge.validation.twin.day import Day, draw_day
+from cangauge.validation.twin.pack import Pack, draw_pack
+from cangauge.validation.twin.plant import TwinPlant
 
 
 @pytest.fixture(scope="session")

@@ -14,12 +14,19 @@ import pytest
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
-from cangauge.twin.case import CaseOptions, draw_case, make_case
-from cangauge.twin.faults import Fault, fault_kinds
-from cangauge.twin.inject import inject, scale_injection, scaled_to_pack, with_start
-from cangauge.twin.real_case import RecordedSet, make_real_case
-from cangauge.twin.survey import charge_of, survey_pack
-from cangauge.twin.world import World, draw_world, rms
+from cangauge.validation.twin.case import CaseOptions, draw_case, make_case
+from cangauge.validation.twin.faults import Fault, fault_kinds
+from cangauge.validation.twin.recorded import (
+    RecordedSet,
+    charge_of,
+    inject,
+    make_real_case,
+    scale_injection,
+    scaled_to_pack,
+    survey_pack,
+    with_start,
+)
+from cangauge.validation.twin.world import World, draw_world, rms
 
 OPTIONS = CaseOptions(kind="leaf24", hours=0.5, climate="mild")
 IDS = [kind.id for kind in (*fault_kinds(), *fault_kinds(outside=True))]

@@ -12,11 +12,11 @@ from typer.testing import CliRunner
 
 from cangauge.cli.twin import twin_command
 from cangauge.errors import InputError
-from cangauge.identify.charge import capacity_from_full_discharge
 from cangauge.logs.read import read_log
-from cangauge.twin.effect_option import parse_effect
-from cangauge.twin.pack import Pack
-from cangauge.twin.schedule import read_speed
+from cangauge.model.charge import capacity_from_full_discharge
+from cangauge.validation.twin.day import read_speed
+from cangauge.validation.twin.faults import parse_effect
+from cangauge.validation.twin.pack import Pack
 
 app = typer.Typer()
 app.command()(twin_command)

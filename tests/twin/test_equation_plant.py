@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cangauge.gapcheck.floors import identify
-from cangauge.twin.faults import Fault, fault_kind, fault_kinds
-from cangauge.twin.simulate import Truth, simulate
-from cangauge.twin.world import World, draw_world, record_day, rms
+from cangauge.validation.cases import identify
+from cangauge.validation.twin.faults import Fault, fault_kind, fault_kinds
+from cangauge.validation.twin.simulate import Truth, simulate
+from cangauge.validation.twin.world import World, draw_world, record_day, rms
 
 
 @pytest.fixture(scope="module")

@@ -6,15 +6,21 @@ import numpy as np
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.twin.condition import HEALTHY, Switching, is_on
-from cangauge.twin.day import Day, draw_day
-from cangauge.twin.fault_list import cole_cole, finite_warburg
-from cangauge.twin.faults import Fault, apply_faults, fault_kind, fault_kinds
-from cangauge.twin.pack import Pack
-from cangauge.twin.plant import TwinPlant
-from cangauge.twin.scaling import scale_to_gap
-from cangauge.twin.simulate import Truth, gap_v, simulate
-from cangauge.twin.world import record_day, rms
+from cangauge.validation.twin.condition import HEALTHY, Switching, is_on
+from cangauge.validation.twin.day import Day, draw_day
+from cangauge.validation.twin.faults import (
+    Fault,
+    apply_faults,
+    cole_cole,
+    fault_kind,
+    fault_kinds,
+    finite_warburg,
+)
+from cangauge.validation.twin.pack import Pack
+from cangauge.validation.twin.plant import TwinPlant
+from cangauge.validation.twin.scaling import scale_to_gap
+from cangauge.validation.twin.simulate import Truth, gap_v, simulate
+from cangauge.validation.twin.world import record_day, rms
 
 DESIGN_IDS = {
     "current_offset", "current_gain", "voltage_offset", "voltage_gain", "temperature_lag",

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.twin.condition import HEALTHY, Condition, WeakCells
-from cangauge.twin.day import Day, draw_day
-from cangauge.twin.pack import draw_pack
-from cangauge.twin.pybamm_plant import PARAMETER_SETS, PybammPlant, draw_pybamm_plant
-from cangauge.twin.simulate import simulate
+from cangauge.validation.twin.condition import HEALTHY, Condition, WeakCells
+from cangauge.validation.twin.day import Day, draw_day
+from cangauge.validation.twin.pack import draw_pack
+from cangauge.validation.twin.pybamm_plant import PARAMETER_SETS, PybammPlant, draw_pybamm_plant
+from cangauge.validation.twin.simulate import simulate
 
 needs_pybamm = pytest.mark.skipif(
     importlib.util.find_spec("pybamm") is None, reason="the extra pybamm is not installed"

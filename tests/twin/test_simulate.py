@@ -10,13 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lsim
 
-from cangauge.twin.condition import HEALTHY
-from cangauge.twin.day import Day, draw_day
-from cangauge.twin.pack import KINDS, Pack, draw_pack
-from cangauge.twin.plant import TwinPlant
-from cangauge.twin.relaxation import lagged, relax
-from cangauge.twin.simulate import simulate, true_soc_pct
-from cangauge.twin.thermal import temperatures
+from cangauge.validation.twin.condition import HEALTHY
+from cangauge.validation.twin.day import Day, draw_day
+from cangauge.validation.twin.pack import KINDS, Pack, draw_pack
+from cangauge.validation.twin.plant import TwinPlant, lagged, relax, temperatures
+from cangauge.validation.twin.simulate import simulate, true_soc_pct
 
 
 def constant_day(

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cangauge.twin.day import Day, draw_day
-from cangauge.twin.faults import Fault
-from cangauge.twin.pack import Pack, draw_pack
-from cangauge.twin.plant import TwinPlant
-from cangauge.twin.world import record_day, rms
+from cangauge.validation.twin.day import Day, draw_day
+from cangauge.validation.twin.faults import Fault
+from cangauge.validation.twin.pack import Pack, draw_pack
+from cangauge.validation.twin.plant import TwinPlant
+from cangauge.validation.twin.world import record_day, rms
 
 
 def with_sensors(pack: Pack, **changes: float) -> Pack:

@@ -13,16 +13,16 @@ import numpy as np
 from can.typechecking import Channel
 from numpy.typing import NDArray
 
-from cangauge.bus.captures import Capture, CaptureInfo, open_capture
-from cangauge.bus.captures.capture import CLOCK_ID, CLOCK_PERIOD_S
-from cangauge.bus.counters import Counters
-from cangauge.bus.decode import SampleAssembler
+from cangauge._typing import FloatArray
+from cangauge.bus.captures.capture import CLOCK_ID, CLOCK_PERIOD_S, Capture, open_capture
+from cangauge.bus.captures.files import CaptureInfo
+from cangauge.bus.decoder import Counters, SampleAssembler
 from cangauge.bus.time_source import TimeSource, TimeSourceName, time_source
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.types import Sample
-from cangauge.logs.log import FloatArray, Log
-from cangauge.logs.signs import settle_sign
+from cangauge.estimate.validity import Sample
+from cangauge.logs.log import Log
+from cangauge.logs.sign import settle_sign
 from cangauge.logs.units import refuse_wrong_units
 
 VOLTAGE_FILL_S: Final = 1.0

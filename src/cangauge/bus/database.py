@@ -1,20 +1,359 @@
-"""DBC files: read within bounds of time and memory, and searched with helpful errors."""
+"""One signal ↔ the bits of a payload, decided once when the DBC is read.
+
+cantools reads the DBC and says where every signal is; decoding only the one signal that is
+wanted, on plain integers, costs a third of decoding its whole message. Values agree with those
+of cantools to the last bit.
+
+DBC files: read within bounds of time and memory, and searched with helpful errors.
+"""
 
 from __future__ import annotations
 
 import logging
+import math
 import re
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 import cantools.database
+import numpy as np
 from cantools.database.can import Database, Message, Signal
+from numpy.typing import NDArray
 
-from cangauge.errors import InputError
-from cangauge.files import read_bounded
-from cangauge.limits import MAX_DBC_BYTES
-from cangauge.nearest import closest
+from cangauge._io import MAX_DBC_BYTES, read_bounded
+from cangauge._typing import FloatArray
+from cangauge.errors import InputError, closest
+
+# --- One signal ↔ the bits of a payload, decided once when the DBC is read
+
+# How value tables name codes that are no values.
+_NOT_A_VALUE = re.compile(
+    r"^(sna|n/?a|no data|invalid|error|fault|fehler|undefined|unknown|init)$"
+    r"|(not|un)[\s_-]?(available|avail|valid|def)|invalid",
+    re.IGNORECASE,
+)
+_FLOATS: Final = {16: "e", 32: "f", 64: "d"}
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """Bits of a payload, as an unsigned number.
+
+    Parameters
+    ----------
+    shift, width : int
+        Lowest bit and number of bits, in the payload read as one number.
+    big_endian : bool
+        How the payload is read as one number: Motorola or Intel.
+    """
+
+    shift: int
+    width: int
+    big_endian: bool
+
+    def get(self, payload: bytes | bytearray) -> int:
+        """Return the bits of a payload of the message's own length."""
+        word = int.from_bytes(payload, "big" if self.big_endian else "little")
+        return (word >> self.shift) & ((1 << self.width) - 1)
+
+    def put(self, payload: bytearray, raw: int) -> None:
+        """Set the bits in a payload of the message's own length."""
+        order: Literal["big", "little"] = "big" if self.big_endian else "little"
+        mask = ((1 << self.width) - 1) << self.shift
+        word = int.from_bytes(payload, order) & ~mask | ((raw << self.shift) & mask)
+        payload[:] = word.to_bytes(len(payload), order)
+
+    @classmethod
+    def of(cls, signal: Signal, length: int) -> Field:
+        """Return where a signal is in a payload of `length` bytes (DBC bit numbering)."""
+        if signal.byte_order == "little_endian":
+            return cls(signal.start, signal.length, big_endian=False)
+        from_top = 8 * (signal.start // 8) + 7 - signal.start % 8
+        return cls(8 * length - from_top - signal.length, signal.length, big_endian=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """A multiplexer that must show one of these values for a signal to be in the frame."""
+
+    field: Field
+    values: frozenset[int]
+
+
+@dataclass(frozen=True, slots=True)
+class SignalCodec:
+    """Converts one signal between payload and physical value in the DBC's unit.
+
+    Parameters
+    ----------
+    name, unit : str
+    field : Field
+    is_signed : bool
+    float_format : str
+        `struct` format of an IEEE float, "" for integers.
+    factor, offset : float
+        value = raw × factor + offset.
+    not_available : frozenset of int
+        Raw codes that mean "no value".
+    conditions : tuple of Condition
+        All must hold for the signal to be in a frame.
+    """
+
+    name: str
+    unit: str
+    field: Field
+    is_signed: bool
+    float_format: str
+    factor: float
+    offset: float
+    not_available: frozenset[int]
+    conditions: tuple[Condition, ...] = ()
+
+    def is_in(self, payload: bytes | bytearray) -> bool:
+        """Return whether the multiplexers, if any, say that the payload carries the signal."""
+        return all(each.field.get(payload) in each.values for each in self.conditions)
+
+    def decode(self, payload: bytes | bytearray) -> float:
+        """Return the value in the DBC's unit; NaN for "not available"."""
+        field = self.field
+        raw = (int.from_bytes(payload, "big" if field.big_endian else "little") >> field.shift) & (
+            (1 << field.width) - 1
+        )
+        if self.float_format:
+            number = _as_float(raw, self.float_format)
+            return number * self.factor + self.offset if math.isfinite(number) else math.nan
+        if self.is_signed and raw >> (field.width - 1):
+            raw -= 1 << field.width
+        if raw in self.not_available:
+            return math.nan
+        return raw * self.factor + self.offset
+
+    def encode_into(self, payload: bytearray, value: float) -> None:
+        """Set the signal and its multiplexers; NaN becomes the first "not available" code.
+
+        Raises
+        ------
+        InputError
+            If the value does not fit, or is NaN and there is no such code.
+        """
+        for condition in self.conditions:
+            condition.field.put(payload, min(condition.values))
+        if self.float_format:
+            raw = self._float_bits(value)
+        elif math.isnan(value):
+            raw = self._missing()
+        else:
+            raw = self._number(value)
+        self.field.put(payload, raw)
+
+    def quantise(self, values: FloatArray) -> FloatArray:
+        """Return what `decode` gives after `encode_into`, for every value, without range check."""
+        if self.float_format:
+            kind = {"e": np.float16, "f": np.float32, "d": np.float64}[self.float_format]
+            numbers = ((values - self.offset) / self.factor).astype(kind).astype(np.float64)
+        else:
+            numbers = np.rint((values - self.offset) / self.factor)
+        return np.asarray(numbers * self.factor + self.offset)
+
+    def fits(self, values: FloatArray) -> NDArray[np.bool_]:
+        """Return which values `encode_into` takes; NaN counts as one that it does."""
+        numbers = (values - self.offset) / self.factor
+        if self.float_format:
+            largest = {"e": 65504.0, "f": 3.4028234e38, "d": math.inf}[self.float_format]
+            return np.asarray(~(np.abs(numbers) > largest))
+        raw = np.rint(numbers)
+        low, high = self.raw_range
+        return np.asarray(~((raw < low) | (raw > high) | np.isin(raw, list(self.not_available))))
+
+    @property
+    def raw_range(self) -> tuple[int, int]:
+        """Smallest and largest raw number."""
+        width = self.field.width
+        if self.is_signed:
+            return -(1 << (width - 1)), (1 << (width - 1)) - 1
+        return 0, (1 << width) - 1
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Smallest and largest value that can be sent, in the DBC's unit."""
+        if self.float_format:
+            return -math.inf, math.inf
+        low, high = self.raw_range
+        while low in self.not_available:
+            low += 1
+        while high in self.not_available:
+            high -= 1
+        ends = (low * self.factor + self.offset, high * self.factor + self.offset)
+        return min(ends), max(ends)
+
+    @property
+    def half_step(self) -> float:
+        """Largest error of rounding to the signal's step, in the DBC's unit; 0 for floats."""
+        return 0.0 if self.float_format else abs(self.factor) / 2.0
+
+    def _number(self, value: float) -> int:
+        number = (value - self.offset) / self.factor
+        if not math.isfinite(number):
+            raise self._refuse(value)
+        raw = round(number)
+        low, high = self.raw_range
+        if not low <= raw <= high or raw in self.not_available:
+            raise self._refuse(value)
+        return raw
+
+    def _float_bits(self, value: float) -> int:
+        try:
+            packed = struct.pack(">" + self.float_format, (value - self.offset) / self.factor)
+        except OverflowError:
+            raise self._refuse(value) from None
+        return int.from_bytes(packed, "big")
+
+    def _missing(self) -> int:
+        if not self.not_available:
+            raise InputError(
+                "the DBC has no code for a missing value", field=self.name, value=math.nan
+            )
+        return min(self.not_available)
+
+    def _refuse(self, value: float) -> InputError:
+        low, high = self.range
+        return InputError(
+            f"does not fit into the signal, which holds {low:g} to {high:g} {self.unit}".rstrip(),
+            field=self.name,
+            value=value,
+            cure="use a DBC with a wider signal",
+        )
+
+
+def signal_codec(
+    message: Message,
+    signal: Signal,
+    *,
+    source: object,
+    field: str,
+    not_available: tuple[int, ...] = (),
+    when: dict[str, int] | None = None,
+) -> SignalCodec:
+    """Build the codec of a signal.
+
+    Parameters
+    ----------
+    message, signal : cantools.database.can.Message, cantools.database.can.Signal
+    source, field : object, str
+        For messages: the file, and the name of the mapping's entry.
+    not_available : tuple of int
+        Raw codes that mean "no value", besides those that the value table names so ("not
+        available", "SNA", "invalid", …).
+    when : dict of str to int, optional
+        Further conditions: raw values of other signals of the message.
+
+    Raises
+    ------
+    InputError
+        If the signal does not fit into its message or cannot be a number.
+    """
+    _check_layout(message, signal, source, field)
+    is_float = signal.conversion.is_float
+    return SignalCodec(
+        name=signal.name,
+        unit=(signal.unit or "").strip(),
+        field=Field.of(signal, message.length),
+        is_signed=signal.is_signed and not is_float,
+        float_format=_FLOATS[signal.length] if is_float else "",
+        factor=float(signal.conversion.scale),
+        offset=float(signal.conversion.offset),
+        not_available=_codes_of_no_value(signal) | frozenset(not_available),
+        conditions=(
+            *_multiplexers(message, signal, source, field),
+            *_conditions(message, when or {}, source, field),
+        ),
+    )
+
+
+def _codes_of_no_value(signal: Signal) -> frozenset[int]:
+    names: Mapping[int, object] = signal.conversion.choices or {}
+    if 2 * len(names) > 1 << min(signal.length, 64):
+        return frozenset()  # most codes have a name: an enumeration, where "invalid" is a value
+    return frozenset(int(raw) for raw, name in names.items() if _NOT_A_VALUE.search(str(name)))
+
+
+def _check_layout(message: Message, signal: Signal, source: object, field: str) -> None:
+    place = Field.of(signal, message.length)
+    problem = ""
+    if signal.length < 1 or place.shift < 0 or place.shift + place.width > 8 * message.length:
+        problem = f"the signal does not fit into the {message.length} bytes of {message.name}"
+    elif signal.conversion.is_float and signal.length not in _FLOATS:
+        problem = f"a float of {signal.length} bits is not possible"
+    elif not signal.conversion.is_float and signal.length > 64:
+        problem = f"a number of {signal.length} bits is not possible"
+    elif not (
+        math.isfinite(signal.conversion.scale)
+        and math.isfinite(signal.conversion.offset)
+        and signal.conversion.scale != 0
+    ):
+        problem = "factor and offset must be finite and the factor not 0"
+    if problem:
+        raise InputError(
+            problem,
+            source=str(source),
+            field=f"{field}.signal",
+            value=signal.name,
+            cure="correct the DBC",
+        )
+
+
+def _multiplexers(message: Message, signal: Signal, source: object, field: str) -> list[Condition]:
+    conditions: list[Condition] = []
+    while signal.multiplexer_signal is not None:
+        name = signal.multiplexer_signal
+        selector = next((each for each in message.signals if each.name == name), None)
+        if selector is None:
+            raise InputError(
+                f"{signal.name} is multiplexed by a signal that {message.name} does not have",
+                source=str(source),
+                field=field,
+                value=name,
+                cure="correct the DBC",
+            )
+        if len(conditions) > len(message.signals):
+            raise InputError("signals are multiplexed in a circle", source=str(source), field=field)
+        _check_layout(message, selector, source, field)
+        values = frozenset(signal.multiplexer_ids or ())
+        conditions.append(Condition(Field.of(selector, message.length), values))
+        signal = selector
+    return conditions
+
+
+def _conditions(
+    message: Message, when: dict[str, int], source: object, field: str
+) -> list[Condition]:
+    conditions = []
+    for name, value in when.items():
+        selector = next((each for each in message.signals if each.name == name), None)
+        if selector is None:
+            raise InputError(
+                f"message {message.name} has no such signal",
+                source=str(source),
+                field=f"{field}.when",
+                value=name,
+            )
+        _check_layout(message, selector, source, field)
+        place = Field.of(selector, message.length)
+        conditions.append(Condition(place, frozenset({value & ((1 << place.width) - 1)})))
+    return conditions
+
+
+def _as_float(raw: int, float_format: str) -> float:
+    size = struct.calcsize(float_format)
+    number: float = struct.unpack(">" + float_format, raw.to_bytes(size, "big"))[0]
+    return number
+
+
+# --- DBC files: read within bounds of time and memory, and searched with helpful errors
 
 MAX_MESSAGES: Final = 20_000
 MAX_MESSAGE_BYTES: Final = 1785

@@ -61,8 +61,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from cangauge.bus.e2e_rule import LIST_LENGTH, DataIdMode
-from cangauge.bus.protection import ProtectionRule
+from cangauge.bus.protection import LIST_LENGTH, DataIdMode, ProtectionRule
 from cangauge.logs.log import TemperatureSource
 
 PAIR_WITHIN_S = 0.020

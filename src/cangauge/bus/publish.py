@@ -22,13 +22,12 @@ import can
 from can.typechecking import CanFilter
 from cantools.database.can import Database, Message
 
-from cangauge.bus.database import load_dbc
-from cangauge.bus.e2e_rule import E2eRule
-from cangauge.bus.signal_codec import SignalCodec, signal_codec
+from cangauge._resources import shared_file
+from cangauge.bus.database import SignalCodec, load_dbc, signal_codec
+from cangauge.bus.protection import E2eRule
 from cangauge.bus.time_source import REPLAY_CLOCK_ID
 from cangauge.errors import InputError
-from cangauge.estimate.types import Estimate, Reason, Status
-from cangauge.share import shared_file
+from cangauge.estimate.validity import Estimate, Reason, Status
 
 ESTIMATE_EVERY_S: Final = 0.1
 """Time between two beats [s]."""

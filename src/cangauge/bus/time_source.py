@@ -15,10 +15,9 @@ from typing import Final, Literal, Protocol, get_args
 
 import can
 
-from cangauge.bus.database import load_dbc
+from cangauge._resources import shared_file
+from cangauge.bus.database import SignalCodec, load_dbc, signal_codec
 from cangauge.bus.protection import CRC_ONLY_RULE
-from cangauge.bus.signal_codec import SignalCodec, signal_codec
-from cangauge.share import shared_file
 
 TimeSourceName = Literal["receive", "replay-clock"]
 TIME_SOURCES: Final[tuple[str, ...]] = get_args(TimeSourceName)

@@ -13,23 +13,23 @@ import pyarrow.parquet as pq
 import typer
 from rich.table import Table
 
-from cangauge.atomic import check_writable, write_text_atomic
+from cangauge._io import check_writable, write_text_atomic
+from cangauge._resources import shared_file
 from cangauge.bus.open import has_socketcan
 from cangauge.bus.vehicle import load_vehicle
-from cangauge.cli.inputs import JsonOption
+from cangauge.cli.options import JsonOption
 from cangauge.cli.output import console, emit_json, note
 from cangauge.errors import CangaugeError, InputError
 from cangauge.estimate.offline import EstimateTable, Scores, estimate_log, score
 from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.types import Reason, Status
+from cangauge.estimate.validity import Reason, Status
 from cangauge.identify.fit import Identification, fit
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import model_json
 from cangauge.model.published import SOC_NEWTON_MAE_PCT, VOLTAGE_MAE_PCT
-from cangauge.replay.bound import quantisation_bound
-from cangauge.report.estimate_report import estimate_report
-from cangauge.report.fit_report import fit_report
-from cangauge.share import shared_file
+from cangauge.replay.steps import quantisation_bound
+from cangauge.report.estimate import estimate_report
+from cangauge.report.fit import fit_report
 
 TRAINED_ON = "leaf2012_reconstruction_white.parquet"
 PLAYED = "leaf2012_reconstruction_correlated.parquet"

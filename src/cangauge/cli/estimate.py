@@ -1,19 +1,29 @@
-"""`cangauge estimate`: a log or capture and a model → SoC at every sample, offline."""
+"""The file of estimates: one row a sample, as CSV or Parquet.
+
+What `cangauge estimate` estimates: a log, or a capture by the live service's own path.
+
+`cangauge estimate`: a log or capture and a model → SoC at every sample, offline.
+"""
 
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
 import typer
+from numpy.typing import NDArray
+from rich.progress import Progress
 
-from cangauge.atomic import atomic_path
-from cangauge.cli.estimate_file import check_suffix, write_estimates
-from cangauge.cli.estimate_sources import Estimated, from_capture, from_log
-from cangauge.cli.inputs import (
+from cangauge._formatting import number
+from cangauge._io import atomic_path
+from cangauge._typing import FloatArray
+from cangauge.cli.options import (
     DbcOption,
     JsonOption,
     MapOption,
@@ -25,18 +35,262 @@ from cangauge.cli.inputs import (
     known_temperature_source,
     load_log,
     note_not_a_capture,
+    refuse_single_row,
+    refuse_turned_current,
     within,
 )
-from cangauge.cli.output import emit_json, note
-from cangauge.cli.tables import print_table
+from cangauge.cli.output import console, emit_json, note, print_table
 from cangauge.errors import InputError
-from cangauge.estimate.offline import EstimateTable
+from cangauge.estimate.offline import EstimateTable, Scores, estimate_log, score
 from cangauge.estimate.settings import VALID_STD_PCT, EstimatorSettings, Method
-from cangauge.estimate.types import Reason
+from cangauge.estimate.validity import Reason, Status, reason_name, reason_names
+from cangauge.identify.rows import usual_gap_s
+from cangauge.logs.log import Log
 from cangauge.logs.read import CaptureGivenError
+from cangauge.model.charge import counted_soc_pct
 from cangauge.model.delay_line import GAP_S
 from cangauge.model.model_file import ModelFile, load_model
-from cangauge.report.words import number, reason_name, reason_names
+from cangauge.report.charts import Recorded, Recording
+from cangauge.service.estimate_table import NUMBERS
+
+# --- The file of estimates: one row a sample, as CSV or Parquet
+
+SUFFIXES = (".csv", ".parquet")
+
+
+def check_suffix(output: Path) -> None:
+    """Raise InputError if the name says neither CSV nor Parquet."""
+    if output.suffix.lower() not in SUFFIXES:
+        raise InputError(
+            "the suffix says neither CSV nor Parquet",
+            source=output,
+            field="--output",
+            value=output.suffix,
+            cure="name it .csv or .parquet",
+        )
+
+
+def write_estimates(path: Path, time_s: NDArray[np.float64], table: EstimateTable) -> None:
+    """Write estimates; the suffix says how.
+
+    Parameters
+    ----------
+    path : Path
+        Ends in .csv or .parquet.
+    time_s : array of shape (n,)
+        The samples' own time [s]: a refused sample's estimate is the one before.
+    table : EstimateTable
+        n estimates; what is not known becomes empty (CSV) or null (Parquet).
+    """
+    columns: dict[str, Any] = {"time_s": pa.array(time_s)}
+    columns |= {name: pa.array(getattr(table, name), from_pandas=True) for name in NUMBERS}
+    columns["status"] = pa.array([Status(value).name.lower() for value in table.status.tolist()])
+    words = {value: reason_names(value) for value in np.unique(table.reasons).tolist()}
+    columns["reasons"] = pa.array([words[value] for value in table.reasons.tolist()])
+    if path.suffix.lower() == ".parquet":
+        pa.parquet.write_table(pa.table(columns), path)
+        return
+    with path.open("wb") as file:
+        # The header by hand: pyarrow always puts quotes around names; no cell needs any.
+        file.write((",".join(columns) + "\n").encode())
+        plain = pa.csv.WriteOptions(include_header=False, quoting_style="none")
+        pa.csv.write_csv(pa.table(columns), file, plain)
+
+
+# --- What `cangauge estimate` estimates: a log, or a capture by the live service's own path
+
+if TYPE_CHECKING:
+    from cangauge.bus.vehicle import Vehicle
+
+VOLTAGE_MARGIN = 0.2
+"""A recording whose median voltage lies further outside the model's is another pack's."""
+
+Origin = Literal["given", "log", "voltage"]
+"""Where the initial SoC comes from."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimated:
+    """An estimate with all that a table, a report and a JSON object need.
+
+    Parameters
+    ----------
+    recorded : Recorded
+        n samples.
+    table : EstimateTable
+        n estimates.
+    scores : Scores
+    settings : EstimatorSettings
+    origin : {"given", "log", "voltage"}
+        Where the initial SoC comes from.
+    facts : dict
+        What else belongs into the JSON object.
+    """
+
+    recorded: Recorded
+    table: EstimateTable
+    scores: Scores
+    settings: EstimatorSettings
+    origin: Origin
+    facts: dict[str, Any]
+
+
+def from_log(
+    log: Log, model: ModelFile, settings: EstimatorSettings, *, given: str | None, gap_given: bool
+) -> Estimated:
+    """Estimate a log.
+
+    Parameters
+    ----------
+    log : Log
+    model : ModelFile
+    settings : EstimatorSettings
+        As the user gave them.
+    given : str, optional
+        The initial SoC as given, "auto" for the first voltages; by default the log's first
+        reference SoC, counted back to its first row.
+    gap_given : bool
+        Whether the gap was given; by default it follows a slow log's steps.
+
+    Raises
+    ------
+    InputError
+        If the log is another pack's.
+    """
+    check_same_pack(log, model)
+    origin: Origin = "voltage" if settings.initial_soc_pct is None else "given"
+    settings = replace(settings, temperature_source=log.temperature_source)
+    if given is None and log.first_soc() is not None:
+        origin = "log"
+        first = counted_soc_pct(log, settings.capacity_ah or model.capacity_ah, None)[0]
+        settings = replace(settings, initial_soc_pct=float(np.clip(first, 0.0, 100.0)))
+    if not gap_given:
+        settings = replace(settings, gap_s=_gap_s(log))
+    with _progress() as progress:
+        task = progress.add_task("estimating", total=len(log))
+        table, scores = estimate_log(
+            log, model, settings, lambda done: progress.update(task, completed=done)
+        )
+    return Estimated(log, table, scores, settings, origin, {})
+
+
+def from_capture(
+    path: Path, vehicle: Vehicle, model: ModelFile, settings: EstimatorSettings
+) -> Estimated:
+    """Estimate a capture, bit for bit as the service does.
+
+    Like the service it begins from the first voltages unless an initial SoC is given, whatever
+    the car itself says; the car's SoC is the reference to compare with.
+
+    Raises
+    ------
+    InputError
+        If the capture gives no sample, its current is turned, or it is another pack's.
+    """
+    # python-can and cantools are slow to import; logs do without.
+    from cangauge.service.capture_estimate import estimate_capture  # noqa: PLC0415
+
+    if settings.temperature_source == "unknown":
+        settings = replace(settings, temperature_source=vehicle.temperature_source)
+    with _progress() as progress:
+        task = progress.add_task("estimating", total=None)
+        found = estimate_capture(
+            path,
+            vehicle,
+            model,
+            settings,
+            progress=lambda done: progress.update(task, completed=done),
+        )
+    recording = Recording(
+        time_s=_running_on(found.time_s),
+        current_a=found.current_a,
+        voltage_v=found.voltage_v,
+        temperature_c=found.temperature_c,
+        soc_pct=found.soc_reference_pct if np.isfinite(found.soc_reference_pct).any() else None,
+        name=path.name.split(".")[0],
+        source=str(path),
+        temperature_source=settings.temperature_source,
+        remarks=found.remarks,
+    )
+    refuse_single_row(recording)
+    for remark in recording.remarks:
+        note(f"{path}: {remark}")
+    check_same_pack(recording, model)
+    _check_sign(recording)
+    # All that is asked of the log here is what a recording has.
+    scores = score(found.table, cast("Log", recording), found.seconds)
+    facts = {"time_source": found.time_source, "frames": asdict(found.counts)}
+    origin: Origin = "voltage" if settings.initial_soc_pct is None else "given"
+    return Estimated(recording, found.table, scores, settings, origin, facts)
+
+
+def check_same_pack(recorded: Recorded, model: ModelFile) -> None:
+    """Refuse a recording whose voltage shows that the model belongs to another pack.
+
+    Raises
+    ------
+    InputError
+        If the median voltage lies more than `VOLTAGE_MARGIN` outside the model's pseudo-OCV.
+    """
+    known = recorded.voltage_v[np.isfinite(recorded.voltage_v)]
+    if not known.size:
+        return
+    low, high = model.voltage_model().pseudo_ocv([0.0, 100.0])
+    median = float(np.median(known))
+    if not (1.0 - VOLTAGE_MARGIN) * low <= median <= (1.0 + VOLTAGE_MARGIN) * high:
+        raise InputError(
+            f"the median is {median:.1f} V, but the model {model.name} is of a pack of"
+            f" {low:.0f} … {high:.0f} V",
+            source=recorded.source or recorded.name,
+            field="voltage_v",
+            cure="give the model of this pack with -m, or check the unit of the voltage",
+        )
+
+
+def _check_sign(recording: Recording) -> None:
+    """Refuse a turned current; a log of the rows that have everything tells it."""
+    whole = np.isfinite(recording.voltage_v)
+    whole[1:] &= np.diff(recording.time_s) > 0.0
+    if whole.sum() < 2:
+        return
+    soc_pct = recording.soc_pct
+    refuse_turned_current(
+        Log(
+            time_s=recording.time_s[whole],
+            current_a=recording.current_a[whole],
+            voltage_v=recording.voltage_v[whole],
+            temperature_c=np.zeros(int(whole.sum())),
+            soc_pct=None if soc_pct is None else soc_pct[whole],
+            name=recording.name,
+            source=recording.source,
+        ),
+        is_capture=True,
+    )
+
+
+def _running_on(time_s: FloatArray) -> FloatArray:
+    """Return time that goes on where a second replay began anew in the same capture [s]."""
+    step_s = np.diff(time_s)
+    if not np.any(step_s < 0.0):
+        return time_s
+    return np.asarray(time_s[0] + np.concatenate(([0.0], np.cumsum(np.maximum(step_s, 0.0)))))
+
+
+def _gap_s(log: Log) -> float:
+    gap_s = min(usual_gap_s(log.time_s, GAP_S), 3600.0)
+    if gap_s > GAP_S:
+        note(
+            f"note: {log.source or log.name}: its usual step is {gap_s / 3.0:g} s; steps over"
+            f" {gap_s:g} s count as gaps (--max-gap-s)"
+        )
+    return gap_s
+
+
+def _progress() -> Progress:
+    return Progress(console=console, transient=True, disable=not console.is_terminal)
+
+
+# --- `cangauge estimate`: a log or capture and a model → SoC at every sample, offline
 
 AUTO = "auto"
 DOUBTFUL_VALID, DOUBTFUL_COVER = 0.1, 0.5
@@ -156,7 +410,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     page = None
     if report is not None:
         # bokeh takes half a second to import.
-        from cangauge.report.estimate_report import estimate_report  # noqa: PLC0415
+        from cangauge.report.estimate import estimate_report  # noqa: PLC0415
 
         page = estimate_report(done.recorded, done.table, done.scores, model, done.settings)
     with ExitStack() as both:  # estimates and report, or neither

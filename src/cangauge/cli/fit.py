@@ -11,8 +11,9 @@ from typing import Annotated
 
 import typer
 
-from cangauge.atomic import atomic_path
-from cangauge.cli.inputs import (
+from cangauge._formatting import number, significant, span
+from cangauge._io import atomic_path
+from cangauge.cli.options import (
     DbcOption,
     JsonOption,
     MapOption,
@@ -24,17 +25,16 @@ from cangauge.cli.inputs import (
     load_log,
     within,
 )
-from cangauge.cli.output import console, emit_json, note
-from cangauge.cli.tables import print_table
+from cangauge.cli.output import console, emit_json, note, print_table
 from cangauge.errors import InputError
-from cangauge.identify.charge import capacity_from_full_discharge, capacity_from_reference
 from cangauge.identify.delays import DelaySearch, search_delays
-from cangauge.identify.effects.ids import parse_ids
-from cangauge.identify.fit import FitOptions, Identification, fit
+from cangauge.identify.effect_search import parse_ids
+from cangauge.identify.fit import Identification, fit
+from cangauge.identify.rows import FitOptions
 from cangauge.logs.log import Log
+from cangauge.model.charge import capacity_from_full_discharge, capacity_from_reference
 from cangauge.model.model_file import model_json
-from cangauge.report.effect_rows import effect_rows, step_rows
-from cangauge.report.words import number, significant, span
+from cangauge.report.tables import effect_rows, step_rows
 
 FROM_SOC = "from-soc"
 AUTO = "auto"
@@ -155,7 +155,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         if report is not None:
             status.update("drawing the report")
             # bokeh takes half a second to import.
-            from cangauge.report.fit_report import fit_report  # noqa: PLC0415
+            from cangauge.report.fit import fit_report  # noqa: PLC0415
 
             page = fit_report(result)
     _write({output: model_json(result.model)} | ({report: page} if report and page else {}))

@@ -9,8 +9,9 @@ from typing import Annotated, Any
 
 import typer
 
-from cangauge.atomic import atomic_path
-from cangauge.cli.inputs import (
+from cangauge._formatting import NONE_KNOWN, number, significant
+from cangauge._io import atomic_path
+from cangauge.cli.options import (
     DbcOption,
     JsonOption,
     MapOption,
@@ -22,16 +23,14 @@ from cangauge.cli.inputs import (
     load_log,
     within,
 )
-from cangauge.cli.output import emit_json, note
-from cangauge.cli.tables import print_table
+from cangauge.cli.output import emit_json, note, print_table
+from cangauge.diagnosis.diagnose import Diagnosis, diagnose, in_words
+from cangauge.diagnosis.extended_model import model_file_of
+from cangauge.diagnosis.posterior import NONE, UNKNOWN
 from cangauge.errors import InputError
-from cangauge.gap.diagnose import Diagnosis, diagnose, in_words
-from cangauge.gap.extend import model_file_of
-from cangauge.gap.verdict import NONE, UNKNOWN
 from cangauge.logs.log import Log
 from cangauge.model.model_file import ModelFile, load_model, model_json
-from cangauge.report.gap_limits import verdict_limit
-from cangauge.report.words import NONE_KNOWN, number, significant
+from cangauge.report.tables import verdict_limit
 
 SHOWN = 5
 SHORTEST_S = 300.0
@@ -115,7 +114,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
             stack.enter_context(atomic_path(extended)).write_text(model_json(better))
         if report is not None:
             # Drawing is slow to import; the diagnosis does without.
-            from cangauge.report.gap_report import gap_report  # noqa: PLC0415
+            from cangauge.report.diagnosis import gap_report  # noqa: PLC0415
 
             stack.enter_context(atomic_path(report)).write_text(gap_report(found))
     if json_output:

@@ -21,11 +21,14 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from cangauge.atomic import write_text_atomic
-from cangauge.cli.inputs import JsonOption, ReportOption, check_outputs
+from cangauge._formatting import duration
+from cangauge._io import write_text_atomic
+from cangauge.cli.options import JsonOption, ReportOption, check_outputs
 from cangauge.cli.output import console, emit_json, note
 from cangauge.errors import InputError
-from cangauge.gapcheck.check import (
+from cangauge.validation.cases import FULL, NEEDS_DATA, SMALL, Sizes, folder_of, open_set_of, plan
+from cangauge.validation.cases import seconds_of as planned_seconds
+from cangauge.validation.check import (
     OPEN_SET,
     Drawn,
     answers_before,
@@ -36,14 +39,9 @@ from cangauge.gapcheck.check import (
     outcomes_of,
     some_of,
 )
-from cangauge.gapcheck.plan import FULL, NEEDS_DATA, SMALL, Sizes, open_set_of, plan
-from cangauge.gapcheck.plan import seconds_of as planned_seconds
-from cangauge.gapcheck.recorded import folder_of
-from cangauge.gapcheck.score import score
-from cangauge.gapcheck.tables import print_result
-from cangauge.gapcheck.targets import judge_targets
-from cangauge.report.words import duration
-from cangauge.twin.pybamm_plant import import_pybamm
+from cangauge.validation.score import score
+from cangauge.validation.tables import judge_targets, print_result
+from cangauge.validation.twin.pybamm_plant import import_pybamm
 
 FINAL_SEED = 8
 """Raised for each release's check: what one has shown may have shaped the next method."""
@@ -189,7 +187,7 @@ def gap_check_command(  # noqa: PLR0917 - typer passes options by name
     print_result(result, console)
     if report is not None:
         # Drawing is slow to import; the check does without.
-        from cangauge.report.check_report import check_report  # noqa: PLC0415
+        from cangauge.report.check import check_report  # noqa: PLC0415
 
         write_text_atomic(report, check_report(result))
         note(f"report: {report}")

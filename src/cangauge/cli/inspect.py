@@ -10,14 +10,14 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from cangauge.cli.inputs import JsonOption
+from cangauge.cli.options import JsonOption
 from cangauge.cli.output import emit_json
 from cangauge.errors import InputError
-from cangauge.inspect.analysis import LogInspection, inspect_log
+from cangauge.inspect.log import LogInspection, inspect_log
 from cangauge.logs.read import CaptureGivenError, read_log
 
 if TYPE_CHECKING:
-    from cangauge.bus.capture_inspect import CaptureInspection
+    from cangauge.inspect.capture import CaptureInspection
 
 PIPED_WIDTH = 140
 """Columns of the tables where stdout is no terminal that has a width."""
@@ -100,8 +100,8 @@ def _inspect_capture(
     temperature_c: float | None,
 ) -> CaptureInspection:
     # Imported here: python-can and cantools are slow to import, and logs do without.
-    from cangauge.bus.capture_inspect import inspect_capture  # noqa: PLC0415
     from cangauge.bus.vehicle import load_vehicle  # noqa: PLC0415
+    from cangauge.inspect.capture import inspect_capture  # noqa: PLC0415
 
     car = None
     if vehicle is not None or dbc is not None or map_file is not None:

@@ -10,13 +10,14 @@ from typing import Annotated, Any, Self
 import typer
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from cangauge.bus.captures import is_capture
-from cangauge.bus.encode import FrameEncoder
+from cangauge._formatting import duration, number
+from cangauge.bus.captures.capture import is_capture
+from cangauge.bus.connection import BusPort
+from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import bus_address, open_bus, parse_bus_options
 from cangauge.bus.publish import FrameIds, standard_filter
-from cangauge.bus.receive import BusPort
 from cangauge.bus.vehicle import Vehicle, load_vehicle
-from cangauge.cli.bus_options import (
+from cangauge.cli.options import (
     BusDbcOption,
     BusMapOption,
     BusOptionOption,
@@ -27,15 +28,14 @@ from cangauge.cli.bus_options import (
     DetailIdOption,
     EstimateIdOption,
     InterfaceOption,
+    JsonOption,
     frame_ids,
 )
-from cangauge.cli.inputs import JsonOption
 from cangauge.cli.output import console, emit_json, note
 from cangauge.errors import InputError
 from cangauge.logs.read import read_log
 from cangauge.replay.player import ReplaySettings, ReplayState, play
 from cangauge.replay.steps import CaptureSource, LogSource, Source
-from cangauge.report.words import duration, number
 from cangauge.service.config import DEFAULT_VEHICLE
 from cangauge.service.signals import stop_on_signals
 

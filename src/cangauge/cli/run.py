@@ -10,8 +10,9 @@ from typing import Annotated, Any
 
 import typer
 
+from cangauge._logging import LogFormat, emit, logging_to
 from cangauge.bus.open import parse_bus_options
-from cangauge.cli.bus_options import (
+from cangauge.cli.options import (
     BusDbcOption,
     BusMapOption,
     BusOptionOption,
@@ -21,13 +22,10 @@ from cangauge.cli.bus_options import (
     ClockIdOption,
     DetailIdOption,
     EstimateIdOption,
-    InterfaceOption,
-    frame_ids,
-)
-from cangauge.cli.inputs import JsonOption, TemperatureSourceOption
-from cangauge.cli.ops_options import (
     HttpOption,
     HttpTokenFileOption,
+    InterfaceOption,
+    JsonOption,
     LogFormatOption,
     LogLevelOption,
     RecordKeepMbOption,
@@ -35,12 +33,13 @@ from cangauge.cli.ops_options import (
     RecordPartMbOption,
     RecordPartSOption,
     StatusSocketOption,
+    TemperatureSourceOption,
+    frame_ids,
 )
 from cangauge.cli.output import emit_json
-from cangauge.cli.run_service import run_service
 from cangauge.errors import CangaugeError
-from cangauge.events import LogFormat, emit, logging_to
 from cangauge.service.config import RunConfig, load_config
+from cangauge.service.run import run_service
 
 _LOG = logging.getLogger(__name__)
 

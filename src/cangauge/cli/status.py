@@ -7,11 +7,10 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from cangauge.cli.inputs import JsonOption
-from cangauge.cli.output import emit_json
-from cangauge.cli.tables import print_table
+from cangauge._formatting import NONE_KNOWN, duration, number
+from cangauge.cli.options import JsonOption
+from cangauge.cli.output import emit_json, print_table
 from cangauge.errors import CangaugeError
-from cangauge.report.words import NONE_KNOWN, duration, number
 from cangauge.service.status_client import NotRunningError, fetch_status, find_socket
 
 TRUSTED: Final = frozenset({"valid", "degraded"})

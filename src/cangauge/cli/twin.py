@@ -11,22 +11,18 @@ from typing import Annotated, Any, cast
 import numpy as np
 import typer
 
-from cangauge.atomic import write_text_atomic
-from cangauge.cli.inputs import JsonOption, check_outputs, within
-from cangauge.cli.output import console, emit_json, note
-from cangauge.cli.tables import print_table
+from cangauge._io import write_text_atomic
+from cangauge.cli.options import JsonOption, check_outputs, within
+from cangauge.cli.output import console, emit_json, note, print_table
 from cangauge.errors import InputError
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
-from cangauge.twin.day import Day, draw_day
-from cangauge.twin.effect_option import parse_effect
-from cangauge.twin.faults import Fault, fault_kinds
-from cangauge.twin.plant import Plant
-from cangauge.twin.record import Recording
-from cangauge.twin.scaling import scale_to_gap
-from cangauge.twin.schedule import read_speed
-from cangauge.twin.simulate import Truth, simulate
-from cangauge.twin.world import PlantName, draw_plant, record_day, rms
+from cangauge.validation.twin.day import Day, draw_day, read_speed
+from cangauge.validation.twin.faults import Fault, fault_kinds, parse_effect
+from cangauge.validation.twin.plant import Plant
+from cangauge.validation.twin.scaling import scale_to_gap
+from cangauge.validation.twin.simulate import Recording, Truth, simulate
+from cangauge.validation.twin.world import PlantName, draw_plant, record_day, rms
 
 DEFAULT_GAP = 0.003
 """Gap of an effect whose size is not given, as a part of the nominal voltage."""

@@ -9,26 +9,26 @@ from __future__ import annotations
 import math
 
 from cangauge.errors import InputError
-from cangauge.estimate.anchors import Anchor, AnchorWatch
-from cangauge.estimate.belief import Belief, Since, Verdict
-from cangauge.estimate.clock import EstimatorClock
-from cangauge.estimate.coulomb import ChargeStep, CoulombCounter
-from cangauge.estimate.fusion import UNKNOWN_SOC_STD_PCT, Fusion, Measurement
-from cangauge.estimate.settings import EstimatorSettings, Method
+from cangauge.estimate.counting import ChargeStep, CoulombCounter, EstimatorClock
+from cangauge.estimate.ekf import UNKNOWN_SOC_STD_PCT, Fusion, Measurement, VoltageError
+from cangauge.estimate.hypothesis_filter import Belief, Since, Verdict
+from cangauge.estimate.settings import Anchor, AnchorWatch, EstimatorSettings, Method
 from cangauge.estimate.state import DelayLineState, EstimatorState
-from cangauge.estimate.types import Estimate, Reason, Sample, Status
 from cangauge.estimate.validity import (
+    Estimate,
+    Reason,
+    Sample,
+    Status,
     acceptable,
     cleaned,
     outside_model,
     status_of,
     temperature_mismatch,
 )
-from cangauge.estimate.voltage_error import VoltageError
 from cangauge.model.delay_line import DelayLine
-from cangauge.model.effects.effect import Reading
-from cangauge.model.inverse import Inverse, soc_from_ocv
+from cangauge.model.effects.base import Reading
 from cangauge.model.model_file import ModelFile
+from cangauge.model.voltage_model import Inverse, soc_from_ocv
 
 __all__ = ["Estimator", "EstimatorSettings", "Method"]
 

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cangauge._typing import FloatArray
 from cangauge.estimate.estimator import Estimator
 from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.types import Estimate, Sample, Status
+from cangauge.estimate.validity import Estimate, Sample, Status
 from cangauge.logs.log import Log
 from cangauge.model.model_file import ModelFile
-
-FloatArray = NDArray[np.float64]
 
 PROGRESS_EVERY = 5000
 """Samples between two calls of the progress callback."""

@@ -13,16 +13,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.identify.held_out import folds
-from cangauge.identify.options import FitOptions
-from cangauge.identify.rows import FitRows
+from cangauge.identify.rows import FitOptions, FitRows, folds
 from cangauge.identify.voltage_fit import columns_of, prepare
 from cangauge.logs.log import Log
-
-FloatArray = NDArray[np.float64]
 
 CANDIDATES_S = (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 50.0, 70.0, 100.0, 150.0, 200.0, 300.0)
 DELAYS_AT_MOST = 6

@@ -1,4 +1,6 @@
-"""Log → the rows that a fit uses, at the model's own rate.
+"""What a user may choose in an identification.
+
+Log → the rows that a fit uses, at the model's own rate.
 
 Rules, in this order:
 
@@ -7,23 +9,53 @@ Rules, in this order:
    are rows less than `GUARD_S` away from one (contactor open, pre-charge).
 3. Delay line: the first 70 s (the longest delay), and as long after a gap in the current longer
    than `gap_s`, are removed.
+
+Which rows to fit on and which to judge on.
+
+Several logs: whole logs are left out in turn. One or two logs: short interleaved blocks with a
+guard between them, the first and the last block of each log always kept for the fit, since the
+1/s⁴ terms explode beyond the SoC that they saw.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.identify.charge import counted_soc_pct
 from cangauge.logs.log import Log
-from cangauge.logs.unstepped import unstepped
+from cangauge.logs.resample import unstepped
+from cangauge.model.charge import counted_soc_pct
 from cangauge.model.delay_line import GAP_S, delayed_currents, settled
 
-FloatArray = NDArray[np.float64]
+# --- What a user may choose in an identification
+
+DELAYS_S = (0.0, 10.0, 30.0, 70.0)
+"""The published delays [s]."""
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """What a user may choose; the defaults are the published choices."""
+
+    capacity_ah: float | None = None
+    """Charge from 100 to 0 % [Ah]; by default from a log that runs from full to empty."""
+    initial_soc_pct: float | None = None
+    """SoC at each log's first row [%]; by default the logs' own reference, else 100."""
+    rate_hz: float = 1.0
+    delay_s: tuple[float, ...] = DELAYS_S
+    epsilon: float = 0.05
+    t_ref_c: float = 20.0
+    name: str | None = None
+    effects: tuple[str, ...] = ()
+    """Effects beyond the coefficients: ids, or `auto` alone to let logs left out choose."""
+
+
+# --- Log → the rows that a fit uses, at the model's own rate
 
 LOW_VOLTAGE = 0.5
 """Rows below this fraction of the log's median voltage are start-up or shut-down."""
@@ -135,3 +167,54 @@ def running_rows(time_s: FloatArray, voltage_v: FloatArray) -> NDArray[np.bool_]
 def usual_gap_s(time_s: FloatArray, gap_s: float) -> float:
     """Return what counts as a gap in a recorded log [s]: `gap_s`, or 3 usual steps if longer."""
     return max(gap_s, 3.0 * float(np.median(np.diff(time_s)))) if time_s.size > 1 else gap_s
+
+
+# --- Which rows to fit on and which to judge on
+
+Mask = NDArray[np.bool_]
+
+LOGS_AT_LEAST = 3
+FOLDS_AT_MOST = 12
+BLOCK_S, INTERLEAVED_GUARD_S = 240.0, 60.0
+BLOCK_FOLDS = 5
+
+
+def folds(logs: Sequence[FitRows]) -> Iterator[tuple[Mask, Mask]]:
+    """Yield (fit on, judge on) masks over the rows of all logs, one after another."""
+    owner = np.concatenate([np.full(len(rows), k) for k, rows in enumerate(logs)])
+    if len(logs) >= LOGS_AT_LEAST:
+        number = min(len(logs), FOLDS_AT_MOST)
+        for fold in range(number):
+            judged = owner % number == fold
+            yield ~judged, judged
+        return
+    block, since = _blocks(logs)
+    for fold in range(BLOCK_FOLDS):
+        judged = block % BLOCK_FOLDS == fold
+        edge = _edge_blocks(block, owner)
+        core = (
+            judged
+            & ~edge
+            & (since >= INTERLEAVED_GUARD_S)
+            & (since < BLOCK_S - INTERLEAVED_GUARD_S)
+        )
+        if core.any():
+            yield ~judged | edge, core
+
+
+def _blocks(logs: Sequence[FitRows]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    number, since, first = [], [], 0
+    for rows in logs:
+        elapsed = rows.time_s - rows.time_s[0]
+        number.append(first + (elapsed // BLOCK_S).astype(np.intp))
+        since.append(elapsed % BLOCK_S)
+        first = int(number[-1][-1]) + 1
+    return np.concatenate(number), np.concatenate(since)
+
+
+def _edge_blocks(block: NDArray[np.intp], owner: NDArray[np.intp]) -> Mask:
+    edge = np.zeros(block.size, dtype=bool)
+    for log in np.unique(owner):
+        numbers = block[owner == log]
+        edge |= (block == numbers[0]) | (block == numbers[-1])
+    return edge

@@ -8,12 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.identify.held_out import LOGS_AT_LEAST, folds
-from cangauge.identify.least_squares import BLOCK_S, Solution, solve
-from cangauge.identify.options import FitOptions
-from cangauge.identify.rows import FitRows, fit_rows
-from cangauge.identify.temperature import Held, how_firmly
+from cangauge.identify.rows import LOGS_AT_LEAST, FitOptions, FitRows, fit_rows, folds
+from cangauge.inference.least_squares import BLOCK_S, Held, Solution, how_firmly, solve
 from cangauge.logs.log import Log
 from cangauge.model.voltage_model import (
     BASIS_NAMES,
@@ -23,8 +21,6 @@ from cangauge.model.voltage_model import (
     ocv_basis,
     ocv_basis_slope,
 )
-
-FloatArray = NDArray[np.float64]
 
 SLOPE_CHECKS = 201
 """Points over the identified SoC at which the pseudo-OCV must rise."""

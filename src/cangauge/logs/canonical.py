@@ -19,13 +19,13 @@ import pyarrow.compute as pc
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 
-from cangauge.atomic import atomic_path
+from cangauge._io import MAX_LOG_COLUMNS, MAX_LOG_ROWS, MAX_PARQUET_NAMES, atomic_path
+from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.limits import MAX_LOG_COLUMNS, MAX_LOG_ROWS, MAX_PARQUET_NAMES
-from cangauge.logs.assemble import REQUIRED, Draft
 from cangauge.logs.columns import read_columns
-from cangauge.logs.content import Content, cells, delimiter_of
-from cangauge.logs.log import TEMPERATURE_SOURCES, FloatArray, Log, TemperatureSource
+from cangauge.logs.draft import REQUIRED, Draft
+from cangauge.logs.file_content import Content, cells, delimiter_of
+from cangauge.logs.log import TEMPERATURE_SOURCES, Log, TemperatureSource
 
 _OPTIONAL: Final = ("soc_pct",)
 _SOURCE: Final = "temperature_source"

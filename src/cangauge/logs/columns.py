@@ -11,10 +11,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.csv as pacsv
 
+from cangauge._io import MAX_LOG_COLUMNS, MAX_LOG_ROWS, MAX_ODD_ROWS
+from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.limits import MAX_LOG_COLUMNS, MAX_LOG_ROWS, MAX_ODD_ROWS
-from cangauge.logs.content import Content, cells
-from cangauge.logs.log import FloatArray
+from cangauge.logs.file_content import Content, cells
 
 _MISSING: Final = pa.array(
     ["", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "1.#qnan", "-1.#ind"]

@@ -8,12 +8,11 @@ from typing import Literal, Self, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 
 TemperatureSource = Literal["cell", "pack", "coolant", "room", "unknown"]
 TEMPERATURE_SOURCES: tuple[str, ...] = get_args(TemperatureSource)
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

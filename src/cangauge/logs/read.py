@@ -7,11 +7,14 @@ from os import PathLike
 from pathlib import Path
 
 from cangauge.errors import InputError
-from cangauge.logs import bmw_i3, canonical, cycler, d3
-from cangauge.logs.assemble import Draft
-from cangauge.logs.content import Content, cells, delimiter_of, read_content
+from cangauge.logs import canonical
+from cangauge.logs import formats as bmw_i3
+from cangauge.logs import formats as cycler
+from cangauge.logs import formats as d3
+from cangauge.logs.draft import Draft
+from cangauge.logs.file_content import Content, cells, delimiter_of, read_content
 from cangauge.logs.log import TEMPERATURE_SOURCES, Log, TemperatureSource
-from cangauge.logs.signs import settle_sign
+from cangauge.logs.sign import settle_sign
 from cangauge.logs.units import COLDEST_C, HOTTEST_C
 
 _KNOWN = (
@@ -126,13 +129,13 @@ def _is_recording_in_parts(path: Path) -> bool:
     except OSError:  # a name that is too long
         return False
     # Imported here: as below.
-    from cangauge.bus.captures.parts import parts_of_run  # noqa: PLC0415
+    from cangauge.bus.captures.files import parts_of_run  # noqa: PLC0415
 
     return bool(parts_of_run(path)) and _is_capture(path)
 
 
 def _is_capture(path: Path) -> bool:
     # Imported here: python-can is slow to import, and only an unknown file needs it.
-    from cangauge.bus.captures import is_capture  # noqa: PLC0415
+    from cangauge.bus.captures.capture import is_capture  # noqa: PLC0415
 
     return is_capture(path)

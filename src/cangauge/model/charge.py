@@ -1,14 +1,24 @@
 """Charge by the trapezoidal rule: what the model, its effects and the estimator all count by.
 
 C_i = C_{i−1} − (I_i + I_{i−1})·(t_i − t_{i−1})/2
+
+Charge by the trapezoidal rule, and the capacity that a log shows.
+
+C_i = C_{i−1} − (I_i + I_{i−1})·(t_i − t_{i−1})/2,      S = 100·C/C_t
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from cangauge._typing import FloatArray
+from cangauge.errors import InputError
+from cangauge.logs.log import Log
+
+# --- Charge by the trapezoidal rule: what the model, its effects and the estimator all count by
 
 BRIDGE_S = 60.0
 """Over a longer gap in the current no charge is counted [s]: the pack is taken to have rested."""
@@ -25,3 +35,121 @@ def discharged_ah(time_s: FloatArray, current_a: FloatArray) -> FloatArray:
     step_s = np.diff(time_s)
     step_ah = np.where(step_s > BRIDGE_S, 0.0, (current_a[1:] + current_a[:-1]) * step_s / 7200.0)
     return np.concatenate(([0.0], np.cumsum(step_ah)))
+
+
+# --- Charge by the trapezoidal rule, and the capacity that a log shows
+
+FULL_PCT, EMPTY_PCT = 98.0, 2.0
+"""A log whose reference SoC starts above and ends below these shows the whole capacity [%]."""
+
+KNEE_STEEPNESS = 5.0
+"""A log without reference SoC ran empty if its voltage falls this much more steeply against
+charge at the end than in its middle."""
+
+
+def counted_soc_pct(log: Log, capacity_ah: float, initial_soc_pct: float | None) -> FloatArray:
+    """Return the SoC counted from the log's current [%], shape (n,).
+
+    Parameters
+    ----------
+    log : Log
+    capacity_ah : float
+        Charge from 100 to 0 % [Ah].
+    initial_soc_pct : float, optional
+        SoC at the first row [%]. By default the log's reference anchors the count at its first
+        finite value; a log without reference starts at 100 %.
+    """
+    out = discharged_ah(log.time_s, log.current_a)
+    anchor = log.first_soc() if initial_soc_pct is None else (0, initial_soc_pct)
+    row, value = anchor if anchor is not None else (0, 100.0)
+    return np.asarray(value - 100.0 * (out - out[row]) / capacity_ah)
+
+
+def capacity_from_reference(logs: Sequence[Log]) -> float:
+    """Return the charge per 100 % of reference SoC [Ah], by regression pooled over the logs.
+
+    Raises
+    ------
+    InputError
+        If no log has a reference SoC that moves by at least 1 %.
+    """
+    covariance = variance = 0.0
+    for log in logs:
+        if log.soc_pct is None:
+            continue
+        known = np.isfinite(log.soc_pct)
+        if not known.any() or np.ptp(log.soc_pct[known]) < 1.0:
+            continue
+        soc = log.soc_pct[known]
+        out = discharged_ah(log.time_s, log.current_a)[known]
+        covariance += float(np.sum((soc - soc.mean()) * (out - out.mean())))
+        variance += float(np.sum((soc - soc.mean()) ** 2))
+    if variance == 0.0:
+        raise InputError(
+            "no log has a reference SoC that moves by 1 % or more",
+            field="soc_pct",
+            cure="give the capacity in Ah with --capacity-ah",
+        )
+    return -100.0 * covariance / variance
+
+
+def capacity_from_full_discharge(logs: Sequence[Log], initial_soc_pct: float | None) -> float:
+    """Return the capacity from the first log that runs from full to empty [Ah].
+
+    Raises
+    ------
+    InputError
+        If none does.
+    """
+    for log in logs:
+        capacity = _whole_capacity_ah(log, initial_soc_pct)
+        if capacity is not None:
+            return capacity
+    raise InputError(
+        f"no log runs from full to empty ({FULL_PCT:.0f} % or more to {EMPTY_PCT:.0f} % or less),"
+        " so none gives the capacity",
+        source=logs[0].source or logs[0].name,
+        field="capacity_ah",
+        cure="give it with --capacity-ah A, or --capacity-ah from-soc to take the charge per"
+        " 100 % of the logs' soc_pct",
+    )
+
+
+def _whole_capacity_ah(log: Log, initial_soc_pct: float | None) -> float | None:
+    out = discharged_ah(log.time_s, log.current_a)
+    anchor = log.first_soc() if initial_soc_pct is None else (0, initial_soc_pct)
+    first_row, first = anchor if anchor is not None else (0, 100.0)
+    if first < FULL_PCT:
+        return None
+    if log.soc_pct is not None and np.isfinite(log.soc_pct).sum() > 1:
+        last_row = int(np.flatnonzero(np.isfinite(log.soc_pct))[-1])
+        last = float(log.soc_pct[last_row])
+        if last > EMPTY_PCT:
+            return None
+        return float(100.0 * (out[last_row] - out[first_row]) / (first - last))
+    if not _ends_in_the_knee(log, out):
+        return None
+    return float(100.0 * (out[-1] - out[first_row]) / first)
+
+
+def _ends_in_the_knee(log: Log, out_ah: FloatArray) -> bool:
+    """Whether the voltage, less its drop over the resistance, falls steeply at the end."""
+    total = float(out_ah[-1])
+    running = _running(log)
+    if total <= 0.0 or running.sum() < 100:
+        return False
+    volts, current, out = log.voltage_v[running], log.current_a[running], out_ah[running]
+    near_end = out > 0.98 * total
+    middle = (out > 0.3 * total) & (out < 0.7 * total)
+    if near_end.sum() < 10 or middle.sum() < 10:
+        return False
+
+    def fall_per_ah(rows: NDArray[np.bool_]) -> float:
+        columns = np.column_stack([np.ones(rows.sum()), out[rows], current[rows]])
+        return -float(np.linalg.lstsq(columns, volts[rows], rcond=None)[0][1])
+
+    return fall_per_ah(near_end) > KNEE_STEEPNESS * max(fall_per_ah(middle), 0.0)
+
+
+def _running(log: Log) -> NDArray[np.bool_]:
+    return np.asarray(log.voltage_v > 0.5 * np.median(log.voltage_v))

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float64]
+from cangauge._typing import FloatArray
 
 GAP_S = 2.0
 """A gap in the current longer than this empties the delay line [s]."""

@@ -15,13 +15,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.model.charge import discharged_ah
 from cangauge.model.delay_line import delayed_currents
-from cangauge.model.effects.effect import Effect, FloatArray, Reading, Values
+from cangauge.model.effects.base import Counting, Effect, Pack, PackState, Reading, Signals, Values
 from cangauge.model.effects.library import LIBRARY
-from cangauge.model.effects.pack_state import Counting, PackState, Signals
-from cangauge.model.effects.parameter import Pack
 from cangauge.model.voltage_model import SLOPE_AT_LEAST, VoltageModel
 
 SLOPE_STEP_PCT = 0.05

@@ -17,15 +17,14 @@ from pydantic import (
     model_validator,
 )
 
+from cangauge._config import schema_error
+from cangauge._io import MAX_MODEL_BYTES, MAX_MODEL_COLUMNS, MAX_MODEL_ITEMS, read_bounded
 from cangauge.errors import InputError
-from cangauge.files import read_bounded
-from cangauge.limits import MAX_MODEL_BYTES, MAX_MODEL_COLUMNS, MAX_MODEL_ITEMS
 from cangauge.logs.log import TemperatureSource
+from cangauge.model.effects.base import Pack
 from cangauge.model.effects.library import parse_effects
-from cangauge.model.effects.parameter import Pack
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.voltage_model import BASIS_NAMES, VoltageModel
-from cangauge.schema import schema_error
 
 MODEL_FORMAT = "cangauge-model"
 MODEL_VERSION = 1

@@ -13,16 +13,16 @@ import can
 import numpy as np
 from can.typechecking import Channel
 
+from cangauge._typing import FloatArray
 from cangauge.bus.capture_log import open_vehicle_capture
 from cangauge.bus.time_source import REPLAY_CLOCK_ID, TimeSourceName, is_clock
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.offline import EstimateTable
 from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.types import Estimate
-from cangauge.logs.log import FloatArray
+from cangauge.estimate.validity import Estimate
 from cangauge.model.model_file import ModelFile
-from cangauge.service.stream import EstimateStream, FrameCounts
+from cangauge.service.pipeline import EstimateStream, FrameCounts
 
 PROGRESS_EVERY: Final = 50_000
 """Frames between two calls of the progress callback."""

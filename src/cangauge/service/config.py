@@ -1,4 +1,24 @@
-"""What `cangauge run` can be told: a TOML file, and options of the command line that go before it.
+"""Where HTTP is served, and who may ask: loopback, or a bearer token.
+
+The token comes from a file or the environment, never from the command line, which other users of
+the machine can read.
+
+How a service is watched and what it records: the part of its configuration for operators.
+
+Keys of the file, and options of `cangauge run` by the same names::
+
+    record = "record/drive.log"     # .log, .csv, .blf, .mf4
+    record_part_mb = 64             # a new file after so much …
+    record_part_s = 3600            # … or after so long
+    record_keep_mb = 2000           # the oldest files are removed beyond this
+
+    status_socket = "auto"          # a path, or "off"
+    http = "127.0.0.1:9464"         # /status, /healthz, /metrics
+    http_token_file = "http-token"  # required where http is not loopback
+    log_format = "json"             # or "text"
+    log_level = "info"
+
+What `cangauge run` can be told: a TOML file, and options of the command line that go before it.
 
 Keys are the options' names, with underscores::
 
@@ -39,8 +59,10 @@ How the service is watched and what it records: see `ops_config`.
 
 from __future__ import annotations
 
+import ipaddress
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Final, Self
@@ -55,23 +77,228 @@ from pydantic import (
     StrictBool,
 )
 
+from cangauge._config import read_toml, validated
+from cangauge._logging import LogFormat, LogLevel
 from cangauge.bus.mapping import CheckMap, MessageMap, RuleMap
 from cangauge.bus.open import BusAddress, bus_address, is_interface_name
-from cangauge.bus.overrides import Overrides
 from cangauge.bus.publish import FrameIds
 from cangauge.bus.time_source import TimeSourceName
-from cangauge.bus.validation import read_toml, validated
-from cangauge.bus.vehicle import Vehicle, load_vehicle
+from cangauge.bus.vehicle import Overrides, Vehicle, load_vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.anchors import FullCharge, LongRest
-from cangauge.estimate.settings import VALID_STD_PCT, EstimatorSettings, Method
+from cangauge.estimate.settings import (
+    VALID_STD_PCT,
+    EstimatorSettings,
+    FullCharge,
+    LongRest,
+    Method,
+)
 from cangauge.logs.log import TemperatureSource
 from cangauge.model.delay_line import GAP_S
-from cangauge.service.gauge import GaugeSettings
-from cangauge.service.loop import LoopSettings
-from cangauge.service.ops_config import OPS_PATHS, OpsConfig
-from cangauge.service.state_keeper import StateSettings, state_path
-from cangauge.service.upkeep import CHECKPOINT_EVERY_S
+from cangauge.service.loop import CHECKPOINT_EVERY_S, LoopSettings
+from cangauge.service.pipeline import GaugeSettings
+from cangauge.service.recording import RecordLimits
+from cangauge.service.state import StateSettings, state_path
+
+# --- Where HTTP is served, and who may ask: loopback, or a bearer token
+
+TOKEN_VARIABLE: Final = "CANGAUGE_HTTP_TOKEN"  # noqa: S105 - the variable's name, no secret
+LOOPBACK: Final = "127.0.0.1"
+SHORTEST_TOKEN: Final = 16
+LONGEST_TOKEN: Final = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class HttpAddress:
+    """Where to listen.
+
+    Parameters
+    ----------
+    host : str
+        IP address, or "localhost".
+    port : int
+        0: any free one.
+    token : str or None
+        What a request must bear.
+    """
+
+    host: str
+    port: int
+    token: str | None = field(default=None, repr=False)
+
+    def __str__(self) -> str:
+        """Return it as it is written in a URL."""
+        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+def http_address(
+    text: str,
+    token_file: str | PathLike[str] | None = None,
+    environment: Mapping[str, str] | None = None,
+) -> HttpAddress:
+    """Return where to listen and the token, if the two go together.
+
+    Parameters
+    ----------
+    text : str
+        "9464" (on loopback), "127.0.0.1:9464", "0.0.0.0:9464", "[::1]:9464".
+    token_file : path-like, optional
+        By default the environment variable `TOKEN_VARIABLE`, if there is one.
+    environment : mapping, optional
+
+    Raises
+    ------
+    InputError
+        If it is no address, the token cannot be read or is too short, or the address is not
+        loopback and there is no token.
+    """
+    host, port = _host_and_port(text)
+    token = read_token(token_file, os.environ if environment is None else environment)
+    if token is None and not is_loopback_name(host):
+        raise InputError(
+            "this address is open to the network, and there is no token",
+            field="http",
+            value=text,
+            cure=f"put a token into a file for --http-token-file or into {TOKEN_VARIABLE},"
+            f" or listen on {LOOPBACK}:{port}",
+        )
+    return HttpAddress(host, port, token)
+
+
+def is_loopback_name(host: str) -> bool:
+    """Return whether a host is this machine's loopback: "localhost", 127.…, ::1."""
+    host = host.removeprefix("[").removesuffix("]").lower()
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _host_and_port(text: str) -> tuple[str, int]:
+    host, colon, port = text.strip().rpartition(":")
+    if not colon:
+        host = LOOPBACK
+    host = host.removeprefix("[").removesuffix("]")
+    try:
+        if host.lower() != "localhost":
+            ipaddress.ip_address(host)
+        number = int(port)
+    except ValueError:
+        number = -1
+    if not 0 <= number <= 65535:
+        raise InputError(
+            "no address of HOST:PORT, the host an IP address or localhost",
+            field="http",
+            value=text,
+            cure=f"write it as {LOOPBACK}:9464",
+        )
+    return host, number
+
+
+def read_token(path: str | PathLike[str] | None, environment: Mapping[str, str]) -> str | None:
+    """Return the token in a file, or in the environment; None if there is neither.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or is too short or no printable text.
+    """
+    if path is None:
+        given = environment.get(TOKEN_VARIABLE)
+        return None if given is None else _checked(given, TOKEN_VARIABLE)
+    try:
+        with Path(path).open("rb") as file:
+            content = file.read(LONGEST_TOKEN + 2).decode("utf-8")
+    except FileNotFoundError as error:
+        raise InputError(
+            "no such file", source=path, field="http_token_file", cure="check the path"
+        ) from error
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "not UTF-8 text"
+        raise InputError(
+            f"cannot be read: {reason}", source=path, field="http_token_file"
+        ) from error
+    return _checked(content, str(path))
+
+
+def _checked(content: str, source: str) -> str:
+    token = content.strip()
+    if not SHORTEST_TOKEN <= len(token) <= LONGEST_TOKEN or not token.isascii() or " " in token:
+        # The value is a secret, if a bad one: it is not repeated.
+        raise InputError(
+            f"a token is {SHORTEST_TOKEN} to {LONGEST_TOKEN} printable characters without spaces",
+            source=source,
+            field="http_token",
+            cure="make one: python -c 'import secrets; print(secrets.token_urlsafe())'",
+        )
+    return token
+
+
+# --- How a service is watched and what it records: the part of its configuration for operators
+
+OPS_PATHS: Final = ("record", "http_token_file")
+"""Keys that are paths, relative to the file that they stand in."""
+
+Megabytes = Annotated[FiniteFloat, Field(gt=0.0, le=1e9)]
+PartSeconds = Annotated[FiniteFloat, Field(ge=1.0, le=1e9)]
+
+
+class OpsConfig(BaseModel):
+    """The keys for operators.
+
+    Parameters
+    ----------
+    record : str, optional
+        File to record the frames into.
+    record_part_mb, record_part_s : float, optional
+        A new file is begun after so many megabytes, or seconds.
+    record_keep_mb : float, optional
+        The oldest files of the recording are removed beyond so many megabytes.
+    http : str, optional
+        Where to serve HTTP.
+    http_token_file : str, optional
+        File with the token that requests must bear.
+    status_socket : str
+        Path of the unix socket for `cangauge status`; "auto", "off".
+    log_format : {"text", "json"}
+    log_level : {"debug", "info", "warning", "error"}
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    record: str | None = None
+    record_part_mb: Megabytes | None = None
+    record_part_s: PartSeconds | None = None
+    record_keep_mb: Megabytes | None = None
+    http: str | None = None
+    http_token_file: str | None = None
+    status_socket: str = "auto"
+    log_format: LogFormat = "text"
+    log_level: LogLevel = "info"
+
+    def http_address(self) -> HttpAddress | None:
+        """Return where HTTP is served, None if it is not; may raise InputError."""
+        return None if self.http is None else http_address(self.http, self.http_token_file)
+
+    def unix_path(self) -> Path | None:
+        """Return the path of the unix socket where one is named."""
+        return None if self.status_socket in {"auto", "off"} else Path(self.status_socket)
+
+    def record_limits(self) -> RecordLimits:
+        """Return when the recording begins a new file, and what it keeps; may raise InputError."""
+        return RecordLimits(
+            part_bytes=_bytes(self.record_part_mb),
+            part_s=self.record_part_s,
+            keep_bytes=_bytes(self.record_keep_mb),
+        )
+
+
+def _bytes(megabytes: float | None) -> int | None:
+    return None if megabytes is None else int(megabytes * 1e6)
+
+
+# --- What `cangauge run` can be told: a TOML file, and options of the command line that go b…
 
 DEFAULT_VEHICLE: Final = "generic"
 """What `replay` sends by default, so that both commands find each other without options."""

@@ -1,4 +1,10 @@
-"""The receive loop: receives, hands to the gauge, sends.
+"""Noticing that somebody else sends the frames that this service publishes.
+
+Two services with the same ids leave whoever reads them with a SoC that jumps between two values.
+
+What the loop does now and then beside its frames: saves, re-reads, tells of losses.
+
+The receive loop: receives, hands to the gauge, sends.
 
 It alone knows a clock, a monotonic one: for the rate of publishing, and to notice silence.
 """
@@ -14,14 +20,196 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 import can
+from can.typechecking import CanFilter
 
-from cangauge.bus.publish import ESTIMATE_EVERY_S, standard_filter
-from cangauge.bus.receive import BusPort
+from cangauge._logging import Voice
+from cangauge.bus.connection import BusPort
+from cangauge.bus.publish import ESTIMATE_EVERY_S, FrameIds, standard_filter
 from cangauge.bus.time_source import is_clock
-from cangauge.estimate.types import Estimate
-from cangauge.service.gauge import Gauge
-from cangauge.service.rivals import Rivals
-from cangauge.service.upkeep import CHECKPOINT_EVERY_S, Upkeep
+from cangauge.errors import CangaugeError
+from cangauge.estimate.validity import Estimate
+from cangauge.service.pipeline import Gauge
+
+# --- Noticing that somebody else sends the frames that this service publishes
+
+SEEN: Final = 3
+"""So many frames within `WITHIN_S` are no accident."""
+
+WITHIN_S: Final = 5.0
+AGAIN_S: Final = 600.0
+"""While it lasts, it is warned of so often [s]."""
+
+_REMEMBERED: Final = 64
+
+
+class Rivals:
+    """Tells one's own frames that come back from those of others.
+
+    Parameters
+    ----------
+    ids : FrameIds
+        What this service publishes.
+    echoes : bool
+        Whether the bus hands one's own frames back (see `InterfaceFacts`).
+    warn : callable, optional
+        Takes a line of text.
+
+    Attributes
+    ----------
+    frames : int
+        Frames with own ids that others sent.
+    ids : frozenset of int
+        What it looks out for.
+    """
+
+    def __init__(
+        self, ids: FrameIds, *, echoes: bool, warn: Callable[[str], None] | None = None
+    ) -> None:
+        self.frames = 0
+        self._echoes = echoes
+        self._warn = warn
+        self._sent: deque[tuple[int, bytes]] = deque(maxlen=_REMEMBERED)
+        self._seen_s: deque[float] = deque(maxlen=SEEN)
+        self._quiet_until_s = -math.inf
+        self.use(ids)
+
+    def use(self, ids: FrameIds) -> None:
+        """Look out for these ids from now on."""
+        self.ids = frozenset({ids.soc_estimate, ids.soc_detail})
+
+    @property
+    def filters(self) -> list[CanFilter]:
+        """What must be received to notice them."""
+        return [standard_filter(each) for each in sorted(self.ids)]
+
+    def sent(self, message: can.Message) -> None:
+        """Note a frame of one's own."""
+        if self._echoes:
+            self._sent.append((message.arbitration_id, bytes(message.data)))
+
+    def takes(self, message: can.Message, now_s: float) -> bool:
+        """Return whether a received frame has an own id: it is then no input.
+
+        Parameters
+        ----------
+        message : can.Message
+        now_s : float
+            Monotonic time [s].
+        """
+        if message.arbitration_id not in self.ids or message.is_extended_id:
+            return False
+        if not self._is_echo(message):
+            self._note(message.arbitration_id, now_s)
+        return True
+
+    def _is_echo(self, message: can.Message) -> bool:
+        frame = (message.arbitration_id, bytes(message.data))
+        if frame not in self._sent:
+            return False
+        # Each comes back once, in the order sent; those before it were lost. So a rival who sends
+        # the very same frames is noticed as well: by then one's own are one too many.
+        while self._sent.popleft() != frame:
+            pass
+        return True
+
+    def _note(self, frame_id: int, now_s: float) -> None:
+        self.frames += 1
+        self._seen_s.append(now_s)
+        is_many = len(self._seen_s) == SEEN and now_s - self._seen_s[0] <= WITHIN_S
+        if is_many and now_s >= self._quiet_until_s and self._warn is not None:
+            self._quiet_until_s = now_s + AGAIN_S
+            self._warn(
+                f"warning: somebody else sends 0x{frame_id:X} on this bus, which this service"
+                " publishes: is another one running? Give one of them other ids"
+                " (--soc-estimate-id, --soc-detail-id)"
+            )
+
+
+# --- What the loop does now and then beside its frames: saves, re-reads, tells of losses
+
+LOOK_EVERY_S: Final = 0.1
+
+CHECKPOINT_EVERY_S: Final = 10.0
+"""How often the state is saved [s]: a service that is killed, writes for a while and takes three
+seconds to start again then has missed less than half a minute of charge, however it flowed. A
+state of 20 kB makes 0.2 GB of writing a day."""
+
+FIRST_CHECKPOINT_S: Final = 1.0
+"""The first checkpoint comes so soon, lest a service that is killed again and again keeps nothing
+[s]."""
+
+
+class Upkeep:
+    """Looks after what needs no more than a glance every `LOOK_EVERY_S`.
+
+    Parameters
+    ----------
+    port : BusPort
+        Whose receive queue is watched.
+    checkpoint : callable, optional
+        Saves the state; called after `FIRST_CHECKPOINT_S`, every `every_s`, and at the end.
+    every_s : float
+    warn : callable, optional
+        Takes a line of text.
+    """
+
+    def __init__(
+        self,
+        port: BusPort,
+        checkpoint: Callable[[], None] | None = None,
+        every_s: float = CHECKPOINT_EVERY_S,
+        warn: Callable[[str], None] | None = None,
+    ) -> None:
+        self._port = port
+        self._checkpoint = checkpoint
+        self.every_s = every_s
+        self._voice = Voice(warn) if warn is not None else None
+        self._look_s = 0.0
+        self._save_s: float | None = None
+        self._drops = 0
+
+    def look(self, now_s: float) -> None:
+        """Do what is due (monotonic time [s])."""
+        if now_s < self._look_s:
+            return
+        self._look_s = now_s + LOOK_EVERY_S
+        self._watch_queue()
+        if self._voice is not None:
+            self._voice.look()
+        if self._save_s is None:
+            self._save_s = now_s + min(FIRST_CHECKPOINT_S, self.every_s)
+        elif now_s >= self._save_s:
+            self._save_s = now_s + self.every_s
+            self._save()
+
+    def finish(self) -> None:
+        """Save for the last time."""
+        self._save()
+
+    def _watch_queue(self) -> None:
+        drops = self._port.queue_drops or 0
+        if drops > self._drops:
+            self._say(
+                f"warning: {self._port.name}: the receive queue overflowed:"
+                f" {drops - self._drops} frames lost ({drops} so far)"
+            )
+            self._drops = drops
+
+    def _save(self) -> None:
+        if self._checkpoint is None:
+            return
+        try:
+            self._checkpoint()
+        except (OSError, CangaugeError) as error:
+            # A full disk must not stop the estimate.
+            self._say(f"warning: the state could not be saved: {error}")
+
+    def _say(self, text: str) -> None:
+        if self._voice is not None:
+            self._voice.say(text)
+
+
+# --- The receive loop: receives, hands to the gauge, sends
 
 LATE_S: Final = 0.01
 """So much later than due a beat may come, so that it tells of a sample that is about to [s]."""
@@ -29,8 +217,6 @@ LATE_S: Final = 0.01
 GLANCE_EVERY_S: Final = 0.01
 """While frames come, whatever else there is to do is looked after so often [s], not each time."""
 
-LOOK_EVERY_S: Final = 0.1
-"""How long receiving may block before signals and heartbeats are looked at again [s]."""
 
 SEND_WITHIN_S: Final = 0.1
 """How long a frame may wait for room in the transmit queue [s]: by then the next one is due.

@@ -10,9 +10,8 @@ from typing import Final
 
 from cangauge import __version__
 from cangauge.errors import InputError
-from cangauge.estimate.types import Reason, Status
-from cangauge.service.histogram import BOUNDS_S, HistogramCounts
-from cangauge.service.snapshot import Snapshot, reason_ids
+from cangauge.estimate.validity import Reason, Status
+from cangauge.service.status import BOUNDS_S, HistogramCounts, Snapshot, reason_ids
 
 try:
     from prometheus_client import CollectorRegistry, ProcessCollector

@@ -11,9 +11,9 @@ from typing import Any, Final, cast
 from urllib.parse import urlsplit
 
 from cangauge.errors import CangaugeError, InputError
-from cangauge.service.address import read_token
-from cangauge.service.snapshot import SCHEMA
-from cangauge.service.status_socket import served_sockets
+from cangauge.service.config import read_token
+from cangauge.service.http import served_sockets
+from cangauge.service.status import SCHEMA
 
 ANSWER_WITHIN_S: Final = 3.0
 LARGEST_ANSWER: Final = 1 << 20

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cangauge.estimate.coulomb import CoulombCounter
+from cangauge.estimate.counting import CoulombCounter
 from cangauge.model.delay_line import DelayLine
-from cangauge.model.effects.effect import Effect, Reading
+from cangauge.model.effects.base import Effect, Pack, Parameter, Reading, Signals
 from cangauge.model.effects.library import LIBRARY
-from cangauge.model.effects.pack_state import Signals
-from cangauge.model.effects.parameter import Pack, Parameter
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 from synthetic import drive_current

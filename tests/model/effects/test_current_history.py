@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from stepping import CAPACITY_AH, MODEL
 
+from cangauge.model.effects.base import Signals
 from cangauge.model.effects.library import LIBRARY
-from cangauge.model.effects.pack_state import Signals
 from cangauge.model.extended import ExtendedModel
 
 ROWS = np.arange(0, 3000, 7)

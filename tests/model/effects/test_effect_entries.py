@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from stepping import EFFECTS, MODEL, PACK, irregular_signals, middle, within
 
 from cangauge.errors import InputError
-from cangauge.model.effects.effect import Effect
+from cangauge.model.effects.base import LEEWAY, Effect, Pack
 from cangauge.model.effects.library import LIBRARY, effect_entries, effect_of, parse_effects
-from cangauge.model.effects.parameter import LEEWAY, Pack
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.published import CAPACITY_AH
 

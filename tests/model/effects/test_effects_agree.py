@@ -12,10 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stepping import EFFECTS, MODEL, PACK, irregular_signals, middle, step_through, within
 
-from cangauge.model.effects.effect import Effect, Reading
+from cangauge.model.effects.base import Effect, Pack, Reading, Signals
 from cangauge.model.effects.library import LIBRARY
-from cangauge.model.effects.pack_state import Signals
-from cangauge.model.effects.parameter import Pack
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.published import CAPACITY_AH
 from cangauge.model.voltage_model import VoltageModel

@@ -12,10 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stepping import MODEL, PACK, irregular_signals, step_through
 
-from cangauge.model.effects.effect import Reading, Values
+from cangauge.model.effects.base import PackState, Reading, Signals, Values
 from cangauge.model.effects.first_order import LowPass, decaying_sum, low_passed
 from cangauge.model.effects.library import LIBRARY
-from cangauge.model.effects.pack_state import PackState, Signals
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.published import CAPACITY_AH
 

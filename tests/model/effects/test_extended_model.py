@@ -15,12 +15,11 @@ from stepping import EFFECTS, MODEL, irregular_signals, middle, step_through
 from cangauge.identify.rows import fit_rows
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
-from cangauge.model.effects.effect import Reading
+from cangauge.model.effects.base import Reading, Signals
 from cangauge.model.effects.library import LIBRARY
-from cangauge.model.effects.pack_state import Signals
 from cangauge.model.extended import ExtendedModel
-from cangauge.model.inverse import soc_from_ocv
 from cangauge.model.published import CAPACITY_AH
+from cangauge.model.voltage_model import soc_from_ocv
 from synthetic import synthetic_log
 
 ALL = tuple((effect, middle(effect)) for effect in EFFECTS)

@@ -11,18 +11,18 @@ from typing import Final
 import can
 from can.typechecking import Channel
 
-from cangauge.bus.captures.info import CaptureInfo, Stamps
-from cangauge.bus.captures.library import (
+from cangauge._io import MAX_BUSES, MAX_IDLE_LINES, MAX_STAMP_S
+from cangauge.bus.captures.files import CaptureInfo, LineStream, Stamps, parts_of_run, read_head
+from cangauge.bus.captures.readers import (
     DAMAGE,
     LIBRARY_FORMATS,
+    TEXT_FORMATS,
     LibraryFormat,
+    Parser,
+    TextFormat,
     library_messages,
 )
-from cangauge.bus.captures.parts import parts_of_run
-from cangauge.bus.captures.stream import LineStream, read_head
-from cangauge.bus.captures.text_formats import TEXT_FORMATS, Parser, TextFormat
 from cangauge.errors import InputError
-from cangauge.limits import MAX_BUSES, MAX_IDLE_LINES, MAX_STAMP_S
 
 CLOCK_ID: Final = 0x1DB
 """Without time stamps, time is counted in frames of this id (Nissan Leaf) …"""

@@ -21,9 +21,9 @@ from typing import BinaryIO, Final, cast
 
 import can
 
-from cangauge.bus.captures.stream import open_bytes
+from cangauge._io import MAX_MF4_MEMORY, MF4_SILENCE_S, MF4_SILENCE_S_PER_MIB, MIB
+from cangauge.bus.captures.files import open_bytes
 from cangauge.errors import InputError
-from cangauge.limits import MAX_MF4_MEMORY, MF4_SILENCE_S, MF4_SILENCE_S_PER_MIB, MIB
 
 _FRAME: Final = struct.Struct("<dIBBiB")
 """Stamp [s], id, flags by `_FLAGS`, DLC, channel (or `_NO_CHANNEL`), bytes of data that follow."""

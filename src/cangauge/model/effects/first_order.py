@@ -15,9 +15,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from cangauge._typing import FloatArray
 
 DECAY_A_BLOCK = 300.0
 """Time constants summed up at once: e³⁰⁰, and e⁵⁰ for a last step, are far from overflow."""

@@ -1,0 +1,42 @@
+"""Numbers as text, the same in every message, report and table."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+NONE_KNOWN: Final = "–"
+
+LONGEST_WHOLE: Final = 1e6
+"""Larger numbers are written with a power of ten."""
+
+
+def number(value: float | None, digits: int = 3, unit: str = "") -> str:
+    """Return a number with fixed digits and its unit, or a dash where it is not known."""
+    if value is None or not math.isfinite(value):
+        return NONE_KNOWN
+    text = f"{round(value, digits) + 0.0:.{digits}f}".replace("-", "−")
+    return f"{text} {unit}" if unit else text
+
+
+def significant(value: float | None, digits: int = 4, unit: str = "") -> str:
+    """Return a number with so many significant digits, or a dash where it is not known."""
+    if value is None or not math.isfinite(value):
+        return NONE_KNOWN
+    text = f"{value:#.{digits}g}".rstrip(".")
+    if "e+" in text and abs(value) < LONGEST_WHOLE:
+        text = f"{float(text):.0f}"
+    text = text.replace("-", "−")
+    return f"{text} {unit}" if unit else text
+
+
+def span(low: float, high: float, digits: int = 1, unit: str = "") -> str:
+    """Return a range, such as "20.0 … 26.0 °C"."""
+    return f"{number(low, digits)} … {number(high, digits)} {unit}".rstrip()
+
+
+def duration(seconds: float) -> str:
+    """Return a time span in the unit that suits it."""
+    if seconds < 120.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.1f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.2f} h"

@@ -1,0 +1,374 @@
+"""What the commands that take a LOG or a capture have in common: options, reading, guards.
+
+What the commands on a bus have in common: options.
+
+Options of `cangauge run` for whoever operates the service.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sized
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, cast
+
+import typer
+
+from cangauge._io import check_writable
+from cangauge.bus.vehicle import PRESETS
+from cangauge.cli.output import note
+from cangauge.errors import InputError
+from cangauge.logs.log import TEMPERATURE_SOURCES, Log, TemperatureSource
+
+# --- What the commands that take a LOG or a capture have in common: options, reading, guards
+
+VehicleOption = Annotated[
+    str | None,
+    typer.Option(
+        "--vehicle",
+        metavar="PRESET",
+        help="For a capture: the car's preset (a DBC and a map that ship with cangauge).",
+    ),
+]
+DbcOption = Annotated[
+    Path | None,
+    typer.Option("--dbc", metavar="FILE", help="For a capture: the bus's DBC; needs --map."),
+]
+MapOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--map",
+        metavar="FILE",
+        help="For a capture: which signals of the DBC are current, voltage and temperature.",
+    ),
+]
+TemperatureOption = Annotated[
+    float | None,
+    typer.Option(
+        "--temperature", metavar="C", help="Constant temperature [°C], where the input has none."
+    ),
+]
+TemperatureSourceOption = Annotated[
+    str | None,
+    typer.Option(
+        "--temperature-source",
+        metavar="SOURCE",
+        help="What the temperature was measured on, where the input does not say it: "
+        f"{', '.join(TEMPERATURE_SOURCES)}.",
+    ),
+]
+JsonOption = Annotated[
+    bool,
+    typer.Option(
+        "--json", help="Print one JSON object on stdout and nothing else there, also of an error."
+    ),
+]
+ReportOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--report", metavar="FILE.html", help="Write a report: one page that needs no network."
+    ),
+]
+
+
+def load_log(
+    path: Path,
+    *,
+    vehicle: str | None = None,
+    dbc: Path | None = None,
+    map_file: Path | None = None,
+    temperature_c: float | None = None,
+    temperature_source: str | None = None,
+    refuse_turned: bool = False,
+) -> Log:
+    """Read a log, or a capture by its vehicle, and say on stderr what the reader remarked.
+
+    Parameters
+    ----------
+    path : Path
+    vehicle : str, optional
+        Preset of the car (captures only).
+    dbc, map_file : Path, optional
+        DBC and map of signals, in place of a preset (captures only).
+    temperature_c : float, optional
+        Constant temperature [°C].
+    temperature_source : str, optional
+        What the temperature was measured on.
+    refuse_turned : bool
+        Refuse a log whose data show clearly that positive current charges, as a command must
+        that would compute nonsense from it.
+
+    Returns
+    -------
+    Log
+        Positive current discharges, as far as the format says it.
+
+    Raises
+    ------
+    InputError
+        If the input cannot be read, an option has no known value, or (with `refuse_turned`) the
+        sign of current is turned.
+    """
+    # pyarrow is slow to import, and the service, which has the same options, does without.
+    from cangauge.logs.read import CaptureGivenError, read_log  # noqa: PLC0415
+
+    source = known_temperature_source(temperature_source)
+    described = vehicle is not None or dbc is not None or map_file is not None
+    is_capture = False
+    try:
+        log = read_log(path, temperature_source=source, temperature_c=temperature_c)
+        if described:
+            note_not_a_capture(path)
+    except CaptureGivenError:
+        if not described:
+            raise
+        # cantools is slow to import, and logs do without.
+        from cangauge.bus.capture_log import capture_to_log  # noqa: PLC0415
+        from cangauge.bus.vehicle import load_vehicle  # noqa: PLC0415
+
+        car = load_vehicle(vehicle, dbc, map_file, temperature_c=temperature_c)
+        log, is_capture = capture_to_log(path, car), True
+        if source is not None:
+            log = replace(log, temperature_source=source)
+    if refuse_turned:
+        refuse_single_row(log)
+        refuse_turned_current(log, is_capture=is_capture)
+    for remark in log.remarks:
+        note(f"{log.source or log.name}: {remark}")
+    return log
+
+
+def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> None:
+    """Refuse, before any long work, outputs that cannot be written or that would overwrite input.
+
+    Parameters
+    ----------
+    outputs, inputs : iterable of Path
+        None among the outputs means that this one is not wanted.
+
+    Raises
+    ------
+    InputError
+        If a folder is missing or not writable, an output is named twice, or is also an input.
+    """
+    read = {path.resolve() for path in inputs}
+    written: set[Path] = set()
+    for output in outputs:
+        if output is None:
+            continue
+        place = output.resolve()
+        if place in read:
+            raise InputError(
+                "this output is also an input", source=output, cure="name another file for it"
+            )
+        # /dev/null may well be named twice.
+        if place in written and (place.is_file() or not place.exists()):
+            raise InputError(
+                "two outputs have this name", source=output, cure="name two different files"
+            )
+        written.add(place)
+        check_writable(output)
+
+
+def within(value: float, low: float, high: float, *, option: str, unit: str) -> float:
+    """Return `value` if it lies within low … high (NaN does not), else raise InputError."""
+    if not low <= value <= high:
+        raise InputError(
+            f"must lie within {low:g} … {high:g} {unit}".rstrip(), field=option, value=value
+        )
+    return value
+
+
+def refuse_single_row(recorded: Sized) -> None:
+    """Raise InputError for a log of one row: no charge can be counted over it."""
+    if len(recorded) < 2:
+        raise InputError(
+            "a single row: charge is counted from one row to the next",
+            source=getattr(recorded, "source", None),
+            cure="give a log of minutes or hours",
+        )
+
+
+def refuse_turned_current(log: Log, *, is_capture: bool) -> None:
+    """Raise InputError if the data show clearly that positive current charges."""
+    # For the same reason as in `load_log`.
+    from cangauge.logs.sign import require_discharge_positive  # noqa: PLC0415
+
+    try:
+        require_discharge_positive(log)
+    except InputError as error:
+        if not is_capture:
+            raise
+        # The frames are as they are; it is the map that must turn them.
+        cure = "take the preset of this car, or set sign = -1 under [current] of the map file"
+        raise InputError(
+            error.problem, source=error.source, field=error.field, cure=cure
+        ) from error
+
+
+def note_not_a_capture(path: Path) -> None:
+    """Say on stderr that the options for captures were not needed."""
+    note(f"{path}: a log, not a capture: --vehicle, --dbc and --map do not apply to it")
+
+
+def known_temperature_source(given: str | None) -> TemperatureSource | None:
+    """Return the temperature source if it is a known one, None if none was given.
+
+    Raises
+    ------
+    InputError
+        If it is not known.
+    """
+    if given is None:
+        return None
+    if given not in TEMPERATURE_SOURCES:
+        raise InputError(
+            "not a known temperature source",
+            field="--temperature-source",
+            value=given,
+            cure=f"use one of: {', '.join(TEMPERATURE_SOURCES)}",
+        )
+    return cast("TemperatureSource", given)
+
+
+# --- What the commands on a bus have in common: options
+
+InterfaceOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="I",
+        help="python-can interface: socketcan, udp_multicast, pcan, slcan, … Default: socketcan"
+        " where there is a vcan0, else udp_multicast, whose packets stay on this machine.",
+    ),
+]
+ChannelOption = Annotated[
+    str | None,
+    typer.Option(metavar="C", help="Channel, e.g. can0. Default: vcan0, or 239.74.163.2."),
+]
+BusOptionOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--bus-option", metavar="K=V", help="More for the bus's driver, e.g. bitrate=500000."
+    ),
+]
+BusVehicleOption = Annotated[
+    str | None,
+    typer.Option(
+        "--vehicle",
+        metavar="PRESET",
+        help=f"Whose frames: {', '.join(PRESETS)}. Default: generic, without --dbc and --map.",
+    ),
+]
+BusDbcOption = Annotated[
+    Path | None, typer.Option("--dbc", metavar="FILE", help="Another car's DBC; needs --map.")
+]
+BusMapOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--map",
+        metavar="FILE",
+        help="TOML file: which signals are current, voltage and temperature, with sign and scale.",
+    ),
+]
+BusTemperatureOption = Annotated[
+    float | None,
+    typer.Option("--temperature", metavar="C", help="Constant temperature [°C], not the bus's."),
+]
+EstimateIdOption = Annotated[
+    str | None, typer.Option(metavar="ID", help="Id of SOC_ESTIMATE. Default: 0x5A0.")
+]
+DetailIdOption = Annotated[
+    str | None, typer.Option(metavar="ID", help="Id of SOC_DETAIL. Default: 0x5A1.")
+]
+ClockIdOption = Annotated[
+    str | None, typer.Option(metavar="ID", help="Id of REPLAY_CLOCK. Default: 0x5AF.")
+]
+
+
+def frame_ids(
+    soc_estimate: str | None, soc_detail: str | None, replay_clock: str | None
+) -> dict[str, int]:
+    """Return those of the ids that were given, by their key; "0x…" is hexadecimal.
+
+    Raises
+    ------
+    InputError
+        If one is no number.
+    """
+    given = {
+        "soc_estimate": soc_estimate,
+        "soc_detail": soc_detail,
+        "replay_clock": replay_clock,
+    }
+    ids = {}
+    for key, text in given.items():
+        if text is None:
+            continue
+        try:
+            ids[key] = int(text, 0)
+        except ValueError as error:
+            raise InputError(
+                "no CAN id",
+                field=f"--{key.replace('_', '-')}-id",
+                value=text,
+                cure="write it as 0x5A0",
+            ) from error
+    return ids
+
+
+# --- Options of `cangauge run` for whoever operates the service
+
+RecordOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Record the frames received (.log, .csv, .blf, .mf4): `cangauge estimate` on them"
+        " gives the live numbers, bit for bit. A kill loses the last half second; of an .mf4 the"
+        " whole part. A full disk costs frames of the recording, never the estimate. A recording"
+        " that is there stays: the next run's is FILE-0001, FILE-0002, …",
+    ),
+]
+RecordPartMbOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="MB",
+        help="Begin a new file after so much [MB]: NAME-RUN-PART. The name NAME-RUN stands"
+        " for all parts.",
+    ),
+]
+RecordPartSOption = Annotated[
+    float | None, typer.Option(metavar="S", help="Begin a new file after so long [s].")
+]
+RecordKeepMbOption = Annotated[
+    float | None,
+    typer.Option(metavar="MB", help="Remove the oldest files of the recording beyond this [MB]."),
+]
+HttpOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="HOST:PORT",
+        help="Serve /status, /healthz and /metrics there (extra `metrics`), e.g. 127.0.0.1:9464."
+        " Anything but loopback requires a token.",
+    ),
+]
+HttpTokenFileOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="File with the bearer token that requests must have; or in CANGAUGE_HTTP_TOKEN.",
+    ),
+]
+StatusSocketOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="PATH|auto|off",
+        help="Unix socket for `cangauge status`. Default: auto, in the user's runtime folder.",
+    ),
+]
+LogFormatOption = Annotated[
+    str | None,
+    typer.Option(metavar="text|json", help="Events on stderr, one a line. Default: text."),
+]
+LogLevelOption = Annotated[
+    str | None, typer.Option(metavar="debug|info|warning|error", help="Default: info.")
+]

@@ -1,1 +1,0 @@
-"""The withheld check: causes are drawn and sealed, diagnosed from the logs alone, then scored."""

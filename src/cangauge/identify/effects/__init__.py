@@ -1,1 +1,0 @@
-"""Which effects clean logs show, found by error on logs left out."""

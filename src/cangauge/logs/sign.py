@@ -1,0 +1,301 @@
+"""The sign of current, found from the data: positive should discharge.
+
+Three kinds of evidence, each with its figures in words:
+
+- **steps**: when current rises by a step, the voltage of a battery that discharges falls (ohmic
+  drop). Every clear step is one vote; a sign test tells how likely the votes are by chance.
+- **charge**: over hours, voltage follows the charge that is left.
+- **SoC**: a reference SoC falls as charge is taken out.
+
+The confidence adds up what each kind is worth (a decade of odds per unit of weight) and is a
+ranking figure, not a measured frequency; weights are capped so that no kind decides alone against
+another.
+
+What readers do about the sign of current.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from cangauge._typing import FloatArray
+from cangauge.errors import InputError
+from cangauge.logs.log import Log
+
+# --- The sign of current, found from the data: positive should discharge
+
+IntArray = NDArray[np.intp]
+Kind = Literal["steps", "charge", "soc"]
+
+STEP_SPACING_S: Final = 1.0
+"""Time between the rows whose difference is a step [s]."""
+STEP_LIMIT_S: Final = 90.0
+"""Rows further apart make no step [s]: the cycler's slowest logging is 60 s."""
+STEP_SHARE: Final = 0.05
+"""A step is at least this part of the range of current."""
+MAX_STEPS: Final = 400
+VOTES_PER_FREE_ONE: Final = 3.0
+"""So many votes count as one independent one: no wrong sign in random windows of real logs."""
+CLEAR_SHARE: Final = 0.75
+"""Below this share of agreeing votes [-] steps say nothing."""
+MOST_CONFIDENT: Final = 0.9999
+SURE_WEIGHT: Final = 2.0
+"""Below this weight (confidence 0.99) the sign stays open."""
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """Differences of current and voltage between rows about a second apart.
+
+    Parameters
+    ----------
+    row : array of shape (k,)
+        Row of the later sample.
+    current_a, voltage_v : arrays of shape (k,)
+        Changes [A], [V].
+    """
+
+    row: IntArray
+    current_a: FloatArray
+    voltage_v: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What one kind of evidence says.
+
+    Parameters
+    ----------
+    kind : {"steps", "charge", "soc"}
+    weight : float
+        Decades of odds, positive when positive current discharges [-].
+    text : str
+        The figures in words.
+    """
+
+    kind: Kind
+    weight: float
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class SignFinding:
+    """Which way current is counted in a log.
+
+    Parameters
+    ----------
+    sign : {+1, -1, 0}
+        +1: positive current discharges (as it should); -1: it charges; 0: cannot be told.
+    confidence : float
+        0.5 (a coin) to 0.9999 [-]; see the module's docstring.
+    evidence : tuple of Evidence
+    """
+
+    sign: Literal[1, -1, 0]
+    confidence: float
+    evidence: tuple[Evidence, ...]
+
+    @property
+    def strongest(self) -> Evidence:
+        """The evidence that speaks most for the finding."""
+        return max(self.evidence, key=lambda item: item.weight * (self.sign or 1))
+
+    @property
+    def sentence(self) -> str:
+        """Say the finding and its grounds in one line."""
+        what = {
+            1: "positive current discharges",
+            -1: "positive current CHARGES: the sign is turned",
+            0: "the sign of current cannot be told from this log",
+        }[self.sign]
+        grounds = "; ".join(item.text for item in self.evidence)
+        return f"{what} (confidence {self.confidence:.4g}): {grounds}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return {
+            "sign": self.sign,
+            "confidence": self.confidence,
+            "sentence": self.sentence,
+            "evidence": [
+                {"kind": item.kind, "weight": item.weight, "text": item.text}
+                for item in self.evidence
+            ],
+        }
+
+
+def sign_of_current(log: Log) -> SignFinding:
+    """Find from the data whether positive current discharges.
+
+    Parameters
+    ----------
+    log : Log
+        Current in whatever sign.
+
+    Returns
+    -------
+    SignFinding
+    """
+    evidence = (_from_steps(log), _from_charge(log), _from_soc(log))
+    weight = sum(item.weight for item in evidence)
+    opposed = any(item.weight * weight < 0.0 and abs(item.weight) >= 1.0 for item in evidence)
+    sure = abs(weight) >= SURE_WEIGHT and not opposed
+    odds = 10.0 ** abs(weight)
+    return SignFinding(
+        sign=(1 if weight > 0.0 else -1) if sure else 0,
+        confidence=min(float(odds / (1.0 + odds)), MOST_CONFIDENT),
+        evidence=evidence,
+    )
+
+
+def require_discharge_positive(log: Log) -> None:
+    """Raise InputError if the data say clearly that positive current charges.
+
+    For commands that would compute nonsense from such a log.
+    """
+    finding = sign_of_current(log)
+    if finding.sign < 0:
+        ground = finding.strongest
+        cure = "multiply the column by -1: positive current discharges"
+        if ground.kind == "soc":
+            cure += "; or, if the current is right, correct soc_pct or leave it out"
+        raise InputError(
+            f"the sign of current is turned: {ground.text}",
+            source=log.source or log.name,
+            field="current_a",
+            cure=cure,
+        )
+
+
+def current_steps(log: Log) -> Steps:
+    """Return the clear steps of current, at most `MAX_STEPS` of the largest ones."""
+    rows = spaced_rows(log.time_s, STEP_SPACING_S)
+    change = np.diff(log.current_a[rows])
+    near = np.diff(log.time_s[rows]) <= STEP_LIMIT_S
+    span = float(np.ptp(log.current_a))
+    chosen = np.flatnonzero(near & (np.abs(change) >= STEP_SHARE * span) & (change != 0.0))
+    if chosen.size > MAX_STEPS:
+        order = np.argpartition(-np.abs(change[chosen]), MAX_STEPS)[:MAX_STEPS]
+        chosen = np.sort(chosen[order])
+    return Steps(
+        row=rows[chosen + 1],
+        current_a=change[chosen],
+        voltage_v=np.diff(log.voltage_v[rows])[chosen],
+    )
+
+
+def _from_steps(log: Log) -> Evidence:
+    steps = current_steps(log)
+    votes = -np.sign(steps.current_a * steps.voltage_v)
+    fell, rose = int((votes > 0).sum()), int((votes < 0).sum())
+    cast = fell + rose
+    if cast == 0:
+        return Evidence("steps", 0.0, "no clear step of current")
+    larger = max(fell, rose)
+    text = (
+        f"voltage moved against current in {fell} of {cast} steps"
+        if fell >= rose
+        else f"voltage moved with current in {rose} of {cast} steps"
+    )
+    share = larger / cast
+    # Steps follow one another and share slow voltage changes: votes count for fewer.
+    free = max(1, round(cast / VOTES_PER_FREE_ONE))
+    chance = 2.0 * float(special.bdtrc(round(share * free) - 1, free, 0.5))
+    weight = min(6.0, -float(np.log10(chance))) if share >= CLEAR_SHARE and chance < 1.0 else 0.0
+    return Evidence("steps", weight if fell >= rose else -weight, text)
+
+
+def _from_charge(log: Log) -> Evidence:
+    charge = charge_ah(log)
+    rows = spaced_rows(log.time_s, log.duration_s / 200.0)
+    voltage, taken = log.voltage_v[rows], charge[rows]
+    typical = float(np.median(log.voltage_v))
+    span = float(np.ptp(voltage))
+    if rows.size < 20 or np.ptp(taken) <= 0.0 or span <= 0.0:
+        return Evidence("charge", 0.0, "no voltage trend over charge")
+    rank = correlation(_ranks(taken), _ranks(voltage))
+    text = f"voltage against charge taken out: rank correlation {rank:+.2f}"
+    weight = 0.0
+    if span >= 0.05 * typical and abs(rank) >= 0.7:
+        weight = 3.0 if abs(rank) >= 0.9 else 1.5
+    return Evidence("charge", -float(np.sign(rank)) * weight, text)
+
+
+def _from_soc(log: Log) -> Evidence:
+    if log.soc_pct is None:
+        return Evidence("soc", 0.0, "no reference SoC")
+    known = np.flatnonzero(np.isfinite(log.soc_pct))
+    soc = log.soc_pct[known]
+    span = float(np.ptp(soc)) if known.size > 10 else 0.0
+    taken = charge_ah(log)[known]
+    if span < 1.0 or np.ptp(taken) <= 0.0:
+        return Evidence("soc", 0.0, f"reference SoC moves by only {span:.1f} %")
+    alike = correlation(taken, soc)
+    way = "rises" if alike > 0.0 else "falls"
+    text = f"reference SoC {way} as charge is taken out (correlation {alike:+.3f})"
+    weight = 4.0 if abs(alike) >= 0.95 else 1.0 if abs(alike) >= 0.8 else 0.0
+    return Evidence("soc", -float(np.sign(alike)) * weight, text)
+
+
+def correlation(a: FloatArray, b: FloatArray) -> float:
+    """Return the correlation of two arrays of shape (n,), 0 where one of them hardly moves."""
+    a, b = a - a.mean(), b - b.mean()
+    size = float(np.sqrt(np.sum(a * a)) * np.sqrt(np.sum(b * b)))
+    tiny = np.finfo(np.float64).tiny
+    return float(np.clip(np.sum(a * b) / size, -1.0, 1.0)) if size > tiny else 0.0
+
+
+def _ranks(values: FloatArray) -> FloatArray:
+    """Return ranks from 0; equal values share the mean of theirs."""
+    _, place, count = np.unique(values, return_inverse=True, return_counts=True)
+    mean_rank = np.cumsum(count) - (count + 1) / 2.0
+    return np.asarray(mean_rank[place], dtype=np.float64)
+
+
+def charge_ah(log: Log) -> FloatArray:
+    """Return the charge taken out since the first row [Ah], shape (n,), by trapezoids."""
+    parts = (log.current_a[1:] + log.current_a[:-1]) * np.diff(log.time_s) / 7200.0
+    return np.concatenate(([0.0], np.cumsum(parts)))
+
+
+def spaced_rows(time_s: FloatArray, spacing_s: float) -> IntArray:
+    """Return the first row of every slot of `spacing_s` that holds any."""
+    if spacing_s <= 0.0:
+        return np.zeros(1, dtype=np.intp)
+    slot = np.floor((time_s - time_s[0]) / spacing_s)
+    return np.concatenate(([0], np.flatnonzero(np.diff(slot) > 0.0) + 1)).astype(np.intp)
+
+
+# --- What readers do about the sign of current
+
+
+def settle_sign(log: Log, *, stored_sign_unknown: bool) -> Log:
+    """Check the sign of current against the data; turn it only where the format leaves it open.
+
+    Parameters
+    ----------
+    log : Log
+    stored_sign_unknown : bool
+        Whether the format does not say which way current is counted (copies from CAN).
+
+    Returns
+    -------
+    Log
+        With a remark where the data disagree with the sign, or cannot confirm an unknown one.
+    """
+    finding = sign_of_current(log)
+    if stored_sign_unknown and finding.sign < 0:
+        text = f"current negated, sign found from the data: {finding.strongest.text}"
+        return replace(log, current_a=0.0 - log.current_a, remarks=(*log.remarks, text))
+    if stored_sign_unknown and finding.sign == 0:
+        text = "sign of current unknown and not to be told from the data: kept as stored"
+    elif finding.sign < 0:
+        text = f"current looks turned and was kept as stored: {finding.sentence}"
+    else:
+        return log
+    return replace(log, remarks=(*log.remarks, text))

@@ -1,0 +1,306 @@
+"""Open-circuit voltage that remembers whether the pack was charged or discharged.
+
+Open-circuit voltage whose temperature coefficient changes with SoC.
+
+Open-circuit voltage of another shape than the published formula can take.
+
+Some cells in series with less capacity than the others: they run empty first.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar, Final
+
+import numpy as np
+
+from cangauge._typing import FloatArray
+from cangauge.model.charge import BRIDGE_S
+from cangauge.model.effects.base import (
+    LAG,
+    WITHIN_C,
+    Effect,
+    Inside,
+    OnlineEffect,
+    Pack,
+    PackState,
+    Parameter,
+    Values,
+)
+from cangauge.model.effects.first_order import decaying_sum
+from cangauge.model.voltage_model import VoltageModel
+
+# --- Open-circuit voltage that remembers whether the pack was charged or discharged
+
+
+class Hysteresis(Effect):
+    """One-state hysteresis: the state follows −sign(I) over a few per cent of charge.
+
+    It begins in the middle (0), since what went before a log is not known, and stays through a
+    rest, however long.
+    """
+
+    id = "hysteresis"
+    family = "equilibrium"
+    is_structure: ClassVar[bool] = True
+    parameters = (
+        Parameter("half_width_v", "V", 0.0, 0.01, scale="voltage"),
+        Parameter("travel_pct", "%", 0.5, 12.0, neutral=None, grid=(1.0, 2.0, 4.0, 7.0, 11.0)),
+    )
+    signature = "memory of sign(I) over Ah: it turns with lasting charge or discharge, and stays"
+    equation = "ΔU = M·h, dh/dt = |I|/(γ·C)·(−sign(I) − h)"
+    source = "one-state model, Plett, J. Power Sources 134 (2004) 262"
+    separated_by = (
+        "rests of an hour after a discharge and after a charge to the same SoC:"
+        " slow_diffusion decays, this stays"
+    )
+
+    def extra_voltage(
+        self, state: PackState, values: Values, model: VoltageModel, pack: Pack
+    ) -> FloatArray:
+        """Return M·h [V]."""
+        del model
+        seconds = np.diff(state.time_s)
+        mean = 0.5 * (state.current_a[1:] + state.current_a[:-1])
+        travel_as = 36.0 * pack.capacity_ah * values["travel_pct"]
+        decay = np.where(seconds > BRIDGE_S, 0.0, np.abs(mean) * seconds / travel_as)
+        return values["half_width_v"] * decaying_sum(decay, np.sign(mean) * np.expm1(-decay), 0.0)
+
+    def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
+        """Return M·h at one sample at a time."""
+        del model
+        return _HysteresisOnline(
+            values["half_width_v"], 36.0 * pack.capacity_ah * values["travel_pct"]
+        )
+
+
+class _HysteresisOnline(OnlineEffect):
+    def __init__(self, half_width_v: float, travel_as: float) -> None:
+        self._half_width_v = half_width_v
+        self._travel_as = travel_as
+        self._last: tuple[float, float] | None = None
+        self._state = 0.0
+
+    def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
+        del temperature_c, drop_v
+        if self._last is not None and time_s - self._last[0] <= BRIDGE_S:
+            mean = 0.5 * (current_a + self._last[1])
+            decay = abs(mean) * (time_s - self._last[0]) / self._travel_as
+            toward = math.copysign(1.0, mean)
+            self._state = math.exp(-decay) * self._state + toward * math.expm1(-decay)
+        self._last = (time_s, current_a)
+
+    def extra_voltage(self, soc_pct: float) -> float:
+        del soc_pct
+        return self._half_width_v * self._state
+
+    def memory(self) -> list[float]:
+        return [] if self._last is None else [*self._last, self._state]
+
+    def remember(self, memory: Sequence[float], latest_s: float) -> None:
+        self._last = None
+        if memory:
+            time_s, current_a, self._state = memory
+            self._last = (time_s, current_a)
+            if not (all(map(math.isfinite, memory)) and abs(self._state) <= 1.0):
+                raise ValueError("the state lies within ±1")
+            if not time_s <= latest_s:
+                raise ValueError("later than the latest sample")
+
+
+# --- Open-circuit voltage whose temperature coefficient changes with SoC
+
+
+class EntropicCoefficient(Effect):
+    """Change of dU/dT: its level, slope and curvature over SoC, on top of the model's kt.
+
+    The bounds are ± 0.4 mV/K a cell. The temperature is that of the cells' inside, which may follow
+    the measured one late (`lag_s`, 0: at once).
+    """
+
+    id = "entropic_coefficient"
+    family = "equilibrium"
+    is_structure: ClassVar[bool] = True
+    parameters = (
+        Parameter("level_v_per_k", "V/K", -1.1e-4, 1.1e-4, scale="voltage"),
+        Parameter("slope_v_per_k", "V/K", -1.1e-4, 1.1e-4, scale="voltage"),
+        Parameter("curve_v_per_k", "V/K", -1.1e-4, 1.1e-4, scale="voltage"),
+        LAG,
+    )
+    signature = "(T − T_r)·f(S), at any current"
+    equation = (
+        "ΔU = (T − T_r)·(c + a·x + b·(3x² − 1)/2), x = S/50 − 1; τ·dT/dt = T_measured − T,"
+        " τ = lag_s"
+    )
+    source = "Reynier, Yazami, Fultz, J. Power Sources 119–121 (2003) 850"
+    separated_by = (
+        "the same SoC, rested, at two temperatures; at one temperature it cannot be told from"
+        " any other change of the OCV with SoC"
+    )
+
+    def extra_voltage(
+        self, state: PackState, values: Values, model: VoltageModel, pack: Pack
+    ) -> FloatArray:
+        """Return the additional open-circuit voltage [V]."""
+        del pack
+        warmer = np.clip(state.inside_c(values["lag_s"]), *WITHIN_C) - model.t_ref_c
+        x = np.clip(state.soc_pct, 0.0, 100.0) / 50.0 - 1.0
+        shape = values["level_v_per_k"] + values["slope_v_per_k"] * x
+        shape += values["curve_v_per_k"] * (1.5 * x * x - 0.5)
+        return np.asarray(warmer * shape)
+
+    def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
+        """Return the additional open-circuit voltage at one sample at a time."""
+        del pack
+        return _EntropicCoefficientOnline(values, model.t_ref_c)
+
+
+class _EntropicCoefficientOnline(OnlineEffect):
+    uses_soc = True
+
+    def __init__(self, values: Values, t_ref_c: float) -> None:
+        self._level = values["level_v_per_k"]
+        self._slope = values["slope_v_per_k"]
+        self._curve = values["curve_v_per_k"]
+        self._inside = Inside(values["lag_s"])
+        self.follows_temperature = self._inside.is_late
+        self._t_ref_c = t_ref_c
+        self._warmer = 0.0
+
+    def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
+        del current_a, drop_v
+        low, high = WITHIN_C
+        inside_at = self._inside.step(time_s, temperature_c)
+        self._warmer = min(max(inside_at, low), high) - self._t_ref_c
+
+    def extra_voltage(self, soc_pct: float) -> float:
+        x = min(max(soc_pct, 0.0), 100.0) / 50.0 - 1.0
+        return self._warmer * (self._level + self._slope * x + self._curve * (1.5 * x * x - 0.5))
+
+    def memory(self) -> list[float]:
+        return self._inside.memory()
+
+    def remember(self, memory: Sequence[float], latest_s: float) -> None:
+        self._inside.remember(memory, latest_s)
+
+
+# --- Open-circuit voltage of another shape than the published formula can take
+
+CENTRES_PCT: Final = (3.0, 8.0, 14.0, 22.0, 32.0, 43.0, 54.0, 65.0, 76.0, 86.0, 94.0)
+WIDTHS_PCT: Final = (3.0, 3.5, 4.5, 5.5, 6.5, 7.0, 7.0, 7.0, 6.5, 5.5, 4.5)
+"""Middle and width of each bump [% SoC], narrower where chemistries bend more."""
+
+
+class OcvShape(Effect):
+    """Smooth bumps over SoC.
+
+    It is structure of a chemistry and no fault: the diagnosis learns it from reference logs, and
+    never names it as a cause.
+    """
+
+    id = "ocv_shape"
+    family = "equilibrium"
+    is_structure: ClassVar[bool] = True
+    is_cause: ClassVar[bool] = False
+    parameters = tuple(
+        Parameter(f"at_{centre:.0f}_pct_v", "V", -0.01, 0.01, scale="voltage")
+        for centre in CENTRES_PCT
+    )
+    signature = "a curve over SoC, the same at any current, temperature and time"
+    equation = "ΔU = Σ vₖ·exp(−½((S − cₖ)/wₖ)²)"
+    source = "radial basis functions, Broomhead, Lowe, Complex Systems 2 (1988) 321"
+    separated_by = "other logs over the same SoC: what is in all of them is the chemistry's"
+
+    def extra_voltage(
+        self, state: PackState, values: Values, model: VoltageModel, pack: Pack
+    ) -> FloatArray:
+        """Return the additional open-circuit voltage [V]."""
+        del model, pack
+        soc = np.clip(state.soc_pct, 0.0, 100.0)
+        volts = np.zeros_like(soc)
+        for parameter, centre, width in zip(self.parameters, CENTRES_PCT, WIDTHS_PCT, strict=True):
+            height = values[parameter.name]
+            if height:
+                volts += height * np.exp(-0.5 * ((soc - centre) / width) ** 2)
+        return volts
+
+    def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
+        """Return the additional open-circuit voltage at one sample at a time."""
+        del model, pack
+        return _OcvShapeOnline([values[parameter.name] for parameter in self.parameters])
+
+
+class _OcvShapeOnline(OnlineEffect):
+    uses_soc = True
+
+    def __init__(self, heights_v: list[float]) -> None:
+        self._bumps = tuple(zip(heights_v, CENTRES_PCT, WIDTHS_PCT, strict=True))
+
+    def extra_voltage(self, soc_pct: float) -> float:
+        soc = min(max(soc_pct, 0.0), 100.0)
+        return sum(
+            height * math.exp(-0.5 * ((soc - centre) / width) ** 2)
+            for height, centre, width in self._bumps
+        )
+
+
+# --- Some cells in series with less capacity than the others: they run empty first
+
+
+class WeakCell(Effect):
+    """A fraction of the cells whose SoC runs ahead, from full, by a capacity deficit.
+
+    Below empty the weak cells follow the straight line on which the model goes on outside its
+    range: a cell that reverses falls faster, but a pack is stopped before that.
+    """
+
+    id = "weak_cell"
+    family = "imbalance"
+    parameters = (
+        Parameter("fraction", "1", 0.0, 0.15),
+        Parameter(
+            "deficit_pct",
+            "%",
+            2.0,
+            65.0,
+            neutral=None,
+            grid=(4.0, 7.0, 11.0, 16.0, 23.0, 33.0, 48.0),
+        ),
+    )
+    signature = "the knee near empty comes early, by the share of the weak cells"
+    equation = "ΔU = (n/N)·(OCV(S_w) − OCV(S)), 1 − S_w = (1 − S)/(1 − d)"
+    source = "Dubarry, Vuillaume, Liaw, Int. J. Energy Res. 34 (2010) 216"
+    separated_by = (
+        "a discharge to below 10 %: a lost capacity of all cells brings the whole knee forward,"
+        " weak cells a small one; or the cells' own voltages"
+    )
+
+    def extra_voltage(
+        self, state: PackState, values: Values, model: VoltageModel, pack: Pack
+    ) -> FloatArray:
+        """Return what the weak cells lack [V]."""
+        del pack
+        ahead = 1.0 / (1.0 - values["deficit_pct"] / 100.0)
+        weak = 100.0 - (100.0 - state.soc_pct) * ahead
+        lack = model.pseudo_ocv(weak) - model.pseudo_ocv(state.soc_pct)
+        return np.asarray(values["fraction"] * lack)
+
+    def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
+        """Return what the weak cells lack at one sample at a time."""
+        del pack
+        return _WeakCellOnline(values["fraction"], values["deficit_pct"], model)
+
+
+class _WeakCellOnline(OnlineEffect):
+    uses_soc = True
+
+    def __init__(self, fraction: float, deficit_pct: float, model: VoltageModel) -> None:
+        self._fraction = fraction
+        self._ahead = 1.0 / (1.0 - deficit_pct / 100.0)
+        self._model = model
+
+    def extra_voltage(self, soc_pct: float) -> float:
+        weak = 100.0 - (100.0 - soc_pct) * self._ahead
+        lack = self._model.pseudo_ocv_at(weak)[0] - self._model.pseudo_ocv_at(soc_pct)[0]
+        return self._fraction * lack

@@ -1,0 +1,132 @@
+"""Current and voltage stamped apart: the current's stamps are `skew_s` late."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+
+from cangauge.model.effects.base import (
+    Effect,
+    OnlineEffect,
+    Pack,
+    Parameter,
+    Reading,
+    Signals,
+    Values,
+)
+from cangauge.model.voltage_model import VoltageModel
+
+
+class TimeSkew(Effect):
+    """The current that belongs to a voltage is found `skew_s` later in the log.
+
+    The current is interpolated, never the voltage: averaging neighbouring voltages would lower
+    their noise and look like an improvement. Online, with a positive skew, a voltage waits until
+    its current has come, so estimates are `skew_s` late. The rows at the end of a log whose
+    current never came keep the last one offline, and are not given out online.
+    """
+
+    id = "time_skew"
+    family = "timing"
+    is_structure: ClassVar[bool] = True
+    parameters = (
+        Parameter(
+            "skew_s",
+            "s",
+            -4.0,
+            4.0,
+            grid=(-4.0, -3.0, -2.0, -1.5, -1.0, -0.7, -0.5, -0.35, -0.2, -0.1, 0.0,
+                  0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0),
+        ),
+    )  # fmt: skip
+    signature = "∝ R·dI/dt: spikes of either sign at every change of load"
+    equation = "I(t) = I_measured(t + skew)"
+    source = "definition"
+    bends_at = (-0.9, -0.6, -0.35, -0.2, -0.1, 0.1, 0.2, 0.35, 0.6, 0.9)
+    separated_by = (
+        "a log at 10 Hz or faster: a skew gives spikes of both signs and the same area at both"
+        " ends of a pulse, fast_polarization a tail after each"
+    )
+
+    def correct(self, signals: Signals, values: Values, pack: Pack) -> Signals:
+        """Return the signals with the current moved."""
+        del pack
+        skew_s = values["skew_s"]
+        if skew_s == 0.0:
+            return signals
+        current = np.interp(signals.time_s + skew_s, signals.time_s, signals.current_a)
+        return replace(signals, current_a=current)
+
+    def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
+        """Return the correction of one sample at a time."""
+        del model, pack
+        return _TimeSkewOnline(values["skew_s"]) if values["skew_s"] != 0.0 else OnlineEffect()
+
+
+class _TimeSkewOnline(OnlineEffect):
+    def __init__(self, skew_s: float) -> None:
+        self._skew_s = skew_s
+        self._waiting: deque[Reading] = deque()
+        self._times: list[float] = []
+        self._currents: list[float] = []
+
+    def correct(self, reading: Reading) -> Sequence[Reading]:
+        self._times.append(reading.time_s)
+        self._currents.append(reading.current_a)
+        self._waiting.append(reading)
+        ready = []
+        while self._waiting and self._waiting[0].time_s + self._skew_s <= reading.time_s:
+            first = self._waiting.popleft()
+            ready.append(first._replace(current_a=self._current_at(first.time_s + self._skew_s)))
+        self._forget(reading.time_s)
+        return ready
+
+    def _current_at(self, time_s: float) -> float:
+        right = bisect_right(self._times, time_s)
+        if right == 0:
+            return self._currents[0]
+        if right == len(self._times):
+            return self._currents[-1]
+        t0, t1 = self._times[right - 1], self._times[right]
+        c0, c1 = self._currents[right - 1], self._currents[right]
+        return c0 + (c1 - c0) * (time_s - t0) / (t1 - t0)
+
+    def _forget(self, now_s: float) -> None:
+        """Drop what no later look-up can need: all before the next one, but one to the left."""
+        upcoming = self._waiting[0].time_s if self._waiting else now_s
+        stale = bisect_right(self._times, upcoming + self._skew_s) - 1
+        if stale > 64:
+            del self._times[:stale]
+            del self._currents[:stale]
+
+    def memory(self) -> list[float]:
+        flat = [value for reading in self._waiting for value in reading]
+        return [float(len(self._waiting)), *flat, *self._times, *self._currents]
+
+    def remember(self, memory: Sequence[float], latest_s: float) -> None:
+        waiting = int(memory[0]) if memory else -1
+        first = 1 + 4 * waiting
+        kept, odd = divmod(len(memory) - first, 2)
+        if waiting < 0 or kept < 0 or odd:
+            raise ValueError("not the readings that wait, and as many currents as times")
+        readings = [Reading(*memory[k : k + 4]) for k in range(1, first, 4)]
+        times, currents = list(memory[first : first + kept]), list(memory[first + kept :])
+        stamps = [reading.time_s for reading in readings]
+        if not all(map(math.isfinite, [*times, *currents, *stamps])):
+            raise ValueError("not finite")
+        if any(b <= a for kind in (times, stamps) for a, b in itertools.pairwise(kind)):
+            raise ValueError("times must increase")
+        if times and not times[-1] <= latest_s:
+            raise ValueError("later than the latest sample")
+        # What waits are the latest samples, and so are the times, as far back as they are kept.
+        both = min(waiting, kept)
+        if stamps[waiting - both :] != times[kept - both :] or (waiting and not kept):
+            raise ValueError("what waits does not fit the times")
+        self._waiting, self._times, self._currents = deque(readings), times, currents

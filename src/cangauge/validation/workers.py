@@ -1,0 +1,191 @@
+"""Diagnosing processes: each gets copies of a case's open files under a name that says nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any, Final
+
+from cangauge._resources import THREADS
+
+COMMAND: Final = (sys.executable, "-m", "cangauge.validation.worker")
+LONGEST_S: Final = 600.0
+"""A case that takes longer is stopped and counts as crashed."""
+
+_PASSED_ON: Final = (
+    "PATH", "PYTHONPATH", "HOME", "LANG", "LC_ALL", "TMPDIR", "TEMP", "SYSTEMROOT",
+    "LD_LIBRARY_PATH", "VIRTUAL_ENV",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Task:
+    """One diagnosis that is asked for.
+
+    Parameters
+    ----------
+    id : str
+    case : str
+        Name of the folder that holds its logs and model.
+    leave_out : tuple of str
+        Effects that the library is to be without.
+    wants_model : bool
+        Whether the extended model is wanted too.
+    """
+
+    id: str
+    case: str
+    protocol: str
+    leave_out: tuple[str, ...] = ()
+    wants_model: bool = False
+
+
+@dataclass(eq=False)
+class _Worker:
+    """One process, started when it is first needed and again after it died."""
+
+    home: Path
+    process: subprocess.Popen[str] | None = field(default=None)
+
+    def ask(self, request: dict[str, Any]) -> dict[str, Any]:
+        process = self._running()
+        if process.stdin is None or process.stdout is None:  # both are pipes
+            return {"error": "the diagnosing process has no pipes"}
+        late = threading.Timer(LONGEST_S, process.kill)
+        began = time.perf_counter()
+        late.start()
+        try:
+            process.stdin.write(json.dumps(request) + "\n")
+            process.stdin.flush()
+            line = process.stdout.readline()
+        except BrokenPipeError:
+            line = ""
+        finally:
+            late.cancel()
+        if not line:
+            code = process.wait()
+            self.process = None
+            seconds = time.perf_counter() - began
+            return {"error": f"the diagnosing process ended with code {code}", "seconds": seconds}
+        found: dict[str, Any] = json.loads(line)
+        return found
+
+    def _running(self) -> subprocess.Popen[str]:
+        if self.process is None:
+            self.process = subprocess.Popen(  # noqa: S603 - this very package
+                COMMAND,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                text=True,
+                encoding="utf-8",
+                cwd=self.home,
+                env=environment(),
+            )
+        return self.process
+
+    def stop(self) -> None:
+        if self.process is None:
+            return
+        if self.process.stdin is not None:
+            self.process.stdin.close()
+        try:
+            self.process.wait(timeout=5.0)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        if self.process.stdout is not None:
+            self.process.stdout.close()
+
+
+def environment() -> dict[str, str]:
+    """Return what a diagnosing process knows of its surroundings: where Python is, one thread."""
+    kept = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
+    return kept | dict.fromkeys(THREADS, "1")
+
+
+def request_of(task: Task, source: Path, home: Path) -> dict[str, Any]:
+    """Copy a case's open files into an empty folder and return the request for them.
+
+    Parameters
+    ----------
+    task : Task
+    source : Path
+        The case's folder.
+    home : Path
+        The empty folder.
+    """
+    listing = json.loads((source / "case.json").read_text(encoding="utf-8"))
+
+    def copied(name: str) -> str:
+        shutil.copyfile(source / name, home / name)
+        return str(home / name)
+
+    return {
+        "model": copied("model.json"),
+        "logs": [copied(name) for name in listing["logs"]],
+        "references": [copied(name) for name in listing["references"]],
+        "leave_out": list(task.leave_out),
+        "extended": str(home / "extended.json") if task.wants_model else None,
+    }
+
+
+def diagnose_all(
+    tasks: Sequence[Task], cases: Path, jobs: int
+) -> Iterator[tuple[Task, dict[str, Any]]]:
+    """Yield every task with its answer, as they come.
+
+    Parameters
+    ----------
+    tasks : sequence of Task
+    cases : Path
+        Folder that holds the cases' folders.
+    jobs : int
+        Processes.
+    """
+    with tempfile.TemporaryDirectory(prefix="gap-") as top:
+        workers = [_Worker(Path(top)) for _ in range(jobs)]
+        free: SimpleQueue[_Worker] = SimpleQueue()
+        for worker in workers:
+            free.put(worker)
+
+        def run(task: Task) -> dict[str, Any]:
+            worker = free.get()
+            home = Path(tempfile.mkdtemp(dir=top))
+            try:
+                found = worker.ask(request_of(task, cases / task.case, home))
+                if task.wants_model and "error" not in found:
+                    text = (home / "extended.json").read_text(encoding="utf-8")
+                    found["extended_model"] = json.loads(text)
+            # A kept case whose files are gone, a full disk, an answer that was cut off.
+            except (OSError, ValueError) as error:
+                return {"error": f"{type(error).__name__}: {error}"}
+            else:
+                return found
+            finally:
+                shutil.rmtree(home, ignore_errors=True)
+                free.put(worker)
+
+        try:
+            with ThreadPoolExecutor(jobs) as pool:
+                asked = {pool.submit(run, task): task for task in tasks}
+                try:
+                    for future in as_completed(asked):
+                        yield asked[future], future.result()
+                finally:
+                    for future in asked:
+                        future.cancel()
+        finally:
+            for worker in workers:
+                worker.stop()

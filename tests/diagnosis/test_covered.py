@@ -1,0 +1,64 @@
+"""Which temperatures references teach, beyond those that they have been at."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cangauge.diagnosis.problem import BEYOND_WEIGHT, charge_weight, temperatures_covered
+from cangauge.model.effects.base import Pack
+from cangauge.model.effects.library import LIBRARY, candidates
+
+
+def log(low_c: float, high_c: float) -> Any:
+    return SimpleNamespace(rows=SimpleNamespace(temperature_c=np.linspace(low_c, high_c, 50)))
+
+
+@pytest.mark.parametrize(
+    ("references_c", "log_c", "covered"),
+    [
+        ((20.0, 24.0), (18.0, 22.0), True),
+        ((20.0, 24.0), (8.0, 14.0), False),  # many kelvin below few
+        ((0.0, 30.0), (34.0, 36.0), True),  # few above many
+        ((0.0, 30.0), (-6.0, -4.0), True),  # few below many
+        ((0.0, 30.0), (-20.0, -14.0), False),
+        ((16.0, 32.0), (36.0, 39.0), True),
+        ((16.0, 32.0), (9.0, 12.0), False),  # as far below: the cold is another matter
+        ((16.0, 32.0), (5.0, 27.0), True),  # most rows inside
+    ],
+)
+def test_a_pack_is_known_a_little_beyond_its_temperatures(
+    references_c: tuple[float, float], log_c: tuple[float, float], covered: bool
+) -> None:
+    middle = sum(references_c) / 2.0
+    references = [log(references_c[0], middle), log(middle, references_c[1])]
+    assert temperatures_covered(references, [log(*log_c)]) is covered
+
+
+def at_charge(*soc_pct: float) -> Any:
+    return SimpleNamespace(rows=SimpleNamespace(soc_pct=np.array(soc_pct)))
+
+
+def test_a_pseudo_ocv_is_known_best_where_references_have_been() -> None:
+    references = [at_charge(40.0, 50.0), at_charge(70.0, 60.0)]
+    log = at_charge(20.0, 36.0, 38.0, 55.0, 72.0, 74.0, 92.0)
+    weight = charge_weight(log, references, (30.0, 90.0))
+    assert weight.tolist() == [0.0, BEYOND_WEIGHT, 1.0, 1.0, 1.0, BEYOND_WEIGHT, 0.0]
+    assert np.all(charge_weight(at_charge(10.0, 90.0), [], (30.0, 80.0)) == 1.0)
+
+
+def test_a_diagnosis_tries_spread_diffusion_and_a_fit_does_not() -> None:
+    pack = Pack(voltage_v=360.0, capacity_ah=60.0, resistance_ohm=0.1, cells=96)
+    tried = [
+        {
+            choice.shape["spread"]
+            for choice in candidates(
+                [LIBRARY["slow_diffusion"]], pack, np.arange(10.0), elsewhere=elsewhere
+            )
+        }
+        for elsewhere in (False, True)
+    ]
+    assert tried == [{0.0}, {0.0, 1.0}]

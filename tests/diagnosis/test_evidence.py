@@ -1,0 +1,165 @@
+"""The evidence: Bayes factors against quadrature, and faults that physics' bounds rule out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import quad
+from scipy.stats import halfnorm, norm
+
+from cangauge.diagnosis.bayes_factors import PRIOR_PARTS, scores
+from cangauge.diagnosis.diagnose import diagnose
+from cangauge.diagnosis.hypotheses import Frame
+from cangauge.diagnosis.linear_gaussian import ErrorModel, Evidence
+from cangauge.identify.fit import fit
+from cangauge.identify.rows import FitOptions
+from cangauge.inference.time_scales import SCALES
+from cangauge.logs.log import Log
+from cangauge.model.effects.base import Pack
+from cangauge.model.effects.first_order import low_passed
+from cangauge.model.effects.library import LIBRARY, Candidate, candidates
+from cangauge.model.model_file import ModelFile
+from cangauge.model.published import CAPACITY_AH, leaf_2012_model
+from synthetic import synthetic_log
+
+PACK = Pack.of(leaf_2012_model(), CAPACITY_AH)
+ERROR = ErrorModel((0.25,) * SCALES, (), 0.5)
+
+
+def alone(choice: Candidate, gradient: float, curvature: float, error: ErrorModel) -> Evidence:
+    """The evidence for one candidate of one amplitude: ln p(a) = g·a − S·a²/2."""
+    return Evidence(
+        frame=Frame((choice,), None, np.ones(1)),
+        error=error,
+        gradient=np.array([gradient]),
+        curvature=np.array([[curvature]]),
+        squares=0.0,
+        mean=np.zeros(1),
+        per_amplitude=np.zeros((1, 1)),
+        precision=np.eye(1),
+    )
+
+
+def candidate(effect_id: str) -> Candidate:
+    return candidates([LIBRARY[effect_id]], PACK, np.arange(1000.0))[0]
+
+
+@pytest.mark.parametrize("effect_id", ["slow_diffusion", "voltage_offset", "coulombic_efficiency"])
+# Rounded: next to nothing, but not nothing, is too much for the quadrature.
+@given(
+    st.floats(-6.0, 6.0).map(lambda value: round(value, 6)),
+    st.floats(0.1, 100.0),
+    st.floats(1.0, 5.0),
+)
+def test_bayes_factor_is_the_mean_over_the_prior(
+    effect_id: str, toward: float, sharpness: float, strays: float
+) -> None:
+    """Against quadrature: a normal prior, or half of one where the bounds allow one sign only.
+
+    `sharpness` is how much narrower the evidence is than the bounds' own prior, `toward` how many
+    of its deviations its peak is away from nothing.
+    """
+    choice = candidate(effect_id)
+    (low, high) = choice.bounds[0].tolist()
+    width = (high - low) / 4.0
+    curvature = (sharpness / width) ** 2
+    gradient = toward * sharpness / width
+    error = replace(ERROR, strays={effect_id: strays})
+    (found,) = scores(alone(choice, strays * gradient, strays * curvature, error))
+
+    factors = []
+    for part in PRIOR_PARTS:
+        prior = halfnorm(scale=part * width) if 0.0 in (low, high) else norm(scale=part * width)
+        sign = -1.0 if high == 0.0 else 1.0
+        peak = gradient / (curvature + (part * width) ** -2.0) * sign
+        begin = 0.0 if 0.0 in (low, high) else peak - 12.0 * part * width
+        factors.append(
+            quad(
+                lambda a, prior=prior, sign=sign: (
+                    np.exp(gradient * sign * a - 0.5 * curvature * a * a) * prior.pdf(a)
+                ),
+                begin,
+                max(peak, 0.0) + 12.0 * part * width,
+                # Where nothing pulls up, all that counts lies close to zero.
+                points=[max(peak, begin), *(begin + k / abs(gradient) for k in (1.0, 5.0, 25.0))]
+                if gradient
+                else None,
+                limit=400,
+            )[0]
+        )
+    expected = np.log(np.mean(factors))
+    if 0.0 in (low, high) or abs(gradient / curvature) < high:
+        # Beyond its bounds an amplitude of either sign is held there, and the factor with it.
+        assert found.log_bayes_factor == pytest.approx(expected, rel=1e-5, abs=1e-6)
+
+
+@given(st.floats(0.0, 30.0), st.floats(0.5, 100.0))
+def test_what_points_the_wrong_way_is_no_evidence(toward: float, sharpness: float) -> None:
+    """A polarisation cannot be negative: the more it would have to be, the less it is believed."""
+    choice = candidate("slow_diffusion")
+    width = float(choice.bounds[0, 1]) / 4.0
+    wrong, worse = (
+        scores(alone(choice, -by * sharpness / width, (sharpness / width) ** 2, ERROR))[0]
+        for by in (toward, toward + 1.0)
+    )
+    assert wrong.log_bayes_factor <= 1e-12
+    assert worse.log_bayes_factor < wrong.log_bayes_factor
+    assert wrong.amplitude.tolist() == [0.0]
+    assert wrong.explained == 0.0
+
+
+def day(seed: int) -> Log:
+    return synthetic_log(
+        hours=0.6, start_pct=85.0, end_pct=65.0, noise_v=0.5, seed=seed, name=f"day {seed}"
+    )
+
+
+@pytest.fixture(scope="module")
+def model() -> ModelFile:
+    logs = [synthetic_log(noise_v=0.5, seed=seed) for seed in (1, 2, 3)]
+    return fit(logs, FitOptions(capacity_ah=CAPACITY_AH)).model
+
+
+def polarised(log: Log, ohm: float) -> Log:
+    lagged = low_passed(log.time_s, log.current_a, 400.0, 0.0)
+    return replace(log, voltage_v=log.voltage_v - ohm * lagged)
+
+
+def efficient(log: Log, part: float) -> Log:
+    """As if charge came back with an efficiency of 1 + part."""
+    gained = np.concatenate(
+        ([0.0], np.cumsum(np.diff(log.time_s) * np.maximum(-log.current_a[1:], 0.0)))
+    )
+    volts = 0.5 * part * 100.0 * gained / 3600.0 / CAPACITY_AH
+    return replace(log, voltage_v=log.voltage_v + volts)
+
+
+@pytest.mark.parametrize(
+    ("effect_id", "change"),
+    [
+        ("slow_diffusion", lambda log: polarised(log, -0.08)),
+        ("coulombic_efficiency", lambda log: efficient(log, 0.6)),
+    ],
+)
+def test_a_fault_that_bounds_rule_out_is_not_named(
+    effect_id: str, change: Callable[[Log], Log], model: ModelFile
+) -> None:
+    """Its opposite may well be; whatever is found keeps its bounds."""
+    found = diagnose(
+        [change(day(seed)) for seed in (21, 22)], model, [day(seed) for seed in (11, 12, 13)]
+    )
+    assert effect_id not in {found.verdict.cause, *found.verdict.ambiguous_with}
+    (mine,) = [item for item in found.verdict.candidates if item.effect_id == effect_id]
+    assert mine.log_bayes_factor < 0.5
+    # Those of the model that is diagnosed: the extended one's coefficients have moved a little.
+    pack = model.extended_model().pack
+    for effect, values in found.extension.model.effects:
+        for parameter in effect.parameters:
+            low, high = parameter.bounds(pack)
+            rounding = 1e-6 * (high - low)
+            assert low - rounding <= values[parameter.name] <= high + rounding
