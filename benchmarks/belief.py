@@ -32,7 +32,7 @@ from scipy.optimize import minimize
 from cangauge.diagnosis import posterior as belief
 from cangauge.diagnosis.extended_model import library_without
 from cangauge.diagnosis.posterior import ALIKE_FROM, NAMED_FROM, SEEN_BELOW, Compared, compare
-from cangauge.diagnosis.problem import settle
+from cangauge.diagnosis.problem import build_problem
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import load_model
 from cangauge.validation.score import LEAST_GAP
@@ -117,7 +117,9 @@ def case_of(label: dict[str, Any], folder: Path) -> Case:
             [read_log(path) for path in sorted(place.glob(f"{kind}_*.parquet"))]
             for kind in ("log", "reference")
         )
-        settled = settle(logs, load_model(place / "model.json"), references, library_without(()))
+        settled = build_problem(
+            logs, load_model(place / "model.json"), references, library_without(())
+        )
         _, compared = compare(settled)
         kept.write_bytes(pickle.dumps((compared, bool(settled.error.strays))))
     compared, learned = pickle.loads(kept.read_bytes())  # noqa: S301 - written just above

@@ -25,7 +25,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from cangauge.bus.connection import BusPort
+from cangauge.bus.connection import BusConnection
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.publish import standard_filter
 from cangauge.bus.vehicle import Vehicle, load_vehicle
@@ -33,7 +33,7 @@ from cangauge.estimate.offline import run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate
 from cangauge.logs.log import Log
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 from cangauge.replay.player import ReplaySettings, play
 from cangauge.replay.steps import LogSource, quantisation_bound
 from cangauge.service.capture_estimate import estimate_capture
@@ -62,15 +62,15 @@ class Comparison:
 
 
 def over_bus(
-    log: Log, vehicle: Vehicle, model: ModelFile, address: BusAddress, record: Path
+    log: Log, vehicle: Vehicle, model: Model, address: BusAddress, record: Path
 ) -> tuple[list[Estimate], Gauge, float]:
     """Play a log on a bus and estimate it there; return the estimates, the gauge and seconds."""
     gauge = Gauge(vehicle, model, GaugeSettings(time_source="replay-clock"))
     rows: list[Estimate] = []
     done = threading.Event()
     with (
-        BusPort(open_bus(address, gauge.filters), str(address)) as ears,
-        BusPort(open_bus(address, [standard_filter(0x5A1)]), str(address)) as mouth,
+        BusConnection(open_bus(address, gauge.filters), str(address)) as ears,
+        BusConnection(open_bus(address, [standard_filter(0x5A1)]), str(address)) as mouth,
         Recorder(record) as recorder,
     ):
         outputs = Outputs(record=recorder, table=lambda _, estimate: rows.append(estimate))
@@ -87,7 +87,7 @@ def over_bus(
         return rows, gauge, time.monotonic() - began
 
 
-def compare(log: Log, vehicle: Vehicle, model: ModelFile, address: BusAddress) -> Comparison:
+def compare(log: Log, vehicle: Vehicle, model: Model, address: BusAddress) -> Comparison:
     """Return how the bus's estimate of a log differs from the log's own."""
     with tempfile.TemporaryDirectory() as folder:
         record = Path(folder) / "trip.log"

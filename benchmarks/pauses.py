@@ -25,7 +25,7 @@ from cangauge.estimate.estimator import Estimator
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.logs.log import Log
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 from real_trips import DATA, TEST, TRAINING, identify, read_trips
 
 AT_S = (10.0, 120.0, 600.0)
@@ -67,7 +67,7 @@ def errors(
     return [found[k][0] for k in at], [found[k][1] for k in at], [estimator.pause_verdict]
 
 
-def judge(first: Log, second: Log, model: ModelFile, hours: float) -> Pause:
+def judge(first: Log, second: Log, model: Model, hours: float) -> Pause:
     """Drive one trip, wait, drive the next."""
     soc = [trip.soc_pct[np.isfinite(trip.soc_pct)] for trip in (first, second)
            if trip.soc_pct is not None]  # fmt: skip

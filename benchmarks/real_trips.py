@@ -37,7 +37,7 @@ from cangauge.identify.voltage_fit import prepare
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.charge import capacity_from_reference
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "bmw_i3"
 TRAINING = [f"A{number:02d}" for number in range(1, 22, 2)]
@@ -126,7 +126,7 @@ def explain(identification: Identification, tests: Sequence[Log]) -> tuple[LogFi
     return evaluate_extended(identification.found.model, prepared)
 
 
-def estimate(log: Log, model: ModelFile, initial_pct: float | None) -> EstimateTable:
+def estimate(log: Log, model: Model, initial_pct: float | None) -> EstimateTable:
     """Run the EKF over a trip, from an initial SoC (std 1 %) or from the first voltages."""
     start = None if initial_pct is None else min(max(initial_pct, 0.0), 100.0)
     return run_estimator(samples_of(log), model, EstimatorSettings(initial_soc_pct=start))
@@ -269,7 +269,7 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _options(model: ModelFile) -> FitOptions:
+def _options(model: Model) -> FitOptions:
     return FitOptions(capacity_ah=model.capacity_ah, delay_s=tuple(model.delays_s))
 
 

@@ -45,7 +45,7 @@ from cangauge.bus.publish import FrameIds, SocEstimate, SocReader
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate, Reason, Sample
-from cangauge.model.model_file import ModelFile, load_model
+from cangauge.model.model_file import Model, load_model
 from cangauge.service.loop import CHECKPOINT_EVERY_S, FIRST_CHECKPOINT_S
 from cangauge.service.pipeline import Gauge, GaugeSettings
 from cangauge.service.state import StateKeeper, StateSettings
@@ -107,7 +107,7 @@ def main() -> None:
 # --- in this process --------------------------------------------------------------------------
 
 
-def drive(seconds: float, model: ModelFile, seed: int) -> list[Sample]:
+def drive(seconds: float, model: Model, seed: int) -> list[Sample]:
     """Return a drive with pulses and regeneration, down and up by turns; the model's voltage."""
     rng = np.random.default_rng(seed)
     time_s = np.arange(0.0, seconds, 1.0 / RATE_HZ)
@@ -132,7 +132,7 @@ def drive(seconds: float, model: ModelFile, seed: int) -> list[Sample]:
 class Life:
     """A service from its start to its kill, driven by samples; the wall clock is theirs."""
 
-    def __init__(self, model: ModelFile, path: Path | None) -> None:
+    def __init__(self, model: Model, path: Path | None) -> None:
         self.now_s = EPOCH_S
         settings = GaugeSettings(EstimatorSettings(initial_soc_pct=START_PCT - 15.0))
         self.gauge = Gauge(load_vehicle("generic"), model, settings)

@@ -20,13 +20,13 @@ import can
 import pytest
 
 from cangauge._resources import shared_file
-from cangauge.bus.connection import BusPort
+from cangauge.bus.connection import BusConnection
 from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.vehicle import Vehicle, load_vehicle
 from cangauge.cli.app import main
 from cangauge.estimate.validity import Estimate
 from cangauge.logs.log import Log
-from cangauge.model.model_file import ModelFile, load_model
+from cangauge.model.model_file import Model, load_model
 from cangauge.service.loop import LoopSettings, Outputs, RunSummary, serve
 from cangauge.service.pipeline import Gauge, GaugeSettings
 from synthetic import synthetic_log
@@ -38,7 +38,7 @@ def leaf_model_path() -> Path:
     return shared_file("replay", "leaf2012_published_model.json")
 
 
-def leaf_model() -> ModelFile:
+def leaf_model() -> Model:
     return load_model(leaf_model_path())
 
 
@@ -58,7 +58,7 @@ def short_log(seconds: float = 100.0, rate_hz: float = 10.0, *, noise_v: float =
 class Service:
     """`serve` on a bus of its own, in a thread; estimates and warnings are kept."""
 
-    port: BusPort
+    port: BusConnection
     gauge: Gauge
     settings: LoopSettings = field(default_factory=LoopSettings)
     record: Any = None
@@ -100,8 +100,8 @@ class Service:
             self.error = error
 
 
-def virtual_port(channel: str, filters: Sequence[Any] | None = None) -> BusPort:
-    return BusPort(open_bus(BusAddress("virtual", channel), filters), f"virtual {channel}")
+def virtual_port(channel: str, filters: Sequence[Any] | None = None) -> BusConnection:
+    return BusConnection(open_bus(BusAddress("virtual", channel), filters), f"virtual {channel}")
 
 
 def virtual_service(
@@ -177,7 +177,7 @@ def never() -> bool:
     return False
 
 
-def collect(port: BusPort, seconds: float) -> list[can.Message]:
+def collect(port: BusConnection, seconds: float) -> list[can.Message]:
     """All frames that come within that time."""
     until = time.monotonic() + seconds
     found = []

@@ -35,7 +35,7 @@ from cangauge.inspect.capture import inspect_capture
 from cangauge.inspect.log import inspect_log
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
-from cangauge.model.model_file import ModelFile, load_model
+from cangauge.model.model_file import Model, load_model
 from cangauge.service.config import load_config
 from cangauge.service.pipeline import EstimateStream
 from cangauge.validation.twin.day import read_speed
@@ -80,7 +80,7 @@ def _file(data: bytes, name: str = "input") -> Iterator[Path]:
 
 
 @cache
-def _model() -> ModelFile:
+def _model() -> Model:
     return load_model(shared_file("replay", "leaf2012_published_model.json"))
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import can
 import pytest
 
-from cangauge.bus.decoder import SampleAssembler
+from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import LEAF_RULE
 from cangauge.bus.vehicle import EXTENDED, Vehicle, load_vehicle
@@ -37,7 +37,7 @@ def frames_of(
     return frames
 
 
-def feed(assembler: SampleAssembler, frames: list[can.Message]) -> list[Sample]:
+def feed(assembler: SampleDecoder, frames: list[can.Message]) -> list[Sample]:
     return [sample for frame in frames if (sample := assembler.handle(frame)) is not None]
 
 
@@ -47,7 +47,7 @@ def leaf_frame(hex_data: str, time_s: float, counter: int) -> can.Message:
 
 
 def test_every_sample_arrives_with_its_temperature_and_soc(generic: Vehicle) -> None:
-    assembler = SampleAssembler(generic)
+    assembler = SampleDecoder(generic)
     samples = feed(assembler, frames_of(generic))
     assert [each.current_a for each in samples] == [float(n) for n in range(10)]
     assert all(each.temperature_c == 20.0 for each in samples)
@@ -62,7 +62,7 @@ def test_every_sample_arrives_with_its_temperature_and_soc(generic: Vehicle) -> 
 
 
 def test_only_wanted_ids_are_looked_at(generic: Vehicle) -> None:
-    assembler = SampleAssembler(generic)
+    assembler = SampleDecoder(generic)
     assert assembler.wanted_ids == (CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID, SOC_ID)
     strange = can.Message(arbitration_id=0x123, is_extended_id=False, data=b"\xff" * 8)
     assert assembler.handle(strange) is None
@@ -72,7 +72,7 @@ def test_only_wanted_ids_are_looked_at(generic: Vehicle) -> None:
 
 @pytest.mark.parametrize("kind", ["is_extended_id", "is_remote_frame", "is_error_frame"])
 def test_extended_remote_and_error_frames_are_not_taken(generic: Vehicle, kind: str) -> None:
-    assembler = SampleAssembler(generic)
+    assembler = SampleDecoder(generic)
     for frame in frames_of(generic):
         setattr(frame, kind, True)
         assert assembler.handle(frame) is None
@@ -85,7 +85,7 @@ def test_damaged_and_short_frames_are_refused_and_counted(generic: Vehicle) -> N
     frames = [frame for frame in frames_of(generic) if frame.arbitration_id == CURRENT_ID]
     frames[3].data[0] ^= 0x10
     frames[5].data = frames[5].data[:-1]
-    assembler = SampleAssembler(generic)
+    assembler = SampleDecoder(generic)
     samples = feed(assembler, frames)
     last = assembler.flush()
     assert last is not None
@@ -99,7 +99,7 @@ def test_damaged_and_short_frames_are_refused_and_counted(generic: Vehicle) -> N
 
 def test_repeated_frames_are_refused(generic: Vehicle) -> None:
     frames = frames_of(generic, 5)
-    assembler = SampleAssembler(generic)
+    assembler = SampleDecoder(generic)
     samples = feed(assembler, [frame for frame in frames for _ in range(2)])
     assert [each.current_a for each in samples] == [0.0, 1.0, 2.0, 3.0, 4.0]
     assert assembler.counters.counter_repeats == len(frames)
@@ -111,7 +111,7 @@ def test_neighbours_of_lost_frames_are_used(generic: Vehicle) -> None:
         for frame in frames_of(generic)
         if not (0.25 < frame.timestamp < 0.55 and frame.arbitration_id in {CURRENT_ID, VOLTAGE_ID})
     ]
-    assembler = SampleAssembler(generic)
+    assembler = SampleDecoder(generic)
     samples = feed(assembler, frames)
     assert [each.current_a for each in samples] == [0.0, 1.0, 2.0, 6.0, 7.0, 8.0, 9.0]
     assert assembler.counters.counter_jumps == 2
@@ -122,7 +122,7 @@ def test_longer_frames_are_read_by_their_first_bytes(generic: Vehicle) -> None:
     frames = frames_of(generic, 3)
     for frame in frames:
         frame.data += b"\x00\x00"
-    assert len(feed(SampleAssembler(generic), frames)) == 3
+    assert len(feed(SampleDecoder(generic), frames)) == 3
 
 
 def test_missing_voltage_keeps_the_charge(generic: Vehicle) -> None:
@@ -131,13 +131,13 @@ def test_missing_voltage_keeps_the_charge(generic: Vehicle) -> None:
         for frame in frames_of(generic)
         if not (frame.arbitration_id == VOLTAGE_ID and 0.25 < frame.timestamp < 0.65)
     ]
-    samples = feed(SampleAssembler(generic), frames)
+    samples = feed(SampleDecoder(generic), frames)
     assert [each.current_a for each in samples] == [float(n) for n in range(10)]
     assert [math.isnan(each.voltage_v) for each in samples] == [3 <= n <= 6 for n in range(10)]
 
 
 def test_temperature_holds_until_its_time_out(generic: Vehicle) -> None:
-    assembler = SampleAssembler(generic)
+    assembler = SampleDecoder(generic)
     frames = [
         frame
         for frame in frames_of(generic, 25, step_s=1.0)
@@ -149,7 +149,7 @@ def test_temperature_holds_until_its_time_out(generic: Vehicle) -> None:
 
 
 def test_reference_soc_is_nan_when_it_is_old(generic: Vehicle) -> None:
-    assembler = SampleAssembler(generic)
+    assembler = SampleDecoder(generic)
     assert math.isnan(assembler.reference_soc_pct)
     frames = frames_of(generic, 15, step_s=1.0)
     feed(assembler, [f for f in frames if f.arbitration_id != SOC_ID or f.timestamp == 0.0])
@@ -160,7 +160,7 @@ def test_reference_soc_is_nan_when_it_is_old(generic: Vehicle) -> None:
 
 def test_fixed_temperature_needs_no_frame() -> None:
     vehicle = load_vehicle("generic", temperature_c=12.5)
-    assembler = SampleAssembler(vehicle)
+    assembler = SampleDecoder(vehicle)
     assert TEMPERATURE_ID not in assembler.wanted_ids
     samples = feed(assembler, frames_of(load_vehicle("generic"), 20, step_s=5.0))
     assert {each.temperature_c for each in samples} == {12.5}
@@ -168,7 +168,7 @@ def test_fixed_temperature_needs_no_frame() -> None:
 
 def test_a_log_that_starts_again_is_decoded_again(generic: Vehicle) -> None:
     frames = frames_of(generic, 16)  # so that the counters go on
-    assembler = SampleAssembler(generic)
+    assembler = SampleDecoder(generic)
     first = feed(assembler, frames)
     second = feed(assembler, frames_of(generic, 16))
     assert first == second
@@ -176,7 +176,7 @@ def test_a_log_that_starts_again_is_decoded_again(generic: Vehicle) -> None:
 
 
 def test_old_values_do_not_hold_for_ever_when_time_starts_again(generic: Vehicle) -> None:
-    assembler = SampleAssembler(generic)
+    assembler = SampleDecoder(generic)
     late = frames_of(generic, 1)
     for frame in late:
         frame.timestamp = 5000.0
@@ -192,7 +192,7 @@ def test_old_values_do_not_hold_for_ever_when_time_starts_again(generic: Vehicle
 
 
 def test_leaf_turns_the_sign_and_refuses_codes_of_wake_up(leaf: Vehicle) -> None:
-    assembler = SampleAssembler(leaf)
+    assembler = SampleDecoder(leaf)
     both = leaf_frame("7FE0FFC000000000", 0.00, 0)
     voltage = leaf_frame("FFE0FFC000000000", 0.01, 1)
     good = leaf_frame("FDA0BAAA00000000", 0.02, 2)
@@ -211,7 +211,7 @@ def test_leaf_turns_the_sign_and_refuses_codes_of_wake_up(leaf: Vehicle) -> None
 
 
 def test_leaf_takes_the_average_of_the_multiplexed_temperatures(leaf: Vehicle) -> None:
-    assembler = SampleAssembler(leaf)
+    assembler = SampleDecoder(leaf)
     for n, payload in enumerate(("405068003A000000", "805656003CD40002", "C06060003AD40000")):
         data = bytes.fromhex(payload)
         assembler.handle(
@@ -227,7 +227,7 @@ def test_an_extended_id_is_wanted_where_the_dbc_means_it(generic: Vehicle) -> No
     signal = replace(generic.current, key=0x18FF0001 | EXTENDED)
     messages = {**generic.messages, signal.key: generic.messages[CURRENT_ID]}
     vehicle = replace(generic, current=signal, messages=messages)
-    assembler = SampleAssembler(vehicle)
+    assembler = SampleDecoder(vehicle)
     assert assembler.wanted_ids[0] == 0x18FF0001
     assert vehicle.filters[0] == {
         "can_id": 0x18FF0001,
@@ -238,7 +238,7 @@ def test_an_extended_id_is_wanted_where_the_dbc_means_it(generic: Vehicle) -> No
 
 
 def test_counters_as_plain_values(generic: Vehicle) -> None:
-    assembler = SampleAssembler(generic)
+    assembler = SampleDecoder(generic)
     feed(assembler, frames_of(generic))
     told = assembler.counters.to_dict()
     assert told["samples"] == 10

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cangauge.bus.capture_log import capture_samples, capture_to_log
-from cangauge.bus.decoder import SampleAssembler
+from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import LEAF_RULE
 from cangauge.bus.time_source import ClockFrames, ReceiveTime
@@ -66,7 +66,7 @@ def test_samples_are_those_of_the_live_service_to_the_last_bit(
         f for f in drive(generic) if not (f.arbitration_id == VOLTAGE_ID and f.timestamp < 1003)
     ]
     path = record(tmp_path / "drive.log", frames)
-    live, clock, assembler = [], ReceiveTime(), SampleAssembler(generic)
+    live, clock, assembler = [], ReceiveTime(), SampleDecoder(generic)
     for message in can.LogReader(path):
         time_s = clock.time_of(message)
         assert time_s is not None

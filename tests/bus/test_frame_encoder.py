@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cangauge.bus.decoder import SampleAssembler
+from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle, load_vehicle
 from cangauge.errors import InputError
@@ -43,7 +43,7 @@ logs = st.lists(
 
 
 def through_frames(vehicle: Vehicle, log: Log) -> tuple[list[Sample], list[float]]:
-    encoder, assembler = FrameEncoder(vehicle), SampleAssembler(vehicle)
+    encoder, assembler = FrameEncoder(vehicle), SampleDecoder(vehicle)
     samples, references = [], []
     soc = log.soc_pct if log.soc_pct is not None else np.full(len(log), math.nan)
     for row, reference in zip(rows_of(log), soc.tolist(), strict=True):
@@ -138,7 +138,7 @@ def test_missing_values() -> None:
     sent = generic.encode(Sample(0.0, 1.0, math.nan, math.nan), math.nan)
     assert [message.arbitration_id for message in sent] == [0x400]
     leaf = VEHICLES["leaf_ze0"]
-    assembler = SampleAssembler(leaf)
+    assembler = SampleDecoder(leaf)
     (message,) = FrameEncoder(leaf).encode(Sample(0.0, 1.0, math.nan, math.nan))
     made = assembler.handle(message)
     assert made is not None

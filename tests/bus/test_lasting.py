@@ -17,7 +17,7 @@ from can.typechecking import CanFilter
 from cangauge.bus import reconnect as lasting
 from cangauge.bus.open import BusAddress, DriverMissingError, open_bus
 from cangauge.bus.publish import standard_filter
-from cangauge.bus.reconnect import FIRST_PAUSE_S, LONGEST_PAUSE_S, LastingPort
+from cangauge.bus.reconnect import FIRST_PAUSE_S, LONGEST_PAUSE_S, ReconnectingBus
 from cangauge.errors import InputError
 from live import BrokenBus, network_down, unpack_error
 
@@ -48,14 +48,14 @@ def missing() -> InputError:
     return InputError("no such bus", field="--channel", value="can9")
 
 
-def port_on(opener: Opener, lines: list[str], *, wait: bool = False) -> LastingPort:
-    port = LastingPort(ADDRESS, [standard_filter(0x123)], lines.append, opener)
+def port_on(opener: Opener, lines: list[str], *, wait: bool = False) -> ReconnectingBus:
+    port = ReconnectingBus(ADDRESS, [standard_filter(0x123)], lines.append, opener)
     port.open(wait=wait)
     return port
 
 
 def pump(
-    port: LastingPort, seconds: float, until: Callable[[], bool] = lambda: False
+    port: ReconnectingBus, seconds: float, until: Callable[[], bool] = lambda: False
 ) -> list[can.Message]:
     found = []
     end_s = time.monotonic() + seconds

@@ -11,7 +11,7 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.connection import BusPort, interface_facts, queue_drops
+from cangauge.bus.connection import BusConnection, backend_capabilities, queue_drops
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 
 linux_only = pytest.mark.skipif(sys.platform != "linux", reason="the count is Linux's")
@@ -24,7 +24,10 @@ def multicast() -> BusAddress:
 @linux_only
 def test_every_frame_is_received_or_counted() -> None:
     address, sent = multicast(), 4000
-    with BusPort(open_bus(address), "receiver") as port, BusPort(open_bus(address), "sender") as tx:
+    with (
+        BusConnection(open_bus(address), "receiver") as port,
+        BusConnection(open_bus(address), "sender") as tx,
+    ):
         with socket.socket(fileno=os.dup(port._bus.fileno())) as own:  # type: ignore[union-attr] # open
             own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
         assert port.queue_drops == 0
@@ -40,7 +43,7 @@ def test_every_frame_is_received_or_counted() -> None:
 
 
 def test_where_nobody_counts_it_says_so() -> None:
-    with BusPort(open_bus(BusAddress("virtual", "drops")), "virtual") as port:
+    with BusConnection(open_bus(BusAddress("virtual", "drops")), "virtual") as port:
         assert port.queue_drops is None
     assert port.queue_drops is None
 
@@ -67,8 +70,11 @@ def descriptors() -> int:
 @linux_only
 def test_the_kernel_stamps_multicast_when_it_comes_in() -> None:
     address = multicast()
-    assert interface_facts(address).stamps == "kernel"
-    with BusPort(open_bus(address), "receiver") as port, BusPort(open_bus(address), "sender") as tx:
+    assert backend_capabilities(address).stamps == "kernel"
+    with (
+        BusConnection(open_bus(address), "receiver") as port,
+        BusConnection(open_bus(address), "sender") as tx,
+    ):
         before_s = time.time()
         tx.send(can.Message(arbitration_id=1, is_extended_id=False))
         sent_s = time.time()
@@ -79,12 +85,12 @@ def test_the_kernel_stamps_multicast_when_it_comes_in() -> None:
 
 
 def test_what_interfaces_do() -> None:
-    virtual = interface_facts(BusAddress("virtual", "x"))
+    virtual = backend_capabilities(BusAddress("virtual", "x"))
     assert (virtual.stamps, virtual.echoes) == ("sender", False)
-    pcan = interface_facts(BusAddress("pcan", "PCAN_USBBUS1", {"receive_own_messages": True}))
+    pcan = backend_capabilities(BusAddress("pcan", "PCAN_USBBUS1", {"receive_own_messages": True}))
     assert (pcan.stamps, pcan.echoes, pcan.has_error_classes) == ("driver", True, False)
-    socketcan = interface_facts(BusAddress("socketcan", "can0"))
+    socketcan = backend_capabilities(BusAddress("socketcan", "can0"))
     assert (socketcan.stamps, socketcan.echoes, socketcan.has_error_classes) == (
         "kernel", False, True,
     )  # fmt: skip
-    assert interface_facts(multicast()).echoes
+    assert backend_capabilities(multicast()).echoes

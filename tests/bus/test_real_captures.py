@@ -12,7 +12,7 @@ from cangauge._resources import shared_file
 from cangauge.bus.capture_log import capture_samples, capture_to_log
 from cangauge.bus.captures.capture import is_capture, open_capture
 from cangauge.bus.database import load_dbc
-from cangauge.bus.decoder import SampleAssembler
+from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.protection import LEAF_RULE
 from cangauge.bus.vehicle import Vehicle, load_vehicle
 from cangauge.inspect.capture import inspect_capture
@@ -190,7 +190,7 @@ def test_maximum_energy_alternates_with_present_energy(folder: Path) -> None:
 def test_a_capture_decodes_the_same_frame_by_frame(folder: Path) -> None:
     """The log is what the assembler gives, bit for bit."""
     name = "10bars.csv.gz"
-    assembler = SampleAssembler(vehicle_of(name))
+    assembler = SampleDecoder(vehicle_of(name))
     made = [s for m in open_capture(folder / name) if (s := assembler.handle(m)) is not None]
     log = capture_to_log(folder / name, vehicle_of(name))
     assert [each.time_s for each in made] == log.time_s.tolist()

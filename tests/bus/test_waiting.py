@@ -11,7 +11,13 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.connection import AT_ONCE, BusError, BusPort, NothingWaitsError, waiting_frames
+from cangauge.bus.connection import (
+    AT_ONCE,
+    BusConnection,
+    BusError,
+    NothingWaitsError,
+    pending_frames,
+)
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.publish import standard_filter
 from live import BrokenBus, network_down, same_frames, unpack_error
@@ -75,7 +81,7 @@ def test_the_frames_are_those_of_python_can(
         open_bus(address, filters) as ours,
         open_bus(multicast()) as sender,
     ):
-        waiting = waiting_frames(ours)
+        waiting = pending_frames(ours)
         assert waiting is not None
         wait_for_stamps(sender, theirs, ours)
         for frame in sent:
@@ -103,7 +109,10 @@ def test_the_frames_are_those_of_python_can(
 @linux_only
 def test_other_filters_hold_from_the_next_frame_on() -> None:
     frame = can.Message(arbitration_id=0x55, is_extended_id=False)
-    with BusPort(open_bus(multicast(), FILTERS), "rx") as port, open_bus(multicast()) as sender:
+    with (
+        BusConnection(open_bus(multicast(), FILTERS), "rx") as port,
+        open_bus(multicast()) as sender,
+    ):
         for _ in range(2):
             sender.send(frame)
             assert port.receive_waiting(0.2) == []
@@ -121,8 +130,8 @@ def test_what_is_no_frame_is_counted_and_passed_over() -> None:
     junk = [b"", b"\xff", b"\x01", b"\x90", b"\x81\xa1x\x01", bytes(5000)]
     good = can.Message(arbitration_id=0x123, is_extended_id=False, data=b"1")
     with (
-        BusPort(open_bus(address), "theirs") as theirs,
-        BusPort(open_bus(address), "ours") as ours,
+        BusConnection(open_bus(address), "theirs") as theirs,
+        BusConnection(open_bus(address), "ours") as ours,
         open_bus(address) as sender,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as raw,
     ):
@@ -139,7 +148,7 @@ def test_what_is_no_frame_is_counted_and_passed_over() -> None:
 @linux_only
 def test_many_that_wait_come_in_parts_and_in_order_and_nothing_is_waited_for() -> None:
     address = multicast()
-    with BusPort(open_bus(address), "rx") as port, open_bus(address) as sender:
+    with BusConnection(open_bus(address), "rx") as port, open_bus(address) as sender:
         for number in range(3 * AT_ONCE + 1):
             sender.send(can.Message(arbitration_id=number, is_extended_id=False))
         began_s = time.monotonic()
@@ -162,7 +171,7 @@ def test_a_closed_port_leaves_no_descriptor_behind() -> None:
     address = multicast()
     before = descriptors()
     for _ in range(3):
-        with BusPort(open_bus(address), "rx") as port:
+        with BusConnection(open_bus(address), "rx") as port:
             port.receive_waiting(0.0)
     assert descriptors() == before
 
@@ -170,7 +179,7 @@ def test_a_closed_port_leaves_no_descriptor_behind() -> None:
 def test_a_bus_whose_socket_is_not_known_gives_one_frame_at_a_time() -> None:
     frame = can.Message(arbitration_id=1)
     script: list[object] = [frame, frame, None, unpack_error(), frame, network_down()]
-    port = BusPort(BrokenBus(script), "x")  # type: ignore[arg-type] # what is used of one
+    port = BusConnection(BrokenBus(script), "x")  # type: ignore[arg-type] # what is used of one
     assert [len(port.receive_waiting(0.0)) for _ in range(5)] == [1, 1, 0, 0, 1]
     assert port.garbled == 1
     with pytest.raises(BusError):
@@ -201,7 +210,7 @@ class Script:
 
 def test_an_error_takes_no_frame_with_it_that_was_read_before() -> None:
     frame = can.Message(arbitration_id=1)
-    port = BusPort(BrokenBus([]), "x")  # type: ignore[arg-type] # what is used of one
+    port = BusConnection(BrokenBus([]), "x")  # type: ignore[arg-type] # what is used of one
     port._waiting = Script(frame, unpack_error(), None, frame, network_down())
     assert port.receive_waiting(0.0) == [frame, frame]
     assert port.garbled == 1
@@ -212,7 +221,7 @@ def test_an_error_takes_no_frame_with_it_that_was_read_before() -> None:
 
 def test_frames_after_an_error_frame_wait_for_the_next_call() -> None:
     frame, error = can.Message(arbitration_id=1), can.Message(is_error_frame=True)
-    port = BusPort(BrokenBus([]), "x")  # type: ignore[arg-type] # what is used of one
+    port = BusConnection(BrokenBus([]), "x")  # type: ignore[arg-type] # what is used of one
     port._waiting = Script(frame, error, error, frame, frame)
     assert [len(port.receive_waiting(0.0)) for _ in range(4)] == [1, 0, 2, 0]
     assert port.error_frames == 2

@@ -8,13 +8,13 @@ from days import day
 from cangauge.identify.fit import fit
 from cangauge.identify.rows import FitOptions
 from cangauge.logs.log import Log
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH
 from synthetic import synthetic_log
 
 
 @pytest.fixture(scope="session")
-def model() -> ModelFile:
+def model() -> Model:
     """The published equation, identified from three full discharges."""
     logs = [synthetic_log(noise_v=0.5, seed=seed) for seed in (1, 2, 3)]
     return fit(logs, FitOptions(capacity_ah=CAPACITY_AH)).model

@@ -13,12 +13,12 @@ from days import day, late
 from cangauge.diagnosis.cross_validation import soc_mae_pct
 from cangauge.diagnosis.diagnose import Diagnosis, diagnose, in_words
 from cangauge.diagnosis.extended_model import library_without, model_file_of
-from cangauge.diagnosis.problem import settle
+from cangauge.diagnosis.problem import build_problem
 from cangauge.errors import InputError
 from cangauge.estimate.offline import estimate_log
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.logs.log import Log
-from cangauge.model.model_file import ModelFile, load_model, model_json
+from cangauge.model.model_file import Model, load_model, model_json
 from cangauge.report.diagnosis import gap_report
 from synthetic import synthetic_log
 
@@ -37,13 +37,13 @@ FAULTS = {
 
 
 @pytest.fixture(scope="module")
-def offset(model: ModelFile, references: list[Log]) -> Diagnosis:
+def offset(model: Model, references: list[Log]) -> Diagnosis:
     return diagnose([FAULTS["current_offset"](day(21))], model, references)
 
 
 @pytest.mark.parametrize("effect", FAULTS)
 def test_names_a_clear_fault_or_says_what_it_cannot_tell_it_from(
-    effect: str, model: ModelFile, references: list[Log]
+    effect: str, model: Model, references: list[Log]
 ) -> None:
     found = diagnose([FAULTS[effect](day(21)), FAULTS[effect](day(22))], model, references)
     assert effect in {found.verdict.cause, *found.verdict.ambiguous_with}
@@ -51,7 +51,7 @@ def test_names_a_clear_fault_or_says_what_it_cannot_tell_it_from(
     assert found.extended_rmse_v < found.baseline_rmse_v
 
 
-def test_says_none_on_clean_logs(model: ModelFile, references: list[Log]) -> None:
+def test_says_none_on_clean_logs(model: Model, references: list[Log]) -> None:
     for seed in range(30, 36):
         found = diagnose([day(seed)], model, references)
         assert found.verdict.cause == "none"
@@ -60,7 +60,7 @@ def test_says_none_on_clean_logs(model: ModelFile, references: list[Log]) -> Non
 
 @pytest.mark.parametrize("taught_from_pct", [55.0, None])
 def test_what_shows_only_at_a_charge_that_no_reference_has_been_at_is_no_clear_cause(
-    taught_from_pct: float | None, model: ModelFile, references: list[Log]
+    taught_from_pct: float | None, model: Model, references: list[Log]
 ) -> None:
     if taught_from_pct is not None:
         taught_pct = (taught_from_pct, model.range.soc_pct[1])
@@ -82,14 +82,14 @@ def test_what_shows_only_at_a_charge_that_no_reference_has_been_at_is_no_clear_c
         assert found.verdict.cause == "none"
 
 
-def test_says_unknown_of_what_no_effect_is_like(model: ModelFile, references: list[Log]) -> None:
+def test_says_unknown_of_what_no_effect_is_like(model: Model, references: list[Log]) -> None:
     log = day(21)
     wave = 6.0 * np.sin(2.0 * np.pi * log.time_s / 240.0)
     found = diagnose([replace(log, voltage_v=log.voltage_v + wave)], model, references)
     assert found.verdict.cause == "unknown"
 
 
-def test_finds_both_of_two_causes(model: ModelFile, references: list[Log]) -> None:
+def test_finds_both_of_two_causes(model: Model, references: list[Log]) -> None:
     logs = [FAULTS["resistance_asymmetry"](FAULTS["current_offset"](day(k))) for k in (21, 22)]
     found = diagnose(logs, model, references)
     assert {score.effect_id for score in found.verdict.accepted} == {
@@ -99,7 +99,7 @@ def test_finds_both_of_two_causes(model: ModelFile, references: list[Log]) -> No
 
 
 def test_what_the_shape_of_a_large_cause_leaves_is_no_second_cause(
-    model: ModelFile, references: list[Log]
+    model: Model, references: list[Log]
 ) -> None:
     def rising(log: Log) -> Log:  # a step of resistance, but for its quarter of an hour
         part = np.clip((log.time_s - 900.0) / 900.0, 0.0, 1.0)
@@ -110,7 +110,7 @@ def test_what_the_shape_of_a_large_cause_leaves_is_no_second_cause(
 
 
 def test_a_step_is_found_at_its_moment_in_logs_of_any_length(
-    model: ModelFile, references: list[Log]
+    model: Model, references: list[Log]
 ) -> None:
     short = synthetic_log(
         hours=0.55, start_pct=80.0, end_pct=62.0, noise_v=0.5, seed=22, name="short"
@@ -134,7 +134,7 @@ def test_parameter_and_closed_fraction_are_those_put_in(offset: Diagnosis) -> No
 
 
 def test_extended_model_runs_in_the_estimator(
-    offset: Diagnosis, model: ModelFile, tmp_path: Path
+    offset: Diagnosis, model: Model, tmp_path: Path
 ) -> None:
     path = tmp_path / "better.json"
     path.write_text(model_json(model_file_of(offset.extension, model, offset.extended_rmse_v)))
@@ -178,37 +178,37 @@ def test_page_tells_the_verdict_and_loads_nothing(offset: Diagnosis) -> None:
     assert "default-src 'none'" in page
 
 
-def test_without_references_the_models_noise_is_the_floor(model: ModelFile) -> None:
+def test_without_references_the_models_noise_is_the_floor(model: Model) -> None:
     found = diagnose([day(21)], model, [])
     assert found.floor_v == model.noise.voltage_rmse_v
     assert found.verdict.cause == "none"
 
 
-def test_without_references_nothing_is_said_of_them(model: ModelFile) -> None:
+def test_without_references_nothing_is_said_of_them(model: Model) -> None:
     found = diagnose([day(21)], model, [])
     assert in_words(found).startswith("No gap beyond what the model file states (")
 
 
-def test_refuses_where_nothing_tells_how_well_the_model_is_known(model: ModelFile) -> None:
+def test_refuses_where_nothing_tells_how_well_the_model_is_known(model: Model) -> None:
     with pytest.raises(InputError, match="--reference"):
         diagnose([day(21)], model.model_copy(update={"information": None}), [])
 
 
-def test_coefficients_are_known_by_their_names(offset: Diagnosis, model: ModelFile) -> None:
+def test_coefficients_are_known_by_their_names(offset: Diagnosis, model: Model) -> None:
     shuffled = model.model_copy(update={"coefficients": dict(sorted(model.coefficients.items()))})
     assert list(shuffled.coefficients) != list(model.coefficients)
     one, other = (model_file_of(offset.extension, given, 0.5) for given in (model, shuffled))
     assert one.coefficients == other.coefficients
 
 
-def test_the_extended_models_noise_agrees_with_itself(offset: Diagnosis, model: ModelFile) -> None:
+def test_the_extended_models_noise_agrees_with_itself(offset: Diagnosis, model: Model) -> None:
     for times in (0.5, 8.0):
         noise = model_file_of(offset.extension, model, times * model.noise.voltage_rmse_v).noise
         assert noise.fast_std_v == pytest.approx(times * model.noise.fast_std_v)
         assert noise.voltage_mae_pct == pytest.approx(times * model.noise.voltage_mae_pct)
 
 
-def test_a_soc_at_some_rows_is_compared_with_if_it_is_told_all_along(model: ModelFile) -> None:
+def test_a_soc_at_some_rows_is_compared_with_if_it_is_told_all_along(model: Model) -> None:
     log = day(40)
     assert log.soc_pct is not None
     rows = np.arange(len(log))
@@ -219,25 +219,25 @@ def test_a_soc_at_some_rows_is_compared_with_if_it_is_told_all_along(model: Mode
     assert soc_mae_pct([replace(log, soc_pct=first)], model) is None
 
 
-def test_steps_of_a_fast_logs_temperature_are_read_between(model: ModelFile) -> None:
+def test_steps_of_a_fast_logs_temperature_are_read_between(model: Model) -> None:
     """Found in the reports: means over parts of a second would blur them first."""
     fast = synthetic_log(hours=1.0, rate_hz=100.0, start_pct=80.0, end_pct=70.0)
     warming_c = 20.0 + 3.0 * (1.0 - np.exp(-fast.time_s / 1500.0)) + 0.2 * np.sin(fast.time_s / 400)
     coarse = replace(fast, temperature_c=np.floor(warming_c + 0.5))
-    settled = settle([coarse], model, [], library_without([]))
+    settled = build_problem([coarse], model, [], library_without([]))
     seen = settled.diagnosed[0].prepared.log
     error_k = seen.temperature_c - np.interp(seen.time_s, fast.time_s, warming_c)
     assert np.sqrt(np.mean(error_k**2)) < 0.13
     assert settled.temperature_step_k == 1.0
 
 
-def test_refuses_a_log_of_another_pack(model: ModelFile, references: list[Log]) -> None:
+def test_refuses_a_log_of_another_pack(model: Model, references: list[Log]) -> None:
     log = day(21)
     with pytest.raises(InputError, match="another pack"):
         diagnose([replace(log, voltage_v=log.voltage_v / 4.0)], model, references)
 
 
-def test_refuses_a_turned_current_by_its_count(model: ModelFile, references: list[Log]) -> None:
+def test_refuses_a_turned_current_by_its_count(model: Model, references: list[Log]) -> None:
     log = day(21)
     with pytest.raises(InputError, match="sign of current"):
         diagnose([replace(log, current_a=-log.current_a)], model, references)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cangauge.diagnosis.design_matrix import log_terms
+from cangauge.diagnosis.design_matrix import design_matrix
 from cangauge.diagnosis.diagnose import diagnose
 from cangauge.diagnosis.extended_model import model_file_of
 from cangauge.diagnosis.problem import _over_all_temperatures
@@ -18,7 +18,7 @@ from cangauge.logs.log import Log
 from cangauge.model.effects.base import Signals
 from cangauge.model.effects.library import LIBRARY, candidates
 from cangauge.model.extended import ExtendedModel
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 from synthetic import synthetic_log
 
@@ -42,13 +42,13 @@ def day(seed: int, warmth_c: float, offset_a: float = 0.0) -> Log:
 
 
 @pytest.fixture(scope="module")
-def model() -> ModelFile:
+def model() -> Model:
     logs = [day(1, 8.0), day(2, 15.0), day(3, 22.0), day(4, 29.0)]
     effects = ("resistance_temperature",)
     return fit(logs, replace(OPTIONS, effects=effects, name="with effects")).model
 
 
-def test_widened_temperatures_leave_the_effects_where_they_were(model: ModelFile) -> None:
+def test_widened_temperatures_leave_the_effects_where_they_were(model: Model) -> None:
     given = model.extended_model()
     inside = prepare_log(day(5, 18.0), OPTIONS)
     wider = _over_all_temperatures(given, [day(6, -12.0)])
@@ -66,12 +66,12 @@ def test_structure_is_told_from_the_effects_that_the_model_has() -> None:
     amount = 0.1 * piece.bounds[:, 1]
     acting = given.with_effect(piece.effect, piece.values(amount))
     assert acting.effects[0][0].id == "resistance_soc"
-    terms = log_terms(item, given, [piece], acting)
+    terms = design_matrix(item, given, [piece], acting)
     expected = residual(item, acting) + terms.effects[0] @ amount
     np.testing.assert_allclose(terms.residual_v, expected, atol=1e-9)
 
 
-def test_a_fault_is_named_beside_effects_that_the_model_has(model: ModelFile) -> None:
+def test_a_fault_is_named_beside_effects_that_the_model_has(model: Model) -> None:
     references = [day(seed, warmth) for seed, warmth in ((11, 9.0), (12, 18.0), (13, 27.0))]
     found = diagnose([day(21, 14.0, 4.0), day(22, 24.0, 4.0)], model, references)
     assert "current_offset" in {found.verdict.cause, *found.verdict.ambiguous_with}
@@ -85,7 +85,7 @@ def test_a_fault_is_named_beside_effects_that_the_model_has(model: ModelFile) ->
     assert given["reference_c"] in {values["reference_c"] for values in kept}
 
 
-def test_the_effects_that_the_model_has_are_no_gap(model: ModelFile) -> None:
+def test_the_effects_that_the_model_has_are_no_gap(model: Model) -> None:
     references = [day(seed, warmth) for seed, warmth in ((11, 9.0), (12, 18.0), (13, 27.0))]
     found = diagnose([day(21, 8.0)], model, references)
     assert found.verdict.cause == "none"

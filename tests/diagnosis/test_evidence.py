@@ -23,7 +23,7 @@ from cangauge.logs.log import Log
 from cangauge.model.effects.base import Pack
 from cangauge.model.effects.first_order import low_passed
 from cangauge.model.effects.library import LIBRARY, Candidate, candidates
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 from synthetic import synthetic_log
 
@@ -120,7 +120,7 @@ def day(seed: int) -> Log:
 
 
 @pytest.fixture(scope="module")
-def model() -> ModelFile:
+def model() -> Model:
     logs = [synthetic_log(noise_v=0.5, seed=seed) for seed in (1, 2, 3)]
     return fit(logs, FitOptions(capacity_ah=CAPACITY_AH)).model
 
@@ -147,7 +147,7 @@ def efficient(log: Log, part: float) -> Log:
     ],
 )
 def test_a_fault_that_bounds_rule_out_is_not_named(
-    effect_id: str, change: Callable[[Log], Log], model: ModelFile
+    effect_id: str, change: Callable[[Log], Log], model: Model
 ) -> None:
     """Its opposite may well be; whatever is found keeps its bounds."""
     found = diagnose(

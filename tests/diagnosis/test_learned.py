@@ -11,14 +11,14 @@ import pytest
 from cangauge.diagnosis import references as learned_module
 from cangauge.diagnosis.cross_validation import rms
 from cangauge.diagnosis.extended_model import library_without
-from cangauge.diagnosis.problem import Settled, settle
+from cangauge.diagnosis.problem import DiagnosisProblem, build_problem
 from cangauge.diagnosis.references import Learned
 from cangauge.identify.fit import fit
 from cangauge.identify.linearized import prepare_log, residual
 from cangauge.identify.rows import FitOptions
 from cangauge.logs.log import Log
 from cangauge.model.effects.first_order import low_passed
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 from synthetic import synthetic_log
 
@@ -37,7 +37,7 @@ def warm_inside(log: Log, rise_k: float) -> Log:
 
 
 @pytest.fixture(scope="module")
-def model() -> ModelFile:
+def model() -> Model:
     """Of logs that say next to nothing of kt: it is a twentieth of the pack's."""
     logs = [synthetic_log(noise_v=NOISE_V, seed=seed) for seed in (1, 2, 3)]
     without = [
@@ -47,13 +47,13 @@ def model() -> ModelFile:
     return fit(without, FitOptions(capacity_ah=CAPACITY_AH)).model
 
 
-def learned(model: ModelFile, rise_k: float) -> Settled:
+def learned(model: Model, rise_k: float) -> DiagnosisProblem:
     references = [warm_inside(day(seed), rise_k) for seed in (11, 12, 13)]
-    return settle([warm_inside(day(21), rise_k)], model, references, library_without([]))
+    return build_problem([warm_inside(day(21), rise_k)], model, references, library_without([]))
 
 
 @pytest.mark.parametrize("rise_k", [1.0, 3.0])
-def test_a_rise_and_kt_are_told_apart(rise_k: float, model: ModelFile) -> None:
+def test_a_rise_and_kt_are_told_apart(rise_k: float, model: Model) -> None:
     """In columns of the model's own kt the rise is twenty times too large."""
     settled = learned(model, rise_k)
     assert settled.model.model.kt_v_per_k == pytest.approx(KT_V_K, rel=0.05)
@@ -62,16 +62,18 @@ def test_a_rise_and_kt_are_told_apart(rise_k: float, model: ModelFile) -> None:
     assert rms(residual(another, settled.acting)) < 1.15 * NOISE_V
 
 
-def test_references_that_the_structure_explains_do_not_stray(model: ModelFile) -> None:
+def test_references_that_the_structure_explains_do_not_stray(model: Model) -> None:
     strays = [*learned(model, 1.0).error.strays.values()]
     assert np.exp(np.mean(np.log(strays))) < 2.0
 
 
-def test_a_reference_has_its_own_moments(model: ModelFile) -> None:
+def test_a_reference_has_its_own_moments(model: Model) -> None:
     """A moment is a part of a log's length: a short reference has all that a long log has."""
     short = synthetic_log(hours=0.3, start_pct=80.0, end_pct=70.0, noise_v=NOISE_V, seed=14)
     references = [day(11), day(12), short]
-    settled = settle([synthetic_log(hours=2.0, seed=5)], model, references, library_without([]))
+    settled = build_problem(
+        [synthetic_log(hours=2.0, seed=5)], model, references, library_without([])
+    )
     frame = settled.frame
     moments = [k for k, at in enumerate(frame.shown) if "start_s" in frame.choices[at].shape]
     assert moments
@@ -80,7 +82,7 @@ def test_a_reference_has_its_own_moments(model: ModelFile) -> None:
 
 
 def test_where_no_step_does_the_most_probable_is_taken(
-    model: ModelFile, monkeypatch: pytest.MonkeyPatch
+    model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Steps that go round in circles: the second of three was the best."""
     chances = iter([100.0, 50.0, 60.0, 55.0])

@@ -11,9 +11,9 @@ import pytest
 from cangauge.diagnosis.diagnose import diagnose
 from cangauge.diagnosis.extended_model import library_without
 from cangauge.diagnosis.posterior import Verdict, decide
-from cangauge.diagnosis.problem import Settled, settle
+from cangauge.diagnosis.problem import DiagnosisProblem, build_problem
 from cangauge.logs.log import Log
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 from synthetic import synthetic_log
 
 
@@ -49,9 +49,9 @@ def with_late_current(log: Log, late_s: float) -> Log:
 
 
 @pytest.fixture(scope="module")
-def learn(model: ModelFile) -> Callable[[Sequence[Log]], Settled]:
-    def learned(references: Sequence[Log]) -> Settled:
-        return settle([day(21)], model, references, library_without([]))
+def learn(model: Model) -> Callable[[Sequence[Log]], DiagnosisProblem]:
+    def learned(references: Sequence[Log]) -> DiagnosisProblem:
+        return build_problem([day(21)], model, references, library_without([]))
 
     return learned
 
@@ -62,12 +62,14 @@ def references() -> list[Log]:
 
 
 @pytest.fixture(scope="module")
-def alike(learn: Callable[[Sequence[Log]], Settled], references: list[Log]) -> Settled:
+def alike(
+    learn: Callable[[Sequence[Log]], DiagnosisProblem], references: list[Log]
+) -> DiagnosisProblem:
     """What is learned from references that differ by their noise alone."""
     return learn(references)
 
 
-def own_std(settled: Settled, effect_id: str) -> float:
+def own_std(settled: DiagnosisProblem, effect_id: str) -> float:
     """By how much logs are taken to differ in an effect, over what is usual; its largest shape."""
     frame, error = settled.frame, settled.error
     names = [frame.choices[k].effect.id for k in frame.own for _ in frame.choices[k].amplitudes]
@@ -75,7 +77,7 @@ def own_std(settled: Settled, effect_id: str) -> float:
     return max(part for name, part in zip(names, parts.tolist(), strict=True) if name == effect_id)
 
 
-def level_std(settled: Settled) -> float:
+def level_std(settled: DiagnosisProblem) -> float:
     """The same of the level of the resistance."""
     return settled.error.own_std[-1] / float(settled.frame.own_prior[-1])
 
@@ -98,7 +100,7 @@ def test_where_references_differ_logs_are_taken_to_differ(
     change: Callable[[Log, float], Log],
     size: float,
     effect_id: str,
-    model: ModelFile,
+    model: Model,
     references: list[Log],
 ) -> None:
     """The same fault is worth little beside references that stray by as much; others lose less."""
@@ -107,7 +109,7 @@ def test_where_references_differ_logs_are_taken_to_differ(
     def beside_both(logs: Sequence[Log]) -> list[Verdict]:
         """Beside references that are alike, and beside those that differ."""
         return [
-            decide(settle(logs, model, known, library_without([])))
+            decide(build_problem(logs, model, known, library_without([])))
             for known in (references, varied)
         ]
 
@@ -131,7 +133,9 @@ def test_where_references_differ_logs_are_taken_to_differ(
 
 
 def test_where_references_differ_in_resistance_logs_are_taken_to_differ(
-    learn: Callable[[Sequence[Log]], Settled], references: list[Log], alike: Settled
+    learn: Callable[[Sequence[Log]], DiagnosisProblem],
+    references: list[Log],
+    alike: DiagnosisProblem,
 ) -> None:
     ohms = learn(apart(more_resistance, references, 0.03))
     assert level_std(ohms) > 3.0 * level_std(alike)
@@ -139,7 +143,7 @@ def test_where_references_differ_in_resistance_logs_are_taken_to_differ(
 
 
 def test_the_error_is_that_of_the_references_not_that_of_the_model_file(
-    learn: Callable[[Sequence[Log]], Settled], alike: Settled, model: ModelFile
+    learn: Callable[[Sequence[Log]], DiagnosisProblem], alike: DiagnosisProblem, model: Model
 ) -> None:
     """0.5 V of white noise on every scale; then twice as much."""
     assert alike.error.rmse_v == pytest.approx(0.5, rel=0.05)
@@ -150,7 +154,9 @@ def test_the_error_is_that_of_the_references_not_that_of_the_model_file(
 
 
 def test_an_effect_that_strays_on_references_is_believed_less(
-    learn: Callable[[Sequence[Log]], Settled], references: list[Log], alike: Settled
+    learn: Callable[[Sequence[Log]], DiagnosisProblem],
+    references: list[Log],
+    alike: DiagnosisProblem,
 ) -> None:
     """One reference with 4 A too much, of three: the others would have called it an offset."""
     assert all(worth >= 1.0 for worth in alike.error.strays.values())
@@ -163,7 +169,7 @@ def test_an_effect_that_strays_on_references_is_believed_less(
 
 
 def test_an_effect_that_references_stray_in_is_no_cause(
-    model: ModelFile, references: list[Log]
+    model: Model, references: list[Log]
 ) -> None:
     """4 A too much are a fault beside references without; not beside references that vary so."""
     logs = [more_amperes(day(seed), 4.0) for seed in (21, 22)]
@@ -172,7 +178,7 @@ def test_an_effect_that_references_stray_in_is_no_cause(
     assert varied.verdict.cause == "none"
 
 
-def test_references_that_bear_the_model_file_out_keep_its_word(alike: Settled) -> None:
+def test_references_that_bear_the_model_file_out_keep_its_word(alike: DiagnosisProblem) -> None:
     """Not exactly 1: chance alone puts thirteen coefficients a little further away, or nearer."""
     assert alike.error.trust > 0.3
 
@@ -187,10 +193,10 @@ def test_references_that_bear_the_model_file_out_keep_its_word(alike: Settled) -
 )
 def test_references_that_all_contradict_the_model_file_overrule_it(
     change: Callable[[Log], Log],
-    learn: Callable[[Sequence[Log]], Settled],
+    learn: Callable[[Sequence[Log]], DiagnosisProblem],
     references: list[Log],
-    alike: Settled,
-    model: ModelFile,
+    alike: DiagnosisProblem,
+    model: Model,
 ) -> None:
     """What all of them share is the pack, not a difference from log to log."""
     found = learn([change(log) for log in references])
@@ -209,9 +215,7 @@ def test_references_that_all_contradict_the_model_file_overrule_it(
 
 
 @pytest.mark.parametrize("noise_v", [0.52, 0.6, 0.75])
-def test_a_noisier_sensor_is_no_gap(
-    noise_v: float, model: ModelFile, references: list[Log]
-) -> None:
+def test_a_noisier_sensor_is_no_gap(noise_v: float, model: Model, references: list[Log]) -> None:
     for seed in (41, 42):
         found = diagnose([day(seed, noise_v)], model, references)
         assert found.verdict.cause == "none"
@@ -219,7 +223,7 @@ def test_a_noisier_sensor_is_no_gap(
 
 
 def test_a_single_reference_leaves_the_model_files_noise(
-    learn: Callable[[Sequence[Log]], Settled], references: list[Log], model: ModelFile
+    learn: Callable[[Sequence[Log]], DiagnosisProblem], references: list[Log], model: Model
 ) -> None:
     one = learn(references[:1])
     none = learn([])
@@ -230,7 +234,9 @@ def test_a_single_reference_leaves_the_model_files_noise(
 
 
 def test_only_the_structure_that_references_show_may_take_much(
-    learn: Callable[[Sequence[Log]], Settled], references: list[Log], alike: Settled
+    learn: Callable[[Sequence[Log]], DiagnosisProblem],
+    references: list[Log],
+    alike: DiagnosisProblem,
 ) -> None:
     """What one piece needs would leave the others free to go astray."""
     assert max(alike.error.structure.values()) < 0.01
@@ -240,7 +246,7 @@ def test_only_the_structure_that_references_show_may_take_much(
     assert max(found[name] for name in ("hysteresis", "ocv_shape", "resistance_asymmetry")) < 0.01
 
 
-def test_what_all_references_share_is_not_what_logs_differ_by(model: ModelFile) -> None:
+def test_what_all_references_share_is_not_what_logs_differ_by(model: Model) -> None:
     # All of a pack's currents are late. If references took that as each its own, a log that is
     # not could be as much its own.
     def drive(seed: int, late_s: float) -> Log:
@@ -251,6 +257,6 @@ def test_what_all_references_share_is_not_what_logs_differ_by(model: ModelFile) 
 
     references = [drive(seed, 0.3) for seed in (11, 12, 13)]
     logs = [drive(seed, 0.05) for seed in (21, 22)]
-    best = decide(settle(logs, model, references, library_without([]))).candidates[0]
+    best = decide(build_problem(logs, model, references, library_without([]))).candidates[0]
     assert best.effect_id == "time_skew"
     assert best.log_bayes_factor > 100.0

@@ -11,10 +11,10 @@ from days import day, late
 
 from cangauge.diagnosis.caveats import reference_fit, worse_with
 from cangauge.diagnosis.diagnose import diagnose, in_words
-from cangauge.diagnosis.input_checks import FEW, sound, without_spikes
+from cangauge.diagnosis.input_checks import FEW, check_inputs, without_outliers
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 
 
 def with_row(log: Log, channel: str, row: int, value: float) -> Log:
@@ -25,7 +25,7 @@ def with_row(log: Log, channel: str, row: int, value: float) -> Log:
 
 @pytest.mark.parametrize(("channel", "value"), [("current_a", -1023.0), ("voltage_v", 250.0)])
 def test_one_wrong_row_is_left_out_and_told(
-    model: ModelFile, references: list[Log], channel: str, value: float
+    model: Model, references: list[Log], channel: str, value: float
 ) -> None:
     """A row of −1023 A made `charge_transfer` of a healthy log, with a probability of 0.82."""
     healthy = day(21)
@@ -38,7 +38,7 @@ def test_one_wrong_row_is_left_out_and_told(
     assert f"{value:.0f}" in told
 
 
-def test_what_a_pack_does_stays(model: ModelFile) -> None:
+def test_what_a_pack_does_stays(model: Model) -> None:
     extended = model.extended_model()
     log = day(21)
     ohm = -extended.model.resistance_ohm[0]
@@ -52,22 +52,22 @@ def test_what_a_pack_does_stays(model: ModelFile) -> None:
         "voltage_v", 1502, log.voltage_v[1502] - ohm * (pulse_a - log.current_a[1500]),
     )  # fmt: skip
     for each in (log, answered, late):
-        kept, rows = without_spikes(each, extended)
+        kept, rows = without_outliers(each, extended)
         assert kept is each
         assert rows.size == 0
 
 
-def test_many_wrong_rows_are_a_fault_to_be_found(model: ModelFile) -> None:
+def test_many_wrong_rows_are_a_fault_to_be_found(model: Model) -> None:
     log = day(21)
     for k in range(FEW + 1):
         log = with_row(log, "current_a", 300 + 200 * k, 1023.0)
-    kept, rows = without_spikes(log, model.extended_model())
+    kept, rows = without_outliers(log, model.extended_model())
     assert kept is log
     assert rows.size == 0
 
 
 @pytest.mark.parametrize("channel", ["current_a", "voltage_v"])
-def test_a_dead_channel_is_refused(model: ModelFile, references: list[Log], channel: str) -> None:
+def test_a_dead_channel_is_refused(model: Model, references: list[Log], channel: str) -> None:
     log = day(21)
     dead = replace(log, **{channel: np.full(len(log), getattr(log, channel)[0])})
     with pytest.raises(InputError, match=r"never changes in 48 min") as caught:
@@ -75,7 +75,7 @@ def test_a_dead_channel_is_refused(model: ModelFile, references: list[Log], chan
     assert caught.value.field == channel
 
 
-def test_a_log_counts_once(model: ModelFile, references: list[Log]) -> None:
+def test_a_log_counts_once(model: Model, references: list[Log]) -> None:
     extended = model.extended_model()
     renamed = replace(references[0], name="a copy")
     for logs, given in (
@@ -84,10 +84,10 @@ def test_a_log_counts_once(model: ModelFile, references: list[Log]) -> None:
         ([day(21)], [*references, renamed]),
     ):
         with pytest.raises(InputError, match="would count twice"):
-            sound(logs, given, extended)
+            check_inputs(logs, given, extended)
 
 
-def test_a_pause_is_told(model: ModelFile, references: list[Log]) -> None:
+def test_a_pause_is_told(model: Model, references: list[Log]) -> None:
     log = day(21)
     keep = (log.time_s < 900.0) | (log.time_s > 2100.0)
     found = diagnose([log.rows(keep)], model, references)
@@ -95,7 +95,7 @@ def test_a_pause_is_told(model: ModelFile, references: list[Log]) -> None:
     assert "day 21 (20 min, 0.2 h in)" in told
 
 
-def test_a_log_of_another_pack_gets_no_name(model: ModelFile, references: list[Log]) -> None:
+def test_a_log_of_another_pack_gets_no_name(model: Model, references: list[Log]) -> None:
     """Voltage_gain was named with 0.08 where `unknown` had 0.87."""
     log = day(21)
     other = replace(log, voltage_v=1.13 * log.voltage_v, temperature_c=log.temperature_c - 15.0)
@@ -119,7 +119,7 @@ def asymmetric(log: Log) -> Log:
     ],
 )
 def test_where_no_reference_has_been_a_clear_cause_is_named_without_being_certain(
-    model: ModelFile, references: list[Log], fault: Callable[[Log], Log], cause: str
+    model: Model, references: list[Log], fault: Callable[[Log], Log], cause: str
 ) -> None:
     log = fault(day(21))
     colder_v = model.extended_model().model.kt_v_per_k * -20.0
@@ -131,7 +131,7 @@ def test_where_no_reference_has_been_a_clear_cause_is_named_without_being_certai
 
 
 def test_where_no_reference_has_been_resistance_in_the_cold_tells_no_fault(
-    model: ModelFile, references: list[Log]
+    model: Model, references: list[Log]
 ) -> None:
     log = day(21)
     colder_v = model.extended_model().model.kt_v_per_k * -20.0

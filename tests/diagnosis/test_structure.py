@@ -8,14 +8,14 @@ import pytest
 
 from cangauge.diagnosis.cross_validation import rms
 from cangauge.diagnosis.extended_model import extend, library_without
-from cangauge.diagnosis.problem import Settled, settle
+from cangauge.diagnosis.problem import DiagnosisProblem, build_problem
 from cangauge.diagnosis.references import needed
 from cangauge.identify.fit import fit
 from cangauge.identify.linearized import prepare_log, residual
 from cangauge.identify.rows import FitOptions
 from cangauge.logs.log import Log
 from cangauge.model.effects.first_order import low_passed
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH
 from synthetic import synthetic_log
 
@@ -34,25 +34,25 @@ def polarised(log: Log) -> Log:
 
 
 @pytest.fixture(scope="module")
-def model() -> ModelFile:
+def model() -> Model:
     logs = [synthetic_log(noise_v=NOISE_V, seed=seed) for seed in (1, 2, 3)]
     return fit(logs, FitOptions(capacity_ah=CAPACITY_AH)).model
 
 
-def needed_of(settled: Settled) -> set[str]:
+def needed_of(settled: DiagnosisProblem) -> set[str]:
     pieces = needed(settled.frame, settled.reference_grams, settled.error)
     return {settled.frame.choices[k].effect.id for k in pieces}
 
 
-def test_a_pack_that_obeys_the_model_needs_none(model: ModelFile) -> None:
-    settled = settle([day(21)], model, [day(11), day(12), day(13)], library_without([]))
+def test_a_pack_that_obeys_the_model_needs_none(model: Model) -> None:
+    settled = build_problem([day(21)], model, [day(11), day(12), day(13)], library_without([]))
     assert needed_of(settled) == set()
     assert extend(settled, []).model.effects == ()
 
 
-def test_structure_that_references_show_runs_in_the_extended_model(model: ModelFile) -> None:
+def test_structure_that_references_show_runs_in_the_extended_model(model: Model) -> None:
     references = [polarised(day(seed)) for seed in (11, 12, 13)]
-    settled = settle([polarised(day(21))], model, references, library_without([]))
+    settled = build_problem([polarised(day(21))], model, references, library_without([]))
     assert "slow_diffusion" in needed_of(settled)
     extended = extend(settled, []).model
     assert "slow_diffusion" in {effect.id for effect, _ in extended.effects}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cangauge.logs.log import Log
-from cangauge.logs.resample import ENOUGH_HZ, thinned
+from cangauge.logs.resample import ENOUGH_HZ, resample
 from cangauge.model.charge import discharged_ah
 
 
@@ -23,13 +23,13 @@ def drive(rate_hz: float, seconds: float = 120.0, pause_s: float = 0.0) -> Log:
 @pytest.mark.parametrize("rate_hz", [0.5, 1.0, 10.0, 20.0, 39.0])
 def test_a_log_that_is_not_fast_stays_itself(rate_hz: float) -> None:
     log = drive(rate_hz)
-    assert thinned(log) is log
+    assert resample(log) is log
 
 
 @pytest.mark.parametrize("rate_hz", [50.0, 100.0, 333.0])
 def test_a_fast_log_keeps_its_charge_and_what_goes_with_what(rate_hz: float) -> None:
     log = drive(rate_hz, pause_s=50.0)
-    few = thinned(log)
+    few = resample(log)
     assert len(few) == pytest.approx(120.0 * ENOUGH_HZ, abs=2)
     assert np.all(np.diff(few.time_s) > 0.0)
     assert np.sum(np.diff(few.time_s) > 40.0) == 1
@@ -44,7 +44,7 @@ def test_a_fast_log_keeps_its_charge_and_what_goes_with_what(rate_hz: float) -> 
 def test_a_soc_that_comes_more_slowly_than_the_current_is_kept() -> None:
     log = drive(100.0)
     told = np.where(np.arange(len(log)) % 100 == 3, log.soc_pct, np.nan)
-    few = thinned(replace(log, soc_pct=told))
+    few = resample(replace(log, soc_pct=told))
     assert few.soc_pct is not None
     assert np.isfinite(few.soc_pct).sum() == np.isfinite(told).sum()
     assert few.first_soc() == (0, told[3])
@@ -52,4 +52,4 @@ def test_a_soc_that_comes_more_slowly_than_the_current_is_kept() -> None:
 
 def test_a_log_of_one_row_is_left_to_those_who_say_what_is_wrong_with_it() -> None:
     log = drive(1.0, seconds=1.0)
-    assert thinned(log) is log
+    assert resample(log) is log

@@ -9,7 +9,7 @@ import pytest
 
 from cangauge.diagnosis.caveats import limits, stepped_temperature
 from cangauge.diagnosis.cross_validation import LogErrors
-from cangauge.diagnosis.design_matrix import LogTerms
+from cangauge.diagnosis.design_matrix import DesignMatrix
 from cangauge.diagnosis.error_breakdown import (
     LEAST_ROWS,
     MOMENTS,
@@ -36,10 +36,10 @@ def prepared(log: Log) -> Prepared:
     return prepare_log(log, OPTIONS)
 
 
-def terms(log: Log) -> LogTerms:
+def terms(log: Log) -> DesignMatrix:
     item = prepared(log)
     none = np.zeros((len(item.rows), 0))
-    return LogTerms(item, np.zeros(len(item.rows)), none, none, ())
+    return DesignMatrix(item, np.zeros(len(item.rows)), none, none, ())
 
 
 def long_log(**changes: object) -> Log:

@@ -15,7 +15,7 @@ from cangauge.estimate.settings import EstimatorSettings, FullCharge, LongRest
 from cangauge.estimate.state import EstimatorState
 from cangauge.estimate.validity import Estimate, Reason, Sample, Status
 from cangauge.model.effects.library import LIBRARY
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
 from estimate.test_snapshot import extended_by
 
@@ -88,7 +88,7 @@ def check(estimate: Estimate, method: str, was_known: bool) -> bool:
     return known
 
 
-def run(model: ModelFile, chosen: EstimatorSettings, samples: list[Sample]) -> None:
+def run(model: Model, chosen: EstimatorSettings, samples: list[Sample]) -> None:
     estimator = Estimator(model, chosen)
     known = False
     for sample in samples:
@@ -132,7 +132,7 @@ def test_a_model_without_noise_is_no_trap(zero: str) -> None:
     raw = PLAIN.model_dump()
     names = ["fast_std_v", "slow_std_v", "lasting_std_v"] if zero == "all" else [zero]
     raw["noise"] |= dict.fromkeys(names, 0.0)
-    model = ModelFile.model_validate(raw)
+    model = Model.model_validate(raw)
     samples = [Sample(0.5 * k, 20.0, 370.0 + (k % 7), 23.0) for k in range(400)]
     samples += [Sample(1000.0 + k, 0.0, 390.0, 23.0) for k in range(200)]
     run(model, EstimatorSettings(initial_soc_pct=50.0, initial_soc_std_pct=0.0), samples)

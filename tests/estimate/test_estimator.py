@@ -17,14 +17,14 @@ from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Reason, Sample, Status
 from cangauge.identify.fit import fit
 from cangauge.identify.rows import FitOptions
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
 from cangauge.model.voltage_model import soc_from_ocv
 from synthetic import synthetic_log
 
 
 @pytest.fixture(scope="module")
-def model() -> ModelFile:
+def model() -> Model:
     logs = [synthetic_log(noise_v=0.5, seed=seed) for seed in (1, 2, 3)]
     return fit(logs, FitOptions(capacity_ah=CAPACITY_AH)).model
 
@@ -59,7 +59,7 @@ def test_counter_integrates_irregular_steps_and_limits_gaps() -> None:
 
 
 @pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
-def test_each_method_follows_a_clean_log(model: ModelFile, method: str) -> None:
+def test_each_method_follows_a_clean_log(model: Model, method: str) -> None:
     log = synthetic_log(noise_v=0.2, seed=9)
     table, scores = estimate_log(
         log, model, EstimatorSettings(method=method, initial_soc_pct=100.0)
@@ -69,7 +69,7 @@ def test_each_method_follows_a_clean_log(model: ModelFile, method: str) -> None:
     assert np.all((table.soc_pct >= 0.0) & (table.soc_pct <= 100.0))
 
 
-def test_filter_recovers_from_a_wrong_start_and_says_so(model: ModelFile) -> None:
+def test_filter_recovers_from_a_wrong_start_and_says_so(model: Model) -> None:
     log = synthetic_log(start_pct=80.0, end_pct=40.0, noise_v=0.5, seed=11, hours=1.5)
     table, _ = estimate_log(log, model, EstimatorSettings(initial_soc_pct=60.0))
     error = np.abs(table.soc_pct - log.soc_pct)
@@ -80,7 +80,7 @@ def test_filter_recovers_from_a_wrong_start_and_says_so(model: ModelFile) -> Non
 
 @pytest.mark.parametrize("wrong_pct", [-60.0, -20.0, 15.0])
 def test_a_wrong_start_leaves_no_trace_once_the_voltages_refute_it(
-    model: ModelFile, wrong_pct: float
+    model: Model, wrong_pct: float
 ) -> None:
     log = synthetic_log(start_pct=80.0, end_pct=70.0, noise_v=0.5, seed=11, hours=0.5)
     wrong, _ = estimate_log(log, model, EstimatorSettings(initial_soc_pct=80.0 + wrong_pct))
@@ -116,7 +116,7 @@ def test_a_right_start_is_believed_though_the_voltages_are_off(sigmas: float) ->
     assert not np.any(given.reasons & Reason.INNOVATION_LARGE)
 
 
-def test_a_start_of_which_little_is_claimed_asks_no_question(model: ModelFile) -> None:
+def test_a_start_of_which_little_is_claimed_asks_no_question(model: Model) -> None:
     log = synthetic_log(start_pct=80.0, end_pct=79.0, noise_v=0.5, seed=11, hours=0.1)
     for std_pct, stories in ((1.0, 2), (30.0, 1)):
         estimator = Estimator(
@@ -132,7 +132,7 @@ def test_a_start_of_which_little_is_claimed_asks_no_question(model: ModelFile) -
     assert len(estimator.snapshot().belief.filters) == 1
 
 
-def test_filter_learns_the_offset_that_a_counter_drifts_with(model: ModelFile) -> None:
+def test_filter_learns_the_offset_that_a_counter_drifts_with(model: Model) -> None:
     log = synthetic_log(start_pct=95.0, end_pct=20.0, noise_v=0.5, seed=12)
     samples = [item._replace(current_a=item.current_a + 2.0) for item in samples_of(log)]
     settings_ = EstimatorSettings(initial_soc_pct=95.0)
@@ -146,7 +146,7 @@ def test_filter_learns_the_offset_that_a_counter_drifts_with(model: ModelFile) -
     assert estimator.offset_a == pytest.approx(2.0, abs=0.5)
 
 
-def test_standard_deviation_is_honest(model: ModelFile) -> None:
+def test_standard_deviation_is_honest(model: Model) -> None:
     inside, sigma, square = [], [], []
     for seed in range(20, 30):
         log = synthetic_log(start_pct=90.0, end_pct=50.0, noise_v=0.5, seed=seed, hours=1.0)
@@ -158,7 +158,7 @@ def test_standard_deviation_is_honest(model: ModelFile) -> None:
     assert np.mean(inside) >= 0.9
 
 
-def test_starts_without_initial_soc_from_the_first_voltage(model: ModelFile) -> None:
+def test_starts_without_initial_soc_from_the_first_voltage(model: Model) -> None:
     log = synthetic_log(start_pct=70.0, end_pct=60.0, noise_v=0.2, seed=4, hours=0.5)
     first = Estimator(model).step(next(samples_of(log)))
     assert first.soc_pct == pytest.approx(70.0, abs=8.0)
@@ -167,7 +167,7 @@ def test_starts_without_initial_soc_from_the_first_voltage(model: ModelFile) -> 
     assert first.reasons == Reason.DELAY_LINE_FILLING | Reason.SOC_UNCERTAIN
 
 
-def test_status_is_valid_once_the_delay_line_is_full(model: ModelFile) -> None:
+def test_status_is_valid_once_the_delay_line_is_full(model: Model) -> None:
     log = synthetic_log(start_pct=70.0, end_pct=60.0, noise_v=0.2, seed=4, hours=0.5)
     table, _ = estimate_log(log, model, EstimatorSettings())
     filling = (table.reasons & Reason.DELAY_LINE_FILLING) != 0
@@ -175,7 +175,7 @@ def test_status_is_valid_once_the_delay_line_is_full(model: ModelFile) -> None:
     assert np.mean(table.status[~filling] == Status.VALID) > 0.95
 
 
-def test_gap_in_current_degrades_for_the_delay_lines_length(model: ModelFile) -> None:
+def test_gap_in_current_degrades_for_the_delay_lines_length(model: Model) -> None:
     log = synthetic_log(start_pct=70.0, end_pct=60.0, noise_v=0.2, seed=4, hours=0.5)
     keep = (log.time_s < 600.0) | (log.time_s >= 605.0)
     table, _ = estimate_log(log.rows(keep), model, EstimatorSettings())
@@ -184,7 +184,7 @@ def test_gap_in_current_degrades_for_the_delay_lines_length(model: ModelFile) ->
     assert table.time_s[gap].max() == 674.0
 
 
-def test_missing_voltage_and_temperature_keep_the_count_going(model: ModelFile) -> None:
+def test_missing_voltage_and_temperature_keep_the_count_going(model: Model) -> None:
     log = synthetic_log(start_pct=70.0, end_pct=60.0, noise_v=0.2, seed=4, hours=0.5)
     samples = [
         item._replace(voltage_v=math.nan, temperature_c=math.nan) if item.time_s > 900 else item
@@ -213,7 +213,7 @@ def test_no_input_raises_or_leaves_0_to_100(rows: list[tuple[float, ...]]) -> No
 _MODEL = fit([synthetic_log(noise_v=0.5)], FitOptions(capacity_ah=CAPACITY_AH)).model
 
 
-def test_refuses_time_that_does_not_increase(model: ModelFile) -> None:
+def test_refuses_time_that_does_not_increase(model: Model) -> None:
     estimator = Estimator(model)
     estimator.step(Sample(1.0, 10.0, 380.0, 23.0))
     again = estimator.step(Sample(1.0, 5000.0, 380.0, 23.0))
@@ -221,13 +221,13 @@ def test_refuses_time_that_does_not_increase(model: ModelFile) -> None:
     assert again.samples == 1
 
 
-def test_temperature_measured_elsewhere_degrades(model: ModelFile) -> None:
+def test_temperature_measured_elsewhere_degrades(model: Model) -> None:
     estimator = Estimator(model, EstimatorSettings(temperature_source="cell"))
     estimate = estimator.step(Sample(0.0, 10.0, 380.0, 23.0))
     assert estimate.reasons & Reason.TEMPERATURE_SOURCE_MISMATCH
 
 
-def test_the_same_samples_give_the_same_numbers(model: ModelFile) -> None:
+def test_the_same_samples_give_the_same_numbers(model: Model) -> None:
     log = synthetic_log(hours=0.3, noise_v=0.5)
     first = run_estimator(samples_of(log), model, EstimatorSettings())
     again = run_estimator(samples_of(log), model, EstimatorSettings())
@@ -240,7 +240,7 @@ def test_settings_out_of_range_are_named() -> None:
         EstimatorSettings(initial_soc_pct=140.0)
 
 
-def test_open_contactors_do_not_disturb_the_filter(model: ModelFile) -> None:
+def test_open_contactors_do_not_disturb_the_filter(model: Model) -> None:
     log = synthetic_log(start_pct=80.0, end_pct=70.0, noise_v=0.3, seed=6, hours=0.5)
     down = (log.time_s >= 900.0) & (log.time_s < 930.0)
     samples = [
@@ -255,7 +255,7 @@ def test_open_contactors_do_not_disturb_the_filter(model: ModelFile) -> None:
     assert not np.any(table.reasons & Reason.INNOVATION_LARGE)
 
 
-def test_a_long_rest_draws_the_soc_toward_the_rest_voltage(model: ModelFile) -> None:
+def test_a_long_rest_draws_the_soc_toward_the_rest_voltage(model: Model) -> None:
     log = synthetic_log(start_pct=80.0, end_pct=70.0, noise_v=0.3, seed=6, hours=0.4)
     # The drive ends with a SoC that is 4 % off, and the pack rests for 40 minutes.
     soc_pct = float(log.soc_pct[-1])
@@ -272,7 +272,7 @@ def test_a_long_rest_draws_the_soc_toward_the_rest_voltage(model: ModelFile) -> 
     assert sigma[620] < sigma[590]
 
 
-def test_a_soc_too_uncertain_is_degraded_and_says_so(model: ModelFile) -> None:
+def test_a_soc_too_uncertain_is_degraded_and_says_so(model: Model) -> None:
     log = synthetic_log(start_pct=70.0, end_pct=60.0, noise_v=0.2, seed=4, hours=0.5)
     table, _ = estimate_log(log, model, EstimatorSettings(valid_std_pct=0.8))
     uncertain = (table.reasons & Reason.SOC_UNCERTAIN) != 0

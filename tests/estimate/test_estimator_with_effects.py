@@ -12,7 +12,7 @@ from cangauge.estimate.settings import EstimatorSettings
 from cangauge.logs.log import Log
 from cangauge.model.effects.base import Effect, Pack, Signals
 from cangauge.model.effects.library import LIBRARY, effect_entries
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
 from synthetic import synthetic_log
 
@@ -31,13 +31,13 @@ def upper_half(effect: Effect) -> dict[str, float]:
     return values | ({"skew_s": 0.7} if effect.id == "time_skew" else {})
 
 
-def log_and_model(effect: Effect) -> tuple[Log, ModelFile]:
+def log_and_model(effect: Effect) -> tuple[Log, Model]:
     """A log that the effect alone explains, and the published model with the effect."""
     values = upper_half(effect)
     plain = leaf_2012_model_file()
     wide = {"soc_pct": (0.0, 100.0), "temperature_c": (-30.0, 60.0), "current_a": (-300.0, 300.0)}
     raw = plain.model_dump() | {"effects": effect_entries([(effect, values)]), "range": wide}
-    model = ModelFile.model_validate(raw)
+    model = Model.model_validate(raw)
     log = synthetic_log(hours=0.7, rate_hz=2.0, start_pct=START_PCT, end_pct=15.0, seed=7)
     signals = Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c - 12.0)
     found = model.extended_model().predict(signals, START_PCT, np.arange(len(log)))
@@ -67,7 +67,7 @@ def test_predicts_the_same_voltage_as_offline(effect: Effect) -> None:
 @each_effect
 def test_filter_finds_the_soc_that_the_plain_model_misses(effect: Effect) -> None:
     log, model = log_and_model(effect)
-    plain = ModelFile.model_validate(model.model_dump() | {"effects": []})
+    plain = Model.model_validate(model.model_dump() | {"effects": []})
     settings = EstimatorSettings(initial_soc_pct=START_PCT)
     extended = estimate_log(log, model, settings)[1]
     missed = estimate_log(log, plain, settings)[1]

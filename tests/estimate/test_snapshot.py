@@ -19,7 +19,7 @@ from cangauge.estimate.state import EstimatorState
 from cangauge.estimate.validity import Estimate, Reason, Sample
 from cangauge.model.effects.base import Pack
 from cangauge.model.effects.library import LIBRARY, effect_entries
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
 from synthetic import synthetic_log
 
@@ -28,7 +28,7 @@ PLAIN = leaf_2012_model_file()
 ANCHORS = {"full_charge": FullCharge(400.0, 5.0), "long_rest": LongRest(600.0)}
 
 
-def extended_by(ids: list[str]) -> ModelFile:
+def extended_by(ids: list[str]) -> Model:
     """The published model with effects, half way to their bounds."""
     chosen = []
     for effect_id in ids:
@@ -39,7 +39,7 @@ def extended_by(ids: list[str]) -> ModelFile:
             far = high if high > values[parameter.name] else low
             values[parameter.name] = 0.5 * (values[parameter.name] + far)
         chosen.append((effect, values | ({"skew_s": 0.7} if effect_id == "time_skew" else {})))
-    return ModelFile.model_validate(PLAIN.model_dump() | {"effects": effect_entries(chosen)})
+    return Model.model_validate(PLAIN.model_dump() | {"effects": effect_entries(chosen)})
 
 
 def eventful_samples() -> list[Sample]:
@@ -89,7 +89,7 @@ def remembered(thing: Any, depth: int = 0) -> Any:
     return thing if isinstance(thing, int | float | str | bool | None) else type(thing).__name__
 
 
-def check_goes_on(model: ModelFile, chosen: EstimatorSettings, at: int) -> None:
+def check_goes_on(model: Model, chosen: EstimatorSettings, at: int) -> None:
     whole = Estimator(model, chosen)
     for sample in EVENTFUL[:at]:
         whole.step(sample)

@@ -8,7 +8,7 @@ from cangauge.estimate.estimator import Estimator
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate, Reason, Sample
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 from live import leaf_model, short_log
 
 
@@ -22,7 +22,7 @@ def stepped(estimator: Estimator, samples: list[Sample]) -> Estimate:
     return estimate
 
 
-def other_model() -> ModelFile:
+def other_model() -> Model:
     model = leaf_model()
     k0 = model.coefficients["k0"]
     shifted = {**model.coefficients, "k0": k0.model_copy(update={"value": k0.value + 2.0})}

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cangauge.errors import InputError
-from cangauge.logs.draft import Draft
-from cangauge.logs.file_content import Content
+from cangauge.logs.draft import DraftLog
+from cangauge.logs.file_content import FileContent
 from cangauge.logs.units import convert
 
 
@@ -31,8 +31,8 @@ def drive(
 
 
 def checked(values: dict[str, np.ndarray]) -> tuple[str, ...]:
-    content = Content(Path("drive.csv"), b"", "drive", ())
-    return Draft(content, values).to_log().remarks
+    content = FileContent(Path("drive.csv"), b"", "drive", ())
+    return DraftLog(content, values).to_log().remarks
 
 
 @settings(max_examples=50)

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cangauge.logs.log import Log
-from cangauge.logs.resample import unstepped, usual_step_k
+from cangauge.logs.resample import dequantize, usual_step_k
 
 FloatArray = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ def rms(values: FloatArray) -> float:
 def test_most_of_the_steps_error_is_gone(step_c: float, noise_c: float) -> None:
     true = warming()
     seen = reported(true, step_c, noise_c)
-    read = unstepped(log_of(seen)).temperature_c
+    read = dequantize(log_of(seen)).temperature_c
     assert rms(read - true) < 0.6 * rms(seen - true)
 
 
@@ -45,18 +45,18 @@ def test_most_of_the_steps_error_is_gone(step_c: float, noise_c: float) -> None:
 def test_it_is_never_further_from_the_report_than_half_a_step(pause_s: float) -> None:
     """Above all not where the temperature jumped while nothing was recorded."""
     seen = reported(np.concatenate((warming() + 15.0, warming())), 0.5, 0.01)
-    read = unstepped(log_of(seen, pause_s)).temperature_c
+    read = dequantize(log_of(seen, pause_s)).temperature_c
     assert np.max(np.abs(read - seen)) <= 0.25 + 1e-9
 
 
 def test_a_fine_temperature_stays_what_it_is() -> None:
     true = warming()
-    np.testing.assert_allclose(unstepped(log_of(true)).temperature_c, true, atol=1e-3)
+    np.testing.assert_allclose(dequantize(log_of(true)).temperature_c, true, atol=1e-3)
 
 
 def test_a_temperature_that_never_changes_stays() -> None:
     log = log_of(np.full(100, 21.0))
-    assert unstepped(log) is log
+    assert dequantize(log) is log
 
 
 @pytest.mark.parametrize("step_c", [0.25, 1.0])

@@ -10,17 +10,17 @@ import pytest
 from cangauge.errors import InputError
 from cangauge.identify.fit import fit
 from cangauge.identify.rows import FitOptions
-from cangauge.model.model_file import ModelFile, load_model, model_json
+from cangauge.model.model_file import Model, load_model, model_json
 from synthetic import synthetic_log
 
 
 @pytest.fixture(scope="module")
-def model() -> ModelFile:
+def model() -> Model:
     log = synthetic_log(hours=1.0, end_pct=60.0, noise_v=0.5)
     return fit([log], FitOptions(capacity_ah=51.5)).model
 
 
-def test_round_trip(model: ModelFile, tmp_path: Path) -> None:
+def test_round_trip(model: Model, tmp_path: Path) -> None:
     path = tmp_path / "model.json"
     path.write_text(model_json(model))
     again = load_model(path)
@@ -44,7 +44,7 @@ def test_round_trip(model: ModelFile, tmp_path: Path) -> None:
         (lambda raw: raw["information"]["scale"].pop(), "information"),
     ],
 )
-def test_names_the_broken_field(model: ModelFile, tmp_path: Path, break_it, field) -> None:
+def test_names_the_broken_field(model: Model, tmp_path: Path, break_it, field) -> None:
     raw = json.loads(model_json(model))
     break_it(raw)
     path = tmp_path / "broken.json"

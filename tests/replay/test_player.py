@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cangauge.bus.connection import BusPort
+from cangauge.bus.connection import BusConnection
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.publish import FrameIds, SocPublisher, standard_filter
@@ -174,7 +174,7 @@ def test_a_frame_lost_on_the_way_does_not_pass_unnoticed() -> None:
     bus = LossyBus(open_bus(BusAddress("virtual", "lossy"), SOC_FRAMES), {200, 400, 401, 402})
     source = LogSource(short_log(30.0), load_vehicle("leaf_aze0"))
     with virtual_service("lossy", REPLAYED, vehicle=load_vehicle("leaf_aze0")) as service:
-        port = BusPort(bus, "lossy")  # type: ignore[arg-type] # has what is used of a bus
+        port = BusConnection(bus, "lossy")  # type: ignore[arg-type] # has what is used of a bus
         with port, pytest.raises(CangaugeError, match="of 300 samples sent have been processed"):
             play(port, source, settings, stop=never)
         assert service.gauge.counts.lost > 0
@@ -202,7 +202,7 @@ def test_frames_under_way_are_bounded() -> None:
                     receiver.send(publisher.detail_frame(NOTHING_YET, samples))
 
     thread = threading.Thread(target=receive)
-    with BusPort(bus, "window") as port:
+    with BusConnection(bus, "window") as port:
         thread.start()
         source = LogSource(short_log(50.0), load_vehicle("generic"))
         state = play(port, source, MAX, stop=never)

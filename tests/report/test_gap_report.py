@@ -16,7 +16,7 @@ from cangauge.errors import InputError
 from cangauge.identify.fit import fit
 from cangauge.identify.rows import FitOptions
 from cangauge.logs.log import Log
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH
 from cangauge.report.diagnosis import gap_page, share_figures
 from cangauge.report.page import Beside, Bullets, Figure, Page, Section, Table, render
@@ -42,7 +42,7 @@ def day(seed: int) -> Log:
 
 
 @pytest.fixture(scope="module")
-def model() -> ModelFile:
+def model() -> Model:
     logs = [synthetic_log(noise_v=0.5, seed=seed) for seed in (1, 2)]
     return fit(logs, FitOptions(capacity_ah=CAPACITY_AH)).model
 
@@ -53,7 +53,7 @@ def references() -> list[Log]:
 
 
 @pytest.fixture(scope="module")
-def offset(model: ModelFile, references: list[Log]) -> Diagnosis:
+def offset(model: Model, references: list[Log]) -> Diagnosis:
     logs = [replace(day(seed), current_a=day(seed).current_a + 6.0) for seed in (21, 22)]
     return diagnose(logs, model, references)
 
@@ -187,7 +187,7 @@ def test_page_is_small_and_loads_nothing(page: Page) -> None:
     assert render(page).count("<figure>") == text.count("<figure>") == len(figures(page))
 
 
-def test_a_poor_log_is_told_first_what_it_cannot_show(model: ModelFile) -> None:
+def test_a_poor_log_is_told_first_what_it_cannot_show(model: Model) -> None:
     short = synthetic_log(hours=0.15, start_pct=70.0, end_pct=68.0, noise_v=0.5, name="stub")
     short = replace(short, temperature_c=np.full(len(short), 23.0))
     found = diagnose([short], model, [])
@@ -203,7 +203,7 @@ def test_a_poor_log_is_told_first_what_it_cannot_show(model: ModelFile) -> None:
     assert any(tile.label == "Floor: model file" for tile in page.tiles)
 
 
-def test_a_coarse_temperature_is_told_of(model: ModelFile) -> None:
+def test_a_coarse_temperature_is_told_of(model: Model) -> None:
     log = synthetic_log(hours=0.5, start_pct=70.0, end_pct=60.0, noise_v=0.5, name="coarse")
     coarse = replace(log, temperature_c=np.round(log.temperature_c))
     told = [" ".join(diagnose([each], model, []).limits) for each in (log, coarse)]
@@ -211,7 +211,7 @@ def test_a_coarse_temperature_is_told_of(model: ModelFile) -> None:
     assert "reported in steps of 1 K" in told[1]
 
 
-def test_a_log_too_short_to_judge_on_is_refused(model: ModelFile) -> None:
+def test_a_log_too_short_to_judge_on_is_refused(model: Model) -> None:
     five = synthetic_log(hours=305.0 / 3600.0, start_pct=70.0, end_pct=69.0, noise_v=0.5)
     with pytest.raises(InputError, match="nothing can be concluded"):
         diagnose([five], model, [])

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import can
 import pytest
 
-from cangauge.bus.connection import UNKNOWN_INTERFACE, InterfaceFacts, Stamps
+from cangauge.bus.connection import UNKNOWN_INTERFACE, BackendCapabilities, Stamps
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.publish import SocDetail, SocEstimate, SocReader
 from cangauge.bus.vehicle import load_vehicle
@@ -157,7 +157,7 @@ def test_a_backlog_is_old_until_it_is_worked_off(
 ) -> None:
     """Stopped from 3.0 to 9.0 s, the service then reads in two seconds what waited meanwhile."""
     desk = Desk(frames_every(0.02, 14.0))
-    desk.facts = InterfaceFacts(stamps, echoes=False, has_error_classes=False)
+    desk.facts = BackendCapabilities(stamps, echoes=False, has_error_classes=False)
     receive = desk.receive_waiting
 
     def stopped(timeout_s: float) -> list[can.Message]:

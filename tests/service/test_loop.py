@@ -10,7 +10,7 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.connection import BusError, BusPort
+from cangauge.bus.connection import BusConnection, BusError
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.publish import SocDetail, SocEstimate, SocReader
 from cangauge.bus.time_source import ClockFrames
@@ -35,7 +35,7 @@ from live import (
 )
 
 
-def send_log(port: BusPort, seconds: float, pause_s: float = 0.0) -> None:
+def send_log(port: BusConnection, seconds: float, pause_s: float = 0.0) -> None:
     encoder = FrameEncoder(load_vehicle("generic"))
     for sample in samples_of(short_log(seconds)):
         for frame in encoder.encode(sample):
@@ -66,7 +66,7 @@ def test_an_estimate_is_published_every_100_ms_also_where_samples_are_slower() -
     assert 18 <= len(frames) <= 30
 
 
-def collect_queue(port: BusPort) -> list[can.Message]:
+def collect_queue(port: BusConnection) -> list[can.Message]:
     found = []
     while (message := port.receive(0.01)) is not None:
         found.append(message)
@@ -141,7 +141,7 @@ def test_a_replays_clock_on_the_bus_is_warned_of_once_and_not_recorded(tmp_path:
 
 def serve_on(bus: BrokenBus, seconds: float) -> Service:
     gauge = Gauge(load_vehicle("generic"), leaf_model(), GaugeSettings())
-    port = BusPort(bus, "fake bus")  # type: ignore[arg-type] # has what a bus is used for
+    port = BusConnection(bus, "fake bus")  # type: ignore[arg-type] # has what a bus is used for
     with Service(port, gauge, LoopSettings(duration_s=seconds)) as service:
         service.join(5.0)
     return service

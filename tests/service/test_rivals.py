@@ -8,11 +8,11 @@ import time
 import can
 import pytest
 
-from cangauge.bus.connection import BusPort, interface_facts
+from cangauge.bus.connection import BusConnection, backend_capabilities
 from cangauge.bus.open import bus_address, open_bus
 from cangauge.bus.publish import FrameIds
 from cangauge.bus.vehicle import load_vehicle
-from cangauge.service.loop import AGAIN_S, Rivals
+from cangauge.service.loop import AGAIN_S, DuplicateSenderDetector
 from cangauge.service.pipeline import Gauge, GaugeSettings
 from live import Service, leaf_model, virtual_service, waits
 
@@ -48,7 +48,7 @@ def multicast_service(port: int) -> Service:
     gauge = Gauge(load_vehicle("generic"), leaf_model())
     address = bus_address("udp_multicast", options={"port": port})
     bus = open_bus(address, gauge.filters)
-    return Service(BusPort(bus, str(address), interface_facts(address)), gauge)
+    return Service(BusConnection(bus, str(address), backend_capabilities(address)), gauge)
 
 
 def test_where_ones_own_frames_come_back_they_are_known() -> None:
@@ -64,7 +64,7 @@ def test_where_ones_own_frames_come_back_they_are_known() -> None:
 @pytest.mark.parametrize("echoes", [False, True])
 def test_even_the_very_same_frames_of_another_are_noticed(echoes: bool) -> None:
     warnings = list[str]()
-    rivals = Rivals(FrameIds(), echoes=echoes, warn=warnings.append)
+    rivals = DuplicateSenderDetector(FrameIds(), echoes=echoes, warn=warnings.append)
     for number in range(4):
         mine = frame(data=bytes([number] * 8))
         rivals.sent(mine)
@@ -77,7 +77,7 @@ def test_even_the_very_same_frames_of_another_are_noticed(echoes: bool) -> None:
 
 def test_a_single_frame_is_no_service_and_one_that_stays_is_mentioned_again() -> None:
     warnings = list[str]()
-    rivals = Rivals(FrameIds(), echoes=False, warn=warnings.append)
+    rivals = DuplicateSenderDetector(FrameIds(), echoes=False, warn=warnings.append)
     for time_s in (0.0, 10.0, 20.0):
         assert rivals.takes(frame(), time_s)
     assert warnings == []
@@ -89,7 +89,7 @@ def test_a_single_frame_is_no_service_and_one_that_stays_is_mentioned_again() ->
 
 
 def test_an_echo_that_is_lost_does_not_make_the_next_one_a_rival() -> None:
-    rivals = Rivals(FrameIds(), echoes=True)
+    rivals = DuplicateSenderDetector(FrameIds(), echoes=True)
     for number in range(200):
         rivals.sent(frame(data=bytes([number] * 8)))
         if number % 3:

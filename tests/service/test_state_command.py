@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.bus.connection import BusPort
+from cangauge.bus.connection import BusConnection
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.publish import SocEstimate, SocReader, standard_filter
@@ -34,7 +34,7 @@ PORT = 43_821
 BUS = ("--interface", "udp_multicast", "--channel", ADDRESS, "--bus-option", f"port={PORT}")
 
 
-def drive(port: BusPort, first: int, after: int) -> None:
+def drive(port: BusConnection, first: int, after: int) -> None:
     encoder = FrameEncoder(load_vehicle("generic"))
     for sample in list(samples_of(short_log(100.0)))[first:after]:
         for frame in encoder.encode(sample):
@@ -58,7 +58,7 @@ def test_stopped_killed_and_started_again(tmp_path: Path) -> None:
     path = tmp_path / "state.json"
     wanted = [standard_filter(0x5A0)]
     address = BusAddress("udp_multicast", ADDRESS, {"port": PORT})
-    with BusPort(open_bus(address, wanted), "bus") as port:
+    with BusConnection(open_bus(address, wanted), "bus") as port:
         service = run(path)
         drive(port, 0, 100)
         assert waits(

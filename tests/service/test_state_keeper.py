@@ -23,7 +23,7 @@ from cangauge.bus.vehicle import load_vehicle
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate, Reason, Sample, Status
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 from cangauge.service import state as state_keeper
 from cangauge.service.pipeline import Gauge, GaugeSettings
 from cangauge.service.state import (
@@ -60,7 +60,7 @@ class Machine:
     path: Path
     clock: Clock = field(default_factory=Clock)
     said: list[str] = field(default_factory=list)
-    model: ModelFile = MODEL
+    model: Model = MODEL
     settings: GaugeSettings = field(default_factory=GaugeSettings)
     max_age_s: float = 86400.0
 
@@ -345,7 +345,7 @@ def test_an_old_one_is_refused(machine: Machine) -> None:
 
 def test_another_models_is_refused(machine: Machine) -> None:
     kept(machine)
-    machine.model = ModelFile.model_validate(MODEL.model_dump() | {"capacity_ah": 51.4})
+    machine.model = Model.model_validate(MODEL.model_dump() | {"capacity_ah": 51.4})
     check_refused(machine, f"of another model ({MODEL.name})")
 
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from cangauge.bus.connection import BusError, BusPort
+from cangauge.bus.connection import BusConnection, BusError
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.errors import CangaugeError
 from cangauge.estimate.offline import samples_of
-from cangauge.service.loop import LoopSettings, Outputs, Upkeep, serve
+from cangauge.service.loop import Housekeeping, LoopSettings, Outputs, serve
 from live import BrokenBus, network_down, short_log, virtual_port, virtual_service
 
 
@@ -71,7 +71,7 @@ def test_a_state_that_cannot_be_saved_is_a_warning(error: Exception) -> None:
 def test_the_state_is_saved_also_when_the_service_breaks() -> None:
     saved = []
     gauge = virtual_service("breaks").gauge
-    port = BusPort(BrokenBus([network_down()]), "fake")  # type: ignore[arg-type] # has what is used
+    port = BusConnection(BrokenBus([network_down()]), "fake")  # type: ignore[arg-type] # has what is used
     with pytest.raises(BusError):
         serve(
             port, gauge, LoopSettings(), Outputs(checkpoint=lambda: saved.append(1)), lambda: False
@@ -85,7 +85,7 @@ def test_frames_lost_in_the_receive_queue_are_told_as_they_come() -> None:
         queue_drops: int | None = None
 
     port, said = Port(), list[str]()
-    upkeep = Upkeep(port, warn=said.append)  # type: ignore[arg-type] # all that is looked at
+    upkeep = Housekeeping(port, warn=said.append)  # type: ignore[arg-type] # all that is looked at
     upkeep.look(1.0)
     port.queue_drops = 7
     upkeep.look(1.05)  # too soon to look

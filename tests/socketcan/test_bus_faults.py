@@ -18,11 +18,11 @@ from typing import Self
 import can
 import pytest
 
-from cangauge.bus.connection import BusPort
+from cangauge.bus.connection import BusConnection
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, has_socketcan, open_bus
 from cangauge.bus.publish import SocDetail, SocEstimate, SocReader, standard_filter
-from cangauge.bus.reconnect import LONGEST_PAUSE_S, LastingPort
+from cangauge.bus.reconnect import LONGEST_PAUSE_S, ReconnectingBus
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.offline import samples_of
@@ -70,13 +70,13 @@ class Lasting(Service):
         known = GaugeSettings(EstimatorSettings(initial_soc_pct=80.0))
         gauge = Gauge(load_vehicle("generic"), leaf_model(), known)
         self.lines: list[str] = []
-        port = LastingPort(address, gauge.filters, self.lines.append)
+        port = ReconnectingBus(address, gauge.filters, self.lines.append)
         port.open(wait=wait)
         super().__init__(port, gauge, LoopSettings(timeout_s=STALE_S))
 
     @property
-    def lasting(self) -> LastingPort:
-        assert isinstance(self.port, LastingPort)
+    def lasting(self) -> ReconnectingBus:
+        assert isinstance(self.port, ReconnectingBus)
         return self.port
 
 
@@ -99,7 +99,7 @@ class Pack:
 
     def _run(self) -> None:
         encoder = FrameEncoder(load_vehicle("generic"))
-        port = LastingPort(self._address, [], lambda _line: None)
+        port = ReconnectingBus(self._address, [], lambda _line: None)
         port.open(wait=True)
         with port:
             for sample in samples_of(short_log(600.0)):
@@ -278,7 +278,10 @@ def test_two_thousand_error_frames_keep_nothing_from_the_estimate() -> None:
 
 
 def test_the_kernel_stamps_when_a_frame_comes_in_and_not_when_it_is_read() -> None:
-    with BusPort(open_bus(VCAN), "receiver") as port, BusPort(open_bus(VCAN), "sender") as sender:
+    with (
+        BusConnection(open_bus(VCAN), "receiver") as port,
+        BusConnection(open_bus(VCAN), "sender") as sender,
+    ):
         before_s = time.time()
         sender.send(can.Message(arbitration_id=0x123, is_extended_id=False))
         sent_s = time.time()
@@ -358,7 +361,10 @@ def _overflow() -> int:
     """Send until a receive queue as large as the service's has overflowed; return how many."""
     encoder, sent = FrameEncoder(load_vehicle("generic")), 0
     frames = [frame for each in samples_of(short_log(200.0)) for frame in encoder.encode(each)]
-    with BusPort(open_bus(VCAN), "witness") as witness, BusPort(open_bus(VCAN, []), "tx") as sender:
+    with (
+        BusConnection(open_bus(VCAN), "witness") as witness,
+        BusConnection(open_bus(VCAN, []), "tx") as sender,
+    ):
         while not witness.queue_drops:
             for frame in frames:
                 sender.send(frame)

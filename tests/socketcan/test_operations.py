@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cangauge.bus.connection import BusPort
+from cangauge.bus.connection import BusConnection
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, has_socketcan, open_bus
 from cangauge.bus.vehicle import load_vehicle
@@ -44,8 +44,8 @@ def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
     encoder = FrameEncoder(load_vehicle("generic"))
     frames = [encoder.encode(sample) for sample in samples_of(short_log(50.0))]
     with (
-        BusPort(open_bus(VCAN, gauge.filters), "vcan0") as port,
-        BusPort(open_bus(VCAN, []), "sender") as sender,
+        BusConnection(open_bus(VCAN, gauge.filters), "vcan0") as port,
+        BusConnection(open_bus(VCAN, []), "sender") as sender,
         Recorder(tmp_path / "seen.blf", RecordLimits(part_bytes=5_000)) as recorder,
     ):
         monitor = Monitor(gauge, port, identity=IDENTITY, notifier=Notifier(), record=recorder)

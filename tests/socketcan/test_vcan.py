@@ -14,7 +14,7 @@ import can
 import numpy as np
 import pytest
 
-from cangauge.bus.connection import BusPort, NothingWaitsError, waiting_frames
+from cangauge.bus.connection import BusConnection, NothingWaitsError, pending_frames
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, has_socketcan, open_bus
 from cangauge.bus.publish import FrameIds, SocEstimate, SocReader, standard_filter
@@ -54,14 +54,16 @@ def _vcan0() -> None:
 
 
 @pytest.fixture
-def replay_port() -> Iterator[BusPort]:
-    with BusPort(open_bus(VCAN, SOC_FRAMES), str(VCAN)) as port:
+def replay_port() -> Iterator[BusConnection]:
+    with BusConnection(open_bus(VCAN, SOC_FRAMES), str(VCAN)) as port:
         yield port
 
 
 def service(preset: str, settings: GaugeSettings, record: Recorder | None = None) -> Service:
     gauge = Gauge(load_vehicle(preset), leaf_model(), settings)
-    return Service(BusPort(open_bus(VCAN, gauge.filters), str(VCAN)), gauge, LoopSettings(), record)
+    return Service(
+        BusConnection(open_bus(VCAN, gauge.filters), str(VCAN)), gauge, LoopSettings(), record
+    )
 
 
 @pytest.mark.parametrize("filters", [None, SOC_FRAMES], ids=["all", "filtered"])
@@ -88,7 +90,7 @@ def test_frames_read_without_asking_are_those_of_python_can(
         open_bus(address, []) as sender,
         socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw,
     ):
-        waiting = waiting_frames(ours)
+        waiting = pending_frames(ours)
         assert waiting is not None
         for frame in sent:
             sender.send(frame)
@@ -114,7 +116,7 @@ def test_the_default_bus_is_vcan0() -> None:
 
 @pytest.mark.parametrize("preset", ["generic", "leaf_aze0"])
 def test_a_log_at_full_speed_within_the_bound_and_bit_for_bit(
-    replay_port: BusPort, tmp_path: Path, preset: str
+    replay_port: BusConnection, tmp_path: Path, preset: str
 ) -> None:
     log, vehicle, path = short_log(60.0), load_vehicle(preset), tmp_path / "vcan0.log"
     estimator = EstimatorSettings(initial_soc_pct=80.0)
@@ -133,7 +135,9 @@ def test_a_log_at_full_speed_within_the_bound_and_bit_for_bit(
     assert np.array_equal(recorded.table.residual_v, residual, equal_nan=True)
 
 
-def test_in_real_time_the_kernels_stamps_are_bus_time(replay_port: BusPort, tmp_path: Path) -> None:
+def test_in_real_time_the_kernels_stamps_are_bus_time(
+    replay_port: BusConnection, tmp_path: Path
+) -> None:
     log, path = short_log(6.01), tmp_path / "vcan0.log"
     with Recorder(path) as recorder, service("generic", GaugeSettings(), recorder) as live:
         state = play(
@@ -167,7 +171,7 @@ def test_the_kernel_filters_the_wanted_ids() -> None:
     bus.shutdown()
 
 
-def test_unwanted_traffic_costs_no_wanted_frame(replay_port: BusPort, tmp_path: Path) -> None:
+def test_unwanted_traffic_costs_no_wanted_frame(replay_port: BusConnection, tmp_path: Path) -> None:
     """2,000 unwanted frames for 100 wanted ones, as fast as they can be sent."""
     encoder, path = FrameEncoder(load_vehicle("leaf_aze0")), tmp_path / "busy.log"
     time_s = 1.7e9
@@ -194,7 +198,7 @@ def test_unwanted_traffic_costs_no_wanted_frame(replay_port: BusPort, tmp_path: 
     assert live.gauge.counts.frames < 150  # the rest never left the kernel
 
 
-def test_what_is_published_can_be_read_by_others(replay_port: BusPort) -> None:
+def test_what_is_published_can_be_read_by_others(replay_port: BusConnection) -> None:
     listener = can.Bus("vcan0", interface="socketcan", ignore_config=True, can_filters=SOC_FRAMES)
     with service("generic", GaugeSettings(time_source="replay-clock")) as live:
         log = short_log(20.0)

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from cangauge._typing import FloatArray
 from cangauge.bus.captures.capture import CLOCK_ID, CLOCK_PERIOD_S, Capture, open_capture
 from cangauge.bus.captures.files import CaptureInfo
-from cangauge.bus.decoder import Counters, SampleAssembler
+from cangauge.bus.decoder import FrameStatistics, SampleDecoder
 from cangauge.bus.time_source import TimeSource, TimeSourceName, time_source
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.validity import Sample
 from cangauge.logs.log import Log
-from cangauge.logs.sign import settle_sign
+from cangauge.logs.sign import resolve_sign
 from cangauge.logs.units import refuse_wrong_units
 
 VOLTAGE_FILL_S: Final = 1.0
@@ -44,7 +44,7 @@ class CaptureSamples:
         [V], [°C]; NaN where the sample has none.
     soc_pct : array of shape (n,)
         The car's own SoC when the sample was made [%]; NaN where there is none.
-    counters : Counters
+    counters : FrameStatistics
         Fate of the frames of that bus.
     info : CaptureInfo
         What reading the file showed.
@@ -57,7 +57,7 @@ class CaptureSamples:
     voltage_v: FloatArray
     temperature_c: FloatArray
     soc_pct: FloatArray
-    counters: Counters
+    counters: FrameStatistics
     info: CaptureInfo
     remarks: tuple[str, ...]
 
@@ -75,7 +75,7 @@ class _Bus:
     """One of the buses in a capture: its own assembler, and what came out of it."""
 
     def __init__(self, vehicle: Vehicle) -> None:
-        self.assembler = SampleAssembler(vehicle)
+        self.assembler = SampleDecoder(vehicle)
         self._values = array("d")
 
     def __len__(self) -> int:
@@ -201,7 +201,7 @@ def capture_to_log(
         remarks=tuple(remarks),
     )
     _check_values(log, vehicle)
-    return settle_sign(log, stored_sign_unknown=False)
+    return resolve_sign(log, stored_sign_unknown=False)
 
 
 def _decode(capture: Capture, vehicle: Vehicle, clock: TimeSource) -> dict[Channel | None, _Bus]:
@@ -236,7 +236,7 @@ def _no_samples(path: Path, vehicle: Vehicle, bus: _Bus | None) -> InputError:
     )
 
 
-def _fate(counters: Counters) -> list[str]:
+def _fate(counters: FrameStatistics) -> list[str]:
     """Return in words what was refused and lost."""
     told = []
     for count, text in (

@@ -58,7 +58,7 @@ _LINUX: Final = sys.platform == "linux"
 
 
 @dataclass(frozen=True)
-class InterfaceFacts:
+class BackendCapabilities:
     """What an interface does.
 
     Parameters
@@ -78,20 +78,20 @@ class InterfaceFacts:
     has_error_classes: bool
 
 
-UNKNOWN_INTERFACE: Final = InterfaceFacts("driver", echoes=False, has_error_classes=False)
+UNKNOWN_INTERFACE: Final = BackendCapabilities("driver", echoes=False, has_error_classes=False)
 
 
-def interface_facts(address: BusAddress) -> InterfaceFacts:
+def backend_capabilities(address: BusAddress) -> BackendCapabilities:
     """Return what the interface of an address does."""
     asked = bool(address.options.get("receive_own_messages", False))
     if address.interface == "socketcan":
-        return InterfaceFacts("kernel", echoes=asked, has_error_classes=True)
+        return BackendCapabilities("kernel", echoes=asked, has_error_classes=True)
     if address.interface == "udp_multicast":
         # Elsewhere python-can stamps when it reads.
         stamps: Stamps = "kernel" if _LINUX else "driver"
-        return InterfaceFacts(stamps, echoes=True, has_error_classes=False)
+        return BackendCapabilities(stamps, echoes=True, has_error_classes=False)
     stamps = "sender" if address.interface == "virtual" else "driver"
-    return InterfaceFacts(stamps, echoes=asked, has_error_classes=False)
+    return BackendCapabilities(stamps, echoes=asked, has_error_classes=False)
 
 
 # --- What SocketCAN's error frames tell (linux/can/error.h)
@@ -187,7 +187,7 @@ class NothingWaitsError(Exception):
     """No frame is waiting in the socket."""
 
 
-class WaitingFrames(Protocol):
+class PendingFrames(Protocol):
     """Reads what waits in a bus's socket."""
 
     def next(self) -> can.Message | None:
@@ -210,7 +210,7 @@ class WaitingFrames(Protocol):
         """Let go of the socket; the bus stays open."""
 
 
-def waiting_frames(bus: can.BusABC) -> WaitingFrames | None:
+def pending_frames(bus: can.BusABC) -> PendingFrames | None:
     """Return what reads the frames that wait; None where the interface's socket is not known."""
     if sys.platform != "linux":
         return None
@@ -339,7 +339,7 @@ class BusError(CangaugeError):
     """The bus failed while in use (interface down, adapter unplugged)."""
 
 
-class BusPort:
+class BusConnection:
     """A bus in use.
 
     Parameters
@@ -348,7 +348,7 @@ class BusPort:
         Closed by `close`, or at the end of a `with` block; None: there is none at present.
     name : str
         For messages.
-    facts : InterfaceFacts, optional
+    facts : BackendCapabilities, optional
         What its interface does.
 
     Attributes
@@ -367,10 +367,10 @@ class BusPort:
     """
 
     def __init__(
-        self, bus: can.BusABC | None, name: str, facts: InterfaceFacts = UNKNOWN_INTERFACE
+        self, bus: can.BusABC | None, name: str, facts: BackendCapabilities = UNKNOWN_INTERFACE
     ) -> None:
         self._bus: can.BusABC | None = None
-        self._waiting: WaitingFrames | None = None
+        self._waiting: PendingFrames | None = None
         self._is_empty = True
         self._failed: BusError | None = None
         self.name = name
@@ -453,7 +453,7 @@ class BusPort:
             self._sort_out(error)
         return self._read(self._waiting)
 
-    def _read(self, waiting: WaitingFrames) -> list[can.Message]:
+    def _read(self, waiting: PendingFrames) -> list[can.Message]:
         found: list[can.Message] = []
         self._is_empty = False
         take_next = waiting.next
@@ -565,7 +565,7 @@ class BusPort:
         self.garbled += 1
 
     def _use(self, bus: can.BusABC) -> None:
-        self._bus, self._waiting = bus, waiting_frames(bus)
+        self._bus, self._waiting = bus, pending_frames(bus)
         self._is_empty, self._failed = True, None
 
     def _open_bus(self) -> can.BusABC:

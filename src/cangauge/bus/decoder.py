@@ -36,7 +36,7 @@ import can
 
 from cangauge.bus.plausibility import Fault, Pack, SignalChecks, SignalHealth, Still, StuckPair
 from cangauge.bus.protection import FrameChecker, Verdict
-from cangauge.bus.vehicle import EXTENDED, BoundSignal, Vehicle
+from cangauge.bus.vehicle import EXTENDED, Vehicle, VehicleSignal
 from cangauge.estimate.validity import (
     CURRENT_AT_MOST_A,
     TEMPERATURE_WITHIN_C,
@@ -49,7 +49,7 @@ from cangauge.estimate.validity import (
 
 
 @dataclass(slots=True)
-class MessageCounters:
+class MessageStatistics:
     """Fate of the frames of one wanted message."""
 
     wanted: int = 0
@@ -75,16 +75,16 @@ class MessageCounters:
 
 
 @dataclass(slots=True)
-class Counters:
+class FrameStatistics:
     """Fate of all frames.
 
     Parameters
     ----------
-    messages : dict of int to MessageCounters
+    messages : dict of int to MessageStatistics
         By key: arbitration id, plus `vehicle.EXTENDED` for an extended one.
     """
 
-    messages: dict[int, MessageCounters] = field(default_factory=dict)
+    messages: dict[int, MessageStatistics] = field(default_factory=dict)
     frames: int = 0
     """Frames handed over, wanted or not."""
     ignored: int = 0
@@ -291,10 +291,10 @@ class SignalGate:
 
     Parameters
     ----------
-    signal : BoundSignal
+    signal : VehicleSignal
     health : SignalHealth
     is_stuck : Watch, optional
-    fate : MessageCounters
+    fate : MessageStatistics
         Where it is counted what became of a value.
     """
 
@@ -302,10 +302,10 @@ class SignalGate:
 
     def __init__(
         self,
-        signal: BoundSignal,
+        signal: VehicleSignal,
         health: SignalHealth,
         is_stuck: Watch | None,
-        fate: MessageCounters,
+        fate: MessageStatistics,
     ) -> None:
         codec = signal.codec
         self._decode = codec.decode
@@ -327,7 +327,7 @@ class SignalGate:
         """
         if self._is_in is not None and not self._is_in(payload):
             return math.nan
-        value = self._gain * self._decode(payload) + self._offset  # as `BoundSignal.decode`
+        value = self._gain * self._decode(payload) + self._offset  # as `VehicleSignal.decode`
         health, is_stuck = self._health, self._is_stuck
         fault = health.judge(value, time_s)
         if fault is _NO_FAULT:
@@ -378,7 +378,7 @@ class InputHealth:
         """Return what is known of one signal."""
         return self._of[role]
 
-    def gate(self, signal: BoundSignal, fate: MessageCounters) -> SignalGate:
+    def gate(self, signal: VehicleSignal, fate: MessageStatistics) -> SignalGate:
         """Return what reads a signal's values; what becomes of them is counted in `fate`."""
         return SignalGate(signal, self._of[signal.role], self._watch(signal), fate)
 
@@ -418,7 +418,7 @@ class InputHealth:
                     reasons |= _WHY[health.fault]
         return reasons
 
-    def _watch(self, signal: BoundSignal) -> Watch | None:
+    def _watch(self, signal: VehicleSignal) -> Watch | None:
         """Return what notices that a signal is stuck; None where nothing can."""
         if signal.role == "temperature" and signal.checks.stuck_after_s < math.inf:
             return _StillFor(signal.checks.stuck_after_s)
@@ -480,14 +480,14 @@ class _Route:
 
     length: int
     checker: FrameChecker | None
-    counters: MessageCounters
+    counters: MessageStatistics
     take_fast: Callable[[bytearray, float], Sample | None] | None = None
     """Takes a payload and its bus time [s], if there is current or voltage in it."""
     slow: tuple[SignalGate, ...] = ()
     last_s: float = -math.inf
 
 
-class SampleAssembler:
+class SampleDecoder:
     """Makes samples from a vehicle's frames; pure, driven by the frames' time stamps alone.
 
     Refused are frames with a wrong CRC, with a counter that stands still, or that are too short,
@@ -510,7 +510,7 @@ class SampleAssembler:
         What is known of the signals; to be read only.
     wanted_ids : tuple of int
         Arbitration ids worth receiving, for filters in the kernel (see `Vehicle.filters`).
-    counters : Counters
+    counters : FrameStatistics
         What happened to the frames so far.
     """
 
@@ -523,15 +523,17 @@ class SampleAssembler:
         self._routes: dict[int, _Route] = {}
         for signal in vehicle.signals:
             self._add(signal)
-        self._counters = Counters({key: route.counters for key, route in self._routes.items()})
+        self._counters = FrameStatistics(
+            {key: route.counters for key, route in self._routes.items()}
+        )
         self._now_s = -math.inf
 
-    def _add(self, signal: BoundSignal) -> None:
+    def _add(self, signal: VehicleSignal) -> None:
         route = self._routes.get(signal.key)
         if route is None:
             message = self.vehicle.messages[signal.key]
             checker = None if message.rule is None else FrameChecker(message.rule, message.period_s)
-            route = _Route(signal.length, checker, MessageCounters())
+            route = _Route(signal.length, checker, MessageStatistics())
             self._routes[signal.key] = route
         gate = self.health.gate(signal, route.counters)
         if signal.role == "current":
@@ -558,7 +560,7 @@ class SampleAssembler:
         return self._now_s
 
     @property
-    def counters(self) -> Counters:
+    def counters(self) -> FrameStatistics:
         """What happened to the frames so far; kept up to date."""
         self._counters.current_unpaired = self._pairing.current_unpaired
         self._counters.voltage_unpaired = self._pairing.voltage_unpaired

@@ -13,7 +13,7 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.bus.database import Condition
 from cangauge.bus.protection import Protection
-from cangauge.bus.vehicle import BoundSignal, Vehicle
+from cangauge.bus.vehicle import Vehicle, VehicleSignal
 from cangauge.errors import InputError
 from cangauge.estimate.validity import Sample
 from cangauge.logs.log import Log
@@ -36,7 +36,7 @@ _UNITS: Final = {"current": "A", "voltage": "V", "temperature": "°C", "soc_refe
 class _Outgoing:
     """One frame to send: signals of one message that can stand in one payload."""
 
-    signals: tuple[BoundSignal, ...]
+    signals: tuple[VehicleSignal, ...]
     rule: Protection | None
     is_slow: bool
     last: bytes = b""
@@ -51,7 +51,7 @@ class _Outgoing:
 
 
 class FrameEncoder:
-    """Makes frames of samples; the inverse of `SampleAssembler`.
+    """Makes frames of samples; the inverse of `SampleDecoder`.
 
     Slow signals (temperature, SoC) go first, so that a sample finds its own temperature, then
     current, then voltage. Slow ones are sent when their value as a frame carries it changes, and
@@ -176,7 +176,7 @@ class FrameEncoder:
             soc_pct=sent.get("soc_pct", log.soc_pct),
         )
 
-    def _columns(self, log: Log) -> list[tuple[BoundSignal, str, FloatArray]]:
+    def _columns(self, log: Log) -> list[tuple[VehicleSignal, str, FloatArray]]:
         found = []
         for signal in self.vehicle.signals:
             values = getattr(log, _FIELDS[signal.role])
@@ -187,7 +187,7 @@ class FrameEncoder:
 
 def _plan(vehicle: Vehicle) -> list[_Outgoing]:
     """Return the frames of one sample, slow ones first."""
-    groups: dict[tuple[int, tuple[Condition, ...]], list[BoundSignal]] = {}
+    groups: dict[tuple[int, tuple[Condition, ...]], list[VehicleSignal]] = {}
     for signal in vehicle.signals:
         groups.setdefault((signal.key, signal.codec.conditions), []).append(signal)
     frames = []

@@ -1,6 +1,6 @@
 """A bus that may go and come back: interface down, removed or not there yet, adapter unplugged.
 
-`LastingPort` never raises once it is open. While the bus is away, receiving waits and returns
+`ReconnectingBus` never raises once it is open. While the bus is away, receiving waits and returns
 nothing, frames to send are counted and dropped, and opening is tried again and again with growing
 pauses, in a thread of its own since some drivers take seconds for it.
 """
@@ -18,7 +18,7 @@ import can
 from can.typechecking import CanFilter
 
 from cangauge._logging import Voice
-from cangauge.bus.connection import SEND_WITHIN_S, BusError, BusPort, interface_facts
+from cangauge.bus.connection import SEND_WITHIN_S, BusConnection, BusError, backend_capabilities
 from cangauge.bus.open import BusAddress, DriverMissingError, open_bus
 from cangauge.errors import InputError
 
@@ -37,7 +37,7 @@ _Received = TypeVar("_Received")
 Opener = Callable[[BusAddress, Sequence[CanFilter] | None], can.BusABC]
 
 
-class LastingPort(BusPort):
+class ReconnectingBus(BusConnection):
     """A bus in use that is opened again when it was lost.
 
     Parameters
@@ -62,7 +62,7 @@ class LastingPort(BusPort):
         say: Callable[[str], None],
         opener: Opener = open_bus,
     ) -> None:
-        super().__init__(None, str(address), interface_facts(address))
+        super().__init__(None, str(address), backend_capabilities(address))
         self.losses = 0
         self._address = address
         self._filters = list(filters)

@@ -68,7 +68,7 @@ EXTENDED: Final = 1 << 31
 
 
 @dataclass(frozen=True, slots=True)
-class BoundSignal:
+class VehicleSignal:
     """One of a vehicle's signals: where it is in which frame, and what it means.
 
     Parameters
@@ -142,7 +142,7 @@ class BoundSignal:
 
 
 @dataclass(frozen=True, slots=True)
-class MessageRule:
+class MessageProtection:
     """Protection and period of one message."""
 
     rule: Protection | None
@@ -156,31 +156,31 @@ class Vehicle:
     Parameters
     ----------
     name : str
-    current, voltage : BoundSignal
-    temperature, soc_reference : BoundSignal or None
+    current, voltage : VehicleSignal
+    temperature, soc_reference : VehicleSignal or None
     fixed_temperature_c : float
         Temperature where no signal gives it [°C]; NaN: none.
     temperature_source : {"cell", "pack", "coolant", "room", "unknown"}
     pair_within_s : float
         Current and voltage at most this far apart in bus time belong together [s].
-    messages : dict of int to MessageRule
+    messages : dict of int to MessageProtection
         By key (id, plus `EXTENDED`), for every message with a wanted signal.
     dbc_files : tuple of str
     """
 
     name: str
-    current: BoundSignal
-    voltage: BoundSignal
-    temperature: BoundSignal | None
-    soc_reference: BoundSignal | None
+    current: VehicleSignal
+    voltage: VehicleSignal
+    temperature: VehicleSignal | None
+    soc_reference: VehicleSignal | None
     fixed_temperature_c: float
     temperature_source: TemperatureSource
     pair_within_s: float
-    messages: dict[int, MessageRule]
+    messages: dict[int, MessageProtection]
     dbc_files: tuple[str, ...]
 
     @property
-    def signals(self) -> tuple[BoundSignal, ...]:
+    def signals(self) -> tuple[VehicleSignal, ...]:
         """All signals that there are: current, voltage, temperature, reference SoC."""
         found = (self.current, self.voltage, self.temperature, self.soc_reference)
         return tuple(signal for signal in found if signal is not None)
@@ -564,7 +564,7 @@ class _Binder:
         self._overrides = overrides
         self._found: dict[int, Message] = {}
 
-    def signal(self, role: Role, wanted: SignalMap) -> BoundSignal:
+    def signal(self, role: Role, wanted: SignalMap) -> VehicleSignal:
         message, signal, file = self._find(role, wanted)
         codec = signal_codec(
             message,
@@ -577,7 +577,7 @@ class _Binder:
         key = message.frame_id | (EXTENDED if message.is_extended_frame else 0)
         self._found[key] = message
         factor, offset = self._unit(role, wanted, codec)
-        return BoundSignal(
+        return VehicleSignal(
             role=role,
             key=key,
             message=message.name,
@@ -589,18 +589,18 @@ class _Binder:
             checks=self._checks(role, wanted),
         )
 
-    def messages(self) -> dict[int, MessageRule]:
+    def messages(self) -> dict[int, MessageProtection]:
         """Return protection and period of the messages found so far."""
         stated = self._overrides.stated_messages(self._mapping, self._source, self._key)
         own: dict[str, RuleMap] = {**self._mapping.rules, **self._overrides.rules}
-        rules: dict[int, MessageRule] = {}
+        rules: dict[int, MessageProtection] = {}
         for key, message in self._found.items():
             each, source = stated.get(key, (None, self._source))
             period = None if each is None else each.period_s
             if period is None:
                 period = _cycle_s(message)
             rule = None if each is None else choose_rule(message, each, own, source=source)
-            rules[key] = MessageRule(rule, period)
+            rules[key] = MessageProtection(rule, period)
         return rules
 
     def _checks(self, role: Role, wanted: SignalMap) -> SignalChecks:

@@ -49,7 +49,7 @@ from cangauge.logs.log import Log
 from cangauge.logs.read import CaptureGivenError
 from cangauge.model.charge import counted_soc_pct
 from cangauge.model.delay_line import GAP_S
-from cangauge.model.model_file import ModelFile, load_model
+from cangauge.model.model_file import Model, load_model
 from cangauge.report.charts import Recorded, Recording
 from cangauge.service.estimate_table import NUMBERS
 
@@ -136,14 +136,14 @@ class Estimated:
 
 
 def from_log(
-    log: Log, model: ModelFile, settings: EstimatorSettings, *, given: str | None, gap_given: bool
+    log: Log, model: Model, settings: EstimatorSettings, *, given: str | None, gap_given: bool
 ) -> Estimated:
     """Estimate a log.
 
     Parameters
     ----------
     log : Log
-    model : ModelFile
+    model : Model
     settings : EstimatorSettings
         As the user gave them.
     given : str, optional
@@ -175,7 +175,7 @@ def from_log(
 
 
 def from_capture(
-    path: Path, vehicle: Vehicle, model: ModelFile, settings: EstimatorSettings
+    path: Path, vehicle: Vehicle, model: Model, settings: EstimatorSettings
 ) -> Estimated:
     """Estimate a capture, bit for bit as the service does.
 
@@ -224,7 +224,7 @@ def from_capture(
     return Estimated(recording, found.table, scores, settings, origin, facts)
 
 
-def check_same_pack(recorded: Recorded, model: ModelFile) -> None:
+def check_same_pack(recorded: Recorded, model: Model) -> None:
     """Refuse a recording whose voltage shows that the model belongs to another pack.
 
     Raises
@@ -426,7 +426,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     note(f"estimates: {output}" + (f"\nreport: {report}" if report else ""))
 
 
-def _warn(done: Estimated, model: ModelFile) -> None:
+def _warn(done: Estimated, model: Model) -> None:
     """Say on stderr what makes the estimate doubtful as a whole."""
     scores, name = done.scores, done.recorded.source or done.recorded.name
     if scores.valid_fraction < DOUBTFUL_VALID:
@@ -464,7 +464,7 @@ def _start(given: str | None) -> float | None:
         ) from error
 
 
-def _as_json(done: Estimated, model: ModelFile) -> dict[str, Any]:
+def _as_json(done: Estimated, model: Model) -> dict[str, Any]:
     settings = done.settings
     return {
         **vars(done.scores),

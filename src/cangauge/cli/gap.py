@@ -29,7 +29,7 @@ from cangauge.diagnosis.extended_model import model_file_of
 from cangauge.diagnosis.posterior import NONE, UNKNOWN
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
-from cangauge.model.model_file import ModelFile, load_model, model_json
+from cangauge.model.model_file import Model, load_model, model_json
 from cangauge.report.tables import verdict_limit
 
 SHOWN = 5
@@ -151,7 +151,7 @@ def _check_apart(logs: list[Path], references: list[Path]) -> None:
             )
 
 
-def _with_capacity(model: ModelFile, capacity_ah: float) -> ModelFile:
+def _with_capacity(model: Model, capacity_ah: float) -> Model:
     within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
     return model.model_copy(update={"capacity_ah": capacity_ah})
 

@@ -12,7 +12,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 
 from cangauge._formatting import duration, number
 from cangauge.bus.captures.capture import is_capture
-from cangauge.bus.connection import BusPort
+from cangauge.bus.connection import BusConnection
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import bus_address, open_bus, parse_bus_options
 from cangauge.bus.publish import FrameIds, standard_filter
@@ -117,7 +117,7 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
     with ExitStack() as stack:
         stop = stack.enter_context(stop_on_signals())
         filters = [standard_filter(ids.soc_estimate), standard_filter(ids.soc_detail)]
-        port = stack.enter_context(BusPort(open_bus(address, filters), str(address)))
+        port = stack.enter_context(BusConnection(open_bus(address, filters), str(address)))
         note(f"playing {recorded} on {address}, speed {speed}")
         bar = stack.enter_context(_Bar(source, loop=loop)) if console.is_terminal else None
         state = play(
@@ -206,7 +206,7 @@ def _summary_line(state: ReplayState) -> str:
     return text
 
 
-def _as_json(state: ReplayState, port: BusPort, source: Source) -> dict[str, Any]:
+def _as_json(state: ReplayState, port: BusConnection, source: Source) -> dict[str, Any]:
     result: dict[str, Any] = {
         "bus": port.name,
         "frames": state.frames,

@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.bayes_factors import scores
-from cangauge.diagnosis.design_matrix import LogTerms
+from cangauge.diagnosis.design_matrix import DesignMatrix
 from cangauge.diagnosis.linear_gaussian import Evidence, Gram, gather, gram_of
-from cangauge.diagnosis.problem import Settled
+from cangauge.diagnosis.problem import DiagnosisProblem
 from cangauge.estimate.offline import run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.identify.linearized import Prepared, residual
 from cangauge.logs.log import Log
 from cangauge.model.extended import ExtendedModel
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 
 # --- Errors of the diagnosed logs, row by row: with the model as given and with the extended…
 
@@ -42,7 +42,7 @@ class LogErrors:
     """Measured, corrected by what the model knows of the sensors, − extended model [V]."""
 
 
-def errors_before_and_after(settled: Settled, extended: ExtendedModel) -> list[LogErrors]:
+def errors_before_and_after(settled: DiagnosisProblem, extended: ExtendedModel) -> list[LogErrors]:
     """Return the errors of every diagnosed log.
 
     Those after are of rows that the extended model was fitted on; how far the gap shrinks is
@@ -50,7 +50,7 @@ def errors_before_and_after(settled: Settled, extended: ExtendedModel) -> list[L
 
     Parameters
     ----------
-    settled : Settled
+    settled : DiagnosisProblem
     extended : ExtendedModel
         Of the diagnosis (`Extension.model`).
     """
@@ -91,12 +91,12 @@ class Fold:
     """Which of the diagnosed logs, and which rows of it, shape (m,)."""
 
 
-def folds(settled: Settled) -> list[Fold]:
+def folds(settled: DiagnosisProblem) -> list[Fold]:
     """Return the evidence without some rows, in turn, with those rows; none for a log too short.
 
     Parameters
     ----------
-    settled : Settled
+    settled : DiagnosisProblem
     """
     return [
         Fold(gather(settled.frame, settled.reference_grams, fit_on, settled.error), tuple(judged))
@@ -104,12 +104,14 @@ def folds(settled: Settled) -> list[Fold]:
     ]
 
 
-def judge(settled: Settled, held_out: Sequence[Fold], effects: Sequence[str]) -> list[Judged]:
+def judge(
+    settled: DiagnosisProblem, held_out: Sequence[Fold], effects: Sequence[str]
+) -> list[Judged]:
     """Return the errors with some effects added, each fitted without the rows that judge it.
 
     Parameters
     ----------
-    settled : Settled
+    settled : DiagnosisProblem
     held_out : sequence of Fold
         From `folds`.
     effects : sequence of str
@@ -160,12 +162,12 @@ def solution_with(evidence: Evidence, effects: Sequence[str]) -> FloatArray:
     return whole
 
 
-def _volts(terms: LogTerms, solution: FloatArray) -> FloatArray:
+def _volts(terms: DesignMatrix, solution: FloatArray) -> FloatArray:
     return np.column_stack([terms.baseline, *terms.effects]) @ solution
 
 
 def _folds(
-    settled: Settled,
+    settled: DiagnosisProblem,
 ) -> list[tuple[list[Gram], list[tuple[int, NDArray[np.bool_]]]]]:
     logs = settled.diagnosed
     grams = settled.diagnosed_grams
@@ -206,7 +208,7 @@ def closed_fraction(baseline: float, extended: float, floor: float) -> float | N
 
 
 def closed_interval(
-    settled: Settled, judged: Sequence[Judged], floor: float
+    settled: DiagnosisProblem, judged: Sequence[Judged], floor: float
 ) -> tuple[float, float] | None:
     """Return a 95 % interval of the closed fraction, by a bootstrap over pieces of the logs."""
     pieces = []
@@ -246,14 +248,14 @@ TOLD_EVERY_S, TOLD_PART = 60.0, 0.5
 """A log tells its SoC if it does in this part of its minutes: one value is where it starts."""
 
 
-def soc_mae_pct(logs: Sequence[Log], model: ModelFile) -> float | None:
+def soc_mae_pct(logs: Sequence[Log], model: Model) -> float | None:
     """Return the EKF's mean absolute error, initial SoC withheld [%]; None without reference.
 
     Parameters
     ----------
     logs : sequence of Log
         Those that tell their SoC all along are judged.
-    model : ModelFile
+    model : Model
         Plain or extended: what `cangauge run` would run.
     """
     errors = []

@@ -37,7 +37,7 @@ OWN_SLOW_S = 150.0
 
 
 @dataclass(frozen=True, eq=False)
-class LogTerms:
+class DesignMatrix:
     """Everything that the evidence needs of one log; m rows."""
 
     prepared: Prepared
@@ -51,7 +51,7 @@ class LogTerms:
     effects: tuple[FloatArray, ...]
     """Columns of each candidate (of a reference: of those in `Frame.shown`), shape (m, k) each."""
 
-    def at(self, keep: NDArray[np.bool_]) -> LogTerms:
+    def at(self, keep: NDArray[np.bool_]) -> DesignMatrix:
         """Return the terms on some of the rows."""
         return replace(
             self,
@@ -62,12 +62,12 @@ class LogTerms:
         )
 
 
-def log_terms(
+def design_matrix(
     prepared: Prepared,
     model: ExtendedModel,
     choices: Sequence[Candidate],
     acting: ExtendedModel | None = None,
-) -> LogTerms:
+) -> DesignMatrix:
     """Return the terms of one log, with the columns of some candidates.
 
     Parameters
@@ -120,7 +120,7 @@ def log_terms(
     if acting is not None:
         change = acting.model.coefficients - voltage_model.coefficients
         residual_v += baseline @ change + _structure_v(model, acting, choices, effects)
-    return LogTerms(prepared, residual_v, baseline, own, effects)
+    return DesignMatrix(prepared, residual_v, baseline, own, effects)
 
 
 def own_choices(choices: Sequence[Candidate], pack: Pack, prepared: Prepared) -> list[Candidate]:

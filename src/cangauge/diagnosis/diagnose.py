@@ -36,10 +36,10 @@ from cangauge.diagnosis.posterior import (
     Verdict,
     decide,
 )
-from cangauge.diagnosis.problem import Settled, settle
+from cangauge.diagnosis.problem import DiagnosisProblem, build_problem
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 
 EVEN = 0.5
 """A verdict with less is as likely wrong as right."""
@@ -52,7 +52,7 @@ SHOWN = 6
 class Diagnosis:
     """What the diagnosis found."""
 
-    settled: Settled
+    settled: DiagnosisProblem
     verdict: Verdict
     baseline_rmse_v: float
     extended_rmse_v: float
@@ -139,7 +139,7 @@ class Diagnosis:
 
 def diagnose(
     logs: Sequence[Log],
-    model_file: ModelFile,
+    model_file: Model,
     references: Sequence[Log],
     *,
     leave_out: Sequence[str] = (),
@@ -152,7 +152,7 @@ def diagnose(
     ----------
     logs : sequence of Log
         Logs that the model does not explain, sharing one cause.
-    model_file : ModelFile
+    model_file : Model
     references : sequence of Log
         Logs on which the model is known to be good.
     leave_out : sequence of str
@@ -168,7 +168,7 @@ def diagnose(
         If a log cannot be diagnosed: too short, of another pack, counted out of 0–100 %.
     """
     say = progress or _silent
-    settled = settle(
+    settled = build_problem(
         logs,
         model_file,
         references,
@@ -220,7 +220,11 @@ def diagnose(
 
 
 def _candidates(
-    settled: Settled, held_out: Sequence[Fold], verdict: Verdict, floor: float, extension: Extension
+    settled: DiagnosisProblem,
+    held_out: Sequence[Fold],
+    verdict: Verdict,
+    floor: float,
+    extension: Extension,
 ) -> list[dict[str, Any]]:
     result = []
     for number, score in enumerate(verdict.candidates):
@@ -237,7 +241,7 @@ def _candidates(
     return result
 
 
-def _errors(settled: Settled, judged: Sequence[Judged], floor: float) -> dict[str, Any]:
+def _errors(settled: DiagnosisProblem, judged: Sequence[Judged], floor: float) -> dict[str, Any]:
     if not judged:
         return {"rmse_v": None, "closed_fraction": None, "ci": None}
     baseline = rms(np.concatenate([item.baseline_v for item in judged]))
@@ -250,14 +254,14 @@ def _errors(settled: Settled, judged: Sequence[Judged], floor: float) -> dict[st
     }
 
 
-def _floor_v(settled: Settled, model_file: ModelFile) -> float:
+def _floor_v(settled: DiagnosisProblem, model_file: Model) -> float:
     """Return the model's error on the references, or what the model file states without any."""
     if not settled.references:
         return model_file.noise.voltage_rmse_v
     return rms(np.concatenate(settled.given_errors_v[0]))
 
 
-def _observability(settled: Settled) -> list[dict[str, object]]:
+def _observability(settled: DiagnosisProblem) -> list[dict[str, object]]:
     """Return how much of each effect's physical range these logs could show.
 
     `visible` is 1 less the smallest amplitude that would have the evidence of `ACCEPT_LOG_BAYES`,

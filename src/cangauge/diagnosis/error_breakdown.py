@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.cross_validation import DRAWS, PIECE_S, LogErrors
-from cangauge.diagnosis.design_matrix import LogTerms
+from cangauge.diagnosis.design_matrix import DesignMatrix
 
 # --- Where the gap lies: shares of the squared error over SoC, temperature, current, rest an…
 
@@ -53,13 +53,13 @@ class Place:
 
 
 def places(
-    logs: Sequence[LogTerms], errors_v: Sequence[FloatArray], capacity_ah: float
+    logs: Sequence[DesignMatrix], errors_v: Sequence[FloatArray], capacity_ah: float
 ) -> list[Place]:
     """Return the shares of every axis; on each axis they sum to one.
 
     Parameters
     ----------
-    logs : sequence of LogTerms
+    logs : sequence of DesignMatrix
         Diagnosed logs.
     errors_v : sequence of arrays
         Measured − model as given on the rows of each log [V].
@@ -80,7 +80,7 @@ def places(
 
 
 def _axes(
-    logs: Sequence[LogTerms], capacity_ah: float
+    logs: Sequence[DesignMatrix], capacity_ah: float
 ) -> Iterator[tuple[str, str, FloatArray, FloatArray]]:
     rows = [terms.prepared.rows for terms in logs]
     current = np.concatenate([item.delayed_current_a[:, 0] for item in rows])
@@ -141,7 +141,7 @@ def _interval(mine: FloatArray, whole: FloatArray) -> tuple[float, float]:
 
 
 def _time_scales(
-    logs: Sequence[LogTerms], errors_v: Sequence[FloatArray], piece: NDArray[np.intp]
+    logs: Sequence[DesignMatrix], errors_v: Sequence[FloatArray], piece: NDArray[np.intp]
 ) -> list[Place]:
     """Split the residual into bands by moving averages; a band's share is its squares'."""
     bands: list[list[FloatArray]] = [[] for _ in SCALES_S[1:]]
@@ -181,7 +181,7 @@ def _moving_average(values: FloatArray, width: float) -> FloatArray:
     return np.asarray((total[high] - total[low]) / (high - low))
 
 
-def _pieces(logs: Sequence[LogTerms]) -> NDArray[np.intp]:
+def _pieces(logs: Sequence[DesignMatrix]) -> NDArray[np.intp]:
     numbers, first = [], 0
     for terms in logs:
         time_s = terms.prepared.rows.time_s
@@ -239,13 +239,13 @@ class Around:
 
 
 def worst_moments(
-    logs: Sequence[LogTerms], errors_v: Sequence[FloatArray], number: int = MOMENTS
+    logs: Sequence[DesignMatrix], errors_v: Sequence[FloatArray], number: int = MOMENTS
 ) -> list[Moment]:
     """Return the moments with the largest error of all logs, the worst first.
 
     Parameters
     ----------
-    logs : sequence of LogTerms
+    logs : sequence of DesignMatrix
     errors_v : sequence of arrays
         Measured − model on the rows of each log [V].
     number : int

@@ -30,7 +30,7 @@ from scipy.optimize import least_squares
 from cangauge import __version__
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.bayes_factors import Score
-from cangauge.diagnosis.design_matrix import LogTerms
+from cangauge.diagnosis.design_matrix import DesignMatrix
 from cangauge.diagnosis.linear_gaussian import (
     Gram,
     gather,
@@ -39,13 +39,13 @@ from cangauge.diagnosis.linear_gaussian import (
     prior_precision,
     within_bounds,
 )
-from cangauge.diagnosis.problem import Settled
+from cangauge.diagnosis.problem import DiagnosisProblem
 from cangauge.diagnosis.references import needed, with_pieces
 from cangauge.identify.linearized import as_modelled, residual, state_of
 from cangauge.model.effects.base import LEEWAY, Effect, Pack, Values
 from cangauge.model.effects.library import LIBRARY, STEP, Candidate, effect_entries, one_of
 from cangauge.model.extended import ExtendedModel
-from cangauge.model.model_file import Made, ModelFile, Ranges
+from cangauge.model.model_file import Made, Model, Ranges
 
 # --- The moment at which a cause begins: found by trying, since the voltage jumps there
 
@@ -59,13 +59,13 @@ there all along, has next to no rows before or after it: it is a row that is wro
 
 
 def at_moment(
-    logs: Sequence[LogTerms], model: ExtendedModel, effect: Effect, start: Values
+    logs: Sequence[DesignMatrix], model: ExtendedModel, effect: Effect, start: Values
 ) -> dict[str, float]:
     """Return the values with the moments that leave the least mean square of the logs' voltage.
 
     Parameters
     ----------
-    logs : sequence of LogTerms
+    logs : sequence of DesignMatrix
     model : ExtendedModel
         Without the effect.
     effect : Effect
@@ -81,7 +81,7 @@ def at_moment(
 
 
 def _best(
-    logs: Sequence[LogTerms], model: ExtendedModel, effect: Effect, values: Values, name: str
+    logs: Sequence[DesignMatrix], model: ExtendedModel, effect: Effect, values: Values, name: str
 ) -> float:
     states = [state_of(terms.prepared, model) for terms in logs]
     # What the coefficients or a log's own level explain as well is no jump.
@@ -133,7 +133,7 @@ LEAST_ROWS = 30
 
 
 def variance_by_charge(
-    logs: Sequence[LogTerms],
+    logs: Sequence[DesignMatrix],
     scale: FloatArray,
     factors: Sequence[float],
     amplitudes: Callable[[Sequence[Gram]], FloatArray],
@@ -142,7 +142,7 @@ def variance_by_charge(
 
     Parameters
     ----------
-    logs : sequence of LogTerms
+    logs : sequence of DesignMatrix
     scale : array of shape (p,)
         Of the baseline's columns.
     factors : sequence of float
@@ -225,16 +225,16 @@ class AtCause:
     causes: tuple[Cause, ...]
     covariance: FloatArray
     """Of all amplitudes, in order, shape (…, …)."""
-    settled: Settled
+    settled: DiagnosisProblem
     """The common ground with the causes taken off the diagnosed logs' residuals."""
 
 
-def at_causes(settled: Settled, causes: Sequence[Cause]) -> AtCause:
+def at_causes(settled: DiagnosisProblem, causes: Sequence[Cause]) -> AtCause:
     """Return the causes with their most probable amplitudes.
 
     Parameters
     ----------
-    settled : Settled
+    settled : DiagnosisProblem
     causes : sequence of Cause
         Where to begin, one at least.
 
@@ -285,7 +285,7 @@ def at_causes(settled: Settled, causes: Sequence[Cause]) -> AtCause:
     return AtCause(found, covariance, replace(settled, diagnosed=tuple(diagnosed)))
 
 
-def squares(settled: Settled, causes: Sequence[Cause]) -> float:
+def squares(settled: DiagnosisProblem, causes: Sequence[Cause]) -> float:
     """Return the weighed squares that the diagnosed logs keep with some causes."""
     grams = [
         gram_of(_terms_at(terms, settled, causes, tangents=False), settled.frame.scale).weakened(
@@ -297,8 +297,12 @@ def squares(settled: Settled, causes: Sequence[Cause]) -> float:
 
 
 def _terms_at(
-    terms: LogTerms, settled: Settled, causes: Sequence[Cause], *, tangents: bool = True
-) -> LogTerms:
+    terms: DesignMatrix,
+    settled: DiagnosisProblem,
+    causes: Sequence[Cause],
+    *,
+    tangents: bool = True,
+) -> DesignMatrix:
     """Return a diagnosed log's terms with the causes in its residual, and their tangents there."""
     prepared, acting = terms.prepared.remembering(), settled.acting or settled.model
     changed = residual(prepared, with_causes(acting, causes)) - residual(prepared, acting)
@@ -346,12 +350,12 @@ class Extension:
     """Standard deviation of each of their amplitudes."""
 
 
-def extend(settled: Settled, accepted: Sequence[Score]) -> Extension:
+def extend(settled: DiagnosisProblem, accepted: Sequence[Score]) -> Extension:
     """Return the extended model, its cause refined beyond the linear solution.
 
     Parameters
     ----------
-    settled : Settled
+    settled : DiagnosisProblem
     accepted : sequence of Score
     """
     few = _with_needed_structure(settled)
@@ -376,7 +380,7 @@ def extend(settled: Settled, accepted: Sequence[Score]) -> Extension:
     )
 
 
-def _begin(few: Settled, accepted: Sequence[Score]) -> list[Cause]:
+def _begin(few: DiagnosisProblem, accepted: Sequence[Score]) -> list[Cause]:
     """Return the causes by the linear solution and a fit of amplitudes and shapes from there."""
     evidence = gather(few.frame, few.reference_grams, few.diagnosed_grams, few.error)
     chosen = [k for score in accepted for k in score.candidates]
@@ -403,7 +407,7 @@ def _begin(few: Settled, accepted: Sequence[Score]) -> list[Cause]:
     return causes
 
 
-def _with_needed_structure(settled: Settled) -> Settled:
+def _with_needed_structure(settled: DiagnosisProblem) -> DiagnosisProblem:
     """Return the common ground with no more structure than the references call for.
 
     Under the error that is expected of the diagnosed logs: beyond the references' temperatures that
@@ -423,7 +427,7 @@ def _with_needed_structure(settled: Settled) -> Settled:
     )
 
 
-def _base(settled: Settled) -> tuple[ExtendedModel, tuple[str, ...]]:
+def _base(settled: DiagnosisProblem) -> tuple[ExtendedModel, tuple[str, ...]]:
     """Return the given model with coefficients and structure, the logs being without a cause."""
     evidence = gather(
         settled.frame, settled.reference_grams, settled.diagnosed_grams, settled.error
@@ -432,7 +436,9 @@ def _base(settled: Settled) -> tuple[ExtendedModel, tuple[str, ...]]:
     return _moved(settled, solution)
 
 
-def _moved(settled: Settled, solution: FloatArray) -> tuple[ExtendedModel, tuple[str, ...]]:
+def _moved(
+    settled: DiagnosisProblem, solution: FloatArray
+) -> tuple[ExtendedModel, tuple[str, ...]]:
     """Return the given model with a solution's coefficients and structure, and what was not."""
     given, frame = settled.model, settled.frame
     p = frame.scale.size
@@ -456,7 +462,7 @@ def mixed(choices: Sequence[Candidate], amplitudes: Sequence[FloatArray]) -> dic
 
 
 def _refined(
-    settled: Settled, model: ExtendedModel, effect: Effect, start: Values
+    settled: DiagnosisProblem, model: ExtendedModel, effect: Effect, start: Values
 ) -> tuple[ExtendedModel, dict[str, float]]:
     """Return model and parameters, fitted through the model's own equations from a start."""
     free = (*effect.amplitudes, *(shape for shape in effect.shapes if not shape.is_moment))
@@ -497,13 +503,13 @@ def _refined(
     return model.with_effect(effect, values), values
 
 
-def model_file_of(extension: Extension, given: ModelFile, error_v: float) -> ModelFile:
+def model_file_of(extension: Extension, given: Model, error_v: float) -> Model:
     """Return the extended model as a model file that estimator and service run.
 
     Parameters
     ----------
     extension : Extension
-    given : ModelFile
+    given : Model
         The model that was diagnosed.
     error_v : float
         RMS error that is left on rows held out [V]; all parts of the noise are scaled to it.
@@ -577,14 +583,14 @@ def _for_later_drives(effect: Effect, values: Values) -> Values:
 
 
 def cause_parameters(
-    score: Score, settled: Settled, extension: Extension | None = None
+    score: Score, settled: DiagnosisProblem, extension: Extension | None = None
 ) -> dict[str, dict[str, object]]:
     """Return each parameter of a candidate with its 95 % interval and unit.
 
     Parameters
     ----------
     score : Score
-    settled : Settled
+    settled : DiagnosisProblem
     extension : Extension, optional
         If the candidate is in it, values and intervals are those found there; else the linear
         solution's.

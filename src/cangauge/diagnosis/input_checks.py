@@ -48,7 +48,7 @@ SMALLEST = 100
 """In so few rows nothing is usual."""
 
 
-def without_spikes(log: Log, model: ExtendedModel) -> tuple[Log, NDArray[np.intp]]:
+def without_outliers(log: Log, model: ExtendedModel) -> tuple[Log, NDArray[np.intp]]:
     """Return a log without the few rows that no pack makes, and which these were.
 
     Parameters
@@ -98,7 +98,7 @@ LEAST_PART, MOST_PART = 0.7, 1.4
 """The median voltage of the model's pack lies between these parts of its usual one."""
 
 
-def sound(
+def check_inputs(
     logs: Sequence[Log], references: Sequence[Log], model: ExtendedModel
 ) -> tuple[list[Log], list[Log], list[str]]:
     """Return logs and references without rows that no pack makes, and what is to be said of it.
@@ -120,7 +120,7 @@ def sound(
         _check_apart(one, other)
     kept, said = [], []
     for log in (*logs, *references):
-        clean, rows = without_spikes(log, model)
+        clean, rows = without_outliers(log, model)
         kept.append(clean)
         said += [_sentence(log, int(row)) for row in rows]
     return kept[: len(logs)], kept[len(logs) :], said

@@ -25,7 +25,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from cangauge._typing import FloatArray
-from cangauge.diagnosis.design_matrix import LogTerms
+from cangauge.diagnosis.design_matrix import DesignMatrix
 from cangauge.diagnosis.hypotheses import Frame
 from cangauge.errors import InputError
 from cangauge.identify.voltage_fit import SLOPE_CHECKS
@@ -120,12 +120,12 @@ class Gram:
         return np.asarray(np.tensordot(1.0 / np.array(error.scale_v2), self.products, axes=1))
 
 
-def gram_of(terms: LogTerms, scale: FloatArray, weight: FloatArray | None = None) -> Gram:
+def gram_of(terms: DesignMatrix, scale: FloatArray, weight: FloatArray | None = None) -> Gram:
     """Return a log's products, baseline columns divided by `scale`.
 
     Parameters
     ----------
-    terms : LogTerms
+    terms : DesignMatrix
     scale : array of shape (p,)
     weight : array of shape (m,), optional
         Weight of each row: one of a half counts as one whose error is twice as large. Rows of

@@ -40,7 +40,7 @@ from cangauge.diagnosis.bayes_factors import (
     scores,
 )
 from cangauge.diagnosis.linear_gaussian import Evidence, gather
-from cangauge.diagnosis.problem import Settled
+from cangauge.diagnosis.problem import DiagnosisProblem
 
 # --- Every effect beside the others: not by its evidence alone, but by what it does to the gap
 
@@ -67,7 +67,7 @@ class Witness:
     """Log Bayes factor as if the references did not stray at all."""
     left_v: float
     """RMS of what the logs keep with it, what is each log's own not taken off, as if they were
-    driven no harder than the references (`Settled.hardness`) [V]."""
+    driven no harder than the references (`DiagnosisProblem.hardness`) [V]."""
     left_excess: float
     """What it leaves of the excess (`remainder.excess`)."""
 
@@ -118,7 +118,7 @@ class Compared:
         return -math.log(min(max(left, LEAST_LEFT), MOST_LEFT))
 
 
-def compare(settled: Settled) -> tuple[Evidence, Compared]:
+def compare(settled: DiagnosisProblem) -> tuple[Evidence, Compared]:
     """Return the evidence of the diagnosed logs, and every effect beside the others."""
     frame, error, grams = settled.frame, settled.error, settled.judged_grams
     evidence = gather(frame, settled.reference_grams, grams, error)
@@ -337,7 +337,7 @@ class Verdict:
     """Part of the gap that the best effect explains."""
 
 
-def decide(settled: Settled) -> Verdict:
+def decide(settled: DiagnosisProblem) -> Verdict:
     """Return the verdict on the diagnosed logs."""
     evidence, compared = compare(settled)
     belief = believe(compared)

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
-from cangauge.diagnosis.design_matrix import LogTerms, log_terms, own_choices
+from cangauge.diagnosis.design_matrix import DesignMatrix, design_matrix, own_choices
 from cangauge.diagnosis.hypotheses import Frame
-from cangauge.diagnosis.input_checks import sound
+from cangauge.diagnosis.input_checks import check_inputs
 from cangauge.diagnosis.linear_gaussian import ErrorModel, Gram, gram_of
 from cangauge.diagnosis.references import (
     LEAST_TRUST_BEYOND,
@@ -31,11 +31,11 @@ from cangauge.errors import InputError
 from cangauge.identify.linearized import Prepared, prepare_log, residual
 from cangauge.identify.rows import FitOptions
 from cangauge.logs.log import Log, TemperatureSource
-from cangauge.logs.resample import thinned, unstepped, usual_step_k
+from cangauge.logs.resample import dequantize, resample, usual_step_k
 from cangauge.model.effects.base import Effect
 from cangauge.model.effects.library import Candidate, candidates
 from cangauge.model.extended import ExtendedModel
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 
 # --- Where references have been: the temperatures and the charge at which the model is known
 
@@ -148,7 +148,7 @@ others are at least this part of a log."""
 
 
 @dataclass(frozen=True, eq=False)
-class Settled:
+class DiagnosisProblem:
     """The common ground of a diagnosis."""
 
     model: ExtendedModel
@@ -157,8 +157,8 @@ class Settled:
     options: FitOptions
     frame: Frame
     error: ErrorModel
-    references: tuple[LogTerms, ...]
-    diagnosed: tuple[LogTerms, ...]
+    references: tuple[DesignMatrix, ...]
+    diagnosed: tuple[DesignMatrix, ...]
     as_given: ExtendedModel
     """The model before its temperatures were widened; what the gap is measured from."""
     covered: bool = True
@@ -212,7 +212,7 @@ class Settled:
                 grams.append(judged.weakened(self.hardness(terms)))
         return tuple(grams) or self.diagnosed_grams
 
-    def hardness(self, terms: LogTerms) -> float:
+    def hardness(self, terms: DesignMatrix) -> float:
         """Return how much larger a log's error may be than the references', as variance.
 
         What a voltage model lacks grows with the current, so a log with twice the mean square
@@ -224,22 +224,22 @@ class Settled:
         return max(1.0, _mean_square(terms) / max(usual, 1e-12))
 
 
-def settle(
+def build_problem(
     logs: Sequence[Log],
-    model_file: ModelFile,
+    model_file: Model,
     references: Sequence[Log],
     effects: Sequence[Effect],
     *,
     initial_soc_pct: float | None = None,
     progress: Callable[[str], None] | None = None,
-) -> Settled:
+) -> DiagnosisProblem:
     """Prepare everything that the verdicts need.
 
     Parameters
     ----------
     logs, references : sequence of Log
         Diagnosed logs, which share one cause, and logs on which the model is known to be good.
-    model_file : ModelFile
+    model_file : Model
     effects : sequence of Effect
         The library to choose from.
     initial_soc_pct : float, optional
@@ -254,7 +254,7 @@ def settle(
         twice, or if neither references nor the model file tell how well the model is known.
     """
     given = model_file.extended_model()
-    logs, references, left_out = sound(logs, references, given)
+    logs, references, left_out = check_inputs(logs, references, given)
     model = _over_all_temperatures(given, [*logs, *references])
     options = FitOptions(
         capacity_ah=model_file.capacity_ah,
@@ -275,14 +275,14 @@ def settle(
     choices = candidates(effects, model.pack, logs[0].time_s, elsewhere=True)
     say = progress or _silent
     # Steps are found in the reports, before means blur them.
-    of_logs = [prepare_log(thinned(unstepped(log)), options) for log in logs]
+    of_logs = [prepare_log(resample(dequantize(log)), options) for log in logs]
     without_start = replace(options, initial_soc_pct=None)
-    of_references = [prepare_log(thinned(unstepped(log)), without_start) for log in references]
+    of_references = [prepare_log(resample(dequantize(log)), without_start) for log in references]
     covered = not of_references or temperatures_covered(of_references, of_logs)
     frame = _frame(model_file, choices, has_references=bool(of_references), covered=covered)
     error = error_from_noise(model_file.noise, model_file.rate_hz, frame)
     acting: ExtendedModel | None = None
-    terms_of_references: tuple[LogTerms, ...] = ()
+    terms_of_references: tuple[DesignMatrix, ...] = ()
     if of_references:
         say("learning from the references")
         grams = reference_grams(reference_terms(of_references, model, frame), frame)
@@ -302,8 +302,8 @@ def settle(
     diagnosed = []
     for item in of_logs:
         say(f"weighing {item.log.name} against every effect")
-        diagnosed.append(log_terms(item, model, own_choices(choices, model.pack, item), acting))
-    return Settled(
+        diagnosed.append(design_matrix(item, model, own_choices(choices, model.pack, item), acting))
+    return DiagnosisProblem(
         model=model,
         options=options,
         frame=frame,
@@ -320,7 +320,7 @@ def settle(
 
 
 def _judged(
-    references: Sequence[LogTerms], grams: Sequence[Gram], frame: Frame, model: ExtendedModel
+    references: Sequence[DesignMatrix], grams: Sequence[Gram], frame: Frame, model: ExtendedModel
 ) -> list[Gram]:
     """Return each reference's products as if it were diagnosed beside the others."""
     found = []
@@ -333,7 +333,7 @@ def _judged(
 
 
 def _frame(
-    model_file: ModelFile,
+    model_file: Model,
     choices: Sequence[Candidate],
     *,
     has_references: bool,
@@ -359,7 +359,7 @@ def _follows_temperature(choice: Candidate) -> bool:
     return choice.effect.id in ALWAYS_OF_TEMPERATURE or bool(choice.shape.get("activation_k"))
 
 
-def _own(choices: Sequence[Candidate], model_file: ModelFile) -> tuple[tuple[int, ...], FloatArray]:
+def _own(choices: Sequence[Candidate], model_file: Model) -> tuple[tuple[int, ...], FloatArray]:
     """Return by which candidates logs may differ, every effect, and how much at first.
 
     At their usual shapes: what little logs differ by has no more of a shape than that.
@@ -416,7 +416,7 @@ def _beyond_the_references(error: ErrorModel) -> ErrorModel:
     return replace(error, scale_v2=(error.lasting_v2,) * len(error.scale_v2), strays={})
 
 
-def _mean_square(terms: LogTerms) -> float:
+def _mean_square(terms: DesignMatrix) -> float:
     current = terms.prepared.rows.delayed_current_a[:, 0]
     return float(np.mean(current**2))
 

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.bayes_factors import kept_v2
-from cangauge.diagnosis.design_matrix import LEVELS, LogTerms, log_terms, own_choices
+from cangauge.diagnosis.design_matrix import LEVELS, DesignMatrix, design_matrix, own_choices
 from cangauge.diagnosis.hypotheses import Frame
 from cangauge.diagnosis.linear_gaussian import (
     ErrorModel,
@@ -518,7 +518,7 @@ class Learned:
     acting: ExtendedModel | None
     """With the structure that they call for; None if its pseudo-OCV would not rise."""
     frame: Frame
-    references: tuple[LogTerms, ...]
+    references: tuple[DesignMatrix, ...]
     grams: tuple[Gram, ...]
 
 
@@ -592,17 +592,17 @@ def reference_terms(
     model: ExtendedModel,
     frame: Frame,
     acting: ExtendedModel | None = None,
-) -> tuple[LogTerms, ...]:
+) -> tuple[DesignMatrix, ...]:
     """Return the references' columns, of the candidates in `Frame.shown`."""
     wanted = tuple(dict.fromkeys(frame.shown))  # structure may be a log's own as well
     at = [wanted.index(k) for k in frame.shown]
     found = []
     for item in references:
         choices = own_choices(frame.choices, model.pack, item)
-        found.append(log_terms(item, model, [choices[k] for k in wanted], acting))
+        found.append(design_matrix(item, model, [choices[k] for k in wanted], acting))
     return tuple(replace(terms, effects=tuple(terms.effects[k] for k in at)) for terms in found)
 
 
-def reference_grams(references: Sequence[LogTerms], frame: Frame) -> tuple[Gram, ...]:
+def reference_grams(references: Sequence[DesignMatrix], frame: Frame) -> tuple[Gram, ...]:
     """Return the products of the references' columns."""
     return tuple(gram_of(terms, frame.scale) for terms in references)

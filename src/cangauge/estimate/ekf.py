@@ -27,7 +27,7 @@ from cangauge.estimate.state import FilterState
 from cangauge.estimate.validity import outside_model_std_v
 from cangauge.model.delay_line import DelayLine
 from cangauge.model.extended import OnlineExtendedModel
-from cangauge.model.model_file import ModelFile, ModelNoise, effective_error_std_v
+from cangauge.model.model_file import Model, ModelNoise, effective_error_std_v
 from cangauge.model.voltage_model import VoltageModel
 
 # --- How uncertain one voltage is against the model: more where the model is out of its depth
@@ -39,18 +39,18 @@ TEMPERATURE_STD_K = 10.0
 """Uncertainty of a temperature that is not measured [K]."""
 
 
-class VoltageError:
+class MeasurementNoise:
     """The fast error of the voltages that an estimator uses; its biases are states of the filter.
 
     Parameters
     ----------
     model : VoltageModel
-    file : ModelFile
+    file : Model
         What the model came from: its noise and rate.
     capacity_ah : float
     """
 
-    def __init__(self, model: VoltageModel, file: ModelFile, capacity_ah: float) -> None:
+    def __init__(self, model: VoltageModel, file: Model, capacity_ah: float) -> None:
         self._model = model
         self._fast_std_v = effective_error_std_v(file.noise, 1.0 / file.rate_hz)
         self._usual_a = USUAL_CURRENT_C_RATE * capacity_ah
@@ -147,7 +147,7 @@ class Measurement:
     """Standard deviation of its fast error [V] if the SoC is so large [%]."""
 
 
-class Fusion:
+class SocEkf:
     """The filter; see the module's text for its state and equations.
 
     Parameters

@@ -10,8 +10,8 @@ import math
 
 from cangauge.errors import InputError
 from cangauge.estimate.counting import ChargeStep, CoulombCounter, EstimatorClock
-from cangauge.estimate.ekf import UNKNOWN_SOC_STD_PCT, Fusion, Measurement, VoltageError
-from cangauge.estimate.hypothesis_filter import Belief, Since, Verdict
+from cangauge.estimate.ekf import UNKNOWN_SOC_STD_PCT, Measurement, MeasurementNoise, SocEkf
+from cangauge.estimate.hypothesis_filter import HypothesisFilter, Since, Verdict
 from cangauge.estimate.settings import Anchor, AnchorWatch, EstimatorSettings, Method
 from cangauge.estimate.state import DelayLineState, EstimatorState
 from cangauge.estimate.validity import (
@@ -27,7 +27,7 @@ from cangauge.estimate.validity import (
 )
 from cangauge.model.delay_line import DelayLine
 from cangauge.model.effects.base import Reading
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 from cangauge.model.voltage_model import Inverse, soc_from_ocv
 
 __all__ = ["Estimator", "EstimatorSettings", "Method"]
@@ -67,11 +67,11 @@ class Estimator:
 
     Parameters
     ----------
-    model : ModelFile
+    model : Model
     settings : EstimatorSettings, optional
     """
 
-    def __init__(self, model: ModelFile, settings: EstimatorSettings | None = None) -> None:
+    def __init__(self, model: Model, settings: EstimatorSettings | None = None) -> None:
         self.settings = settings or EstimatorSettings()
         self._file = model
         extended = model.extended_model()
@@ -82,10 +82,10 @@ class Estimator:
         self._counter = CoulombCounter(self.capacity_ah, self.settings.gap_s)
         self._line = DelayLine(self._model.delay_s, gap_s=self.settings.gap_s)
         noise = model.noise
-        self._fusion = Belief(lambda: Fusion(self._online, self.capacity_ah, noise))
+        self._fusion = HypothesisFilter(lambda: SocEkf(self._online, self.capacity_ah, noise))
         self._anchors = AnchorWatch(self.settings.full_charge, self.settings.long_rest)
         self._bias_std_v = math.hypot(noise.slow_std_v, noise.lasting_std_v)
-        self._voltage_error = VoltageError(self._model, model, self.capacity_ah)
+        self._voltage_error = MeasurementNoise(self._model, model, self.capacity_ah)
         self._standing = temperature_mismatch(
             model.temperature_source, self.settings.temperature_source
         )

@@ -24,8 +24,8 @@ import numpy as np
 
 from cangauge.errors import InputError
 from cangauge.estimate.counting import ChargeStep, moved_log_odds, moved_std_pct
-from cangauge.estimate.ekf import UNKNOWN_SOC_STD_PCT, Fusion, Measurement
-from cangauge.estimate.state import BeliefState, FilterState, SinceState
+from cangauge.estimate.ekf import UNKNOWN_SOC_STD_PCT, Measurement, SocEkf
+from cangauge.estimate.state import FilterState, HypothesisFilterState, SinceState
 
 CLEAR_LOG_ODDS = math.log(1000.0)
 """Beyond this the less likely story is dropped."""
@@ -95,16 +95,16 @@ class Since:
         return cls(**state.model_dump())
 
 
-class Belief:
-    """One filter or two; takes the place of a `Fusion`.
+class HypothesisFilter:
+    """One filter or two; takes the place of a `SocEkf`.
 
     Parameters
     ----------
     make : callable
-        Returns a new `Fusion`.
+        Returns a new `SocEkf`.
     """
 
-    def __init__(self, make: Callable[[], Fusion]) -> None:
+    def __init__(self, make: Callable[[], SocEkf]) -> None:
         self._make = make
         # Parked, as told, or the only one first.
         self._filters = [make()]
@@ -205,12 +205,12 @@ class Belief:
         return self._mean([each.offset_pct(seconds) for each in self._filters])
 
     def count_std_pct(self, start_var_pct2: float, hours: float, moved_pct: float) -> float:
-        """Return the standard deviation of counting alone [%]; see `Fusion.count_std_pct`."""
+        """Return the standard deviation of counting alone [%]; see `SocEkf.count_std_pct`."""
         return self._filters[0].count_std_pct(start_var_pct2, hours, moved_pct)
 
-    def state(self) -> BeliefState:
+    def state(self) -> HypothesisFilterState:
         """Return what is to be remembered."""
-        return BeliefState.model_construct(
+        return HypothesisFilterState.model_construct(
             filters=[each.state() for each in self._filters],
             is_untried=self._is_untried,
             log_odds=self._log_odds,
@@ -219,7 +219,7 @@ class Belief:
             verdict=self.verdict,
         )
 
-    def restore(self, state: BeliefState) -> None:
+    def restore(self, state: HypothesisFilterState) -> None:
         """Go on from a state.
 
         Raises
@@ -241,7 +241,7 @@ class Belief:
 
     # --- inside -----------------------------------------------------------------------------
 
-    def _copy(self, state: FilterState) -> Fusion:
+    def _copy(self, state: FilterState) -> SocEkf:
         copy = self._make()
         copy.restore(state)
         return copy
@@ -254,7 +254,7 @@ class Belief:
     def _mean(self, values: Sequence[float]) -> float:
         return (1.0 - self._second) * values[0] + self._second * values[1]
 
-    def _open(self, other: Fusion, log_odds: float) -> None:
+    def _open(self, other: SocEkf, log_odds: float) -> None:
         """Let another filter tell a second story."""
         self._filters.append(other)
         self._log_odds = log_odds

@@ -14,7 +14,7 @@ from cangauge.estimate.estimator import Estimator
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate, Sample, Status
 from cangauge.logs.log import Log
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 
 PROGRESS_EVERY = 5000
 """Samples between two calls of the progress callback."""
@@ -82,7 +82,7 @@ def samples_of(log: Log) -> Iterator[Sample]:
 
 def run_estimator(
     samples: Iterable[Sample],
-    model: ModelFile,
+    model: Model,
     settings: EstimatorSettings,
     progress: Callable[[int], None] | None = None,
 ) -> EstimateTable:
@@ -91,7 +91,7 @@ def run_estimator(
     Parameters
     ----------
     samples : iterable of Sample
-    model : ModelFile
+    model : Model
     settings : EstimatorSettings
     progress : callable, optional
         Called with the number of samples done, every `PROGRESS_EVERY`.
@@ -107,7 +107,7 @@ def run_estimator(
 
 def estimate_log(
     log: Log,
-    model: ModelFile,
+    model: Model,
     settings: EstimatorSettings,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[EstimateTable, Scores]:

@@ -100,7 +100,7 @@ class DelayLineState(_Strict):
 
 
 class FilterState(_Strict):
-    """A `Fusion`: state x, covariance P, and the running mean of its innovations."""
+    """A `SocEkf`: state x, covariance P, and the running mean of its innovations."""
 
     x: Annotated[list[Finite], Field(max_length=64)]
     p: Annotated[list[Annotated[list[Finite], Field(max_length=64)]], Field(max_length=64)]
@@ -108,8 +108,8 @@ class FilterState(_Strict):
     mean_seconds: NotNegative
 
 
-class BeliefState(_Strict):
-    """A `Belief`: one filter, or two while it is open which of two stories is true."""
+class HypothesisFilterState(_Strict):
+    """A `HypothesisFilter`: one filter, or two while it is open which of two stories is true."""
 
     filters: Annotated[list[FilterState], Field(max_length=2)]
     is_untried: bool = False
@@ -160,7 +160,7 @@ class EstimatorState(_Strict):
         list[Annotated[list[MaybeNan], Field(max_length=EFFECT_NUMBERS_AT_MOST)]],
         Field(max_length=EFFECTS_AT_MOST),
     ]
-    belief: BeliefState
+    belief: HypothesisFilterState
     since: SinceState
     anchors: AnchorState
     samples: Count

@@ -43,7 +43,7 @@ from cangauge.model.model_file import (
     Coefficient,
     Information,
     Made,
-    ModelFile,
+    Model,
     ModelNoise,
     Ranges,
     SourceLog,
@@ -331,7 +331,7 @@ def model_from_fit(
     errors: tuple[Sequence[LogFit], Sequence[FloatArray]],
     *,
     found: FittedEffects | None = None,
-) -> ModelFile:
+) -> Model:
     """Return the model file of a fit.
 
     Parameters
@@ -349,7 +349,7 @@ def model_from_fit(
     fits, held_out_error_v = errors
     names = [*BASIS_NAMES, "kt", *resistance_names(len(options.delay_s))]
     rows = [item.rows for item in fits]
-    return ModelFile.model_validate(
+    return Model.model_validate(
         {
             "name": options.name or ", ".join(log.name for log in logs[:3]),
             "coefficients": {
@@ -502,7 +502,7 @@ MOSTLY_KEPT = 0.8
 class Identification:
     """A fitted model with the figures that belong to it."""
 
-    model: ModelFile
+    model: Model
     voltage_model: VoltageModel
     logs: tuple[Log, ...]
     fits: tuple[LogFit, ...]

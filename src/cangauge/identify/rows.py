@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
-from cangauge.logs.resample import unstepped
+from cangauge.logs.resample import dequantize
 from cangauge.model.charge import counted_soc_pct
 from cangauge.model.delay_line import GAP_S, delayed_currents, settled
 
@@ -135,7 +135,7 @@ def fit_rows(
         time_s=log.time_s[keep],
         voltage_v=log.voltage_v[keep],
         temperature_c=log.temperature_c[keep],
-        between_c=unstepped(log).temperature_c[keep],
+        between_c=dequantize(log).temperature_c[keep],
         soc_pct=soc[keep],
         delayed_current_a=delayed_currents(log.time_s, log.current_a, delay_s, log.time_s[keep]),
         removed={

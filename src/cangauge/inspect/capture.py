@@ -18,7 +18,7 @@ from can.typechecking import Channel
 from cangauge.bus.capture_log import capture_to_log, open_vehicle_capture
 from cangauge.bus.captures.capture import open_capture
 from cangauge.bus.captures.files import CaptureInfo
-from cangauge.bus.decoder import SampleAssembler
+from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.protection import GENERIC_RULE, LEAF_RULE, FrameChecker, Verdict
 from cangauge.bus.vehicle import PRESETS, Vehicle, preset_vehicle
 from cangauge.inspect.log import LogInspection, inspect_log
@@ -417,7 +417,7 @@ class _Attempt:
     """A preset tried on one bus of the capture."""
 
     def __init__(self, vehicle: Vehicle) -> None:
-        self.assembler = SampleAssembler(vehicle)
+        self.assembler = SampleDecoder(vehicle)
         self.samples = 0
         self.current = _Range()
         self.voltage = _Range()

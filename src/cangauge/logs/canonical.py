@@ -23,8 +23,8 @@ from cangauge._io import MAX_LOG_COLUMNS, MAX_LOG_ROWS, MAX_PARQUET_NAMES, atomi
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.columns import read_columns
-from cangauge.logs.draft import REQUIRED, Draft
-from cangauge.logs.file_content import Content, cells, delimiter_of
+from cangauge.logs.draft import REQUIRED, DraftLog
+from cangauge.logs.file_content import FileContent, cells, delimiter_of
 from cangauge.logs.log import TEMPERATURE_SOURCES, Log, TemperatureSource
 
 _OPTIONAL: Final = ("soc_pct",)
@@ -41,12 +41,12 @@ def is_canonical_header(names: list[str]) -> bool:
     return len(found & set(REQUIRED)) >= 2
 
 
-def read_parquet(content: Content) -> Draft:
+def read_parquet(content: FileContent) -> DraftLog:
     """Read a canonical log from Parquet.
 
     Parameters
     ----------
-    content : Content
+    content : FileContent
         The file.
 
     Raises
@@ -89,12 +89,12 @@ def read_parquet(content: Content) -> Draft:
     return _draft(content, values, labels, names, word)
 
 
-def read_csv(content: Content) -> Draft:
+def read_csv(content: FileContent) -> DraftLog:
     """Read a canonical log from text with `,`, `;` or tab between the columns.
 
     Parameters
     ----------
-    content : Content
+    content : FileContent
         The file.
 
     Raises
@@ -199,7 +199,7 @@ def _places(names: list[str], path: object) -> dict[str, int]:
             )
         if found:
             places[field] = found[0]
-    # Temperature may be given by the user instead: `Draft.to_log` asks for it.
+    # Temperature may be given by the user instead: `DraftLog.to_log` asks for it.
     missing = [field for field in REQUIRED if field not in places and field != "temperature_c"]
     if missing:
         shown = ", ".join(names[:12]) + (", …" if len(names) > 12 else "")
@@ -213,12 +213,12 @@ def _places(names: list[str], path: object) -> dict[str, int]:
 
 
 def _draft(
-    content: Content,
+    content: FileContent,
     values: dict[str, FloatArray],
     labels: dict[str, str],
     names: list[str],
     word: str,
-) -> Draft:
+) -> DraftLog:
     remarks = []
     known = {*REQUIRED, *_OPTIONAL, _SOURCE}
     extra = [name for name in names if name and name.strip().lower() not in known]
@@ -233,10 +233,10 @@ def _draft(
             value=word,
             cure=f"use one of: {', '.join(TEMPERATURE_SOURCES)}",
         )
-    return Draft(content, values, labels, cast("TemperatureSource", word), remarks=remarks)
+    return DraftLog(content, values, labels, cast("TemperatureSource", word), remarks=remarks)
 
 
-def _open_parquet(content: Content, *words: str) -> Any:
+def _open_parquet(content: FileContent, *words: str) -> Any:
     return pq.ParquetFile(
         pa.BufferReader(content.data),
         # Checksums are there in files that we wrote; others are read without.

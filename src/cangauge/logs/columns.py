@@ -14,7 +14,7 @@ import pyarrow.csv as pacsv
 from cangauge._io import MAX_LOG_COLUMNS, MAX_LOG_ROWS, MAX_ODD_ROWS
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.logs.file_content import Content, cells
+from cangauge.logs.file_content import FileContent, cells
 
 _MISSING: Final = pa.array(
     ["", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "1.#qnan", "-1.#ind"]
@@ -72,7 +72,7 @@ class Columns:
 
 
 def read_columns(
-    content: Content,
+    content: FileContent,
     wanted: Mapping[str, int],
     *,
     header: list[str],
@@ -86,7 +86,7 @@ def read_columns(
 
     Parameters
     ----------
-    content : Content
+    content : FileContent
         The unpacked file.
     wanted : mapping of str to int
         Index of the column [0-based] by the name to give it.
@@ -157,7 +157,7 @@ def read_columns(
     )
 
 
-def _width(content: Content, header: list[str], delimiter: str, skip_lines: int) -> int:
+def _width(content: FileContent, header: list[str], delimiter: str, skip_lines: int) -> int:
     """Return the number of cells of the first data row: headers can be shorter than rows."""
     first = next((line for line in content.head[skip_lines:] if line.strip()), None)
     if first is None:
@@ -183,7 +183,7 @@ def _width(content: Content, header: list[str], delimiter: str, skip_lines: int)
 
 
 def _judge_odd_rows(
-    odd: list[Any], rows: int, skip_lines: int, content: Content
+    odd: list[Any], rows: int, skip_lines: int, content: FileContent
 ) -> tuple[str, ...]:
     if not odd:
         return ()
@@ -205,7 +205,7 @@ def _judge_odd_rows(
     return tuple(remarks)
 
 
-def _odd_row(row: Any, skip_lines: int, content: Content) -> InputError:
+def _odd_row(row: Any, skip_lines: int, content: FileContent) -> InputError:
     return InputError(
         f"row {row.number - skip_lines} has {row.actual_columns} cells where the others"
         f" have {row.expected_columns}",
@@ -214,7 +214,7 @@ def _odd_row(row: Any, skip_lines: int, content: Content) -> InputError:
     )
 
 
-def _unended(content: Content) -> tuple[str, ...]:
+def _unended(content: FileContent) -> tuple[str, ...]:
     """Say that the last value may be cut: half a number is a number too."""
     if content.data.endswith((b"\n", b"\r")):
         return ()

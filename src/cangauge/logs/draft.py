@@ -10,7 +10,7 @@ import numpy as np
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.logs.file_content import Content
+from cangauge.logs.file_content import FileContent
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.units import refuse_wrong_units
 
@@ -20,12 +20,12 @@ MAX_MISSING_SHARE: Final = 0.05
 
 
 @dataclass(slots=True)
-class Draft:
+class DraftLog:
     """What a reader found in a file, before it is checked.
 
     Parameters
     ----------
-    content : Content
+    content : FileContent
         The file.
     values : dict of str to array of shape (n,)
         `time_s`, `current_a` (positive = discharge), `voltage_v`, `temperature_c` and maybe
@@ -42,7 +42,7 @@ class Draft:
         What the reader changed or noticed.
     """
 
-    content: Content
+    content: FileContent
     values: dict[str, FloatArray]
     labels: dict[str, str] = field(default_factory=dict)
     temperature_source: TemperatureSource = "unknown"

@@ -28,7 +28,7 @@ _ZIP_METHODS: Final = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 @dataclass(frozen=True, slots=True)
-class Content:
+class FileContent:
     r"""The unpacked content of one file.
 
     Parameters
@@ -73,7 +73,7 @@ def cells(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in next(reader, [])]
 
 
-def read_content(path: str | PathLike[str]) -> Content:
+def read_file_content(path: str | PathLike[str]) -> FileContent:
     """Read a file whole, unpack gzip and zip, decode text.
 
     Raises
@@ -91,9 +91,9 @@ def read_content(path: str | PathLike[str]) -> Content:
     if not data.strip():
         raise InputError("the file is empty", source=path, cure="check the export")
     if data.startswith(_PARQUET):
-        return Content(path, data, stem, (), remarks)
+        return FileContent(path, data, stem, (), remarks)
     data = _as_utf8(data)
-    return Content(path, data, stem, _head(data), remarks)
+    return FileContent(path, data, stem, _head(data), remarks)
 
 
 def _gunzip(data: bytes, path: Path) -> bytes:

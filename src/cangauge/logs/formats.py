@@ -43,8 +43,8 @@ from cangauge._io import MAX_HEADING
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.columns import Columns, read_columns
-from cangauge.logs.draft import Draft
-from cangauge.logs.file_content import Content, cells
+from cangauge.logs.draft import DraftLog
+from cangauge.logs.file_content import FileContent, cells
 from cangauge.logs.units import convert
 
 # --- Trips of the BMW i3 ("Battery and Heating Data in Real Driving Cycles"): `;`-separated …
@@ -65,7 +65,7 @@ def is_bmw_i3_header(line: str) -> bool:
     return line.lower().startswith("time [s];") and "battery voltage [" in line.lower()
 
 
-def read_bmw_i3(content: Content) -> Draft:
+def read_bmw_i3(content: FileContent) -> DraftLog:
     """Read one trip.
 
     Raises
@@ -81,7 +81,7 @@ def read_bmw_i3(content: Content) -> Draft:
         if match and field and field not in wanted:
             wanted[field], units[field] = index, match["unit"] or ""
     columns = read_columns(content, wanted, header=header, delimiter=";", skip_lines=1)
-    draft = Draft(
+    draft = DraftLog(
         content,
         {},
         columns.label,
@@ -166,7 +166,7 @@ class Layout:
     skip_lines: int
 
 
-def find_layout(content: Content) -> Layout | None:
+def find_layout(content: FileContent) -> Layout | None:
     """Return the layout of a cycler's export, or None if it is something else."""
     for number, line in enumerate(content.head[:_PREAMBLE_LINES]):
         header = cells(line, ",")
@@ -181,7 +181,7 @@ def find_layout(content: Content) -> Layout | None:
     return None
 
 
-def read_cycler(content: Content, layout: Layout) -> Draft:
+def read_cycler(content: FileContent, layout: Layout) -> DraftLog:
     """Read a cycler's export.
 
     Raises
@@ -208,7 +208,7 @@ def read_cycler(content: Content, layout: Layout) -> Draft:
         content, wanted, header=header, delimiter=",", skip_lines=layout.skip_lines
     )
     fields = ("time_s", "current_a", "voltage_v")
-    draft = Draft(
+    draft = DraftLog(
         content,
         {field: columns.numbers(field) for field in fields},
         dict(columns.label),
@@ -232,7 +232,7 @@ def read_cycler(content: Content, layout: Layout) -> Draft:
     return draft
 
 
-def _temperature_from_name(draft: Draft, kind: _Format) -> None:
+def _temperature_from_name(draft: DraftLog, kind: _Format) -> None:
     found = (
         list(kind.temperature_name.finditer(draft.content.path.name))
         if kind.temperature_name
@@ -302,7 +302,7 @@ def is_d3_header(line: str) -> bool:
     return has_time and any(heading.simple.startswith(("hvbatt", "dyno")) for heading in found)
 
 
-def read_d3(content: Content) -> Draft:
+def read_d3(content: FileContent) -> DraftLog:
     """Read one test; see the rules at the top of the module.
 
     The sign of a current that was copied from CAN is left as stored: `settle_can_sign` turns it.
@@ -328,7 +328,7 @@ def read_d3(content: Content) -> Draft:
         delimiter="\t",
         skip_lines=1,
     )
-    draft = Draft(content, {}, drop_incomplete=True, remarks=[*columns.remarks])
+    draft = DraftLog(content, {}, drop_incomplete=True, remarks=[*columns.remarks])
     for field, heading in places.items():
         if heading:
             draft.values[field] = _converted(draft, columns, field, field, heading)
@@ -344,7 +344,7 @@ def read_d3(content: Content) -> Draft:
     return draft
 
 
-def _take_instrument(draft: Draft, columns: Columns, wanted: Mapping[str, _Heading]) -> None:
+def _take_instrument(draft: DraftLog, columns: Columns, wanted: Mapping[str, _Heading]) -> None:
     """Take current and voltage from the first instrument that has both, and say which.
 
     Where none has both, each comes from the first that has it.
@@ -373,7 +373,7 @@ def _take_instrument(draft: Draft, columns: Columns, wanted: Mapping[str, _Headi
 
 
 def _converted(
-    draft: Draft, columns: Columns, name: str, field: str, heading: _Heading
+    draft: DraftLog, columns: Columns, name: str, field: str, heading: _Heading
 ) -> FloatArray:
     draft.labels[field] = heading.text
     values, remark = convert(
@@ -387,7 +387,7 @@ def _converted(
     return values
 
 
-def _drop_wait(draft: Draft) -> None:
+def _drop_wait(draft: DraftLog) -> None:
     waiting = draft.values["time_s"] < 0.0
     count = int(waiting.sum())
     if count == waiting.size:

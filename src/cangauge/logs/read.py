@@ -11,10 +11,10 @@ from cangauge.logs import canonical
 from cangauge.logs import formats as bmw_i3
 from cangauge.logs import formats as cycler
 from cangauge.logs import formats as d3
-from cangauge.logs.draft import Draft
-from cangauge.logs.file_content import Content, cells, delimiter_of, read_content
+from cangauge.logs.draft import DraftLog
+from cangauge.logs.file_content import FileContent, cells, delimiter_of, read_file_content
 from cangauge.logs.log import TEMPERATURE_SOURCES, Log, TemperatureSource
-from cangauge.logs.sign import settle_sign
+from cangauge.logs.sign import resolve_sign
 from cangauge.logs.units import COLDEST_C, HOTTEST_C
 
 _KNOWN = (
@@ -75,15 +75,15 @@ def read_log(
             field="--temperature",
             value=temperature_c,
         )
-    content = read_content(path)
+    content = read_file_content(path)
     draft = _read(content)
     log = draft.to_log(temperature_c)
     if temperature_source is not None:
         log = replace(log, temperature_source=temperature_source)
-    return settle_sign(log, stored_sign_unknown=draft.sign_unknown)
+    return resolve_sign(log, stored_sign_unknown=draft.sign_unknown)
 
 
-def _read(content: Content) -> Draft:
+def _read(content: FileContent) -> DraftLog:
     if content.is_parquet:
         return canonical.read_parquet(content)
     line = next((text for text in content.head if text.strip()), "")
@@ -99,7 +99,7 @@ def _read(content: Content) -> Draft:
     raise _unknown(content, line)
 
 
-def _unknown(content: Content, line: str) -> InputError:
+def _unknown(content: FileContent, line: str) -> InputError:
     if _is_capture(content.path):
         return _capture_given(content.path)
     shown = line.strip()

@@ -32,7 +32,7 @@ STEPPED_PART = 0.5
 """A temperature that changes at this part of the rows or more is not reported in steps."""
 
 
-def unstepped(log: Log) -> Log:
+def dequantize(log: Log) -> Log:
     """Return a log with the temperature that its reports are the steps of.
 
     Straight lines from change to change, through the middle of what stands in between, and nowhere
@@ -74,7 +74,7 @@ ENOUGH_HZ = 20.0
 """Stretches a second [Hz]. A log with less than twice as many samples is taken as it is."""
 
 
-def thinned(log: Log) -> Log:
+def resample(log: Log) -> Log:
     """Return a log with no more rows than a diagnosis can use.
 
     The means of all signals over a stretch stand at the mean of its times, so nothing is late

@@ -274,7 +274,7 @@ def spaced_rows(time_s: FloatArray, spacing_s: float) -> IntArray:
 # --- What readers do about the sign of current
 
 
-def settle_sign(log: Log, *, stored_sign_unknown: bool) -> Log:
+def resolve_sign(log: Log, *, stored_sign_unknown: bool) -> Log:
     """Check the sign of current against the data; turn it only where the format leaves it open.
 
     Parameters

@@ -123,7 +123,7 @@ class Made(_Strict):
     fingerprint: str
 
 
-class ModelFile(_Strict):
+class Model(_Strict):
     """Everything that a model file holds."""
 
     format: Literal["cangauge-model"] = "cangauge-model"
@@ -210,12 +210,12 @@ def resistance_names(number: int) -> list[str]:
     return [f"R{k}" for k in range(1, number + 1)]
 
 
-def model_json(model: ModelFile) -> str:
+def model_json(model: Model) -> str:
     """Return the model file's text."""
     return json.dumps(model.model_dump(mode="json"), indent=1, allow_nan=False) + "\n"
 
 
-def load_model(path: Path | str) -> ModelFile:
+def load_model(path: Path | str) -> Model:
     """Read and validate a model file.
 
     Raises
@@ -248,10 +248,10 @@ def load_model(path: Path | str) -> ModelFile:
             cure="make it again with `cangauge fit`",
         )
     try:
-        model = ModelFile.model_validate(raw)
+        model = Model.model_validate(raw)
         model.extended_model()
     except ValidationError as error:
-        raise schema_error(error, ModelFile, path, _CURE) from error
+        raise schema_error(error, Model, path, _CURE) from error
     except InputError as error:
         raise InputError(
             error.problem, source=path, field=error.field, value=error.value, cure=error.cure

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from cangauge.model.model_file import ModelFile, resistance_names
+from cangauge.model.model_file import Model, resistance_names
 from cangauge.model.voltage_model import BASIS_NAMES, VoltageModel
 
 CAPACITY_AH = 51.5
@@ -38,7 +38,7 @@ def leaf_2012_model() -> VoltageModel:
     )
 
 
-def leaf_2012_model_file() -> ModelFile:
+def leaf_2012_model_file() -> Model:
     """Return the published model as a model file that `estimate` and `run` take.
 
     The paper gives no noise and no standard errors. The noise here is assumed: its sum gives the
@@ -51,7 +51,7 @@ def leaf_2012_model_file() -> ModelFile:
     names = [*BASIS_NAMES, "kt", *resistance_names(len(model.delay_s))]
     values = [*model.ocv_v, model.kt_v_per_k, *model.resistance_ohm]
     units = {"kt": "V/K"} | dict.fromkeys(resistance_names(len(model.delay_s)), "ohm")
-    return ModelFile.model_validate(
+    return Model.model_validate(
         {
             "name": "2012 Nissan Leaf, published coefficients",
             "coefficients": {

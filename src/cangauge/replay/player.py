@@ -20,7 +20,7 @@ from typing import Final
 
 import can
 
-from cangauge.bus.connection import BusPort
+from cangauge.bus.connection import BusConnection
 from cangauge.bus.publish import SAMPLES_MODULO, FrameIds, SocDetail, SocEstimate, SocReader
 from cangauge.bus.time_source import ClockFrames
 from cangauge.errors import CangaugeError, InputError
@@ -99,7 +99,7 @@ class Receiver:
 
     Parameters
     ----------
-    port : BusPort
+    port : BusConnection
         Receives SOC_ESTIMATE and SOC_DETAIL only.
     reader : SocReader
     stop : callable
@@ -117,7 +117,7 @@ class Receiver:
 
     def __init__(
         self,
-        port: BusPort,
+        port: BusConnection,
         reader: SocReader,
         stop: Callable[[], bool],
         warn: Callable[[str], None] | None = None,
@@ -316,7 +316,7 @@ class ReplayState:
 
 
 def play(
-    port: BusPort,
+    port: BusConnection,
     source: Source,
     settings: ReplaySettings,
     *,
@@ -328,7 +328,7 @@ def play(
 
     Parameters
     ----------
-    port : BusPort
+    port : BusConnection
         Needs to receive SOC_ESTIMATE and SOC_DETAIL only.
     source : Source
     settings : ReplaySettings
@@ -372,7 +372,7 @@ def play(
 class _Player:
     def __init__(
         self,
-        port: BusPort,
+        port: BusConnection,
         settings: ReplaySettings,
         stop: Callable[[], bool],
         show: Callable[[ReplayState], None] | None,

@@ -27,7 +27,7 @@ import numpy as np
 
 from cangauge.bus.capture_log import open_vehicle_capture
 from cangauge.bus.captures.capture import open_capture
-from cangauge.bus.decoder import SampleAssembler
+from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.publish import FrameIds
 from cangauge.bus.time_source import ReceiveTime, ReplayClock, is_clock, whole_us
@@ -35,7 +35,7 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.validity import Sample
 from cangauge.logs.log import Log
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 
 # --- How far the SoC of a replayed log can be from that of the log itself: frames are rounded
 
@@ -54,14 +54,14 @@ class QuantisationBound:
 
 
 def quantisation_bound(
-    vehicle: Vehicle, model: ModelFile, log: Log, capacity_ah: float | None = None
+    vehicle: Vehicle, model: Model, log: Log, capacity_ah: float | None = None
 ) -> QuantisationBound:
     """Return the bound for a log that is replayed as a vehicle's frames with REPLAY_CLOCK.
 
     Parameters
     ----------
     vehicle : Vehicle
-    model : ModelFile
+    model : Model
     log : Log
     capacity_ah : float, optional
         Instead of the model's [Ah].
@@ -274,7 +274,7 @@ class _SampleCounter:
     samples: int = 0
 
     def __post_init__(self) -> None:
-        self._assembler = SampleAssembler(self.vehicle)
+        self._assembler = SampleDecoder(self.vehicle)
 
     def after(self, frames: Iterable[can.Message]) -> int:
         """Return how many samples there are after these frames."""

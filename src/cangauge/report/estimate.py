@@ -17,7 +17,7 @@ from cangauge.estimate.offline import EstimateTable, Scores
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import REASON_WORDS, Reason, Status, reason_name
 from cangauge.identify.rows import running_rows
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 from cangauge.report.charts import (
     AMBER,
     BLACK,
@@ -155,7 +155,7 @@ def estimate_report(
     log: Recorded,
     table: EstimateTable,
     scores: Scores,
-    model: ModelFile,
+    model: Model,
     settings: EstimatorSettings | None = None,
 ) -> str:
     """Return the report of an estimate as one self-contained HTML page.
@@ -167,7 +167,7 @@ def estimate_report(
     table : EstimateTable
         Its estimates, n rows.
     scores : Scores
-    model : ModelFile
+    model : Model
     settings : EstimatorSettings, optional
     """
     return render(estimate_page(log, table, scores, model, settings))
@@ -177,7 +177,7 @@ def estimate_page(
     log: Recorded,
     table: EstimateTable,
     scores: Scores,
-    model: ModelFile,
+    model: Model,
     settings: EstimatorSettings | None = None,
     *,
     title: str | None = None,
@@ -378,7 +378,7 @@ def _input(log: Recorded, time: TimeFigures) -> list[Block]:
     ]
 
 
-def _settings(log: Recorded, model: ModelFile, settings: EstimatorSettings) -> list[Block]:
+def _settings(log: Recorded, model: Model, settings: EstimatorSettings) -> list[Block]:
     start = settings.initial_soc_pct
     given = (
         "from the first voltages"

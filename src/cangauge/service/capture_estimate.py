@@ -21,7 +21,7 @@ from cangauge.errors import InputError
 from cangauge.estimate.offline import EstimateTable
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate
-from cangauge.model.model_file import ModelFile
+from cangauge.model.model_file import Model
 from cangauge.service.pipeline import EstimateStream, FrameCounts
 
 PROGRESS_EVERY: Final = 50_000
@@ -84,7 +84,7 @@ class _Lane:
 def estimate_capture(
     path: str | PathLike[str],
     vehicle: Vehicle,
-    model: ModelFile,
+    model: Model,
     settings: EstimatorSettings | None = None,
     *,
     time_source: TimeSourceName | Literal["auto"] = "auto",
@@ -97,7 +97,7 @@ def estimate_capture(
     ----------
     path : path-like
     vehicle : Vehicle
-    model : ModelFile
+    model : Model
     settings : EstimatorSettings, optional
     time_source : {"auto", "receive", "replay-clock"}
         "auto": the replay clock if the capture holds one, else the receive stamps.
@@ -152,7 +152,7 @@ class _Reader:
     def __init__(
         self,
         vehicle: Vehicle,
-        model: ModelFile,
+        model: Model,
         settings: EstimatorSettings | None,
         time_source: TimeSourceName | Literal["auto"],
         clock_id: int,

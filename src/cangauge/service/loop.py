@@ -23,7 +23,7 @@ import can
 from can.typechecking import CanFilter
 
 from cangauge._logging import Voice
-from cangauge.bus.connection import BusPort
+from cangauge.bus.connection import BusConnection
 from cangauge.bus.publish import ESTIMATE_EVERY_S, FrameIds, standard_filter
 from cangauge.bus.time_source import is_clock
 from cangauge.errors import CangaugeError
@@ -42,7 +42,7 @@ AGAIN_S: Final = 600.0
 _REMEMBERED: Final = 64
 
 
-class Rivals:
+class DuplicateSenderDetector:
     """Tells one's own frames that come back from those of others.
 
     Parameters
@@ -50,7 +50,7 @@ class Rivals:
     ids : FrameIds
         What this service publishes.
     echoes : bool
-        Whether the bus hands one's own frames back (see `InterfaceFacts`).
+        Whether the bus hands one's own frames back (see `BackendCapabilities`).
     warn : callable, optional
         Takes a line of text.
 
@@ -139,12 +139,12 @@ FIRST_CHECKPOINT_S: Final = 1.0
 [s]."""
 
 
-class Upkeep:
+class Housekeeping:
     """Looks after what needs no more than a glance every `LOOK_EVERY_S`.
 
     Parameters
     ----------
-    port : BusPort
+    port : BusConnection
         Whose receive queue is watched.
     checkpoint : callable, optional
         Saves the state; called after `FIRST_CHECKPOINT_S`, every `every_s`, and at the end.
@@ -155,7 +155,7 @@ class Upkeep:
 
     def __init__(
         self,
-        port: BusPort,
+        port: BusConnection,
         checkpoint: Callable[[], None] | None = None,
         every_s: float = CHECKPOINT_EVERY_S,
         warn: Callable[[str], None] | None = None,
@@ -305,7 +305,7 @@ class RunSummary:
 
 
 def serve(
-    port: BusPort,
+    port: BusConnection,
     gauge: Gauge,
     settings: LoopSettings,
     outputs: Outputs,
@@ -315,7 +315,7 @@ def serve(
 
     Parameters
     ----------
-    port : BusPort
+    port : BusConnection
     gauge : Gauge
     settings : LoopSettings
     outputs : Outputs
@@ -329,7 +329,7 @@ def serve(
     Raises
     ------
     BusError
-        If the bus is gone (never with a `LastingPort`, which waits until it is back).
+        If the bus is gone (never with a `ReconnectingBus`, which waits until it is back).
     """
     loop = _Loop(port, gauge, settings, outputs)
     cpu = time.process_time()
@@ -349,14 +349,18 @@ def serve(
 
 class _Loop:
     def __init__(
-        self, port: BusPort, gauge: Gauge, settings: LoopSettings, outputs: Outputs
+        self, port: BusConnection, gauge: Gauge, settings: LoopSettings, outputs: Outputs
     ) -> None:
         self._port = port
         self._gauge = gauge
         self._settings = settings
         self._outputs = outputs
-        self.rivals = Rivals(gauge.settings.ids, echoes=port.facts.echoes, warn=outputs.warn)
-        self._upkeep = Upkeep(port, outputs.checkpoint, settings.checkpoint_every_s, outputs.warn)
+        self.rivals = DuplicateSenderDetector(
+            gauge.settings.ids, echoes=port.facts.echoes, warn=outputs.warn
+        )
+        self._upkeep = Housekeeping(
+            port, outputs.checkpoint, settings.checkpoint_every_s, outputs.warn
+        )
         self._ignores_clock = self._awaits_clock = gauge.settings.time_source == "receive"
         self._stamps_are_wall_time = port.facts.stamps == "kernel"
         self._no_input: frozenset[int] = frozenset()

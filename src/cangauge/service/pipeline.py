@@ -14,7 +14,7 @@ from typing import Final
 import can
 from can.typechecking import CanFilter
 
-from cangauge.bus.decoder import Counters, SampleAssembler
+from cangauge.bus.decoder import FrameStatistics, SampleDecoder
 from cangauge.bus.plausibility import MISSED_AT_LEAST, Pack
 from cangauge.bus.publish import FrameIds, SocPublisher, standard_filter
 from cangauge.bus.time_source import (
@@ -31,7 +31,7 @@ from cangauge.estimate.hypothesis_filter import Verdict
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.state import EstimatorState
 from cangauge.estimate.validity import Estimate, Reason, Sample, Status, status_of
-from cangauge.model.model_file import ModelFile, effective_error_std_v
+from cangauge.model.model_file import Model, effective_error_std_v
 
 # --- Frames → estimates: the one path that a live bus and a recorded capture both take
 
@@ -85,7 +85,7 @@ class EstimateStream:
     Parameters
     ----------
     vehicle : Vehicle
-    model : ModelFile
+    model : Model
     settings : EstimatorSettings, optional
         A temperature source that it leaves unknown is the vehicle's.
     time_source : {"receive", "replay-clock"}
@@ -96,7 +96,7 @@ class EstimateStream:
     def __init__(
         self,
         vehicle: Vehicle,
-        model: ModelFile,
+        model: Model,
         settings: EstimatorSettings | None = None,
         time_source: TimeSourceName = "receive",
         clock_id: int = REPLAY_CLOCK_ID,
@@ -116,7 +116,7 @@ class EstimateStream:
         """Samples handed to the estimator so far, those that it refused included."""
         self.latest_sample: Sample | None = None
         self._pack = pack_of(model, settings.capacity_ah)
-        self._assembler = SampleAssembler(vehicle, self._pack)
+        self._assembler = SampleDecoder(vehicle, self._pack)
         self._estimator = Estimator(model, settings)
         # The latest estimate as the estimator gave it (None until there was a sample) and judged;
         # a sample that came since is waiting for somebody to ask for its estimate.
@@ -162,7 +162,7 @@ class EstimateStream:
         return self._latest
 
     def reconfigure(
-        self, vehicle: Vehicle | None, model: ModelFile, settings: EstimatorSettings
+        self, vehicle: Vehicle | None, model: Model, settings: EstimatorSettings
     ) -> None:
         """Go on with another vehicle (None: the same), model and settings.
 
@@ -182,7 +182,7 @@ class EstimateStream:
             # What a signal may be follows from both.
             self._past, self._untimed = self.counts, 0
             self._vehicle, self._pack = vehicle or self._vehicle, pack
-            self._assembler = SampleAssembler(self._vehicle, pack)
+            self._assembler = SampleDecoder(self._vehicle, pack)
         if (model, settings) == (self._model, old):
             return
         before = self._estimator
@@ -209,7 +209,7 @@ class EstimateStream:
         )
 
     @property
-    def counters(self) -> Counters:
+    def counters(self) -> FrameStatistics:
         """The same in detail, of the log that is running."""
         return self._assembler.counters
 
@@ -219,7 +219,7 @@ class EstimateStream:
         return self._assembler.reference_soc_pct
 
     @property
-    def model(self) -> ModelFile:
+    def model(self) -> Model:
         """The model in use."""
         return self._model
 
@@ -315,17 +315,17 @@ class EstimateStream:
         self._past = replace(self.counts, beginnings=self._past.beginnings + 1)
         self._untimed = 0
         self.beginnings = self._time.beginnings
-        self._assembler = SampleAssembler(self._vehicle, self._pack)
+        self._assembler = SampleDecoder(self._vehicle, self._pack)
         self._estimator = Estimator(self._model, self._settings)
         self._estimated = None
 
 
-def pack_of(model: ModelFile, capacity_ah: float | None = None) -> Pack:
+def pack_of(model: Model, capacity_ah: float | None = None) -> Pack:
     """Return what a model knows of a pack that helps to judge its signals.
 
     Parameters
     ----------
-    model : ModelFile
+    model : Model
     capacity_ah : float, optional
         Instead of the model's [Ah].
     """
@@ -372,7 +372,7 @@ class Gauge:
     Parameters
     ----------
     vehicle : Vehicle
-    model : ModelFile
+    model : Model
     settings : GaugeSettings, optional
 
     Raises
@@ -382,7 +382,7 @@ class Gauge:
     """
 
     def __init__(
-        self, vehicle: Vehicle, model: ModelFile, settings: GaugeSettings | None = None
+        self, vehicle: Vehicle, model: Model, settings: GaugeSettings | None = None
     ) -> None:
         self.settings = settings or GaugeSettings()
         ids = self.settings.ids
@@ -397,16 +397,14 @@ class Gauge:
         self.published = NOTHING_YET
         """The estimate as last put on the bus, stale where it was told to be."""
 
-    def reconfigure(
-        self, vehicle: Vehicle | None, model: ModelFile, settings: GaugeSettings
-    ) -> None:
+    def reconfigure(self, vehicle: Vehicle | None, model: Model, settings: GaugeSettings) -> None:
         """Go on with another configuration, from the SoC that is known.
 
         Parameters
         ----------
         vehicle : Vehicle, optional
             None: the same.
-        model : ModelFile
+        model : Model
         settings : GaugeSettings
             Of the estimator's, initial SoC and standard deviation stay what they were; time source
             and REPLAY_CLOCK's id must be what they were.
@@ -506,7 +504,7 @@ class Gauge:
         return self._stream.counts
 
     @property
-    def counters(self) -> Counters:
+    def counters(self) -> FrameStatistics:
         """The same in detail, of the log that is running."""
         return self._stream.counters
 
@@ -521,7 +519,7 @@ class Gauge:
         return self._vehicle
 
     @property
-    def model(self) -> ModelFile:
+    def model(self) -> Model:
         """The model in use."""
         return self._stream.model
 

@@ -34,8 +34,8 @@ from rich.text import Text
 
 from cangauge._formatting import number
 from cangauge._logging import emit, speaker
-from cangauge.bus.connection import BusPort
-from cangauge.bus.reconnect import LastingPort
+from cangauge.bus.connection import BusConnection
+from cangauge.bus.reconnect import ReconnectingBus
 from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.options import check_outputs
 from cangauge.cli.output import console
@@ -243,7 +243,7 @@ _LOG = logging.getLogger(__name__)
 
 @contextmanager
 def operated(
-    config: RunConfig, vehicle: str, gauge: Gauge, port: BusPort, recorder: Recorder | None
+    config: RunConfig, vehicle: str, gauge: Gauge, port: BusConnection, recorder: Recorder | None
 ) -> Iterator[Monitor]:
     """Yield the monitor of a service whose status is served and of which systemd knows.
 
@@ -308,7 +308,7 @@ def _serve(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None:
 # --- What a run of the service amounted to: one line for the log, one object for `--json`
 
 
-def summary_line(gauge: Gauge, port: LastingPort, summary: RunSummary) -> str:
+def summary_line(gauge: Gauge, port: ReconnectingBus, summary: RunSummary) -> str:
     """Return the line: frames, losses, the last SoC."""
     counts, latest = gauge.counts, gauge.latest
     soc = f"{number(latest.soc_pct, 2)} ± {number(latest.soc_std_pct, 2, '%')}"
@@ -320,7 +320,7 @@ def summary_line(gauge: Gauge, port: LastingPort, summary: RunSummary) -> str:
     )
 
 
-def _troubles(port: LastingPort, summary: RunSummary) -> str:
+def _troubles(port: ReconnectingBus, summary: RunSummary) -> str:
     """Return what went wrong on the bus, as a part of the summary."""
     kinds = ", ".join(f"{kind} {count}" for kind, count in port.error_kinds.most_common())
     found = {
@@ -333,7 +333,7 @@ def _troubles(port: LastingPort, summary: RunSummary) -> str:
     return "".join(f", {count} {what}" for what, count in found.items() if count)
 
 
-def summary_json(gauge: Gauge, port: LastingPort, summary: RunSummary) -> dict[str, Any]:
+def summary_json(gauge: Gauge, port: ReconnectingBus, summary: RunSummary) -> dict[str, Any]:
     """Return the object."""
     counts, latest = gauge.counts, gauge.latest
     return {
@@ -406,7 +406,7 @@ def run_service(config: RunConfig, read: Callable[[], RunConfig]) -> dict[str, A
         # Signals first: whoever starts the service may end it at any moment after.
         stop = stack.enter_context(stop_on_signals())
         hangup = stack.enter_context(note_hangups())
-        port = stack.enter_context(LastingPort(address, gauge.filters, _voice("bus.notice")))
+        port = stack.enter_context(ReconnectingBus(address, gauge.filters, _voice("bus.notice")))
         port.open(wait=config.wait_for_bus)
         recorder = table = line = keeper = None
         if kept is not None:

@@ -22,8 +22,8 @@ from typing import Any, Final, Protocol
 from cangauge import __version__
 from cangauge._formatting import number
 from cangauge._logging import Pace, emit
-from cangauge.bus.connection import BusPort
-from cangauge.bus.decoder import Counters, MessageCounters
+from cangauge.bus.connection import BusConnection
+from cangauge.bus.decoder import FrameStatistics, MessageStatistics
 from cangauge.estimate.validity import Estimate, Reason, Sample, Status, reason_name, reason_names
 from cangauge.service.pipeline import Gauge
 from cangauge.service.systemd import Notifier
@@ -324,7 +324,7 @@ _NO_REJECTS: Final = frozenset({"wanted", "counter_jumps", "frames_lost"})
 _OF_VALUES: Final = frozenset({"not_available", "implausible", "stuck", "held_back"})
 """Counters of values that were refused, while their frame was not."""
 _REJECTS: Final = tuple(
-    each.name for each in fields(MessageCounters) if each.name not in _NO_REJECTS
+    each.name for each in fields(MessageStatistics) if each.name not in _NO_REJECTS
 )
 
 _LOG = logging.getLogger(__name__)
@@ -344,7 +344,7 @@ class Monitor:
     Parameters
     ----------
     gauge : Gauge
-    port : BusPort
+    port : BusConnection
     identity : Identity
     notifier : Notifier
     record : Recording, optional
@@ -362,7 +362,7 @@ class Monitor:
     def __init__(
         self,
         gauge: Gauge,
-        port: BusPort,
+        port: BusConnection,
         *,
         identity: Identity,
         notifier: Notifier,
@@ -498,13 +498,13 @@ def status_line(snapshot: Snapshot) -> str:
     return f"{soc}, {status}, {snapshot.samples_per_s:.1f} samples/s"
 
 
-def _rejects(counters: Counters) -> dict[str, int]:
+def _rejects(counters: FrameStatistics) -> dict[str, int]:
     return {
         name: sum(int(getattr(each, name)) for each in counters.messages.values())
         for name in _REJECTS
     }
 
 
-def _bus_counts(port: BusPort) -> dict[str, int]:
+def _bus_counts(port: BusConnection) -> dict[str, int]:
     found = {name: getattr(port, name, None) for name in BUS_COUNTS}
     return {name: int(value) for name, value in found.items() if value is not None}

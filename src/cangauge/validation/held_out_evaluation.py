@@ -13,7 +13,7 @@ from cangauge.estimate.offline import run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
-from cangauge.model.model_file import ModelFile, load_model
+from cangauge.model.model_file import Model, load_model
 
 SETTLED_S: Final = 300.0
 """The SoC of the EKF is judged from here on, its initial SoC withheld [s]."""
@@ -53,7 +53,7 @@ def judge_later(
     }
 
 
-def errors_of(log: Log, model: ModelFile) -> dict[str, float]:
+def errors_of(log: Log, model: Model) -> dict[str, float]:
     """Return sums of squares and of absolute errors of one log.
 
     Voltage: at the SoC counted from the log's own start, on rows where the delay line is full.
