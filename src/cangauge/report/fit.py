@@ -15,8 +15,9 @@ import numpy as np
 
 from cangauge._formatting import duration, number, significant, span
 from cangauge._typing import FloatArray
-from cangauge.identify.fit import Identification, LogFit
-from cangauge.identify.rows import running_rows
+from cangauge.identify.evaluate import LogFit
+from cangauge.identify.fit import Identification
+from cangauge.inference.rows import running_rows
 from cangauge.model.charge import discharged_ah
 from cangauge.model.effects.library import LIBRARY
 from cangauge.report.charts import (
