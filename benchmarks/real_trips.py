@@ -117,10 +117,10 @@ def identify(
 def explain(identification: Identification, tests: Sequence[Log]) -> tuple[LogFit, ...]:
     """Return how the model explains trips that it has not seen, on the rows of a fit."""
     options = _options(identification.model)
-    if identification.found is None:
+    if identification.effects is None:
         model = identification.voltage_model
         return tuple(evaluate(model, fit_rows(trip, options)) for trip in tests)
-    extended = identification.found.model
+    extended = identification.effects.model
     return tuple(evaluate_extended(extended, sample_log(trip, options)) for trip in tests)
 
 

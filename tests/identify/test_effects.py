@@ -94,8 +94,8 @@ def fitted(name: str, effects: tuple[str, ...] = ("auto",)) -> Identification:
 
 
 def parameters(result: Identification, effect_id: str) -> dict[str, tuple[float, float | None]]:
-    assert result.found is not None
-    ((_, estimates),) = [item for item in result.found.estimates if item[0] == effect_id]
+    assert result.effects is not None
+    ((_, estimates),) = [item for item in result.effects.estimates if item[0] == effect_id]
     return {item.name: (item.value, item.std_error) for item in estimates}
 
 
@@ -110,8 +110,8 @@ def share_at(reference_c: float, of: dict[str, float]) -> float:
 @pytest.mark.parametrize("name", ["cold", "dynamics", "hysteresis"])
 def test_auto_finds_true_effects_with_their_parameters(name: str) -> None:
     result = fitted(name)
-    assert result.found is not None
-    assert [effect.id for effect, _ in result.found.model.effects] == [
+    assert result.effects is not None
+    assert [effect.id for effect, _ in result.effects.model.effects] == [
         i for i, _ in TRUE_EFFECTS[name]
     ]
     for effect_id, values in TRUE_EFFECTS[name]:
@@ -124,7 +124,7 @@ def test_auto_finds_true_effects_with_their_parameters(name: str) -> None:
                 continue
             assert abs(value - true[parameter]) < 3.5 * std_error
             assert 0.0 < std_error < 0.1 * abs(true[parameter])
-    before, after = result.found.held_out_rmse_v
+    before, after = result.effects.held_out_rmse_v
     # The remaining error is that of the same trips without effects.
     assert after == pytest.approx(fitted("nothing").model.noise.voltage_rmse_v, rel=0.03)
     assert before > 1.2 * after
@@ -133,10 +133,10 @@ def test_auto_finds_true_effects_with_their_parameters(name: str) -> None:
 
 def test_auto_takes_nothing_on_logs_without_effects() -> None:
     result = fitted("nothing")
-    assert result.found is not None
-    assert result.found.model.effects == ()
+    assert result.effects is not None
+    assert result.effects.model.effects == ()
     assert result.model.effects == []
-    assert {step.what for step in result.found.steps} <= {"not added"}
+    assert {step.what for step in result.effects.steps} <= {"not added"}
     assert any("none taken" in remark for remark in result.remarks)
     plain = fit(trips("nothing"), capacity_ah=CAPACITY_AH)
     for key, item in plain.model.coefficients.items():
@@ -154,7 +154,7 @@ def test_one_log_is_cross_validated_by_blocks() -> None:
     result = fit(
         [replace(log, voltage_v=volts + noise)], capacity_ah=CAPACITY_AH, effects=("auto",)
     )
-    ids = [effect.id for effect, _ in result.found.model.effects]
+    ids = [effect.id for effect, _ in result.effects.model.effects]
     assert ids == ["fast_polarization", "slow_diffusion"]
     value, std_error = parameters(result, "fast_polarization")["tau_s"]
     assert abs(value - 3.0) < 3.5 * std_error
@@ -163,23 +163,23 @@ def test_one_log_is_cross_validated_by_blocks() -> None:
 
 def test_named_effects_are_all_taken_and_reported() -> None:
     result = fitted("cold", ("resistance_asymmetry", "resistance_temperature"))
-    ids = [effect.id for effect, _ in result.found.model.effects]
+    ids = [effect.id for effect, _ in result.effects.model.effects]
     assert ids == ["resistance_temperature", "resistance_asymmetry"]
-    assert [step.effect_id for step in result.found.steps] == ids  # the more helpful one first
+    assert [step.effect_id for step in result.effects.steps] == ids  # the more helpful one first
     value, std_error = parameters(result, "resistance_asymmetry")["charging_ohm"]
     assert abs(value) < 3.5 * std_error + 1e-9  # there is none
     assert not any("bound" in remark for remark in result.remarks)
     described = result.to_dict()
     assert [item["id"] for item in described["effects"]] == ids
     assert described["effects"][0]["parameters"]["share"]["unit"] == "1"
-    assert described["effect_search"]["held_out_rmse_with_v"] == result.found.held_out_rmse_v[1]
+    assert described["effect_search"]["held_out_rmse_with_v"] == result.effects.held_out_rmse_v[1]
 
 
 @pytest.mark.parametrize("name", ["cold", "hysteresis"])
 def test_the_estimator_reproduces_the_newton_inverse_of_the_fit(name: str) -> None:
     result = fitted(name)
-    entries = effect_entries(result.found.model.effects)
-    assert parse_effects(entries, result.found.model.pack) == list(result.found.model.effects)
+    entries = effect_entries(result.effects.model.effects)
+    assert parse_effects(entries, result.effects.model.pack) == list(result.effects.model.effects)
     for number, log in enumerate(trips(name)[:2]):
         table, _ = estimate_log(log, result.model, EstimatorSettings(initial_soc_pct=None))
         rows = result.fits[number].rows

@@ -220,7 +220,7 @@ def test_keyword_arguments_suffice_for_a_fit_with_effects() -> None:
         for start in (95, 85, 75)
     ]
     found = fit(logs, capacity_ah=CAPACITY_AH, delay_s=[0.0, 10.0, 30.0, 70.0], effects="auto")
-    assert found.found is not None
+    assert found.effects is not None
     assert found.model.made.options["effects"] == "auto"
 
 

@@ -288,9 +288,9 @@ def _show(result: Identification, search: DelaySearch | None) -> None:
             for name, item in model.coefficients.items()
         ],
     )  # fmt: skip
-    if result.found is not None:
-        print_table("Effects", *effect_rows(result.found))
-        print_table("Search for effects", *step_rows(result.found))
+    if result.effects is not None:
+        print_table("Effects", *effect_rows(result.effects))
+        print_table("Search for effects", *step_rows(result.effects))
     print_table(
         "Energy at the terminals",
         ["", "value", "<unit"],

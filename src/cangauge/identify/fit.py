@@ -77,7 +77,7 @@ class Identification:
     voltage_rmse_v: float
     soc_newton_mae_pct: float
     remarks: tuple[str, ...] = ()
-    found: FittedEffects | None = None
+    effects: FittedEffects | None = None
     """Effects, if any were asked for."""
 
     def to_dict(self) -> dict[str, object]:
@@ -114,7 +114,7 @@ class Identification:
                 for item in self.fits
             ],
             "remarks": list(self.remarks),
-        } | ({} if self.found is None else self.found.to_dict())
+        } | ({} if self.effects is None else self.effects.to_dict())
 
 
 def fit(
@@ -243,7 +243,7 @@ def fit(
             *_remarks(voltage_model, solution, rows),
             *(found.remarks() if found is not None else ()),
         ),
-        found=found,
+        effects=found,
     )
 
 

@@ -112,7 +112,7 @@ def _meaning(name: str, result: Identification) -> str:
 
 def effect_tables(result: Identification) -> list[Block]:
     """Return the effects with their parameters, and how they were found."""
-    found = result.found
+    found = result.effects
     if found is None:
         return []
     ids = dict.fromkeys(effect_id for effect_id, _ in found.estimates)
@@ -342,7 +342,7 @@ def fit_figures(result: Identification, time: TimeFigures) -> list[Block]:
 
 
 def _and_effects(result: Identification) -> str:
-    return ", effects" if result.found is not None and result.found.model.effects else ""
+    return ", effects" if result.effects is not None and result.effects.model.effects else ""
 
 
 def _ocv_plane(result: Identification) -> Plot:
@@ -545,7 +545,7 @@ def fit_page(result: Identification) -> Page:
         Section("Resistance", [resistance_figure(result)]),
         Section("Energy", energy_figures(result)),
         Section("Coefficients", [coefficient_table(result)]),
-        *([Section("Effects", effect_tables(result))] if result.found is not None else []),
+        *([Section("Effects", effect_tables(result))] if result.effects is not None else []),
         Section("How it was made", _made(result)),
     ]
     return Page(

@@ -384,6 +384,15 @@ class OnlineEffect:
             lag.restore(state[size * k : size * (k + 1)], latest_s)
 
 
+class OnlineInteriorEffect(OnlineEffect):
+    """Online effect of the temperature of the cell interior, `lag_s` behind the measured one."""
+
+    def __init__(self, lag_s: float) -> None:
+        self.interior = LowPass(lag_s)
+        self.lags = (self.interior,) if self.interior.is_lagging else ()
+        self.follows_temperature = self.interior.is_lagging
+
+
 class Effect:
     """A mechanism that the voltage model lacks."""
 

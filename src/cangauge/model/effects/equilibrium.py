@@ -15,12 +15,13 @@ from cangauge.model.effects.base import (
     WITHIN_C,
     Effect,
     OnlineEffect,
+    OnlineInteriorEffect,
     Pack,
     PackState,
     Parameter,
     Values,
 )
-from cangauge.model.effects.first_order import LowPass, decaying_sum
+from cangauge.model.effects.first_order import decaying_sum
 from cangauge.model.voltage_model import VoltageModel
 
 
@@ -134,23 +135,21 @@ class EntropicCoefficient(Effect):
         return _EntropicCoefficientOnline(values, model.t_ref_c)
 
 
-class _EntropicCoefficientOnline(OnlineEffect):
+class _EntropicCoefficientOnline(OnlineInteriorEffect):
     uses_soc = True
 
     def __init__(self, values: Values, t_ref_c: float) -> None:
+        super().__init__(values["lag_s"])
         self._level = values["level_v_per_k"]
         self._slope = values["slope_v_per_k"]
         self._curve = values["curve_v_per_k"]
-        self._inside = LowPass(values["lag_s"])
-        self.lags = (self._inside,) if self._inside.is_lagging else ()
-        self.follows_temperature = self._inside.is_lagging
         self._t_ref_c = t_ref_c
         self._warmer = 0.0
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         low, high = WITHIN_C
-        inside_at = self._inside.step(time_s, temperature_c)
-        self._warmer = min(max(inside_at, low), high) - self._t_ref_c
+        interior_c = self.interior.step(time_s, temperature_c)
+        self._warmer = min(max(interior_c, low), high) - self._t_ref_c
 
     def extra_voltage(self, soc_pct: float) -> float:
         x = min(max(soc_pct, 0.0), 100.0) / 50.0 - 1.0

@@ -15,13 +15,13 @@ from cangauge.model.effects.base import (
     WITHIN_C,
     Effect,
     OnlineEffect,
+    OnlineInteriorEffect,
     Pack,
     PackState,
     Parameter,
     Values,
     scaled_drop_at,
 )
-from cangauge.model.effects.first_order import LowPass
 from cangauge.model.voltage_model import VoltageModel
 
 ZERO_C_IN_K: Final = 273.15
@@ -95,20 +95,18 @@ class ResistanceTemperature(Effect):
         return _ResistanceTemperatureOnline(values, pack.resistance_ohm)
 
 
-class _ResistanceTemperatureOnline(OnlineEffect):
+class _ResistanceTemperatureOnline(OnlineInteriorEffect):
     def __init__(self, values: Values, resistance_ohm: float) -> None:
+        super().__init__(values["lag_s"])
         self._share = values["share"]
         self._activation_k = values["activation_k"]
         self._delayed = values["delayed"]
         self._reference_per_k = inverse_k_at(values["reference_c"])
         self._resistance_ohm = resistance_ohm
-        self._inside = LowPass(values["lag_s"])
-        self.lags = (self._inside,) if self._inside.is_lagging else ()
-        self.follows_temperature = self._inside.is_lagging
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         scaled_v = scaled_drop_at(drop_v, current_a, self._delayed, self._resistance_ohm)
-        colder = inverse_k_at(self._inside.step(time_s, temperature_c)) - self._reference_per_k
+        colder = inverse_k_at(self.interior.step(time_s, temperature_c)) - self._reference_per_k
         self.volts = self._share * scaled_v * math.expm1(self._activation_k * colder)
 
 

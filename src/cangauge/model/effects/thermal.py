@@ -12,6 +12,7 @@ from cangauge.model.charge import BRIDGE_S
 from cangauge.model.effects.base import (
     Effect,
     OnlineEffect,
+    OnlineInteriorEffect,
     Pack,
     PackState,
     Parameter,
@@ -158,20 +159,15 @@ class InnerTemperature(Effect):
         return per_k * (state.lagged_temperature_c(values["tau_s"]) - state.temperature_c)
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        return _InnerTemperatureOnline(
-            values["voltage_v_per_k"], values["drop_per_k"], values["tau_s"]
-        )
+        return _InnerTemperatureOnline(values)
 
 
-class _InnerTemperatureOnline(OnlineEffect):
-    follows_temperature = True
-
-    def __init__(self, voltage_v_per_k: float, drop_per_k: float, tau_s: float) -> None:
-        self._voltage_v_per_k = voltage_v_per_k
-        self._drop_per_k = drop_per_k
-        self._inside = LowPass(tau_s)
-        self.lags = (self._inside,)
+class _InnerTemperatureOnline(OnlineInteriorEffect):
+    def __init__(self, values: Values) -> None:
+        super().__init__(values["tau_s"])
+        self._voltage_v_per_k = values["voltage_v_per_k"]
+        self._drop_per_k = values["drop_per_k"]
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
-        away = self._inside.step(time_s, temperature_c) - temperature_c
+        away = self.interior.step(time_s, temperature_c) - temperature_c
         self.volts = (self._voltage_v_per_k + self._drop_per_k * drop_v) * away
