@@ -34,7 +34,7 @@ from cangauge.diagnosis.extended_model import library_without
 from cangauge.diagnosis.posterior import ALIKE_FROM, NAMED_FROM, SEEN_BELOW, Compared, compare
 from cangauge.diagnosis.problem import build_problem
 from cangauge.logs.read import read_log
-from cangauge.model.model_file import load_model
+from cangauge.model.model_file import Model
 from cangauge.validation.score import LEAST_GAP
 
 FloatArray = NDArray[np.float64]
@@ -118,7 +118,7 @@ def case_of(label: dict[str, Any], folder: Path) -> Case:
             for kind in ("log", "reference")
         )
         settled = build_problem(
-            logs, load_model(place / "model.json"), references, library_without(())
+            logs, Model.load(place / "model.json"), references, library_without(())
         )
         _, compared = compare(settled)
         kept.write_bytes(pickle.dumps((compared, bool(settled.error.strays))))

@@ -44,7 +44,7 @@ from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Sample
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
-from cangauge.model.model_file import load_model
+from cangauge.model.model_file import Model
 from cangauge.replay.player import Pacer
 from cangauge.service.pipeline import Gauge, GaugeSettings
 from cangauge.service.recording import Recorder
@@ -218,7 +218,7 @@ def offline() -> tuple[Result, list[Row]]:
     log = long_log()
     read_s = time.monotonic() - began
     settings = EstimatorSettings(temperature_source=log.temperature_source)
-    _, scores = estimate_log(log, load_model(model_path()), settings)
+    _, scores = estimate_log(log, Model.load(model_path()), settings)
     result = {"rows": len(log), "read_seconds": read_s, "seconds": scores.seconds}
     rows = [
         ("log", f"{log.duration_s / 3600:.2f} h, {len(log)} samples", ""),
@@ -271,7 +271,7 @@ def memory(hours: float = 24.0) -> tuple[Result, list[Row]]:
 
 def _live_a_day(pipe: Any, hours: float) -> None:
     vehicle = load_vehicle("generic")
-    gauge = Gauge(vehicle, load_model(model_path()), GaugeSettings())
+    gauge = Gauge(vehicle, Model.load(model_path()), GaugeSettings())
     encoder = FrameEncoder(vehicle)
     log = long_log()
     columns = (log.current_a.tolist(), log.voltage_v.tolist(), log.temperature_c.tolist())

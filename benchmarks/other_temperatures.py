@@ -10,7 +10,6 @@ root mean square error on other logs, within the SoC that the model saw, and the
 from __future__ import annotations
 
 import argparse
-import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,8 +18,8 @@ from rich.console import Console
 from rich.table import Table
 
 from cangauge.errors import InputError
-from cangauge.identify.rows import FitOptions
-from cangauge.identify.voltage_fit import fit_voltage_model, prepare
+from cangauge.identify.voltage_fit import fit_voltage_model
+from cangauge.inference.rows import FitOptions, fit_rows
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.charge import capacity_from_reference
@@ -78,9 +77,11 @@ def judged(
     """Return the cells of a row of the table, from the number of models on."""
     found, kt = [], []
     for training in models:
-        rows = prepare(training, options)
+        rows = [fit_rows(log, options) for log in training]
         try:
-            two = [fit_voltage_model(rows, options, is_held=held)[0] for held in (False, True)]
+            two = [
+                fit_voltage_model(rows, options, with_kt_prior=held)[0] for held in (False, True)
+            ]
         except InputError:  # too little SoC
             continue
         kt.append([model.kt_v_per_k for model in two])
@@ -100,7 +101,7 @@ def error_v(logs: Sequence[Log], options: FitOptions, model: VoltageModel) -> fl
     """Return the root mean square error over logs [V], each counting the same."""
     squares = []
     low, high = model.soc_range_pct
-    for rows in itertools.chain.from_iterable(prepare([log], options) for log in logs):
+    for rows in (fit_rows(log, options) for log in logs):
         inside = (rows.soc_pct >= low) & (rows.soc_pct <= high)
         if inside.sum() >= ROWS_AT_LEAST:
             volts = model.voltage(rows.soc_pct, rows.temperature_c, rows.delayed_current_a)

@@ -19,7 +19,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -30,10 +30,9 @@ from rich.table import Table
 from cangauge.estimate.offline import EstimateTable, run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Sample
-from cangauge.identify.fit import Identification, LogFit, evaluate, evaluate_extended, fit
-from cangauge.identify.linearized import prepare_log
-from cangauge.identify.rows import FitOptions
-from cangauge.identify.voltage_fit import prepare
+from cangauge.identify.evaluate import LogFit, evaluate, evaluate_extended
+from cangauge.identify.fit import Identification, fit
+from cangauge.inference.rows import FitOptions, fit_rows, sample_log
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.charge import capacity_from_reference
@@ -110,20 +109,19 @@ def read_trips(folder: Path, names: Sequence[str]) -> list[Log]:
 def identify(
     training: Sequence[Log],
     effects: tuple[str, ...] = (),
-    progress: Callable[[str], None] | None = None,
 ) -> Identification:
     """Fit model and capacity, and perhaps effects, on the training trips alone."""
-    options = FitOptions(capacity_ah=capacity_from_reference(training), effects=effects)
-    return fit(training, options, progress)
+    return fit(training, capacity_ah=capacity_from_reference(training), effects=effects)
 
 
 def explain(identification: Identification, tests: Sequence[Log]) -> tuple[LogFit, ...]:
     """Return how the model explains trips that it has not seen, on the rows of a fit."""
     options = _options(identification.model)
-    if identification.found is None:
-        return evaluate(identification.voltage_model, prepare(tests, options))
-    prepared = [prepare_log(trip, options) for trip in tests]
-    return evaluate_extended(identification.found.model, prepared)
+    if identification.effects is None:
+        model = identification.voltage_model
+        return tuple(evaluate(model, fit_rows(trip, options)) for trip in tests)
+    extended = identification.effects.model
+    return tuple(evaluate_extended(extended, sample_log(trip, options)) for trip in tests)
 
 
 def estimate(log: Log, model: Model, initial_pct: float | None) -> EstimateTable:
@@ -214,7 +212,7 @@ def judge(
     """Do the whole comparison, or with some of the chains alone, and return its figures."""
     console.print("reading 22 trips, fitting 11 of them …")
     began = time.perf_counter()
-    identification = identify(read_trips(folder, TRAINING), effects, console.print)
+    identification = identify(read_trips(folder, TRAINING), effects)
     fit_seconds = time.perf_counter() - began
     model = identification.model
     all_tests = read_trips(folder, TEST)

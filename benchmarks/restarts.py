@@ -45,7 +45,7 @@ from cangauge.bus.publish import FrameIds, SocEstimate, SocReader
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate, Reason, Sample
-from cangauge.model.model_file import Model, load_model
+from cangauge.model.model_file import Model
 from cangauge.service.loop import CHECKPOINT_EVERY_S, FIRST_CHECKPOINT_S
 from cangauge.service.pipeline import Gauge, GaugeSettings
 from cangauge.service.state import StateKeeper, StateSettings
@@ -168,7 +168,7 @@ class Life:
 def in_process(kills: int, seed: int, folder: Path, console: Console) -> Result:
     """Kill so many services at random moments of one drive."""
     rng = np.random.default_rng(seed)
-    model = load_model(shared_file("replay", "leaf2012_published_model.json"))
+    model = Model.load(shared_file("replay", "leaf2012_published_model.json"))
     path = folder / "state.json"
     lives = np.ceil((rng.exponential(MEAN_BETWEEN_KILLS_S, kills + 1) + 1.0) * RATE_HZ).astype(int)
     away = np.ceil(rng.uniform(0.2, 3.0, kills + 1) * RATE_HZ).astype(int)
@@ -257,7 +257,7 @@ def real_process(kills: int, seed: int, folder: Path, console: Console) -> Resul
     """Kill `cangauge run` so often with SIGKILL, beside one that nobody kills."""
     rng = np.random.default_rng(seed)
     model_path = shared_file("replay", "leaf2012_published_model.json")
-    model = load_model(model_path)
+    model = Model.load(model_path)
     lives = rng.uniform(1.5, 6.0, kills)
     samples = drive(kills * 30.0 + 300.0, model, seed)
     flowed, net = flowed_pct(samples, model.capacity_ah)

@@ -26,7 +26,7 @@ from cangauge.bus.vehicle import Vehicle, load_vehicle
 from cangauge.cli.app import main
 from cangauge.estimate.validity import Estimate
 from cangauge.logs.log import Log
-from cangauge.model.model_file import Model, load_model
+from cangauge.model.model_file import Model
 from cangauge.service.loop import LoopSettings, Outputs, RunSummary, serve
 from cangauge.service.pipeline import Gauge, GaugeSettings
 from synthetic import synthetic_log
@@ -39,7 +39,7 @@ def leaf_model_path() -> Path:
 
 
 def leaf_model() -> Model:
-    return load_model(leaf_model_path())
+    return Model.load(leaf_model_path())
 
 
 def short_log(seconds: float = 100.0, rate_hz: float = 10.0, *, noise_v: float = 0.3) -> Log:

@@ -1,4 +1,4 @@
-"""Logs made from the published equation, for tests: what a fit must find is known."""
+"""Simulated logs of the published equation, with a known truth, for tests."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from cangauge.bus.vehicle import load_vehicle
 from cangauge.estimate.validity import Sample
 from cangauge.model.effects.base import Pack, Parameter
 from cangauge.model.effects.library import LIBRARY, effect_entries
-from cangauge.model.model_file import load_model
+from cangauge.model.model_file import Model
 
 ROWS = 12
 
@@ -315,7 +315,7 @@ def model_tree() -> dict[str, Any]:
     """Return a model file's content, with every effect and with information."""
     path = shared_file("replay", "leaf2012_published_model.json")
     tree: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    file = load_model(path)
+    file = Model.load(path)
     pack = Pack.of(file.voltage_model(), file.capacity_ah)
     tree["effects"] = effect_entries(
         [(effect, {p.name: _somewhere(p, pack) for p in effect.parameters})
@@ -328,8 +328,6 @@ def model_tree() -> dict[str, Any]:
         "scale": [1.0 + k for k in range(n)],
         "root": [[float(i == k) for k in range(n)] for i in range(n)],
         "projected": [0.5] * n,
-        "rows": 9000,
-        "residual_sum_v2": 12.5,
     }
     return tree
 

@@ -35,7 +35,7 @@ from cangauge.inspect.capture import inspect_capture
 from cangauge.inspect.log import inspect_log
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
-from cangauge.model.model_file import Model, load_model
+from cangauge.model.model_file import Model
 from cangauge.service.config import load_config
 from cangauge.service.pipeline import EstimateStream
 from cangauge.validation.twin.day import read_speed
@@ -81,7 +81,7 @@ def _file(data: bytes, name: str = "input") -> Iterator[Path]:
 
 @cache
 def _model() -> Model:
-    return load_model(shared_file("replay", "leaf2012_published_model.json"))
+    return Model.load(shared_file("replay", "leaf2012_published_model.json"))
 
 
 def _packed(rng: Random, data: bytes) -> bytes:
@@ -347,7 +347,7 @@ def _make_model(rng: Random) -> bytes:
 
 def _run_model(data: bytes) -> bool:
     with _file(data, "mutant.json") as path:
-        model = load_model(path)
+        model = Model.load(path)
     volts = model.voltage_model().pseudo_ocv([-5.0, 0.0, 50.0, 100.0, 105.0])
     if not all(map(math.isfinite, volts.tolist())):
         raise FindingError(f"a pseudo-OCV of {volts} V")

@@ -16,7 +16,6 @@ from cangauge.cli.fit import fit_command
 from cangauge.cli.gap import gap_command
 from cangauge.identify.fit import fit
 from cangauge.logs.canonical import write_log
-from cangauge.model.model_file import model_json
 from synthetic import synthetic_log
 
 app = typer.Typer()
@@ -56,5 +55,5 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     part = synthetic_log(hours=0.4, start_pct=80.0, end_pct=60.0, noise_v=0.5, seed=3, name="part")
     write_log(full, folder / "full.parquet")
     write_log(part, folder / "part.csv")
-    (folder / "model.json").write_text(model_json(fit([full]).model), encoding="utf-8")
+    fit([full]).model.save(folder / "model.json")
     return folder

@@ -21,7 +21,7 @@ from cangauge.estimate.offline import estimate_log, samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.logs.canonical import write_log
 from cangauge.logs.read import read_log
-from cangauge.model.model_file import load_model
+from cangauge.model.model_file import Model
 from cangauge.service.capture_estimate import estimate_capture
 
 Run = Callable[..., object]
@@ -68,7 +68,7 @@ def test_a_row_per_sample_bit_for_bit(run: Run, made: Path, tmp_path: Path, suff
     assert table.column_names == COLUMNS
     log = read_log(made / "part.csv")
     settings = EstimatorSettings(initial_soc_pct=log.soc_pct[0], temperature_source="room")
-    expected, _ = estimate_log(log, load_model(made / "model.json"), settings)
+    expected, _ = estimate_log(log, Model.load(made / "model.json"), settings)
     assert table["time_s"].to_numpy().tolist() == log.time_s.tolist()
     for name in COLUMNS[1:7]:
         assert table[name].to_numpy().tolist() == getattr(expected, name).tolist()
@@ -167,7 +167,7 @@ def test_a_refused_sample_keeps_its_own_time(made: Path, tmp_path: Path) -> None
     amperes = log.current_a.copy()
     amperes[20] = 1e5
     wild = replace(log, current_a=amperes)
-    table, _ = estimate_log(wild, load_model(made / "model.json"), EstimatorSettings())
+    table, _ = estimate_log(wild, Model.load(made / "model.json"), EstimatorSettings())
     assert table.time_s[20] == log.time_s[19]
     write_estimates(tmp_path / "soc.parquet", wild.time_s, table)
     written = pa.parquet.read_table(tmp_path / "soc.parquet")
@@ -271,7 +271,7 @@ def test_a_capture_is_estimated_as_the_service_does(
     assert found["frames"]["lost"] == 0
     assert found["soc_mae_pct"] is not None
     table = pa.parquet.read_table(out)
-    live = estimate_capture(capture, load_vehicle("generic"), load_model(made / "model.json")).table
+    live = estimate_capture(capture, load_vehicle("generic"), Model.load(made / "model.json")).table
     assert len(table) == found["rows"] == len(read_log(made / "part.csv"))
     for name in COLUMNS[1:7]:
         assert np.array_equal(table[name].to_numpy(), getattr(live, name), equal_nan=True)

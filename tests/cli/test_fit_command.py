@@ -13,7 +13,7 @@ import pytest
 from cangauge.errors import CangaugeError
 from cangauge.logs.canonical import write_log
 from cangauge.logs.read import read_log
-from cangauge.model.model_file import load_model
+from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH
 
 Run = Callable[..., object]
@@ -49,7 +49,7 @@ def test_json_is_one_object_that_keeps_the_contract(run: Run, made: Path, tmp_pa
     assert {item["unit"] for item in found["coefficients"].values()} == {"V", "V/K", "ohm"}
     assert found["capacity_ah"] == pytest.approx(CAPACITY_AH, rel=0.02)
     assert found["coefficients"]["R1"]["value"] == pytest.approx(-0.1032, rel=0.02)
-    model = load_model(tmp_path / "m.json")
+    model = Model.load(tmp_path / "m.json")
     assert model.coefficients["kt"].value == found["coefficients"]["kt"]["value"]
     assert model.capacity_ah == found["capacity_ah"]
 
@@ -69,7 +69,7 @@ def test_options_go_into_the_model_file(run: Run, made: Path, tmp_path: Path) ->
         "--name", "my pack", "--temperature-source", "cell", "--initial-soc", "99.5",
     )  # fmt: skip
     assert ran.code == 0, ran.err
-    model = load_model(tmp_path / "m.json")
+    model = Model.load(tmp_path / "m.json")
     assert model.capacity_ah == 51.0
     assert model.rate_hz == 0.5
     assert model.delays_s == [0.0, 20.0]
@@ -96,7 +96,7 @@ def test_delays_by_search(run: Run, made: Path, tmp_path: Path) -> None:
     assert errors == sorted(errors)
     assert best["delays_s"][0] == 0.0
     assert len(found["delays_s"]) > 1
-    assert load_model(tmp_path / "m.json").delays_s == found["delays_s"]
+    assert Model.load(tmp_path / "m.json").delays_s == found["delays_s"]
 
 
 def test_several_logs_and_a_report(run: Run, made: Path, tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_effects_go_into_model_json_tables_and_report(run: Run, made: Path, tmp_
     search = found["effect_search"]
     assert [step["step"] for step in search["steps"]] == ["added", "added"]
     assert search["held_out_rmse_with_v"] == found["held_out"]["voltage_rmse_v"]
-    model = load_model(tmp_path / "m.json")
+    model = Model.load(tmp_path / "m.json")
     assert [effect.id for effect, _ in model.extended_model().effects] == [
         "resistance_asymmetry", "fast_polarization",
     ]  # fmt: skip
@@ -145,7 +145,7 @@ def test_too_short_a_log_for_effects_is_refused(run: Run, made: Path, tmp_path: 
     write_log(log.rows(np.arange(700)), tmp_path / "short.csv")
     given = ("fit", tmp_path / "short.csv", "-o", tmp_path / "m.json", "--capacity-ah", "51.5")
     assert run(*given).code == 0
-    refused(run(*given, "--effects", "auto"), "short", "can be held out", "--effects")
+    refused(run(*given, "--effects", "auto"), "short", "too little to hold rows out", "--effects")
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_too_short_a_log_for_effects_is_refused(run: Run, made: Path, tmp_path: 
     [
         (["--effects", "gremlin"], ["--effects", "gremlin", "known are", "hysteresis"]),
         (["--effects", "auto,hysteresis"], ["--effects", "auto alone"]),
-        (["--effects", "voltage_offset"], ["--effects", "voltage_offset", "k0 holds it"]),
+        (["--effects", "voltage_offset"], ["--effects", "voltage_offset", "k0 absorbs it"]),
         (["--delays", "0,10,5"], ["--delays", "increase", "0,10,5"]),
         (["--delays", "0;10"], ["--delays", "0;10"]),
         (["--epsilon", "0.6"], ["--epsilon", "0.6"]),

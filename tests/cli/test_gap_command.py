@@ -12,7 +12,7 @@ import pytest
 
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
-from cangauge.model.model_file import load_model
+from cangauge.model.model_file import Model
 from synthetic import synthetic_log
 
 Run = Callable[..., object]
@@ -55,7 +55,7 @@ def test_json_report_and_a_model_that_runs(
     assert found["extended_model"] == str(better)
     assert isinstance(found["limits"], list)
     assert "What these logs cannot show" in page.read_text(encoding="utf-8") or not found["limits"]
-    assert [entry["id"] for entry in load_model(better).effects]
+    assert [entry["id"] for entry in Model.load(better).effects]
     ran = run("estimate", days / "trip.csv", "-m", better, "-o", tmp_path / "soc.csv")
     assert ran.code == 0
 

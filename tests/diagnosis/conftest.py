@@ -6,7 +6,6 @@ import pytest
 from days import day
 
 from cangauge.identify.fit import fit
-from cangauge.identify.rows import FitOptions
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH
@@ -17,7 +16,7 @@ from synthetic import synthetic_log
 def model() -> Model:
     """The published equation, identified from three full discharges."""
     logs = [synthetic_log(noise_v=0.5, seed=seed) for seed in (1, 2, 3)]
-    return fit(logs, FitOptions(capacity_ah=CAPACITY_AH)).model
+    return fit(logs, capacity_ah=CAPACITY_AH).model
 
 
 @pytest.fixture(scope="session")

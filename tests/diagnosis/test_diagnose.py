@@ -18,7 +18,7 @@ from cangauge.errors import InputError
 from cangauge.estimate.offline import estimate_log
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.logs.log import Log
-from cangauge.model.model_file import Model, load_model, model_json
+from cangauge.model.model_file import Model
 from cangauge.report.diagnosis import gap_report
 from synthetic import synthetic_log
 
@@ -137,11 +137,11 @@ def test_extended_model_runs_in_the_estimator(
     offset: Diagnosis, model: Model, tmp_path: Path
 ) -> None:
     path = tmp_path / "better.json"
-    path.write_text(model_json(model_file_of(offset.extension, model, offset.extended_rmse_v)))
+    model_file_of(offset.extension, model, offset.extended_rmse_v).save(path)
     log = FAULTS["current_offset"](day(40))
     settings = EstimatorSettings(initial_soc_pct=85.0, method="coulomb")
     _, plain = estimate_log(log, model, settings)
-    _, better = estimate_log(log, load_model(path), settings)
+    _, better = estimate_log(log, Model.load(path), settings)
     assert plain.soc_mae_pct is not None
     assert better.soc_mae_pct is not None
     assert better.soc_mae_pct < 0.25 * plain.soc_mae_pct

@@ -12,8 +12,8 @@ from cangauge.diagnosis.diagnose import diagnose
 from cangauge.diagnosis.extended_model import model_file_of
 from cangauge.diagnosis.problem import _over_all_temperatures
 from cangauge.identify.fit import fit
-from cangauge.identify.linearized import prepare_log, residual
-from cangauge.identify.rows import FitOptions
+from cangauge.inference.linearized import residual
+from cangauge.inference.rows import FitOptions, sample_log
 from cangauge.logs.log import Log
 from cangauge.model.effects.base import Signals
 from cangauge.model.effects.library import LIBRARY, candidates
@@ -50,7 +50,7 @@ def model() -> Model:
 
 def test_widened_temperatures_leave_the_effects_where_they_were(model: Model) -> None:
     given = model.extended_model()
-    inside = prepare_log(day(5, 18.0), OPTIONS)
+    inside = sample_log(day(5, 18.0), OPTIONS)
     wider = _over_all_temperatures(given, [day(6, -12.0)])
     assert wider.model.temperature_range_c[0] < given.model.temperature_range_c[0] - 10.0
     assert np.array_equal(residual(inside, wider), residual(inside, given))
@@ -61,7 +61,7 @@ def test_structure_is_told_from_the_effects_that_the_model_has() -> None:
     plain = ExtendedModel(TRUTH.model, CAPACITY_AH)
     own = {"ohm": 0.02, "tau_s": 312.7, "spread": 0.0, "activation_k": 0.0, "by_slope": 0.0}
     given = plain.with_effect(LIBRARY["slow_diffusion"], own)
-    item = prepare_log(day(5, 18.0), OPTIONS)
+    item = sample_log(day(5, 18.0), OPTIONS)
     (piece, *_) = candidates([LIBRARY["resistance_soc"]], given.pack, item.log.time_s)
     amount = 0.1 * piece.bounds[:, 1]
     acting = given.with_effect(piece.effect, piece.values(amount))

@@ -17,7 +17,6 @@ from cangauge.diagnosis.diagnose import diagnose
 from cangauge.diagnosis.hypotheses import Frame
 from cangauge.diagnosis.linear_gaussian import ErrorModel, Evidence
 from cangauge.identify.fit import fit
-from cangauge.identify.rows import FitOptions
 from cangauge.inference.time_scales import SCALES
 from cangauge.logs.log import Log
 from cangauge.model.effects.base import Pack
@@ -122,7 +121,7 @@ def day(seed: int) -> Log:
 @pytest.fixture(scope="module")
 def model() -> Model:
     logs = [synthetic_log(noise_v=0.5, seed=seed) for seed in (1, 2, 3)]
-    return fit(logs, FitOptions(capacity_ah=CAPACITY_AH)).model
+    return fit(logs, capacity_ah=CAPACITY_AH).model
 
 
 def polarised(log: Log, ohm: float) -> Log:

@@ -14,8 +14,8 @@ from cangauge.diagnosis.extended_model import library_without
 from cangauge.diagnosis.problem import DiagnosisProblem, build_problem
 from cangauge.diagnosis.references import Learned
 from cangauge.identify.fit import fit
-from cangauge.identify.linearized import prepare_log, residual
-from cangauge.identify.rows import FitOptions
+from cangauge.inference.linearized import residual
+from cangauge.inference.rows import sample_log
 from cangauge.logs.log import Log
 from cangauge.model.effects.first_order import low_passed
 from cangauge.model.model_file import Model
@@ -44,7 +44,7 @@ def model() -> Model:
         replace(log, voltage_v=log.voltage_v - 0.95 * KT_V_K * (log.temperature_c - 20.0))
         for log in logs
     ]
-    return fit(without, FitOptions(capacity_ah=CAPACITY_AH)).model
+    return fit(without, capacity_ah=CAPACITY_AH).model
 
 
 def learned(model: Model, rise_k: float) -> DiagnosisProblem:
@@ -58,7 +58,7 @@ def test_a_rise_and_kt_are_told_apart(rise_k: float, model: Model) -> None:
     settled = learned(model, rise_k)
     assert settled.model.model.kt_v_per_k == pytest.approx(KT_V_K, rel=0.05)
     assert settled.acting is not None
-    another = prepare_log(warm_inside(day(31), rise_k), settled.options)
+    another = sample_log(warm_inside(day(31), rise_k), settled.options)
     assert rms(residual(another, settled.acting)) < 1.15 * NOISE_V
 
 

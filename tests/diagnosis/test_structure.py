@@ -11,8 +11,8 @@ from cangauge.diagnosis.extended_model import extend, library_without
 from cangauge.diagnosis.problem import DiagnosisProblem, build_problem
 from cangauge.diagnosis.references import needed
 from cangauge.identify.fit import fit
-from cangauge.identify.linearized import prepare_log, residual
-from cangauge.identify.rows import FitOptions
+from cangauge.inference.linearized import residual
+from cangauge.inference.rows import sample_log
 from cangauge.logs.log import Log
 from cangauge.model.effects.first_order import low_passed
 from cangauge.model.model_file import Model
@@ -36,7 +36,7 @@ def polarised(log: Log) -> Log:
 @pytest.fixture(scope="module")
 def model() -> Model:
     logs = [synthetic_log(noise_v=NOISE_V, seed=seed) for seed in (1, 2, 3)]
-    return fit(logs, FitOptions(capacity_ah=CAPACITY_AH)).model
+    return fit(logs, capacity_ah=CAPACITY_AH).model
 
 
 def needed_of(settled: DiagnosisProblem) -> set[str]:
@@ -56,6 +56,6 @@ def test_structure_that_references_show_runs_in_the_extended_model(model: Model)
     assert "slow_diffusion" in needed_of(settled)
     extended = extend(settled, []).model
     assert "slow_diffusion" in {effect.id for effect, _ in extended.effects}
-    another = prepare_log(polarised(day(31)), settled.options)
+    another = sample_log(polarised(day(31)), settled.options)
     assert rms(residual(another, extended)) < 1.1 * NOISE_V
     assert rms(residual(another, model.extended_model())) > 1.5 * NOISE_V

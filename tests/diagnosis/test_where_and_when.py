@@ -21,8 +21,7 @@ from cangauge.diagnosis.error_breakdown import (
     places,
     worst_moments,
 )
-from cangauge.identify.linearized import Prepared, prepare_log
-from cangauge.identify.rows import FitOptions
+from cangauge.inference.rows import FitOptions, SampledLog, sample_log
 from cangauge.logs.log import Log
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 from synthetic import synthetic_log
@@ -32,8 +31,8 @@ OPTIONS = FitOptions(
 )
 
 
-def prepared(log: Log) -> Prepared:
-    return prepare_log(log, OPTIONS)
+def prepared(log: Log) -> SampledLog:
+    return sample_log(log, OPTIONS)
 
 
 def terms(log: Log) -> DesignMatrix:

@@ -16,7 +16,6 @@ from cangauge.estimate.offline import estimate_log, run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Reason, Sample, Status
 from cangauge.identify.fit import fit
-from cangauge.identify.rows import FitOptions
 from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
 from cangauge.model.voltage_model import soc_from_ocv
@@ -26,7 +25,7 @@ from synthetic import synthetic_log
 @pytest.fixture(scope="module")
 def model() -> Model:
     logs = [synthetic_log(noise_v=0.5, seed=seed) for seed in (1, 2, 3)]
-    return fit(logs, FitOptions(capacity_ah=CAPACITY_AH)).model
+    return fit(logs, capacity_ah=CAPACITY_AH).model
 
 
 @given(st.floats(0.0, 100.0), st.floats(0.0, 100.0))
@@ -210,7 +209,7 @@ def test_no_input_raises_or_leaves_0_to_100(rows: list[tuple[float, ...]]) -> No
         assert math.isnan(estimate.soc_pct) or 0.0 <= estimate.soc_pct <= 100.0
 
 
-_MODEL = fit([synthetic_log(noise_v=0.5)], FitOptions(capacity_ah=CAPACITY_AH)).model
+_MODEL = fit([synthetic_log(noise_v=0.5)], capacity_ah=CAPACITY_AH).model
 
 
 def test_refuses_time_that_does_not_increase(model: Model) -> None:

@@ -28,7 +28,7 @@ from cangauge.errors import InputError
 from cangauge.inspect.capture import inspect_capture
 from cangauge.logs.read import read_log
 from cangauge.model.effects.library import LIBRARY
-from cangauge.model.model_file import load_model
+from cangauge.model.model_file import Model
 from cangauge.service.config import load_config
 from fuzzing import corpus
 
@@ -276,13 +276,13 @@ def test_models(tmp_path: Path, change: dict[str, object]) -> None:
             tree[key] = value
     path = tmp_path / "x.json"
     path.write_text(json.dumps(tree))
-    assert refused(lambda: load_model(path))
+    assert refused(lambda: Model.load(path))
 
 
 def test_a_model_as_it_should_be_is_read(tmp_path: Path) -> None:
     path = tmp_path / "x.json"
     path.write_text(json.dumps(corpus.model_tree()))
-    assert len(load_model(path).effects) == len(LIBRARY)
+    assert len(Model.load(path).effects) == len(LIBRARY)
 
 
 def test_stamps_that_are_no_time_are_malformed(tmp_path: Path) -> None:

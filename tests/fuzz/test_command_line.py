@@ -260,7 +260,7 @@ def test_what_is_no_file(command: str, refused: Callable[..., str]) -> None:
     Path("folder").mkdir()
     Path("empty").touch()
     for name, told in (
-        ("pipe", "a pipe"), ("folder", "a folder"), ("empty", "empty|is no JSON"),
+        ("pipe", "a pipe"), ("folder", "a folder"), ("empty", "empty|no JSON|not JSON"),
         ("/dev/zero", "a device"), ("absent", "no such file"),
     ):  # fmt: skip
         args = ["-m", name] if command == "run" else [name, *VALID[command][1:]]

@@ -15,7 +15,7 @@ from cangauge.bus.database import load_dbc
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.errors import InputError
 from cangauge.logs.read import read_log
-from cangauge.model.model_file import load_model
+from cangauge.model.model_file import Model
 from cangauge.service.config import load_config
 from cangauge.validation.twin.day import read_speed
 
@@ -25,7 +25,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "dbc": load_dbc,
     "map": lambda path: load_vehicle(map_file=path),
     "config": load_config,
-    "model": load_model,
+    "model": Model.load,
     "speed": read_speed,
 }
 

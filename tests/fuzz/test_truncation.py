@@ -18,7 +18,7 @@ from cangauge.bus.database import load_dbc
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.errors import InputError
 from cangauge.logs.read import read_log
-from cangauge.model.model_file import load_model
+from cangauge.model.model_file import Model
 from cangauge.service.config import load_config
 from cangauge.validation.twin.day import read_speed
 from fuzzing import corpus
@@ -79,7 +79,7 @@ TEXTS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "speed.csv": (corpus.SPEED, read_speed),
     "model.json": (
         json.dumps(corpus.model_tree() | {"effects": [], "information": None}),
-        load_model,
+        Model.load,
     ),
 }
 

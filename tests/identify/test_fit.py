@@ -1,4 +1,4 @@
-"""Identification: finds what made the log, and says what it cannot find."""
+"""Identification: recovers the truth of simulated logs and refuses insufficient ones."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import pytest
 
 from cangauge.errors import InputError
 from cangauge.identify.delays import search_delays
-from cangauge.identify.fit import describe_noise, fit
-from cangauge.identify.rows import FitOptions
+from cangauge.identify.fit import common_name, fit
+from cangauge.identify.noise import describe_noise
 from cangauge.inference.least_squares import solve
+from cangauge.inference.rows import FitOptions
 from cangauge.logs.log import Log
 from cangauge.model.charge import (
     capacity_from_full_discharge,
@@ -25,7 +26,7 @@ from synthetic import synthetic_log
 TRUTH = leaf_2012_model()
 
 
-def test_gives_back_the_coefficients_of_a_noiseless_log() -> None:
+def test_recovers_the_coefficients_of_a_noiseless_log() -> None:
     found = fit([synthetic_log()])
     model = found.voltage_model
     soc = np.linspace(*model.soc_range_pct, 200)
@@ -41,9 +42,8 @@ def test_irregular_time_stamps_give_the_same_model() -> None:
     log = synthetic_log(rate_hz=10.0, hours=1.0, end_pct=50.0)
     rng = np.random.default_rng(3)
     keep = np.sort(rng.choice(len(log), len(log) // 2, replace=False))
-    # Halved at random, the current between samples is not known: only piecewise constant currents
-    # survive that. The log's are, but for the steps.
-    found = fit([log.rows(keep)], FitOptions(capacity_ah=CAPACITY_AH))
+    # The current between the kept samples is unknown, but piecewise constant except for the steps.
+    found = fit([log.rows(keep)], capacity_ah=CAPACITY_AH)
     soc = np.linspace(55.0, 98.0, 50)
     assert found.voltage_model.pseudo_ocv(soc) == pytest.approx(TRUTH.pseudo_ocv(soc), abs=0.1)
 
@@ -53,7 +53,7 @@ def test_standard_errors_cover_the_truth() -> None:
     inside = []
     for seed in range(30):
         log = synthetic_log(noise_v=1.0, seed=seed, hours=1.5)
-        found = fit([log], FitOptions(capacity_ah=CAPACITY_AH))
+        found = fit([log], capacity_ah=CAPACITY_AH)
         error = found.solution.coefficients - truth
         inside.append(np.abs(error[-5:]) < 2.0 * found.solution.std_error[-5:])
     # 150 draws of kt and R1…R4: 2 standard errors must hold about 95 % of them.
@@ -64,8 +64,8 @@ def test_removes_start_up_and_shut_down_rows() -> None:
     log = synthetic_log(noise_v=0.2)
     voltage = log.voltage_v.copy()
     voltage[3000:3020] = np.linspace(150.0, 2.0, 20)
-    broken = fit([replace(log, voltage_v=voltage)], FitOptions(capacity_ah=CAPACITY_AH))
-    whole = fit([log], FitOptions(capacity_ah=CAPACITY_AH))
+    broken = fit([replace(log, voltage_v=voltage)], capacity_ah=CAPACITY_AH)
+    whole = fit([log], capacity_ah=CAPACITY_AH)
     assert broken.fits[0].rows.removed["start_up_or_shut_down"] == 24
     assert broken.voltage_mae_pct == pytest.approx(whole.voltage_mae_pct, rel=0.02)
 
@@ -74,7 +74,7 @@ def test_pseudo_ocv_rises_where_the_plain_fit_would_fall() -> None:
     rng = np.random.default_rng(0)
     log = synthetic_log(hours=0.6, start_pct=80.0, end_pct=72.0)
     slow = 3.0 * np.sin(np.linspace(0.0, 9.0, len(log))) + rng.normal(0.0, 0.3, len(log))
-    found = fit([replace(log, voltage_v=log.voltage_v + slow)], FitOptions(capacity_ah=CAPACITY_AH))
+    found = fit([replace(log, voltage_v=log.voltage_v + slow)], capacity_ah=CAPACITY_AH)
     assert found.solution.constrained
     soc = np.linspace(0.0, 100.0, 500)
     assert np.all(np.diff(found.voltage_model.pseudo_ocv(soc)) > 0.0)
@@ -86,12 +86,12 @@ def test_slope_resistance_agrees_with_the_autocorrelation() -> None:
     assert found.slope_ohm == pytest.approx(found.slope_expected_ohm, rel=0.01)
 
 
-def test_several_logs_in_one_fit_cover_more_soc_than_each() -> None:
+def test_several_logs_cover_more_soc_than_each() -> None:
     logs = [
         synthetic_log(start_pct=start, end_pct=start - 30.0, hours=1.0, noise_v=0.3, seed=start)
         for start in (95, 70, 45)
     ]
-    found = fit(logs, FitOptions(capacity_ah=CAPACITY_AH))
+    found = fit(logs, capacity_ah=CAPACITY_AH)
     soc = np.linspace(20.0, 90.0, 50)
     assert found.voltage_model.pseudo_ocv(soc) == pytest.approx(TRUTH.pseudo_ocv(soc), abs=0.3)
     assert found.model.noise.judged_on == "whole logs left out in turn"
@@ -113,23 +113,23 @@ def test_capacity_needs_a_log_from_full_to_empty() -> None:
     ("log", "words"),
     [
         (synthetic_log(hours=0.015, end_pct=99.0), "no rows are left"),
-        (synthetic_log(hours=0.5, start_pct=80.0, end_pct=79.5), "SoC moves by only"),
-        (replace(synthetic_log(), current_a=np.full(9000, 20.0)), "current never changes"),
+        (synthetic_log(hours=0.5, start_pct=80.0, end_pct=79.5), "too little for a voltage model"),
+        (replace(synthetic_log(), current_a=np.full(9000, 20.0)), "current is constant"),
         (replace(synthetic_log(), current_a=-synthetic_log().current_a), "sign of current"),
     ],
 )
-def test_says_what_a_log_cannot_identify(log: Log, words: str) -> None:
+def test_names_the_reason_why_a_log_identifies_nothing(log: Log, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        fit([log], FitOptions(capacity_ah=CAPACITY_AH))
+        fit([log], capacity_ah=CAPACITY_AH)
 
 
-def test_refuses_to_mix_temperatures_of_different_things() -> None:
+def test_refuses_logs_with_different_temperature_sources() -> None:
     log = synthetic_log(hours=0.5)
-    with pytest.raises(InputError, match="different things"):
-        fit([log, replace(log, temperature_source="cell")], FitOptions(capacity_ah=CAPACITY_AH))
+    with pytest.raises(InputError, match="different sources"):
+        fit([log, replace(log, temperature_source="cell")], capacity_ah=CAPACITY_AH)
 
 
-def test_information_gives_the_solution_back() -> None:
+def test_information_reproduces_the_solution() -> None:
     found = fit([synthetic_log(noise_v=0.5)])
     information = found.model.information
     assert information is not None
@@ -139,7 +139,7 @@ def test_information_gives_the_solution_back() -> None:
     assert x == pytest.approx(found.solution.coefficients, rel=1e-6)
 
 
-def test_search_over_delays_finds_the_delays_that_made_the_log() -> None:
+def test_delay_search_finds_the_true_delays() -> None:
     truth = VoltageModel(TRUTH.ocv_v, TRUTH.kt_v_per_k, (-0.1, -0.03, -0.03), (0.0, 20.0, 100.0))
     log = synthetic_log(model=truth, noise_v=0.3)
     found = search_delays([log], FitOptions(capacity_ah=CAPACITY_AH))
@@ -147,7 +147,7 @@ def test_search_over_delays_finds_the_delays_that_made_the_log() -> None:
     assert found.held_out_rmse_v == pytest.approx(0.3, rel=0.1)
 
 
-def test_noise_tells_fast_from_slow() -> None:
+def test_noise_is_split_into_fast_and_slow() -> None:
     rng = np.random.default_rng(5)
     logs = []
     for _ in range(40):
@@ -167,28 +167,28 @@ def test_white_noise_is_white_at_every_rate(rate_hz: float) -> None:
     logs = [(np.arange(4000.0) / rate_hz, rng.normal(0.0, 0.5, 4000)) for _ in range(3)]
     noise = describe_noise(logs, rate_hz)
     assert noise.fast_std_v == pytest.approx(0.5, rel=0.1)
-    assert noise.fast_time_s < 0.15 / rate_hz  # a part of the time between two rows
+    assert noise.fast_time_s < 0.15 / rate_hz  # well below the row interval
 
 
-def test_a_log_without_which_the_others_identify_nothing_judges_nothing() -> None:
+def test_an_indispensable_log_is_not_held_out() -> None:
     long = synthetic_log(hours=1.1, start_pct=95.0, end_pct=10.0, noise_v=0.5, name="long")
     short = [
         synthetic_log(hours=0.05, start_pct=60.0, end_pct=59.0, noise_v=0.5, seed=seed)
         for seed in (2, 3)
     ]
-    found = fit([long, *short], FitOptions(capacity_ah=CAPACITY_AH))
+    found = fit([long, *short], capacity_ah=CAPACITY_AH)
     of_long, *of_short = found.held_out_error_v
     assert np.isnan(of_long).all()
     assert all(np.isfinite(errors).any() for errors in of_short)
 
 
-def test_capacity_counts_from_the_row_that_tells_the_soc() -> None:
+def test_capacity_counts_from_the_first_known_soc() -> None:
     whole = synthetic_log(hours=1.5, end_pct=0.5)
     assert whole.soc_pct is not None
     at = 300
-    told = np.full(len(whole), np.nan)
-    told[at] = 100.0
-    late = capacity_from_full_discharge([replace(whole, soc_pct=told)], None)
+    reference = np.full(len(whole), np.nan)
+    reference[at] = 100.0
+    late = capacity_from_full_discharge([replace(whole, soc_pct=reference)], None)
     out_ah = discharged_ah(whole.time_s, whole.current_a)
     assert late == pytest.approx(out_ah[-1] - out_ah[at])
 
@@ -212,3 +212,40 @@ def test_constrained_least_squares_is_optimal() -> None:
         other = found.coefficients + rng.normal(0.0, 0.05, 5)
         if np.all(bounds @ other >= 0.2):
             assert np.sum((columns @ other - target) ** 2) >= best - 1e-6
+
+
+def test_keyword_arguments_suffice_for_a_fit_with_effects() -> None:
+    logs = [
+        synthetic_log(start_pct=start, end_pct=start - 30.0, hours=0.6, noise_v=0.3, seed=start)
+        for start in (95, 85, 75)
+    ]
+    found = fit(logs, capacity_ah=CAPACITY_AH, delay_s=[0.0, 10.0, 30.0, 70.0], effects="auto")
+    assert found.effects is not None
+    assert found.model.made.options["effects"] == "auto"
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["TripA01", "TripA03", "TripA05", "TripA07", "TripA09"], "TripA (5 logs)"),
+        (["TripA01"], "TripA01"),
+        (["leaf2012_a", "leaf2012_b"], "leaf2012 (2 logs)"),
+        (["drive 9", "drive 10"], "drive (2 logs)"),
+        (["drive1", "drive12"], "drive (2 logs)"),
+        (["cold", "cold"], "cold (2 logs)"),
+        (["cold", "mild", "warm"], "cold and 2 more"),
+        (["2024-01-05", "2024-01-06"], "2024-01 (2 logs)"),
+        (["1", "2"], "1 and 1 more"),
+    ],
+)
+def test_a_model_is_named_after_the_common_part_of_its_logs(
+    names: list[str], expected: str
+) -> None:
+    assert common_name(names) == expected
+
+
+def test_a_given_name_is_kept() -> None:
+    log = synthetic_log(hours=0.5, name="day")
+    assert fit([log], capacity_ah=CAPACITY_AH).model.name == "day"
+    assert fit([log, log], capacity_ah=CAPACITY_AH).model.name == "day (2 logs)"
+    assert fit([log], capacity_ah=CAPACITY_AH, name="pack").model.name == "pack"

@@ -1,4 +1,4 @@
-"""The nearest point within bounds, whatever the size of the numbers."""
+"""Projection onto linear bounds, at any scale of the numbers."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def by_lawson_and_hanson(z: FloatArray, bounds: FloatArray, at_least: FloatArray
 
 
 @pytest.mark.parametrize("seed", [1744, *range(30)])
-def test_the_nearest_point_is_that_of_lawson_and_hanson(seed: int) -> None:
-    """1744: the solver stopped short. Found by gap-check, where a diagnosis ended so."""
+def test_projection_equals_lawson_and_hanson(seed: int) -> None:
+    """Seed 1744: the solver alone stops short of its tolerance."""
     rng = np.random.default_rng(seed)
     n, m = rng.integers(2, 40), rng.integers(1, 30)
     bounds = rng.normal(size=(m, n)) @ np.diag(10.0 ** rng.uniform(-4.0, 0.0, n))

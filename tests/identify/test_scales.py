@@ -1,4 +1,4 @@
-"""Rows by time scale: nothing is lost or made up, and noise has the variance that is stated."""
+"""Haar transform: orthonormal, and noise has the stated variance on each scale."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cangauge.inference.time_scales import SCALES, by_scale, scale_variances
+from cangauge.inference.time_scales import SCALES, haar_transform, scale_variances
 
 FloatArray = NDArray[np.float64]
 ROWS = 2048
@@ -21,9 +21,9 @@ ROWS = 2048
 @example(1023, 1, 0)
 @example(1024, 1, 0)
 @example(1025, 1, 0)
-def test_keeps_sums_of_squares_and_products(rows: int, columns: int, seed: int) -> None:
+def test_preserves_sums_of_squares_and_products(rows: int, columns: int, seed: int) -> None:
     values = np.random.default_rng(seed).normal(3.0, 1.0, (rows, columns))
-    parts = by_scale(values)
+    parts = haar_transform(values)
     assert len(parts) == SCALES
     assert sum(len(part) for part in parts) == rows
     kept = sum(part.T @ part for part in parts)
@@ -33,24 +33,24 @@ def test_keeps_sums_of_squares_and_products(rows: int, columns: int, seed: int) 
 @given(st.integers(1, 300))
 @example(256)
 def test_is_orthonormal(rows: int) -> None:
-    transform = np.vstack(by_scale(np.eye(rows)))
+    transform = np.vstack(haar_transform(np.eye(rows)))
     np.testing.assert_allclose(transform @ transform.T, np.eye(rows), atol=1e-12)
 
 
 @settings(deadline=None)
 @given(st.integers(8, 2000), st.floats(-5.0, 5.0))
-def test_a_constant_is_slow_and_a_flutter_is_fast(rows: int, level: float) -> None:
-    """What lasts is in the last scale alone; what turns sign at every row mostly in the first."""
-    constant = by_scale(np.full((rows, 1), level))
+def test_a_constant_is_slow_and_an_alternation_is_fast(rows: int, level: float) -> None:
+    """A constant lies in the last scale alone, alternating signs mostly in the first."""
+    constant = haar_transform(np.full((rows, 1), level))
     for part in constant[:-1]:
         np.testing.assert_allclose(part, 0.0, atol=1e-9)
     assert float(np.sum(constant[-1] ** 2)) == pytest.approx(rows * level**2, rel=1e-9, abs=1e-9)
-    flutter = by_scale(np.where(np.arange(rows) % 2, 1.0, -1.0)[:, None])
-    assert float(np.sum(flutter[0] ** 2)) > 0.6 * rows
+    alternating = haar_transform(np.where(np.arange(rows) % 2, 1.0, -1.0)[:, None])
+    assert float(np.sum(alternating[0] ** 2)) > 0.6 * rows
 
 
-def test_a_step_is_found_on_the_scale_of_the_stretches_that_it_parts() -> None:
-    step = by_scale(np.repeat([0.0, 1.0], 32)[:, None])
+def test_a_step_lies_on_the_scale_of_its_stretches() -> None:
+    step = haar_transform(np.repeat([0.0, 1.0], 32)[:, None])
     by_size = [float(np.sum(part**2)) for part in step]
     # 64 rows: the mean (of scale SCALES − 1) and the difference of two stretches of 32 rows.
     assert by_size[5] == pytest.approx(16.0)
@@ -58,9 +58,9 @@ def test_a_step_is_found_on_the_scale_of_the_stretches_that_it_parts() -> None:
     assert sum(by_size) == pytest.approx(32.0)
 
 
-def stated_by_covariance(covariance: FloatArray) -> list[float]:
-    """The mean variance of each scale's coefficients, of an error with this covariance."""
-    transform = by_scale(np.eye(len(covariance)))
+def expected_variances(covariance: FloatArray) -> list[float]:
+    """The mean variance of each scale's coefficients, from the covariance of the error."""
+    transform = haar_transform(np.eye(len(covariance)))
     return [float(np.mean(np.sum((part @ covariance) * part, axis=1))) for part in transform]
 
 
@@ -68,28 +68,28 @@ def stated_by_covariance(covariance: FloatArray) -> list[float]:
     ("fast_v2", "fast_rows", "slow_v2", "slow_rows"),
     [(0.3, 0.0, 0.0, 0.0), (0.0, 0.0, 2.0, 5.0), (0.2, 1.5, 0.7, 12.0), (0.1, 0.0, 0.5, 60.0)],
 )
-def test_variance_by_scale_is_that_of_the_errors_covariance(
+def test_scale_variances_follow_from_the_covariance(
     fast_v2: float, fast_rows: float, slow_v2: float, slow_rows: float
 ) -> None:
-    """Exact on stretches of 2ʲ rows: white noise, and e^(−lag/length) for what is correlated."""
+    """Exact on stretches of 2ʲ rows, for white and exponentially correlated noise."""
     apart = np.abs(np.subtract.outer(np.arange(ROWS), np.arange(ROWS)))
     covariance = np.zeros((ROWS, ROWS))
     for variance, length in ((fast_v2, fast_rows), (slow_v2, slow_rows)):
         alike = np.exp(-apart / length) if length > 0.0 else np.eye(ROWS)
         covariance += variance * alike
-    expected = stated_by_covariance(covariance)
+    expected = expected_variances(covariance)
     found = scale_variances(fast_v2, fast_rows, slow_v2, slow_rows)
     assert found.shape == (SCALES,)
     np.testing.assert_allclose(found[:-1], expected[:-1], rtol=1e-9)
-    # The last scale stands for all that is slower: the density at frequency zero, which
-    # stretches of 512 rows come near from below.
+    # The last scale stands for all slower ones, with the spectral density at frequency zero, which
+    # stretches of 512 rows approach from below.
     assert expected[-1] <= found[-1] * (1.0 + 1e-9)
     longest = max(fast_rows, slow_rows)
     assert found[-1] <= expected[-1] * (1.0 + 6.0 * longest / 512.0) + 1e-12
 
 
-def test_noise_drawn_has_the_variance_stated() -> None:
-    """White noise of 0.4 V and an error of 0.8 V that is correlated over 30 rows, as drawn."""
+def test_drawn_noise_has_the_stated_variance() -> None:
+    """White noise of 0.4 V plus 0.8 V correlated over 30 rows."""
     rng = np.random.default_rng(4)
     rows, kept = 1 << 17, np.exp(-1.0 / 30.0)
     drive = rng.normal(0.0, 0.8 * np.sqrt(1.0 - kept**2), rows).tolist()
@@ -98,13 +98,13 @@ def test_noise_drawn_has_the_variance_stated() -> None:
         slow.append(kept * slow[-1] + kick)
     error = np.array(slow) + rng.normal(0.0, 0.4, rows)
     stated = scale_variances(0.16, 0.0, 0.64, 30.0)
-    for part, variance in zip(by_scale(error[:, None]), stated, strict=True):
-        # Four standard deviations of a mean of so many squares.
+    for part, variance in zip(haar_transform(error[:, None]), stated, strict=True):
+        # Four standard deviations of the mean of the squares.
         assert float(np.mean(part**2)) == pytest.approx(
             variance, rel=4.0 * np.sqrt(2.0 / len(part))
         )
 
 
-def test_white_noise_is_alike_on_all_scales_and_correlated_noise_grows() -> None:
+def test_white_noise_is_flat_and_correlated_noise_grows() -> None:
     np.testing.assert_allclose(scale_variances(0.5, 0.0, 0.0, 0.0), 0.5)
     assert np.all(np.diff(scale_variances(0.0, 0.0, 1.0, 40.0)) > 0.0)

@@ -1,4 +1,4 @@
-"""The voltage model: equation, slope, behaviour outside its range, delay line."""
+"""Voltage model: equation, slope, extrapolation, delay line."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_is_the_published_equation(soc: float, temperature: float, current: list
     st.floats(0.0, 50.0),
     st.lists(st.floats(-300, 300), min_size=4, max_size=4),
 )
-def test_one_sample_and_arrays_agree(soc: float, temperature: float, current: list[float]) -> None:
+def test_scalar_and_array_forms_agree(soc: float, temperature: float, current: list[float]) -> None:
     volts, slope = MODEL.pseudo_ocv_at(soc)
     whole = MODEL.voltage([soc], [temperature], [current])[0]
     assert volts + MODEL.offset_at(temperature, current) == pytest.approx(whole, abs=1e-9)
@@ -51,19 +51,17 @@ def test_slope_is_the_derivative(soc: float) -> None:
     assert MODEL.pseudo_ocv_slope([soc])[0] == pytest.approx(numeric, rel=1e-4)
 
 
-def test_rises_everywhere_and_stays_bounded_outside_the_identified_soc() -> None:
+def test_rises_and_stays_bounded_outside_the_identified_soc() -> None:
     narrow = VoltageModel(K, -0.74, (-0.1,), (0.0,), soc_range_pct=(40.0, 80.0))
     soc = np.linspace(-10.0, 110.0, 500)
     volts = narrow.pseudo_ocv(soc)
     assert np.all(np.diff(volts) > 0.0)
-    # Three times the range, at about its slope; the formula itself falls by hundreds of volts.
+    # Three times the range at about its slope; the formula itself falls by hundreds of volts.
     assert np.ptp(volts) < 4.0 * np.ptp(narrow.pseudo_ocv([40.0, 80.0]))
 
 
 @given(st.floats(0.0, 100.0), st.integers(0, 7))
-def test_columns_are_how_the_pseudo_ocv_moves_beyond_the_identified_soc_too(
-    soc: float, k: int
-) -> None:
+def test_columns_are_derivatives_inside_and_outside(soc: float, k: int) -> None:
     narrow = VoltageModel(K, -0.74, (-0.1,), (0.0,), soc_range_pct=(40.0, 80.0))
     coefficients = narrow.coefficients
     coefficients[k] += 1e-3
@@ -72,7 +70,7 @@ def test_columns_are_how_the_pseudo_ocv_moves_beyond_the_identified_soc_too(
     assert 1e-3 * narrow.pseudo_ocv_columns([soc])[0, k] == pytest.approx(change, abs=1e-8)
 
 
-def test_temperature_is_held_beyond_its_range() -> None:
+def test_temperature_is_limited_to_its_range() -> None:
     far, farther = MODEL.pseudo_ocv([50.0, 50.0], [-20.0, -40.0])
     assert far == farther
 
@@ -93,7 +91,7 @@ def test_refuses_a_falling_pseudo_ocv() -> None:
         ({"soc_range_pct": (0.0, 5e-324)}, "soc_range_pct"),
     ],
 )
-def test_names_the_field_that_is_wrong(change: dict[str, object], field: str) -> None:
+def test_names_the_invalid_field(change: dict[str, object], field: str) -> None:
     good = {
         "ocv_v": K,
         "kt_v_per_k": -0.74,
@@ -106,7 +104,7 @@ def test_names_the_field_that_is_wrong(change: dict[str, object], field: str) ->
 
 
 @given(st.lists(st.tuples(st.floats(0.02, 1.9), st.floats(-100, 200)), min_size=2, max_size=300))
-def test_ring_buffer_equals_interpolation_over_the_whole_log(
+def test_ring_buffer_equals_interpolation_of_the_log(
     steps: list[tuple[float, float]],
 ) -> None:
     delays = (0.0, 10.0, 30.0, 70.0)
@@ -121,7 +119,7 @@ def test_ring_buffer_equals_interpolation_over_the_whole_log(
     assert line.full == bool(full[-1])
 
 
-def test_a_gap_empties_the_delay_line_in_both() -> None:
+def test_a_gap_empties_the_delay_line_in_both_forms() -> None:
     time_s = np.concatenate([np.arange(0.0, 100.0), np.arange(103.0, 300.0)])
     full = settled(time_s, 70.0, time_s)
     assert full[time_s < 100.0].sum() == 30

@@ -1,4 +1,4 @@
-"""The fit gives back the published model and figures from the reconstruction."""
+"""A fit of the reconstructed log reproduces the published model and figures."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ def curve_deviation_pct(found: Identification) -> float:
     return float(100.0 * np.max(np.abs(found.voltage_model.pseudo_ocv(soc) - there) / there))
 
 
-def test_white_gives_back_the_voltage_curve() -> None:
+def test_white_reproduces_the_voltage_curve() -> None:
     assert curve_deviation_pct(fitted("white")) < 0.1
 
 
-def test_white_gives_back_r1() -> None:
+def test_white_reproduces_r1() -> None:
     r1 = fitted("white").voltage_model.resistance_ohm[0]
     assert r1 == pytest.approx(MODEL.resistance_ohm[0], rel=0.02)
 
 
-def test_white_gives_back_the_other_coefficients_within_their_standard_errors() -> None:
+def test_white_reproduces_coefficients_within_standard_errors() -> None:
     coefficients = fitted("white").model.coefficients
     published_values = {"kt": MODEL.kt_v_per_k} | {
         f"R{j}": value for j, value in enumerate(MODEL.resistance_ohm, start=1)
@@ -72,9 +72,8 @@ def test_energy_balance(variant: str) -> None:
     assert energy.heat_kwh == pytest.approx(published.HEAT_KWH, rel=0.05)
 
 
-def test_white_newton_error_is_what_white_noise_alone_gives() -> None:
-    # The published 2.5 % holds model error too, which a log made from the model cannot have; no
-    # noise was shaped to meet it.
+def test_white_newton_error_is_that_of_white_noise() -> None:
+    # The published 2.5 % includes model error, which a log simulated by the model does not have.
     found = fitted("white").soc_newton_mae_pct
     assert 1.7 <= found <= 2.0
     assert found < published.SOC_NEWTON_MAE_PCT

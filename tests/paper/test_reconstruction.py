@@ -1,4 +1,4 @@
-"""The shipped reconstruction of the 2012 Leaf test meets the published facts of the real one."""
+"""The shipped reconstruction of the 2012 Leaf test agrees with the published facts."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from cangauge._resources import shared_file
-from cangauge.identify.fit import energy_balance
-from cangauge.identify.rows import FitRows, decimate, fit_rows
+from cangauge.identify.evaluate import energy_balance
+from cangauge.inference.rows import FitOptions, FitRows, decimate, fit_rows
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model import published
@@ -31,9 +31,7 @@ def shipped(variant: str) -> Log:
 
 @cache
 def rows_of(variant: str) -> FitRows:
-    return fit_rows(
-        shipped(variant), capacity_ah=published.CAPACITY_AH, delay_s=MODEL.delay_s, rate_hz=1.0
-    )
+    return fit_rows(shipped(variant), FitOptions(published.CAPACITY_AH, delay_s=MODEL.delay_s))
 
 
 def error_of(rows: FitRows) -> np.ndarray:
@@ -85,14 +83,14 @@ def test_currents(variant: str) -> None:
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_temperature_is_the_rooms_and_spans_what_was_published(variant: str) -> None:
+def test_room_temperature_spans_the_published_range(variant: str) -> None:
     log = shipped(variant)
     assert log.temperature_source == "room"
     assert log.temperature_c.min() == pytest.approx(20.0, abs=0.5)
     assert log.temperature_c.max() == pytest.approx(26.0, abs=0.5)
     assert log.temperature_c.min() >= 20.0
     assert log.temperature_c.max() <= 26.0
-    # kt could not be told from the pseudo-OCV if temperature followed SoC.
+    # kt would not be separable from the pseudo-OCV if temperature followed SoC.
     assert abs(np.corrcoef(log.temperature_c, log.soc_pct)[0, 1]) < 0.2
 
 
@@ -136,8 +134,8 @@ def test_correlated_error_lasts_minutes() -> None:
         return float(np.mean(np.exp(-lag_s / np.array([60.0, 120.0, 300.0]))))
 
     assert autocorrelation("correlated", 1.0) == pytest.approx(expected(1.0), abs=0.01)
-    # Three standard deviations over logs of this length (0.065 and 0.12, over 120 other seeds):
-    # they hold only some fifty independent pieces. This seed is a low draw, 0.44 for 0.60.
+    # Three standard deviations over logs of this length (0.065 and 0.12, over 120 other seeds),
+    # each with about fifty independent pieces. This seed is a low draw, 0.44 for 0.60.
     assert autocorrelation("correlated", 60.0) == pytest.approx(expected(60.0), abs=0.195)
     assert abs(autocorrelation("correlated", 1500.0)) < 0.36
 
@@ -149,7 +147,7 @@ def test_slope_resistance() -> None:
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_between_schedules_the_contactor_opens_and_the_fit_leaves_these_rows_out(
+def test_the_fit_excludes_rows_with_an_open_contactor(
     variant: str,
 ) -> None:
     log = shipped(variant)
@@ -159,7 +157,7 @@ def test_between_schedules_the_contactor_opens_and_the_fit_leaves_these_rows_out
     assert np.all(log.current_a[down] == 0.0)
     rows = rows_of(variant)
     assert rows.removed["start_up_or_shut_down"] > 200
-    # Five standard deviations of the error: no row of a collapse or a pre-charge is left.
+    # Five standard deviations of the error: no row of a shut-down or pre-charge is left.
     assert np.max(np.abs(error_of(rows))) < 5.0 * 1.17
     assert len(rows) > 8500
 
@@ -182,7 +180,7 @@ def test_ten_minutes_are_a_cut_of_the_white_log() -> None:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_it_says_that_it_is_a_reconstruction_and_is_small(name: str) -> None:
+def test_the_file_is_marked_as_reconstruction_and_small(name: str) -> None:
     path = shared_file("replay", name)
     metadata = pq.read_schema(path).metadata
     assert metadata[b"notice"].startswith(b"A RECONSTRUCTION, not the measured log")
@@ -192,7 +190,7 @@ def test_it_says_that_it_is_a_reconstruction_and_is_small(name: str) -> None:
 
 
 @pytest.mark.real
-def test_the_script_gives_the_shipped_values_again(
+def test_the_script_reproduces_the_shipped_files(
     project: Path, shared_data: Path, tmp_path: Path
 ) -> None:
     script = project / "replay" / "make_leaf_reconstruction.py"
@@ -207,7 +205,7 @@ def test_the_script_gives_the_shipped_values_again(
         assert again.equals(there)
 
 
-def test_the_script_names_a_schedule_that_is_not_there(project: Path, tmp_path: Path) -> None:
+def test_the_script_names_a_missing_schedule(project: Path, tmp_path: Path) -> None:
     script = project / "replay" / "make_leaf_reconstruction.py"
     done = subprocess.run(
         [sys.executable, script, "--schedules", tmp_path, "-o", tmp_path],

@@ -1,4 +1,4 @@
-"""Real trips: what `benchmarks/real_trips.py` prints must meet the targets that it states."""
+"""Real trips: the figures of `benchmarks/real_trips.py` meet their targets."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from real_trips import CHECKED, checks, judge
 pytestmark = [pytest.mark.real, pytest.mark.slow]
 
 MISSED = {"chain_capacity_high: 2σ coverage ≤"}
-"""Stated in the README: the band is wider there than it should be (over 99 %)."""
+"""Documented: there the band is too wide (over 99 %)."""
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,6 @@ from cangauge.diagnosis.diagnose import Diagnosis, diagnose
 from cangauge.diagnosis.error_breakdown import MOMENTS, Place
 from cangauge.errors import InputError
 from cangauge.identify.fit import fit
-from cangauge.identify.rows import FitOptions
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH
@@ -44,7 +43,7 @@ def day(seed: int) -> Log:
 @pytest.fixture(scope="module")
 def model() -> Model:
     logs = [synthetic_log(noise_v=0.5, seed=seed) for seed in (1, 2)]
-    return fit(logs, FitOptions(capacity_ah=CAPACITY_AH)).model
+    return fit(logs, capacity_ah=CAPACITY_AH).model
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.validity import Reason
-from cangauge.model.model_file import load_model
+from cangauge.model.model_file import Model
 from cangauge.service.config import load_config
 from cangauge.service.loop import LoopSettings
 from cangauge.service.pipeline import Gauge
@@ -48,7 +48,7 @@ class Car:
         self.write(text)
         config = load_config(self.path)
         vehicle = config.load_vehicle()
-        self.gauge = Gauge(vehicle, load_model(config.model), config.gauge_settings())
+        self.gauge = Gauge(vehicle, Model.load(config.model), config.gauge_settings())
         self.said: list[str] = []
         self.reloader = Reloader(
             lambda: load_config(self.path), config, vehicle, self.gauge, self.said.append

@@ -25,7 +25,6 @@ from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Reason, Status
 from cangauge.identify.fit import Identification, fit
 from cangauge.logs.read import read_log
-from cangauge.model.model_file import model_json
 from cangauge.model.published import SOC_NEWTON_MAE_PCT, VOLTAGE_MAE_PCT
 from cangauge.replay.steps import quantisation_bound
 from cangauge.report.estimate import estimate_report
@@ -69,7 +68,7 @@ def demo_command(
     fit_page, soc_page = folder / "fit.html", folder / "soc.html"
     note("1/4  fitting the voltage model on 2.6 h of the reconstructed Leaf test …")
     identification = fit([read_log(shared_file("replay", TRAINED_ON))])
-    write_text_atomic(model_path, model_json(identification.model))
+    identification.model.save(model_path)
     write_text_atomic(fit_page, fit_report(identification))
     note("2/4  playing another 2.6 h on the bus, as fast as the service acknowledges …")
     played = shared_file("replay", PLAYED)

@@ -44,12 +44,12 @@ from cangauge.errors import InputError
 from cangauge.estimate.offline import EstimateTable, Scores, estimate_log, score
 from cangauge.estimate.settings import VALID_STD_PCT, EstimatorSettings, Method
 from cangauge.estimate.validity import Reason, Status, reason_name, reason_names
-from cangauge.identify.rows import usual_gap_s
+from cangauge.inference.rows import usual_gap_s
 from cangauge.logs.log import Log
 from cangauge.logs.read import CaptureGivenError
 from cangauge.model.charge import counted_soc_pct
 from cangauge.model.delay_line import GAP_S
-from cangauge.model.model_file import Model, load_model
+from cangauge.model.model_file import Model
 from cangauge.report.charts import Recorded, Recording
 from cangauge.service.estimate_table import NUMBERS
 
@@ -377,7 +377,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     if max_gap_s is not None:
         within(max_gap_s, 1e-3, 3600.0, option="--max-gap-s", unit="s")
     check_outputs([output, report], [log_path, model_path])
-    model = load_model(model_path)
+    model = Model.load(model_path)
     settings = EstimatorSettings(
         method=chosen,
         initial_soc_pct=start,

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
-from dataclasses import replace
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
@@ -28,12 +28,10 @@ from cangauge.cli.options import (
 from cangauge.cli.output import console, emit_json, note, print_table
 from cangauge.errors import InputError
 from cangauge.identify.delays import DelaySearch, search_delays
-from cangauge.identify.effect_search import parse_ids
+from cangauge.identify.effect_search import parse_effect_ids
 from cangauge.identify.fit import Identification, fit
-from cangauge.identify.rows import FitOptions
-from cangauge.logs.log import Log
+from cangauge.inference.rows import DELAYS_S, FitOptions
 from cangauge.model.charge import capacity_from_full_discharge, capacity_from_reference
-from cangauge.model.model_file import model_json
 from cangauge.report.tables import effect_rows, step_rows
 
 FROM_SOC = "from-soc"
@@ -116,19 +114,14 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
 
     The model file and the report are written only when all has succeeded.
     """
-    options = FitOptions(
-        capacity_ah=_capacity(capacity_ah),
-        initial_soc_pct=initial_soc
-        if initial_soc is None
-        else within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%"),
-        rate_hz=within(rate_hz, 0.01, 1000.0, option="--rate-hz", unit="Hz"),
-        epsilon=within(epsilon, 1e-4, 0.49, option="--epsilon", unit=""),
-        t_ref_c=within(t_ref, -60.0, 120.0, option="--t-ref", unit="°C"),
-        name=name,
-        effects=parse_ids(effects) if effects else (),
-    )
-    if delays != AUTO:
-        options = replace(options, delay_s=_delays(delays))
+    capacity = _capacity(capacity_ah)
+    if initial_soc is not None:
+        within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
+    within(rate_hz, 0.01, 1000.0, option="--rate-hz", unit="Hz")
+    within(epsilon, 1e-4, 0.49, option="--epsilon", unit="")
+    within(t_ref, -60.0, 120.0, option="--t-ref", unit="°C")
+    effect_ids = parse_effect_ids(effects) if effects else ()
+    delay_s = DELAYS_S if delays == AUTO else _delays(delays)
     check_outputs([output, report], logs)
     with console.status("reading") as status:
         recorded = []
@@ -146,11 +139,26 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
                 )
             )
         if capacity_ah == FROM_SOC:
-            options = replace(options, capacity_ah=capacity_from_reference(recorded))
+            capacity = capacity_from_reference(recorded)
         search = None
-        if delays == AUTO:
-            options, search = _search(recorded, options)
-        result = fit(recorded, options, _Progress(status.update))
+        with _progress(status.update):
+            if delays == AUTO:
+                if capacity is None:
+                    capacity = capacity_from_full_discharge(recorded, initial_soc)
+                options = FitOptions(capacity, initial_soc, rate_hz, epsilon=epsilon, t_ref_c=t_ref)
+                search = search_delays(recorded, options)
+                delay_s = search.delay_s
+            result = fit(
+                recorded,
+                capacity_ah=capacity,
+                initial_soc_pct=initial_soc,
+                rate_hz=rate_hz,
+                delay_s=delay_s,
+                epsilon=epsilon,
+                t_ref_c=t_ref,
+                effects=effect_ids,
+                name=name,
+            )
         page = None
         if report is not None:
             status.update("drawing the report")
@@ -158,7 +166,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
             from cangauge.report.fit import fit_report  # noqa: PLC0415
 
             page = fit_report(result)
-    _write({output: model_json(result.model)} | ({report: page} if report and page else {}))
+    _write({output: result.model.to_json()} | ({report: page} if report and page else {}))
     if json_output:
         extra: dict[str, object] = {"model": str(output), "report": report and str(report)}
         if search is not None:
@@ -173,16 +181,31 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
     note(f"model: {output}" + (f"\nreport: {report}" if report else ""))
 
 
-class _Progress:
-    """Shows each step, and keeps on the screen what was decided about an effect."""
+class _ProgressHandler(logging.Handler):
+    """Show each step of a fit as status; print its decisions (INFO)."""
 
     def __init__(self, show: Callable[[str], None]) -> None:
+        super().__init__()
         self._show = show
 
-    def __call__(self, text: str) -> None:
-        if " held out " in text:
-            note(text)
-        self._show(text)
+    def emit(self, record: logging.LogRecord) -> None:
+        """Show one record."""
+        if record.levelno >= logging.INFO:
+            note(record.getMessage())
+        self._show(record.getMessage())
+
+
+@contextmanager
+def _progress(show: Callable[[str], None]) -> Iterator[None]:
+    logger, handler = logging.getLogger("cangauge.identify"), _ProgressHandler(show)
+    level = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.DEBUG)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
 
 
 def _capacity(given: str | None) -> float | None:
@@ -217,15 +240,6 @@ def _delays(given: str) -> tuple[float, ...]:
             cure=cure,
         )
     return delays
-
-
-def _search(logs: Sequence[Log], options: FitOptions) -> tuple[FitOptions, DelaySearch]:
-    capacity = options.capacity_ah
-    if capacity is None:
-        capacity = capacity_from_full_discharge(logs, options.initial_soc_pct)
-    options = replace(options, capacity_ah=capacity)
-    found = search_delays(logs, options, note)
-    return replace(options, delay_s=found.delay_s), found
 
 
 def _best(search: DelaySearch) -> list[tuple[tuple[float, ...], float]]:
@@ -274,9 +288,9 @@ def _show(result: Identification, search: DelaySearch | None) -> None:
             for name, item in model.coefficients.items()
         ],
     )  # fmt: skip
-    if result.found is not None:
-        print_table("Effects", *effect_rows(result.found))
-        print_table("Search for effects", *step_rows(result.found))
+    if result.effects is not None:
+        print_table("Effects", *effect_rows(result.effects))
+        print_table("Search for effects", *step_rows(result.effects))
     print_table(
         "Energy at the terminals",
         ["", "value", "<unit"],

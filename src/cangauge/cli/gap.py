@@ -29,7 +29,7 @@ from cangauge.diagnosis.extended_model import model_file_of
 from cangauge.diagnosis.posterior import NONE, UNKNOWN
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
-from cangauge.model.model_file import Model, load_model, model_json
+from cangauge.model.model_file import Model
 from cangauge.report.tables import verdict_limit
 
 SHOWN = 5
@@ -88,7 +88,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     given = list(reference or [])
     _check_apart(logs, given)
     check_outputs([report, extended], [*logs, *given, model])
-    model_file = load_model(model)
+    model_file = Model.load(model)
     if initial_soc is not None:
         within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
     if capacity_ah is not None:
@@ -111,7 +111,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     with ExitStack() as stack:
         if extended is not None:
             better = model_file_of(found.extension, model_file, found.extended_rmse_v)
-            stack.enter_context(atomic_path(extended)).write_text(model_json(better))
+            stack.enter_context(atomic_path(extended)).write_text(better.to_json())
         if report is not None:
             # Drawing is slow to import; the diagnosis does without.
             from cangauge.report.diagnosis import gap_report  # noqa: PLC0415

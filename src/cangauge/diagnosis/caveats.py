@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cangauge.diagnosis.problem import COVERED_K, COVERED_PCT
-from cangauge.identify.linearized import Prepared
+from cangauge.inference.rows import SampledLog
 from cangauge.logs.log import TemperatureSource
 from cangauge.model.charge import BRIDGE_S
 
@@ -36,8 +36,8 @@ FEW_REFERENCES = 3
 
 
 def limits(
-    logs: Sequence[Prepared],
-    references: Sequence[Prepared],
+    logs: Sequence[SampledLog],
+    references: Sequence[SampledLog],
     capacity_ah: float,
     initial_soc_pct: float | None = None,
     temperature_source: TemperatureSource = "unknown",
@@ -46,9 +46,9 @@ def limits(
 
     Parameters
     ----------
-    logs : sequence of Prepared
+    logs : sequence of SampledLog
         Diagnosed logs.
-    references : sequence of Prepared
+    references : sequence of SampledLog
     capacity_ah : float
         Of the model [Ah].
     initial_soc_pct : float, optional
@@ -137,7 +137,7 @@ def worse_with(baseline_v: float, extended_v: float) -> str:
     )
 
 
-def _pauses(logs: Sequence[Prepared]) -> str:
+def _pauses(logs: Sequence[SampledLog]) -> str:
     found = []
     for item in logs:
         time_s = item.log.time_s
@@ -156,7 +156,7 @@ def _pauses(logs: Sequence[Prepared]) -> str:
     )
 
 
-def _duration(logs: Sequence[Prepared]) -> str:
+def _duration(logs: Sequence[SampledLog]) -> str:
     short = [item.log for item in logs if item.log.duration_s < SHORT_S]
     if not short:
         return ""
@@ -169,7 +169,7 @@ def _duration(logs: Sequence[Prepared]) -> str:
     )
 
 
-def _temperature(logs: Sequence[Prepared], references: Sequence[Prepared]) -> str:
+def _temperature(logs: Sequence[SampledLog], references: Sequence[SampledLog]) -> str:
     low, high = _range([item.rows.temperature_c for item in logs])
     sentences = []
     if high - low < ONE_TEMPERATURE_K:
@@ -190,7 +190,7 @@ def _temperature(logs: Sequence[Prepared], references: Sequence[Prepared]) -> st
     return " ".join(sentences)
 
 
-def _soc(logs: Sequence[Prepared], references: Sequence[Prepared]) -> str:
+def _soc(logs: Sequence[SampledLog], references: Sequence[SampledLog]) -> str:
     low, high = _range([item.rows.soc_pct for item in logs])
     sentences = []
     if high - low < ONE_SOC_PCT:
@@ -211,7 +211,7 @@ def _soc(logs: Sequence[Prepared], references: Sequence[Prepared]) -> str:
     return " ".join(sentences)
 
 
-def _start(logs: Sequence[Prepared], initial_soc_pct: float | None) -> str:
+def _start(logs: Sequence[SampledLog], initial_soc_pct: float | None) -> str:
     names = [item.log.name for item in logs if item.log.first_soc() is None]
     if initial_soc_pct is not None or not names:
         return ""
@@ -222,7 +222,7 @@ def _start(logs: Sequence[Prepared], initial_soc_pct: float | None) -> str:
     )
 
 
-def _reference_start(references: Sequence[Prepared]) -> str:
+def _reference_start(references: Sequence[SampledLog]) -> str:
     names = [item.log.name for item in references if item.log.first_soc() is None]
     if not names:
         return ""
@@ -233,7 +233,7 @@ def _reference_start(references: Sequence[Prepared]) -> str:
     )
 
 
-def _source(logs: Sequence[Prepared], of_model: TemperatureSource) -> str:
+def _source(logs: Sequence[SampledLog], of_model: TemperatureSource) -> str:
     others = sorted({item.log.temperature_source for item in logs} - {of_model, "unknown"})
     if of_model == "unknown" or not others:
         return ""
@@ -244,7 +244,7 @@ def _source(logs: Sequence[Prepared], of_model: TemperatureSource) -> str:
     )
 
 
-def _charging(logs: Sequence[Prepared], capacity_ah: float) -> str:
+def _charging(logs: Sequence[SampledLog], capacity_ah: float) -> str:
     current = np.concatenate([item.rows.delayed_current_a[:, 0] for item in logs])
     least_a = REST_C_RATE * capacity_ah
     sentences = []

@@ -23,7 +23,8 @@ from cangauge.diagnosis.linear_gaussian import Evidence, Gram, gather, gram_of
 from cangauge.diagnosis.problem import DiagnosisProblem
 from cangauge.estimate.offline import run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
-from cangauge.identify.linearized import Prepared, residual
+from cangauge.inference.linearized import residual
+from cangauge.inference.rows import SampledLog
 from cangauge.logs.log import Log
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Model
@@ -35,7 +36,7 @@ from cangauge.model.model_file import Model
 class LogErrors:
     """One diagnosed log; m rows at the model's rate."""
 
-    prepared: Prepared
+    prepared: SampledLog
     before_v: FloatArray
     """Measured − model as given, shape (m,) [V]."""
     after_v: FloatArray

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.identify.linearized import (
-    Prepared,
-    as_modelled,
+from cangauge.inference.linearized import (
     coefficient_columns,
     effect_columns,
-    predictions,
+    pack_state,
+    predict_logs,
     residual,
-    state_of,
+    with_modelled_voltage,
 )
+from cangauge.inference.rows import SampledLog
 from cangauge.model.effects.base import Pack
 from cangauge.model.effects.library import Candidate, candidates
 from cangauge.model.extended import ExtendedModel
@@ -40,7 +40,7 @@ OWN_SLOW_S = 150.0
 class DesignMatrix:
     """Everything that the evidence needs of one log; m rows."""
 
-    prepared: Prepared
+    prepared: SampledLog
     residual_v: FloatArray
     """What the columns are to explain, shape (m,): of the model as it is or, so that they are exact
     where the structure acts, of the acting one and what they say that its structure does."""
@@ -63,7 +63,7 @@ class DesignMatrix:
 
 
 def design_matrix(
-    prepared: Prepared,
+    prepared: SampledLog,
     model: ExtendedModel,
     choices: Sequence[Candidate],
     acting: ExtendedModel | None = None,
@@ -72,7 +72,7 @@ def design_matrix(
 
     Parameters
     ----------
-    prepared : Prepared
+    prepared : SampledLog
     model : ExtendedModel
     choices : sequence of Candidate
     acting : ExtendedModel, optional
@@ -82,7 +82,7 @@ def design_matrix(
     """
     voltage_model = model.model
     rows = prepared.rows
-    remembering = prepared.remembering()  # until all columns are there
+    remembering = prepared.with_history_cache()  # until all columns are there
     current = prepared.log.current_a
     slow = remembering.signals.history.lagged_a(OWN_SLOW_S)
     own = np.column_stack(
@@ -91,16 +91,16 @@ def design_matrix(
             -model.pack.resistance_ohm * current[prepared.at],
         ]
     )
-    smooth = as_modelled(remembering, model)
+    smooth = with_modelled_voltage(remembering, model)
     here = residual(smooth, model)
-    state = state_of(smooth, model)
+    state = pack_state(smooth, model)
     if acting is not None:
-        smooth_acting = as_modelled(remembering, acting)
+        smooth_acting = with_modelled_voltage(remembering, acting)
         here_acting = residual(smooth_acting, acting)
-        state_acting = state_of(smooth_acting, acting)
+        state_acting = pack_state(smooth_acting, acting)
     # Effects that the model has already may scale what its coefficients multiply.
     baseline = (
-        coefficient_columns(model, [prepared], predictions(model, [prepared]))
+        coefficient_columns(model, [prepared], predict_logs(model, [prepared]))
         if model.effects
         else np.column_stack(
             [
@@ -123,7 +123,7 @@ def design_matrix(
     return DesignMatrix(prepared, residual_v, baseline, own, effects)
 
 
-def own_choices(choices: Sequence[Candidate], pack: Pack, prepared: Prepared) -> list[Candidate]:
+def own_choices(choices: Sequence[Candidate], pack: Pack, prepared: SampledLog) -> list[Candidate]:
     """Return the candidates as they are on one log: a moment is a part of its length.
 
     Raises
@@ -132,7 +132,7 @@ def own_choices(choices: Sequence[Candidate], pack: Pack, prepared: Prepared) ->
         If they are not as many.
     """
     effects = list(dict.fromkeys(choice.effect for choice in choices))
-    own = candidates(effects, pack, prepared.log.time_s, elsewhere=True)
+    own = candidates(effects, pack, prepared.log.time_s, for_diagnosis=True)
     if [each.effect.id for each in own] != [each.effect.id for each in choices]:
         raise InputError("the effects' shapes differ between logs", source=prepared.log.source)
     return own

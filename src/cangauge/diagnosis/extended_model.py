@@ -41,9 +41,9 @@ from cangauge.diagnosis.linear_gaussian import (
 )
 from cangauge.diagnosis.problem import DiagnosisProblem
 from cangauge.diagnosis.references import needed, with_pieces
-from cangauge.identify.linearized import as_modelled, residual, state_of
-from cangauge.model.effects.base import LEEWAY, Effect, Pack, Values
-from cangauge.model.effects.library import LIBRARY, STEP, Candidate, effect_entries, one_of
+from cangauge.inference.linearized import pack_state, residual, with_modelled_voltage
+from cangauge.model.effects.base import BOUND_MARGIN, Effect, Pack, Values
+from cangauge.model.effects.library import LIBRARY, STEP, Candidate, effect_entries, shape_key
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Made, Model, Ranges
 
@@ -75,7 +75,7 @@ def at_moment(
     """
     values = dict(start)
     for parameter in effect.shapes:
-        if parameter.is_moment:
+        if parameter.is_change_point:
             values[parameter.name] = _best(logs, model, effect, values, parameter.name)
     return values
 
@@ -83,7 +83,7 @@ def at_moment(
 def _best(
     logs: Sequence[DesignMatrix], model: ExtendedModel, effect: Effect, values: Values, name: str
 ) -> float:
-    states = [state_of(terms.prepared, model) for terms in logs]
+    states = [pack_state(terms.prepared, model) for terms in logs]
     # What the coefficients or a log's own level explain as well is no jump.
     known = [np.linalg.qr(np.column_stack([terms.baseline, terms.own]))[0] for terms in logs]
     left_v = np.concatenate(
@@ -304,11 +304,11 @@ def _terms_at(
     tangents: bool = True,
 ) -> DesignMatrix:
     """Return a diagnosed log's terms with the causes in its residual, and their tangents there."""
-    prepared, acting = terms.prepared.remembering(), settled.acting or settled.model
+    prepared, acting = terms.prepared.with_history_cache(), settled.acting or settled.model
     changed = residual(prepared, with_causes(acting, causes)) - residual(prepared, acting)
     effects = list(terms.effects)
     if tangents:
-        smooth = as_modelled(prepared, with_causes(acting, causes))
+        smooth = with_modelled_voltage(prepared, with_causes(acting, causes))
         here = residual(smooth, with_causes(acting, causes))
         for number, cause in enumerate(causes):
             columns = np.empty_like(effects[cause.candidate])
@@ -365,7 +365,7 @@ def extend(settled: DiagnosisProblem, accepted: Sequence[Score]) -> Extension:
     base, remarks = _base(_with_needed_structure(found.settled))
     # The pack's sizes have moved with the coefficients, and a file must agree with them.
     causes = [
-        replace(cause, values=cause.choice.effect.within(cause.values, base.pack))
+        replace(cause, values=cause.choice.effect.clipped(cause.values, base.pack))
         for cause in found.causes
     ]
     std = iter(np.sqrt(np.diag(found.covariance)).tolist())
@@ -465,7 +465,7 @@ def _refined(
     settled: DiagnosisProblem, model: ExtendedModel, effect: Effect, start: Values
 ) -> tuple[ExtendedModel, dict[str, float]]:
     """Return model and parameters, fitted through the model's own equations from a start."""
-    free = (*effect.amplitudes, *(shape for shape in effect.shapes if not shape.is_moment))
+    free = (*effect.amplitudes, *(shape for shape in effect.shapes if not shape.is_change_point))
     parameters = free or effect.parameters
     constants = {p.name: start[p.name] for p in effect.parameters if p not in parameters}
     pack = settled.model.pack  # not the model's, whose structure has taken much of its resistance
@@ -481,7 +481,7 @@ def _refined(
         values = (centre + unit * scale).tolist()
         return {p.name: value for p, value in zip(parameters, values, strict=True)} | constants
 
-    logs = [terms.prepared.remembering() for terms in settled.diagnosed]
+    logs = [terms.prepared.with_history_cache() for terms in settled.diagnosed]
 
     def errors(unit: FloatArray) -> FloatArray:
         trial = model.with_effect(effect, values_of(unit))
@@ -565,7 +565,7 @@ def _merged(effects: Sequence[tuple[Effect, Values]], pack: Pack) -> list[tuple[
     """Return the effects, those of one kind and shape added up, within physical bounds."""
     merged: dict[tuple[object, ...], tuple[Effect, dict[str, float]]] = {}
     for effect, values in effects:
-        key = one_of(effect, values)
+        key = shape_key(effect, values)
         if key not in merged:
             merged[key] = (effect, dict(values))
             continue
@@ -573,7 +573,7 @@ def _merged(effects: Sequence[tuple[Effect, Values]], pack: Pack) -> list[tuple[
         _, total = merged[key]
         for parameter in effect.amplitudes:
             total[parameter.name] += values[parameter.name] - neutral[parameter.name]
-        merged[key] = (effect, effect.within(total, pack))
+        merged[key] = (effect, effect.clipped(total, pack))
     return list(merged.values())
 
 
@@ -611,7 +611,7 @@ def cause_parameters(
     result: dict[str, dict[str, object]] = {}
     for name in first.amplitudes:
         # What a bound is relative to is read off the model: an interval may go beyond it.
-        low, high = named[name].bounds(settled.model.pack, LEEWAY)
+        low, high = named[name].bounds(settled.model.pack, BOUND_MARGIN)
         away = 1.96 * std[name]
         interval = [max(values[name] - away, low), min(values[name] + away, high)]
         result[name] = {"value": values[name], "ci": interval, "unit": units[name]}

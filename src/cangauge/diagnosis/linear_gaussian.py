@@ -28,9 +28,9 @@ from cangauge._typing import FloatArray
 from cangauge.diagnosis.design_matrix import DesignMatrix
 from cangauge.diagnosis.hypotheses import Frame
 from cangauge.errors import InputError
-from cangauge.identify.voltage_fit import SLOPE_CHECKS
 from cangauge.inference.least_squares import nearest_rising
-from cangauge.inference.time_scales import by_scale
+from cangauge.inference.linearized import SLOPE_CHECKS
+from cangauge.inference.time_scales import haar_transform
 from cangauge.model.voltage_model import BASIS_NAMES, SLOPE_AT_LEAST, VoltageModel, ocv_basis_slope
 
 # --- The evidence for each effect: one linear Gaussian model of all logs, references and dia…
@@ -50,7 +50,7 @@ class ErrorModel:
     """How far residuals stray without a cause."""
 
     scale_v2: tuple[float, ...]
-    """Variance of the coefficients of each scale (`scales.by_scale`) [V²]."""
+    """Variance of the coefficients of each scale (`scales.haar_transform`) [V²]."""
     own_std: tuple[float, ...]
     """Standard deviation, from log to log, of what is each log's own (`Frame.own_prior`)."""
     rmse_v: float
@@ -137,7 +137,7 @@ def gram_of(terms: DesignMatrix, scale: FloatArray, weight: FloatArray | None = 
         keep = weight > 0.0
         columns = columns[keep] * weight[keep, None]
         part = float(np.mean(weight[keep] ** 2))
-    parts = by_scale(columns)
+    parts = haar_transform(columns)
     return Gram(
         np.stack([each.T @ each for each in parts]),
         part * np.array([float(len(each)) for each in parts]),

@@ -28,8 +28,8 @@ from cangauge.diagnosis.references import (
     with_strays,
 )
 from cangauge.errors import InputError
-from cangauge.identify.linearized import Prepared, prepare_log, residual
-from cangauge.identify.rows import FitOptions
+from cangauge.inference.linearized import residual
+from cangauge.inference.rows import FitOptions, SampledLog, sample_log
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.resample import dequantize, resample, usual_step_k
 from cangauge.model.effects.base import Effect
@@ -56,7 +56,7 @@ LEAST_COUNT = 0.1
 """A reference that went where no other has been still counts so much."""
 
 
-def temperatures_covered(references: Sequence[Prepared], diagnosed: Sequence[Prepared]) -> bool:
+def temperatures_covered(references: Sequence[SampledLog], diagnosed: Sequence[SampledLog]) -> bool:
     """Return whether most rows of the diagnosed logs are at temperatures that references teach."""
     seen = np.concatenate([item.rows.temperature_c for item in references])
     asked = np.concatenate([item.rows.temperature_c for item in diagnosed])
@@ -67,14 +67,14 @@ def temperatures_covered(references: Sequence[Prepared], diagnosed: Sequence[Pre
 
 
 def charge_weight(
-    item: Prepared, references: Sequence[Prepared], taught_pct: tuple[float, float]
+    item: SampledLog, references: Sequence[SampledLog], taught_pct: tuple[float, float]
 ) -> FloatArray:
     """Return how much each row of a log tells by where it is charged, shape (m,).
 
     Parameters
     ----------
-    item : Prepared
-    references : sequence of Prepared
+    item : SampledLog
+    references : sequence of SampledLog
     taught_pct : tuple of float
         SoC that the model was fitted on, low and high [%].
 
@@ -92,7 +92,7 @@ def charge_weight(
     return np.where(_inside(item, references, "soc_pct", COVERED_PCT), 1.0, beyond)
 
 
-def counting(references: Sequence[Prepared], diagnosed: Sequence[Prepared]) -> list[float]:
+def counting(references: Sequence[SampledLog], diagnosed: Sequence[SampledLog]) -> list[float]:
     """Return how much each reference says of how far the diagnosed logs may stray.
 
     One that went where no other has been shows how the model extrapolates. If the diagnosed logs
@@ -109,7 +109,7 @@ def counting(references: Sequence[Prepared], diagnosed: Sequence[Prepared]) -> l
     ]
 
 
-def _part_inside(item: Prepared, others: Sequence[Prepared]) -> float:
+def _part_inside(item: SampledLog, others: Sequence[SampledLog]) -> float:
     """Return the part of a log's rows within the temperatures and SoC of others [-]."""
     warm = _inside(item, others, "temperature_c", COVERED_K)
     charged = _inside(item, others, "soc_pct", COVERED_PCT)
@@ -117,7 +117,7 @@ def _part_inside(item: Prepared, others: Sequence[Prepared]) -> float:
 
 
 def _inside(
-    item: Prepared, others: Sequence[Prepared], name: str, margin: float
+    item: SampledLog, others: Sequence[SampledLog], name: str, margin: float
 ) -> NDArray[np.bool_]:
     """Return which rows lie within the range of others; all of them, if there are no others."""
     values = getattr(item.rows, name)
@@ -272,12 +272,12 @@ def build_problem(
             field="information",
             cure="give logs on which the model is good with --reference",
         )
-    choices = candidates(effects, model.pack, logs[0].time_s, elsewhere=True)
+    choices = candidates(effects, model.pack, logs[0].time_s, for_diagnosis=True)
     say = progress or _silent
     # Steps are found in the reports, before means blur them.
-    of_logs = [prepare_log(resample(dequantize(log)), options) for log in logs]
+    of_logs = [sample_log(resample(dequantize(log)), options) for log in logs]
     without_start = replace(options, initial_soc_pct=None)
-    of_references = [prepare_log(resample(dequantize(log)), without_start) for log in references]
+    of_references = [sample_log(resample(dequantize(log)), without_start) for log in references]
     covered = not of_references or temperatures_covered(of_references, of_logs)
     frame = _frame(model_file, choices, has_references=bool(of_references), covered=covered)
     error = error_from_noise(model_file.noise, model_file.rate_hz, frame)
@@ -366,7 +366,7 @@ def _own(choices: Sequence[Candidate], model_file: Model) -> tuple[tuple[int, ..
     """
     by_effect: dict[str, dict[tuple[object, ...], int]] = {}
     for k, choice in enumerate(choices):
-        if choice.effect.is_cause and choice.is_usual:
+        if choice.effect.is_cause and choice.is_for_fit:
             # The first of one shape is what an effect does when it is small. What it does when it
             # is large differs from log to log by a cause alone.
             of_one = by_effect.setdefault(choice.effect.id, {})

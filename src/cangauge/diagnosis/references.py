@@ -50,7 +50,7 @@ from cangauge.diagnosis.linear_gaussian import (
     structure_precision,
     within_bounds,
 )
-from cangauge.identify.linearized import Prepared
+from cangauge.inference.rows import SampledLog
 from cangauge.inference.time_scales import SCALES, scale_variances
 from cangauge.model.effects.library import Candidate
 from cangauge.model.extended import ExtendedModel
@@ -450,7 +450,7 @@ def with_pieces(model: ExtendedModel, frame: Frame, amplitudes: FloatArray) -> E
         amplitude = np.clip(total, low, high)
         if np.any(np.abs(amplitude) > NEGLIGIBLE * (high - low)):
             # The pack's sizes move with the coefficients, and a file must agree with them.
-            values = choice.effect.within(choice.values(amplitude), model.pack)
+            values = choice.effect.clipped(choice.values(amplitude), model.pack)
             model = model.with_effect(choice.effect, values)
     return model
 
@@ -523,7 +523,7 @@ class Learned:
 
 
 def learn(
-    references: Sequence[Prepared],
+    references: Sequence[SampledLog],
     model: ExtendedModel,
     frame: Frame,
     grams: Sequence[Gram],
@@ -533,7 +533,7 @@ def learn(
 
     Parameters
     ----------
-    references : sequence of Prepared
+    references : sequence of SampledLog
     model : ExtendedModel
     frame : Frame
     grams : sequence of Gram
@@ -556,14 +556,14 @@ def learn(
     return replace(found, references=terms)
 
 
-def _moved(references: Sequence[Prepared], last: Learned, error: ErrorModel) -> Learned:
+def _moved(references: Sequence[SampledLog], last: Learned, error: ErrorModel) -> Learned:
     """Return the model with the references' coefficients, and their columns of it."""
     model, frame = _with_coefficients(last, error)
     grams = reference_grams(reference_terms(references, model, frame), frame)
     return Learned(model, None, frame, (), grams)
 
 
-def _step(references: Sequence[Prepared], last: Learned, error: ErrorModel) -> Learned:
+def _step(references: Sequence[SampledLog], last: Learned, error: ErrorModel) -> Learned:
     """Return what the references teach, by their columns about what they taught last."""
     acting = repaired(last.model, last.frame, last.grams, error)
     model, frame = _with_coefficients(last, error)
@@ -588,7 +588,7 @@ def _with_coefficients(last: Learned, error: ErrorModel) -> tuple[ExtendedModel,
 
 
 def reference_terms(
-    references: Sequence[Prepared],
+    references: Sequence[SampledLog],
     model: ExtendedModel,
     frame: Frame,
     acting: ExtendedModel | None = None,

@@ -386,7 +386,7 @@ class Estimator:
             clock=self._clock.state(),
             counter=self._counter.state(),
             line=DelayLineState.model_construct(time_s=times, current_a=currents, since_s=since_s),
-            effects=self._online.memory(),
+            effects=self._online.state(),
             belief=self._fusion.state(),
             since=self._since.state(),
             anchors=self._anchors.state(),
@@ -422,7 +422,7 @@ class Estimator:
             If the state does not fit the model; the estimator must then not be used.
         """
         self._resume(state, age_s)
-        self._online.remember(state.effects, state.clock.last_s)
+        self._online.restore(state.effects, state.clock.last_s)
         self._anchors.restore(state.anchors)
         self.resets = state.resets
         is_same = (state.method, state.capacity_ah) == (self.settings.method, self.capacity_ah)

@@ -1,18 +1,17 @@
-"""Models judged on rows that their fit did not see, and whether one is better by more than chance.
+"""Cross-validation of extended models, and whether one is significantly better than another.
 
-Three logs or more: whole logs are left out in turn (in groups, beyond twelve). One or two logs:
-interleaved blocks of 240 s with a guard of 60 s (`identify.held_out`). Each log, or block, is one
-comparison of two models: the logarithm of the ratio of their mean square errors there, so that a
-log that is hard for both does not outweigh the others.
+Three logs or more: whole logs are held out in turn (in groups, beyond twelve). One or two logs:
+interleaved blocks of 240 s with a guard of 60 s (`rows.folds`). Each log, or block, is one
+comparison of two models: the log ratio of their mean square errors there, so that a log that is
+hard for both does not dominate the others.
 
-The rule: a model with one more effect is better by more than chance if the mean of these
-logarithms exceeds its standard error by so much as Student's t exceeds with probability `CHANCE`
-(2.2 standard errors for eleven logs, 4.3 for three) over the effect's amplitudes, and if the pooled
-root mean square error falls by `GAIN_AT_LEAST`. One standard error would let in the best of ten
-useless effects too often, and those with several amplitudes first. Where whole logs are left out,
-half as many standard errors are asked of the error's variance within each log: a few logs that
-differ by what lasts as long as they do are easily told apart by an effect of the temperature, by
-chance, and nothing within them bears it out.
+A model with one more effect is significantly better if the mean log ratio exceeds its standard
+error by the quantile of Student's t at probability `CHANCE`, divided by the number of the effect's
+amplitudes (2.2 standard errors for eleven logs, 4.3 for three), and if the pooled root mean square
+error falls by `GAIN_AT_LEAST`. One standard error would let in the best of ten useless effects too
+often, and first those with several amplitudes. Where whole logs are held out, half as many standard
+errors are also required of the error's variance within each log: errors that last as long as a log
+are easily explained by an effect of temperature, by chance, which nothing within the logs supports.
 """
 
 from __future__ import annotations
@@ -28,192 +27,196 @@ from scipy.stats import t as student_t
 
 from cangauge._typing import FloatArray
 from cangauge.errors import CangaugeError, InputError
-from cangauge.identify.linearized import (
-    Linear,
-    Mask,
-    Prepared,
-    best_change,
-    linearise,
-    moved_by,
-    residual_of,
-    spanning,
-    step_on,
+from cangauge.inference.linearized import (
+    Linearization,
+    changed_model,
+    constrained_change,
+    gauss_newton_step,
+    linearize,
+    stacked_residual,
+    with_ranges,
 )
-from cangauge.identify.rows import BLOCK_S, LOGS_AT_LEAST, folds
+from cangauge.inference.rows import (
+    BLOCK_S,
+    LOGS_AT_LEAST,
+    Mask,
+    SampledLog,
+    block_numbers,
+    folds,
+)
 from cangauge.model.extended import ExtendedModel
 
 CHANCE = 0.025
-"""Probability with which Student's t exceeds what is asked for. A useless effect mostly raises the
-error on rows left out, so even the best of many is rarely taken."""
+"""Significance level of an effect. A useless effect mostly raises the held-out error, so even the
+best of many is rarely taken."""
 
 GAIN_AT_LEAST = 0.01
-"""The held-out root mean square error must fall by this part, or the effect is not worth it."""
+"""Least relative decrease of the held-out root mean square error."""
 
 UNITS_AT_LEAST = 3
-"""Fewer logs or blocks than this tell nothing about chance."""
+"""Least number of logs or blocks for a test."""
 
 WITHIN = 0.5
-"""So many standard errors, in parts of those asked for, must the error fall within the logs."""
+"""Standard errors required within the logs, relative to those required in total."""
 
 LEAST_V2 = 1e-12
-"""Mean square errors below this are alike [V²]."""
+"""Lower limit of mean square errors [V²]."""
 
 SOC_BEYOND_PCT = 1.0
-"""Rows this far outside the SoC of the fit are judged; beyond, the model is not to be trusted."""
+"""Held-out rows farther than this outside the SoC of the training rows are left out [%]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fold:
-    """Rows to fit on and rows to judge on, shape (n,) over all logs."""
+    """Training and held-out rows, masks of shape (n,) over all logs."""
 
-    fit_on: Mask
-    judge_on: Mask
+    training: Mask
+    held_out: Mask
     logs: tuple[int, ...]
-    """Which logs the judged rows belong to."""
+    """Index of the logs with held-out rows."""
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
-    """A model's errors on rows left out."""
+class HeldOutErrors:
+    """Held-out errors of a model."""
 
     error_v: FloatArray
-    """Shape (n,); NaN where no fold judged the row."""
+    """Shape (n,); NaN where no fold holds the row out."""
     unit: NDArray[np.intp]
-    """Number of the log, or block, that each row belongs to, shape (n,)."""
+    """Number of the log, or block, of each row, shape (n,)."""
     whole_logs: bool = False
-    """Whether whole logs were left out."""
+    """Whether whole logs are held out."""
 
     @property
     def rmse_v(self) -> float:
-        """Root mean square error of all judged rows [V]."""
+        """Root mean square error of all held-out rows [V]."""
         return float(np.sqrt(np.nanmean(self.error_v**2)))
 
     @property
     def unit_v2(self) -> FloatArray:
-        """Mean square error of each judged log or block [V²], shape (units,)."""
+        """Mean square error of each log or block [V²], shape (units,)."""
         seen = ~np.isnan(self.error_v)
-        return mean_squares(self.error_v[seen] ** 2, self.unit[seen])
+        return _mean_squares(self.error_v[seen] ** 2, self.unit[seen])
 
     @property
     def within_v2(self) -> FloatArray:
-        """Variance of the error within each log, shape (units,)."""
+        """Variance of the error within each log [V²], shape (units,)."""
         seen = ~np.isnan(self.error_v)
         unit = self.unit[seen]
         mean = np.bincount(unit, self.error_v[seen]) / np.maximum(np.bincount(unit), 1)
-        return mean_squares((self.error_v[seen] - mean[unit]) ** 2, unit)
+        return _mean_squares((self.error_v[seen] - mean[unit]) ** 2, unit)
 
 
-def mean_squares(squares: FloatArray, unit: NDArray[np.intp]) -> FloatArray:
-    """Return the mean of squares over each unit that has any, in order; never zero."""
+def _mean_squares(squares: FloatArray, unit: NDArray[np.intp]) -> FloatArray:
+    """Return the mean of squares over each unit with rows, in order, at least `LEAST_V2`."""
     total, count = np.bincount(unit, squares), np.bincount(unit)
     return np.maximum(total[count > 0] / count[count > 0], LEAST_V2)
 
 
-class Judge:
-    """Judges models of some logs, all on the same rows.
+class CrossValidation:
+    """Held-out errors of models on the same rows of the same logs.
 
     Parameters
     ----------
-    logs : sequence of Prepared
+    logs : sequence of SampledLog
 
     Raises
     ------
     InputError
-        If the logs are too short to hold anything out.
+        If the logs are too short to hold rows out.
     """
 
-    def __init__(self, logs: Sequence[Prepared]) -> None:
+    def __init__(self, logs: Sequence[SampledLog]) -> None:
         self.logs = tuple(logs)
         rows = [item.rows for item in logs]
         soc = np.concatenate([item.soc_pct for item in rows])
-        self.unit = _units(logs)
-        owner = np.concatenate([np.full(len(item), k) for k, item in enumerate(rows)])
+        owner = np.repeat(np.arange(len(rows)), [len(item) for item in rows])
         self._owner = owner
+        self.unit = owner if len(logs) >= LOGS_AT_LEAST else block_numbers(rows, BLOCK_S)
         self.folds: list[Fold] = []
-        for fit_on, left_out in folds(rows):
-            lo, hi = soc[fit_on].min() - SOC_BEYOND_PCT, soc[fit_on].max() + SOC_BEYOND_PCT
-            judged = left_out & (soc > lo) & (soc < hi)
-            if judged.any():
-                of_logs = tuple(np.unique(owner[judged]).tolist())
-                self.folds.append(Fold(fit_on, judged, of_logs))
-        judged = np.any([fold.judge_on for fold in self.folds], axis=0)
-        if not self.folds or np.unique(self.unit[judged]).size < UNITS_AT_LEAST:
+        for training, held_out in folds(rows):
+            lo, hi = soc[training].min() - SOC_BEYOND_PCT, soc[training].max() + SOC_BEYOND_PCT
+            inside = held_out & (soc > lo) & (soc < hi)
+            if inside.any():
+                of_logs = tuple(np.unique(owner[inside]).tolist())
+                self.folds.append(Fold(training, inside, of_logs))
+        held_out = np.any([fold.held_out for fold in self.folds], axis=0)
+        if not self.folds or np.unique(self.unit[held_out]).size < UNITS_AT_LEAST:
             seconds = sum(item.log.duration_s for item in logs)
             raise InputError(
-                f"too little of {seconds:.0f} s of data can be held out to judge effects on",
+                f"{seconds:.0f} s of data are too little to hold rows out for a test of effects",
                 source=", ".join(item.log.name for item in logs),
                 field="effects",
                 cure="give an hour with changing load, or three logs and more over the same SoC;"
                 " or fit without --effects",
             )
 
-    def __call__(self, model: ExtendedModel) -> Judged:
-        """Return the errors of a fitted model, each row's by a fit that did not see it.
+    def errors(self, model: ExtendedModel) -> HeldOutErrors:
+        """Return the held-out errors of a fitted model.
 
-        Every fold goes one Gauss–Newton step from the model, which is where the fold's own fit
-        lies but for what the step is not linear in.
+        For each fold one Gauss–Newton step is taken on its training rows, which is the fold's own
+        fit up to the nonlinearity.
         """
         error_v = np.full(self.unit.size, np.nan)
-        whole = linearise(model, self.logs)
+        whole = linearize(model, self.logs)
         for fold in self.folds:
-            in_fold = replace(whole, model=spanning(model, whole.here, fold.fit_on))
+            in_fold = replace(whole, model=with_ranges(model, whole.predictions, fold.training))
             try:
-                moved = moved_by(in_fold, step_on(in_fold, fold.fit_on))
+                changed = changed_model(in_fold, gauss_newton_step(in_fold, fold.training))
             except CangaugeError:
-                # A fold on which the model cannot be fitted is judged as it would be in use.
-                error_v[fold.judge_on] = math.inf
+                error_v[fold.held_out] = math.inf  # a model that a fold cannot fit is no better
                 continue
             of_logs = np.isin(self._owner, fold.logs)
-            seen = residual_of(moved, [self.logs[k] for k in fold.logs])
-            error_v[fold.judge_on] = seen[fold.judge_on[of_logs]]
-        return Judged(error_v, self.unit, whole_logs=len(self.logs) >= LOGS_AT_LEAST)
+            residual_v = stacked_residual(changed, [self.logs[k] for k in fold.logs])
+            error_v[fold.held_out] = residual_v[fold.held_out[of_logs]]
+        return HeldOutErrors(error_v, self.unit, whole_logs=len(self.logs) >= LOGS_AT_LEAST)
 
     def screen(
-        self, linear: Linear, extra: Sequence[FloatArray], bounds: Sequence[FloatArray]
+        self, linear: Linearization, extra: Sequence[FloatArray], bounds: Sequence[FloatArray]
     ) -> list[float]:
-        """Return by how much each of some additions would lower the held-out error, linearly.
+        """Return the decrease of the held-out error by each of several additions, linearly.
 
         Parameters
         ----------
-        linear : Linear
-            At the model that they are added to.
+        linear : Linearization
+            At the model to which they are added.
         extra : sequence of arrays of shape (n, k)
             Columns of each addition.
         bounds : sequence of arrays of shape (k, 2)
-            Limits of each addition's amplitudes.
+            Bounds of each addition's amplitudes.
 
         Returns
         -------
         list of float
-            Mean logarithm of the ratio of mean square errors, before over after.
+            Mean log ratio of mean square errors, before over after.
         """
         p = linear.columns.shape[1]
         table = np.column_stack([linear.columns, *extra, linear.residual_v])
-        holding = np.zeros((1, table.shape[1]))
-        holding[:, [*range(p), -1]] = linear.holding
+        prior_row = np.zeros((1, table.shape[1]))
+        prior_row[:, [*range(p), -1]] = linear.prior_row
         first = p + np.cumsum([0, *(columns.shape[1] for columns in extra)])
         choices = [np.arange(0), *(np.arange(a, b) for a, b in itertools.pairwise(first))]
         squares = np.full((len(choices), self.unit.size), np.nan)
         for fold in self.folds:
-            compact = np.linalg.qr(np.vstack([table[fold.fit_on], holding])).R
-            rows = table[fold.judge_on]
-            span = spanning(linear.model, linear.here, fold.fit_on).model.soc_range_pct
-            limits = linear.limits(span)
+            factor = np.linalg.qr(np.vstack([table[fold.training], prior_row])).R
+            rows = table[fold.held_out]
+            in_fold = with_ranges(linear.model, linear.predictions, fold.training).model
+            constraints = linear.constraints(in_fold.soc_range_pct)
             for k, own in enumerate(choices):
                 used = np.concatenate((np.arange(p), own, [table.shape[1] - 1]))
-                within = _with_bounds(limits, bounds[k - 1] if own.size else np.empty((0, 2)))
-                change = best_change(compact[:, used], within)
+                bounded = _with_bounds(constraints, bounds[k - 1] if own.size else np.empty((0, 2)))
+                change = constrained_change(factor[:, used], bounded)
                 error_v = rows[:, -1] - rows[:, used[:-1]] @ change
-                squares[k, fold.judge_on] = error_v**2
+                squares[k, fold.held_out] = error_v**2
         seen = np.isfinite(squares[0])
-        log_v2 = [np.log(mean_squares(item[seen], self.unit[seen])) for item in squares]
+        log_v2 = [np.log(_mean_squares(item[seen], self.unit[seen])) for item in squares]
         return [float(np.mean(log_v2[0] - item)) for item in log_v2[1:]]
 
 
 def _with_bounds(
-    limits: tuple[FloatArray, FloatArray], bounds: FloatArray
+    constraints: tuple[FloatArray, FloatArray], bounds: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    matrix, at_least = limits
+    matrix, at_least = constraints
     k = bounds.shape[0]
     wider = np.hstack([matrix, np.zeros((matrix.shape[0], k))])
     own = np.hstack([np.zeros((k, matrix.shape[1])), np.eye(k)])
@@ -225,35 +228,35 @@ def _with_bounds(
 
 @dataclass(frozen=True)
 class Comparison:
-    """How much better one model is than another on rows left out."""
+    """Held-out errors of two models, and the test statistic of their difference."""
 
     before_rmse_v: float
     after_rmse_v: float
     t_value: float
-    """Mean logarithm of the ratio of mean square errors over its standard error; where whole logs
-    are left out, the lesser of that and twice the same of the variances within the logs."""
-    needed: float
-    """What chance would not exceed."""
+    """Mean log ratio of mean square errors over its standard error. Where whole logs are held out,
+    at most twice the same statistic of the variances within the logs."""
+    t_critical: float
+    """Quantile that `t_value` must exceed."""
 
     @property
-    def better(self) -> bool:
-        """Whether the second is better by more than chance, and by enough."""
-        return self.worth_it and self.t_value > self.needed
+    def is_significant(self) -> bool:
+        """Whether the second model is better, significantly and by `GAIN_AT_LEAST`."""
+        return self.is_worthwhile and self.t_value > self.t_critical
 
     @property
-    def worth_it(self) -> bool:
-        """Whether the error falls by enough, be it by chance."""
+    def is_worthwhile(self) -> bool:
+        """Whether the error falls by `GAIN_AT_LEAST`, significantly or not."""
         return self.after_rmse_v <= (1.0 - GAIN_AT_LEAST) * self.before_rmse_v
 
 
-def compare(before: Judged, after: Judged, amplitudes: int = 1) -> Comparison:
-    """Compare two models on the same rows.
+def compare(before: HeldOutErrors, after: HeldOutErrors, amplitudes: int = 1) -> Comparison:
+    """Compare two models on the same held-out rows.
 
     Parameters
     ----------
-    before, after : Judged
+    before, after : HeldOutErrors
     amplitudes : int
-        Of the effect that the second has beside the first.
+        Number of amplitudes that the second model has in addition.
     """
     t_value = _t_value(before.unit_v2, after.unit_v2)
     if before.whole_logs:
@@ -267,24 +270,10 @@ def compare(before: Judged, after: Judged, amplitudes: int = 1) -> Comparison:
 
 
 def _t_value(before_v2: FloatArray, after_v2: FloatArray) -> float:
-    """Return the mean logarithm of the ratio of mean squares over its standard error."""
+    """Return the mean log ratio of mean squares over its standard error."""
     with np.errstate(invalid="ignore"):
-        logs = np.log(before_v2) - np.log(after_v2)
-    if not np.all(np.isfinite(logs)):
+        ratios = np.log(before_v2) - np.log(after_v2)
+    if not np.all(np.isfinite(ratios)):
         return -math.inf
-    error = float(np.std(logs, ddof=1)) / math.sqrt(logs.size)
-    return float(np.mean(logs)) / max(error, 1e-12)
-
-
-def _units(logs: Sequence[Prepared]) -> NDArray[np.intp]:
-    """Return the number of each row's log; of its block, where blocks are left out."""
-    numbers: list[NDArray[np.intp]] = []
-    first = 0
-    for item in logs:
-        time_s = item.rows.time_s
-        number = np.zeros(time_s.size, dtype=np.intp)
-        if len(logs) < LOGS_AT_LEAST:
-            number = ((time_s - time_s[0]) // BLOCK_S).astype(np.intp)
-        numbers.append(first + number)
-        first = int(numbers[-1].max()) + 1
-    return np.concatenate(numbers)
+    error = float(np.std(ratios, ddof=1)) / math.sqrt(ratios.size)
+    return float(np.mean(ratios)) / max(error, 1e-12)

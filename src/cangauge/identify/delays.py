@@ -1,91 +1,84 @@
-"""A search over number and size of delays, like the paper's trial and error, by held-out error.
+"""Greedy search over number and length of the delays by held-out error.
 
-Delays are added one at a time, and then each is tried elsewhere, as long as the error on rows
-that the fit did not see falls by at least `GAIN_AT_LEAST`. All choices are judged on the same rows
-(those with the longest candidate behind them). The pseudo-OCV is not held rising here; the final
-fit does that.
+In each round one delay is added or moved, as long as the held-out error falls by at least
+`GAIN_AT_LEAST`. All choices are compared on the same rows (those with the longest candidate behind
+them), without the constraint of a rising pseudo-OCV, which the final fit adds.
 """
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.identify.rows import FitOptions, FitRows, folds
-from cangauge.identify.voltage_fit import columns_of, prepare
+from cangauge.identify.voltage_fit import design_matrix
+from cangauge.inference.rows import FitOptions, FitRows, fit_rows, folds
 from cangauge.logs.log import Log
+
+_LOG = logging.getLogger(__name__)
 
 CANDIDATES_S = (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 50.0, 70.0, 100.0, 150.0, 200.0, 300.0)
 DELAYS_AT_MOST = 6
 GAIN_AT_LEAST = 0.005
-"""A change must lower the held-out error by this much, relative, to be worth it."""
+"""Least relative decrease of the held-out error for a change to be taken."""
 
 
 @dataclass(frozen=True)
 class DelaySearch:
-    """What the search found."""
+    """Result of `search_delays`."""
 
     delay_s: tuple[float, ...]
     """The chosen delays [s], increasing from 0."""
     held_out_rmse_v: float
-    """Their error on rows that the fit did not see [V]."""
+    """Their held-out error [V]."""
     tried: tuple[tuple[tuple[float, ...], float], ...]
-    """Every choice that was tried, with its held-out error [V], in order."""
+    """Every choice tried, with its held-out error [V], in order."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Fold:
-    """Triangular factors of [columns | voltage]: all that least squares needs of the rows."""
+    """Triangular factors of [columns | voltage], sufficient for least squares."""
 
-    fitted: FloatArray
-    judged: FloatArray
-    judged_rows: int
+    training: FloatArray
+    held_out: FloatArray
+    held_out_rows: int
 
 
-def search_delays(
-    logs: Sequence[Log],
-    options: FitOptions,
-    progress: Callable[[str], None] | None = None,
-) -> DelaySearch:
-    """Choose delays for the logs.
+def search_delays(logs: Sequence[Log], options: FitOptions) -> DelaySearch:
+    """Choose delays for the logs; each choice taken is logged at INFO.
 
     Parameters
     ----------
     logs : sequence of Log
     options : FitOptions
-        Its capacity must be given; its delays are ignored.
-    progress : callable, optional
-        Called with a line of text for each delay that is taken in.
+        Its delays are ignored.
 
     Raises
     ------
     InputError
-        If the logs are too short to hold anything out.
+        If the logs are too short to hold rows out.
     """
-    rows = prepare(logs, replace(options, delay_s=CANDIDATES_S))
-    judge = _Judge(rows, options)
+    candidates = replace(options, delay_s=CANDIDATES_S)
+    held_out_error = _HeldOutError([fit_rows(log, candidates) for log in logs], options)
     best: tuple[float, ...] = (0.0,)
-    error = judge(best)
-    improved = True
-    while improved:
+    error_v = held_out_error(best)
+    while True:
         choices = _neighbours(best)
-        errors = [judge(choice) for choice in choices]
-        k = int(np.argmin(errors))
-        improved = errors[k] < (1.0 - GAIN_AT_LEAST) * error
-        if improved:
-            best, error = choices[k], errors[k]
-            if progress is not None:
-                progress(f"delays {', '.join(f'{d:g}' for d in best)} s: {error:.4f} V held out")
-    return DelaySearch(best, error, tuple(judge.tried.items()))
+        errors_v = [held_out_error(choice) for choice in choices]
+        k = int(np.argmin(errors_v))
+        if not errors_v[k] < (1.0 - GAIN_AT_LEAST) * error_v:
+            return DelaySearch(best, error_v, tuple(held_out_error.tried.items()))
+        best, error_v = choices[k], errors_v[k]
+        _LOG.info("delays %s s: %.4f V held out", ", ".join(f"{d:g}" for d in best), error_v)
 
 
 def _neighbours(delay_s: tuple[float, ...]) -> list[tuple[float, ...]]:
-    """Return the choices with one delay more, or one moved elsewhere; 0 s always stays."""
+    """Return the choices with one more delay, or with one moved; 0 s is always kept."""
     free = [delay for delay in CANDIDATES_S if delay not in delay_s]
     more = [tuple(sorted((*delay_s, new))) for new in free] if len(delay_s) < DELAYS_AT_MOST else []
     moved = [
@@ -96,29 +89,26 @@ def _neighbours(delay_s: tuple[float, ...]) -> list[tuple[float, ...]]:
     return more + moved
 
 
-class _Judge:
-    """Held-out error of a choice of delays; remembers what was tried."""
+class _HeldOutError:
+    """Held-out error of a choice of delays [V], with a cache of the choices tried."""
 
     def __init__(self, rows: Sequence[FitRows], options: FitOptions) -> None:
-        columns = np.vstack([columns_of(item, options.epsilon, options.t_ref_c) for item in rows])
+        columns = np.vstack(
+            [design_matrix(item, options.epsilon, options.t_ref_c) for item in rows]
+        )
         scale = np.linalg.norm(columns, axis=0)
         scale[scale == 0.0] = 1.0
         volts = np.concatenate([item.voltage_v for item in rows])
         soc = np.concatenate([item.soc_pct for item in rows])
         table = np.column_stack([columns / scale, volts])
         self._shared = columns.shape[1] - len(CANDIDATES_S)
-        self._folds = []
-        for fitted, left_out in folds(rows):
-            seen = (soc >= soc[fitted].min()) & (soc <= soc[fitted].max())
-            judged = left_out & seen
+        self._folds: list[_Fold] = []
+        for training, held_out in folds(rows):
+            inside = (soc >= soc[training].min()) & (soc <= soc[training].max())
+            judged = held_out & inside
             if judged.any():
-                self._folds.append(
-                    _Fold(
-                        np.linalg.qr(table[fitted]).R,
-                        np.linalg.qr(table[judged]).R,
-                        int(judged.sum()),
-                    )
-                )
+                factors = np.linalg.qr(table[training]).R, np.linalg.qr(table[judged]).R
+                self._folds.append(_Fold(*factors, int(judged.sum())))
         if not self._folds:
             raise InputError(
                 "the logs are too short to hold rows out for a search over delays",
@@ -139,7 +129,7 @@ class _Judge:
         ]
         square, count = 0.0, 0
         for fold in self._folds:
-            x = np.linalg.lstsq(fold.fitted[:, used], fold.fitted[:, -1], rcond=1e-11)[0]
-            square += float(np.sum((fold.judged[:, used] @ x - fold.judged[:, -1]) ** 2))
-            count += fold.judged_rows
+            x = np.linalg.lstsq(fold.training[:, used], fold.training[:, -1], rcond=1e-11)[0]
+            square += float(np.sum((fold.held_out[:, used] @ x - fold.held_out[:, -1]) ** 2))
+            count += fold.held_out_rows
         return math.sqrt(square / count)

@@ -1,40 +1,35 @@
-"""Which effects a fit may look for, and what a user may name.
+"""Selection of effects by forward selection and backward elimination, and their joint fit.
 
-Which effects clean logs show: forward selection, shapes moved, and a backward pass.
-
-Forward: every effect with every value of its shapes is weighed by a linear step on the folds; the
-most promising are fitted together with all that is there, on the model's own equations, and the
-better one is taken if it is so by more than chance (`judge`). Backward: an effect whose removal
-costs no more than chance goes, the least missed first; and each is weighed against the best other
-one in its place.
-
-Effects fitted to logs, with standard errors and what each was worth on logs left out.
+Forward: every effect with every trial value of its shapes is screened by a linear step on the
+folds. The most promising are fitted jointly with the present model, on its own equations, and the
+better one is added if it is significantly better (`cross_validation`). Backward: the effect whose
+removal costs least is removed if the cost is not significant; otherwise each effect is compared
+with the best other one in its place.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from cangauge._typing import FloatArray
 from cangauge.errors import CangaugeError, InputError
-from cangauge.identify.cross_validation import Comparison, Judge, Judged, compare
-from cangauge.identify.linearized import (
+from cangauge.identify.cross_validation import Comparison, CrossValidation, HeldOutErrors, compare
+from cangauge.inference.least_squares import BLOCK_S, Solution
+from cangauge.inference.linearized import (
     ROUGHLY_CONVERGED,
-    Linear,
-    Prepared,
-    as_modelled,
+    Linearization,
     effect_columns,
-    linearise,
-    refine,
-    residual_of,
+    fit_extended,
+    linearize,
+    residual,
     solution_at,
+    with_modelled_voltage,
 )
-from cangauge.identify.rows import LOGS_AT_LEAST
-from cangauge.identify.voltage_fit import blocks_of
-from cangauge.inference.least_squares import Solution
+from cangauge.inference.rows import LOGS_AT_LEAST, SampledLog, block_numbers
 from cangauge.model.effects.base import Effect, Values
 from cangauge.model.effects.library import (
     LIBRARY,
@@ -42,358 +37,116 @@ from cangauge.model.effects.library import (
     candidates,
     effect_entries,
     effect_of,
-    one_of,
     parse_effects,
+    shape_key,
 )
 from cangauge.model.extended import ExtendedModel
 
-# --- Which effects a fit may look for, and what a user may name
+_LOG = logging.getLogger(__name__)
 
 AUTO = "auto"
 
-CLEAN = (
+SEARCHED = (
     "resistance_temperature", "resistance_soc", "resistance_asymmetry", "charge_transfer",
     "fast_polarization", "slow_diffusion", "hysteresis", "entropic_coefficient",
     "temperature_lag", "core_temperature",
 )  # fmt: skip
-"""Structure that a clean pack may well have and the coefficients lack: what `auto` tries."""
+"""Effects that `auto` tries: structure of a healthy pack that the coefficients lack."""
 
-REFUSED = {
+NOT_IDENTIFIABLE = {
     "initial_soc": "it belongs to one log: give --initial-soc",
-    "resistance_step": "it belongs to one log: a clean pack has none",
+    "resistance_step": "it belongs to one log, not to a healthy pack",
     "capacity": "give --capacity-ah; the curve over SoC follows it",
-    "current_gain": "resistances and capacity hold it: give --capacity-ah",
-    "voltage_offset": "k0 holds it",
-    "voltage_gain": "the coefficients hold it",
+    "current_gain": "resistances and capacity absorb it: give --capacity-ah",
+    "voltage_offset": "k0 absorbs it",
+    "voltage_gain": "the coefficients absorb it",
 }
-"""Effects that a fit cannot tell from its own numbers, and why."""
+"""Effects that a fit cannot separate from its own coefficients, and why."""
 
-TWICE = 2
-"""So often one effect may be taken, with different shapes: a chain of RC elements."""
+COPIES_AT_MOST = 2
+"""Copies of one effect with different shapes in a model: a chain of RC elements."""
+
+EFFECTS_AT_MOST = 8
+
+TAU_RATIO_AT_LEAST = 2.0
+"""Ratio of the time constants of two copies of one effect."""
+
+FITTED_PER_ROUND = 2
+"""Number of the most promising effects of a round that are fitted in full."""
+
+FEW_LOGS = 5
+"""With fewer whole logs the standard error of the mean gain is unreliable; a remark says so."""
+
+AT_BOUND = 1e-6
+"""Distance of a parameter from its bound, relative to their width, at which the bound is active."""
 
 
-def parse_ids(given: Sequence[str]) -> tuple[str, ...]:
-    """Return effect ids from options that may hold several, separated by commas.
+def parse_effect_ids(given: Sequence[str]) -> tuple[str, ...]:
+    """Return effect ids from texts that may hold several, separated by commas.
 
     Raises
     ------
     InputError
-        If an id is unknown, cannot be told from the coefficients, is there too often, or stands
-        beside `auto`.
+        If an id is unknown, not identifiable by a fit, repeated too often, or combined with
+        `auto`.
     """
     ids = [part.strip() for text in given for part in text.split(",")]
     if ids == [AUTO]:
         return (AUTO,)
     if AUTO in ids:
         raise InputError(
-            "auto chooses by itself", field="--effects", value=", ".join(ids),
+            "auto selects effects itself", field="--effects", value=", ".join(ids),
             cure="give auto alone, or ids alone",
         )  # fmt: skip
     for effect_id in ids:
-        effect_of(effect_id, "--effects")
-        if effect_id in REFUSED:
+        effect = effect_of(effect_id, "--effects")
+        if effect_id in NOT_IDENTIFIABLE:
             raise InputError(
-                "a fit on clean logs cannot find it",
+                "not identifiable by a fit",
                 field="--effects",
                 value=effect_id,
-                cure=REFUSED[effect_id],
+                cure=NOT_IDENTIFIABLE[effect_id],
             )
-        often = TWICE if LIBRARY[effect_id].shapes and LIBRARY[effect_id].amplitudes else 1
-        if ids.count(effect_id) > often:
+        copies = COPIES_AT_MOST if effect.shapes and effect.amplitudes else 1
+        if ids.count(effect_id) > copies:
             raise InputError(
-                f"may be there {'twice' if often == TWICE else 'once'}",
+                f"may be given {'twice' if copies == COPIES_AT_MOST else 'once'} at most",
                 field="--effects",
                 value=", ".join(ids),
             )
     return tuple(ids)
 
 
-# --- Which effects clean logs show: forward selection, shapes moved, and a backward pass
-
-Progress = Callable[[str], None]
-
-EFFECTS_AT_MOST = 8
-APART = 2.0
-"""Two elements of one effect differ in their time constants by this factor at least."""
-
-TRIES = 2
-"""So many of the most promising effects of a round are fitted in full; the better one counts."""
-
-
 @dataclass(frozen=True)
-class Step:
-    """One effect taken, or left out again."""
+class SearchStep:
+    """One effect added or removed, or a decision against it."""
 
     what: str
     """`added`, `not added`, `removed`, or `in place of` another."""
     effect_id: str
     comparison: Comparison
-    """Against the model without it (with the other, where it takes its place)."""
+    """With the model without it (or with the other effect, where it replaces one)."""
 
     def to_dict(self) -> dict[str, object]:
-        """Return the step as `fit --json` prints it."""
+        """Return the step for `fit --json`."""
         return {
             "step": self.what,
             "effect": self.effect_id,
             "held_out_rmse_without_v": self.comparison.before_rmse_v,
             "held_out_rmse_with_v": self.comparison.after_rmse_v,
             "t_value": self.comparison.t_value,
-            "t_needed": self.comparison.needed,
+            "t_needed": self.comparison.t_critical,
         }
 
 
-@dataclass(frozen=True, eq=False)
-class Found:
-    """The model with the effects that were found."""
-
-    model: ExtendedModel
-    judged: Judged
-    plain: Judged
-    """Of the model without effects."""
-    steps: tuple[Step, ...]
-
-
-def find_effects(
-    plain: ExtendedModel,
-    logs: Sequence[Prepared],
-    ids: Sequence[str],
-    say: Progress,
-) -> Found:
-    """Return the model with the effects that the logs show, or that were named.
-
-    Parameters
-    ----------
-    plain : ExtendedModel
-        The fitted voltage model, without effects.
-    logs : sequence of Prepared
-    ids : sequence of str
-        From `ids.parse_ids`: `auto`, or effects that are all taken, whatever they bring.
-    say : callable
-        Called with a line of text before each long step.
-
-    Raises
-    ------
-    InputError
-        If the logs are too short to judge anything.
-    """
-    judge = Judge(logs)
-    search = _Search(judge, judge(plain), say)
-    if tuple(ids) == (AUTO,):
-        model, judged = search.forward(plain, search.plain)
-        model, judged = search.backward(model, judged)
-    else:
-        model, judged = search.named(plain, search.plain, ids)
-    if model.effects:
-        say("effects: fitting all of them once more")
-        model = refine(model, logs)
-        judged = judge(model)
-    return Found(model, judged, search.plain, tuple(search.steps))
-
-
-@dataclass(eq=False)
-class _Tried:
-    model: ExtendedModel
-    judged: Judged
-    comparison: Comparison
-
-    @property
-    def order(self) -> tuple[bool, float]:
-        """The better the smaller."""
-        return not self.comparison.better, self.judged.rmse_v
-
-
-class _Search:
-    def __init__(self, judge: Judge, plain: Judged, say: Progress) -> None:
-        self.judge = judge
-        self.plain = plain
-        self.steps: list[Step] = []
-        self._say = say
-
-    def forward(self, model: ExtendedModel, judged: Judged) -> tuple[ExtendedModel, Judged]:
-        """Take effects as long as one is better by more than chance."""
-        pool = [LIBRARY[effect_id] for effect_id in CLEAN]
-        while len(model.effects) < EFFECTS_AT_MOST:
-            best: tuple[Candidate, _Tried] | None = None
-            for choice in self._promising(model, pool)[:TRIES]:
-                tried = self._with(model, judged, choice)
-                if tried is None:
-                    continue
-                if best is None or tried.order < best[1].order:
-                    best = choice, tried
-            if best is None:
-                break
-            choice, tried = best
-            # The better one of those tried, and only if it is so by more than chance.
-            taken = tried.comparison.better
-            self._note("added" if taken else "not added", choice.effect.id, tried.comparison)
-            if not taken:
-                break
-            model, judged = tried.model, tried.judged
-        return model, judged
-
-    def named(
-        self, model: ExtendedModel, judged: Judged, ids: Sequence[str]
-    ) -> tuple[ExtendedModel, Judged]:
-        """Take all effects that were named, the most helpful first."""
-        left = list(ids)
-        while left:
-            pool = [LIBRARY[effect_id] for effect_id in dict.fromkeys(left)]
-            for choice in self._promising(model, pool):
-                tried = self._with(model, judged, choice)
-                if tried is not None:
-                    break
-            else:
-                raise InputError(
-                    "the model cannot be fitted with it", field="--effects", value=", ".join(left)
-                )
-            self._note("added", choice.effect.id, tried.comparison)
-            model, judged = tried.model, tried.judged
-            left.remove(choice.effect.id)
-        return model, judged
-
-    def backward(self, model: ExtendedModel, judged: Judged) -> tuple[ExtendedModel, Judged]:
-        """Leave out effects whose removal costs no more than chance; try others in their place."""
-        for _ in range(EFFECTS_AT_MOST):
-            if len(model.effects) < 2:
-                break
-            fewer = [self._without(model, judged, k) for k in range(len(model.effects))]
-            least = min(fewer, key=lambda item: item.judged.rmse_v)
-            if not least.comparison.better:
-                gone = model.effects[fewer.index(least)][0].id
-                self._note("removed", gone, least.comparison)
-                model, judged = least.model, least.judged
-                continue
-            exchanged = self._exchanged(model, judged, fewer)
-            if exchanged is None:
-                break
-            model, judged = exchanged.model, exchanged.judged
-        return model, judged
-
-    def _without(self, model: ExtendedModel, judged: Judged, number: int) -> _Tried:
-        self._say(f"effects: without {model.effects[number][0].id}")
-        kept = tuple(item for k, item in enumerate(model.effects) if k != number)
-        without = refine(replace(model, effects=kept), self.judge.logs, ROUGHLY_CONVERGED)
-        seen = self.judge(without)
-        amplitudes = _amplitudes(model.effects[number][0])
-        return _Tried(without, seen, compare(seen, judged, amplitudes))
-
-    def _exchanged(
-        self, model: ExtendedModel, judged: Judged, fewer: Sequence[_Tried]
-    ) -> _Tried | None:
-        """Return the model with one effect in the place of another, if that is better.
-
-        What was taken first stood in for what came later; it need not be the best beside it.
-        """
-        for (gone, _), without in zip(model.effects, fewer, strict=True):
-            pool = [LIBRARY[effect_id] for effect_id in CLEAN if effect_id != gone.id]
-            for choice in self._promising(without.model, pool)[:1]:
-                tried = self._with(without.model, judged, choice)
-                if tried is not None and tried.comparison.worth_it:
-                    self._note(f"in place of {gone.id}", choice.effect.id, tried.comparison)
-                    return tried
-        return None
-
-    def _note(self, what: str, effect_id: str, found: Comparison) -> None:
-        self.steps.append(Step(what, effect_id, found))
-        self._say(
-            f"effects: {effect_id} {what}, held out {found.before_rmse_v:.3f} V without,"
-            f" {found.after_rmse_v:.3f} V with it"
-        )
-
-    def _promising(self, model: ExtendedModel, pool: Sequence[Effect]) -> list[Candidate]:
-        """Return each effect with its best shape, the most promising effect first."""
-        self._say(f"effects: weighing {len(pool)} beside {len(model.effects)} taken")
-        logs = self.judge.logs
-        choices = [
-            choice
-            for choice in candidates(pool, model.pack, logs[0].log.time_s)
-            if _beside(choice, model)
-        ]
-        if not choices:
-            return []
-        linear = linearise(model, logs)
-        columns = _columns(linear, logs, choices)
-        gains = self.judge.screen(linear, columns, [choice.bounds for choice in choices])
-        best: dict[str, tuple[float, Candidate]] = {}
-        for gain, choice in zip(gains, choices, strict=True):
-            if choice.effect.id not in best or gain > best[choice.effect.id][0]:
-                best[choice.effect.id] = gain, choice
-        return [choice for _, choice in sorted(best.values(), key=lambda item: -item[0])]
-
-    def _with(self, model: ExtendedModel, judged: Judged, choice: Candidate) -> _Tried | None:
-        """Return the model fitted with one more effect; None if it cannot be."""
-        self._say(f"effects: fitting {choice.effect.id} with the others")
-        start = choice.values(_inside(choice))
-        try:
-            with_it = model.with_effect(choice.effect, start)
-            more = refine(with_it, self.judge.logs, ROUGHLY_CONVERGED)
-            # Two elements may have become one, or bounds that follow the resistance left behind.
-            parse_effects(effect_entries(more.effects), more.pack)
-        except CangaugeError:
-            return None
-        seen = self.judge(more)
-        return _Tried(more, seen, compare(judged, seen, len(choice.amplitudes)))
-
-
-def _amplitudes(effect: Effect) -> int:
-    return max(len(effect.amplitudes), 1)
-
-
-def _inside(choice: Candidate) -> FloatArray:
-    """Return amplitudes to start from: small ones, so that the shapes already tell."""
-    return choice.steps
-
-
-def _columns(
-    linear: Linear, logs: Sequence[Prepared], choices: Sequence[Candidate]
-) -> list[FloatArray]:
-    smooth = [as_modelled(item, linear.model) for item in logs]
-    here = [residual_of(linear.model, [item]) for item in smooth]
-    return [
-        np.vstack(
-            [
-                effect_columns(item, linear.model, choice, at)
-                for item, at in zip(smooth, here, strict=True)
-            ]
-        )
-        for choice in choices
-    ]
-
-
-def _beside(choice: Candidate, model: ExtendedModel) -> bool:
-    """Return whether a candidate is another one than the effects that the model has."""
-    values = choice.values(_inside(choice))
-    alike = [taken for effect, taken in model.effects if effect.id == choice.effect.id]
-    if len(alike) >= TWICE or (alike and not choice.shape):
-        return False
-    own = one_of(choice.effect, values)
-    return all(own != one_of(choice.effect, taken) and _apart(values, taken) for taken in alike)
-
-
-def _apart(one: Values, other: Values) -> bool:
-    if "tau_s" not in one:
-        return True
-    ratio = one["tau_s"] / other["tau_s"]
-    return max(ratio, 1.0 / ratio) >= APART
-
-
-# --- Effects fitted to logs, with standard errors and what each was worth on logs left out
-
-FEW_LOGS = 5
-"""With fewer whole logs their mean gain has hardly a standard error; it is said."""
-
-AT_BOUND = 1e-6
-"""A parameter this near its bound, in parts of the bounds, is held by it."""
-
-
 @dataclass(frozen=True)
-class Estimate:
+class ParameterEstimate:
     """One parameter of an effect."""
 
     name: str
     value: float
     std_error: float | None
-    """None for a choice between two, and for a constant."""
+    """None for a discrete choice and for a constant."""
     unit: str
 
     def to_dict(self) -> dict[str, object]:
@@ -403,34 +156,34 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class FittedEffects:
-    """A model with effects, as its logs gave it."""
+    """A model with effects, fitted to logs, and the search that selected them."""
 
     model: ExtendedModel
-    linear: Linear
-    """The residual of the logs near the model."""
+    linear: Linearization
+    """At the model."""
     solution: Solution
-    """Of the voltage model's coefficients, the effects' parameters being open too."""
-    estimates: tuple[tuple[str, tuple[Estimate, ...]], ...]
+    """Of the voltage model's coefficients; the effects' parameters are free too."""
+    estimates: tuple[tuple[str, tuple[ParameterEstimate, ...]], ...]
     """Id and parameters of each effect, in the model's order."""
     held_out_error_v: tuple[FloatArray, ...]
-    """Of each log, by fits that did not see the row [V]; NaN where none judged it."""
+    """Held-out errors of each log's rows [V]; NaN where no fold holds the row out."""
     held_out_rmse_v: tuple[float, float]
     """Without any effect, and with all of them [V]."""
-    steps: tuple[Step, ...]
+    steps: tuple[SearchStep, ...]
 
     def remarks(self) -> list[str]:
-        """Return what a user should know of the effects beside their numbers."""
+        """Return remarks for the user on the selection and on active bounds."""
         before, after = self.held_out_rmse_v
         if not self.model.effects:
-            return ["no effect lowers the error on data left out by more than chance: none taken"]
-        found = ["the slope resistance expected from the coefficients leaves out the effects' part"]
+            return ["no effect reduces the held-out error significantly: none taken"]
+        found = ["the slope resistance expected from the coefficients excludes the effects' part"]
         if LOGS_AT_LEAST <= len(self.held_out_error_v) < FEW_LOGS:
             found.append(
-                f"the effects were judged on {len(self.held_out_error_v)} logs left out in turn:"
-                " so few hardly tell chance from effect; give five or more"
+                f"the effects were selected on only {len(self.held_out_error_v)} logs held out in"
+                " turn: give five or more for a reliable selection"
             )
         if after > before:
-            found.append("the effects raise the error on data left out: leave them out")
+            found.append("the effects increase the held-out error: omit them")
         for item in self.linear.free:
             reach = AT_BOUND * (item.high - item.low)
             edge = {item.low: item.value - item.low, item.high: item.high - item.value}
@@ -441,7 +194,7 @@ class FittedEffects:
         return found
 
     def to_dict(self) -> dict[str, object]:
-        """Return the part of `cangauge fit --json` that is about effects."""
+        """Return the part of `cangauge fit --json` on effects."""
         return {
             "effects": [
                 {"id": effect_id, "parameters": {item.name: item.to_dict() for item in parameters}}
@@ -456,42 +209,52 @@ class FittedEffects:
 
 
 def fit_effects(
-    plain: ExtendedModel, logs: Sequence[Prepared], ids: Sequence[str], say: Progress
+    plain: ExtendedModel, logs: Sequence[SampledLog], ids: Sequence[str]
 ) -> FittedEffects:
-    """Find effects and fit them together with the coefficients.
+    """Select effects and fit them jointly with the coefficients.
 
     Parameters
     ----------
     plain : ExtendedModel
         The fitted voltage model, without effects.
-    logs : sequence of Prepared
+    logs : sequence of SampledLog
     ids : sequence of str
-        Effects to take, or `auto` alone.
-    say : callable
-        Called with a line of text before each long step.
+        From `parse_effect_ids`: `auto` alone, or effects that are all taken.
 
     Raises
     ------
     InputError
-        If the logs are too short to judge anything.
+        If the logs are too short to hold rows out.
     """
-    found = find_effects(plain, logs, ids, say)
-    linear = linearise(found.model, logs)
-    whole = solution_at(linear, blocks_of([item.rows for item in logs]))
-    n = found.model.model.coefficients.size
-    ends = np.cumsum([len(item.rows) for item in logs])[:-1]
+    search = _Search(CrossValidation(logs))
+    plain_errors = search.validation.errors(plain)
+    if tuple(ids) == (AUTO,):
+        model, errors = search.backward(*search.forward(plain, plain_errors))
+    else:
+        model, errors = search.named(plain, plain_errors, ids)
+    if model.effects:
+        _LOG.debug("effects: final joint fit")
+        model = fit_extended(model, logs)
+        errors = search.validation.errors(model)
+    linear = linearize(model, logs)
+    rows = [item.rows for item in logs]
+    whole = solution_at(linear, block_numbers(rows, BLOCK_S))
+    n = model.model.coefficients.size
+    ends = np.cumsum([len(item) for item in rows])[:-1]
     return FittedEffects(
-        model=found.model,
+        model=model,
         linear=linear,
-        solution=whole.part(n),
+        solution=whole.first(n),
         estimates=tuple(_estimates(linear, whole.std_error[n:])),
-        held_out_error_v=tuple(np.split(found.judged.error_v, ends)),
-        held_out_rmse_v=(found.plain.rmse_v, found.judged.rmse_v),
-        steps=found.steps,
+        held_out_error_v=tuple(np.split(errors.error_v, ends)),
+        held_out_rmse_v=(plain_errors.rmse_v, errors.rmse_v),
+        steps=tuple(search.steps),
     )
 
 
-def _estimates(linear: Linear, std_error: FloatArray) -> list[tuple[str, tuple[Estimate, ...]]]:
+def _estimates(
+    linear: Linearization, std_error: FloatArray
+) -> list[tuple[str, tuple[ParameterEstimate, ...]]]:
     known = {
         (item.effect, item.name): float(error)
         for item, error in zip(linear.free, std_error, strict=True)
@@ -500,7 +263,7 @@ def _estimates(linear: Linear, std_error: FloatArray) -> list[tuple[str, tuple[E
         (
             effect.id,
             tuple(
-                Estimate(
+                ParameterEstimate(
                     parameter.name,
                     float(values[parameter.name]),
                     known.get((number, parameter.name)),
@@ -511,3 +274,189 @@ def _estimates(linear: Linear, std_error: FloatArray) -> list[tuple[str, tuple[E
         )
         for number, (effect, values) in enumerate(linear.model.effects)
     ]
+
+
+@dataclass(eq=False)
+class _Trial:
+    model: ExtendedModel
+    errors: HeldOutErrors
+    comparison: Comparison
+
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """The better the smaller."""
+        return not self.comparison.is_significant, self.errors.rmse_v
+
+
+class _Search:
+    """Selection on one cross-validation; every decision goes into `steps`."""
+
+    def __init__(self, validation: CrossValidation) -> None:
+        self.validation = validation
+        self.steps: list[SearchStep] = []
+
+    def forward(
+        self, model: ExtendedModel, errors: HeldOutErrors
+    ) -> tuple[ExtendedModel, HeldOutErrors]:
+        """Add effects as long as one is significantly better."""
+        pool = [LIBRARY[effect_id] for effect_id in SEARCHED]
+        while len(model.effects) < EFFECTS_AT_MOST:
+            trials = [
+                (trial, choice.effect.id)
+                for choice in self._promising(model, pool)[:FITTED_PER_ROUND]
+                if (trial := self._with(model, errors, choice)) is not None
+            ]
+            if not trials:
+                break
+            best, effect_id = min(trials, key=lambda item: item[0].rank)
+            added = best.comparison.is_significant
+            self._note("added" if added else "not added", effect_id, best.comparison)
+            if not added:
+                break
+            model, errors = best.model, best.errors
+        return model, errors
+
+    def named(
+        self, model: ExtendedModel, errors: HeldOutErrors, ids: Sequence[str]
+    ) -> tuple[ExtendedModel, HeldOutErrors]:
+        """Add all named effects, the most helpful first."""
+        left = list(ids)
+        while left:
+            pool = [LIBRARY[effect_id] for effect_id in dict.fromkeys(left)]
+            for choice in self._promising(model, pool):
+                trial = self._with(model, errors, choice)
+                if trial is not None:
+                    break
+            else:
+                raise InputError(
+                    "the model cannot be fitted with it", field="--effects", value=", ".join(left)
+                )
+            self._note("added", choice.effect.id, trial.comparison)
+            model, errors = trial.model, trial.errors
+            left.remove(choice.effect.id)
+        return model, errors
+
+    def backward(
+        self, model: ExtendedModel, errors: HeldOutErrors
+    ) -> tuple[ExtendedModel, HeldOutErrors]:
+        """Remove effects without a significant contribution; try others in place of the rest."""
+        for _ in range(EFFECTS_AT_MOST):
+            if len(model.effects) < 2:
+                break
+            fewer = [self._without(model, errors, k) for k in range(len(model.effects))]
+            least = min(fewer, key=lambda item: item.errors.rmse_v)
+            if not least.comparison.is_significant:
+                removed = model.effects[fewer.index(least)][0].id
+                self._note("removed", removed, least.comparison)
+                model, errors = least.model, least.errors
+                continue
+            exchanged = self._exchanged(model, errors, fewer)
+            if exchanged is None:
+                break
+            model, errors = exchanged.model, exchanged.errors
+        return model, errors
+
+    def _without(self, model: ExtendedModel, errors: HeldOutErrors, number: int) -> _Trial:
+        effect = model.effects[number][0]
+        _LOG.debug("effects: fitting without %s", effect.id)
+        kept = tuple(item for k, item in enumerate(model.effects) if k != number)
+        without = fit_extended(
+            replace(model, effects=kept), self.validation.logs, ROUGHLY_CONVERGED
+        )
+        without_errors = self.validation.errors(without)
+        amplitudes = max(len(effect.amplitudes), 1)
+        return _Trial(without, without_errors, compare(without_errors, errors, amplitudes))
+
+    def _exchanged(
+        self, model: ExtendedModel, errors: HeldOutErrors, fewer: Sequence[_Trial]
+    ) -> _Trial | None:
+        """Return the model with one effect replaced by a better one, or None.
+
+        An effect added early may have stood in for later ones and need not be the best with them.
+        """
+        for (removed, _), without in zip(model.effects, fewer, strict=True):
+            pool = [LIBRARY[effect_id] for effect_id in SEARCHED if effect_id != removed.id]
+            for choice in self._promising(without.model, pool)[:1]:
+                trial = self._with(without.model, errors, choice)
+                if trial is not None and trial.comparison.is_worthwhile:
+                    self._note(f"in place of {removed.id}", choice.effect.id, trial.comparison)
+                    return trial
+        return None
+
+    def _note(self, what: str, effect_id: str, comparison: Comparison) -> None:
+        self.steps.append(SearchStep(what, effect_id, comparison))
+        _LOG.info(
+            "effects: %s %s, held out %.3f V without, %.3f V with it",
+            effect_id, what, comparison.before_rmse_v, comparison.after_rmse_v,
+        )  # fmt: skip
+
+    def _promising(self, model: ExtendedModel, pool: Sequence[Effect]) -> list[Candidate]:
+        """Return each effect with its best shape, the most promising effect first."""
+        _LOG.debug("effects: screening %d with %d taken", len(pool), len(model.effects))
+        logs = self.validation.logs
+        choices = [
+            choice
+            for choice in candidates(pool, model.pack, logs[0].log.time_s)
+            if _is_addable(choice, model)
+        ]
+        if not choices:
+            return []
+        linear = linearize(model, logs)
+        columns = _columns(linear, logs, choices)
+        gains = self.validation.screen(linear, columns, [choice.bounds for choice in choices])
+        best: dict[str, tuple[float, Candidate]] = {}
+        for gain, choice in zip(gains, choices, strict=True):
+            if choice.effect.id not in best or gain > best[choice.effect.id][0]:
+                best[choice.effect.id] = gain, choice
+        return [choice for _, choice in sorted(best.values(), key=lambda item: -item[0])]
+
+    def _with(
+        self, model: ExtendedModel, errors: HeldOutErrors, choice: Candidate
+    ) -> _Trial | None:
+        """Return the model fitted with one more effect; None if the fit fails."""
+        _LOG.debug("effects: fitting with %s", choice.effect.id)
+        start = choice.values(choice.steps)  # small amplitudes, so that the shapes matter
+        try:
+            extended = model.with_effect(choice.effect, start)
+            extended = fit_extended(extended, self.validation.logs, ROUGHLY_CONVERGED)
+            # Two copies may have merged, or bounds relative to the resistance have been left.
+            parse_effects(effect_entries(extended.effects), extended.pack)
+        except CangaugeError:
+            return None
+        with_errors = self.validation.errors(extended)
+        return _Trial(extended, with_errors, compare(errors, with_errors, len(choice.amplitudes)))
+
+
+def _columns(
+    linear: Linearization, logs: Sequence[SampledLog], choices: Sequence[Candidate]
+) -> list[FloatArray]:
+    smooth = [with_modelled_voltage(item, linear.model) for item in logs]
+    residuals = [residual(item, linear.model) for item in smooth]
+    return [
+        np.vstack(
+            [
+                effect_columns(item, linear.model, choice, residual_v)
+                for item, residual_v in zip(smooth, residuals, strict=True)
+            ]
+        )
+        for choice in choices
+    ]
+
+
+def _is_addable(choice: Candidate, model: ExtendedModel) -> bool:
+    """Return whether a candidate differs enough from the effects in the model."""
+    values = choice.values(choice.steps)
+    copies = [taken for effect, taken in model.effects if effect.id == choice.effect.id]
+    if len(copies) >= COPIES_AT_MOST or (copies and not choice.shape):
+        return False
+    key = shape_key(choice.effect, values)
+    return all(
+        key != shape_key(choice.effect, taken) and _has_other_tau(values, taken) for taken in copies
+    )
+
+
+def _has_other_tau(one: Values, other: Values) -> bool:
+    if "tau_s" not in one:
+        return True
+    ratio = one["tau_s"] / other["tau_s"]
+    return max(ratio, 1.0 / ratio) >= TAU_RATIO_AT_LEAST

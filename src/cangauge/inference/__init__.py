@@ -1,1 +1,5 @@
-"""Numerical engines shared by fit and diagnosis."""
+"""Inference shared by fit and diagnosis: rows of logs, error model, least squares, linearization.
+
+Import from its modules; the package itself imports nothing, since `rows` is needed without the
+solvers of `least_squares`.
+"""

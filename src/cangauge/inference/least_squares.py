@@ -1,18 +1,15 @@
-"""The temperature's coefficient, as far as the logs tell it from the open-circuit voltage.
-
-Over one discharge the temperature rises as the charge falls, and what the model lacks changes as
-slowly as both. Plain least squares then finds any coefficient that makes the residual a little
-smaller, and is sure of it: volts per kelvin for a pack of 96 cells, of which each has tenths of a
-millivolt per kelvin (`benchmarks/other_temperatures.py`). So the residual is weighed time scale by
-time scale, slow errors as likely as the faster ones let expect, and the coefficient is held near
-zero by what is usual, as firmly as the logs leave it open.
-
-Least squares with a rising pseudo-OCV: well scaled, with honest standard errors.
+"""Least squares with a rising pseudo-OCV and a prior on the temperature coefficient.
 
 The columns 1 … 1/s⁴, s, ln s, ln(1 − s) are nearly dependent (condition numbers of 10⁶ and more
 over the SoC of a few trips), so the columns are scaled to unit length and the problem is solved
-by SVD. Where the plain solution's pseudo-OCV falls anywhere in the SoC that it saw, the same
-problem is solved as a convex quadratic programme with the slope bounded from below.
+by SVD. Where the pseudo-OCV of the plain solution falls within the identified SoC, the same
+problem is solved as a convex quadratic programme with a lower bound on the slope.
+
+Over one discharge the temperature rises while the charge falls, and the model error changes as
+slowly as both. Plain least squares then returns any temperature coefficient kt that reduces the
+residual slightly, with a small standard error: volts per kelvin for a pack of 96 cells, each of
+which has tenths of a millivolt per kelvin (`benchmarks/other_temperatures.py`). `kt_prior` gives
+kt a zero-mean prior, weighted against the data with the residual's variance per time scale.
 """
 
 from __future__ import annotations
@@ -27,168 +24,56 @@ from scipy import sparse
 
 from cangauge._typing import FloatArray
 from cangauge.errors import CangaugeError
-from cangauge.inference.time_scales import SCALES, by_scale
-
-# --- The temperature's coefficient, as far as the logs tell it from the open-circuit voltage
-
-USUAL_PART_PER_K = 2.5e-4
-"""Usual coefficient, in parts of the voltage [1/K]: 1 mV/K a cell, some times what entropy does.
-Chosen on simulated packs and real cells: half of it was better for the cells, twice to four times
-as much for packs with the published coefficient, which is eight times as large."""
-
-ENOUGH = 40
-"""The variance of a scale with fewer coefficients is not that of its errors: the fit took them."""
-
-STEEPEST = np.log(4.0)
-"""From one scale to the next, errors' variance grows by no more than that of a random walk."""
-
-OCTAVES = 3
-"""How it grows is read from so many of the slowest scales that have enough."""
-
-JITTER = 1e-9
-
-
-@dataclass(frozen=True, eq=False)
-class Held:
-    """How firmly the temperature's coefficient is held at zero."""
-
-    std_v_per_k: float
-    """How far the logs leave it open [V/K]."""
-    usual_v_per_k: float
-    """How large it usually is [V/K]."""
-    own: FloatArray
-    """The temperature as far as no other column goes with it, shape (n,) [K]."""
-    others: FloatArray
-    """By how much the other coefficients move with it, shape (p,), 0 for itself [per V/K]."""
-
-    residual_std_v: float
-    """Of plain least squares [V]."""
-
-    @property
-    def weight(self) -> float:
-        """Weight of a row that says 0 V/K, beside which least squares leaves `part`.
-
-        At least what it would be with white errors: a temperature that never moves has no own
-        part, and nothing else would keep its coefficient from being anything.
-        """
-        leaves = float(np.sqrt((1.0 / self.part - 1.0) * (self.own @ self.own)))
-        return max(leaves, self.residual_std_v / self.usual_v_per_k)
-
-    @property
-    def part(self) -> float:
-        """Part of the plain coefficient that is left (0–1)."""
-        usual = self.usual_v_per_k**2
-        return usual / (usual + self.std_v_per_k**2)
-
-    @property
-    def held_std_v_per_k(self) -> float:
-        """Standard error of what is left [V/K]."""
-        return self.std_v_per_k * float(np.sqrt(self.part))
-
-
-def how_firmly(
-    columns: FloatArray,
-    residual_v: FloatArray,
-    volts: FloatArray,
-    lengths: Sequence[int],
-    at: int,
-) -> Held:
-    """Return how firmly the logs let the temperature's coefficient be held.
-
-    Parameters
-    ----------
-    columns : array of shape (n, p)
-        Of all coefficients, all logs' rows in order of time.
-    residual_v, volts : array of shape (n,)
-        Of plain least squares [V]; measured [V].
-    lengths : sequence of int
-        Rows of each log.
-    at : int
-        Which column is the temperature's.
-    """
-    scale = np.sqrt(np.mean(columns**2, axis=0))
-    scale[scale == 0.0] = 1.0
-    table = np.column_stack([columns / scale, residual_v])
-    ends = np.cumsum(lengths)[:-1]
-    parts = [by_scale(item) for item in np.split(table, ends) if len(item)]
-    of_scale = [np.vstack([part[j] for part in parts]) for j in range(SCALES)]
-    variance = _variance([item[:, -1] for item in of_scale])
-    information = sum(
-        item[:, :-1].T @ item[:, :-1] / v2 for item, v2 in zip(of_scale, variance, strict=True)
-    )
-    total = np.asarray(information)
-    total[np.diag_indices(len(total))] += JITTER * np.trace(total) / len(total)
-    variance_of = float(np.linalg.inv(total)[at, at])
-    own, others = _beside(columns, at)
-    return Held(
-        std_v_per_k=float(np.sqrt(variance_of)) / float(scale[at]),
-        usual_v_per_k=USUAL_PART_PER_K * float(np.median(volts)),
-        own=own,
-        others=others,
-        residual_std_v=float(np.sqrt(np.mean(residual_v**2))),
-    )
-
-
-def _beside(columns: FloatArray, at: int) -> tuple[FloatArray, FloatArray]:
-    """Return what is one column's own, (n,), and how the others make up the rest, (p,)."""
-    norm = np.linalg.norm(columns, axis=0)
-    norm[norm == 0.0] = 1.0
-    rest = np.arange(columns.shape[1]) != at
-    makes_up = np.zeros(columns.shape[1])
-    scaled = columns[:, rest] / norm[rest]
-    makes_up[rest] = np.linalg.lstsq(scaled, columns[:, at], rcond=None)[0] / norm[rest]
-    return columns[:, at] - columns @ makes_up, -makes_up
-
-
-def _variance(residual_v: Sequence[FloatArray]) -> FloatArray:
-    """Return the variance to expect of each scale's errors, shape (SCALES,) [V²].
-
-    What is slower than the scales with enough coefficients is fitted away, and goes on as they do.
-    """
-    counts = np.array([item.size for item in residual_v])
-    found = np.array([float(item @ item) / max(item.size, 1) for item in residual_v])
-    found = np.maximum(found, 1e-12)
-    enough = np.flatnonzero(counts >= ENOUGH)
-    if enough.size:
-        last, first = enough[-1], max(enough[-1] - OCTAVES, 0)
-        growth = np.log(found[last] / found[first]) / max(last - first, 1)
-        growth = float(np.clip(growth, 0.0, STEEPEST))
-        beyond = np.arange(last + 1, SCALES)
-        found[beyond] = np.maximum(found[beyond], found[last] * np.exp(growth * (beyond - last)))
-    return np.asarray(np.maximum.accumulate(found))
-
-
-# --- Least squares with a rising pseudo-OCV: well scaled, with honest standard errors
+from cangauge.inference.time_scales import SCALES, haar_transform
 
 SINGULAR = 1e-11
-"""Directions with a smaller singular value, relative to the largest, are left at zero."""
+"""Singular values below this, relative to the largest, are truncated."""
 
 BLOCK_S = 300.0
-"""Residuals further apart than this count as independent in the standard errors [s]."""
+"""Distance from which residuals count as independent in the standard errors [s]."""
 
 FEASIBLE = 1e-9
-"""A bound is missed by more than this, relative to its value and to one."""
+"""Tolerance of a bound, relative to one plus its value."""
+
+KT_PRIOR_PER_K = 2.5e-4
+"""Prior standard deviation of kt, relative to the voltage [1/K]: 1 mV/K per cell, a few times the
+entropic coefficient. Chosen on simulated packs and real cells: half of it was better for the cells,
+two to four times as much for packs with the published coefficient, which is eight times as
+large."""
+
+COEFFICIENTS_AT_LEAST = 40
+"""Haar coefficients of a scale, at least, for its variance to be that of the errors: with fewer the
+fit has absorbed them."""
+
+GROWTH_AT_MOST = np.log(4.0)
+"""Growth of the log variance of errors from one scale to the next: that of a random walk."""
+
+GROWTH_SCALES = 3
+"""Number of the slowest well-observed scales from which the growth is read."""
+
+JITTER = 1e-9
+"""Ridge on the information matrix, relative to its mean diagonal."""
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Coefficients and what is known of them."""
+    """Coefficients of a fit with their uncertainty."""
 
     coefficients: FloatArray
     """Shape (p,), in the units of the columns."""
     std_error: FloatArray
-    """Shape (p,); robust against residuals that are correlated within `BLOCK_S`."""
+    """Shape (p,); robust against residuals correlated within `BLOCK_S`."""
     condition_number: float
     """Of the scaled columns."""
     constrained: bool
-    """Whether the plain solution broke the bounds, so that they had to hold it."""
-    held: Held | None = None
-    """How firmly the temperature's coefficient was held, if it was."""
+    """Whether a bound is active: the plain solution's pseudo-OCV falls."""
+    kt_prior: KtPrior | None = None
+    """Prior on the temperature coefficient, if one was used."""
 
-    def part(self, first: int) -> Solution:
-        """Return what is known of the first coefficients."""
+    def first(self, number: int) -> Solution:
+        """Return the solution restricted to the first coefficients."""
         return replace(
-            self, coefficients=self.coefficients[:first], std_error=self.std_error[:first]
+            self, coefficients=self.coefficients[:number], std_error=self.std_error[:number]
         )
 
 
@@ -210,7 +95,7 @@ def solve(
     Raises
     ------
     CangaugeError
-        If the convex solver finds no solution.
+        If the convex solver fails.
     """
     scale = np.linalg.norm(columns, axis=0)
     scale[scale == 0.0] = 1.0
@@ -222,7 +107,7 @@ def solve(
     z = left.T @ target
     constrained = bounds is not None and bool(np.any(bounds @ (back @ z) < at_least))
     if constrained and bounds is not None:
-        z = _nearest(z, bounds @ back, np.broadcast_to(at_least, bounds.shape[:1]))
+        z = _project(z, bounds @ back, np.broadcast_to(at_least, bounds.shape[:1]))
     x = back @ z
     return Solution(
         coefficients=x,
@@ -247,51 +132,50 @@ def nearest_rising(
     Raises
     ------
     CangaugeError
-        If the convex solver finds no solution.
+        If the convex solver fails.
     """
     inverse = np.linalg.inv(root)
     plain = inverse @ target
     if np.all(bounds @ plain >= at_least):
         return np.asarray(plain)
-    return np.asarray(inverse @ _nearest(target, bounds @ inverse, at_least))
+    return np.asarray(inverse @ _project(target, bounds @ inverse, at_least))
 
 
-def _nearest(z: FloatArray, bounds: FloatArray, at_least: FloatArray) -> FloatArray:
-    """Return the point nearest to z with bounds·point ≥ at_least.
+def _project(z: FloatArray, bounds: FloatArray, at_least: FloatArray) -> FloatArray:
+    """Return the point nearest to z with bounds·point ≥ at_least, by an active-set outer loop.
 
-    Few of the bounds matter: those that are missed, and those that are missed then.
+    Only bounds violated by z, or by the previous point, enter the quadratic programme.
     """
     length = np.linalg.norm(bounds, axis=1)
-    # What no kept direction moves cannot be bounded.
-    moves = length > 0.0
+    moves = length > 0.0  # a row without a kept direction cannot be bounded
     bounds, at_least = bounds[moves] / length[moves, None], at_least[moves] / length[moves]
-    enough = at_least - FEASIBLE * (1.0 + np.abs(at_least))
-    point, held = z, np.zeros(at_least.size, dtype=bool)
-    while np.any(missed := (bounds @ point < enough) & ~held):
-        held |= missed
-        point = _nearest_within(z, bounds[held], at_least[held])
+    feasible = at_least - FEASIBLE * (1.0 + np.abs(at_least))
+    point, active = z, np.zeros(at_least.size, dtype=bool)
+    while np.any(violated := (bounds @ point < feasible) & ~active):
+        active |= violated
+        point = _solve_quadratic(z, bounds[active], at_least[active])
     return point
 
 
-def _nearest_within(z: FloatArray, bounds: FloatArray, at_least: FloatArray) -> FloatArray:
-    # From z on and in units of what is missed most: the solver's tolerances suit numbers about 1,
-    # and at a hundred it may stop short.
-    missed = at_least - bounds @ z
-    unit = float(np.abs(missed).max())
+def _solve_quadratic(z: FloatArray, bounds: FloatArray, at_least: FloatArray) -> FloatArray:
+    # Relative to z and in units of the largest violation: the solver's tolerances suit numbers
+    # about 1, and at a hundred it may stop short.
+    violation = at_least - bounds @ z
+    unit = float(np.abs(violation).max())
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     solution = clarabel.DefaultSolver(
         sparse.csc_matrix(np.eye(z.size)),
         np.zeros(z.size),
         sparse.csc_matrix(-bounds),
-        -missed / unit,
+        -violation / unit,
         [clarabel.NonnegativeConeT(at_least.size)],
         settings,
     ).solve()
     if str(solution.status) not in {"Solved", "AlmostSolved"}:
         raise CangaugeError(
-            f"the fit under a rising pseudo-OCV found no solution ({solution.status}):"
-            " is the sign of current right, and does the log move over some SoC?"
+            f"the fit with a rising pseudo-OCV failed ({solution.status}):"
+            " check the sign of current, and that the log covers some SoC"
         )
     return z + unit * np.array(solution.x)
 
@@ -299,13 +183,123 @@ def _nearest_within(z: FloatArray, bounds: FloatArray, at_least: FloatArray) -> 
 def _clustered_std_error(
     left: FloatArray, residual: FloatArray, block: NDArray[np.intp], back: FloatArray
 ) -> FloatArray:
-    """Return the sandwich estimate with one cluster a block (Liang and Zeger)."""
+    """Return the cluster-robust sandwich estimate (Liang and Zeger), at least the plain one."""
     _, number = np.unique(block, return_inverse=True)
     scores = np.zeros((int(number.max()) + 1, left.shape[1]))
     np.add.at(scores, number, left * residual[:, None])
     groups, (n, p) = scores.shape[0], left.shape
     small_sample = (groups / max(groups - 1, 1)) * ((n - 1) / max(n - p, 1))
-    # Few blocks cannot tell p directions apart; the plain estimate is then the floor.
+    # A few clusters cannot determine p directions: the plain estimate is the lower limit.
     clustered = small_sample * np.sum((back @ scores.T) ** 2, axis=1)
     plain = float(residual @ residual) / max(n - p, 1) * np.sum(back**2, axis=1)
     return np.asarray(np.sqrt(np.maximum(clustered, plain)))
+
+
+@dataclass(frozen=True, eq=False)
+class KtPrior:
+    """Zero-mean prior on the temperature coefficient kt, against the information of the logs."""
+
+    data_std_v_per_k: float
+    """Standard error of kt from the logs alone [V/K]."""
+    prior_std_v_per_k: float
+    """Prior standard deviation [V/K]."""
+    own_k: FloatArray
+    """Part of the temperature column orthogonal to the other columns, shape (n,) [K]."""
+    shift_per_kt: FloatArray
+    """Change of the other coefficients with kt, shape (p,), 0 for kt itself."""
+    residual_std_v: float
+    """Of plain least squares [V]."""
+
+    @property
+    def row_weight(self) -> float:
+        """Weight of the row kt = 0 V/K that makes least squares shrink kt by `shrinkage` [K].
+
+        At least that for white errors: a temperature that never moves has no `own_k`, and nothing
+        else would bound its coefficient.
+        """
+        weight = float(np.sqrt((1.0 / self.shrinkage - 1.0) * (self.own_k @ self.own_k)))
+        return max(weight, self.residual_std_v / self.prior_std_v_per_k)
+
+    @property
+    def shrinkage(self) -> float:
+        """Posterior mean over the plain coefficient (0–1)."""
+        prior_v2 = self.prior_std_v_per_k**2
+        return prior_v2 / (prior_v2 + self.data_std_v_per_k**2)
+
+    @property
+    def posterior_std_v_per_k(self) -> float:
+        """Posterior standard deviation of kt [V/K]."""
+        return self.data_std_v_per_k * float(np.sqrt(self.shrinkage))
+
+
+def kt_prior(
+    columns: FloatArray,
+    residual_v: FloatArray,
+    volts: FloatArray,
+    lengths: Sequence[int],
+    kt: int,
+) -> KtPrior:
+    """Return the prior on kt with the information that the logs hold on it.
+
+    Parameters
+    ----------
+    columns : array of shape (n, p)
+        Design matrix; rows of all logs, each in order of time.
+    residual_v, volts : array of shape (n,)
+        Residual of plain least squares, and measured voltage [V].
+    lengths : sequence of int
+        Number of rows of each log.
+    kt : int
+        Index of the temperature column.
+    """
+    scale = np.sqrt(np.mean(columns**2, axis=0))
+    scale[scale == 0.0] = 1.0
+    table = np.column_stack([columns / scale, residual_v])
+    ends = np.cumsum(lengths)[:-1]
+    transforms = [haar_transform(item) for item in np.split(table, ends) if len(item)]
+    by_scale = [np.vstack([each[j] for each in transforms]) for j in range(SCALES)]
+    variance = _scale_variances([item[:, -1] for item in by_scale])
+    information = sum(
+        item[:, :-1].T @ item[:, :-1] / v2 for item, v2 in zip(by_scale, variance, strict=True)
+    )
+    total = np.asarray(information)
+    total[np.diag_indices(len(total))] += JITTER * np.trace(total) / len(total)
+    kt_variance = float(np.linalg.inv(total)[kt, kt])
+    own_k, shift_per_kt = _orthogonal_part(columns, kt)
+    return KtPrior(
+        data_std_v_per_k=float(np.sqrt(kt_variance)) / float(scale[kt]),
+        prior_std_v_per_k=KT_PRIOR_PER_K * float(np.median(volts)),
+        own_k=own_k,
+        shift_per_kt=shift_per_kt,
+        residual_std_v=float(np.sqrt(np.mean(residual_v**2))),
+    )
+
+
+def _orthogonal_part(columns: FloatArray, at: int) -> tuple[FloatArray, FloatArray]:
+    """Return a column minus its regression on the others, (n,), and minus its slopes, (p,)."""
+    norm = np.linalg.norm(columns, axis=0)
+    norm[norm == 0.0] = 1.0
+    rest = np.arange(columns.shape[1]) != at
+    slopes = np.zeros(columns.shape[1])
+    scaled = columns[:, rest] / norm[rest]
+    slopes[rest] = np.linalg.lstsq(scaled, columns[:, at], rcond=None)[0] / norm[rest]
+    return columns[:, at] - columns @ slopes, -slopes
+
+
+def _scale_variances(residual_v: Sequence[FloatArray]) -> FloatArray:
+    """Return the expected variance of the errors of each scale, shape (SCALES,) [V²].
+
+    Slower errors than those of the well-observed scales are absorbed by the fit; their variance is
+    extrapolated.
+    """
+    counts = np.array([item.size for item in residual_v])
+    found = np.array([float(item @ item) / max(item.size, 1) for item in residual_v])
+    found = np.maximum(found, 1e-12)
+    observed = np.flatnonzero(counts >= COEFFICIENTS_AT_LEAST)
+    if observed.size:
+        last, first = observed[-1], max(observed[-1] - GROWTH_SCALES, 0)
+        growth = np.log(found[last] / found[first]) / max(last - first, 1)
+        growth = float(np.clip(growth, 0.0, GROWTH_AT_MOST))
+        beyond = np.arange(last + 1, SCALES)
+        found[beyond] = np.maximum(found[beyond], found[last] * np.exp(growth * (beyond - last)))
+    return np.asarray(np.maximum.accumulate(found))

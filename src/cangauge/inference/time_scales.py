@@ -1,10 +1,10 @@
-"""A log's rows by time scale: an orthonormal Haar transform.
+"""Error model by time scale: an orthonormal Haar transform of a log's rows.
 
-What a model misses is correlated in time, and more so over minutes than over seconds. In the
-transform each coefficient is the difference of two neighbouring stretches of the log, and
-coefficients of one scale have about the same variance and hardly any correlation, whatever the
-spectrum. So errors can be weighed scale by scale: a delay of a second is judged against the fast
-errors, an offset against the slow ones (Wornell, Proc. IEEE 81 (1993) 1428).
+Model errors are correlated in time, over minutes more than over seconds. A coefficient of the
+transform is the difference of two neighbouring stretches of the log. Coefficients of one scale have
+about equal variance and little correlation, whatever the spectrum, so errors can be weighted scale
+by scale: a delay of a second against the fast errors, an offset against the slow ones (Wornell,
+Proc. IEEE 81 (1993) 1428).
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from scipy import sparse
 from cangauge._typing import FloatArray
 
 SCALES: Final = 10
-"""Scales: stretches of 2, 4, … 512 rows, and all longer ones with the log's mean."""
+"""Number of scales: stretches of 2, 4, … 512 rows, then all longer ones and the log's mean."""
 
 
-def by_scale(columns: FloatArray) -> list[FloatArray]:
-    """Return the transform of some columns, one array a scale, the finest first.
+def haar_transform(columns: FloatArray) -> list[FloatArray]:
+    """Return the Haar transform of columns, one array per scale, the finest first.
 
     Parameters
     ----------
@@ -32,8 +32,8 @@ def by_scale(columns: FloatArray) -> list[FloatArray]:
     Returns
     -------
     list of arrays
-        `SCALES` arrays of shape (n_j, k) with Σ n_j = n; sums of squares and products over all of
-        them are those of the rows.
+        `SCALES` arrays of shape (n_j, k) with Σ n_j = n. The transform is orthonormal: sums of
+        squares and products are those of the rows.
     """
     n = columns.shape[0]
     total = np.zeros((n + 1, columns.shape[1]))
@@ -46,9 +46,9 @@ def by_scale(columns: FloatArray) -> list[FloatArray]:
 
 
 def _differences(n: int) -> tuple[sparse.csr_array, NDArray[np.intp]]:
-    """Return what makes coefficients of sums up to each row, and how many there are of each scale.
+    """Return the matrix from cumulative sums to coefficients, and the number per scale.
 
-    The finest scale first; all but the log's mean, shape (n − 1, n + 1).
+    The matrix, shape (n − 1, n + 1), holds the finest scale first and omits the log's mean.
     """
     edges = np.array([0, n])
     stretches = []
@@ -58,7 +58,7 @@ def _differences(n: int) -> tuple[sparse.csr_array, NDArray[np.intp]]:
         if not split.any():
             break
         first, end = first[split], end[split]
-        # At the largest power of two inside, so that stretches have the same lengths in all logs.
+        # Split at the largest power of two, so that stretches have the same lengths in all logs.
         middle = first + 2 ** np.ceil(np.log2(end - first) - 1.0).astype(np.intp)
         stretches.append(np.stack([first, middle, end]))
         edges = np.unique(np.concatenate((edges, middle)))
@@ -78,14 +78,14 @@ def _differences(n: int) -> tuple[sparse.csr_array, NDArray[np.intp]]:
 def scale_variances(
     fast_v2: float, fast_rows: float, slow_v2: float, slow_rows: float
 ) -> FloatArray:
-    """Return the variance of the coefficients of an error of two correlated parts, shape (SCALES,).
+    """Return the variance of the Haar coefficients of an error of two parts, shape (SCALES,).
 
     Parameters
     ----------
     fast_v2, slow_v2 : float
         Variances [V²].
     fast_rows, slow_rows : float
-        Correlation lengths, in rows; 0 is white.
+        Exponential correlation lengths, in rows; 0 is white.
     """
     result = np.zeros(SCALES)
     for variance, rows in ((fast_v2, fast_rows), (slow_v2, slow_rows)):
@@ -93,7 +93,7 @@ def scale_variances(
         half, whole = np.array(sums[:-1]), np.array(sums[1:])
         size = 2.0 ** np.arange(1, SCALES + 1)
         result += variance * (4.0 * half - whole) / size
-        # Longer stretches and the mean: the density at frequency zero.
+        # Longer stretches and the mean: the spectral density at frequency zero.
         density = 1.0 if rows <= 0.0 else (1.0 + np.exp(-1.0 / rows)) / (1.0 - np.exp(-1.0 / rows))
         result[-1] += variance * (density - (4.0 * half[-1] - whole[-1]) / size[-1])
     return result

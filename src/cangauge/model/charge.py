@@ -1,8 +1,4 @@
-"""Charge by the trapezoidal rule: what the model, its effects and the estimator all count by.
-
-C_i = C_{i−1} − (I_i + I_{i−1})·(t_i − t_{i−1})/2
-
-Charge by the trapezoidal rule, and the capacity that a log shows.
+"""Coulomb counting by the trapezoidal rule, and the capacity of a pack from its logs.
 
 C_i = C_{i−1} − (I_i + I_{i−1})·(t_i − t_{i−1})/2,      S = 100·C/C_t
 """
@@ -18,14 +14,12 @@ from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
 
-# --- Charge by the trapezoidal rule: what the model, its effects and the estimator all count by
-
 BRIDGE_S = 60.0
-"""Over a longer gap in the current no charge is counted [s]: the pack is taken to have rested."""
+"""Over a longer gap in the current no charge is counted [s]: the pack is assumed to rest."""
 
 
 def discharged_ah(time_s: FloatArray, current_a: FloatArray) -> FloatArray:
-    """Return the charge taken out since the first row [Ah], shape (n,), by the trapezoidal rule.
+    """Return the charge discharged since the first row [Ah], shape (n,), by the trapezoidal rule.
 
     Parameters
     ----------
@@ -37,14 +31,12 @@ def discharged_ah(time_s: FloatArray, current_a: FloatArray) -> FloatArray:
     return np.concatenate(([0.0], np.cumsum(step_ah)))
 
 
-# --- Charge by the trapezoidal rule, and the capacity that a log shows
-
 FULL_PCT, EMPTY_PCT = 98.0, 2.0
-"""A log whose reference SoC starts above and ends below these shows the whole capacity [%]."""
+"""Reference SoC at the start (at least) and end (at most) of a log with the whole capacity [%]."""
 
 KNEE_STEEPNESS = 5.0
-"""A log without reference SoC ran empty if its voltage falls this much more steeply against
-charge at the end than in its middle."""
+"""Ratio of the voltage's slope over charge at the end of a log to that in its middle, from which a
+log without reference SoC counts as discharged to empty."""
 
 
 def counted_soc_pct(log: Log, capacity_ah: float, initial_soc_pct: float | None) -> FloatArray:
@@ -56,8 +48,8 @@ def counted_soc_pct(log: Log, capacity_ah: float, initial_soc_pct: float | None)
     capacity_ah : float
         Charge from 100 to 0 % [Ah].
     initial_soc_pct : float, optional
-        SoC at the first row [%]. By default the log's reference anchors the count at its first
-        finite value; a log without reference starts at 100 %.
+        SoC at the first row [%]. By default the count is anchored at the first finite value of
+        the log's reference SoC; a log without reference starts at 100 %.
     """
     out = discharged_ah(log.time_s, log.current_a)
     anchor = log.first_soc() if initial_soc_pct is None else (0, initial_soc_pct)
@@ -99,19 +91,19 @@ def capacity_from_full_discharge(logs: Sequence[Log], initial_soc_pct: float | N
     Raises
     ------
     InputError
-        If none does.
+        If no log does.
     """
     for log in logs:
         capacity = _whole_capacity_ah(log, initial_soc_pct)
         if capacity is not None:
             return capacity
     raise InputError(
-        f"no log runs from full to empty ({FULL_PCT:.0f} % or more to {EMPTY_PCT:.0f} % or less),"
-        " so none gives the capacity",
+        f"unknown capacity: no log runs from full to empty ({FULL_PCT:.0f} % or more to"
+        f" {EMPTY_PCT:.0f} % or less)",
         source=logs[0].source or logs[0].name,
         field="capacity_ah",
-        cure="give it with --capacity-ah A, or --capacity-ah from-soc to take the charge per"
-        " 100 % of the logs' soc_pct",
+        cure="give --capacity-ah A, or --capacity-ah from-soc for the charge per 100 % of the logs'"
+        " soc_pct",
     )
 
 
@@ -135,7 +127,7 @@ def _whole_capacity_ah(log: Log, initial_soc_pct: float | None) -> float | None:
 def _ends_in_the_knee(log: Log, out_ah: FloatArray) -> bool:
     """Whether the voltage, less its drop over the resistance, falls steeply at the end."""
     total = float(out_ah[-1])
-    running = _running(log)
+    running = log.voltage_v > 0.5 * np.median(log.voltage_v)
     if total <= 0.0 or running.sum() < 100:
         return False
     volts, current, out = log.voltage_v[running], log.current_a[running], out_ah[running]
@@ -149,7 +141,3 @@ def _ends_in_the_knee(log: Log, out_ah: FloatArray) -> bool:
         return -float(np.linalg.lstsq(columns, volts[rows], rcond=None)[0][1])
 
     return fall_per_ah(near_end) > KNEE_STEEPNESS * max(fall_per_ah(middle), 0.0)
-
-
-def _running(log: Log) -> NDArray[np.bool_]:
-    return np.asarray(log.voltage_v > 0.5 * np.median(log.voltage_v))

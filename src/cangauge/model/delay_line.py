@@ -1,8 +1,7 @@
-"""Currents some seconds ago: over a whole log, and online from a ring buffer.
+"""Delayed currents I(t − dj): over a whole log, and online from a ring buffer.
 
-Both interpolate linearly between samples on real time stamps, at any and irregular rates; before
-the first sample the current counts as the first sample's. The same rule, written twice (arrays
-and one sample at a time), and checked against each other in the tests.
+Both interpolate linearly between time stamps, at any and irregular rates; before the first sample
+the current counts as that of the first sample. Tests hold the two forms together.
 """
 
 from __future__ import annotations
@@ -40,9 +39,9 @@ def delayed_currents(
 def settled(
     time_s: FloatArray, longest_delay_s: float, at_s: ArrayLike, gap_s: float = GAP_S
 ) -> NDArray[np.bool_]:
-    """Return which of the times `at_s` have a full, gap-free delay line behind them.
+    """Return at which of the times `at_s` the delay line is full and free of gaps, shape (m,).
 
-    The first `longest_delay_s` of a log, and as long after a gap longer than `gap_s`, have not.
+    It is not in the first `longest_delay_s` of a log and as long after a gap longer than `gap_s`.
     """
     at = np.asarray(at_s, dtype=np.float64)
     after_gap = np.flatnonzero(np.diff(time_s) > gap_s) + 1
@@ -52,11 +51,11 @@ def settled(
 
 
 _BLOCK = 512
-"""So many currents that nobody needs any more are dropped at once."""
+"""Number of stale currents that are dropped at once."""
 
 
 class DelayLine:
-    """Ring buffer of current, as long as the longest delay.
+    """Ring buffer of the current over the longest delay.
 
     Parameters
     ----------
@@ -65,8 +64,8 @@ class DelayLine:
     gap_s : float
         A longer step between two samples empties the line [s].
     spacing_s : float
-        Samples closer together than this are not all kept [s]: the newest always is, older ones
-        thin out, so that memory is bounded at any frame rate (100 Hz × 70 s are kept whole).
+        Least spacing of the samples kept, except the newest [s]: it bounds the memory at any frame
+        rate (70 s at 100 Hz are kept completely).
     """
 
     def __init__(
@@ -81,7 +80,7 @@ class DelayLine:
         self._since = 0.0
 
     def push(self, time_s: float, current_a: float) -> None:
-        """Take one sample; its time must be later than the last one's."""
+        """Append one sample; its time must be later than the previous one."""
         times, currents = self._times, self._currents
         if not times or time_s - times[-1] > self._gap:
             times.clear()
@@ -92,7 +91,7 @@ class DelayLine:
             currents.pop()
         times.append(time_s)
         currents.append(current_a)
-        # Drop in blocks: popping one element from the front of a list at each push costs more.
+        # In blocks: deleting the first element of a list at each push costs more.
         if len(times) > _BLOCK + 1 and times[_BLOCK + 1] <= time_s - self._longest:
             stale = bisect_right(times, time_s - self._longest) - 1
             del times[:stale]
@@ -105,12 +104,12 @@ class DelayLine:
 
     @property
     def filled_s(self) -> float:
-        """How long a gap-free stretch the line has seen [s]."""
+        """Length of the gap-free stretch up to the newest sample [s]."""
         return self._times[-1] - self._since if self._times else 0.0
 
     @property
     def full(self) -> bool:
-        """Whether the longest delay lies within what has been seen."""
+        """Whether the gap-free stretch covers the longest delay."""
         return self.filled_s >= self._longest
 
     def currents(self) -> list[float]:
@@ -133,10 +132,10 @@ class DelayLine:
 
     @property
     def contents(self) -> tuple[list[float], list[float], float]:
-        """Times [s] and currents [A] kept, and when the gap-free stretch began [s]: copies."""
+        """Copies of the times [s] and currents [A], and the start of the gap-free stretch [s]."""
         return list(self._times), list(self._currents), self._since
 
     def fill(self, time_s: Sequence[float], current_a: Sequence[float], since_s: float) -> None:
-        """Take over the contents of another line: times [s], increasing, currents [A]."""
+        """Set times [s], increasing, currents [A], and start of the gap-free stretch [s]."""
         self._times, self._currents = list(time_s), list(current_a)
         self._since = since_s

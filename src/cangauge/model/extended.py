@@ -1,8 +1,8 @@
-"""The extended model: the voltage model with effects, over whole logs and one sample at a time.
+"""Extended model: the voltage model with effects, over whole logs and one sample at a time.
 
-Both do the same in the same order: correct the signals, count charge, delay the current, and add
-the effects' voltages to the voltage model's. Without effects they are the voltage model, to the
-last bit.
+Both forms apply the same steps in the same order: correct the signals, count charge, delay the
+current, add the effects' voltages to the voltage model's. Without effects they equal the voltage
+model bit for bit.
 """
 
 from __future__ import annotations
@@ -24,29 +24,29 @@ from cangauge.model.effects.library import LIBRARY
 from cangauge.model.voltage_model import SLOPE_AT_LEAST, VoltageModel
 
 SLOPE_STEP_PCT = 0.05
-"""Half the step of the numerical slope of the effects' voltage over SoC [%]."""
+"""Half step of the finite difference of the effects' voltage over SoC [%]."""
 
 STEADY_S, STEADY_STEP_S = 4.0 * 3600.0, 10.0
-"""So long does a current last until the voltage is taken to have settled, in such steps [s]."""
+"""Duration of a constant current until the voltage counts as settled, and its time step [s]."""
 
 STEADY_C_RATE = 1.0 / 3.0
 STEADY_CHANGE = 0.05
-"""Current at which the settled voltage's change is taken, either way [1/h]: 20 A at 60 Ah, as in
-driving; and by how much it is changed, relative."""
+"""Current at which the change of the settled voltage is taken, in both directions [1/h] (20 A at
+60 Ah, as in driving), and the relative change of current."""
 
 _ORDER = {effect_id: number for number, effect_id in enumerate(LIBRARY)}
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What the extended model says of a log."""
+    """Prediction of the extended model for a log."""
 
     rows: NDArray[np.intp]
-    """Rows of the log that the voltage was predicted at, shape (m,)."""
+    """Rows of the log at which the voltage is predicted, shape (m,)."""
     voltage_v: FloatArray
     """Predicted voltage [V], shape (m,)."""
     signals: Signals
-    """All rows as perfect sensors would have shown them, shape (n,)."""
+    """All rows as ideal sensors would have shown them, shape (n,)."""
     soc_pct: FloatArray
     """Counted SoC of all rows [%], shape (n,)."""
 
@@ -64,9 +64,9 @@ class ExtendedModel:
     ----------
     model : VoltageModel
     capacity_ah : float
-        The model's own capacity [Ah], which the effects' bounds and C-rates are relative to.
+        Capacity of the model [Ah]; the effects' bounds and C-rates are relative to it.
     effects : sequence of (Effect, values)
-        They are applied in the library's order, whatever order they are given in.
+        Applied in the library's order, not in the given one.
     """
 
     model: VoltageModel
@@ -88,16 +88,14 @@ class ExtendedModel:
         return replace(self, effects=(*self.effects, (effect, values)))
 
     def online(self, capacity_ah: float | None = None) -> OnlineExtendedModel:
-        """Return the model for the estimator, at its first sample.
+        """Return the sample-by-sample form, before the first sample.
 
         Parameters
         ----------
         capacity_ah : float, optional
-            A capacity that the user insists on [Ah]; the effects leave it alone.
+            Capacity set by the user [Ah]; effects do not change it.
         """
         return OnlineExtendedModel(self, capacity_ah)
-
-    # --- over a whole log -----------------------------------------------------------------
 
     def predict(
         self,
@@ -107,7 +105,7 @@ class ExtendedModel:
         *,
         anchor_row: int = 0,
     ) -> Prediction:
-        """Return what the model says of a log.
+        """Predict voltage and SoC of a log.
 
         Parameters
         ----------
@@ -116,16 +114,16 @@ class ExtendedModel:
         initial_soc_pct : float
             SoC at `anchor_row` [%].
         at_rows : array of int, shape (m,)
-            Rows to predict the voltage at.
+            Rows at which to predict the voltage.
         anchor_row : int
-            Row that the initial SoC belongs to.
+            Row at which the initial SoC holds.
         """
         corrected = self.corrected(signals)
         soc = self.counted_soc(corrected, initial_soc_pct, anchor_row=anchor_row)
         state = self.state(corrected, soc) if self.effects else None
         if state is not None:
             delayed = state.history.delayed_a(self.model.delay_s)[at_rows]
-        else:  # rows are few where a log is fast
+        else:  # a fast log has far more samples than rows
             time = corrected.time_s
             delayed = delayed_currents(time, corrected.current_a, self.model.delay_s, time[at_rows])
         volts = self.model.voltage(soc[at_rows], corrected.temperature_c[at_rows], delayed)
@@ -134,7 +132,7 @@ class ExtendedModel:
         return Prediction(at_rows, volts, corrected, soc)
 
     def corrected(self, signals: Signals) -> Signals:
-        """Return the signals as perfect sensors would have shown them."""
+        """Return the signals as ideal sensors would have shown them."""
         for effect, values in self.effects:
             signals = effect.correct(signals, values, self.pack)
         return signals
@@ -160,7 +158,7 @@ class ExtendedModel:
         return np.asarray(counting.initial_soc_pct - moved)
 
     def state(self, corrected: Signals, soc_pct: FloatArray) -> PackState:
-        """Return what extra voltages depend on, for all rows of corrected signals."""
+        """Return the inputs of the extra voltages, for all rows of corrected signals."""
         history = corrected.history
         delayed = history.delayed_a(self.model.delay_s)
         return PackState(
@@ -169,7 +167,7 @@ class ExtendedModel:
             temperature_c=corrected.temperature_c,
             soc_pct=soc_pct,
             drop_v=delayed @ np.array(self.model.resistance_ohm),
-            remembered=history,
+            cached_history=history,
         )
 
     def extra_voltage(self, state: PackState) -> FloatArray:
@@ -182,10 +180,10 @@ class ExtendedModel:
         return volts
 
     def steady_ohm(self) -> float:
-        """Return by how much the voltage changes with a lasting current, negative [V/A].
+        """Return dU/dI for a lasting current, negative [Ω].
 
-        So much of a current sensor's offset the voltage would not show. Polarisation counts in
-        full; what only the sign of current decides, not at all.
+        Polarisation counts in full; effects of the sign of the current alone, such as hysteresis,
+        do not.
         """
         ohm = sum(self.model.resistance_ohm)
         if not self.effects:
@@ -214,54 +212,54 @@ class ExtendedModel:
 
 
 class OnlineExtendedModel:
-    """The extended model in the estimator: call `correct`, then `advance` for each that comes out.
+    """Sample-by-sample form of the extended model, for the estimator.
 
-    `pseudo_ocv_at` then takes the place of the voltage model's, the effects' voltages included.
+    Call `correct`, then `advance` for each reading that comes out; `pseudo_ocv_at` then includes
+    the effects' voltages.
 
     Parameters
     ----------
     extended : ExtendedModel
     capacity_ah : float, optional
-        A capacity that the user insists on [Ah].
+        Capacity set by the user [Ah].
     """
 
     def __init__(self, extended: ExtendedModel, capacity_ah: float | None = None) -> None:
         self.model = extended.model
         self._extended = extended
-        # 50 % stands for any: capacity and efficiency do not depend on it.
+        # Any SoC will do: capacity and efficiency do not depend on it.
         self._counting = extended.counting(50.0)
         self.capacity_ah = capacity_ah or self._counting.capacity_ah
-        """Charge from 100 to 0 % that the counter is to use [Ah]."""
-        working = [
+        """Capacity for the Coulomb counter [Ah]."""
+        self._effects = [
             effect.online(values, extended.model, extended.pack)
             for effect, values in extended.effects
         ]
-        self._effects = working
-        self._beside_soc = [effect for effect in working if not effect.uses_soc]
-        self._over_soc = [effect for effect in working if effect.uses_soc]
+        self._over_soc = [effect for effect in self._effects if effect.uses_soc]
+        self._beside_soc = [effect for effect in self._effects if not effect.uses_soc]
         self._beside_soc_v = 0.0
         self._slope_at_least = SLOPE_AT_LEAST * extended.pack.voltage_v
 
     @cached_property
     def steady_ohm(self) -> float:
-        """By how much the voltage changes with a lasting current, the effects' part too [V/A]."""
+        """`ExtendedModel.steady_ohm`, computed once [Ω]."""
         return self._extended.steady_ohm()
 
     @property
     def plain(self) -> bool:
-        """Whether there are no effects: then nothing needs correcting or advancing."""
+        """Whether there are no effects, so that nothing needs correcting or advancing."""
         return not self._effects
 
     def initial_soc_pct(self, assumed_pct: float) -> float:
-        """Return the SoC to begin from, within 0–100 [%], where the user assumes one."""
+        """Return the SoC at which to start for an assumed one, within 0–100 [%]."""
         return min(max(self._extended.counting(assumed_pct).initial_soc_pct, 0.0), 100.0)
 
     def counted(self, current_a: float) -> float:
-        """Return the part of a (corrected) current whose charge counts [A]."""
+        """Return the counted part of a corrected current [A]."""
         return self._counting.counted_at(current_a)
 
     def correct(self, reading: Reading) -> Sequence[Reading]:
-        """Return the corrected readings that can be given out by now: mostly one, in order."""
+        """Return the corrected readings that are ready, usually one, in order."""
         readings: Sequence[Reading] = (reading,)
         for effect in self._effects:
             if len(readings) == 1:
@@ -274,14 +272,15 @@ class OnlineExtendedModel:
         self, time_s: float, current_a: float, temperature_c: float,
         delayed_current_a: Sequence[float],
     ) -> None:  # fmt: skip
-        """Carry the effects' states to a corrected reading (every one, in order).
+        """Advance the effects' states to a corrected reading (every one, in order).
 
         Parameters
         ----------
-        time_s, current_a, temperature_c : float
-            Time [s], current [A] and temperature [°C], the last one that was known. NaN before the
-            first: effects take the reference temperature, and those that follow it late wait, or
-            they would follow from a temperature that never was.
+        time_s, current_a : float
+            Time [s] and current [A].
+        temperature_c : float
+            Latest known temperature [°C]; NaN before the first. Effects then use the reference
+            temperature, but those that lag behind the temperature wait for the first known one.
         delayed_current_a : sequence of floats
             Current at each delay, from the delay line of corrected currents [A].
         """
@@ -296,38 +295,39 @@ class OnlineExtendedModel:
                 effect.advance(time_s, current_a, self.model.t_ref_c, drop_v)
         self._beside_soc_v = sum((item.extra_voltage(0.0) for item in self._beside_soc), 0.0)
 
-    def memory(self) -> list[list[float]]:
-        """Return what the effects are to remember, one list each."""
-        return [effect.memory() for effect in self._effects]
+    def state(self) -> list[list[float]]:
+        """Return the state of each effect, for `restore`."""
+        return [effect.state() for effect in self._effects]
 
-    def remember(self, memory: Sequence[Sequence[float]], latest_s: float) -> None:
-        """Go on from a memory of the same effects.
+    def restore(self, state: Sequence[Sequence[float]], latest_s: float) -> None:
+        """Continue from a saved state of the same effects.
 
         Parameters
         ----------
-        memory : sequence of sequences
+        state : sequence of sequences
         latest_s : float
-            Time of the latest sample before [s], after which nothing may lie; NaN: none came yet.
+            Time of the latest sample before [s]; NaN if there was none. No time in the state may
+            be later.
 
         Raises
         ------
         InputError
-            If it is none.
+            If the state does not belong to these effects or is malformed; names the effect.
         """
-        if len(memory) != len(self._effects):
+        if len(state) != len(self._effects):
             raise InputError(f"the model has {len(self._effects)} effects", field="effects")
-        for number, (effect, of_effect) in enumerate(zip(self._effects, memory, strict=True)):
+        for number, (effect, of_effect) in enumerate(zip(self._effects, state, strict=True)):
             try:
-                effect.remember(of_effect, latest_s)
+                effect.restore(of_effect, latest_s)
             except ValueError as error:
                 raise InputError(str(error), field=f"effects.{number}") from error
 
     def pseudo_ocv_at(self, soc_pct: float) -> tuple[float, float]:
-        """Return voltage without the model's drop and kt [V], and its slope [V per %], at one SoC.
+        """Return the voltage without the model's drop and kt [V], and its slope [V per %].
 
-        The effects' voltages at the last reading are part of it. The slope is kept positive, so
-        that Newton's method and the filter can use it: an effect may turn the voltage around over
-        a few per cent (resistance that rises toward empty, while charging).
+        The effects' voltages at the latest reading are included. The slope is limited to positive
+        values, for Newton's method and the filter: with an effect the voltage may fall over a few
+        per cent of SoC (resistance that rises toward empty, while charging).
         """
         volts, slope = self.model.pseudo_ocv_at(soc_pct)
         volts += self._beside_soc_v

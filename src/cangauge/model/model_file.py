@@ -1,4 +1,4 @@
-"""The model file: JSON, versioned, validated on load with an error that names the field."""
+"""Model file: versioned JSON, validated on load with an error that names the field."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
+import numpy as np
 from pydantic import (
     BaseModel,
     ConfigDict,
@@ -18,23 +19,28 @@ from pydantic import (
 )
 
 from cangauge._config import schema_error
-from cangauge._io import MAX_MODEL_BYTES, MAX_MODEL_COLUMNS, MAX_MODEL_ITEMS, read_bounded
+from cangauge._io import (
+    MAX_MODEL_BYTES,
+    MAX_MODEL_COLUMNS,
+    MAX_MODEL_ITEMS,
+    read_bounded,
+    write_text_atomic,
+)
 from cangauge.errors import InputError
-from cangauge.logs.log import TemperatureSource
-from cangauge.model.effects.base import Pack
+from cangauge.logs.log import Log, TemperatureSource
+from cangauge.model.effects.base import Pack, Signals
 from cangauge.model.effects.library import parse_effects
-from cangauge.model.extended import ExtendedModel
+from cangauge.model.extended import ExtendedModel, Prediction
 from cangauge.model.voltage_model import BASIS_NAMES, VoltageModel
 
 MODEL_FORMAT = "cangauge-model"
 MODEL_VERSION = 1
-_CURE = "make the file again with `cangauge fit`"
+_CURE = "create the file with `cangauge fit`"
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-
-# Wider than any pack needs, and narrow enough that nothing overflows on the way to a voltage.
+_Finite = Annotated[float, Field(allow_inf_nan=False)]
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+# Wider than any pack needs, narrow enough that no voltage overflows.
 _Value = Annotated[float, Field(ge=-1e12, le=1e12)]
 _Soc = Annotated[float, Field(ge=-10, le=110)]
 _Celsius = Annotated[float, Field(ge=-273.15, le=1000)]
@@ -42,11 +48,8 @@ _Ampere = Annotated[float, Field(ge=-1e6, le=1e6)]
 _Volts = Annotated[float, Field(ge=0, le=1e6)]
 _Delay = Annotated[float, Field(ge=0, le=3600)]
 _Seconds = Annotated[float, Field(ge=0, le=1e9)]
-SocSpan = tuple[_Soc, _Soc]
-TemperatureSpan = tuple[_Celsius, _Celsius]
-CurrentSpan = tuple[_Ampere, _Ampere]
-Columns = Field(max_length=MAX_MODEL_COLUMNS)
-Items = Field(max_length=MAX_MODEL_ITEMS)
+_Columns = Field(max_length=MAX_MODEL_COLUMNS)
+_Items = Field(max_length=MAX_MODEL_ITEMS)
 
 
 class _Strict(BaseModel):
@@ -57,45 +60,43 @@ class Coefficient(_Strict):
     """One coefficient of the voltage model."""
 
     value: _Value
-    std_error: NotNegative | None = None
+    std_error: _NotNegative | None = None
     unit: Literal["V", "V/K", "ohm"]
 
 
 class Ranges(_Strict):
-    """What the model was identified on; beyond it, it is flagged and bounded."""
+    """Identified ranges; an estimate outside is flagged and its extrapolation bounded."""
 
-    soc_pct: SocSpan
-    temperature_c: TemperatureSpan
-    current_a: CurrentSpan
+    soc_pct: tuple[_Soc, _Soc]
+    temperature_c: tuple[_Celsius, _Celsius]
+    current_a: tuple[_Ampere, _Ampere]
 
 
 class ModelNoise(_Strict):
-    """The model's voltage error on data that its fit did not see."""
+    """Voltage error of the model on held-out data, in parts of different duration."""
 
     fast_std_v: _Volts
     fast_time_s: _Seconds
     slow_std_v: _Volts
     slow_time_s: Annotated[float, Field(gt=0, le=1e9)]
     lasting_std_v: _Volts
-    voltage_mae_pct: NotNegative
+    voltage_mae_pct: _NotNegative
     voltage_rmse_v: _Volts
     judged_on: str
 
 
 class Information(_Strict):
-    """Square root of the identification data's information, in scaled columns.
+    """Square root of the identification data's information matrix, in scaled columns.
 
     With X the columns divided by `scale` and y the voltage, `root` is R and `projected` is Qᵀy of
-    X = QR. The information matrix is RᵀR, the least-squares solution R⁻¹Qᵀy / scale, and data of
-    another log can be stacked below: joint identification without the old logs.
+    X = QR. The information matrix is RᵀR and the least-squares solution R⁻¹Qᵀy / scale; rows of
+    another log can be stacked below, for joint identification without the original logs.
     """
 
-    columns: Annotated[list[str], Columns]
-    scale: Annotated[list[Positive], Columns]
-    root: Annotated[list[Annotated[list[Finite], Columns]], Columns]
-    projected: Annotated[list[Finite], Columns]
-    rows: Annotated[int, Field(gt=0)]
-    residual_sum_v2: NotNegative
+    columns: Annotated[list[str], _Columns]
+    scale: Annotated[list[_Positive], _Columns]
+    root: Annotated[list[Annotated[list[_Finite], _Columns]], _Columns]
+    projected: Annotated[list[_Finite], _Columns]
 
     @model_validator(mode="after")
     def _shapes(self) -> Self:
@@ -107,7 +108,7 @@ class Information(_Strict):
 
 
 class SourceLog(_Strict):
-    """A log that the model was identified on."""
+    """A log used for the identification."""
 
     name: str
     rows: int
@@ -118,24 +119,30 @@ class Made(_Strict):
     """How the model was made."""
 
     by: str
-    options: Annotated[dict[str, str | float | int | bool | list[float] | None], Items]
-    logs: Annotated[list[SourceLog], Items]
+    options: Annotated[dict[str, str | float | int | bool | list[float] | None], _Items]
+    logs: Annotated[list[SourceLog], _Items]
     fingerprint: str
 
 
 class Model(_Strict):
-    """Everything that a model file holds."""
+    """A pack's identified model: coefficients, effects, ranges, noise and origin.
+
+    Examples
+    --------
+    >>> model = Model.load("pack.json")  # doctest: +SKIP
+    >>> model.predict(log).residual_v  # doctest: +SKIP
+    """
 
     format: Literal["cangauge-model"] = "cangauge-model"
     version: Literal[1] = 1
     name: str
-    coefficients: Annotated[dict[str, Coefficient], Items]
+    coefficients: Annotated[dict[str, Coefficient], _Items]
     epsilon: Annotated[float, Field(ge=1e-4, lt=0.5)]
     t_ref_c: _Celsius
     delays_s: Annotated[list[_Delay], Field(min_length=1, max_length=64)]
     rate_hz: Annotated[float, Field(ge=1e-3, le=1e4)]
     capacity_ah: Annotated[float, Field(ge=1e-3, le=1e5)]
-    effects: Annotated[list[dict[str, object]], Items] = []
+    effects: Annotated[list[dict[str, object]], _Items] = []
     temperature_source: TemperatureSource
     range: Ranges
     noise: ModelNoise
@@ -156,28 +163,28 @@ class Model(_Strict):
         if given != wanted:
             missing, extra = sorted(wanted - given), sorted(given - wanted)
             words = [f"missing are {', '.join(missing)}"] if missing else []
-            words += [f"not known are {', '.join(extra)}"] if extra else []
+            words += [f"unknown are {', '.join(extra)}"] if extra else []
             count = len(self.delays_s)
             raise ValueError(
                 f"coefficients: {'; '.join(words)} ({count} delays_s need R1 … R{count})"
             )
         if self.information is not None and self.information.columns != self.coefficient_names:
             names = ", ".join(self.coefficient_names)
-            raise ValueError(f"information: its columns must be {names}, in this order")
+            raise ValueError(f"information: the columns must be {names}, in this order")
         return self
 
     @property
     def coefficient_names(self) -> list[str]:
-        """Names of the coefficients in the order of a solution: k0 … k7, kt, R1 … Rn."""
+        """Coefficient names in the order of a solution: k0 … k7, kt, R1 … Rn."""
         return [*BASIS_NAMES, "kt", *resistance_names(len(self.delays_s))]
 
     def voltage_model(self) -> VoltageModel:
-        """Return the voltage model that the file describes.
+        """Return the voltage model without effects.
 
         Raises
         ------
         InputError
-            If its pseudo-OCV does not rise, or its delays do not.
+            If the pseudo-OCV does not rise with SoC.
         """
         value = {name: item.value for name, item in self.coefficients.items()}
         return VoltageModel(
@@ -193,16 +200,100 @@ class Model(_Strict):
         )
 
     def extended_model(self) -> ExtendedModel:
-        """Return the voltage model with the file's effects.
+        """Return the voltage model with the effects.
 
         Raises
         ------
         InputError
-            As `voltage_model`, or if an effect is unknown or a parameter out of its bounds.
+            If the pseudo-OCV does not rise with SoC, an effect is unknown, or a parameter is out
+            of bounds.
         """
         model = self.voltage_model()
         effects = parse_effects(self.effects, Pack.of(model, self.capacity_ah))
         return ExtendedModel(model, self.capacity_ah, tuple(effects))
+
+    @classmethod
+    def load(cls, path: Path | str) -> Model:
+        """Read and validate a model file.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be read or does not describe a usable model; names the field.
+        """
+        path = Path(path)
+        data = read_bounded(path, MAX_MODEL_BYTES, "a model file")
+        try:
+            raw = json.loads(data, parse_constant=_refuse_constant)
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"not JSON ({error})", source=path, cure=_CURE) from error
+        if not isinstance(raw, dict) or raw.get("format") != MODEL_FORMAT:
+            raise InputError(
+                "not a cangauge model",
+                source=path,
+                field="format",
+                value=raw.get("format") if isinstance(raw, dict) else type(raw).__name__,
+                cure=_CURE,
+            )
+        if raw.get("version") != MODEL_VERSION:
+            raise InputError(
+                f"this release reads version {MODEL_VERSION}",
+                source=path,
+                field="version",
+                value=raw.get("version"),
+                cure=_CURE,
+            )
+        try:
+            model = cls.model_validate(raw)
+            model.extended_model()
+        except ValidationError as error:
+            raise schema_error(error, cls, path, _CURE) from error
+        except InputError as error:
+            raise InputError(
+                error.problem, source=path, field=error.field, value=error.value, cure=error.cure
+            ) from error
+        return model
+
+    def to_json(self) -> str:
+        """Return the text of the model file."""
+        return json.dumps(self.model_dump(mode="json"), indent=1, allow_nan=False) + "\n"
+
+    def save(self, path: Path | str) -> None:
+        """Write the model file; an existing file is replaced atomically."""
+        write_text_atomic(Path(path), self.to_json())
+
+    def predict(self, log: Log, *, initial_soc_pct: float | None = None) -> Prediction:
+        """Predict the voltage of a log, with `residual_v` = measured − predicted.
+
+        Parameters
+        ----------
+        log : Log
+        initial_soc_pct : float, optional
+            SoC at the first row [%]; by default the first finite value of the log's reference SoC
+            anchors the count.
+
+        Returns
+        -------
+        Prediction
+            For every row of the log.
+
+        Raises
+        ------
+        InputError
+            If the initial SoC is unknown.
+        """
+        anchor = log.first_soc() if initial_soc_pct is None else (0, initial_soc_pct)
+        if anchor is None:
+            raise InputError(
+                "unknown initial SoC",
+                source=log.source or log.name,
+                field="initial_soc_pct",
+                cure="give initial_soc_pct, or a log with soc_pct",
+            )
+        row, soc_pct = anchor
+        signals = Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
+        rows = np.arange(len(log))
+        return self.extended_model().predict(signals, soc_pct, rows, anchor_row=row)
 
 
 def resistance_names(number: int) -> list[str]:
@@ -210,64 +301,15 @@ def resistance_names(number: int) -> list[str]:
     return [f"R{k}" for k in range(1, number + 1)]
 
 
-def model_json(model: Model) -> str:
-    """Return the model file's text."""
-    return json.dumps(model.model_dump(mode="json"), indent=1, allow_nan=False) + "\n"
-
-
-def load_model(path: Path | str) -> Model:
-    """Read and validate a model file.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read or does not describe a usable model; names the field.
-    """
-    path = Path(path)
-    data = read_bounded(path, MAX_MODEL_BYTES, "a model file")
-    try:
-        raw = json.loads(data, parse_constant=_no_constant)
-    except (ValueError, RecursionError) as error:
-        raise InputError(
-            f"is no JSON ({error})", source=path, cure="a model file is made by `cangauge fit`"
-        ) from error
-    if not isinstance(raw, dict) or raw.get("format") != MODEL_FORMAT:
-        raise InputError(
-            "is no cangauge model",
-            source=path,
-            field="format",
-            value=raw.get("format") if isinstance(raw, dict) else type(raw).__name__,
-            cure="a model file is made by `cangauge fit`",
-        )
-    if raw.get("version") != MODEL_VERSION:
-        raise InputError(
-            f"this release reads version {MODEL_VERSION}",
-            source=path,
-            field="version",
-            value=raw.get("version"),
-            cure="make it again with `cangauge fit`",
-        )
-    try:
-        model = Model.model_validate(raw)
-        model.extended_model()
-    except ValidationError as error:
-        raise schema_error(error, Model, path, _CURE) from error
-    except InputError as error:
-        raise InputError(
-            error.problem, source=path, field=error.field, value=error.value, cure=error.cure
-        ) from error
-    return model
-
-
-def _no_constant(name: str) -> float:
-    raise ValueError(f"{name} is no number that a model may hold")
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a finite number")
 
 
 def effective_error_std_v(noise: ModelNoise, interval_s: float) -> float:
-    """Return the standard deviation to give a voltage that is used every `interval_s` [V].
+    """Return the equivalent white-noise standard deviation of a voltage every `interval_s` [V].
 
-    The fast error lasts `fast_time_s`, so samples closer together share it: n of them tell as
-    much as n / (1 + 2·τ/Δt) independent ones.
+    The fast error is correlated over τ = `fast_time_s`: n samples carry the information of
+    n / (1 + 2·τ/Δt) independent ones.
     """
-    shared = 1.0 + 2.0 * noise.fast_time_s / interval_s
-    return math.sqrt(shared) * noise.fast_std_v
+    inflation = 1.0 + 2.0 * noise.fast_time_s / interval_s
+    return math.sqrt(inflation) * noise.fast_std_v

@@ -11,7 +11,7 @@ CAPACITY_AH = 51.5
 """Charge from 100 to 0 % [Ah]."""
 
 MEAN_VOLTAGE_V = 370.0
-"""About the pack's voltage over the test [V]."""
+"""Approximate mean pack voltage over the test [V]."""
 
 VOLTAGE_MAE_PCT = 0.25
 SOC_NEWTON_MAE_PCT = 2.5
@@ -24,7 +24,7 @@ EFFICIENCY_PCT = 98.0
 
 
 def leaf_2012_model() -> VoltageModel:
-    """Return the published voltage model; its temperature was the test room's, 20–26 °C."""
+    """Return the published voltage model; temperatures are those of the test room, 20–26 °C."""
     return VoltageModel(
         ocv_v=(394.4, 48.89, -4.769, 0.2158, -0.003718, -54.59, 109.3, -3.141),
         kt_v_per_k=-0.7428,
@@ -39,11 +39,10 @@ def leaf_2012_model() -> VoltageModel:
 
 
 def leaf_2012_model_file() -> Model:
-    """Return the published model as a model file that `estimate` and `run` take.
+    """Return the published model for `estimate` and `run`.
 
-    The paper gives no noise and no standard errors. The noise here is assumed: its sum gives the
-    published voltage error of 0.25 % (0.93 V mean, 1.16 V rms), split evenly into a fast, a slow
-    and a lasting part.
+    The paper states neither noise nor standard errors. The noise is assumed: the published voltage
+    error of 0.25 % (0.93 V mean, 1.16 V rms), split evenly into a fast, a slow and a lasting part.
     """
     model = leaf_2012_model()
     rmse_v = VOLTAGE_MAE_PCT / 100.0 * MEAN_VOLTAGE_V * math.sqrt(math.pi / 2.0)

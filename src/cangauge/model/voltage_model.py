@@ -1,4 +1,4 @@
-"""The voltage model: pseudo open-circuit voltage plus resistances on delayed currents.
+"""Voltage model: pseudo open-circuit voltage plus resistances on delayed currents.
 
     U = k0 + k1/s + k2/s² + k3/s³ + k4/s⁴ + k5·s + k6·ln s + k7·ln(1 − s)
         + kt·(T − T_r) + Σj Rj·I(t − dj),      s = (S/100)·(1 − 2ε) + ε
@@ -6,15 +6,11 @@
 Published for a 2012 Nissan Leaf on a chassis dynamometer with delays of 0, 10, 30 and 70 s,
 ε = 0.05 and T_r = 20 °C. Positive current discharges, so the resistances Rj are negative.
 
-Outside the SoC and temperature that it was identified on, the formula is not to be trusted (the
-powers of 1/s explode), so there the pseudo-OCV goes on as a straight line in SoC, and the
-temperature is held at the edge of its range plus `TEMPERATURE_MARGIN_K`.
+Outside the identified SoC the powers of 1/s explode, so the pseudo-OCV is extrapolated linearly;
+the temperature is limited to the identified range ± `TEMPERATURE_MARGIN_K`.
 
-SoC from a voltage: Newton's method, kept inside a bracket.
-
-The pseudo-OCV rises with SoC, so there is one root. Newton's step is taken where it stays inside
-the bracket, else the bracket is halved; it cannot diverge, and says when the voltage lies outside
-what the model can give between 0 and 100 %.
+`soc_from_ocv` inverts the pseudo-OCV by Newton's method inside a bracket. It rises with SoC, so
+there is one root; a step that leaves the bracket is replaced by bisection, so it cannot diverge.
 """
 
 from __future__ import annotations
@@ -31,39 +27,37 @@ from numpy.typing import ArrayLike
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 
-# --- The voltage model: pseudo open-circuit voltage plus resistances on delayed currents
-
 BASIS_NAMES = ("k0", "k1", "k2", "k3", "k4", "k5", "k6", "k7")
-"""Names of the pseudo-OCV's coefficients, in the order of the columns of `ocv_basis`."""
+"""Coefficients of the pseudo-OCV, in the order of the columns of `ocv_basis`."""
 
 TEMPERATURE_MARGIN_K = 5.0
-"""How far beyond the identified temperatures the linear term is followed [K]."""
+"""Extrapolation of the linear temperature term beyond the identified range [K]."""
 
 SLOPE_AT_LEAST = 2e-5
-"""Least rise of the pseudo-OCV per % SoC, relative to the pack's voltage: it must rise, so that
-the inverse has one root, but a flat (LFP) plateau must stay possible. It is 7 mV per % for a
-Leaf, a fiftieth of its flattest slope."""
+"""Lower limit of the pseudo-OCV's slope per % SoC, relative to the pack voltage: it must rise for a
+unique inverse, yet allow a flat (LFP) plateau. 7 mV per % for a Leaf, 1/50 of its flattest
+slope."""
 
 SLOPE_POINTS = 401
-"""Points over the identified SoC at which a model's pseudo-OCV is checked to rise."""
+"""Points over the identified SoC at which the slope of the pseudo-OCV is checked."""
 
 NARROWEST_SOC_PCT = 0.01
-"""A model that saw less SoC than this saw none: its slope would be a quotient of roundings [%]."""
+"""Least width of the identified SoC range [%]: below, slopes are quotients of rounding errors."""
 
 EDGE = 0.25
-"""Outside the identified SoC the pseudo-OCV goes on with the mean slope of this outermost part of
-the range: at the very edge the fitted slope is mostly noise."""
+"""Fraction of the identified SoC range at each end whose mean slope extrapolates the pseudo-OCV: at
+the very edge the fitted slope is mostly noise."""
 
 
 def scaled_soc(soc_pct: ArrayLike, epsilon: float) -> FloatArray:
-    """Return s, the SoC squeezed into [ε, 1 − ε] so that ln s and ln(1 − s) stay finite."""
+    """Return s, the SoC scaled into [ε, 1 − ε] so that ln s and ln(1 − s) are finite."""
     return np.asarray(soc_pct, dtype=np.float64) / 100.0 * (1.0 - 2.0 * epsilon) + epsilon
 
 
 def ocv_basis(soc_pct: ArrayLike, epsilon: float) -> FloatArray:
     """Return the pseudo-OCV's columns, shape (n, 8), for SoC [%] of shape (n,)."""
     s = np.atleast_1d(scaled_soc(soc_pct, epsilon))
-    # Each column in one piece of memory: several times as fast as row by row.
+    # Contiguous columns are several times as fast as contiguous rows.
     basis = np.empty((8, s.size))
     one, r, r2, r3, r4, linear, of_empty, of_full = basis
     one[:], linear[:] = 1.0, s
@@ -111,7 +105,7 @@ class VoltageModel:
     t_ref_c : float
         Reference temperature T_r [°C].
     soc_range_pct, temperature_range_c, current_range_a : pairs of floats
-        What the model was identified on.
+        Identified ranges.
 
     Raises
     ------
@@ -138,13 +132,11 @@ class VoltageModel:
             worst = int(np.argmin(slope))
             at = float(points[worst])
             raise InputError(
-                f"the pseudo-OCV falls with SoC at {at:.1f} %: it has no inverse there",
+                f"the pseudo-OCV falls with SoC at {at:.1f} %, so it has no inverse",
                 field="coefficients",
                 value=float(slope[worst]),
                 cure="identify the model with `cangauge fit`, which keeps it rising",
             )
-
-    # --- over arrays: identification, reports, diagnosis ----------------------------------
 
     def pseudo_ocv(self, soc_pct: ArrayLike, temperature_c: ArrayLike | None = None) -> FloatArray:
         """Return the voltage without current [V].
@@ -152,7 +144,7 @@ class VoltageModel:
         Parameters
         ----------
         soc_pct : array_like of shape (n,)
-            State of charge [%]; values outside the identified range are followed linearly.
+            State of charge [%]; linear extrapolation outside the identified range.
         temperature_c : array_like of shape (n,), optional
             Temperature [°C]; `t_ref_c` if left out.
         """
@@ -168,7 +160,7 @@ class VoltageModel:
         return np.asarray(volts)
 
     def pseudo_ocv_columns(self, soc_pct: ArrayLike) -> FloatArray:
-        """Return how the pseudo-OCV moves with k0 … k7 [-], shape (n, 8), straight lines included.
+        """Return dU/dk of the pseudo-OCV for k0 … k7 [-], shape (n, 8), extrapolation included.
 
         Parameters
         ----------
@@ -206,12 +198,10 @@ class VoltageModel:
         drop = np.asarray(delayed_current_a, dtype=np.float64) @ np.array(self.resistance_ohm)
         return np.asarray(self.pseudo_ocv(soc_pct, temperature_c) + drop)
 
-    # --- one sample: the estimator --------------------------------------------------------
-
     def pseudo_ocv_at(self, soc_pct: float) -> tuple[float, float]:
         """Return pseudo-OCV at `t_ref_c` [V] and its slope [V per %] at one SoC [%].
 
-        Plain floats: 0.5 µs where the array form takes 30 µs.
+        Scalar form for the estimator: 0.5 µs against 30 µs of the array form.
         """
         lo, hi = self.soc_range_pct
         at = min(max(soc_pct, lo), hi)
@@ -234,14 +224,12 @@ class VoltageModel:
         return volts + slope * (soc_pct - at), slope
 
     def offset_at(self, temperature_c: float, delayed_current_a: Sequence[float]) -> float:
-        """Return the part of the voltage that does not depend on SoC [V], for one sample."""
+        """Return the SoC-independent part of the voltage of one sample [V]."""
         lo, hi = self._temperature_limits_c
         volts = self.kt_v_per_k * (min(max(temperature_c, lo), hi) - self.t_ref_c)
         for resistance, current in zip(self.resistance_ohm, delayed_current_a, strict=True):
             volts += resistance * current
         return volts
-
-    # --- facts of the model ---------------------------------------------------------------
 
     @property
     def coefficients(self) -> FloatArray:
@@ -267,14 +255,14 @@ class VoltageModel:
 
     @cached_property
     def _slope_beyond(self) -> tuple[float, float]:
-        """Slopes of the straight lines below and above the identified SoC [V per %]."""
+        """Slopes of the extrapolation below and above the identified SoC [V per %]."""
         low, high = self._columns_beyond
         volts = np.array(self.ocv_v)
         return float(low @ volts), float(high @ volts)
 
     @cached_property
     def _columns_beyond(self) -> tuple[FloatArray, FloatArray]:
-        """How those slopes move with k0 … k7 [1/%], shape (8,) each."""
+        """Derivatives of those slopes by k0 … k7 [1/%], shape (8,) each."""
         lo, hi = self.soc_range_pct
         part = EDGE * (hi - lo)
         columns = ocv_basis([lo, lo + part, hi - part, hi], self.epsilon)
@@ -295,7 +283,7 @@ def _check_shape(model: VoltageModel) -> None:
         )
     if not 0.0 < model.epsilon < 0.5:
         raise InputError(
-            "must lie between 0 and 0.5, or the logarithms end at infinity",
+            "must lie between 0 and 0.5, or the logarithms diverge",
             field="epsilon",
             value=model.epsilon,
             cure="the published value is 0.05",
@@ -321,7 +309,7 @@ def _check_shape(model: VoltageModel) -> None:
         lo, hi = getattr(model, name)
         if name == "soc_range_pct" and not _defined(lo, hi, model.epsilon):
             raise InputError(
-                "the pseudo-OCV's logarithms end within this range",
+                "the logarithms of the pseudo-OCV diverge within this range",
                 field=name,
                 value=(lo, hi),
                 cure="identify the model with a larger epsilon",
@@ -337,17 +325,15 @@ def _defined(low_pct: float, high_pct: float, epsilon: float) -> bool:
     return bool(np.all((ends > 0.0) & (ends < 1.0)))
 
 
-# --- SoC from a voltage: Newton's method, kept inside a bracket
-
 TOLERANCE_PCT = 1e-9
-"""The root is found when a step is smaller than this [% SoC]."""
+"""Step size at which the iteration stops [% SoC]."""
 
 STEPS_AT_MOST = 80
-"""Halving alone needs 37 steps from 100 % down to the tolerance."""
+"""Bisection alone needs 37 steps from 100 % to the tolerance."""
 
 
 class Curve(Protocol):
-    """What can be inverted: a voltage model, or one extended by effects."""
+    """An invertible pseudo-OCV: that of a voltage model or of an online extended model."""
 
     def pseudo_ocv_at(self, soc_pct: float) -> tuple[float, float]:
         """Return voltage [V] and its slope [V per %], positive, at one SoC [%]."""
@@ -359,7 +345,7 @@ class Inverse(NamedTuple):
     soc_pct: float
     """State of charge [%], within 0–100."""
     inside: bool
-    """False if the voltage lies outside the model's range and SoC was clipped."""
+    """False if the voltage lies outside the model's range and the SoC was clipped."""
 
 
 def soc_from_ocv(model: Curve, ocv_v: float, guess_pct: float = 50.0) -> Inverse:
@@ -371,7 +357,7 @@ def soc_from_ocv(model: Curve, ocv_v: float, guess_pct: float = 50.0) -> Inverse
     ocv_v : float
         Voltage [V] less the parts that do not depend on SoC (`VoltageModel.offset_at`).
     guess_pct : float
-        Where to start [%]; the last SoC saves steps.
+        Start of the iteration [%]; the previous SoC saves steps.
     """
     low, high = 0.0, 100.0
     if ocv_v <= model.pseudo_ocv_at(low)[0]:

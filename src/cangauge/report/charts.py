@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 
 from cangauge._formatting import significant
 from cangauge._typing import FloatArray
-from cangauge.identify.rows import usual_gap_s
+from cangauge.inference.rows import usual_gap_s
 from cangauge.model.delay_line import GAP_S
 
 # --- Long series thinned for drawing, so that no peak is lost

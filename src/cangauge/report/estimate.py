@@ -16,7 +16,7 @@ from cangauge._typing import FloatArray
 from cangauge.estimate.offline import EstimateTable, Scores
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import REASON_WORDS, Reason, Status, reason_name
-from cangauge.identify.rows import running_rows
+from cangauge.inference.rows import running_rows
 from cangauge.model.model_file import Model
 from cangauge.report.charts import (
     AMBER,

@@ -15,8 +15,9 @@ import numpy as np
 
 from cangauge._formatting import duration, number, significant, span
 from cangauge._typing import FloatArray
-from cangauge.identify.fit import Identification, LogFit
-from cangauge.identify.rows import running_rows
+from cangauge.identify.evaluate import LogFit
+from cangauge.identify.fit import Identification
+from cangauge.inference.rows import running_rows
 from cangauge.model.charge import discharged_ah
 from cangauge.model.effects.library import LIBRARY
 from cangauge.report.charts import (
@@ -111,7 +112,7 @@ def _meaning(name: str, result: Identification) -> str:
 
 def effect_tables(result: Identification) -> list[Block]:
     """Return the effects with their parameters, and how they were found."""
-    found = result.found
+    found = result.effects
     if found is None:
         return []
     ids = dict.fromkeys(effect_id for effect_id, _ in found.estimates)
@@ -341,7 +342,7 @@ def fit_figures(result: Identification, time: TimeFigures) -> list[Block]:
 
 
 def _and_effects(result: Identification) -> str:
-    return ", effects" if result.found is not None and result.found.model.effects else ""
+    return ", effects" if result.effects is not None and result.effects.model.effects else ""
 
 
 def _ocv_plane(result: Identification) -> Plot:
@@ -544,7 +545,7 @@ def fit_page(result: Identification) -> Page:
         Section("Resistance", [resistance_figure(result)]),
         Section("Energy", energy_figures(result)),
         Section("Coefficients", [coefficient_table(result)]),
-        *([Section("Effects", effect_tables(result))] if result.found is not None else []),
+        *([Section("Effects", effect_tables(result))] if result.effects is not None else []),
         Section("How it was made", _made(result)),
     ]
     return Page(

@@ -38,7 +38,7 @@ def step_rows(found: FittedEffects) -> tuple[list[str], Rows]:
             significant(step.comparison.before_rmse_v, 4),
             significant(step.comparison.after_rmse_v, 4),
             number(step.comparison.t_value, 1),
-            number(step.comparison.needed, 1),
+            number(step.comparison.t_critical, 1),
         ]
         for step in found.steps
     ]

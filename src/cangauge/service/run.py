@@ -41,7 +41,7 @@ from cangauge.cli.options import check_outputs
 from cangauge.cli.output import console
 from cangauge.errors import InputError
 from cangauge.estimate.validity import Status, reason_names
-from cangauge.model.model_file import load_model
+from cangauge.model.model_file import Model
 from cangauge.service.config import RunConfig
 from cangauge.service.http import Endpoint, default_path, has_unix_sockets
 from cangauge.service.loop import LoopSettings, Outputs, RunSummary, serve
@@ -199,7 +199,7 @@ class Reloader:
         """
         try:
             config = self._read()
-            vehicle, model = config.load_vehicle(), load_model(config.model)
+            vehicle, model = config.load_vehicle(), Model.load(config.model)
             key = _vehicle_key(config, vehicle)
             settings = config.gauge_settings()
             started = self._gauge.settings
@@ -396,7 +396,7 @@ def run_service(config: RunConfig, read: Callable[[], RunConfig]) -> dict[str, A
     check_outputs([None if config.output is None else Path(config.output)], [Path(config.model)])
     kept = config.state_settings(os.environ)
     vehicle = config.load_vehicle()
-    gauge = Gauge(vehicle, load_model(config.model), config.gauge_settings())
+    gauge = Gauge(vehicle, Model.load(config.model), config.gauge_settings())
     reloader = Reloader(read, config, vehicle, gauge, _voice("config.reload"))
     address = config.address()
     # All that is loaded by now stays until the end. Left out of garbage collection, it costs no

@@ -33,7 +33,7 @@ from cangauge._formatting import duration, number
 from cangauge._io import write_text_atomic
 from cangauge.errors import CangaugeError, InputError
 from cangauge.estimate.state import EstimatorState
-from cangauge.model.model_file import Model, model_json
+from cangauge.model.model_file import Model
 from cangauge.service.async_writer import BackgroundWriter
 from cangauge.service.loop import CHECKPOINT_EVERY_S
 from cangauge.service.pipeline import Gauge
@@ -68,7 +68,7 @@ class StateContent(BaseModel):
 
 def model_fingerprint(model: Model) -> str:
     """Return a hash of all that a model says."""
-    return hashlib.sha256(model_json(model).encode()).hexdigest()
+    return hashlib.sha256(model.to_json().encode()).hexdigest()
 
 
 def state_text(content: StateContent) -> str:

@@ -28,12 +28,10 @@ import numpy as np
 
 from cangauge.errors import InputError
 from cangauge.identify.fit import Identification, fit
-from cangauge.identify.rows import FitOptions
-from cangauge.identify.voltage_fit import prepare
+from cangauge.inference.rows import FitOptions, fit_rows
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.charge import capacity_from_reference
-from cangauge.model.model_file import model_json
 from cangauge.validation.twin.case import CaseLogs
 from cangauge.validation.twin.faults import fault_kinds
 from cangauge.validation.twin.recorded import RecordedSet, scaled_to_pack, with_start
@@ -50,7 +48,7 @@ def identify(logs: Sequence[Log], capacity_ah: float) -> Identification:
     capacity_ah : float
         Capacity that the gauge assumes [Ah].
     """
-    return fit(logs, FitOptions(capacity_ah=capacity_ah))
+    return fit(logs, capacity_ah=capacity_ah)
 
 
 def missed_v(known: Identification, logs: Sequence[Log]) -> float:
@@ -70,7 +68,7 @@ def missed_v(known: Identification, logs: Sequence[Log]) -> float:
     )
     errors = [
         rows.voltage_v - model.voltage(rows.soc_pct, rows.temperature_c, rows.delayed_current_a)
-        for rows in prepare(logs, options)
+        for rows in (fit_rows(log, options) for log in logs)
     ]
     return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
 
@@ -248,7 +246,7 @@ def _winter(folder: Path, number: int) -> PhysicalCase:
     clean = summer_held_out(folder)
     return PhysicalCase(
         CaseLogs([], training, [trip for trip in trips if trip not in left_out], capacity),
-        model_json(known.model),
+        known.model.to_json(),
         missed_v(known, clean),
         {"left_out": left_out} if left_out else {"clean": clean},
     )
@@ -262,7 +260,7 @@ def _cold_cell(folder: Path, number: int) -> PhysicalCase:
     known = identify(read(_LG_TRAINED), LG_CAPACITY_AH)
     return PhysicalCase(
         CaseLogs([], references, read(_LG_COLD[number]), LG_CAPACITY_AH),
-        model_json(known.model),
+        known.model.to_json(),
         missed_v(known, references),
         {},
     )
@@ -279,7 +277,7 @@ def _hysteresis(folder: Path, number: int) -> PhysicalCase:
     charge = _middle(read(f"OCV_{at}_S3"), ends_full=True)
     return PhysicalCase(
         CaseLogs([], drives, [discharge, charge], _A123_CAPACITY_AH),
-        model_json(known.model),
+        known.model.to_json(),
         missed_v(known, [discharge]),
         {},
     )

@@ -18,7 +18,6 @@ import numpy as np
 
 from cangauge._io import write_text_atomic
 from cangauge.logs.canonical import write_log
-from cangauge.model.model_file import model_json
 from cangauge.validation.cases import (
     CAUSES,
     Group,
@@ -92,7 +91,7 @@ def _simulated(group: Group, folder: Path, sealed: Path) -> list[Label]:
     capacity = world.pack.capacity_ah
     training = [recording.log for recording in world.training]
     references = [recording.log for recording in world.references]
-    model = model_json(identify(training, capacity).model)
+    model = identify(training, capacity).model.to_json()
     known = identify([*training, *references], capacity)
     clean = [recording.log for recording in _clean_days(world, options)]
     floor_v = missed_v(known, clean)
@@ -121,7 +120,7 @@ def _clean_days(world: World, options: CaseOptions) -> list[Any]:
 
 def _real(group: Group, folder: Path, sealed: Path, data: Path | None) -> list[Label]:
     recorded = recorded_set(group.protocol.removeprefix("real-"), data, group.world_seed)
-    model = model_json(identify(recorded.training, recorded.capacity_ah).model)
+    model = identify(recorded.training, recorded.capacity_ah).model.to_json()
     own = {log.name for log in recorded.training}
     further = [log for log in recorded.references if log.name not in own]
     known = identify([*recorded.training, *further], recorded.capacity_ah)

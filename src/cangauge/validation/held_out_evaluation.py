@@ -13,7 +13,7 @@ from cangauge.estimate.offline import run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
-from cangauge.model.model_file import Model, load_model
+from cangauge.model.model_file import Model
 
 SETTLED_S: Final = 300.0
 """The SoC of the EKF is judged from here on, its initial SoC withheld [s]."""
@@ -39,7 +39,7 @@ def judge_later(
         Group → list of `{"log", "plain": {…}, "extended": {…}}`, the errors as sums and counts,
         so that those of several logs can be pooled.
     """
-    models = {"plain": load_model(plain), "extended": load_model(extended)}
+    models = {"plain": Model.load(plain), "extended": Model.load(extended)}
     return {
         group: [
             {"log": item["log"]}

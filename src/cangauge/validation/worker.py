@@ -22,11 +22,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, TextIO
 
-from cangauge._io import write_text_atomic
 from cangauge.diagnosis.diagnose import diagnose
 from cangauge.diagnosis.extended_model import model_file_of
 from cangauge.logs.read import read_log
-from cangauge.model.model_file import load_model, model_json
+from cangauge.model.model_file import Model
 
 SCORED = ("gap", "cause")
 
@@ -36,7 +35,7 @@ def answer(request: dict[str, Any]) -> dict[str, Any]:
     _forget_peak()
     began = time.perf_counter()
     try:
-        model = load_model(Path(request["model"]))
+        model = Model.load(Path(request["model"]))
         found = diagnose(
             [read_log(Path(path)) for path in request["logs"]],
             model,
@@ -45,7 +44,7 @@ def answer(request: dict[str, Any]) -> dict[str, Any]:
         )
         if request.get("extended") is not None:
             better = model_file_of(found.extension, model, found.extended_rmse_v)
-            write_text_atomic(Path(request["extended"]), model_json(better))
+            better.save(Path(request["extended"]))
         whole = found.to_dict(request.get("extended"))
     except Exception as error:  # noqa: BLE001 - a case that crashes counts as wrong; the next goes on
         return {

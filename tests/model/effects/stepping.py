@@ -1,4 +1,4 @@
-"""Logs and the extended model sample by sample, for the tests of effects."""
+"""Signals, and the extended model run sample by sample, for the tests of effects."""
 
 from __future__ import annotations
 
@@ -52,20 +52,20 @@ def middle(effect: Effect, pack: Pack = PACK) -> dict[str, float]:
 
 
 def within(parameter: Parameter, part: float, pack: Pack = PACK) -> float:
-    """The value at a part (0–1) of the way from the lower to the upper bound."""
+    """The value at a fraction (0–1) between the bounds."""
     low, high = parameter.bounds(pack)
     return min(max(low + part * (high - low), low), high)
 
 
 @dataclass
 class Stepped:
-    """What came out sample by sample."""
+    """Results of the sample-by-sample form."""
 
     readings: list[Reading]
     soc_pct: np.ndarray
-    """Counted by the estimator's own counter."""
+    """Counted by the estimator's counter."""
     voltage_v: np.ndarray
-    """Predicted at `asked_soc_pct` where given, else at the counted SoC."""
+    """Predicted at `asked_soc_pct` if given, else at the counted SoC."""
 
 
 def step_through(
@@ -74,7 +74,7 @@ def step_through(
     initial_soc_pct: float,
     asked_soc_pct: np.ndarray | None = None,
 ) -> Stepped:
-    """Run a log through the online model, the delay line and the counter, like the estimator."""
+    """Run a log through online model, delay line and counter, as the estimator does."""
     online = extended.online()
     line = DelayLine(extended.model.delay_s, gap_s=math.inf, spacing_s=0.0)
     counter = CoulombCounter(online.capacity_ah, gap_s=2.0)

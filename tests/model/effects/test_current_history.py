@@ -1,4 +1,4 @@
-"""What is remembered of a current is that of this very current."""
+"""The cached history of a current is used for that current only."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ def extended(**values: dict[str, float]) -> ExtendedModel:
     return model
 
 
-def test_the_model_says_the_same_with_and_without_remembering() -> None:
+def test_the_cache_does_not_change_predictions() -> None:
     model = extended(
         slow_diffusion={"ohm": 0.05, "tau_s": 400.0, "spread": 1.0, "by_slope": 1.0},
         core_temperature={"rise_k": 5.0, "late": 0.5, "tau_s": 500.0},
     )
-    kept = signals().remembering()
+    kept = signals().with_history_cache()
     for _again in range(2):
         assert np.array_equal(
             model.predict(kept, 90.0, ROWS).voltage_v,
@@ -44,12 +44,12 @@ def test_the_model_says_the_same_with_and_without_remembering() -> None:
         )
 
 
-def test_a_corrected_current_has_a_history_of_its_own() -> None:
+def test_a_corrected_current_does_not_use_the_cache() -> None:
     diffusion = {"ohm": 0.05, "tau_s": 400.0}
     plain = extended(slow_diffusion=diffusion)
     corrected = extended(slow_diffusion=diffusion, current_gain={"gain_pct": 10.0})
-    kept = signals().remembering()
-    plain.predict(kept, 90.0, ROWS)  # the measured current's is known now
+    kept = signals().with_history_cache()
+    plain.predict(kept, 90.0, ROWS)  # fills the cache for the measured current
     assert np.array_equal(
         corrected.predict(kept, 90.0, ROWS).voltage_v,
         corrected.predict(signals(), 90.0, ROWS).voltage_v,

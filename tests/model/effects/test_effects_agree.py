@@ -1,4 +1,4 @@
-"""Every effect: neutral does nothing, batch equals online, bounds scale, mid-range is visible."""
+"""Properties of every effect: neutral values, offline = online, scaling of bounds, visibility."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ CELL = VoltageModel(
 )  # fmt: skip
 
 
-def test_library_holds_every_effect_of_the_contract_in_its_family() -> None:
+def test_library_holds_every_effect_in_its_family() -> None:
     found: dict[str, set[str]] = {}
     for key, effect in LIBRARY.items():
         assert key == effect.id
         found.setdefault(effect.family, set()).add(effect.id)
     assert found == FAMILIES
-    # Structure of chemistry and build is learned, and no cause.
+    # Structure of chemistry and construction is learned from references and never a cause.
     assert {key for key, effect in LIBRARY.items() if not effect.is_cause} == {
         "ocv_shape",
         "inner_temperature",
@@ -70,19 +70,19 @@ def test_describes_itself(effect: Effect) -> None:
     named = {parameter.name for parameter in (*effect.amplitudes, *effect.shapes)}
     assert named.isdisjoint(constants)
     assert {parameter.name for parameter in effect.parameters} == named | set(constants)
-    if effect.bends_at:
-        # Taken as parts of the widest bound of the one parameter that the effect has.
+    if effect.secant_points:
+        # Fractions of the widest bound of the effect's only parameter.
         (only,) = effect.parameters
         low, high = only.bounds(PACK)
         neutral = effect.neutral(PACK)[only.name]
         widest = max(high - neutral, neutral - low)
-        for part in effect.bends_at:
+        for part in effect.secant_points:
             assert part != 0.0
             assert low <= neutral + part * widest <= high
 
 
 @each_effect
-def test_neutral_values_do_exactly_nothing(effect: Effect) -> None:
+def test_neutral_values_change_nothing(effect: Effect) -> None:
     signals = irregular_signals()
     rows = np.arange(0, signals.time_s.size, 3)
     plain = ExtendedModel(MODEL, CAPACITY_AH)
@@ -107,7 +107,7 @@ def test_neutral_values_do_exactly_nothing(effect: Effect) -> None:
 
 @each_effect
 @pytest.mark.parametrize("part", [0.0, 0.3, 0.8, 1.0])
-def test_offline_equals_online_on_irregular_samples_with_gaps(effect: Effect, part: float) -> None:
+def test_offline_equals_online_on_irregular_samples(effect: Effect, part: float) -> None:
     signals = irregular_signals(seed=int(10 * part) + 3)
     values = {item.name: within(item, part) for item in effect.parameters}
     if effect.id == "resistance_step":
@@ -128,7 +128,7 @@ def test_offline_equals_online_on_irregular_samples_with_gaps(effect: Effect, pa
 
 @pytest.mark.parametrize("delayed", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("effect_id", ["resistance_temperature", "resistance_soc"])
-def test_offline_equals_online_whichever_drop_is_scaled(effect_id: str, delayed: float) -> None:
+def test_offline_equals_online_for_each_scaled_drop(effect_id: str, delayed: float) -> None:
     signals = irregular_signals(1500, seed=8)
     effect = LIBRARY[effect_id]
     rows = np.arange(signals.time_s.size)
@@ -137,7 +137,7 @@ def test_offline_equals_online_whichever_drop_is_scaled(effect_id: str, delayed:
     batch = extended.predict(signals, 80.0, rows)
     online = step_through(extended, signals, 80.0, batch.soc_pct)
     np.testing.assert_allclose(online.voltage_v, batch.voltage_v, rtol=0.0, atol=1e-9)
-    # Each differs from the others, so that none can stand in for another.
+    # The values of `delayed` are distinguishable.
     for other in {0.0, 0.5, 1.0} - {delayed}:
         values = middle(effect) | {"delayed": other}
         beside = plain.with_effect(effect, values).predict(signals, 80.0, rows)
@@ -147,7 +147,7 @@ def test_offline_equals_online_whichever_drop_is_scaled(effect_id: str, delayed:
 @each_effect
 def test_mid_range_is_visible_on_a_drive(effect: Effect) -> None:
     log = synthetic_log(hours=1.5, start_pct=90.0, end_pct=8.0)
-    # A pack that comes out of the cold, or nothing would tell the inside's temperature.
+    # A pack that warms up, or the interior's temperature would not matter.
     warming_c = log.temperature_c - 15.0 + np.linspace(0.0, 8.0, log.time_s.size)
     signals = Signals(log.time_s, log.current_a, log.voltage_v, warming_c)
     rows = np.arange(70, log.time_s.size)
@@ -164,7 +164,7 @@ def test_amplitudes_enter_the_voltage_nearly_linearly(effect: Effect) -> None:
     base = ExtendedModel(MODEL, CAPACITY_AH)
     neutral = effect.neutral(PACK)
     for parameter in effect.amplitudes:
-        # A bump is seen where it is.
+        # A bump is visible at its SoC only.
         start_pct = float(parameter.name.split("_")[1]) if effect.id == "ocv_shape" else 80.0
         plain = base.predict(signals, start_pct, rows).residual_v
         changes = []
@@ -195,8 +195,8 @@ def test_bounds_scale_with_the_pack(effect: Effect) -> None:
 
 
 @each_effect
-def test_a_pack_of_cells_is_the_cell_times_their_number(effect: Effect) -> None:
-    """At the same part of its bounds, and currents in C-rates, the effect is as large a part."""
+def test_effects_scale_from_cell_to_pack(effect: Effect) -> None:
+    """At equal fractions of the bounds and equal C-rates, the relative effect is equal."""
     many = 96.0
     pack_model = VoltageModel(
         tuple(many * k for k in CELL.ocv_v), many * CELL.kt_v_per_k,
@@ -234,7 +234,7 @@ signal_rows = st.lists(
     st.floats(0.0, 100.0),
     st.booleans(),
 )
-def test_nothing_in_bounds_gives_nan_or_infinity(
+def test_values_within_bounds_give_finite_voltages(
     effect: Effect,
     parts: list[float],
     rows: list[tuple[float, ...]],
@@ -265,7 +265,7 @@ def test_nothing_in_bounds_gives_nan_or_infinity(
 
 
 @each_effect
-def test_missing_voltage_and_temperature_spoil_nothing_but_themselves(effect: Effect) -> None:
+def test_missing_signals_affect_only_themselves(effect: Effect) -> None:
     signals = irregular_signals(400, gaps=False)
     missing = slice(100, 150)
     voltage, temperature = signals.voltage_v.copy(), signals.temperature_c.copy()
@@ -286,7 +286,7 @@ def test_missing_voltage_and_temperature_spoil_nothing_but_themselves(effect: Ef
 
 @each_effect
 def test_is_fast_enough_for_a_search(effect: Effect) -> None:
-    """90,000 rows (2.5 h at 10 Hz) in about 10 ms; the limit leaves room for a busy machine."""
+    """90,000 rows (2.5 h at 10 Hz) take about 10 ms; the limit allows for a busy machine."""
     n = 90_000
     time_s = np.arange(n) * 0.1
     signals = Signals(

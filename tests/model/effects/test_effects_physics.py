@@ -1,4 +1,4 @@
-"""What each effect does to a pack, against results worked out by hand."""
+"""Each effect against analytical results."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def steady(
 
 
 def extra(effect_id: str, state: PackState, values: Values) -> np.ndarray:
-    """The extra voltage [V]; parameters that are not given are as if they were not there."""
+    """The extra voltage [V]; parameters not given are neutral."""
     effect = LIBRARY[effect_id]
     found = effect.extra_voltage(state, {**effect.neutral(PACK), **values}, MODEL, PACK)
     assert found is not None
@@ -41,9 +41,6 @@ def extra(effect_id: str, state: PackState, values: Values) -> np.ndarray:
 
 def with_current(state: PackState, current_a: np.ndarray) -> PackState:
     return replace(state, current_a=current_a, drop_v=current_a * sum(MODEL.resistance_ohm))
-
-
-# --- sensing ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -55,7 +52,7 @@ def with_current(state: PackState, current_a: np.ndarray) -> PackState:
         ("voltage_gain", {"gain_pct": -1.5}, "voltage_v", lambda x: x * 0.985),
     ],
 )
-def test_a_sensors_error_is_undone(
+def test_a_linear_sensor_error_is_undone(
     effect_id: str, values: Values, channel: str, wrong: Callable[[np.ndarray], np.ndarray]
 ) -> None:
     true = irregular_signals(200)
@@ -65,8 +62,8 @@ def test_a_sensors_error_is_undone(
 
 
 @pytest.mark.parametrize("skew_s", [-1.2, -0.3, 0.3, 1.2])
-def test_a_late_or_early_current_is_put_back(skew_s: float) -> None:
-    """A current that is straight between 0.1 s rows: moving it back loses nothing."""
+def test_a_skewed_current_is_realigned(skew_s: float) -> None:
+    """The current is linear between 0.1 s rows, so interpolation loses nothing."""
     time_s = np.arange(0.0, 300.0, 0.1)
     rng = np.random.default_rng(5)
     current = np.interp(time_s, np.arange(0.0, 301.0, 0.5), rng.normal(20.0, 40.0, 602))
@@ -77,7 +74,7 @@ def test_a_late_or_early_current_is_put_back(skew_s: float) -> None:
     np.testing.assert_allclose(found.current_a[inner], current[inner], atol=1e-9)
 
 
-def test_online_a_voltage_waits_for_its_late_current_and_no_longer() -> None:
+def test_online_a_voltage_waits_just_for_its_late_current() -> None:
     signals = irregular_signals(2000, gaps=False)
     extended = ExtendedModel(MODEL, CAPACITY_AH).with_effect(LIBRARY["time_skew"], {"skew_s": 0.8})
     times = [reading.time_s for reading in step_through(extended, signals, 90.0).readings]
@@ -85,7 +82,7 @@ def test_online_a_voltage_waits_for_its_late_current_and_no_longer() -> None:
     assert times == signals.time_s[known].tolist()
 
 
-def test_online_a_voltage_is_given_out_with_the_very_sample_that_brings_its_current() -> None:
+def test_online_a_voltage_leaves_with_the_sample_of_its_current() -> None:
     online = LIBRARY["time_skew"].online({"skew_s": 0.5}, MODEL, PACK)
     assert online.correct(Reading(10.0, 1.0, 371.0, 20.0)) == []
     assert online.correct(Reading(10.25, 2.0, 372.0, 20.0)) == []
@@ -93,18 +90,15 @@ def test_online_a_voltage_is_given_out_with_the_very_sample_that_brings_its_curr
 
 
 @pytest.mark.parametrize("skew_s", [-1.5, 1.5])
-def test_skew_remembers_no_more_than_it_needs(skew_s: float) -> None:
+def test_memory_of_the_skew_is_bounded(skew_s: float) -> None:
     online = LIBRARY["time_skew"].online({"skew_s": skew_s}, MODEL, PACK)
     for k in range(20_000):
         online.correct(Reading(0.01 * k, float(k % 7), 370.0, 20.0))
     assert len(online._times) < 3 * 150
 
 
-# --- thermal ------------------------------------------------------------------------------
-
-
-def test_a_lagging_sensor_is_put_ahead_on_a_ramp() -> None:
-    """Behind a ramp of 10 K an hour a lag of 600 s is 1.67 K too low, once settled."""
+def test_temperature_lag_is_undone_on_a_ramp() -> None:
+    """On a ramp of 10 K/h a lag of 600 s reads 1.67 K low once settled."""
     time_s = np.arange(0.0, 7200.0)
     true = 20.0 + time_s * 10.0 / 3600.0
     shown = low_passed(time_s, true, 600.0, 20.0)
@@ -114,7 +108,7 @@ def test_a_lagging_sensor_is_put_ahead_on_a_ramp() -> None:
     assert found.temperature_c[-1] == pytest.approx(true[-1], abs=1e-3)
 
 
-def test_core_rises_with_the_square_of_a_lasting_current() -> None:
+def test_core_rises_with_the_square_of_the_current() -> None:
     values = {"rise_k": 4.0, "late": 0.0, "tau_s": 1000.0}
     for c_rate, sign in ((1.0, 1.0), (2.0, -1.0)):
         state = steady(20_000.0, sign * c_rate * PACK.capacity_ah)
@@ -128,8 +122,8 @@ def test_core_rises_with_the_square_of_a_lasting_current() -> None:
         assert rise[-1] == pytest.approx(4.0 * c_rate**2, rel=1e-6)
 
 
-def test_core_is_behind_a_surface_that_warms_from_outside() -> None:
-    """Behind a ramp of 10 K an hour, by its time constant: 2.78 K once settled, or a part of it."""
+def test_core_lags_a_surface_that_warms_from_outside() -> None:
+    """On a ramp of 10 K/h by its time constant, 2.78 K once settled, or a fraction of it."""
     time_s = np.arange(0.0, 20_000.0)
     outside = -5.0 + time_s * 10.0 / 3600.0
     signals = Signals(time_s, np.zeros_like(time_s), np.full_like(time_s, 370.0), outside)
@@ -142,9 +136,6 @@ def test_core_is_behind_a_surface_that_warms_from_outside() -> None:
         assert outside[-1] - core[-1] == pytest.approx(behind)
 
 
-# --- charge -------------------------------------------------------------------------------
-
-
 def counted(effect_id: str, values: Values, current_a: float, hours: float) -> float:
     state = steady(3600.0 * hours, current_a)
     signals = Signals(state.time_s, state.current_a, state.current_a, state.temperature_c)
@@ -152,7 +143,7 @@ def counted(effect_id: str, values: Values, current_a: float, hours: float) -> f
     return float(extended.counted_soc(signals, 60.0)[-1])
 
 
-def test_charge_effects_count_as_stated() -> None:
+def test_charge_effects_change_the_count() -> None:
     assert counted("capacity", {"change_pct": -20.0}, 10.0, 1.0) == pytest.approx(60.0 - 25.0)
     assert counted("initial_soc", {"offset_pct": 5.0}, 10.0, 1.0) == pytest.approx(65.0 - 20.0)
     for current, expected in ((-10.0, 60.0 + 19.0), (10.0, 60.0 - 20.0)):
@@ -160,22 +151,19 @@ def test_charge_effects_count_as_stated() -> None:
         assert found == pytest.approx(expected)
 
 
-def test_a_capacity_that_the_user_insists_on_is_left_alone() -> None:
+def test_effects_do_not_change_a_capacity_set_by_the_user() -> None:
     extended = ExtendedModel(MODEL, 50.0).with_effect(LIBRARY["capacity"], {"change_pct": -20.0})
     assert extended.online().capacity_ah == pytest.approx(40.0)
     assert extended.online(47.0).capacity_ah == 47.0
 
 
-# --- resistance ---------------------------------------------------------------------------
-
-
 def at_onset(current_a: float, **state: float) -> PackState:
-    """The current has just begun: only the undelayed resistance drops, 0.4 of all of them."""
+    """A current that has just started: only the undelayed resistance, 0.4 of the sum, drops."""
     just = steady(5.0, current_a, **state)
     return replace(just, drop_v=0.4 * just.drop_v)
 
 
-def test_a_share_of_the_drop_follows_arrhenius_from_its_own_reference() -> None:
+def test_a_share_of_the_drop_follows_arrhenius() -> None:
     values = {
         "share": 0.7, "activation_k": 4000.0, "delayed": 1.0, "reference_c": 23.0, "lag_s": 0.0
     }  # fmt: skip
@@ -188,8 +176,8 @@ def test_a_share_of_the_drop_follows_arrhenius_from_its_own_reference() -> None:
     np.testing.assert_allclose(found, 0.7 * cold.drop_v * (factor - 1.0), rtol=1e-12)
 
 
-def test_a_lagging_inside_resists_as_it_was_before() -> None:
-    """The sensor falls from 23 to 0 °C at once; the inside is at 23·e^(−t/τ) °C."""
+def test_resistance_follows_the_lagging_interior() -> None:
+    """The sensor steps from 23 to 0 °C; the interior is at 23·e^(−t/τ) °C."""
     values = {
         "share": 0.7, "activation_k": 4000.0, "delayed": 1.0, "reference_c": 23.0, "lag_s": 900.0
     }  # fmt: skip
@@ -198,7 +186,7 @@ def test_a_lagging_inside_resists_as_it_was_before() -> None:
     found = extra("resistance_temperature", replace(state, temperature_c=outside), values)
     assert found[0] == 0.0
     for at in (100, 900, 2000):
-        # The sensor is taken to fall in the first second evenly: half a second later than at once.
+        # The sensor falls linearly in the first second: equivalent to a step half a second later.
         inside = 23.0 * math.exp(-(at - 0.5) / 900.0)
         factor = math.exp(4000.0 * (1.0 / (inside + 273.15) - 1.0 / 296.15))
         expected = 0.7 * state.drop_v[at] * (factor - 1.0)
@@ -214,10 +202,10 @@ def test_a_lagging_inside_resists_as_it_was_before() -> None:
         ("resistance_soc", {"at_empty": 2.0, "at_full": 0.0, "width_pct": 10.0}, 2.0 / math.e),
     ],
 )  # fmt: skip
-def test_what_is_not_delayed_scales_the_present_current_over_all_resistance(
+def test_an_undelayed_effect_scales_current_times_all_resistance(
     effect_id: str, values: Values, rise: float
 ) -> None:
-    """A current that has just begun: delayed, only what has arrived by now is scaled."""
+    """For a current that has just started, a delayed effect scales only the drop so far."""
     state = at_onset(50.0, soc_pct=10.0, temperature_c=5.0)
     whole_v = sum(MODEL.resistance_ohm) * 50.0
     assert whole_v < 0.0
@@ -235,13 +223,13 @@ def test_resistance_rises_toward_empty_and_full() -> None:
         )
 
 
-def test_asymmetry_acts_on_charging_current_alone() -> None:
+def test_asymmetry_acts_on_charging_current_only() -> None:
     values = {"charging_ohm": 0.05}
     assert not np.any(extra("resistance_asymmetry", steady(5.0, 40.0), values))
     np.testing.assert_allclose(extra("resistance_asymmetry", steady(5.0, -40.0), values), 2.0)
 
 
-def test_a_step_begins_at_its_moment_and_stays() -> None:
+def test_a_step_persists_from_its_change_point() -> None:
     state = steady(1000.0, 40.0)
     moved = replace(state, time_s=state.time_s + 5e5)
     found = extra("resistance_step", moved, {"step_ohm": 0.05, "start_s": 300.0})
@@ -249,8 +237,8 @@ def test_a_step_begins_at_its_moment_and_stays() -> None:
     np.testing.assert_allclose(found[300:], -2.0)
 
 
-def test_a_steps_moments_to_try_lie_inside_the_log() -> None:
-    """Before the start or after the end a step cannot be told from more or from no resistance."""
+def test_trial_change_points_lie_inside_the_log() -> None:
+    """Outside the log a step is not separable from a constant resistance, or from none."""
     effect = LIBRARY["resistance_step"]
     start = effect.parameters[1]
     for hours in (0.2, 3.0):
@@ -261,9 +249,6 @@ def test_a_steps_moments_to_try_lie_inside_the_log() -> None:
         np.testing.assert_allclose(np.diff(trials), 0.05 * seconds, rtol=1e-9)
         low, high = start.bounds(PACK)
         assert low <= trials[0] <= trials[-1] <= high
-
-
-# --- dynamics -----------------------------------------------------------------------------
 
 
 def test_charge_transfer_bends_between_rest_and_1c() -> None:
@@ -281,7 +266,7 @@ def test_charge_transfer_bends_between_rest_and_1c() -> None:
 @pytest.mark.parametrize("activation_k", [0.0, 5000.0])
 @pytest.mark.parametrize("bend_only", [0.0, 1.0])
 @pytest.mark.parametrize("temperature_c", [-15.0, 25.0, 40.0])
-def test_the_exchange_current_is_as_stated_at_25_c_and_falls_in_the_cold(
+def test_the_exchange_current_follows_arrhenius_from_25_c(
     temperature_c: float, bend_only: float, activation_k: float
 ) -> None:
     """I₀(T) = I₀·exp(B·(1/298.15 − 1/T)): with B = 5000 K 13 times smaller at −15 °C."""
@@ -303,7 +288,7 @@ POLARISATIONS = pytest.mark.parametrize("effect_id", ["fast_polarization", "slow
 
 
 @POLARISATIONS
-def test_polarisation_charges_and_decays_with_its_time_constant(effect_id: str) -> None:
+def test_polarisation_follows_its_time_constant(effect_id: str) -> None:
     tau = 5.0 if effect_id == "fast_polarization" else 400.0
     values = {"ohm": 0.02, "tau_s": tau, "spread": 0.0, "activation_k": 0.0}
     state = steady(40.0 * tau, 50.0)
@@ -317,7 +302,7 @@ def test_polarisation_charges_and_decays_with_its_time_constant(effect_id: str) 
 
 
 @POLARISATIONS
-def test_polarisation_rises_in_the_cold_after_arrhenius_from_25_c(effect_id: str) -> None:
+def test_polarisation_follows_arrhenius_from_25_c(effect_id: str) -> None:
     tau = 5.0 if effect_id == "fast_polarization" else 400.0
     for temperature_c, activation_k in ((25.0, 3000.0), (0.0, 3000.0), (-10.0, 6000.0), (0.0, 0.0)):
         state = steady(3.0 * tau, 50.0, temperature_c=temperature_c)
@@ -327,8 +312,8 @@ def test_polarisation_rises_in_the_cold_after_arrhenius_from_25_c(effect_id: str
         np.testing.assert_allclose(extra(effect_id, state, values), expected, rtol=1e-9, atol=1e-12)
 
 
-def test_polarisation_follows_the_present_temperature_not_that_of_the_past() -> None:
-    """It is the resistance that rises in the cold; the time constant stays."""
+def test_polarisation_scales_with_the_present_temperature() -> None:
+    """The resistance rises in the cold; the time constant does not."""
     state = steady(3000.0, 50.0, temperature_c=25.0)
     warming = replace(state, temperature_c=np.where(state.time_s < 2999.5, 0.0, 25.0))
     values = {"ohm": 0.02, "tau_s": 400.0, "spread": 0.0, "activation_k": 3000.0}
@@ -339,7 +324,7 @@ def test_polarisation_follows_the_present_temperature_not_that_of_the_past() -> 
     )
 
 
-def test_polarisation_has_decayed_after_a_night_asleep() -> None:
+def test_polarisation_has_decayed_after_a_night() -> None:
     time_s = np.concatenate([np.arange(0.0, 3600.0), 3600.0 + 8 * 3600.0 + np.arange(10.0)])
     current = np.full_like(time_s, 50.0)
     state = PackState(time_s, current, current, current, current)
@@ -349,28 +334,28 @@ def test_polarisation_has_decayed_after_a_night_asleep() -> None:
     assert abs(found[3600]) < 1e-6
 
 
-def test_spread_diffusion_answers_sooner_and_ends_at_the_same_resistance() -> None:
+def test_spread_diffusion_is_faster_with_equal_final_resistance() -> None:
     state = steady(30_000.0, 50.0)
     values = {"ohm": 0.02, "tau_s": 1000.0, "activation_k": 0.0}
     one = extra("slow_diffusion", state, values | {"spread": 0.0})
     many = extra("slow_diffusion", state, values | {"spread": 1.0})
     assert many[-1] == pytest.approx(-1.0, rel=1e-6)
     assert one[-1] == pytest.approx(-1.0, rel=1e-6)
-    # Like diffusion's, it grows at first with about the root of the time, one element's with time.
+    # At first it grows like diffusion, with the square root of time; one element grows with time.
     assert many[80] / many[20] == pytest.approx(2.0, rel=0.1)
     assert one[80] / one[20] == pytest.approx(4.0, rel=0.05)
 
 
-def test_diffusion_in_the_particles_shows_by_the_slope_of_the_open_circuit_voltage() -> None:
-    """As a shift of the charge at the surface does: U(S − δ) − U(S), δ after the current."""
+def test_particle_diffusion_follows_the_slope_of_the_ocv() -> None:
+    """Like a shift of the surface charge: U(S − δ) − U(S), with δ ∝ current."""
     drops = []
     for soc_pct in (15.0, 50.0, 85.0):
         state = steady(20_000.0, 50.0, soc_pct=soc_pct)
         values = {"ohm": 0.02, "tau_s": 500.0, "activation_k": 0.0}
-        alike = extra("slow_diffusion", state, values)[-1]
+        uniform = extra("slow_diffusion", state, values)[-1]
         steep = extra("slow_diffusion", state, values | {"by_slope": 1.0})[-1]
         half = extra("slow_diffusion", state, values | {"by_slope": 0.5})[-1]
-        assert half == pytest.approx(0.5 * (alike + steep), rel=1e-12)
+        assert half == pytest.approx(0.5 * (uniform + steep), rel=1e-12)
         drops.append(steep)
     shifted = [
         float(MODEL.pseudo_ocv(soc - 0.01)[0] - MODEL.pseudo_ocv(soc)[0])
@@ -382,17 +367,14 @@ def test_diffusion_in_the_particles_shows_by_the_slope_of_the_open_circuit_volta
     )
 
 
-# --- equilibrium and imbalance ------------------------------------------------------------
-
-
-def test_hysteresis_turns_with_charge_and_stays_through_a_rest() -> None:
+def test_hysteresis_reverses_with_charge_and_persists_at_rest() -> None:
     values = {"half_width_v": 2.0, "travel_pct": 2.0}
     per_hour = PACK.capacity_ah
     time_s = np.concatenate([np.arange(0.0, 10_000.0), 50_000.0 + np.arange(10_000.0)])
     current = np.select([time_s < 3600.0, time_s < 55_000.0], [per_hour * 0.2, 0.0], -per_hour)
     state = with_current(replace(steady(1.0, 0.0), time_s=time_s), current)
     found = extra("hysteresis", state, values)
-    # 20 % of discharge are ten times the travel: the lower branch, from the middle.
+    # 20 % of discharge is ten times the travel: from the middle to the lower branch.
     assert found[0] == 0.0
     assert found[360] == pytest.approx(-2.0 * (1.0 - math.exp(-1.0)), rel=1e-3)
     assert found[3700] == pytest.approx(-2.0, rel=1e-3)
@@ -404,7 +386,7 @@ def test_hysteresis_turns_with_charge_and_stays_through_a_rest() -> None:
     )
 
 
-def test_entropy_bounds_are_tenths_of_a_millivolt_per_kelvin_and_cell() -> None:
+def test_entropy_bounds_are_tenths_of_a_mv_per_k_and_cell() -> None:
     effect = LIBRARY["entropic_coefficient"]
     for parameter in effect.amplitudes:
         low, high = parameter.bounds(PACK)
@@ -419,7 +401,7 @@ def test_entropy_bounds_are_tenths_of_a_millivolt_per_kelvin_and_cell() -> None:
     np.testing.assert_allclose(found, 10.0 * 0.03)
 
 
-def test_the_entropic_level_is_the_same_at_every_soc_and_turns_sign_at_t_r() -> None:
+def test_the_entropic_level_is_constant_over_soc() -> None:
     values = {"level_v_per_k": 0.02, "slope_v_per_k": 0.0, "curve_v_per_k": 0.0}
     for soc_pct in (0.0, 37.0, 100.0):
         for kelvin in (-12.0, 0.0, 10.0):
@@ -428,7 +410,7 @@ def test_the_entropic_level_is_the_same_at_every_soc_and_turns_sign_at_t_r() -> 
             np.testing.assert_allclose(found, 0.02 * kelvin, rtol=1e-12, atol=1e-15)
 
 
-def test_entropy_is_that_of_the_inside_which_warms_late() -> None:
+def test_entropy_follows_the_lagging_interior() -> None:
     values = {"level_v_per_k": 0.02, "slope_v_per_k": 0.0, "curve_v_per_k": 0.0}
     state = steady(5000.0, 0.0)
     outside = np.where(state.time_s < 1.0, MODEL.t_ref_c, MODEL.t_ref_c + 10.0)
@@ -439,8 +421,8 @@ def test_entropy_is_that_of_the_inside_which_warms_late() -> None:
     assert found[5000] == pytest.approx(0.2 * (1.0 - math.exp(-5.0)), rel=1e-3)
 
 
-def test_the_entropic_slope_and_curve_are_nothing_on_average_over_the_soc() -> None:
-    """Legendre's polynomials: the level alone says what the mean over all SoC is."""
+def test_entropic_slope_and_curve_average_to_zero_over_soc() -> None:
+    """Legendre polynomials: the level alone is the mean over SoC."""
     soc = np.linspace(0.0, 100.0, 2001)
     state = replace(steady(2000.0, 0.0, temperature_c=MODEL.t_ref_c + 10.0), soc_pct=soc)
     for name in ("slope_v_per_k", "curve_v_per_k"):
@@ -450,7 +432,7 @@ def test_the_entropic_slope_and_curve_are_nothing_on_average_over_the_soc() -> N
         assert abs(np.trapezoid(found, soc)) / 100.0 < 1e-6
 
 
-def test_weak_cells_bring_the_knee_forward_and_keep_the_pack_rising() -> None:
+def test_weak_cells_advance_the_knee_of_a_rising_ocv() -> None:
     soc = np.linspace(0.0, 100.0, 1001)
     state = replace(steady(1000.0, 0.0), soc_pct=soc, temperature_c=np.full(1001, MODEL.t_ref_c))
     found = extra("weak_cell", state, {"fraction": 0.1, "deficit_pct": 15.0})
@@ -460,16 +442,13 @@ def test_weak_cells_bring_the_knee_forward_and_keep_the_pack_rising() -> None:
     assert np.all(np.diff(MODEL.pseudo_ocv(soc) + found) > 0.0)
 
 
-# --- the lag itself -----------------------------------------------------------------------
-
-
 @given(
     st.lists(st.tuples(st.floats(1e-3, 1e4), st.floats(-500.0, 500.0)), min_size=1, max_size=60),
     st.floats(0.2, 3000.0),
     st.floats(-100.0, 100.0),
     st.sampled_from([60.0, math.inf]),
 )
-def test_lag_over_arrays_equals_lag_sample_by_sample(
+def test_array_and_sample_forms_of_the_lag_agree(
     rows: list[tuple[float, float]], tau_s: float, start: float, rest_s: float
 ) -> None:
     time_s = np.cumsum([step for step, _ in rows])
@@ -488,7 +467,7 @@ def test_lag_solves_its_equation_on_a_ramp() -> None:
     np.testing.assert_allclose(found, time_s - 7.0 * -np.expm1(-time_s / 7.0), atol=1e-12)
 
 
-def test_a_lag_is_worked_out_once_for_a_current_and_anew_for_another() -> None:
+def test_a_lagged_current_is_cached_per_current() -> None:
     state = steady(600.0, 30.0)
     first = state.history.lagged_a(50.0)
     assert state.history.lagged_a(50.0) is first

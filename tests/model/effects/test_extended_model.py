@@ -1,4 +1,4 @@
-"""The extended model: nothing without effects, order, several at once, its slope over SoC."""
+"""Extended model: without effects, order of effects, combinations, slope over SoC."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stepping import EFFECTS, MODEL, irregular_signals, middle, step_through
 
-from cangauge.identify.rows import fit_rows
+from cangauge.inference.rows import FitOptions, fit_rows
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.effects.base import Reading, Signals
@@ -30,7 +30,7 @@ def signals_of(log: Log) -> Signals:
 
 
 def assert_equals_the_voltage_model(log: Log, capacity_ah: float, start_pct: float) -> None:
-    rows = fit_rows(log, capacity_ah=capacity_ah, delay_s=MODEL.delay_s, initial_soc_pct=start_pct)
+    rows = fit_rows(log, FitOptions(capacity_ah, start_pct, delay_s=MODEL.delay_s))
     expected = MODEL.voltage(rows.soc_pct, rows.temperature_c, rows.delayed_current_a)
     at = np.searchsorted(log.time_s, rows.time_s)
     found = ExtendedModel(MODEL, capacity_ah).predict(signals_of(log), start_pct, at)
@@ -39,18 +39,18 @@ def assert_equals_the_voltage_model(log: Log, capacity_ah: float, start_pct: flo
     assert np.array_equal(found.residual_v, rows.voltage_v - expected)
 
 
-def test_without_effects_it_is_the_voltage_model_to_the_last_bit() -> None:
+def test_without_effects_it_equals_the_voltage_model() -> None:
     log = synthetic_log(rate_hz=10.0, hours=0.7, start_pct=90.0, end_pct=60.0)
     assert_equals_the_voltage_model(log, CAPACITY_AH, 90.0)
 
 
 @pytest.mark.real
-def test_without_effects_it_is_the_voltage_model_on_a_real_trip(shared_data: Path) -> None:
+def test_without_effects_it_equals_the_model_on_a_real_trip(shared_data: Path) -> None:
     log = read_log(shared_data / "bmw_i3" / "TripA05.csv.gz")
     assert_equals_the_voltage_model(log, 61.75, 80.0)
 
 
-def test_without_effects_the_online_model_is_the_voltage_model_to_the_last_bit() -> None:
+def test_without_effects_the_online_form_equals_the_model() -> None:
     online = ExtendedModel(MODEL, CAPACITY_AH).online()
     assert online.plain
     assert online.capacity_ah == CAPACITY_AH
@@ -71,7 +71,7 @@ def test_soc_may_be_anchored_at_any_row() -> None:
     np.testing.assert_allclose(again.soc_pct, first.soc_pct, atol=1e-10)
 
 
-def test_the_order_in_which_effects_are_given_does_not_matter() -> None:
+def test_the_given_order_of_effects_does_not_matter() -> None:
     signals = irregular_signals(600)
     rows = np.arange(600)
     forward = ExtendedModel(MODEL, CAPACITY_AH, ALL).predict(signals, 80.0, rows)
@@ -79,7 +79,7 @@ def test_the_order_in_which_effects_are_given_does_not_matter() -> None:
     assert np.array_equal(forward.voltage_v, backward.voltage_v)
 
 
-def test_an_offset_is_taken_off_before_a_gain() -> None:
+def test_an_offset_is_corrected_before_a_gain() -> None:
     signals = irregular_signals(50)
     extended = ExtendedModel(
         MODEL,
@@ -95,7 +95,7 @@ def test_an_offset_is_taken_off_before_a_gain() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(st.sets(st.sampled_from(sorted(LIBRARY)), min_size=2, max_size=6), st.integers(0, 99))
-def test_several_effects_at_once_agree_offline_and_online(chosen: set[str], seed: int) -> None:
+def test_combined_effects_agree_offline_and_online(chosen: set[str], seed: int) -> None:
     signals = irregular_signals(400, seed)
     effects = tuple((LIBRARY[key], middle(LIBRARY[key])) for key in sorted(chosen))
     extended = ExtendedModel(MODEL, CAPACITY_AH, effects)
@@ -103,12 +103,12 @@ def test_several_effects_at_once_agree_offline_and_online(chosen: set[str], seed
     online = step_through(extended, signals, 85.0)
     n = len(online.readings)
     assert n >= 200
-    # The SoC is the counter's own here, so the knee's slope magnifies rounding.
+    # The SoC is that of the counter, so the slope of the knee magnifies rounding.
     np.testing.assert_allclose(online.soc_pct, batch.soc_pct[:n], atol=1e-8)
     np.testing.assert_allclose(online.voltage_v, batch.voltage_v[:n], atol=1e-6)
 
 
-def test_slope_over_soc_is_the_derivative_and_stays_positive() -> None:
+def test_slope_is_the_derivative_and_positive() -> None:
     extended = ExtendedModel(MODEL, CAPACITY_AH, ALL)
     online = extended.online()
     for time_s, current in enumerate((60.0, 0.0, -40.0, -200.0)):
@@ -123,8 +123,8 @@ def test_slope_over_soc_is_the_derivative_and_stays_positive() -> None:
                 assert slope == pytest.approx(numeric, rel=0.02, abs=0.01)
 
 
-def test_slope_stays_positive_where_the_voltage_turns_around() -> None:
-    """Charging hard near empty: as the SoC rises, the rise over the resistance fades faster."""
+def test_slope_stays_positive_where_the_voltage_falls() -> None:
+    """Strong charging near empty: with rising SoC the voltage over the resistance falls faster."""
     values = {"at_empty": 3.0, "at_full": 0.0, "width_pct": 10.0, "delayed": 1.0}
     online = ExtendedModel(MODEL, CAPACITY_AH, ((LIBRARY["resistance_soc"], values),)).online()
     online.advance(0.0, -200.0, 20.0, [-200.0] * 4)
@@ -135,10 +135,10 @@ def test_slope_stays_positive_where_the_voltage_turns_around() -> None:
 
 @settings(max_examples=150, deadline=None)
 @given(st.floats(-400.0, 400.0), st.floats(-30.0, 50.0), st.floats(0.0, 100.0), st.floats(0.0, 1.0))
-def test_newton_finds_a_root_with_all_effects_at_once(
+def test_newton_finds_a_root_with_all_effects(
     current: float, temperature: float, soc: float, part: float
 ) -> None:
-    """Even where an effect turns the curve around, what comes back gives the voltage asked for."""
+    """Even where an effect makes the curve fall, the root reproduces the voltage."""
     values = {"at_empty": 3.0 * part, "at_full": 1.0, "width_pct": 10.0, "delayed": 1.0}
     effects = tuple(
         (effect, values if effect.id == "resistance_soc" else middle(effect)) for effect in EFFECTS
@@ -162,10 +162,10 @@ def test_newton_finds_a_root_with_all_effects_at_once(
         ("entropic_coefficient", {"slope_v_per_k": 1e-3, "lag_s": 1800.0}),
     ],
 )
-def test_what_follows_the_temperature_begins_with_the_first_that_is_known(
+def test_lagging_effects_start_at_the_first_known_temperature(
     effect_id: str, values: dict[str, float]
 ) -> None:
-    """A car tells its temperature more rarely than its current: the first samples have none."""
+    """Temperature frames are rarer than current frames: the first samples have none."""
     extended = ExtendedModel(
         MODEL, CAPACITY_AH, ((LIBRARY[effect_id], {**middle(LIBRARY[effect_id]), **values}),)
     )

@@ -1,1 +1,1 @@
-"""Effects that the baseline model lacks: one file each, fit, offline and online side by side."""
+"""Effects that extend the voltage model, one file per family; see `base` and `library`."""

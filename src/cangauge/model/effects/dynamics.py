@@ -1,11 +1,4 @@
-"""A resistor beside a capacitor: the voltage of low-passed current, shared by two effects.
-
-Polarisation within seconds: an RC element below 10 s.
-
-Polarisation over many minutes: RC elements beyond the delay line's 70 s.
-
-Charge-transfer overpotential after Butler and Volmer: it flattens with current.
-"""
+"""Dynamics that the delay line lacks: RC elements below 10 s and beyond 70 s, charge transfer."""
 
 from __future__ import annotations
 
@@ -22,13 +15,13 @@ from cangauge.model.effects.first_order import LowPass
 from cangauge.model.effects.resistance import arrhenius, arrhenius_at
 from cangauge.model.voltage_model import VoltageModel
 
-# --- A resistor beside a capacitor: the voltage of low-passed current, shared by two effects
-
 ACTIVATION = Parameter("activation_k", "K", 0.0, 6000.0, neutral=None, grid=(0.0, 3000.0))
-"""How the element's resistance rises in the cold; it is the stated one at 25 °C."""
+"""Arrhenius activation of an RC element's resistance, which is stated at 25 °C."""
 
 
-def rc_voltage(state: PackState, ohm: float, tau_s: float, activation_k: float = 0.0) -> FloatArray:
+def _rc_voltage(
+    state: PackState, ohm: float, tau_s: float, activation_k: float = 0.0
+) -> FloatArray:
     """Return −R(T)·(lagged current) [V], shape (n,), at rest before the first sample."""
     lagged = state.history.lagged_a(tau_s)
     if activation_k:
@@ -36,47 +29,31 @@ def rc_voltage(state: PackState, ohm: float, tau_s: float, activation_k: float =
     return -ohm * lagged
 
 
-class OnlineRc(OnlineEffect):
-    """The same, one sample at a time.
+class _OnlineRc(OnlineEffect):
+    """RC elements in series, (resistance [Ω], time constant [s]) each, one sample at a time."""
 
-    Parameters
-    ----------
-    ohm : float
-        Resistance [Ω], positive.
-    tau_s : float
-        Time constant [s].
-    activation_k : float
-        Of the resistance [K].
-    """
-
-    def __init__(self, ohm: float, tau_s: float, activation_k: float = 0.0) -> None:
-        self._ohm = ohm
+    def __init__(self, elements: Sequence[tuple[float, float]], activation_k: float) -> None:
+        self._ohm = [ohm for ohm, _ in elements]
         self._activation_k = activation_k
-        self._colder = 1.0
-        self._lagged = LowPass(tau_s, 0.0, rest_s=BRIDGE_S)
+        self.lags = [LowPass(tau_s, 0.0, rest_s=BRIDGE_S) for _, tau_s in elements]
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
-        """Carry the capacitor to this sample."""
-        del drop_v
-        if self._activation_k:
-            self._colder = arrhenius_at(temperature_c, self._activation_k)
-        self._lagged.step(time_s, current_a)
+        for lag in self.lags:
+            lag.step(time_s, current_a)
+        self._set_volts(
+            arrhenius_at(temperature_c, self._activation_k) if self._activation_k else 1.0
+        )
 
-    def extra_voltage(self, soc_pct: float) -> float:
-        """Return the element's voltage [V]."""
-        del soc_pct
-        return -self._ohm * self._colder * self._lagged.value
+    def restore(self, state: Sequence[float], latest_s: float) -> None:
+        if len(state) not in {0, LowPass.STATE_SIZE * len(self.lags)}:
+            raise ValueError("not the state of this number of RC elements")
+        super().restore(state, latest_s)
+        self._set_volts(1.0)  # the temperature comes with the next sample
 
-    def memory(self) -> list[float]:
-        """Return the last sample's time, current and lagged current."""
-        return self._lagged.memory()
-
-    def remember(self, memory: Sequence[float], latest_s: float) -> None:
-        """Go on from a memory; may raise ValueError."""
-        self._lagged.remember(memory, latest_s)
-
-
-# --- Polarisation within seconds: an RC element below 10 s
+    def _set_volts(self, colder: float) -> None:
+        self.volts = sum(
+            -ohm * colder * lag.value for ohm, lag in zip(self._ohm, self.lags, strict=True)
+        )
 
 
 class FastPolarization(Effect):
@@ -100,42 +77,36 @@ class FastPolarization(Effect):
     def extra_voltage(
         self, state: PackState, values: Values, model: VoltageModel, pack: Pack
     ) -> FloatArray:
-        """Return the element's voltage [V]."""
-        del model, pack
-        return rc_voltage(state, values["ohm"], values["tau_s"], values["activation_k"])
+        return _rc_voltage(state, values["ohm"], values["tau_s"], values["activation_k"])
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        """Return the element, one sample at a time."""
-        del model, pack
-        return OnlineRc(values["ohm"], values["tau_s"], values["activation_k"])
+        return _OnlineRc([(values["ohm"], values["tau_s"])], values["activation_k"])
 
-
-# --- Polarisation over many minutes: RC elements beyond the delay line's 70 s
 
 ELEMENTS: Final = 5
 """RC elements of a spread: with the slowest at 2400 s the fastest has 9 s."""
 
 FASTER: Final = 4.0
-"""Each element is so many times faster than the one before it …"""
+"""Ratio of the time constants of neighbouring elements."""
 
 SMALLER: Final = 2.0
-"""… and has so many times less resistance: diffusion's goes with the root of the time."""
+"""Ratio of their resistances: that of diffusion goes with the square root of time."""
 
-ENDS_PCT: Final = (10.0, 90.0)
-"""The open-circuit voltage's mean slope is that between these."""
+MEAN_SLOPE_PCT: Final = (10.0, 90.0)
+"""SoC between which the mean slope of the open-circuit voltage is taken [%]."""
 
 STEEPEST: Final = 5.0
-"""No slope counts as more than this many times the mean."""
+"""Upper limit of the slope, relative to the mean."""
 
 FLATTEST: Final = 1e-6
-"""And no mean is less [V per %]: a model that does not rise has no slope to follow."""
+"""Lower limit of the mean slope [V per %], so that the ratio exists."""
 
 
 class SlowDiffusion(Effect):
     """Diffusion in the particles and the electrolyte, slower than the model's last delay.
 
-    What diffuses in the particles is charge, and it shows by the slope of the open-circuit voltage
-    (`by_slope` 1); in the electrolyte it shows alike at every SoC (0).
+    In the particles charge diffuses, and its voltage follows the slope of the open-circuit voltage
+    (`by_slope` 1); diffusion in the electrolyte is the same at every SoC (0).
     """
 
     id = "slow_diffusion"
@@ -148,11 +119,11 @@ class SlowDiffusion(Effect):
             grid=(80.0, 130.0, 220.0, 400.0, 750.0, 1400.0, 2400.0),
         ),
         Parameter(
-            "spread", "1", 0.0, 1.0, neutral=None, grid=(0.0,), elsewhere=(1.0,), formerly=0.0
+            "spread", "1", 0.0, 1.0, neutral=None, grid=(0.0,), diagnosis_values=(1.0,)
         ),
         ACTIVATION,
         Parameter(
-            "by_slope", "1", 0.0, 1.0, neutral=None, grid=(0.0,), elsewhere=(1.0,), formerly=0.0
+            "by_slope", "1", 0.0, 1.0, neutral=None, grid=(0.0,), diagnosis_values=(1.0,)
         ),
     )  # fmt: skip
     signature = "low-passed current over 70–2500 s: it decays through a rest after a drive"
@@ -165,34 +136,25 @@ class SlowDiffusion(Effect):
         " diffusion's: Oldham, J. Electroanal. Chem. 72 (1976) 371"
     )
     separated_by = (
-        "a rest of an hour after a drive: hysteresis stays, this decays;"
+        "a rest of an hour after a drive: hysteresis persists, this decays;"
         " core_temperature is even in the current"
     )
 
     def extra_voltage(
         self, state: PackState, values: Values, model: VoltageModel, pack: Pack
     ) -> FloatArray:
-        """Return the elements' voltage [V]."""
-        del pack
         total = np.zeros_like(state.current_a)
         for ohm, tau_s in _elements(values):
-            total += rc_voltage(state, ohm, tau_s, values["activation_k"])
+            total += _rc_voltage(state, ohm, tau_s, values["activation_k"])
         if values["by_slope"]:
             steepness = state.ocv_slope(model) / _mean_slope(model)
             total *= 1.0 + values["by_slope"] * (np.clip(steepness, 0.0, STEEPEST) - 1.0)
         return total
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        """Return the elements, one sample at a time."""
-        del pack
-        elements = [
-            OnlineRc(ohm, tau_s, values["activation_k"]) for ohm, tau_s in _elements(values)
-        ]
-        return (
-            _OnlineBySlope(elements, values, model)
-            if values["by_slope"]
-            else _OnlineElements(elements)
-        )
+        if values["by_slope"]:
+            return _OnlineRcBySlope(values, model)
+        return _OnlineRc(_elements(values), values["activation_k"])
 
 
 def _elements(values: Values) -> list[tuple[float, float]]:
@@ -207,75 +169,41 @@ def _elements(values: Values) -> list[tuple[float, float]]:
 
 def _mean_slope(model: VoltageModel) -> float:
     """Return the mean slope of the pseudo-OCV [V per % SoC], positive."""
-    low, high = ENDS_PCT
+    low, high = MEAN_SLOPE_PCT
     rise_v = model.pseudo_ocv_at(high)[0] - model.pseudo_ocv_at(low)[0]
     return max(rise_v / (high - low), FLATTEST)
 
 
-class _OnlineElements(OnlineEffect):
-    """RC elements in series."""
-
-    def __init__(self, elements: Sequence[OnlineRc]) -> None:
-        self._elements = elements
-
-    def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
-        """Carry the capacitors to this sample."""
-        for element in self._elements:
-            element.advance(time_s, current_a, temperature_c, drop_v)
-
-    def extra_voltage(self, soc_pct: float) -> float:
-        """Return the elements' voltage [V]."""
-        return sum(element.extra_voltage(soc_pct) for element in self._elements)
-
-    def memory(self) -> list[float]:
-        """Return what each element remembers, one after the other."""
-        return [value for element in self._elements for value in element.memory()]
-
-    def remember(self, memory: Sequence[float], latest_s: float) -> None:
-        """Go on from a memory; may raise ValueError."""
-        each, over = divmod(len(memory), len(self._elements))
-        if over:
-            raise ValueError("not that of so many elements")
-        for k, element in enumerate(self._elements):
-            element.remember(memory[k * each : (k + 1) * each], latest_s)
-
-
-class _OnlineBySlope(_OnlineElements):
-    """The same, whose voltage follows the slope of the pseudo-OCV."""
+class _OnlineRcBySlope(_OnlineRc):
+    """RC elements whose voltage follows the slope of the pseudo-OCV."""
 
     uses_soc = True
 
-    def __init__(self, elements: Sequence[OnlineRc], values: Values, model: VoltageModel) -> None:
-        super().__init__(elements)
+    def __init__(self, values: Values, model: VoltageModel) -> None:
+        super().__init__(_elements(values), values["activation_k"])
         self._by_slope = values["by_slope"]
         self._model = model
         self._mean_slope = _mean_slope(model)
 
     def extra_voltage(self, soc_pct: float) -> float:
-        """Return the elements' voltage [V]."""
         steepness = self._model.pseudo_ocv_at(soc_pct)[1] / self._mean_slope
         share = 1.0 + self._by_slope * (min(max(steepness, 0.0), STEEPEST) - 1.0)
-        return share * super().extra_voltage(soc_pct)
+        return share * self.volts
 
 
-# --- Charge-transfer overpotential after Butler and Volmer: it flattens with current
-
-ALIKE_AT_C_RATE = 1.0
-"""At this current [1/h] the bend alone adds nothing, as at none: where logs of the same pack gave
-the model's resistance, it already holds the mean slope over the currents of a drive."""
-
+BEND_ZERO_C_RATE = 1.0
+"""Current at which the bend alone is zero, as at rest [1/h]: a model identified on logs of the same
+pack already contains the mean slope over the currents of a drive."""
 
 ACTIVATION_K = 5000.0
-"""Usual of the exchange current [K], about 42 kJ/mol; `exchange_a` is that at 25 °C."""
+"""Usual activation of the exchange current [K], about 42 kJ/mol; `exchange_a` holds at 25 °C."""
 
 
 class ChargeTransfer(Effect):
-    """An overpotential v·asinh(I/2I₀), or its bend against a straight line.
+    """Butler–Volmer overpotential v·asinh(I/2I₀), or its bend against a straight line.
 
-    That line (`bend_only`) meets it at 0 and ±1 C.
-
-    `scale_v` is 2RT/F a cell and electrode (51 mV at 25 °C) times the cells in series, so the
-    bound is that of two electrodes.
+    With `bend_only` the line through 0 and ±1 C is subtracted. `scale_v` is 2RT/F per electrode
+    (51 mV at 25 °C) times the cells in series; the bound allows two electrodes.
     """
 
     id = "charge_transfer"
@@ -290,7 +218,7 @@ class ChargeTransfer(Effect):
         Parameter("bend_only", "1", 0.0, 1.0, neutral=None, grid=(0.0, 1.0)),
         Parameter(
             "activation_k", "K", 0.0, 10000.0, neutral=None, grid=(ACTIVATION_K,),
-            elsewhere=(0.0,), formerly=ACTIVATION_K,
+            diagnosis_values=(0.0,),
         ),
     )  # fmt: skip
     signature = "I − c·asinh(I/2I₀): too much drop at small currents, too little at large ones"
@@ -304,37 +232,27 @@ class ChargeTransfer(Effect):
     def extra_voltage(
         self, state: PackState, values: Values, model: VoltageModel, pack: Pack
     ) -> FloatArray:
-        """Return the bend [V]."""
-        del model
         per_a = 0.5 / values["exchange_a"] * arrhenius(state.temperature_c, values["activation_k"])
-        alike_a = ALIKE_AT_C_RATE * pack.capacity_ah
-        slope = values["bend_only"] * np.arcsinh(alike_a * per_a) / alike_a
+        zero_a = BEND_ZERO_C_RATE * pack.capacity_ah
+        slope = values["bend_only"] * np.arcsinh(zero_a * per_a) / zero_a
         bend = np.arcsinh(state.current_a * per_a) - slope * state.current_a
         return np.asarray(-values["scale_v"] * bend)
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        """Return the bend at one sample at a time."""
-        del model
-        alike_a = ALIKE_AT_C_RATE * pack.capacity_ah
-        return _ChargeTransferOnline(values, alike_a)
+        zero_a = BEND_ZERO_C_RATE * pack.capacity_ah
+        return _ChargeTransferOnline(values, zero_a)
 
 
 class _ChargeTransferOnline(OnlineEffect):
-    def __init__(self, values: Values, alike_a: float) -> None:
+    def __init__(self, values: Values, zero_a: float) -> None:
         self._scale_v = values["scale_v"]
         self._per_a = 0.5 / values["exchange_a"]
         self._bend_only = values["bend_only"]
         self._activation_k = values["activation_k"]
-        self._alike_a = alike_a
-        self._volts = 0.0
+        self._zero_a = zero_a
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
-        del time_s, drop_v
         per_a = self._per_a * arrhenius_at(temperature_c, self._activation_k)
-        slope = self._bend_only * math.asinh(self._alike_a * per_a) / self._alike_a
+        slope = self._bend_only * math.asinh(self._zero_a * per_a) / self._zero_a
         bend = math.asinh(current_a * per_a) - slope * current_a
-        self._volts = -self._scale_v * bend
-
-    def extra_voltage(self, soc_pct: float) -> float:
-        del soc_pct
-        return self._volts
+        self.volts = -self._scale_v * bend

@@ -1,11 +1,4 @@
-"""Open-circuit voltage that remembers whether the pack was charged or discharged.
-
-Open-circuit voltage whose temperature coefficient changes with SoC.
-
-Open-circuit voltage of another shape than the published formula can take.
-
-Some cells in series with less capacity than the others: they run empty first.
-"""
+"""Changes of the open-circuit voltage: hysteresis, entropy, shape, and weak cells in series."""
 
 from __future__ import annotations
 
@@ -21,8 +14,8 @@ from cangauge.model.effects.base import (
     LAG,
     WITHIN_C,
     Effect,
-    Inside,
     OnlineEffect,
+    OnlineInteriorEffect,
     Pack,
     PackState,
     Parameter,
@@ -31,14 +24,11 @@ from cangauge.model.effects.base import (
 from cangauge.model.effects.first_order import decaying_sum
 from cangauge.model.voltage_model import VoltageModel
 
-# --- Open-circuit voltage that remembers whether the pack was charged or discharged
-
 
 class Hysteresis(Effect):
     """One-state hysteresis: the state follows −sign(I) over a few per cent of charge.
 
-    It begins in the middle (0), since what went before a log is not known, and stays through a
-    rest, however long.
+    It starts at 0, since the charge before a log is unknown, and persists through any rest.
     """
 
     id = "hysteresis"
@@ -48,19 +38,19 @@ class Hysteresis(Effect):
         Parameter("half_width_v", "V", 0.0, 0.01, scale="voltage"),
         Parameter("travel_pct", "%", 0.5, 12.0, neutral=None, grid=(1.0, 2.0, 4.0, 7.0, 11.0)),
     )
-    signature = "memory of sign(I) over Ah: it turns with lasting charge or discharge, and stays"
+    signature = (
+        "memory of sign(I) over Ah: reverses with lasting charge or discharge, persists at rest"
+    )
     equation = "ΔU = M·h, dh/dt = |I|/(γ·C)·(−sign(I) − h)"
     source = "one-state model, Plett, J. Power Sources 134 (2004) 262"
     separated_by = (
         "rests of an hour after a discharge and after a charge to the same SoC:"
-        " slow_diffusion decays, this stays"
+        " slow_diffusion decays, this persists"
     )
 
     def extra_voltage(
         self, state: PackState, values: Values, model: VoltageModel, pack: Pack
     ) -> FloatArray:
-        """Return M·h [V]."""
-        del model
         seconds = np.diff(state.time_s)
         mean = 0.5 * (state.current_a[1:] + state.current_a[:-1])
         travel_as = 36.0 * pack.capacity_ah * values["travel_pct"]
@@ -68,8 +58,6 @@ class Hysteresis(Effect):
         return values["half_width_v"] * decaying_sum(decay, np.sign(mean) * np.expm1(-decay), 0.0)
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        """Return M·h at one sample at a time."""
-        del model
         return _HysteresisOnline(
             values["half_width_v"], 36.0 * pack.capacity_ah * values["travel_pct"]
         )
@@ -83,7 +71,6 @@ class _HysteresisOnline(OnlineEffect):
         self._state = 0.0
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
-        del temperature_c, drop_v
         if self._last is not None and time_s - self._last[0] <= BRIDGE_S:
             mean = 0.5 * (current_a + self._last[1])
             decay = abs(mean) * (time_s - self._last[0]) / self._travel_as
@@ -92,31 +79,27 @@ class _HysteresisOnline(OnlineEffect):
         self._last = (time_s, current_a)
 
     def extra_voltage(self, soc_pct: float) -> float:
-        del soc_pct
         return self._half_width_v * self._state
 
-    def memory(self) -> list[float]:
+    def state(self) -> list[float]:
         return [] if self._last is None else [*self._last, self._state]
 
-    def remember(self, memory: Sequence[float], latest_s: float) -> None:
+    def restore(self, state: Sequence[float], latest_s: float) -> None:
         self._last = None
-        if memory:
-            time_s, current_a, self._state = memory
+        if state:
+            time_s, current_a, self._state = state
             self._last = (time_s, current_a)
-            if not (all(map(math.isfinite, memory)) and abs(self._state) <= 1.0):
+            if not (all(map(math.isfinite, state)) and abs(self._state) <= 1.0):
                 raise ValueError("the state lies within ±1")
             if not time_s <= latest_s:
                 raise ValueError("later than the latest sample")
 
 
-# --- Open-circuit voltage whose temperature coefficient changes with SoC
-
-
 class EntropicCoefficient(Effect):
-    """Change of dU/dT: its level, slope and curvature over SoC, on top of the model's kt.
+    """Level, slope and curvature of dU/dT over SoC, in addition to the model's kt.
 
-    The bounds are ± 0.4 mV/K a cell. The temperature is that of the cells' inside, which may follow
-    the measured one late (`lag_s`, 0: at once).
+    The bounds are ±0.4 mV/K per cell. The temperature is that of the cell interior, `lag_s` behind
+    the measured one.
     """
 
     id = "entropic_coefficient"
@@ -135,68 +118,54 @@ class EntropicCoefficient(Effect):
     )
     source = "Reynier, Yazami, Fultz, J. Power Sources 119–121 (2003) 850"
     separated_by = (
-        "the same SoC, rested, at two temperatures; at one temperature it cannot be told from"
+        "the same SoC, rested, at two temperatures; at one temperature it is not separable from"
         " any other change of the OCV with SoC"
     )
 
     def extra_voltage(
         self, state: PackState, values: Values, model: VoltageModel, pack: Pack
     ) -> FloatArray:
-        """Return the additional open-circuit voltage [V]."""
-        del pack
-        warmer = np.clip(state.inside_c(values["lag_s"]), *WITHIN_C) - model.t_ref_c
+        warmer = np.clip(state.lagged_temperature_c(values["lag_s"]), *WITHIN_C) - model.t_ref_c
         x = np.clip(state.soc_pct, 0.0, 100.0) / 50.0 - 1.0
         shape = values["level_v_per_k"] + values["slope_v_per_k"] * x
         shape += values["curve_v_per_k"] * (1.5 * x * x - 0.5)
         return np.asarray(warmer * shape)
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        """Return the additional open-circuit voltage at one sample at a time."""
-        del pack
         return _EntropicCoefficientOnline(values, model.t_ref_c)
 
 
-class _EntropicCoefficientOnline(OnlineEffect):
+class _EntropicCoefficientOnline(OnlineInteriorEffect):
     uses_soc = True
 
     def __init__(self, values: Values, t_ref_c: float) -> None:
+        super().__init__(values["lag_s"])
         self._level = values["level_v_per_k"]
         self._slope = values["slope_v_per_k"]
         self._curve = values["curve_v_per_k"]
-        self._inside = Inside(values["lag_s"])
-        self.follows_temperature = self._inside.is_late
         self._t_ref_c = t_ref_c
         self._warmer = 0.0
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
-        del current_a, drop_v
         low, high = WITHIN_C
-        inside_at = self._inside.step(time_s, temperature_c)
-        self._warmer = min(max(inside_at, low), high) - self._t_ref_c
+        interior_c = self.interior.step(time_s, temperature_c)
+        self._warmer = min(max(interior_c, low), high) - self._t_ref_c
 
     def extra_voltage(self, soc_pct: float) -> float:
         x = min(max(soc_pct, 0.0), 100.0) / 50.0 - 1.0
         return self._warmer * (self._level + self._slope * x + self._curve * (1.5 * x * x - 0.5))
 
-    def memory(self) -> list[float]:
-        return self._inside.memory()
-
-    def remember(self, memory: Sequence[float], latest_s: float) -> None:
-        self._inside.remember(memory, latest_s)
-
-
-# --- Open-circuit voltage of another shape than the published formula can take
 
 CENTRES_PCT: Final = (3.0, 8.0, 14.0, 22.0, 32.0, 43.0, 54.0, 65.0, 76.0, 86.0, 94.0)
 WIDTHS_PCT: Final = (3.0, 3.5, 4.5, 5.5, 6.5, 7.0, 7.0, 7.0, 6.5, 5.5, 4.5)
-"""Middle and width of each bump [% SoC], narrower where chemistries bend more."""
+"""Centre and width of each bump [% SoC], narrower where the OCV of common chemistries bends."""
 
 
 class OcvShape(Effect):
-    """Smooth bumps over SoC.
+    """Smooth bumps over SoC: an open-circuit voltage that the published formula cannot represent.
 
-    It is structure of a chemistry and no fault: the diagnosis learns it from reference logs, and
-    never names it as a cause.
+    It is structure of a chemistry, not a fault: the diagnosis learns it from reference logs and
+    never names it.
     """
 
     id = "ocv_shape"
@@ -210,13 +179,11 @@ class OcvShape(Effect):
     signature = "a curve over SoC, the same at any current, temperature and time"
     equation = "ΔU = Σ vₖ·exp(−½((S − cₖ)/wₖ)²)"
     source = "radial basis functions, Broomhead, Lowe, Complex Systems 2 (1988) 321"
-    separated_by = "other logs over the same SoC: what is in all of them is the chemistry's"
+    separated_by = "other logs over the same SoC: what all of them share belongs to the chemistry"
 
     def extra_voltage(
         self, state: PackState, values: Values, model: VoltageModel, pack: Pack
     ) -> FloatArray:
-        """Return the additional open-circuit voltage [V]."""
-        del model, pack
         soc = np.clip(state.soc_pct, 0.0, 100.0)
         volts = np.zeros_like(soc)
         for parameter, centre, width in zip(self.parameters, CENTRES_PCT, WIDTHS_PCT, strict=True):
@@ -226,8 +193,6 @@ class OcvShape(Effect):
         return volts
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        """Return the additional open-circuit voltage at one sample at a time."""
-        del model, pack
         return _OcvShapeOnline([values[parameter.name] for parameter in self.parameters])
 
 
@@ -245,14 +210,11 @@ class _OcvShapeOnline(OnlineEffect):
         )
 
 
-# --- Some cells in series with less capacity than the others: they run empty first
-
-
 class WeakCell(Effect):
-    """A fraction of the cells whose SoC runs ahead, from full, by a capacity deficit.
+    """A fraction of the cells with a capacity deficit: from full, their SoC falls faster.
 
-    Below empty the weak cells follow the straight line on which the model goes on outside its
-    range: a cell that reverses falls faster, but a pack is stopped before that.
+    Below empty the weak cells follow the model's linear extrapolation. A reversed cell falls
+    faster, but a pack is switched off before that.
     """
 
     id = "weak_cell"
@@ -268,7 +230,7 @@ class WeakCell(Effect):
             grid=(4.0, 7.0, 11.0, 16.0, 23.0, 33.0, 48.0),
         ),
     )
-    signature = "the knee near empty comes early, by the share of the weak cells"
+    signature = "the knee near empty comes early, by the fraction of weak cells"
     equation = "ΔU = (n/N)·(OCV(S_w) − OCV(S)), 1 − S_w = (1 − S)/(1 − d)"
     source = "Dubarry, Vuillaume, Liaw, Int. J. Energy Res. 34 (2010) 216"
     separated_by = (
@@ -279,16 +241,12 @@ class WeakCell(Effect):
     def extra_voltage(
         self, state: PackState, values: Values, model: VoltageModel, pack: Pack
     ) -> FloatArray:
-        """Return what the weak cells lack [V]."""
-        del pack
         ahead = 1.0 / (1.0 - values["deficit_pct"] / 100.0)
         weak = 100.0 - (100.0 - state.soc_pct) * ahead
         lack = model.pseudo_ocv(weak) - model.pseudo_ocv(state.soc_pct)
         return np.asarray(values["fraction"] * lack)
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        """Return what the weak cells lack at one sample at a time."""
-        del pack
         return _WeakCellOnline(values["fraction"], values["deficit_pct"], model)
 
 

@@ -1,11 +1,11 @@
-"""First-order lag over irregular samples: y' = (x − y)/τ, with x linear between samples.
+"""First-order lag on irregular samples: τ·dy/dt = x − y, with x linear between samples.
 
-The same recursion offline and online, so that both give the same numbers to rounding:
+The array form and the sample-by-sample form use the same recursion and agree to rounding:
 
     y_k = a·y_{k−1} + (1 − a)·x_k + b·(x_{k−1} − x_k),   a = e^(−Δ/τ),   b = (1 − a)·τ/Δ − a
 
-Over a step longer than `rest_s` nobody saw x, and it counts as zero: y_k = a·y_{k−1}. That is the
-rule of the Coulomb counter, which takes the pack to have rested.
+Over a step longer than `rest_s` the input is unknown and counts as zero: y_k = a·y_{k−1}. The
+Coulomb counter uses the same rule: the pack is assumed to have rested.
 """
 
 from __future__ import annotations
@@ -18,11 +18,14 @@ import numpy as np
 
 from cangauge._typing import FloatArray
 
-DECAY_A_BLOCK = 300.0
-"""Time constants summed up at once: e³⁰⁰, and e⁵⁰ for a last step, are far from overflow."""
+NO_LAG_S = 1e-3
+"""A time constant up to this is no lag: output = input [s]."""
 
-NOTHING_LEFT = 50.0
-"""After so many time constants nothing is left (2·10⁻²²)."""
+BLOCK_TIME_CONSTANTS = 300.0
+"""Time constants summed in one block: e³⁰⁰, times e⁵⁰ for a last step, is far from overflow."""
+
+FULL_DECAY = 50.0
+"""Time constants after which a state has decayed completely (2·10⁻²²)."""
 
 
 def decaying_sum(decay: FloatArray, drive: FloatArray, start: float) -> FloatArray:
@@ -31,14 +34,15 @@ def decaying_sum(decay: FloatArray, drive: FloatArray, start: float) -> FloatArr
     Parameters
     ----------
     decay, drive : array of shape (n,)
-        Decay over each step, 0 or more, and what each step adds.
+        Decay over each step (≥ 0) and the increment of each step.
     start : float
+        Value before the first step.
     """
     result = np.empty(decay.size + 1)
     result[0] = start
-    # Counting no further than `NOTHING_LEFT` a step keeps e^elapsed finite.
-    elapsed = np.concatenate(([0.0], np.cumsum(np.minimum(decay, NOTHING_LEFT))))
-    blocks = np.arange(DECAY_A_BLOCK, elapsed[-1], DECAY_A_BLOCK)
+    # Limiting each step to `FULL_DECAY` keeps e^elapsed finite.
+    elapsed = np.concatenate(([0.0], np.cumsum(np.minimum(decay, FULL_DECAY))))
+    blocks = np.arange(BLOCK_TIME_CONSTANTS, elapsed[-1], BLOCK_TIME_CONSTANTS)
     edges = np.concatenate(([0], np.searchsorted(elapsed[1:], blocks), [decay.size]))
     last = start
     for first, after in itertools.pairwise(edges.tolist()):
@@ -52,7 +56,7 @@ def low_passed(
     time_s: FloatArray,
     values: FloatArray,
     tau_s: float,
-    start: float,
+    start: float | None = None,
     rest_s: float = math.inf,
 ) -> FloatArray:
     """Return the lagged values, shape (n,).
@@ -61,42 +65,51 @@ def low_passed(
     ----------
     time_s, values : array of shape (n,)
     tau_s : float
-        Time constant [s].
-    start : float
-        Value of y at the first sample.
+        Time constant [s]; up to `NO_LAG_S` the values themselves are returned.
+    start : float, optional
+        y at the first sample; the first value by default.
     rest_s : float
         Over a longer step the input counts as zero [s].
     """
+    if tau_s <= NO_LAG_S:
+        return values
     seconds = np.diff(time_s)
     step = seconds / tau_s
     rest = -np.expm1(-step)  # 1 − a
     b = rest / step - (1.0 - rest)
     drive = rest * values[1:] + b * (values[:-1] - values[1:])
-    return decaying_sum(step, np.where(seconds > rest_s, 0.0, drive), start)
+    first = float(values[0]) if start is None else start
+    return decaying_sum(step, np.where(seconds > rest_s, 0.0, drive), first)
 
 
 class LowPass:
-    """The same lag, one sample at a time; the first sample sets the state to `start`.
+    """Sample-by-sample form of `low_passed`.
 
     Parameters
     ----------
     tau_s : float
-        Time constant [s].
+        Time constant [s]; up to `NO_LAG_S` the output is the input.
     start : float, optional
-        Value of y at the first sample; the first sample's own by default.
+        y at the first sample; the first sample's value by default.
     rest_s : float
         Over a longer step the input counts as zero [s].
     """
 
+    STATE_SIZE = 3
+    """Numbers in `state` once a sample has come."""
+
     def __init__(self, tau_s: float, start: float | None = None, rest_s: float = math.inf) -> None:
+        self.is_lagging = tau_s > NO_LAG_S
+        self.value = 0.0
         self._tau_s = tau_s
         self._start = start
         self._rest_s = rest_s
         self._last: tuple[float, float] | None = None
-        self.value = 0.0
 
     def step(self, time_s: float, value: float) -> float:
-        """Take one sample and return the lagged value."""
+        """Advance to one sample and return the lagged value."""
+        if not self.is_lagging:
+            return value
         if self._last is None:
             self.value = value if self._start is None else self._start
         else:
@@ -110,18 +123,24 @@ class LowPass:
         self._last = (time_s, value)
         return self.value
 
-    def memory(self) -> list[float]:
-        """Return time [s], input and lagged value of the last sample; nothing before the first."""
+    def state(self) -> list[float]:
+        """Return time [s], input and output at the latest sample; empty before the first."""
         return [] if self._last is None else [*self._last, self.value]
 
-    def remember(self, memory: Sequence[float], latest_s: float) -> None:
-        """Go on from a memory, no later than `latest_s` [s]; may raise ValueError."""
-        if not memory:
+    def restore(self, state: Sequence[float], latest_s: float) -> None:
+        """Continue from a saved state.
+
+        Raises
+        ------
+        ValueError
+            If the state is malformed or later than `latest_s` [s].
+        """
+        if not state:
             self._last, self.value = None, 0.0
             return
-        time_s, last, self.value = memory
+        time_s, last, self.value = state
         self._last = (time_s, last)
-        if not all(map(math.isfinite, memory)):
+        if not all(map(math.isfinite, state)):
             raise ValueError("not finite")
         if not time_s <= latest_s:
             raise ValueError("later than the latest sample")

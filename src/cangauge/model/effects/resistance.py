@@ -1,13 +1,4 @@
-"""Arrhenius' law: what rises in the cold.
-
-Resistance that rises in the cold, after Arrhenius.
-
-Resistance that rises toward empty, and perhaps toward full.
-
-Resistance while charging other than while discharging.
-
-Resistance that changes at a moment: a contact works loose, or is mended.
-"""
+"""Changes of the pack's resistance: with temperature, SoC, direction of current, and in a step."""
 
 from __future__ import annotations
 
@@ -23,8 +14,8 @@ from cangauge.model.effects.base import (
     LAG,
     WITHIN_C,
     Effect,
-    Inside,
     OnlineEffect,
+    OnlineInteriorEffect,
     Pack,
     PackState,
     Parameter,
@@ -33,12 +24,11 @@ from cangauge.model.effects.base import (
 )
 from cangauge.model.voltage_model import VoltageModel
 
-# --- Arrhenius' law: what rises in the cold
-
 ZERO_C_IN_K: Final = 273.15
 COLDEST_C, HOTTEST_C = WITHIN_C
 
-USUAL_C: Final = 25.0
+REFERENCE_C: Final = 25.0
+"""Temperature at which Arrhenius factors are 1 [°C]."""
 
 
 def inverse_k(temperature_c: FloatArray) -> FloatArray:
@@ -52,25 +42,21 @@ def inverse_k_at(temperature_c: float) -> float:
 
 
 def arrhenius(temperature_c: FloatArray, activation_k: float) -> FloatArray:
-    """Return exp(B·(1/T − 1/T₂₅)), shape (n,): more than 1 below 25 °C."""
-    return np.exp(activation_k * (inverse_k(temperature_c) - 1.0 / (USUAL_C + ZERO_C_IN_K)))
+    """Return exp(B·(1/T − 1/T₂₅)), shape (n,): greater than 1 below 25 °C."""
+    return np.exp(activation_k * (inverse_k(temperature_c) - 1.0 / (REFERENCE_C + ZERO_C_IN_K)))
 
 
 def arrhenius_at(temperature_c: float, activation_k: float) -> float:
-    """Return the same of one temperature."""
+    """Return `arrhenius` of one temperature."""
     inverse = inverse_k_at(temperature_c)
-    return math.exp(activation_k * (inverse - 1.0 / (USUAL_C + ZERO_C_IN_K)))
-
-
-# --- Resistance that rises in the cold, after Arrhenius
+    return math.exp(activation_k * (inverse - 1.0 / (REFERENCE_C + ZERO_C_IN_K)))
 
 
 class ResistanceTemperature(Effect):
-    """A share of the voltage model's drop that follows Arrhenius' law.
+    """A share of the voltage model's drop that follows Arrhenius' law: it rises in the cold.
 
-    It adds nothing at `reference_c`, the middle of the temperatures that the model was identified
-    on when the effect was added. It is the cells' inside that resists, which may follow the
-    measured temperature late (`lag_s`, 0: at once).
+    It is zero at `reference_c`, the middle of the identified temperature range when the effect was
+    added. The temperature is that of the cell interior, `lag_s` behind the measured one.
     """
 
     id = "resistance_temperature"
@@ -82,7 +68,7 @@ class ResistanceTemperature(Effect):
         DELAYED,
         Parameter(
             "reference_c", "°C", *WITHIN_C, neutral=None, from_pack="temperature_c",
-            elsewhere=(-15.0, 15.0),
+            diagnosis_values=(-15.0, 15.0),
         ),
         LAG,
     )  # fmt: skip
@@ -94,56 +80,38 @@ class ResistanceTemperature(Effect):
     source = "Waag, Käbitz, Sauer, Applied Energy 102 (2013) 885"
     separated_by = (
         "the same SoC at two temperatures (a second day): where temperature and SoC move"
-        " together it cannot be told from resistance_soc"
+        " together it is not separable from resistance_soc"
     )
 
     def extra_voltage(
         self, state: PackState, values: Values, model: VoltageModel, pack: Pack
     ) -> FloatArray:
-        """Return the change of the drop [V]."""
-        del model
         drop_v = state.scaled_drop_v(values["delayed"], pack)
-        colder = inverse_k(state.inside_c(values["lag_s"])) - inverse_k_at(values["reference_c"])
+        colder = inverse_k(state.lagged_temperature_c(values["lag_s"]))
+        colder = colder - inverse_k_at(values["reference_c"])
         return values["share"] * drop_v * np.expm1(values["activation_k"] * colder)
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        """Return the change of the drop at one sample at a time."""
-        del model
         return _ResistanceTemperatureOnline(values, pack.resistance_ohm)
 
 
-class _ResistanceTemperatureOnline(OnlineEffect):
+class _ResistanceTemperatureOnline(OnlineInteriorEffect):
     def __init__(self, values: Values, resistance_ohm: float) -> None:
+        super().__init__(values["lag_s"])
         self._share = values["share"]
         self._activation_k = values["activation_k"]
         self._delayed = values["delayed"]
         self._reference_per_k = inverse_k_at(values["reference_c"])
         self._resistance_ohm = resistance_ohm
-        self._inside = Inside(values["lag_s"])
-        self.follows_temperature = self._inside.is_late
-        self._volts = 0.0
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         scaled_v = scaled_drop_at(drop_v, current_a, self._delayed, self._resistance_ohm)
-        colder = inverse_k_at(self._inside.step(time_s, temperature_c)) - self._reference_per_k
-        self._volts = self._share * scaled_v * math.expm1(self._activation_k * colder)
-
-    def extra_voltage(self, soc_pct: float) -> float:
-        del soc_pct
-        return self._volts
-
-    def memory(self) -> list[float]:
-        return self._inside.memory()
-
-    def remember(self, memory: Sequence[float], latest_s: float) -> None:
-        self._inside.remember(memory, latest_s)
-
-
-# --- Resistance that rises toward empty, and perhaps toward full
+        colder = inverse_k_at(self.interior.step(time_s, temperature_c)) - self._reference_per_k
+        self.volts = self._share * scaled_v * math.expm1(self._activation_k * colder)
 
 
 class ResistanceSoc(Effect):
-    """Relative change of the drop that falls off from empty and from full."""
+    """Relative change of the drop that decays exponentially from empty and from full."""
 
     id = "resistance_soc"
     family = "resistance"
@@ -159,22 +127,18 @@ class ResistanceSoc(Effect):
     source = "Waag, Käbitz, Sauer, Applied Energy 102 (2013) 885"
     separated_by = (
         "the same SoC at two temperatures: in one discharge SoC and temperature move together"
-        " and it cannot be told from resistance_temperature"
+        " and it is not separable from resistance_temperature"
     )
 
     def extra_voltage(
         self, state: PackState, values: Values, model: VoltageModel, pack: Pack
     ) -> FloatArray:
-        """Return the change of the drop [V]."""
-        del model
         soc, width = np.clip(state.soc_pct, 0.0, 100.0), values["width_pct"]
         rise = values["at_empty"] * np.exp(-soc / width)
         rise += values["at_full"] * np.exp((soc - 100.0) / width)
         return np.asarray(state.scaled_drop_v(values["delayed"], pack) * rise)
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        """Return the change of the drop at one sample at a time."""
-        del model
         return _ResistanceSocOnline(values, pack.resistance_ohm)
 
 
@@ -190,7 +154,6 @@ class _ResistanceSocOnline(OnlineEffect):
         self._drop_v = 0.0
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
-        del time_s, temperature_c
         self._drop_v = scaled_drop_at(drop_v, current_a, self._delayed, self._resistance_ohm)
 
     def extra_voltage(self, soc_pct: float) -> float:
@@ -200,11 +163,8 @@ class _ResistanceSocOnline(OnlineEffect):
         return self._drop_v * rise
 
 
-# --- Resistance while charging other than while discharging
-
-
 class ResistanceAsymmetry(Effect):
-    """More (or less) resistance to charging current."""
+    """Additional (or missing) resistance to charging current."""
 
     id = "resistance_asymmetry"
     family = "resistance"
@@ -215,44 +175,31 @@ class ResistanceAsymmetry(Effect):
     source = "Hu, Li, Peng, J. Power Sources 198 (2012) 359"
     separated_by = (
         "charging and discharging pulses of several sizes: charge_transfer bends with the size"
-        " of the current and alike in both directions"
+        " of the current, equally in both directions"
     )
 
     def extra_voltage(
         self, state: PackState, values: Values, model: VoltageModel, pack: Pack
     ) -> FloatArray:
-        """Return the additional rise while charging [V]."""
-        del model, pack
         return np.asarray(-values["charging_ohm"] * np.minimum(state.current_a, 0.0))
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        """Return the additional rise at one sample at a time."""
-        del model, pack
         return _ResistanceAsymmetryOnline(values["charging_ohm"])
 
 
 class _ResistanceAsymmetryOnline(OnlineEffect):
     def __init__(self, charging_ohm: float) -> None:
         self._charging_ohm = charging_ohm
-        self._volts = 0.0
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
-        del time_s, temperature_c, drop_v
-        self._volts = -self._charging_ohm * min(current_a, 0.0)
-
-    def extra_voltage(self, soc_pct: float) -> float:
-        del soc_pct
-        return self._volts
-
-
-# --- Resistance that changes at a moment: a contact works loose, or is mended
+        self.volts = -self._charging_ohm * min(current_a, 0.0)
 
 
 class ResistanceStep(Effect):
-    """Additional resistance from a moment on, counted from the log's first sample.
+    """Additional resistance from a time on: a contact works loose, or is repaired.
 
-    Online the time counts from the service's first sample. A step that has happened stays, so a
-    model meant for later drives has `start_s` = 0.
+    The time counts from the log's first sample, online from the service's first sample. A step
+    that has happened persists, so a model for later drives has `start_s` = 0.
     """
 
     id = "resistance_step"
@@ -260,20 +207,20 @@ class ResistanceStep(Effect):
     parameters = (
         Parameter("step_ohm", "ohm", -0.4, 2.0, scale="resistance"),
         Parameter(
-            "start_s", "s", 0.0, 1e7, neutral=None, is_moment=True,
+            "start_s", "s", 0.0, 1e7, neutral=None, is_change_point=True,
             grid=(0.0, 300.0, 600.0, 1200.0, 1800.0, 2700.0, 3600.0, 5400.0, 7200.0),
         ),
     )  # fmt: skip
-    signature = "I·1(t > t₀): the drop over the resistance changes at a moment and stays"
+    signature = "I·1(t > t₀): the drop over the resistance changes in a step and stays changed"
     equation = "ΔU = −r·I for t − t_first ≥ t₀, else 0"
     source = "definition"
     separated_by = (
         "the same load before and after at the same SoC and temperature:"
-        " resistance_temperature and resistance_soc come back, a step does not"
+        " resistance_temperature and resistance_soc revert, a step does not"
     )
 
     def trials(self, parameter: Parameter, pack: Pack, time_s: FloatArray) -> tuple[float, ...]:
-        """Return moments spread evenly over the log, its ends apart [s]."""
+        """Return times spread evenly over the log, without its ends [s]."""
         if parameter.name != "start_s":
             return parameter.trials(pack)
         duration = float(time_s[-1] - time_s[0])
@@ -282,14 +229,10 @@ class ResistanceStep(Effect):
     def extra_voltage(
         self, state: PackState, values: Values, model: VoltageModel, pack: Pack
     ) -> FloatArray:
-        """Return the additional drop [V]."""
-        del model, pack
         after = state.time_s - state.time_s[0] >= values["start_s"]
         return np.where(after, -values["step_ohm"] * state.current_a, 0.0)
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        """Return the additional drop at one sample at a time."""
-        del model, pack
         return _ResistanceStepOnline(values["step_ohm"], values["start_s"])
 
 
@@ -298,25 +241,19 @@ class _ResistanceStepOnline(OnlineEffect):
         self._step_ohm = step_ohm
         self._start_s = start_s
         self._first_s: float | None = None
-        self._volts = 0.0
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
-        del temperature_c, drop_v
         if self._first_s is None:
             self._first_s = time_s
         after = time_s - self._first_s >= self._start_s
-        self._volts = -self._step_ohm * current_a if after else 0.0
+        self.volts = -self._step_ohm * current_a if after else 0.0
 
-    def extra_voltage(self, soc_pct: float) -> float:
-        del soc_pct
-        return self._volts
-
-    def memory(self) -> list[float]:
+    def state(self) -> list[float]:
         return [] if self._first_s is None else [self._first_s]
 
-    def remember(self, memory: Sequence[float], latest_s: float) -> None:
+    def restore(self, state: Sequence[float], latest_s: float) -> None:
         self._first_s = None
-        if memory:
-            (self._first_s,) = memory
+        if state:
+            (self._first_s,) = state
             if not self._first_s <= latest_s:
                 raise ValueError("later than the latest sample")

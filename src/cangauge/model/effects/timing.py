@@ -1,4 +1,4 @@
-"""Current and voltage stamped apart: the current's stamps are `skew_s` late."""
+"""Time skew between current and voltage: the time stamps of the current are `skew_s` late."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from cangauge.model.voltage_model import VoltageModel
 class TimeSkew(Effect):
     """The current that belongs to a voltage is found `skew_s` later in the log.
 
-    The current is interpolated, never the voltage: averaging neighbouring voltages would lower
-    their noise and look like an improvement. Online, with a positive skew, a voltage waits until
-    its current has come, so estimates are `skew_s` late. The rows at the end of a log whose
-    current never came keep the last one offline, and are not given out online.
+    The current is interpolated, never the voltage: averaging neighbouring voltages would reduce
+    their noise and look like an improvement. Online, with a positive skew, a voltage waits for its
+    current, so estimates are `skew_s` late. The last rows of a log, whose current never arrives,
+    use the last current offline and are withheld online.
     """
 
     id = "time_skew"
@@ -49,15 +49,13 @@ class TimeSkew(Effect):
     signature = "∝ R·dI/dt: spikes of either sign at every change of load"
     equation = "I(t) = I_measured(t + skew)"
     source = "definition"
-    bends_at = (-0.9, -0.6, -0.35, -0.2, -0.1, 0.1, 0.2, 0.35, 0.6, 0.9)
+    secant_points = (-0.9, -0.6, -0.35, -0.2, -0.1, 0.1, 0.2, 0.35, 0.6, 0.9)
     separated_by = (
         "a log at 10 Hz or faster: a skew gives spikes of both signs and the same area at both"
         " ends of a pulse, fast_polarization a tail after each"
     )
 
     def correct(self, signals: Signals, values: Values, pack: Pack) -> Signals:
-        """Return the signals with the current moved."""
-        del pack
         skew_s = values["skew_s"]
         if skew_s == 0.0:
             return signals
@@ -65,8 +63,6 @@ class TimeSkew(Effect):
         return replace(signals, current_a=current)
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        """Return the correction of one sample at a time."""
-        del model, pack
         return _TimeSkewOnline(values["skew_s"]) if values["skew_s"] != 0.0 else OnlineEffect()
 
 
@@ -85,7 +81,7 @@ class _TimeSkewOnline(OnlineEffect):
         while self._waiting and self._waiting[0].time_s + self._skew_s <= reading.time_s:
             first = self._waiting.popleft()
             ready.append(first._replace(current_a=self._current_at(first.time_s + self._skew_s)))
-        self._forget(reading.time_s)
+        self._drop_stale(reading.time_s)
         return ready
 
     def _current_at(self, time_s: float) -> float:
@@ -98,26 +94,25 @@ class _TimeSkewOnline(OnlineEffect):
         c0, c1 = self._currents[right - 1], self._currents[right]
         return c0 + (c1 - c0) * (time_s - t0) / (t1 - t0)
 
-    def _forget(self, now_s: float) -> None:
-        """Drop what no later look-up can need: all before the next one, but one to the left."""
+    def _drop_stale(self, now_s: float) -> None:
         upcoming = self._waiting[0].time_s if self._waiting else now_s
         stale = bisect_right(self._times, upcoming + self._skew_s) - 1
         if stale > 64:
             del self._times[:stale]
             del self._currents[:stale]
 
-    def memory(self) -> list[float]:
+    def state(self) -> list[float]:
         flat = [value for reading in self._waiting for value in reading]
         return [float(len(self._waiting)), *flat, *self._times, *self._currents]
 
-    def remember(self, memory: Sequence[float], latest_s: float) -> None:
-        waiting = int(memory[0]) if memory else -1
+    def restore(self, state: Sequence[float], latest_s: float) -> None:
+        waiting = int(state[0]) if state else -1
         first = 1 + 4 * waiting
-        kept, odd = divmod(len(memory) - first, 2)
+        kept, odd = divmod(len(state) - first, 2)
         if waiting < 0 or kept < 0 or odd:
-            raise ValueError("not the readings that wait, and as many currents as times")
-        readings = [Reading(*memory[k : k + 4]) for k in range(1, first, 4)]
-        times, currents = list(memory[first : first + kept]), list(memory[first + kept :])
+            raise ValueError("not the waiting readings followed by times and as many currents")
+        readings = [Reading(*state[k : k + 4]) for k in range(1, first, 4)]
+        times, currents = list(state[first : first + kept]), list(state[first + kept :])
         stamps = [reading.time_s for reading in readings]
         if not all(map(math.isfinite, [*times, *currents, *stamps])):
             raise ValueError("not finite")
@@ -125,8 +120,8 @@ class _TimeSkewOnline(OnlineEffect):
             raise ValueError("times must increase")
         if times and not times[-1] <= latest_s:
             raise ValueError("later than the latest sample")
-        # What waits are the latest samples, and so are the times, as far back as they are kept.
+        # The waiting readings are the latest samples, and the kept times end with the same ones.
         both = min(waiting, kept)
         if stamps[waiting - both :] != times[kept - both :] or (waiting and not kept):
-            raise ValueError("what waits does not fit the times")
+            raise ValueError("the waiting readings do not match the times")
         self._waiting, self._times, self._currents = deque(readings), times, currents

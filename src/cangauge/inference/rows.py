@@ -1,0 +1,228 @@
+"""Rows of logs that take part in a fit, at the model's rate, and how they are held out.
+
+A row passes these rules, in this order:
+
+1. Decimation: the first sample at or after each tick of `rate_hz`; a slower log is kept whole.
+2. Start-up and shut-down: rows with a voltage below half the log's median (contactor open,
+   pre-charge) are removed, and rows within `GUARD_S` of one.
+3. Delay line: rows within the longest delay (70 s) of the log's start, or of the end of a gap in
+   the current longer than `gap_s`, are removed.
+
+Three logs or more: whole logs are held out in turn. One or two logs: interleaved blocks with a
+guard between them. The first and the last block of a log always belong to the training rows, since
+the 1/s⁴ terms explode beyond the SoC of the fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cangauge._typing import FloatArray
+from cangauge.errors import InputError
+from cangauge.logs.log import Log
+from cangauge.logs.resample import dequantize
+from cangauge.model.charge import counted_soc_pct, discharged_ah
+from cangauge.model.delay_line import GAP_S, delayed_currents, settled
+from cangauge.model.effects.base import Signals
+
+DELAYS_S = (0.0, 10.0, 30.0, 70.0)
+"""The published delays [s]."""
+
+LOW_VOLTAGE = 0.5
+"""Rows below this fraction of the log's median voltage are start-up or shut-down."""
+
+GUARD_S = 2.0
+"""Distance of a row from start-up and shut-down rows, at least [s]."""
+
+SOC_TOLERANCE_PCT = 3.0
+"""Excess of a counted SoC over 0–100 % from which the capacity or the start must be wrong [%]."""
+
+LOGS_AT_LEAST = 3
+"""From this number of logs on, whole logs are held out."""
+
+FOLDS_AT_MOST = 12
+BLOCK_S, BLOCK_GUARD_S = 240.0, 60.0
+BLOCK_FOLDS = 5
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How logs become rows and columns of a fit; the defaults are the published choices."""
+
+    capacity_ah: float
+    """Charge from 100 to 0 % [Ah]."""
+    initial_soc_pct: float | None = None
+    """SoC at each log's first row [%]; by default its reference SoC, else 100."""
+    rate_hz: float = 1.0
+    delay_s: tuple[float, ...] = DELAYS_S
+    epsilon: float = 0.05
+    t_ref_c: float = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class FitRows:
+    """Rows of one log, shape (m,) each; delayed currents (m, number of delays)."""
+
+    name: str
+    time_s: FloatArray
+    voltage_v: FloatArray
+    temperature_c: FloatArray
+    """As reported [°C]: the input of an estimator."""
+    dequantized_c: FloatArray
+    """Interpolated between the steps of the reports [°C] (`logs.resample.dequantize`)."""
+    soc_pct: FloatArray
+    """Counted SoC [%]."""
+    delayed_current_a: FloatArray
+    """I(t − dj) [A], positive = discharge."""
+    removed: dict[str, int]
+    """Number of rows removed by each rule."""
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return int(self.time_s.size)
+
+
+@dataclass(frozen=True, eq=False)
+class SampledLog:
+    """A log with its rows, as input of the extended model."""
+
+    log: Log
+    rows: FitRows
+    at: NDArray[np.intp]
+    """Index of the rows in the log, shape (m,)."""
+    initial_soc_pct: float
+    """SoC at the log's first sample [%]."""
+    signals: Signals
+    """Signals at the log's own rate."""
+
+    def with_history_cache(self) -> SampledLog:
+        """Return the log with a cache of the current's history: faster, but larger."""
+        return replace(self, signals=self.signals.with_history_cache())
+
+
+def sample_log(log: Log, options: FitOptions) -> SampledLog:
+    """Return a log with its rows and its SoC at the first sample.
+
+    Raises
+    ------
+    InputError
+        As `fit_rows`.
+    """
+    rows = fit_rows(log, options)
+    at = np.searchsorted(log.time_s, rows.time_s)
+    out_ah = discharged_ah(log.time_s, log.current_a)
+    first_pct = float(rows.soc_pct[0] + 100.0 * out_ah[at[0]] / options.capacity_ah)
+    signals = Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
+    return SampledLog(log, rows, at, first_pct, signals)
+
+
+def fit_rows(log: Log, options: FitOptions, *, gap_s: float = GAP_S) -> FitRows:
+    """Return the rows of a log that take part in a fit.
+
+    Raises
+    ------
+    InputError
+        If no row is left, or the counted SoC leaves 0–100 % by more than `SOC_TOLERANCE_PCT`.
+    """
+    source = log.source or log.name
+    capacity_ah, delay_s = options.capacity_ah, options.delay_s
+    soc = counted_soc_pct(log, capacity_ah, options.initial_soc_pct)
+    low, high = float(soc.min()), float(soc.max())
+    if low < -SOC_TOLERANCE_PCT or high > 100.0 + SOC_TOLERANCE_PCT:
+        assumed = options.initial_soc_pct is None and log.first_soc() is None
+        start = " from an assumed start at 100 %" if assumed else ""
+        raise InputError(
+            f"the SoC counted with {capacity_ah:.2f} Ah{start} runs from {high:.1f} to {low:.1f} %",
+            source=source,
+            field="soc_pct",
+            cure="check --capacity-ah, the SoC at the start (soc_pct, --initial-soc) and the sign"
+            " of current (positive must discharge; see `cangauge inspect`)",
+        )
+    ticks = decimate(log.time_s, options.rate_hz)
+    running = running_rows(log.time_s, log.voltage_v)[ticks]
+    full = settled(log.time_s, max(delay_s), log.time_s[ticks], usual_gap_s(log.time_s, gap_s))
+    keep = ticks[running & full]
+    if keep.size < 2:
+        raise InputError(
+            f"no rows are left for the fit: the log lasts {log.duration_s:.0f} s, and the first"
+            f" {max(delay_s):.0f} s, and as long after each gap, fill the delay line",
+            source=source,
+            cure="give a longer log",
+        )
+    return FitRows(
+        name=log.name,
+        time_s=log.time_s[keep],
+        voltage_v=log.voltage_v[keep],
+        temperature_c=log.temperature_c[keep],
+        dequantized_c=dequantize(log).temperature_c[keep],
+        soc_pct=soc[keep],
+        delayed_current_a=delayed_currents(log.time_s, log.current_a, delay_s, log.time_s[keep]),
+        removed={
+            "decimation": len(log) - ticks.size,
+            "start_up_or_shut_down": int(np.sum(~running)),
+            "delay_line_filling": int(np.sum(running & ~full)),
+        },
+    )
+
+
+def decimate(time_s: FloatArray, rate_hz: float) -> NDArray[np.intp]:
+    """Return the index of the first sample at or after each tick of `rate_hz`."""
+    tick = np.floor((time_s - time_s[0]) * rate_hz + 1e-6)
+    return np.flatnonzero(np.concatenate(([True], np.diff(tick) > 0.0)))
+
+
+def running_rows(time_s: FloatArray, voltage_v: FloatArray) -> NDArray[np.bool_]:
+    """Return the mask of rows that are neither start-up nor shut-down (rule 2), shape (n,)."""
+    down = voltage_v < LOW_VOLTAGE * float(np.median(voltage_v))
+    if not down.any():
+        return ~down
+    at = time_s[down]
+    right = np.searchsorted(at, time_s)
+    to_next = np.where(right < at.size, at[np.minimum(right, at.size - 1)] - time_s, np.inf)
+    to_last = np.where(right > 0, time_s - at[np.maximum(right - 1, 0)], np.inf)
+    return np.asarray(np.minimum(to_next, to_last) > GUARD_S) & ~down
+
+
+def usual_gap_s(time_s: FloatArray, gap_s: float) -> float:
+    """Return the duration of a gap in a recorded log [s]: `gap_s`, at least 3 median steps."""
+    return max(gap_s, 3.0 * float(np.median(np.diff(time_s)))) if time_s.size > 1 else gap_s
+
+
+def folds(logs: Sequence[FitRows]) -> Iterator[tuple[Mask, Mask]]:
+    """Yield (training, held out) masks over the rows of all logs, one fold at a time."""
+    owner = np.repeat(np.arange(len(logs)), [len(rows) for rows in logs])
+    if len(logs) >= LOGS_AT_LEAST:
+        number = min(len(logs), FOLDS_AT_MOST)
+        for fold in range(number):
+            held_out = owner % number == fold
+            yield ~held_out, held_out
+        return
+    block = block_numbers(logs, BLOCK_S)
+    since = np.concatenate([(rows.time_s - rows.time_s[0]) % BLOCK_S for rows in logs])
+    edge = np.zeros(block.size, dtype=bool)
+    for log in range(len(logs)):
+        numbers = block[owner == log]
+        edge |= (block == numbers[0]) | (block == numbers[-1])
+    guarded = (since >= BLOCK_GUARD_S) & (since < BLOCK_S - BLOCK_GUARD_S)
+    for fold in range(BLOCK_FOLDS):
+        of_fold = block % BLOCK_FOLDS == fold
+        held_out = of_fold & ~edge & guarded
+        if held_out.any():
+            yield ~of_fold | edge, held_out
+
+
+def block_numbers(logs: Sequence[FitRows], block_s: float) -> NDArray[np.intp]:
+    """Return the number of each row's block of `block_s`, over all logs in order, shape (n,)."""
+    numbers: list[NDArray[np.intp]] = []
+    first = 0
+    for rows in logs:
+        elapsed_s = rows.time_s - rows.time_s[0]
+        numbers.append(first + (elapsed_s // block_s).astype(np.intp))
+        first = int(numbers[-1][-1]) + 1
+    return np.concatenate(numbers)
