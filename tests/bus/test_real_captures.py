@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from cangauge._resources import shared_file
-from cangauge.bus.capture_log import capture_samples, capture_to_log
 from cangauge.bus.captures.capture import is_capture, open_capture
 from cangauge.bus.database import load_dbc
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.protection import LEAF_RULE
+from cangauge.bus.recording import capture_samples, capture_to_log
 from cangauge.bus.vehicle import Vehicle, load_vehicle
 from cangauge.inspect.capture import inspect_capture
 

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.bus.capture_log import capture_to_log
 from cangauge.bus.captures.capture import read_capture
 from cangauge.bus.database import load_dbc
+from cangauge.bus.recording import capture_to_log
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.errors import InputError
 from cangauge.logs.read import read_log

@@ -72,7 +72,7 @@ def test_a_turned_log_is_told_and_keeps_its_capacity() -> None:
     log = drive()
     found = inspect_log(replace(log, current_a=-log.current_a))
     assert found.sign.sign == -1
-    assert found.warnings[0].startswith("the sign of current is turned")
+    assert found.warnings[0].startswith("the sign of current is inverted")
     assert found.soc is not None
     assert found.soc.implied_capacity_ah == pytest.approx(40.0, rel=0.01)
 

@@ -106,7 +106,7 @@ def test_commands_can_refuse_a_turned_log() -> None:
     require_discharge_positive(log)
     with pytest.raises(
         InputError,
-        match=r"drive: current_a: the sign of current is turned: volt.*"
+        match=r"drive: current_a: the sign of current is inverted: volt.*"
         r"age moved with current in (\d+) of \1 steps.*multiply the column by -1",
     ):
         require_discharge_positive(turned(log))

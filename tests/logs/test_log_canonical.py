@@ -61,7 +61,7 @@ def test_what_is_written_reads_back_exactly(log: Log, suffix: str, tmp_path: Pat
         np.testing.assert_array_equal(back.soc_pct, log.soc_pct)
     assert back.temperature_source == log.temperature_source
     assert back.name == "log"
-    assert not [text for text in back.remarks if not text.startswith("current looks turned")]
+    assert not [text for text in back.remarks if not text.startswith("current looks inverted")]
 
 
 @pytest.mark.parametrize("delimiter", [",", ";", "\t"])
@@ -177,11 +177,14 @@ def test_temperature_source_words_are_checked(tmp_path: Path) -> None:
         for a, b in zip(CSV.splitlines(), ["Temperature_Source", "Room", ""], strict=True)
     ]
     assert read_log(write(tmp_path / "x.csv", "\n".join(rows) + "\n")).temperature_source == "room"
-    for word, words in (("oven", "not a known word"), ("pack", "one word throughout")):
+    for word, words in (
+        ("oven", "not a known temperature"),
+        ("pack", "one word throughout"),
+    ):
         text = "\n".join([*rows, f"0.2,1,380,20,{word}"] if word == "pack" else rows)
         with pytest.raises(InputError, match=words):
             read_log(write(tmp_path / "x.csv", text.replace("Room", word, word != "pack") + "\n"))
-    with pytest.raises(InputError, match="not a known temperature source"):
+    with pytest.raises(InputError, match="not a known temperature"):
         read_log(tmp_path / "x.csv", temperature_source="oven")  # type: ignore[arg-type]  # on purpose
 
 
@@ -215,7 +218,7 @@ def test_a_flipped_bit_in_parquet_is_noticed(tmp_path: Path) -> None:
 
 
 def test_writing_needs_a_known_suffix_and_leaves_nothing(tmp_path: Path, small_log: Log) -> None:
-    with pytest.raises(InputError, match=r"'\.xlsx'.*\.parquet or a \.csv"):
+    with pytest.raises(InputError, match=r"'\.xlsx'.*\.parquet or \.csv"):
         write_log(small_log, tmp_path / "x.xlsx")
     with pytest.raises(InputError, match="folder of this file does not exist"):
         write_log(small_log, tmp_path / "absent" / "x.csv")

@@ -85,7 +85,7 @@ def test_the_200_a_clamp_only_where_the_other_is_absent_or_empty(tmp_path: Path,
         emptied.append("\t".join(row))
     log = read_log(write(tmp_path, "\r\n".join(emptied) + "\r\n"))
     assert log.current_a.max() == 20.0
-    assert "HV Battery Current w/500A max clamp [A] is empty and was passed over" in log.remarks
+    assert "HV Battery Current w/500A max clamp [A] is empty and was not used" in log.remarks
 
 
 def test_two_instruments_where_none_has_both(tmp_path: Path, d3: D3) -> None:
@@ -118,7 +118,7 @@ def test_an_instrument_is_never_turned(tmp_path: Path, d3: D3) -> None:
         row[6] = str(-float(row[6]))
     log = read_log(write(tmp_path, "\r\n".join("\t".join(row) for row in lines) + "\r\n"))
     np.testing.assert_array_equal(log.current_a, -expected_current(log.time_s))
-    assert any(text.startswith("current looks turned and was kept") for text in log.remarks)
+    assert any(text.startswith("current looks inverted and was kept") for text in log.remarks)
 
 
 def test_incomplete_rows_are_dropped_up_to_a_limit(tmp_path: Path, d3: D3) -> None:

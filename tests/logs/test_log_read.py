@@ -10,7 +10,7 @@ import pytest
 
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
-from cangauge.logs.read import CaptureGivenError, read_log
+from cangauge.logs.read import read_log
 
 NAMES = (
     "log.parquet",
@@ -91,7 +91,7 @@ def test_damaged_bytes_never_break_out(
         (gzip.compress(b"", mtime=0), "the file is empty"),
         (
             b"\x00\x01\x02" * 100,
-            "not a known kind of log, nor of capture; known are: canonical Parquet",
+            "not a known kind of log; known are: canonical Parquet",
         ),
         (b"%PDF-1.4\n", r"first line: .*not a known kind of log.* \(got '%PDF-1.4'\)"),
         (b"a,b,c\n1,2,3\n", r"\(got 'a,b,c'\)"),
@@ -122,12 +122,3 @@ def test_an_encrypted_zip_is_refused(tmp_path: Path, every_format: dict[str, byt
     (tmp_path / "x.zip").write_bytes(data)
     with pytest.raises(InputError, match=r"zip cannot be unpacked: .*encrypted"):
         read_log(tmp_path / "x.zip")
-
-
-@pytest.mark.real
-def test_a_capture_asks_for_a_vehicle(shared_data: Path) -> None:
-    paths = sorted((shared_data / "leaf_can").glob("*.gz"))
-    assert len(paths) == 9
-    for path in paths:
-        with pytest.raises(CaptureGivenError, match="this is a CAN capture, not a log; give --veh"):
-            read_log(path)

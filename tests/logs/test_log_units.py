@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,7 +9,7 @@ from hypothesis import strategies as st
 
 from cangauge.errors import InputError
 from cangauge.logs.draft import DraftLog
-from cangauge.logs.file_content import FileContent
+from cangauge.logs.log import Log
 from cangauge.logs.units import convert
 
 
@@ -31,8 +29,7 @@ def drive(
 
 
 def checked(values: dict[str, np.ndarray]) -> tuple[str, ...]:
-    content = FileContent(Path("drive.csv"), b"", "drive", ())
-    return DraftLog(content, values).to_log().remarks
+    return Log(**DraftLog("drive", "drive.csv", values).checked()).remarks
 
 
 @settings(max_examples=50)

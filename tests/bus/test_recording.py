@@ -9,10 +9,10 @@ import can
 import numpy as np
 import pytest
 
-from cangauge.bus.capture_log import capture_samples, capture_to_log
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import LEAF_RULE
+from cangauge.bus.recording import capture_samples, capture_to_log
 from cangauge.bus.time_source import ClockFrames, ReceiveTime
 from cangauge.bus.vehicle import Vehicle, load_vehicle
 from cangauge.errors import InputError
@@ -103,7 +103,7 @@ def test_voltage_that_misses_is_interpolated_or_left_out(tmp_path: Path, generic
     log = capture_to_log(path, generic)
     assert len(log) == 200 - 3 - 40
     assert "4 samples without voltage: interpolated" in log.remarks
-    assert "43 samples without voltage left out" in log.remarks
+    assert "43 samples without voltage dropped" in log.remarks
     assert log.voltage_v[log.time_s > 1005.0][0] == 380.0
     assert log.time_s[0] == pytest.approx(1000.3)
 
@@ -142,7 +142,7 @@ def test_losses_and_refusals_are_told(tmp_path: Path, generic: Vehicle) -> None:
     currents[50].data[0] ^= 1
     frames = [frame for frame in frames if frame is not currents[100]]
     log = capture_to_log(record(tmp_path / "x.log", frames), generic)
-    assert "1 frames refused: CRC wrong" in log.remarks
+    assert "1 frames refused: wrong CRC" in log.remarks
     assert "1 counter jumps: at least 1 frames lost" in log.remarks
     assert len(log) == 198
 
@@ -183,7 +183,7 @@ def test_a_wrong_sign_in_the_map_is_seen_in_the_data(tmp_path: Path, generic: Ve
         'temperature.signal = "temperature_c"\n'
     )
     turned = load_vehicle(dbc=generic.dbc_files[0], map_file=tmp_path / "turned.toml")
-    assert any("current looks turned" in each for each in capture_to_log(path, turned).remarks)
+    assert any("current looks inverted" in each for each in capture_to_log(path, turned).remarks)
     assert not any("turned" in each for each in capture_to_log(path, generic).remarks)
 
 
@@ -203,7 +203,7 @@ def test_time_that_stands_still_is_refused(tmp_path: Path, generic: Vehicle) -> 
     frames = drive(generic)
     for frame in frames:
         frame.timestamp = 5.0
-    with pytest.raises(InputError, match="stands still"):
+    with pytest.raises(InputError, match="does not advance"):
         capture_to_log(record(tmp_path / "x.log", frames), generic)
 
 
@@ -216,7 +216,7 @@ def test_stamps_out_of_order_are_dropped_until_time_goes_on(
             frame.timestamp -= 0.5  # five samples arrive late
     log = capture_to_log(record(tmp_path / "x.log", frames), generic)
     assert len(log) == 195
-    assert "5 samples with time not going on dropped" in log.remarks
+    assert "5 samples dropped whose time does not advance" in log.remarks
 
 
 def test_inspection_tells_frames_protection_and_vehicle(tmp_path: Path, generic: Vehicle) -> None:
