@@ -107,6 +107,8 @@ def log_of(
     temperature_source: TemperatureSource | None,
 ) -> Log:
     """Read an opened recording; see `read_recording`."""
+    if temperature_source is not None:
+        known_temperature_source(temperature_source)
     if isinstance(recording, LogFile):
         log = recording.read(temperature_c=temperature_c, temperature_source=temperature_source)
         if vehicle is not None:
@@ -123,7 +125,7 @@ def log_of(
         )
     log = capture_to_log(recording.path, vehicle)
     if temperature_source is not None:
-        log = replace(log, temperature_source=known_temperature_source(temperature_source))
+        log = replace(log, temperature_source=temperature_source)
     return log
 
 

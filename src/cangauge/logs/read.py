@@ -52,6 +52,8 @@ class LogFile:
         """Read the log; see `read_log`."""
         if self.reader is None:
             raise not_recognised(self, "not a known kind of log", f"known are: {KNOWN_LOGS}")
+        if temperature_source is not None:
+            known_temperature_source(temperature_source)
         if temperature_c is not None and not COLDEST_C <= temperature_c <= HOTTEST_C:
             raise InputError(
                 f"must lie within {COLDEST_C:g} … {HOTTEST_C:g} °C",
@@ -61,7 +63,7 @@ class LogFile:
         draft = self.reader(self.content)
         log = Log(**draft.checked(temperature_c))
         if temperature_source is not None:
-            log = replace(log, temperature_source=known_temperature_source(temperature_source))
+            log = replace(log, temperature_source=temperature_source)
         return resolve_sign(log, stored_sign_unknown=draft.sign_unknown)
 
 
