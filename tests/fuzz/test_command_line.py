@@ -195,7 +195,7 @@ def test_no_number_of_an_option_is_out_of_its_range(
 
 
 @pytest.mark.parametrize("option", ["--initial-soc", "--initial-soc-std"])
-def test_a_soc_beyond_100_is_told_in_our_words(option: str, refused: Callable[..., str]) -> None:
+def test_a_soc_beyond_100_is_refused(option: str, refused: Callable[..., str]) -> None:
     for command in ("run", "estimate"):
         line = refused(command, *PRESENT[command], option, "150")
         assert f"{option}: must lie within 0 … 100" in line
@@ -222,7 +222,7 @@ def test_a_reference_that_rises_while_discharging(refused: Callable[..., str]) -
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "words"),
     [
         ({"capacity_a": 50.0}, "capacity_a: unknown key; did you mean capacity_ah?"),
         ({"range": {"soc_pc": [0, 100]}}, "range.soc_pc: unknown key; did you mean soc_pct?"),
@@ -235,17 +235,17 @@ def test_a_reference_that_rises_while_discharging(refused: Callable[..., str]) -
     ],
 )
 def test_mistakes_in_a_model_file(
-    change: dict[str, Any], told: str, refused: Callable[..., str], model_text: str
+    change: dict[str, Any], words: str, refused: Callable[..., str], model_text: str
 ) -> None:
     tree = json.loads(model_text)
     for key, value in change.items():
         tree[key] = {**tree[key], **value} if isinstance(value, dict) else value
     Path("model.json").write_text(json.dumps(tree))
-    assert told in refused("estimate", "log.csv", "-m", "model.json", "-o", "out.csv")
+    assert words in refused("estimate", "log.csv", "-m", "model.json", "-o", "out.csv")
 
 
 @pytest.mark.parametrize("name", ["x.log", "x.blf", "x.csv", "x.asc"])
-def test_junk_is_told_to_be_neither_log_nor_capture(name: str, refused: Callable[..., str]) -> None:
+def test_junk_is_neither_log_nor_capture(name: str, refused: Callable[..., str]) -> None:
     Path(name).write_bytes(bytes(range(256)) * 40)
     for args in (("inspect", name), ("replay", name), ("fit", name, "-o", "out.json"),
                  ("inspect", name, "--vehicle", "leaf_ze0")):  # fmt: skip
@@ -259,12 +259,12 @@ def test_what_is_no_file(command: str, refused: Callable[..., str]) -> None:
     os.mkfifo("pipe")
     Path("folder").mkdir()
     Path("empty").touch()
-    for name, told in (
+    for name, words in (
         ("pipe", "a pipe"), ("folder", "a folder"), ("empty", "empty|is no JSON"),
         ("/dev/zero", "a device"), ("absent", "no such file"),
     ):  # fmt: skip
         args = ["-m", name] if command == "run" else [name, *VALID[command][1:]]
-        assert re.search(told, refused(command, *args))
+        assert re.search(words, refused(command, *args))
     Path("drive.log").write_bytes(corpus.capture_files()["candump.log"])
     Path("car.dbc").write_text(corpus.DBC)
     Path("car.toml").write_text(corpus.MAP)

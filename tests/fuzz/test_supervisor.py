@@ -15,7 +15,7 @@ from fuzzing.targets import targets
 
 
 @pytest.mark.slow
-def test_what_hangs_dies_raises_and_grows_is_found_and_all_the_rest_is_tried() -> None:
+def test_hangs_deaths_errors_and_growth_are_found() -> None:
     done: list[int] = []
     tallies = fuzz(
         [Share("naughty", 0, 30), Share("naughty", 30, 60)],

@@ -11,11 +11,11 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
+from log_strategies import logs
 
 from cangauge.errors import InputError
 from cangauge.logs.canonical import write_log, write_table
-from cangauge.logs.log import TEMPERATURE_SOURCES, Log
+from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 
 CSV = "time_s,current_a,voltage_v,temperature_c\n0.0,1.5,380.0,20\n0.1,-2.5,381.0,20.5\n"
@@ -24,27 +24,6 @@ CSV = "time_s,current_a,voltage_v,temperature_c\n0.0,1.5,380.0,20\n0.1,-2.5,381.
 def write(path: Path, text: str) -> Path:
     path.write_text(text, encoding="utf-8", newline="")
     return path
-
-
-@st.composite
-def logs(draw: st.DrawFn) -> Log:
-    rows = draw(st.integers(1, 30))
-    steps = draw(hnp.arrays(float, rows, elements=st.floats(1e-3, 50.0)))
-
-    def channel(low: float, high: float) -> np.ndarray:
-        return draw(hnp.arrays(float, rows, elements=st.floats(low, high)))
-
-    soc = draw(st.none() | st.just(channel(2.0, 100.0)))
-    if soc is not None:
-        soc[draw(hnp.arrays(bool, rows))] = np.nan
-    return Log(
-        time_s=draw(st.floats(-1e3, 1e9)) + np.cumsum(steps),
-        current_a=channel(-2000.0, 2000.0),
-        voltage_v=channel(1.0, 1500.0),
-        temperature_c=channel(-60.0, 61.0),
-        soc_pct=soc,
-        temperature_source=draw(st.sampled_from(TEMPERATURE_SOURCES)),
-    )
 
 
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])

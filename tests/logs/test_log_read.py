@@ -70,7 +70,7 @@ def test_cut_off_at_every_byte_it_reads_or_is_refused(
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_damaged_bytes_never_break_out(
+def test_damaged_bytes_raise_nothing_but_input_errors(
     tmp_path: Path, every_format: dict[str, bytes], name: str
 ) -> None:
     rng = np.random.default_rng(7)
@@ -100,7 +100,7 @@ def test_damaged_bytes_never_break_out(
         (b"PAR1not parquet", "Parquet file is cut off or damaged"),
     ],
 )
-def test_what_is_no_log_is_said_in_one_line(tmp_path: Path, content: bytes, words: str) -> None:
+def test_unknown_content_is_refused_in_one_line(tmp_path: Path, content: bytes, words: str) -> None:
     path = tmp_path / "x"
     path.write_bytes(content)
     with pytest.raises(InputError, match=words) as caught:
