@@ -1,4 +1,4 @@
-"""Capture files of all kinds → messages."""
+"""Captures of all formats are read as messages."""
 
 from __future__ import annotations
 
@@ -190,7 +190,7 @@ def test_what_python_can_records_is_read_back(tmp_path: Path, name: str, packed:
 
 
 def read_or_refuse(path: Path) -> int:
-    """Return how many frames there are; 0 where it is refused. Anything else is an error."""
+    """Return the number of frames; 0 where it is refused. Any other error fails the test."""
     try:
         return sum(1 for _ in read_capture(path))
     except InputError as error:

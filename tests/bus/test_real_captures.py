@@ -151,7 +151,7 @@ def test_jumps_with_valid_crcs_are_losses_not_refusals(folder: Path) -> None:
     fate = samples.counters.messages[0x1DB]
     assert (fate.wanted, fate.crc_errors, fate.counter_repeats) == (1911, 0, 0)
     assert fate.counter_jumps == 488
-    # 89 of them stand still, after 4 periods or more: 3 or more frames are missing there.
+    # 89 counters repeat after 4 periods or more: 3 or more frames are missing there.
     assert fate.frames_lost == 787
     assert len(samples) == 1910  # one has no current
 
@@ -188,10 +188,10 @@ def test_maximum_energy_alternates_with_present_energy(folder: Path) -> None:
 
 
 def test_a_capture_decodes_the_same_frame_by_frame(folder: Path) -> None:
-    """The log is what the assembler gives, bit for bit."""
+    """The log has the decoder's samples, bit for bit."""
     name = "10bars.csv.gz"
-    assembler = SampleDecoder(vehicle_of(name))
-    made = [s for m in open_capture(folder / name) if (s := assembler.handle(m)) is not None]
+    decoder = SampleDecoder(vehicle_of(name))
+    made = [s for m in open_capture(folder / name) if (s := decoder.handle(m)) is not None]
     log = capture_to_log(folder / name, vehicle_of(name))
     assert [each.time_s for each in made] == log.time_s.tolist()
     assert [each.current_a for each in made] == log.current_a.tolist()

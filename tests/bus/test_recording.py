@@ -143,12 +143,12 @@ def test_samples_are_those_of_the_live_service_to_the_last_bit(
         f for f in drive(generic) if not (f.arbitration_id == VOLTAGE_ID and f.timestamp < 1003)
     ]
     path = record(tmp_path / "drive.log", frames)
-    live, clock, assembler = [], ReceiveTime(), SampleDecoder(generic)
+    live, clock, decoder = [], ReceiveTime(), SampleDecoder(generic)
     for message in can.LogReader(path):
         time_s = clock.time_of(message)
         assert time_s is not None
         message.timestamp = time_s
-        if (sample := assembler.handle(message)) is not None:
+        if (sample := decoder.handle(message)) is not None:
             live.append(sample)
     offline = list(capture_samples(path, generic))
     assert len(live) == len(offline) == 200

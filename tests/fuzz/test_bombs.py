@@ -1,4 +1,4 @@
-"""Small files that unpack, or take time, without bounds: refused within bounds of both."""
+"""Small files of huge content, or of huge run time, are refused within bounds of both."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from fuzzing import corpus
 
 MIB = 1 << 20
 SECONDS = 10.0
-"""CPU time that any of them may take: the machine may be slow, a hang takes for ever."""
+"""Largest CPU time of a case [s]: generous for slow machines, far below a hang."""
 MEMORY = 1500 * MIB
 HEADER = b"time_s,current_a,voltage_v,temperature_c\n"
 FRAME = b"(1436509052.249713) can0 1DB#0004C262000003B6\n"
@@ -58,7 +58,7 @@ def frame_object(length: int = 48) -> bytes:
 
 
 def big_gzip(part: bytes, count: int, head: bytes = b"") -> bytes:
-    """`head` and then `part` so many times, packed without ever standing in memory."""
+    """Pack `head` and `count` times `part`, without holding the content in memory."""
     packer = zlib.compressobj(9, wbits=31)
     step = part * 1000
     parts = [packer.compress(head), *(packer.compress(step) for _ in range(count // 1000))]
@@ -66,7 +66,7 @@ def big_gzip(part: bytes, count: int, head: bytes = b"") -> bytes:
 
 
 def lying_zip() -> bytes:
-    """A member that says it has 100 bytes, and unpacks to 100 MB."""
+    """A member whose header states 100 bytes and that unpacks to 100 MB."""
     out = io.BytesIO()
     with (
         zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive,
@@ -139,7 +139,7 @@ CAPTURES: dict[str, Callable[[], bytes]] = {
 
 
 def refused(run: Callable[[], object]) -> str:
-    """Run it within bounds; return what it was refused with, "" if it was read.
+    """Run it within bounds; return the error message, "" if it was read.
 
     In a process of its own, which may have only so much memory and is ended if it hangs.
     """
@@ -169,7 +169,7 @@ def _bounded(run: Callable[[], object], answer: Connection) -> None:
         message = ""
     except InputError as error:
         message = str(error)
-    # Whatever else is raised ends the process without an answer.
+    # Any other error ends the process without an answer.
     answer.send((message, time.process_time() - began))
 
 
@@ -296,7 +296,7 @@ def test_stamps_that_are_no_time_are_malformed(tmp_path: Path) -> None:
 
 
 def test_python_cans_log_lines_are_not_printed(tmp_path: Path) -> None:
-    """python-can logs a line for each."""
+    """python-can logs a line for each unknown object."""
     odd = struct.pack("<4sHHLL", b"LOBJ", 16, 7, 32, 1) + bytes(16)
     (tmp_path / "x.blf").write_bytes(blf(container(odd * 1000 + frame_object())))
     code = (

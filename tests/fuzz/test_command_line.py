@@ -1,4 +1,4 @@
-"""Every command of `cangauge --help`, wrongly used: exit 2, one clear line, nothing written."""
+"""Wrong use of every command: exit code 2, one clear line, nothing written."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cangauge.cli.app import app, main
 from fuzzing import corpus
 
 # `status` answers 1 where no service runs, and `gap-check` draws its own cases: they are tested in
-# tests/service and tests/gapcheck.
+# tests/service and tests/validation.
 ELSEWHERE = {"status", "gap-check"}
 GROUP: Any = typer.main.get_command(app)
 COMMANDS: dict[str, Any] = {
@@ -26,7 +26,7 @@ COMMANDS: dict[str, Any] = {
     if name not in ELSEWHERE
 }
 VALID = {
-    # Complete but for a file that is not there, so that none of them ever begins to work.
+    # Complete but for an absent file, so that none of them starts to work.
     "demo": ["--folder", "file.txt"],
     "fit": ["absent.csv", "-o", "out.json"],
     "estimate": ["absent.csv", "-m", "model.json", "-o", "out.csv"],
@@ -59,7 +59,7 @@ def run(
     capfd: pytest.CaptureFixture[str],
     model_text: str,
 ) -> Run:
-    """Run `cangauge ARG…` in a folder of its own."""
+    """Run `cangauge ARG…` in an empty folder."""
     monkeypatch.chdir(tmp_path)
     Path("model.json").write_text(model_text)
     Path("file.txt").write_text("x\n")
@@ -78,7 +78,7 @@ def run(
 
 @pytest.fixture
 def refused(run: Run) -> Callable[..., str]:
-    """Run it; return the one line that it is refused with. Nothing may be left in the folder."""
+    """Run it; return its one line of error. Nothing may be left in the folder."""
 
     def call(*args: str) -> str:
         before = {path: path.stat().st_mtime_ns for path in Path().iterdir()}
@@ -151,7 +151,7 @@ def _without(args: list[str], parameter: Any) -> list[str]:
 def test_every_option_with_every_kind_of_wrong_value(
     command: str, parameter: Any, refused: Callable[..., str]
 ) -> None:
-    """Valid ones among them end at the missing file; none may end in a traceback or a file."""
+    """Valid ones fail at the absent file; none may end in a traceback or write a file."""
     if command != "demo":  # whose folder may have any name
         for value in WRONG:
             spelt = f"{parameter.opts[-1]}={value}"

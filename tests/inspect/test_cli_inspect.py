@@ -1,4 +1,4 @@
-"""`cangauge inspect`: one JSON object, or a table and sentences; clear refusals."""
+"""`cangauge inspect`: one JSON object, or a table and sentences; clear errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `inspect_log` says about a log: rates, gaps, steps, stuck channels, charge, abilities."""
+"""`inspect_log`: rates, gaps, quantization, stuck channels, charge, abilities."""
 
 from __future__ import annotations
 

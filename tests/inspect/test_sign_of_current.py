@@ -1,4 +1,4 @@
-"""The sign of current is found where the data hold it, and left open where they do not."""
+"""The sign of current is found where the data show it, and left open elsewhere."""
 
 from __future__ import annotations
 

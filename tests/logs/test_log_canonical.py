@@ -1,4 +1,4 @@
-"""Canonical logs: what is written reads back; what is wrong is named."""
+"""Canonical logs: they read back exactly; errors name the column and row."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ANL D3 tests: three spellings, clamps, copies from CAN, zips, blemishes."""
+"""ANL D3 tests: three spellings, clamps, copies from CAN, zips, incomplete rows."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cangauge.logs.read import read_log
 
 
 class D3(NamedTuple):
-    """Headings by spelling, and what builds a file with them."""
+    """Headings by spelling, and a builder of files with them."""
 
     headers: dict[str, list[str]]
     text: Callable[..., str]

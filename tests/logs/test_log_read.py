@@ -46,7 +46,7 @@ def test_whole_files_read_gzipped_too(
 
 
 def outcome(path: Path, data: bytes) -> Log | InputError:
-    """The log, or the error that says why there is none; anything else breaks the test."""
+    """Return the log or the InputError; anything else fails the test."""
     path.write_bytes(data)
     try:
         return read_log(path)

@@ -21,7 +21,7 @@ def drive() -> Log:
 
 
 def steady(volts: float) -> Log:
-    """A cycler's discharge by a constant current, whose cells warm."""
+    """A cycler's discharge at constant current, with warming cells."""
     log = synthetic_log(hours=0.5, start_pct=80.0, end_pct=55.0)
     falling = np.linspace(1.02, 0.95, len(log))
     return replace(
@@ -81,7 +81,7 @@ def test_kelvin_stays_kelvin_whatever_the_battery(volts: float, tmp_path: Path) 
 
 
 def test_without_a_varying_current_both_cures_are_named(tmp_path: Path) -> None:
-    """300 and 24, hardly moving: a module in kelvin, or an empty pack in °C the wrong way round."""
+    """300 and 24, almost constant: a module in kelvin, or an empty pack with swapped columns."""
     for log in (in_kelvin(steady(24.0)), swapped(steady(300.0))):
         error = refusal(log, tmp_path)
         assert error.problem == "temperature looks like kelvin"

@@ -1,4 +1,4 @@
-"""Wrong units are found from the values, whatever the battery; right ones pass."""
+"""Wrong units are recognised from the values of any battery; correct ones pass."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_a_wrong_unit_names_field_value_and_cure(
 
 
 def test_a_fast_log_in_milliseconds_is_known_by_its_charge() -> None:
-    """100 Hz in ms looks like rows every 10 s; but the charge is hours of the peak current."""
+    """100 Hz in ms looks like rows every 10 s, but moves hours of the peak current."""
     values = drive(interval_s=0.01)
     values["time_s"] = np.rint(np.arange(200_000) * 10.0)
     values["current_a"] = np.where(np.arange(200_000) % 1000 < 200, 150.0, 10.0)

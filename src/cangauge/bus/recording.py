@@ -15,9 +15,8 @@ from typing import Final
 
 import numpy as np
 from can.typechecking import Channel
-from numpy.typing import NDArray
 
-from cangauge._typing import FloatArray
+from cangauge._typing import BoolArray, FloatArray
 from cangauge.bus.captures.capture import (
     CLOCK_ID,
     CLOCK_PERIOD_S,
@@ -410,7 +409,7 @@ def _filled_voltage(
 def _filled_temperature(
     temperature_c: FloatArray, path: Path, vehicle: Vehicle, remarks: list[str]
 ) -> FloatArray:
-    known: NDArray[np.bool_] = np.isfinite(temperature_c)
+    known: BoolArray = np.isfinite(temperature_c)
     if not known.any():
         raise InputError(
             "the capture gives no temperature",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 PIPED_WIDTH = 140
 """Width of the tables where stdout is no terminal [characters]."""
+_NESTED = (Mapping, list, tuple)
 _MARKS = {"yes": "[green]yes[/]", "partly": "[yellow]partly[/]", "no": "[red]no[/]"}
 
 
@@ -75,7 +76,11 @@ def inspect_command(  # noqa: PLR0917 - typer fills the arguments by name
         if given:
             option, value = next(iter(given.items()))
             raise InputError(
-                f"{path} is a log and no capture", field=option, value=value, cure="omit it"
+                "this is a log; the option is for captures",
+                source=path,
+                field=option,
+                value=value,
+                cure="omit it",
             )
         found: LogInspection | CaptureInspection = inspect_log(
             recording.read(temperature_c=temperature)
@@ -120,7 +125,7 @@ def _show_log(console: Console, found: LogInspection) -> None:
         )
     console.print(table)
     console.print(
-        f"Charge: {charge.discharged_ah:.4g} Ah taken out, {charge.charged_ah:.4g} Ah put in,"
+        f"Charge: {charge.discharged_ah:.4g} Ah discharged, {charge.charged_ah:.4g} Ah charged,"
         f" net {charge.net_ah:+.4g} Ah."
     )
     if soc is not None:
@@ -130,7 +135,7 @@ def _show_log(console: Console, found: LogInspection) -> None:
         )
     console.print(f"Sign: {found.sign.sentence}.", markup=False)
     abilities = Table(title="What this log can identify", title_justify="left")
-    for heading in ("what", "can", "because"):
+    for heading in ("quantity", "identifiable", "reason"):
         abilities.add_column(heading)
     for ability in found.abilities[1:]:
         abilities.add_row(ability.topic, _MARKS[ability.verdict], ability.text)
@@ -145,21 +150,23 @@ def _number(value: float | None) -> str:
 
 
 def _show(console: Console, found: Mapping[str, Any], title: str = "") -> None:
-    """Show a nested result: plain values first, then tables and lists under their names."""
-    plain = {key: value for key, value in found.items() if not isinstance(value, Mapping | list)}
+    """Print a nested result: plain values first, then tables and lists under their names."""
+    plain = {key: value for key, value in found.items() if not isinstance(value, _NESTED)}
     if plain:
         _show_rows(console, title, [{"": key, " ": value} for key, value in plain.items()])
     for key, value in found.items():
         if isinstance(value, Mapping):
             _show(console, value, f"{title} {key}".strip())
-        elif isinstance(value, list) and value and all(isinstance(row, Mapping) for row in value):
-            _show_rows(console, f"{title} {key}".strip(), value)
-        elif isinstance(value, list):
+        elif isinstance(value, list | tuple):
+            rows = [row for row in value if isinstance(row, Mapping)]
+            if rows:
+                _show_rows(console, f"{title} {key}".strip(), rows)
+                continue
             for line in value:
                 console.print(f"{key}: {line}", markup=False)
 
 
-def _show_rows(console: Console, title: str, rows: list[dict[str, Any]]) -> None:
+def _show_rows(console: Console, title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     headings = list(dict.fromkeys(key for row in rows for key in row))
     named = any(heading.strip() for heading in headings)
     table = Table(title=title.replace("_", " "), title_justify="left", show_header=named)
@@ -173,4 +180,4 @@ def _show_rows(console: Console, title: str, rows: list[dict[str, Any]]) -> None
 def _shown(value: Any) -> str:
     if value is None:
         return "–"
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    return f"{value:.5g}" if isinstance(value, float) else str(value)

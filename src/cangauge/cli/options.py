@@ -54,7 +54,7 @@ TemperatureSourceOption = Annotated[
     typer.Option(
         "--temperature-source",
         metavar="SOURCE",
-        help="What the temperature was measured on, where the input does not say it: "
+        help="What the temperature was measured on, where the input does not state it: "
         f"{', '.join(TEMPERATURE_SOURCES)}.",
     ),
 ]

@@ -155,23 +155,13 @@ class CaptureInspection:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        info = self.info.to_dict()
+        plain = asdict(self)
+        info = plain.pop("info")
         return {
             "kind": "capture",
-            "name": self.name,
-            "source": self.source,
-            **{key: value for key, value in info.items() if key != "remarks"},
-            "start_s": self.start_s,
-            "duration_s": self.duration_s,
-            "error_frames": self.error_frames,
-            "remote_frames": self.remote_frames,
-            "time_reversals": self.time_reversals,
+            **info,
+            **plain,
             "matching_presets": ", ".join(self.matching),
-            "other_ids": self.other_ids,
-            "ids": [asdict(each) for each in self.ids],
-            "gaps": [asdict(each) for each in self.gaps],
-            "presets": [asdict(each) for each in self.presets],
-            "remarks": info["remarks"],
             "log": None if self.log is None else self.log.to_dict(),
         }
 

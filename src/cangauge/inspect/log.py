@@ -109,22 +109,9 @@ class LogInspection:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        return {
-            "kind": "log",
-            "name": self.name,
-            "source": self.source,
-            "temperature_source": self.temperature_source,
-            "rows": self.rows,
-            "timing": asdict(self.timing),
-            "channels": {name: asdict(channel) for name, channel in self.channels.items()},
-            "charge": asdict(self.charge),
-            "soc": None if self.soc is None else asdict(self.soc),
-            "resistance": None if self.resistance is None else asdict(self.resistance),
-            "sign_of_current": self.sign.to_dict(),
-            "abilities": [asdict(ability) for ability in self.abilities],
-            "remarks": list(self.remarks),
-            "warnings": list(self.warnings),
-        }
+        plain = asdict(self)
+        del plain["sign"]
+        return {"kind": "log", **plain, "sign_of_current": self.sign.to_dict()}
 
 
 def inspect_log(log: Log) -> LogInspection:

@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cangauge._typing import FloatArray
+from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.units import REQUIRED, TemperatureSource, refuse_wrong_units
 
@@ -62,7 +61,7 @@ class DraftLog:
                     cure="check the export, or convert it to a canonical log",
                 )
 
-    def keep(self, rows: NDArray[np.bool_]) -> None:
+    def keep(self, rows: BoolArray) -> None:
         """Keep only the rows of a mask of shape (n,)."""
         self.values = {name: values[rows] for name, values in self.values.items()}
 
@@ -138,7 +137,7 @@ class DraftLog:
         )
         self.keep(~incomplete)
 
-    def _refuse_rows(self, name: str, bad: NDArray[np.bool_]) -> None:
+    def _refuse_rows(self, name: str, bad: BoolArray) -> None:
         if bad.any():
             row = int(np.argmax(bad))
             raise self._error(

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from cangauge._typing import FloatArray
+from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.errors import InputError
 from cangauge.logs.units import (
     REQUIRED,
@@ -235,7 +235,7 @@ class Log:
         rows = np.flatnonzero(np.isfinite(self.soc_pct))
         return (int(rows[0]), float(self.soc_pct[rows[0]])) if rows.size else None
 
-    def rows(self, keep: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Self:
+    def rows(self, keep: BoolArray | IntArray | slice) -> Self:
         """Return the log of the rows that `keep` selects (mask, indices or slice)."""
         return replace(
             self,

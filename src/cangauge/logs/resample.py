@@ -8,9 +8,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cangauge._typing import FloatArray
+from cangauge._typing import FloatArray, IntArray
 from cangauge.logs.log import Log
 
 PLATEAU_S = 60.0
@@ -57,7 +56,7 @@ def usual_step_k(log: Log) -> float:
     return float(np.median(steps[changed])) if changed.any() else 0.0
 
 
-def _midpoints(values: FloatArray, change: NDArray[np.intp]) -> FloatArray:
+def _midpoints(values: FloatArray, change: IntArray) -> FloatArray:
     return np.asarray(0.5 * (values[change] + values[change + 1]))
 
 
@@ -90,7 +89,7 @@ def resample(log: Log) -> Log:
     )
 
 
-def _first_finite(values: FloatArray, first: NDArray[np.intp]) -> FloatArray:
+def _first_finite(values: FloatArray, first: IntArray) -> FloatArray:
     """Return the first finite value of each bin, NaN where there is none."""
     known = np.flatnonzero(np.isfinite(values))
     found = np.full(first.size, np.nan)

@@ -17,14 +17,12 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
-from cangauge._typing import FloatArray
+from cangauge._typing import FloatArray, IntArray
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
 
-IntArray = NDArray[np.intp]
 Kind = Literal["steps", "charge", "soc"]
 
 STEP_SPACING_S: Final = 1.0
@@ -113,12 +111,7 @@ class SignFinding:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        return {
-            "sign": self.sign,
-            "confidence": self.confidence,
-            "sentence": self.sentence,
-            "evidence": [asdict(item) for item in self.evidence],
-        }
+        return {**asdict(self), "sentence": self.sentence}
 
 
 def sign_of_current(log: Log) -> SignFinding:

@@ -6,9 +6,9 @@ import io
 import re
 import zlib
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from cangauge._io import MAX_CAPTURE_BYTES, MAX_LINE, open_unpacked, read_beginning
 
@@ -49,10 +49,6 @@ class CaptureInfo:
     first_malformed: int | None = None
     cut_off: bool = False
     remarks: tuple[str, ...] = ()
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        return {**asdict(self), "remarks": list(self.remarks)}
 
 
 # --- Recordings in parts. `cangauge run` starts a new file now and then and numbers its runs, so
