@@ -200,6 +200,6 @@ def test_a_whole_test_reads_fast_enough_to_be_vectorised(tmp_path: Path, d3: D3)
     """90,000 rows through Python loops would take many times this limit."""
     lines = d3.text(d3.headers["2013"], start_s=0.0, end_s=9000.0)
     path = write(tmp_path, lines)
-    begin = time.perf_counter()
+    begin = time.process_time()
     assert len(read_log(path)) == 90_000
-    assert time.perf_counter() - begin < 0.9
+    assert time.process_time() - begin < 0.9

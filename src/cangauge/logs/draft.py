@@ -99,15 +99,16 @@ class DraftLog:
 
     def _set_temperature(self, given_c: float | None) -> None:
         if given_c is not None:
-            replaced = " in place of the file's" if "temperature_c" in self.values else ""
+            replaced = f" in place of the {self._kind}'s" if "temperature_c" in self.values else ""
             self.remarks.append(f"temperature {given_c:g} °C as given{replaced}")
             self.values["temperature_c"] = np.full(self.values["time_s"].size, given_c)
             self.temperature_source = "unknown"
         elif "temperature_c" not in self.values:
             raise self._error(
                 "temperature_c",
-                "the file holds no temperature",
-                cure="add this column [°C], or give a constant with --temperature",
+                f"the {self._kind} holds no temperature",
+                cure="add this column [°C], or give a constant with "
+                + ("--temperature" if self.source else "temperature_c"),
             )
 
     def _check_missing(self) -> None:
@@ -144,7 +145,7 @@ class DraftLog:
                 name,
                 f"row {row + 1} holds no number ({bad.sum()} such rows of {bad.size})",
                 float(self.values[name][row]),
-                cure="fill or drop these rows in the file",
+                cure=f"fill or drop these rows in the {self._kind}",
             )
 
     def _check_time(self) -> None:
@@ -167,6 +168,10 @@ class DraftLog:
                 f" (the first is row {int(np.argmax(same)) + 1})"
             )
             self.keep(~same)
+
+    @property
+    def _kind(self) -> str:
+        return "file" if self.source else "table"
 
     @property
     def _where(self) -> str:

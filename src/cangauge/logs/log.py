@@ -175,8 +175,6 @@ class Log:
         arrow = arrow.select(names)
         check_types(arrow.schema, places, name)
         draft = draft_from_table(arrow, places, names, name=name, source="")
-        if temperature_c is not None:
-            temperature_c = float(temperature_c)
         fields = draft.checked(temperature_c)
         if temperature_source is not None:
             fields["temperature_source"] = known_temperature_source(temperature_source)
