@@ -19,7 +19,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from cangauge.bus.capture_log import capture_to_log
+from cangauge.bus.recording import capture_to_log
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.estimate.offline import estimate_log
 from cangauge.estimate.settings import EstimatorSettings

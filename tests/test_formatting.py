@@ -1,4 +1,4 @@
-"""Numbers and reasons in words."""
+"""Numbers and reasons as text."""
 
 from __future__ import annotations
 

@@ -19,12 +19,12 @@ from typing import Any
 import can
 
 from cangauge._resources import shared_file
-from cangauge.bus.capture_log import capture_to_log
 from cangauge.bus.captures.capture import is_capture, open_capture
 from cangauge.bus.database import load_dbc
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import GENERIC_RULE
 from cangauge.bus.publish import SocPublisher, SocReader
+from cangauge.bus.recording import capture_to_log
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle, load_vehicle
 from cangauge.estimate.estimator import Estimator
@@ -163,7 +163,7 @@ def _run_capture(data: bytes) -> bool:
         capture = open_capture(path)
         for _ in capture:
             pass
-        capture.info.to_dict()
+        _ = capture.info
         with refusable():
             _use_capture(path, zlib.crc32(data) % 40)
     return True

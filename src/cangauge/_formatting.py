@@ -6,28 +6,27 @@ import math
 from typing import Final
 
 NONE_KNOWN: Final = "–"
-
+"""Stands for a number that is not known."""
 LONGEST_WHOLE: Final = 1e6
 """Larger numbers are written with a power of ten."""
 
 
 def number(value: float | None, digits: int = 3, unit: str = "") -> str:
-    """Return a number with fixed digits and its unit, or a dash where it is not known."""
+    """Return a number with fixed decimals and its unit; a dash if it is None or not finite."""
     if value is None or not math.isfinite(value):
         return NONE_KNOWN
-    text = f"{round(value, digits) + 0.0:.{digits}f}".replace("-", "−")
-    return f"{text} {unit}" if unit else text
+    # "+ 0.0" turns −0.0 into 0.0.
+    return _with_unit(f"{round(value, digits) + 0.0:.{digits}f}", unit)
 
 
 def significant(value: float | None, digits: int = 4, unit: str = "") -> str:
-    """Return a number with so many significant digits, or a dash where it is not known."""
+    """Return a number with significant digits and its unit; a dash if it is None or not finite."""
     if value is None or not math.isfinite(value):
         return NONE_KNOWN
     text = f"{value:#.{digits}g}".rstrip(".")
     if "e+" in text and abs(value) < LONGEST_WHOLE:
         text = f"{float(text):.0f}"
-    text = text.replace("-", "−")
-    return f"{text} {unit}" if unit else text
+    return _with_unit(text, unit)
 
 
 def span(low: float, high: float, digits: int = 1, unit: str = "") -> str:
@@ -36,7 +35,12 @@ def span(low: float, high: float, digits: int = 1, unit: str = "") -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return a time span in the unit that suits it."""
+    """Return a time span in seconds, minutes or hours."""
     if seconds < 120.0:
         return f"{seconds:.0f} s"
     return f"{seconds / 60.0:.1f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.2f} h"
+
+
+def _with_unit(text: str, unit: str) -> str:
+    text = text.replace("-", "−")
+    return f"{text} {unit}" if unit else text

@@ -1,11 +1,7 @@
-"""How large an input may be: every bound that a reader of files keeps, in one place.
+"""Files: limits on what is read, opening what a user names, writing all or nothing.
 
-They stand far above what real files need and far below what hurts the machine. What exceeds one
-is refused by an `InputError`, before the time or the memory is spent.
-
-Opening what a user names as a file: regular files alone, and never more than a bound of them.
-
-Writing files so that nothing half-written is ever left under the wanted name.
+Limits stand far above what real files need and far below what hurts the machine. A file beyond
+one is refused by an `InputError` before the time or the memory is spent.
 """
 
 from __future__ import annotations
@@ -16,6 +12,7 @@ import io
 import os
 import secrets
 import stat
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from os import PathLike
@@ -24,77 +21,72 @@ from typing import TYPE_CHECKING, BinaryIO, Final, cast
 
 from cangauge.errors import CangaugeError, InputError
 
-# --- How large an input may be: every bound that a reader of files keeps, in one place
-
-MIB: Final = 1 << 20
-
-# --- all packed files (gzip, zip) ---------------------------------------------------------------
-UNPACK_FREE_BYTES: Final = 16 * MIB
-"""Whatever unpacks to no more than this may do so at any ratio."""
-UNPACK_RATIO: Final = 250
-"""Beyond it, a file may unpack to so many times its size (real recordings: up to 43 times)."""
-
-# --- logs ---------------------------------------------------------------------------------------
-MAX_LOG_BYTES: Final = 1024 * MIB
-"""Of a log, packed or unpacked: it is read whole."""
-MAX_LOG_ROWS: Final = 20_000_000
-"""Rows of a log, samples of a capture: 23 days at 10 Hz, 0.8 GB of numbers."""
-MAX_LOG_COLUMNS: Final = 10_000
-MAX_LOG_SPAN_S: Final = 366 * 86400.0
-"""From the first row to the last [s]: where a clock was set within a log, decades seem to pass."""
-MAX_HEADING: Final = 200
-"""A column's heading that is longer is none that is known [characters]."""
-MAX_ODD_ROWS: Final = 100
-"""Rows with a wrong number of cells that are kept for the message."""
-MAX_PARQUET_NAMES: Final = 16 * MIB
-"""Longest text, and longest list, in a Parquet file's footer [bytes, items]."""
-
-# --- captures -----------------------------------------------------------------------------------
-MAX_CAPTURE_BYTES: Final = 64 * 1024 * MIB
-"""Of a capture, unpacked: it is read as a stream."""
-MAX_LINE: Final = 16 * 1024
-"""No capture has longer lines; what is longer is not text, or hostile [characters]."""
-MAX_IDLE_LINES: Final = 1_000_000
-"""So many lines in a row without a frame are no capture."""
-MAX_BLF_OBJECT: Final = 16 * MIB
-"""Of one object of a BLF file, packed or unpacked (its writers fill 128 KiB)."""
-MAX_MF4_MEMORY: Final = 4096 * MIB
-"""Of the process that reads an MF4 file."""
-MF4_SILENCE_S: Final = 60.0
-MF4_SILENCE_S_PER_MIB: Final = 0.5
-"""It may give no frame for so long [s], longer with the file's size."""
-MAX_BUSES: Final = 64
-"""Buses in one capture: each is decoded for itself."""
-MAX_STAMP_S: Final = 1e11
-"""Largest time stamp of a frame or a row [s]: the year 5138, if it counts from 1970."""
-
-# --- DBC ----------------------------------------------------------------------------------------
-MAX_DBC_BYTES: Final = 4 * MIB
-"""Reading takes 1–6 s a megabyte; the largest files in use are smaller than this."""
-
-# --- configurations, maps, model files ----------------------------------------------------------
-MAX_TOML_BYTES: Final = 64 * 1024
-MAX_TOML_KEY: Final = 32
-"""Parts of a dotted key: reading takes time and memory with their square."""
-MAX_MODEL_BYTES: Final = 4 * MIB
-"""A model of 64 delays has 0.2 MB."""
-MAX_MODEL_COLUMNS: Final = 256
-"""Columns that the information in a model file may have."""
-MAX_MODEL_ITEMS: Final = 4096
-"""Effects, source logs, coefficients in a model file, each."""
-MAX_SPEED_TRACE_BYTES: Final = 64 * MIB
-
-
-# --- Opening what a user names as a file: regular files alone, and never more than a bound o…
-
 if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
 
-_PIECE: Final = 1 << 20
-GZIP: Final = b"\x1f\x8b"
+MIB: Final = 1 << 20
 
-# Reading these would wait for ever, never end, or do something to a machine.
-_NO_FILES: Final = (
+# Packed files (gzip, zip)
+UNPACK_FREE_BYTES: Final = 16 * MIB
+"""Content of at most this size is unpacked at any ratio."""
+UNPACK_RATIO: Final = 250
+"""Largest ratio of unpacked to packed size beyond it [-] (real recordings: up to 43)."""
+
+# Logs
+MAX_LOG_BYTES: Final = 1024 * MIB
+"""A log, packed or unpacked: it is held in memory."""
+MAX_LOG_ROWS: Final = 20_000_000
+"""Rows of a log, samples of a capture: 23 days at 10 Hz, 0.8 GB as float64."""
+MAX_LOG_COLUMNS: Final = 10_000
+MAX_LOG_SPAN_S: Final = 366 * 86400.0
+"""First to last row [s]: a clock set within a log makes decades seem to pass."""
+MAX_HEADING: Final = 200
+"""Longest column heading that is parsed [characters]."""
+MAX_ODD_ROWS: Final = 100
+"""Rows with a wrong number of cells after which reading stops."""
+MAX_PARQUET_NAMES: Final = 16 * MIB
+"""Longest text, and longest list, in a Parquet footer [bytes, items]."""
+
+# Captures
+MAX_CAPTURE_BYTES: Final = 64 * 1024 * MIB
+"""A capture, unpacked: it is read as a stream."""
+MAX_LINE: Final = 16 * 1024
+"""Longest line of a text capture [characters]."""
+MAX_IDLE_LINES: Final = 1_000_000
+"""Consecutive lines without a frame."""
+MAX_BLF_OBJECT: Final = 16 * MIB
+"""One object of a BLF file, packed or unpacked (writers fill 128 KiB)."""
+MAX_MF4_MEMORY: Final = 4096 * MIB
+"""Memory of the process that reads an MF4 file."""
+MF4_SILENCE_S: Final = 60.0
+"""Longest wait for the next frames of that process [s], plus …"""
+MF4_SILENCE_S_PER_MIB: Final = 0.5
+"""… this for each MiB of the file [s]."""
+MAX_BUSES: Final = 64
+"""Buses in one capture: each has its own decoder."""
+MAX_STAMP_S: Final = 1e11
+"""Largest time stamp of a frame or row [s]: the year 5138, counted from 1970."""
+
+# DBC, TOML and model files
+MAX_DBC_BYTES: Final = 4 * MIB
+"""Parsing takes 1–6 s a megabyte; the largest files in use are smaller."""
+MAX_TOML_BYTES: Final = 64 * 1024
+MAX_TOML_KEY: Final = 32
+"""Parts of a dotted key: parsing takes time and memory with their square."""
+MAX_MODEL_BYTES: Final = 4 * MIB
+"""A model with 64 delays has 0.2 MB."""
+MAX_MODEL_COLUMNS: Final = 256
+"""Columns of the information matrix in a model file."""
+MAX_MODEL_ITEMS: Final = 4096
+"""Effects, source logs and coefficients in a model file, each."""
+MAX_SPEED_TRACE_BYTES: Final = 64 * MIB
+
+
+# --- Reading
+
+_GZIP: Final = b"\x1f\x8b"
+# Opening these would block for ever, never end, or act on a machine.
+_NOT_FILES: Final = (
     (stat.S_ISFIFO, "this is a pipe (FIFO), not a file"),
     (stat.S_ISCHR, "this is a device, not a file"),
     (stat.S_ISBLK, "this is a device, not a file"),
@@ -112,7 +104,7 @@ def open_regular(path: str | PathLike[str]) -> BinaryIO:
     """
     try:
         _refuse_special(Path(path).stat().st_mode, path)
-        # Should it be swapped for a pipe right now, opening does not wait for a writer.
+        # If it is swapped for a pipe right now, O_NONBLOCK keeps `open` from waiting for a writer.
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
         file = cast("BinaryIO", os.fdopen(os.open(path, flags), "rb"))
     except (OSError, ValueError) as error:  # ValueError: a null byte in the path
@@ -125,24 +117,124 @@ def open_regular(path: str | PathLike[str]) -> BinaryIO:
     return file
 
 
-def _read_at_most(file: BinaryIO, size: int) -> bytes:
-    """Read in pieces: reading at once takes memory for all that there might be."""
-    data = bytearray()
-    while len(data) < size and (piece := file.read(min(_PIECE, size - len(data)))):
-        data += piece
-    return bytes(data)
+def open_unpacked(path: str | PathLike[str], limit: int) -> io.BufferedReader:
+    """Open a regular file for reading; gzip is recognised by content and unpacked within bounds.
 
-
-def read_bounded(path: str | PathLike[str], limit: int, what: str) -> bytes:
-    """Return the content of a regular file of at most `limit` bytes.
+    A damaged gzip file raises `EOFError`, `OSError` or `zlib.error` while it is read.
 
     Parameters
     ----------
     path : path-like
     limit : int
-        [bytes]
+        Largest unpacked content [bytes].
+
+    Raises
+    ------
+    InputError
+        As `open_regular`; while reading, if gzip unpacks to more than `limit` or beyond
+        `UNPACK_RATIO`.
+    """
+    file = open_regular(path)
+    try:
+        packed = file.read(len(_GZIP)) == _GZIP
+        file.seek(0)
+    except OSError as error:
+        file.close()
+        raise _unreadable(error, path) from error
+    if not packed:
+        return cast("io.BufferedReader", file)
+    unpacked = gzip.GzipFile(fileobj=file, mode="rb")
+    return bounded(unpacked, path, limit, os.fstat(file.fileno()).st_size, also_close=file)
+
+
+def bounded(
+    unpacked: io.BufferedIOBase,
+    path: str | PathLike[str],
+    limit: int,
+    packed_bytes: int,
+    *,
+    also_close: BinaryIO | None = None,
+) -> io.BufferedReader:
+    """Return a reader of unpacked content that raises `InputError` beyond its bounds.
+
+    Parameters
+    ----------
+    unpacked : buffered reader
+        The content; closed with the returned reader.
+    path : path-like
+        For the message.
+    limit : int
+        Largest content [bytes].
+    packed_bytes : int
+        Size of the packed file [bytes], for the ratio.
+    also_close : binary file, optional
+        Another file to close with the reader.
+    """
+    limit = min(limit, max(UNPACK_FREE_BYTES, UNPACK_RATIO * packed_bytes))
+    return io.BufferedReader(_Bounded(unpacked, path, limit, also_close))
+
+
+class _Bounded(io.RawIOBase):
+    """A stream that raises InputError after `limit` bytes."""
+
+    def __init__(
+        self,
+        source: io.BufferedIOBase,
+        path: str | PathLike[str],
+        limit: int,
+        also_close: BinaryIO | None,
+    ) -> None:
+        self._source = source
+        self._path = path
+        self._limit = limit
+        self._also_close = also_close
+        self._delivered = 0
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: WriteableBuffer, /) -> int:
+        view = memoryview(buffer)
+        # `read1`: the content before a break in the file is delivered before the error.
+        part = self._source.read1(view.nbytes)
+        self._delivered += len(part)
+        if self._delivered > self._limit:
+            raise InputError(
+                f"unpacks to more than {_megabytes(self._limit)}, which no recording of its size"
+                " does",
+                source=self._path,
+                cure="unpack it and check its content",
+            )
+        view[: len(part)] = part
+        return len(part)
+
+    def close(self) -> None:
+        if not self.closed:
+            self._source.close()
+            if self._also_close is not None:
+                self._also_close.close()
+        super().close()
+
+
+def read_beginning(file: io.BufferedReader, size: int) -> bytes:
+    """Return at most `size` bytes from an open file; fewer where it is damaged or ends."""
+    beginning = bytearray()
+    with suppress(EOFError, OSError, zlib.error):
+        while len(beginning) < size and (part := file.read1(size - len(beginning))):
+            beginning += part
+    return bytes(beginning)
+
+
+def read_bounded(path: str | PathLike[str], limit: int, what: str) -> bytes:
+    """Return the content of a regular file.
+
+    Parameters
+    ----------
+    path : path-like
+    limit : int
+        Largest file [bytes].
     what : str
-        What the file should be, for the message ("a model file").
+        The expected kind of file, for the message ("a model file").
 
     Raises
     ------
@@ -151,156 +243,68 @@ def read_bounded(path: str | PathLike[str], limit: int, what: str) -> bytes:
     """
     try:
         with open_regular(path) as file:
-            data = _read_at_most(file, limit + 1)
+            return read_all(file, path, limit, what)
     except OSError as error:
         raise _unreadable(error, path) from error
+
+
+def read_all(file: BinaryIO, path: str | PathLike[str], limit: int, what: str) -> bytes:
+    """Return the rest of an open file; raise InputError if it has more than `limit` bytes."""
+    data = bytearray()
+    # In pieces: a single `read` would allocate the file's whole size first.
+    while len(data) <= limit and (piece := file.read(MIB)):
+        data += piece
     if len(data) > limit:
-        raise too_large(path, limit, what)
-    return data
+        raise InputError(
+            f"larger than the {_megabytes(limit)} that {what} may have",
+            source=path,
+            cure="check that this is the right file, or split it",
+        )
+    return bytes(data)
 
 
-def too_large(path: str | PathLike[str], limit: int, what: str) -> InputError:
-    """Return the error that says that a file is larger than `limit` [bytes]."""
-    return InputError(
-        f"larger than the {_amount(limit)} that {what} may have",
-        source=path,
-        cure="check that this is the right file, or cut it into parts",
-    )
-
-
-def gunzip_bounded(packed: BinaryIO, path: str | PathLike[str], limit: int) -> io.BufferedReader:
-    """Return a reader of an open gzip file's content that refuses to unpack without bounds.
-
-    The content breaks off with `EOFError`, `OSError` or `zlib.error` where the file does.
-
-    Parameters
-    ----------
-    packed : binary file
-        From `open_regular`; closed with the reader.
-    path : path-like
-        For the message.
-    limit : int
-        Of the content [bytes].
-
-    Raises
-    ------
-    InputError
-        While reading: if the content has more than `limit` bytes, or more than `UNPACK_FREE_BYTES`
-        and `UNPACK_RATIO` times the file's.
-    """
-    size = os.fstat(packed.fileno()).st_size
-    unpacked = gzip.GzipFile(fileobj=packed, mode="rb")
-    return io.BufferedReader(Bounded(unpacked, path, min(limit, unpacks_to(size)), packed))
-
-
-def unpacks_to(packed_bytes: int) -> int:
-    """Return how much a packed file of some size may unpack to [bytes]."""
-    return max(UNPACK_FREE_BYTES, UNPACK_RATIO * packed_bytes)
-
-
-class Bounded(io.RawIOBase):
-    """A stream that ends in an InputError after so many bytes.
-
-    Parameters
-    ----------
-    source : buffered reader
-        Where the bytes come from; closed with this one.
-    path : path-like
-        For the message.
-    limit : int
-        [bytes]
-    below : binary file, optional
-        Another file to close with this one.
-    """
-
-    def __init__(
-        self,
-        source: io.BufferedIOBase,
-        path: str | PathLike[str],
-        limit: int,
-        below: BinaryIO | None = None,
-    ) -> None:
-        self._source = source
-        self._path = path
-        self._limit = limit
-        self._below = below
-        self._given = 0
-
-    def readable(self) -> bool:
-        """Return True."""
-        return True
-
-    def readinto(self, buffer: WriteableBuffer, /) -> int:
-        """Read one part."""
-        view = memoryview(buffer)
-        # One part at a time: what stands before a break in the file is given out first.
-        part = self._source.read1(view.nbytes)
-        self._given += len(part)
-        if self._given > self._limit:
-            raise _bomb(self._path, self._limit)
-        view[: len(part)] = part
-        return len(part)
-
-    def close(self) -> None:
-        """Close the source too."""
-        if not self.closed:
-            self._source.close()
-            if self._below is not None:
-                self._below.close()
-        super().close()
-
-
-def _bomb(path: str | PathLike[str], limit: int) -> InputError:
-    return InputError(
-        f"unpacks to more than {_amount(limit)}, which no recording of its size does",
-        source=path,
-        cure="unpack it yourself and check what it holds",
-    )
-
-
-def _amount(limit: int) -> str:
-    return f"{limit // 1024 // 1024} MB" if limit >= 1 << 20 else f"{limit // 1024} kB"
+def _megabytes(size: int) -> str:
+    return f"{size // MIB} MB" if size >= MIB else f"{size // 1024} kB"
 
 
 def _refuse_special(mode: int, path: str | PathLike[str]) -> None:
     if stat.S_ISDIR(mode):
         raise InputError("this is a folder, not a file", source=path, cure="name a file in it")
-    for is_kind, problem in _NO_FILES:
+    for is_kind, problem in _NOT_FILES:
         if is_kind(mode):
-            raise InputError(problem, source=path, cure="save its content as a file, name that")
+            raise InputError(problem, source=path, cure="save its content as a file and name that")
 
 
 def _unreadable(error: OSError | ValueError, path: str | PathLike[str]) -> InputError:
-    shown = Path(path)
     if isinstance(error, FileNotFoundError | NotADirectoryError):
-        return InputError("no such file", source=shown, cure="check the path")
+        return InputError("no such file", source=path, cure="check the path")
     reason = getattr(error, "strerror", None) or str(error)
     cure = "change its rights" if isinstance(error, PermissionError) else "check the path"
-    return InputError(f"cannot be read: {reason}", source=shown, cure=cure)
+    return InputError(f"cannot be read: {reason}", source=path, cure=cure)
 
 
-# --- Writing files so that nothing half-written is ever left under the wanted name
+# --- Writing
 
-FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
-"""Errors of a disk that is full or fails, which pass."""
-_CURES: dict[int, tuple[str, str]] = {
+FULL: Final = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
+"""Errors of a full or failing disk, which may pass."""
+_WRITE_ERRORS: Final[dict[int, tuple[str, str]]] = {
     errno.ENOENT: ("the folder of this file does not exist", "create it or name another one"),
     errno.ENOTDIR: ("a part of this path is a file, not a folder", "name another path"),
     errno.EACCES: ("the folder of this file is not writable", "change its rights or name another"),
     errno.EPERM: ("the folder of this file is not writable", "change its rights or name another"),
     errno.EROFS: ("the file system is read-only", "name another folder"),
-    errno.ENAMETOOLONG: ("the file name is too long", "name a shorter one"),
+    errno.ENAMETOOLONG: ("the file name is too long", "use a shorter one"),
 }
 
 
 @contextmanager
-def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; move it there if the block ends well.
+def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
+    """Yield a temporary path beside `path` and rename it to `path` when the block succeeds.
 
-    The temporary file exists (empty), is on the same file system and keeps the suffix. When the
-    block raises, it is removed and whatever stood at `path` before is untouched. The contents are
-    on the disk before the name changes, so that a power cut leaves the old file or the new one.
-    A device or pipe (`/dev/stdout`) cannot be replaced and is yielded as it is.
+    The temporary file exists (empty), is on the same file system and keeps the suffix. If the
+    block raises, it is removed and `path` stays as it was. The content is synced to disk before
+    the rename: a power cut leaves the old file or the new one. A device or pipe (`/dev/stdout`)
+    cannot be replaced and is yielded itself.
 
     Parameters
     ----------
@@ -324,10 +328,11 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield target
         return
     target = Path(os.path.realpath(target))
-    part = _new_beside(target, shown=path)
+    part = _create_beside(target, shown=path)
     try:
         yield part
-        _to_disk(part)
+        with part.open("rb") as written:
+            os.fsync(written.fileno())
         mode = _mode(target)
         if mode is not None:
             part.chmod(stat.S_IMODE(mode))
@@ -342,16 +347,16 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             part.unlink()
 
 
-def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
-    """Write `text` as UTF-8 at `path`, all or nothing (see `atomic_path`)."""
+def write_text_atomic(path: str | PathLike[str], text: str) -> None:
+    """Write `text` as UTF-8 to `path`, all or nothing (see `atomic_path`)."""
     with atomic_path(path) as part:
         part.write_text(text, encoding="utf-8", newline="\n")
 
 
-def check_writable(path: str | os.PathLike[str]) -> None:
+def check_writable(path: str | PathLike[str]) -> None:
     """Raise the InputError that writing `path` would raise, before any long work is done."""
     if not _is_device(Path(path)):
-        _new_beside(Path(os.path.realpath(path)), shown=path).unlink()
+        _create_beside(Path(os.path.realpath(path)), shown=path).unlink()
 
 
 def _is_device(path: Path) -> bool:
@@ -362,26 +367,21 @@ def _is_device(path: Path) -> bool:
 def _mode(path: Path) -> int | None:
     try:
         return path.stat().st_mode
-    except OSError:  # absent, or a path that cannot be: creating it will say which
+    except OSError:  # absent, or an impossible path: creating it reports which
         return None
 
 
-def _new_beside(target: Path, *, shown: str | os.PathLike[str]) -> Path:
+def _create_beside(target: Path, *, shown: str | PathLike[str]) -> Path:
     mode = _mode(target)
     if mode is not None and stat.S_ISDIR(mode):
         raise InputError("this is a folder", source=shown, cure="name a file in it")
-    # The suffix stays last: writers such as pyarrow and bokeh choose by it.
+    # The suffix stays last: writers such as pyarrow and bokeh choose the format by it.
     part = target.with_name(f".{target.stem[:200]}.{secrets.token_hex(4)}{target.suffix}")
     try:
         part.touch(exist_ok=False)
     except OSError as error:
-        problem, cure = _CURES.get(
+        problem, cure = _WRITE_ERRORS.get(
             error.errno or 0, (f"cannot be written: {error.strerror}", "name another path")
         )
         raise InputError(problem, source=shown, cure=cure) from error
     return part
-
-
-def _to_disk(path: Path) -> None:
-    with path.open("rb") as file:
-        os.fsync(file.fileno())

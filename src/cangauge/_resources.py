@@ -1,11 +1,4 @@
-"""Where the data files that ship with cangauge are: `dbc` and `replay`.
-
-Threads of the linear algebra: one, unless the user asks for more.
-
-cangauge solves thousands of small systems. Threads do not make these faster, and where another
-process has the other core, they wait for each other: a diagnosis then takes many times as long.
-The libraries read these variables when they are loaded.
-"""
+"""The installation's data files, and the threads of the linear algebra."""
 
 from __future__ import annotations
 
@@ -15,11 +8,17 @@ from typing import Final
 
 from cangauge.errors import InputError
 
-# --- Where the data files that ship with cangauge are: `dbc` and `replay`
-
 _PACKAGE = Path(__file__).parent
-# An installed wheel carries them inside the package, a checkout at its top level.
+# An installed wheel has the data inside the package, a checkout at its top level.
 _ROOTS = (_PACKAGE / "share", _PACKAGE.parent.parent)
+
+THREADS: Final = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+)
+"""Environment variables that BLAS libraries read when they are loaded."""
 
 
 def shared_file(folder: str, name: str) -> Path:
@@ -34,7 +33,7 @@ def shared_file(folder: str, name: str) -> Path:
     Raises
     ------
     InputError
-        If it is not there (a broken installation).
+        If it is absent (a broken installation).
     """
     for root in _ROOTS:
         path = root / folder / name
@@ -43,21 +42,15 @@ def shared_file(folder: str, name: str) -> Path:
     raise InputError(
         "this file of the installation is missing",
         source=f"{folder}/{name}",
-        cure="install cangauge again",
+        cure="reinstall cangauge",
     )
 
 
-# --- Threads of the linear algebra: one, unless the user asks for more
-
-THREADS: Final = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-)
-
-
 def one_thread(environment: MutableMapping[str, str]) -> None:
-    """Ask for one thread, where the user has not said how many; before numpy is imported."""
+    """Limit BLAS to one thread where the user has not set it; before numpy is imported.
+
+    cangauge solves thousands of small systems, which threads do not make faster. On a busy core
+    they wait for each other, and a diagnosis takes many times as long.
+    """
     for name in THREADS:
         environment.setdefault(name, "1")

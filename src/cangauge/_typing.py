@@ -7,3 +7,7 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 """Array of float64."""
+IntArray = NDArray[np.intp]
+"""Array of indices."""
+BoolArray = NDArray[np.bool_]
+"""Array of bool, such as a mask of rows."""

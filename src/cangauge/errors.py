@@ -1,7 +1,4 @@
-"""The exceptions that cangauge raises on purpose, and the exit codes that they mean.
-
-The names most like one that does not exist: "did you mean …?".
-"""
+"""Exceptions that cangauge raises on purpose, with exit codes; suggestions for misspelt names."""
 
 from __future__ import annotations
 
@@ -11,18 +8,16 @@ from itertools import islice
 from os import PathLike
 from typing import Any, Final
 
-# --- The exceptions that cangauge raises on purpose, and the exit codes that they mean
-
 
 class CangaugeError(Exception):
-    """Anything that cangauge reports in one clear line instead of a traceback (exit code 1)."""
+    """An error that is reported in one line instead of a traceback (exit code 1)."""
 
     exit_code = 1
-    told = False
-    """Whether stderr has it already, as an event: then nobody else tells it there."""
+    logged = False
+    """Set once logged, to avoid reporting twice."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the message and its parts for `--json`; None is a part that is not known."""
+        """Return the message and its parts for `--json`; unknown parts are None."""
         parts = dict.fromkeys(("source", "field", "value", "cure"))
         return {"message": str(self), **parts}
 
@@ -33,15 +28,20 @@ class InputError(CangaugeError):
     Parameters
     ----------
     problem : str
-        What is wrong, in words ("time runs backwards").
+        The problem in a phrase ("time runs backwards").
     source : path-like, optional
-        The file (or bus, or option) that it was found in.
+        The file, bus or option.
     field : str, optional
         The column, signal, JSON field or option concerned.
     value : object, optional
         The offending value, as read.
     cure : str, optional
         What the user can do about it.
+
+    Examples
+    --------
+    >>> print(InputError("is missing", source="car.toml", field="model", cure="add it"))
+    car.toml: model: is missing; add it
     """
 
     exit_code = 2
@@ -63,7 +63,7 @@ class InputError(CangaugeError):
         super().__init__(self._line())
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the message and its parts for `--json`; None is a part that is not known."""
+        """Return the message and its parts for `--json`; unknown parts are None."""
         return {
             "message": str(self),
             "source": self.source,
@@ -82,16 +82,16 @@ class InputError(CangaugeError):
             text += f" (got {_shown(self.value)})"
         if self.cure:
             text += f"; {_short(self.cure, _LONGEST_PROBLEM)}"
-        # What a file or its name holds must neither break the line nor control a terminal.
+        # Text quoted from a file or its name must neither break the line nor control a terminal.
         return "".join(
             char if char.isprintable() else char.encode("unicode_escape").decode() for char in text
         )
 
 
-# What is quoted from a file may be of any length; a message is to be read.
-_LONGEST_VALUE = 160
-_LONGEST_PROBLEM = 600
-_LONGEST_PATH = 1000
+# Text quoted from a file may have any length [characters].
+_LONGEST_VALUE: Final = 160
+_LONGEST_PROBLEM: Final = 600
+_LONGEST_PATH: Final = 1000
 
 
 def _short(text: str, longest: int = _LONGEST_VALUE) -> str:
@@ -101,13 +101,13 @@ def _short(text: str, longest: int = _LONGEST_VALUE) -> str:
 def _shown(value: object) -> str:
     try:
         text = repr(value)
-    except (ValueError, RecursionError):  # a number of more than 4300 digits; lists in lists in …
+    except (ValueError, RecursionError):  # a number of more than 4300 digits; deeply nested lists
         return f"a huge {type(value).__name__}"
     return _short(text)
 
 
 def _plain(value: object) -> bool | float | str | None:
-    """Return a number or a text as it is, anything else as the message quotes it."""
+    """Return a number or text as it is, anything else as the message quotes it."""
     if hasattr(value, "tolist"):  # numpy's
         value = value.tolist()
     if value is None or isinstance(value, bool | float):
@@ -117,20 +117,19 @@ def _plain(value: object) -> bool | float | str | None:
     return _short(value) if isinstance(value, str) else _shown(value)
 
 
-# --- The names most like one that does not exist: "did you mean …?"
-
-_LONGEST: Final = 200
-_MOST: Final = 20_000
+# Bounds of the search, whose time grows with both [characters, names].
+_LONGEST_NAME: Final = 200
+_MOST_NAMES: Final = 20_000
 
 
 def closest(word: str, names: Iterable[str]) -> str:
-    """Return the names most like a word, joined by commas; "" if none is.
+    """Return up to three names most similar to a word, joined by commas; "" if none is.
 
-    A word that is too long to be a name has none, and only the first names of very many are
-    compared: the search takes time with both.
+    For "did you mean …?".
     """
-    if len(word) > _LONGEST:
+    if len(word) > _LONGEST_NAME:
         return ""
-    by_lower = {name.lower(): name for name in islice(names, _MOST) if len(name) <= _LONGEST}
+    some = islice(names, _MOST_NAMES)
+    by_lower = {name.lower(): name for name in some if len(name) <= _LONGEST_NAME}
     hits = difflib.get_close_matches(word.lower(), by_lower, n=3, cutoff=0.5)
     return ", ".join(by_lower[hit] for hit in hits)

@@ -1,4 +1,4 @@
-"""Capture files of all kinds → messages."""
+"""Captures of all formats are read as messages."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_seconds_id_length_bytes(tmp_path: Path) -> None:
     assert facts(third) == (0.021044, 0x50C, False, "000000025d63")
 
 
-def test_tables_have_whole_milliseconds_and_say_so(tmp_path: Path) -> None:
+def test_tables_have_stamps_in_whole_milliseconds(tmp_path: Path) -> None:
     capture = open_capture(write(tmp_path, TABLE))
     first, second = capture
     assert facts(first) == (1052620.673, 0x1DA, False, "c832180000010159")
@@ -190,7 +190,7 @@ def test_what_python_can_records_is_read_back(tmp_path: Path, name: str, packed:
 
 
 def read_or_refuse(path: Path) -> int:
-    """Return how many frames there are; 0 where it is refused. Anything else is an error."""
+    """Return the number of frames; 0 where it is refused. Any other error fails the test."""
     try:
         return sum(1 for _ in read_capture(path))
     except InputError as error:
@@ -234,7 +234,7 @@ def test_a_gzip_cut_at_every_byte_gives_what_can_be_read(tmp_path: Path) -> None
     assert f"cut off after {frames} frames" in capture.info.remarks[-1]
 
 
-def test_bytes_flipped_anywhere_are_no_disaster(tmp_path: Path) -> None:
+def test_flipped_bytes_raise_nothing_but_input_errors(tmp_path: Path) -> None:
     for name in WRITERS:
         path, _ = recorded(tmp_path, name, count=8)
         content = path.read_bytes()
@@ -305,7 +305,7 @@ def test_lines_without_end_take_no_memory(tmp_path: Path) -> None:
         list(read_capture(path))
 
 
-def test_mf4_without_its_reader_says_what_to_install(tmp_path: Path) -> None:
+def test_mf4_without_its_reader_names_the_package(tmp_path: Path) -> None:
     path = write(tmp_path, b"MDF     4.10    " + struct.pack("<100x"))
     try:
         import asammdf  # noqa: F401, PLC0415

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from cangauge._resources import shared_file
-from cangauge.bus.capture_log import capture_samples, capture_to_log
 from cangauge.bus.captures.capture import is_capture, open_capture
 from cangauge.bus.database import load_dbc
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.protection import LEAF_RULE
+from cangauge.bus.recording import capture_samples, capture_to_log
 from cangauge.bus.vehicle import Vehicle, load_vehicle
 from cangauge.inspect.capture import inspect_capture
 
@@ -100,7 +100,7 @@ def test_every_frame_is_read_and_every_crc_agrees(folder: Path, name: str) -> No
 
 
 @pytest.mark.parametrize("name", list(CAPTURES))
-def test_stamps_run_forward_and_0x1db_comes_every_10_ms(folder: Path, name: str) -> None:
+def test_stamps_increase_and_0x1db_has_a_10_ms_period(folder: Path, name: str) -> None:
     capture = open_capture(folder / name)
     stamps = np.array([m.timestamp for m in capture if m.arbitration_id == 0x1DB])
     assert (np.diff(stamps) > 0.0).all()
@@ -123,11 +123,11 @@ def test_values_are_those_of_the_car(folder: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", list(CAPTURES))
-def test_each_capture_is_recognised_as_its_own_car_only(folder: Path, name: str) -> None:
+def test_each_capture_matches_its_own_car_only(folder: Path, name: str) -> None:
     assert inspect_capture(folder / name).matching == (CAPTURES[name][1],)
 
 
-def test_other_protected_ids_are_found_and_counters_elsewhere_are_not_invented(
+def test_other_protected_ids_are_found(
     folder: Path,
 ) -> None:
     found = {each.id: each for each in inspect_capture(folder / "10bars.csv.gz").ids}
@@ -146,12 +146,12 @@ def test_other_protected_ids_are_found_and_counters_elsewhere_are_not_invented(
     assert found["50C"].counter_repeats is None
 
 
-def test_488_jumps_with_valid_crcs_are_losses_and_the_frames_are_used(folder: Path) -> None:
+def test_jumps_with_valid_crcs_are_losses_not_refusals(folder: Path) -> None:
     samples = capture_samples(folder / LOSSY, vehicle_of(LOSSY))
     fate = samples.counters.messages[0x1DB]
     assert (fate.wanted, fate.crc_errors, fate.counter_repeats) == (1911, 0, 0)
     assert fate.counter_jumps == 488
-    # 89 of them stand still, after 4 periods or more: 3 or more frames are missing there.
+    # 89 counters repeat after 4 periods or more: 3 or more frames are missing there.
     assert fate.frames_lost == 787
     assert len(samples) == 1910  # one has no current
 
@@ -188,10 +188,10 @@ def test_maximum_energy_alternates_with_present_energy(folder: Path) -> None:
 
 
 def test_a_capture_decodes_the_same_frame_by_frame(folder: Path) -> None:
-    """The log is what the assembler gives, bit for bit."""
+    """The log has the decoder's samples, bit for bit."""
     name = "10bars.csv.gz"
-    assembler = SampleDecoder(vehicle_of(name))
-    made = [s for m in open_capture(folder / name) if (s := assembler.handle(m)) is not None]
+    decoder = SampleDecoder(vehicle_of(name))
+    made = [s for m in open_capture(folder / name) if (s := decoder.handle(m)) is not None]
     log = capture_to_log(folder / name, vehicle_of(name))
     assert [each.time_s for each in made] == log.time_s.tolist()
     assert [each.current_a for each in made] == log.current_a.tolist()

@@ -212,7 +212,7 @@ def test_own_protection_rules(own: Path) -> None:
         ('"BMS_Status"', '"0x101"', "current.message", "BMS_Status (0x100)"),
         ('"BMS_Status"', '"BMS_Temps"', "current.signal", "it is in BMS_Status"),
         ("sign = -1", "sign = 2", "current.sign", "must be 1 or -1"),
-        ("sign = -1", "scale = 0", "current.scale", "must be more than 0"),
+        ("sign = -1", "scale = 0", "current.scale", "must be greater than 0"),
         ("sign = -1", "scale = nan", "current.scale", "finite"),
         ("sign = -1", 'scale = "a"', "current.scale", "number"),
         ("sign = -1", "singn = -1", "current.singn", "did you mean sign"),
@@ -220,7 +220,12 @@ def test_own_protection_rules(own: Path) -> None:
         ("[voltage]", "[volts]", "volts", "did you mean voltage?"),
         ('[voltage]\nsignal = "PackVoltage"\n', "", "voltage", "is missing"),
         ('"pack"', '"battery"', "temperature_source", "'battery'"),
-        ('name = "my car"', "pair_within_s = 5", "pair_within_s", "must lie within 0 … 1"),
+        (
+            'name = "my car"',
+            "pair_within_s = 5",
+            "pair_within_s",
+            "must be less than or equal to 1",
+        ),
         ('signal = "PackTemperature"', "", "temperature", "either signal or fixed_c"),
         ('signal = "PackTemperature"', "fixed_c = 900", "temperature.fixed_c", "120"),
     ],
@@ -242,7 +247,7 @@ def test_mistakes_in_a_map_name_field_and_cure(
     [
         ('[messages.BMS_Status]\nprotection = "laef"', "messages.BMS_Status.protection", "known"),
         ('[messages.Nonsense]\nprotection = "leaf"', "messages.Nonsense", "no such message"),
-        ("[messages.BMS_Status]\nperiod_s = -1", "messages.BMS_Status.period_s", "more than 0"),
+        ("[messages.BMS_Status]\nperiod_s = -1", "messages.BMS_Status.period_s", "greater than 0"),
         (
             '[messages.BMS_Status]\nprotection = "r"\n[rules.r]\npolynomial = 7\ncrc_byte = 9',
             "messages.BMS_Status.protection",

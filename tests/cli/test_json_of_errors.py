@@ -144,7 +144,7 @@ def test_a_mistake_of_ours_keeps_its_traceback(
     def fail(*_: object, **__: object) -> None:
         raise ZeroDivisionError("by nothing")
 
-    monkeypatch.setattr("cangauge.cli.inspect.read_log", fail)
+    monkeypatch.setattr("cangauge.bus.recording.open_recording", fail)
     monkeypatch.setattr(sys, "argv", ["cangauge", "inspect", "x.csv", "--json"])
     with pytest.raises(ZeroDivisionError):  # Python prints it and exits with 1
         main()
@@ -175,7 +175,7 @@ def test_any_value_can_be_told(
     def fail(*_: object, **__: object) -> None:
         raise InputError("is wrong", source=Path("x.csv"), field="a", value=value)
 
-    monkeypatch.setattr("cangauge.cli.inspect.read_log", fail)
+    monkeypatch.setattr("cangauge.bus.recording.open_recording", fail)
     error = error_of(in_process("inspect", "x.csv", "--json"), 2)
     assert error["value"] == expected
     assert type(error["value"]) is type(expected)

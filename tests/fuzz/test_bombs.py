@@ -1,4 +1,4 @@
-"""Small files that unpack, or take time, without bounds: refused within bounds of both."""
+"""Small files of huge content, or of huge run time, are refused within bounds of both."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from fuzzing import corpus
 
 MIB = 1 << 20
 SECONDS = 10.0
-"""CPU time that any of them may take: the machine may be slow, a hang takes for ever."""
+"""Largest CPU time of a case [s]: generous for slow machines, far below a hang."""
 MEMORY = 1500 * MIB
 HEADER = b"time_s,current_a,voltage_v,temperature_c\n"
 FRAME = b"(1436509052.249713) can0 1DB#0004C262000003B6\n"
@@ -58,7 +58,7 @@ def frame_object(length: int = 48) -> bytes:
 
 
 def big_gzip(part: bytes, count: int, head: bytes = b"") -> bytes:
-    """`head` and then `part` so many times, packed without ever standing in memory."""
+    """Pack `head` and `count` times `part`, without holding the content in memory."""
     packer = zlib.compressobj(9, wbits=31)
     step = part * 1000
     parts = [packer.compress(head), *(packer.compress(step) for _ in range(count // 1000))]
@@ -66,7 +66,7 @@ def big_gzip(part: bytes, count: int, head: bytes = b"") -> bytes:
 
 
 def lying_zip() -> bytes:
-    """A member that says it has 100 bytes, and unpacks to 100 MB."""
+    """A member whose header states 100 bytes and that unpacks to 100 MB."""
     out = io.BytesIO()
     with (
         zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive,
@@ -139,7 +139,7 @@ CAPTURES: dict[str, Callable[[], bytes]] = {
 
 
 def refused(run: Callable[[], object]) -> str:
-    """Run it within bounds; return what it was refused with, "" if it was read.
+    """Run it within bounds; return the error message, "" if it was read.
 
     In a process of its own, which may have only so much memory and is ended if it hangs.
     """
@@ -150,14 +150,14 @@ def refused(run: Callable[[], object]) -> str:
     theirs.close()
     try:
         assert ours.poll(20 * SECONDS), "it hangs"
-        told, seconds = ours.recv()
+        message, seconds = ours.recv()
     finally:
         child.kill()
         child.join()
     assert seconds < SECONDS
-    assert told.isprintable() or not told
-    assert len(told) < 2000
-    return told
+    assert message.isprintable() or not message
+    assert len(message) < 2000
+    return message
 
 
 def _bounded(run: Callable[[], object], answer: Connection) -> None:
@@ -166,11 +166,11 @@ def _bounded(run: Callable[[], object], answer: Connection) -> None:
     began = time.process_time()
     try:
         run()
-        told = ""
+        message = ""
     except InputError as error:
-        told = str(error)
-    # Whatever else is raised ends the process without an answer.
-    answer.send((told, time.process_time() - began))
+        message = str(error)
+    # Any other error ends the process without an answer.
+    answer.send((message, time.process_time() - began))
 
 
 @pytest.mark.slow
@@ -187,13 +187,13 @@ def test_logs(tmp_path: Path, name: str) -> None:
 def test_captures(tmp_path: Path, name: str) -> None:
     path = tmp_path / "bomb"
     path.write_bytes(CAPTURES[name]())
-    told = refused(lambda: sum(1 for _ in read_capture(path)))
-    assert told or name in {"blanks", "ids"}
+    message = refused(lambda: sum(1 for _ in read_capture(path)))
+    assert message or name in {"blanks", "ids"}
     if name == "ids":
         assert not refused(lambda: inspect_capture(path))
 
 
-def test_a_standing_object_is_told_as_damage(tmp_path: Path) -> None:
+def test_an_object_without_length_is_damage(tmp_path: Path) -> None:
     path = tmp_path / "x.blf"
     path.write_bytes(CAPTURES["object of no length"]())
     with pytest.raises(InputError, match=r"Vector BLF file is damaged .*an object of 0 bytes"):
@@ -242,8 +242,8 @@ def test_the_same_objects_with_a_length_are_read(tmp_path: Path) -> None:
 def test_configurations(tmp_path: Path, text: str) -> None:
     path = tmp_path / "x.toml"
     path.write_text(text)
-    told = refused(lambda: load_config(path).load_vehicle())
-    assert told or text.startswith(('model = "x', "bus_options"))
+    message = refused(lambda: load_config(path).load_vehicle())
+    assert message or text.startswith(('model = "x', "bus_options"))
     assert refused(lambda: load_vehicle(map_file=path))
 
 
@@ -295,8 +295,8 @@ def test_stamps_that_are_no_time_are_malformed(tmp_path: Path) -> None:
     assert sum(1 for _ in read_capture(path)) == len(corpus.leaf_frames())
 
 
-def test_what_readers_say_of_hostile_objects_is_not_printed(tmp_path: Path) -> None:
-    """python-can logs a line for each."""
+def test_python_cans_log_lines_are_not_printed(tmp_path: Path) -> None:
+    """python-can logs a line for each unknown object."""
     odd = struct.pack("<4sHHLL", b"LOBJ", 16, 7, 32, 1) + bytes(16)
     (tmp_path / "x.blf").write_bytes(blf(container(odd * 1000 + frame_object())))
     code = (

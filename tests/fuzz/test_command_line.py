@@ -1,4 +1,4 @@
-"""Every command of `cangauge --help`, wrongly used: exit 2, one clear line, nothing written."""
+"""Wrong use of every command: exit code 2, one clear line, nothing written."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cangauge.cli.app import app, main
 from fuzzing import corpus
 
 # `status` answers 1 where no service runs, and `gap-check` draws its own cases: they are tested in
-# tests/service and tests/gapcheck.
+# tests/service and tests/validation.
 ELSEWHERE = {"status", "gap-check"}
 GROUP: Any = typer.main.get_command(app)
 COMMANDS: dict[str, Any] = {
@@ -26,7 +26,7 @@ COMMANDS: dict[str, Any] = {
     if name not in ELSEWHERE
 }
 VALID = {
-    # Complete but for a file that is not there, so that none of them ever begins to work.
+    # Complete but for an absent file, so that none of them starts to work.
     "demo": ["--folder", "file.txt"],
     "fit": ["absent.csv", "-o", "out.json"],
     "estimate": ["absent.csv", "-m", "model.json", "-o", "out.csv"],
@@ -59,7 +59,7 @@ def run(
     capfd: pytest.CaptureFixture[str],
     model_text: str,
 ) -> Run:
-    """Run `cangauge ARG…` in a folder of its own."""
+    """Run `cangauge ARG…` in an empty folder."""
     monkeypatch.chdir(tmp_path)
     Path("model.json").write_text(model_text)
     Path("file.txt").write_text("x\n")
@@ -78,7 +78,7 @@ def run(
 
 @pytest.fixture
 def refused(run: Run) -> Callable[..., str]:
-    """Run it; return the one line that it is refused with. Nothing may be left in the folder."""
+    """Run it; return its one line of error. Nothing may be left in the folder."""
 
     def call(*args: str) -> str:
         before = {path: path.stat().st_mtime_ns for path in Path().iterdir()}
@@ -151,7 +151,7 @@ def _without(args: list[str], parameter: Any) -> list[str]:
 def test_every_option_with_every_kind_of_wrong_value(
     command: str, parameter: Any, refused: Callable[..., str]
 ) -> None:
-    """Valid ones among them end at the missing file; none may end in a traceback or a file."""
+    """Valid ones fail at the absent file; none may end in a traceback or write a file."""
     if command != "demo":  # whose folder may have any name
         for value in WRONG:
             spelt = f"{parameter.opts[-1]}={value}"
@@ -195,7 +195,7 @@ def test_no_number_of_an_option_is_out_of_its_range(
 
 
 @pytest.mark.parametrize("option", ["--initial-soc", "--initial-soc-std"])
-def test_a_soc_beyond_100_is_told_in_our_words(option: str, refused: Callable[..., str]) -> None:
+def test_a_soc_beyond_100_is_refused(option: str, refused: Callable[..., str]) -> None:
     for command in ("run", "estimate"):
         line = refused(command, *PRESENT[command], option, "150")
         assert f"{option}: must lie within 0 … 100" in line
@@ -217,35 +217,35 @@ def test_a_reference_that_rises_while_discharging(refused: Callable[..., str]) -
     head = "time_s,current_a,voltage_v,temperature_c,soc_pct\n"
     Path("log.csv").write_text(head + "\n".join(rows) + "\n")
     line = refused("fit", "log.csv", "-o", "out.json", "--capacity-ah", "from-soc")
-    assert "sign of current is turned: reference SoC rises as charge is taken out" in line
+    assert "sign of current is inverted: reference SoC rises as charge is taken out" in line
     assert "correct soc_pct or leave it out" in line
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "words"),
     [
         ({"capacity_a": 50.0}, "capacity_a: unknown key; did you mean capacity_ah?"),
         ({"range": {"soc_pc": [0, 100]}}, "range.soc_pc: unknown key; did you mean soc_pct?"),
         ({"coefficients": {"k0": {"valu": 1.0}}}, "coefficients.k0.valu: unknown key; did you"),
         ({"delays_s": [70.0, 30.0, 10.0, 0.0]}, "delays_s: must increase, with R1 … R4 in"),
         ({"delays_s": [0.0, 10.0]}, "2 delays_s need R1 … R2"),
-        ({"capacity_ah": -1}, "capacity_ah: must lie within 0.001 … 100000 (got -1"),
-        ({"name": 3}, "name: must be a text (got 3)"),
+        ({"capacity_ah": -1}, "capacity_ah: must be greater than or equal to 0.001 (got -1"),
+        ({"name": 3}, "name: must be a valid string (got 3)"),
         ({"made": None}, "made: must be a table"),
     ],
 )
 def test_mistakes_in_a_model_file(
-    change: dict[str, Any], told: str, refused: Callable[..., str], model_text: str
+    change: dict[str, Any], words: str, refused: Callable[..., str], model_text: str
 ) -> None:
     tree = json.loads(model_text)
     for key, value in change.items():
         tree[key] = {**tree[key], **value} if isinstance(value, dict) else value
     Path("model.json").write_text(json.dumps(tree))
-    assert told in refused("estimate", "log.csv", "-m", "model.json", "-o", "out.csv")
+    assert words in refused("estimate", "log.csv", "-m", "model.json", "-o", "out.csv")
 
 
 @pytest.mark.parametrize("name", ["x.log", "x.blf", "x.csv", "x.asc"])
-def test_junk_is_told_to_be_neither_log_nor_capture(name: str, refused: Callable[..., str]) -> None:
+def test_junk_is_neither_log_nor_capture(name: str, refused: Callable[..., str]) -> None:
     Path(name).write_bytes(bytes(range(256)) * 40)
     for args in (("inspect", name), ("replay", name), ("fit", name, "-o", "out.json"),
                  ("inspect", name, "--vehicle", "leaf_ze0")):  # fmt: skip
@@ -259,12 +259,12 @@ def test_what_is_no_file(command: str, refused: Callable[..., str]) -> None:
     os.mkfifo("pipe")
     Path("folder").mkdir()
     Path("empty").touch()
-    for name, told in (
+    for name, words in (
         ("pipe", "a pipe"), ("folder", "a folder"), ("empty", "empty|no JSON|not JSON"),
         ("/dev/zero", "a device"), ("absent", "no such file"),
     ):  # fmt: skip
         args = ["-m", name] if command == "run" else [name, *VALID[command][1:]]
-        assert re.search(told, refused(command, *args))
+        assert re.search(words, refused(command, *args))
     Path("drive.log").write_bytes(corpus.capture_files()["candump.log"])
     Path("car.dbc").write_text(corpus.DBC)
     Path("car.toml").write_text(corpus.MAP)

@@ -1,4 +1,4 @@
-"""A small part of `benchmarks/fuzz.py`, drawn by hypothesis, which shrinks what it finds."""
+"""A small part of `benchmarks/fuzz.py`, drawn and shrunk by hypothesis."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_anything_is_read_or_refused_in_one_line(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["logs", "captures", "dbc"])
 def test_the_seeds_themselves_are_read(name: str) -> None:
-    """Else all that is tried is junk."""
+    """Otherwise all mutants would be junk."""
     target: Target = TARGETS[name]
     assert target.seeds is not None
     for file, data in target.seeds().items():

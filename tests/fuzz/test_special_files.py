@@ -1,4 +1,4 @@
-"""What is no file, given as one: said at once, in one line, by every reader."""
+"""Pipes, devices and the like are refused at once, in one line, by every reader."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ READERS: dict[str, Callable[[Path], object]] = {
 
 @pytest.fixture(autouse=True)
 def _no_waiting() -> Iterator[None]:
-    """A reader that waits for a pipe is stopped."""
+    """Stop a reader that waits for a pipe."""
 
     def stop(*_: object) -> None:
         raise TimeoutError("a reader waits")

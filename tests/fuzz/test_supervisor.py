@@ -1,10 +1,10 @@
-"""The fuzzer itself: it must notice what it is there for, or a clean table means nothing."""
+"""The fuzzer itself finds hangs, crashes, errors and growth; otherwise a clean table is void."""
 
 from __future__ import annotations
 
 from random import Random
 
-import naughty_targets as naughty
+import faulty_targets as faulty
 import pytest
 
 from cangauge.errors import InputError
@@ -15,23 +15,23 @@ from fuzzing.targets import targets
 
 
 @pytest.mark.slow
-def test_what_hangs_dies_raises_and_grows_is_found_and_all_the_rest_is_tried() -> None:
+def test_hangs_deaths_errors_and_growth_are_found() -> None:
     done: list[int] = []
     tallies = fuzz(
-        [Share("naughty", 0, 30), Share("naughty", 30, 60)],
+        [Share("faulty", 0, 30), Share("faulty", 30, 60)],
         seed=1,
         workers=2,
         progress=lambda _, inputs: done.append(inputs),
-        module="naughty_targets",
+        module="faulty_targets",
         hang_s=3.0,
     )
-    tally = tallies["naughty"]
+    tally = tallies["faulty"]
     found = {example.number: what for (what, _), example in tally.findings.items()}
     assert found == {
-        naughty.HANGS: "hung",
-        naughty.DIES: "died with exit code -9",
-        naughty.RAISES: "KeyError",
-        naughty.GROWS: "too much memory",
+        faulty.HANGS: "hung",
+        faulty.DIES: "died with exit code -9",
+        faulty.RAISES: "KeyError",
+        faulty.GROWS: "too much memory",
     }
     assert (tally.inputs, tally.accepted, tally.refused) == (60, 30, 27)
     assert sum(done) == 58

@@ -1,4 +1,4 @@
-"""Every format, cut off after every byte: the rows that are there, or an `InputError`.
+"""Every format, cut off after every byte: the remaining rows, or an `InputError`.
 
 `tests/logs/test_log_read.py` does it for every text format of logs, `tests/bus/test_captures.py`
 for every format of captures; here are those packed in other ways, and all that configures.
@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.bus.capture_log import capture_to_log
 from cangauge.bus.captures.capture import read_capture
 from cangauge.bus.database import load_dbc
+from cangauge.bus.recording import capture_to_log
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.errors import InputError
 from cangauge.logs.read import read_log
@@ -32,7 +32,7 @@ CAPTURES = [
 
 
 def outcomes(path: Path, data: bytes, read: Callable[[Path], int]) -> list[int]:
-    """How much was read of every beginning of the file, 0 where it was refused."""
+    """Return the amount read of every beginning of the file, 0 where it was refused."""
     found = []
     for length in range(len(data)):
         path.write_bytes(data[:length])
@@ -47,7 +47,7 @@ def outcomes(path: Path, data: bytes, read: Callable[[Path], int]) -> list[int]:
 @pytest.mark.parametrize("name", LOGS)
 def test_logs(tmp_path: Path, name: str) -> None:
     found = outcomes(tmp_path / name, corpus.log_files()[name], lambda path: len(read_log(path)))
-    # A text has rows before its end; what is packed is whole or nothing.
+    # A text has rows before its end; packed files are read whole or not at all.
     assert max(found) == (corpus.ROWS if name == "utf16.csv" else 0)
 
 

@@ -1,4 +1,4 @@
-"""`cangauge inspect`: one JSON object, or a table and sentences; clear refusals."""
+"""`cangauge inspect`: one JSON object, or a table and sentences; clear errors."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_json_is_one_object_on_stdout(path: Path) -> None:
     assert found["resistance"]["median_ohm"] == pytest.approx(0.1, rel=1e-3)
 
 
-def test_the_table_says_what_the_json_says(path: Path) -> None:
+def test_the_table_shows_the_main_findings(path: Path) -> None:
     result = CliRunner().invoke(app, [str(path)])
     assert result.exit_code == 0
     for words in (

@@ -1,4 +1,4 @@
-"""What `inspect_log` says about a log: rates, gaps, steps, stuck channels, charge, abilities."""
+"""`inspect_log`: rates, gaps, quantization, stuck channels, charge, abilities."""
 
 from __future__ import annotations
 
@@ -68,11 +68,11 @@ def test_the_figures_of_a_plain_drive() -> None:
     assert ability(found, "start from rest")[0] == "yes"
 
 
-def test_a_turned_log_is_told_and_keeps_its_capacity() -> None:
+def test_an_inverted_log_is_warned_of_and_keeps_its_capacity() -> None:
     log = drive()
     found = inspect_log(replace(log, current_a=-log.current_a))
     assert found.sign.sign == -1
-    assert found.warnings[0].startswith("the sign of current is turned")
+    assert found.warnings[0].startswith("the sign of current is inverted")
     assert found.soc is not None
     assert found.soc.implied_capacity_ah == pytest.approx(40.0, rel=0.01)
 
@@ -108,7 +108,7 @@ def test_a_stuck_channel_is_found_where_it_is(channel: str) -> None:
     assert any(w.startswith(f"{channel} stuck at") for w in found.warnings)
 
 
-def test_constant_current_and_constant_voltage_phases_are_not_stuck() -> None:
+def test_cc_and_cv_phases_are_not_stuck() -> None:
     time = np.arange(0.0, 7200.0)
     steps = np.where((time // 20) % 2 == 0, 30.0, -30.0)
     current = np.select(
@@ -141,7 +141,7 @@ def test_missing_soc_is_measured() -> None:
     assert "soc_pct" not in nothing.channels
 
 
-def test_what_a_poor_log_cannot_identify_is_said() -> None:
+def test_a_poor_log_lists_what_it_cannot_identify() -> None:
     time = np.arange(0.0, 6000.0, 10.0)
     log = Log(
         time,

@@ -1,4 +1,4 @@
-"""The sign of current is found where the data hold it, and left open where they do not."""
+"""The sign of current is found where the data show it, and left open elsewhere."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def turned(log: Log) -> Log:
 
 @settings(max_examples=40)
 @given(seed=st.integers(0, 10_000), resistance_ohm=st.floats(0.05, 0.2))
-def test_both_conventions_are_told_apart(seed: int, resistance_ohm: float) -> None:
+def test_both_conventions_are_distinguished(seed: int, resistance_ohm: float) -> None:
     log = drive(seed, resistance_ohm=resistance_ohm)
     finding = sign_of_current(log)
     assert finding.sign == 1
@@ -50,7 +50,7 @@ def test_both_conventions_are_told_apart(seed: int, resistance_ohm: float) -> No
 
 @settings(max_examples=40)
 @given(seed=st.integers(0, 10_000))
-def test_voltage_that_has_nothing_to_do_with_current_leaves_it_open(seed: int) -> None:
+def test_unrelated_voltage_leaves_the_sign_open(seed: int) -> None:
     rng = np.random.default_rng(seed)
     log = drive(seed)
     noise = replace(log, voltage_v=380.0 + rng.normal(0.0, 1.0, len(log)))
@@ -101,12 +101,12 @@ def test_contradicting_evidence_leaves_it_open() -> None:
     assert sign_of_current(replace(log, soc_pct=rising)).sign == 0
 
 
-def test_commands_can_refuse_a_turned_log() -> None:
+def test_commands_can_refuse_an_inverted_log() -> None:
     log = replace(drive(), name="drive")
     require_discharge_positive(log)
     with pytest.raises(
         InputError,
-        match=r"drive: current_a: the sign of current is turned: volt.*"
+        match=r"drive: current_a: the sign of current is inverted: volt.*"
         r"age moved with current in (\d+) of \1 steps.*multiply the column by -1",
     ):
         require_discharge_positive(turned(log))

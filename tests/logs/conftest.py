@@ -1,4 +1,4 @@
-"""Small files of every format, built as their makers write them."""
+"""Small files of every format, as their makers write them."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def voltage_at(time_s: float) -> float:
 
 
 def d3_text(header: list[str], *, start_s: float = -1.0, end_s: float = 40.0) -> str:
-    """A D3 file; the 200 A clamp saturates at 20 A, copies from CAN have the sign turned."""
+    """A D3 file; the 200 A clamp saturates at 20 A, copies from CAN have the sign inverted."""
     lines = ["\t".join(header)]
     for tick in range(round(start_s * 10), round(end_s * 10)):
         time = tick / 10

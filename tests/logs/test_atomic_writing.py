@@ -1,4 +1,4 @@
-"""Nothing half-written: the old file or the new one, and clear lines where writing fails."""
+"""Atomic writing: the old file or the new one, and clear errors where writing fails."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ import pytest
 
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
-from cangauge.logs.read import CaptureGivenError, read_log
+from cangauge.logs.read import read_log
 
 NAMES = (
     "log.parquet",
@@ -46,7 +46,7 @@ def test_whole_files_read_gzipped_too(
 
 
 def outcome(path: Path, data: bytes) -> Log | InputError:
-    """The log, or the error that says why there is none; anything else breaks the test."""
+    """Return the log or the InputError; anything else fails the test."""
     path.write_bytes(data)
     try:
         return read_log(path)
@@ -70,7 +70,7 @@ def test_cut_off_at_every_byte_it_reads_or_is_refused(
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_damaged_bytes_never_break_out(
+def test_damaged_bytes_raise_nothing_but_input_errors(
     tmp_path: Path, every_format: dict[str, bytes], name: str
 ) -> None:
     rng = np.random.default_rng(7)
@@ -91,7 +91,7 @@ def test_damaged_bytes_never_break_out(
         (gzip.compress(b"", mtime=0), "the file is empty"),
         (
             b"\x00\x01\x02" * 100,
-            "not a known kind of log, nor of capture; known are: canonical Parquet",
+            "not a known kind of log; known are: canonical Parquet",
         ),
         (b"%PDF-1.4\n", r"first line: .*not a known kind of log.* \(got '%PDF-1.4'\)"),
         (b"a,b,c\n1,2,3\n", r"\(got 'a,b,c'\)"),
@@ -100,7 +100,7 @@ def test_damaged_bytes_never_break_out(
         (b"PAR1not parquet", "Parquet file is cut off or damaged"),
     ],
 )
-def test_what_is_no_log_is_said_in_one_line(tmp_path: Path, content: bytes, words: str) -> None:
+def test_unknown_content_is_refused_in_one_line(tmp_path: Path, content: bytes, words: str) -> None:
     path = tmp_path / "x"
     path.write_bytes(content)
     with pytest.raises(InputError, match=words) as caught:
@@ -122,12 +122,3 @@ def test_an_encrypted_zip_is_refused(tmp_path: Path, every_format: dict[str, byt
     (tmp_path / "x.zip").write_bytes(data)
     with pytest.raises(InputError, match=r"zip cannot be unpacked: .*encrypted"):
         read_log(tmp_path / "x.zip")
-
-
-@pytest.mark.real
-def test_a_capture_asks_for_a_vehicle(shared_data: Path) -> None:
-    paths = sorted((shared_data / "leaf_can").glob("*.gz"))
-    assert len(paths) == 9
-    for path in paths:
-        with pytest.raises(CaptureGivenError, match="this is a CAN capture, not a log; give --veh"):
-            read_log(path)

@@ -1,4 +1,4 @@
-"""Voltage and temperature that have changed places are told from a temperature in kelvin."""
+"""Swapped voltage and temperature are distinguished from a temperature in kelvin."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def drive() -> Log:
 
 
 def steady(volts: float) -> Log:
-    """A cycler's discharge by a constant current, whose cells warm."""
+    """A cycler's discharge at constant current, with warming cells."""
     log = synthetic_log(hours=0.5, start_pct=80.0, end_pct=55.0)
     falling = np.linspace(1.02, 0.95, len(log))
     return replace(
@@ -62,7 +62,7 @@ def refusal(log: Log, folder: Path) -> InputError:
         pytest.param(steady(700.0), id="constant current, 800 V"),
     ],
 )
-def test_swapped_columns_are_told(log: Log, tmp_path: Path) -> None:
+def test_swapped_columns_are_refused(log: Log, tmp_path: Path) -> None:
     error = refusal(swapped(log), tmp_path)
     assert error.field == "temperature_c"
     assert error.value == pytest.approx(float(np.median(log.voltage_v)))
@@ -80,8 +80,8 @@ def test_kelvin_stays_kelvin_whatever_the_battery(volts: float, tmp_path: Path) 
     assert (error.problem, error.cure) == ("temperature looks like kelvin", "subtract 273.15")
 
 
-def test_where_no_current_tells_them_apart_both_cures_are_named(tmp_path: Path) -> None:
-    """300 and 24, hardly moving: a module in kelvin, or an empty pack in °C the wrong way round."""
+def test_without_a_varying_current_both_cures_are_named(tmp_path: Path) -> None:
+    """300 and 24, almost constant: a module in kelvin, or an empty pack with swapped columns."""
     for log in (in_kelvin(steady(24.0)), swapped(steady(300.0))):
         error = refusal(log, tmp_path)
         assert error.problem == "temperature looks like kelvin"

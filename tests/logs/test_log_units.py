@@ -1,8 +1,6 @@
-"""Wrong units are found from the values, whatever the battery; right ones pass."""
+"""Wrong units are recognised from the values of any battery; correct ones pass."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +9,7 @@ from hypothesis import strategies as st
 
 from cangauge.errors import InputError
 from cangauge.logs.draft import DraftLog
-from cangauge.logs.file_content import FileContent
+from cangauge.logs.log import Log
 from cangauge.logs.units import convert
 
 
@@ -31,8 +29,7 @@ def drive(
 
 
 def checked(values: dict[str, np.ndarray]) -> tuple[str, ...]:
-    content = FileContent(Path("drive.csv"), b"", "drive", ())
-    return DraftLog(content, values).to_log().remarks
+    return Log(**DraftLog("drive", "drive.csv", values).checked()).remarks
 
 
 @settings(max_examples=50)
@@ -75,7 +72,7 @@ def test_a_wrong_unit_names_field_value_and_cure(
 
 
 def test_a_fast_log_in_milliseconds_is_known_by_its_charge() -> None:
-    """100 Hz in ms looks like rows every 10 s; but the charge is hours of the peak current."""
+    """100 Hz in ms looks like rows every 10 s, but moves hours of the peak current."""
     values = drive(interval_s=0.01)
     values["time_s"] = np.rint(np.arange(200_000) * 10.0)
     values["current_a"] = np.where(np.arange(200_000) % 1000 < 200, 150.0, 10.0)

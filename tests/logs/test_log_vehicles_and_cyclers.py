@@ -13,7 +13,7 @@ from cangauge.logs.read import read_log
 from cangauge.logs.sign import charge_ah
 
 
-def test_i3_current_is_turned_and_soc_may_end_early(
+def test_i3_current_is_negated_and_soc_may_end_early(
     tmp_path: Path, build_i3: Callable[[list[str]], bytes]
 ) -> None:
     rows = [f"{k / 10};0;0;391.4;-2.{k};21;22;86.9;100;90" for k in range(5)]
@@ -47,7 +47,7 @@ def test_i3_without_its_columns_is_refused(
         read_log(tmp_path / "x.csv")
 
 
-def test_a_set_point_below_zero_and_a_rate_that_is_no_temperature(
+def test_set_points_are_read_from_file_names_rates_are_not(
     tmp_path: Path, every_format: dict[str, bytes]
 ) -> None:
     cold = tmp_path / "A123_DYN_50_N05_s1.csv"

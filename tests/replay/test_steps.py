@@ -97,7 +97,7 @@ def test_several_replays_in_one_capture_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.real
 def test_samples_of_a_real_capture_are_counted_as_the_receiver_does(shared_data: Path) -> None:
-    from cangauge.bus.capture_log import capture_samples  # noqa: PLC0415 - needs the real data
+    from cangauge.bus.recording import capture_samples  # noqa: PLC0415 - needs the real data
 
     path = shared_data / "leaf_can" / "ZE0w24kWhstock.log.gz"
     vehicle = load_vehicle("leaf_ze0")

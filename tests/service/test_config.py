@@ -86,11 +86,11 @@ def test_the_command_line_goes_before_the_file(tmp_path: Path) -> None:
         ('model = "m"\nmethod = "magic"', "method", "magic"),
         ('model = "m"\ninitial_soc = 130', "initial_soc", "130"),
         ('model = "m"\ninitial_soc = "full"', "initial_soc", "neither a number nor auto"),
-        ('model = "m"\ntimeout_s = 0', "timeout_s", "must be more than 0"),
+        ('model = "m"\ntimeout_s = 0', "timeout_s", "must be greater than 0"),
         ('model = "m"\n[ids]\nsoc_detail = 0x800', "ids.soc_detail", "2047"),
         ('model = "m"\ntimeout_s = nan', "timeout_s", "finite"),
         ('vehicle = "generic"', "model", "is missing"),
-        ("model = 3", "model", "must be a text"),
+        ("model = 3", "model", "must be a valid string"),
         ("model = ", None, "not TOML"),
     ],
 )

@@ -10,9 +10,9 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.capture_log import open_vehicle_capture
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import LEAF_RULE
+from cangauge.bus.recording import open_vehicle_capture
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.estimate.offline import run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings

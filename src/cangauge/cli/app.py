@@ -162,7 +162,7 @@ def main() -> None:
     try:
         code = app(standalone_mode=False)
     except CangaugeError as error:
-        if not error.told:
+        if not error.logged:
             note(f"error: {error}")
         emit_failure(error.to_dict(), error.exit_code)
         sys.exit(error.exit_code)

@@ -46,7 +46,6 @@ from cangauge.estimate.settings import VALID_STD_PCT, EstimatorSettings, Method
 from cangauge.estimate.validity import Reason, Status, reason_name, reason_names
 from cangauge.inference.rows import usual_gap_s
 from cangauge.logs.log import Log
-from cangauge.logs.read import CaptureGivenError
 from cangauge.model.charge import counted_soc_pct
 from cangauge.model.delay_line import GAP_S
 from cangauge.model.model_file import Model
@@ -387,23 +386,24 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
         gap_s=GAP_S if max_gap_s is None else max_gap_s,
     )
     described = vehicle is not None or dbc is not None or map_file is not None
-    try:
+    # python-can and cantools are slow to import.
+    from cangauge.bus.captures.capture import Capture  # noqa: PLC0415
+    from cangauge.bus.recording import capture_without_vehicle, open_recording  # noqa: PLC0415
+    from cangauge.bus.vehicle import load_vehicle  # noqa: PLC0415
+
+    if isinstance(open_recording(log_path), Capture):
+        if not described:
+            raise capture_without_vehicle(log_path)
+        car = load_vehicle(vehicle, dbc, map_file, temperature_c=temperature)
+        source = known_temperature_source(temperature_source) or "unknown"
+        done = from_capture(log_path, car, model, replace(settings, temperature_source=source))
+    else:
         log = load_log(
             log_path,
             temperature_c=temperature,
             temperature_source=temperature_source,
             refuse_turned=True,
         )
-    except CaptureGivenError:
-        if not described:
-            raise
-        # cantools is slow to import, and logs do without.
-        from cangauge.bus.vehicle import load_vehicle  # noqa: PLC0415
-
-        car = load_vehicle(vehicle, dbc, map_file, temperature_c=temperature)
-        source = known_temperature_source(temperature_source) or "unknown"
-        done = from_capture(log_path, car, model, replace(settings, temperature_source=source))
-    else:
         if described:
             note_not_a_capture(log_path)
         done = from_log(log, model, settings, given=initial_soc, gap_given=max_gap_s is not None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,21 +10,27 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from cangauge.cli.options import JsonOption
+from cangauge.cli.options import (
+    DbcOption,
+    JsonOption,
+    MapOption,
+    TemperatureOption,
+    VehicleOption,
+)
 from cangauge.cli.output import emit_json
 from cangauge.errors import InputError
-from cangauge.inspect.log import LogInspection, inspect_log
-from cangauge.logs.read import CaptureGivenError, read_log
 
 if TYPE_CHECKING:
     from cangauge.inspect.capture import CaptureInspection
+    from cangauge.inspect.log import LogInspection
 
 PIPED_WIDTH = 140
-"""Columns of the tables where stdout is no terminal that has a width."""
+"""Width of the tables where stdout is no terminal [characters]."""
+_NESTED = (Mapping, list, tuple)
 _MARKS = {"yes": "[green]yes[/]", "partly": "[yellow]partly[/]", "no": "[red]no[/]"}
 
 
-def inspect_command(  # noqa: PLR0917  # typer fills the arguments by name
+def inspect_command(  # noqa: PLR0917 - typer fills the arguments by name
     path: Annotated[
         Path,
         typer.Argument(
@@ -34,27 +40,17 @@ def inspect_command(  # noqa: PLR0917  # typer fills the arguments by name
             show_default=False,
         ),
     ],
-    vehicle: Annotated[
-        str | None, typer.Option(help="Preset of the car, for a capture.", metavar="PRESET")
-    ] = None,
-    dbc: Annotated[
-        Path | None, typer.Option(help="DBC of the car, for a capture.", metavar="FILE")
-    ] = None,
-    map_file: Annotated[
-        Path | None,
-        typer.Option("--map", help="Mapping of its signals, with --dbc.", metavar="FILE"),
-    ] = None,
-    temperature: Annotated[
-        float | None,
-        typer.Option(help="Constant temperature [°C], where the file holds none.", metavar="T"),
-    ] = None,
+    vehicle: VehicleOption = None,
+    dbc: DbcOption = None,
+    map_file: MapOption = None,
+    temperature: TemperatureOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Tell what a log or capture holds, and find the sign of current from the data.
+    """Show what a log or capture holds, and find the sign of current from the data.
 
-    Rates, gaps longer than 2 s, ranges, steps of quantisation, stuck channels, charge moved [Ah],
-    the capacity that the reference SoC implies [Ah per 100 %], resistance seen in steps [Ω], and
-    what the log can and cannot identify. For a capture also frames, CRC and counter errors.
+    Rates, gaps longer than 2 s, ranges, quantization, stuck channels, charge moved [Ah], the
+    capacity that the reference SoC implies [Ah per 100 %], resistance from steps of current [Ω],
+    and what the log can and cannot identify. For a capture also frames, CRC and counter errors.
 
     For example:
 
@@ -66,47 +62,44 @@ def inspect_command(  # noqa: PLR0917  # typer fills the arguments by name
 
     `cangauge inspect capture.log --vehicle leaf_ze0`
     """
+    # Deferred: the readers and the decoder take half a second to import.
+    from cangauge.bus.recording import open_recording  # noqa: PLC0415
+    from cangauge.bus.vehicle import load_vehicle  # noqa: PLC0415
+    from cangauge.inspect.capture import inspect_capture  # noqa: PLC0415
+    from cangauge.inspect.log import LogInspection, inspect_log  # noqa: PLC0415
+    from cangauge.logs.read import LogFile  # noqa: PLC0415
+
+    recording = open_recording(path)
+    options = {"--vehicle": vehicle, "--dbc": dbc, "--map": map_file}
+    given = {option: str(value) for option, value in options.items() if value is not None}
+    if isinstance(recording, LogFile):
+        if given:
+            option, value = next(iter(given.items()))
+            raise InputError(
+                "this is a log; the option is for captures",
+                source=path,
+                field=option,
+                value=value,
+                cure="omit it",
+            )
+        found: LogInspection | CaptureInspection = inspect_log(
+            recording.read(temperature_c=temperature)
+        )
+    else:
+        car = load_vehicle(vehicle, dbc, map_file, temperature_c=temperature) if given else None
+        found = inspect_capture(path, car)
+    if json_output:
+        emit_json(found.to_dict())
+        return
     console = Console(highlight=False)
     if not console.is_terminal:
         console = Console(highlight=False, width=PIPED_WIDTH)
-    try:
-        log = read_log(path, temperature_c=temperature)
-    except CaptureGivenError:
-        found = _inspect_capture(path, vehicle, dbc, map_file, temperature)
-        if json_output:
-            emit_json(found.to_dict())
-        else:
-            _show(console, {k: v for k, v in found.to_dict().items() if k != "log"})
-            if found.log is not None:
-                _show_log(console, found.log)
-        return
-    for option, given in (("--vehicle", vehicle), ("--dbc", dbc), ("--map", map_file)):
-        if given is not None:
-            raise InputError(
-                f"{path} is a log and no capture", field=option, value=str(given), cure="leave it"
-            )
-    inspection = inspect_log(log)
-    if json_output:
-        emit_json(inspection.to_dict())
+    if isinstance(found, LogInspection):
+        _show_log(console, found)
     else:
-        _show_log(console, inspection)
-
-
-def _inspect_capture(
-    path: Path,
-    vehicle: str | None,
-    dbc: Path | None,
-    map_file: Path | None,
-    temperature_c: float | None,
-) -> CaptureInspection:
-    # Imported here: python-can and cantools are slow to import, and logs do without.
-    from cangauge.bus.vehicle import load_vehicle  # noqa: PLC0415
-    from cangauge.inspect.capture import inspect_capture  # noqa: PLC0415
-
-    car = None
-    if vehicle is not None or dbc is not None or map_file is not None:
-        car = load_vehicle(vehicle, dbc, map_file, temperature_c=temperature_c)
-    return inspect_capture(path, car)
+        _show(console, {key: value for key, value in found.to_dict().items() if key != "log"})
+        if found.log is not None:
+            _show_log(console, found.log)
 
 
 def _show_log(console: Console, found: LogInspection) -> None:
@@ -132,7 +125,7 @@ def _show_log(console: Console, found: LogInspection) -> None:
         )
     console.print(table)
     console.print(
-        f"Charge: {charge.discharged_ah:.4g} Ah taken out, {charge.charged_ah:.4g} Ah put in,"
+        f"Charge: {charge.discharged_ah:.4g} Ah discharged, {charge.charged_ah:.4g} Ah charged,"
         f" net {charge.net_ah:+.4g} Ah."
     )
     if soc is not None:
@@ -142,36 +135,38 @@ def _show_log(console: Console, found: LogInspection) -> None:
         )
     console.print(f"Sign: {found.sign.sentence}.", markup=False)
     abilities = Table(title="What this log can identify", title_justify="left")
-    for heading in ("what", "can", "because"):
+    for heading in ("quantity", "identifiable", "reason"):
         abilities.add_column(heading)
     for ability in found.abilities[1:]:
         abilities.add_row(ability.topic, _MARKS[ability.verdict], ability.text)
     console.print(abilities)
-    for heading, lines in (("Remarks", found.remarks), ("Look at", found.warnings)):
+    for heading, lines in (("Remarks", found.remarks), ("Warning", found.warnings)):
         for line in lines:
             console.print(f"{heading}: {line}", markup=False)
 
 
 def _number(value: float | None) -> str:
-    return "none seen" if value is None else f"{value:.4g}"
+    return "none" if value is None else f"{value:.4g}"
 
 
 def _show(console: Console, found: Mapping[str, Any], title: str = "") -> None:
-    """Show a nested result: plain values first, then tables and lists under their names."""
-    plain = {key: value for key, value in found.items() if not isinstance(value, Mapping | list)}
+    """Print a nested result: plain values first, then tables and lists under their names."""
+    plain = {key: value for key, value in found.items() if not isinstance(value, _NESTED)}
     if plain:
         _show_rows(console, title, [{"": key, " ": value} for key, value in plain.items()])
     for key, value in found.items():
         if isinstance(value, Mapping):
             _show(console, value, f"{title} {key}".strip())
-        elif isinstance(value, list) and value and all(isinstance(row, Mapping) for row in value):
-            _show_rows(console, f"{title} {key}".strip(), value)
-        elif isinstance(value, list):
+        elif isinstance(value, list | tuple):
+            rows = [row for row in value if isinstance(row, Mapping)]
+            if rows:
+                _show_rows(console, f"{title} {key}".strip(), rows)
+                continue
             for line in value:
                 console.print(f"{key}: {line}", markup=False)
 
 
-def _show_rows(console: Console, title: str, rows: list[dict[str, Any]]) -> None:
+def _show_rows(console: Console, title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     headings = list(dict.fromkeys(key for row in rows for key in row))
     named = any(heading.strip() for heading in headings)
     table = Table(title=title.replace("_", " "), title_justify="left", show_header=named)
@@ -185,4 +180,4 @@ def _show_rows(console: Console, title: str, rows: list[dict[str, Any]]) -> None
 def _shown(value: Any) -> str:
     if value is None:
         return "–"
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    return f"{value:.5g}" if isinstance(value, float) else str(value)

@@ -8,9 +8,8 @@ Options of `cangauge run` for whoever operates the service.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sized
-from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, cast
+from typing import Annotated
 
 import typer
 
@@ -18,7 +17,9 @@ from cangauge._io import check_writable
 from cangauge.bus.vehicle import PRESETS
 from cangauge.cli.output import note
 from cangauge.errors import InputError
-from cangauge.logs.log import TEMPERATURE_SOURCES, Log, TemperatureSource
+from cangauge.logs import units
+from cangauge.logs.log import Log
+from cangauge.logs.units import TEMPERATURE_SOURCES, TemperatureSource
 
 # --- What the commands that take a LOG or a capture have in common: options, reading, guards
 
@@ -53,7 +54,7 @@ TemperatureSourceOption = Annotated[
     typer.Option(
         "--temperature-source",
         metavar="SOURCE",
-        help="What the temperature was measured on, where the input does not say it: "
+        help="What the temperature was measured on, where the input does not state it: "
         f"{', '.join(TEMPERATURE_SOURCES)}.",
     ),
 ]
@@ -81,7 +82,7 @@ def load_log(
     temperature_source: str | None = None,
     refuse_turned: bool = False,
 ) -> Log:
-    """Read a log, or a capture by its vehicle, and say on stderr what the reader remarked.
+    """Read a log, or a capture by its vehicle, and print the reader's remarks on stderr.
 
     Parameters
     ----------
@@ -95,41 +96,34 @@ def load_log(
     temperature_source : str, optional
         What the temperature was measured on.
     refuse_turned : bool
-        Refuse a log whose data show clearly that positive current charges, as a command must
-        that would compute nonsense from it.
+        Refuse a single row, and a log whose data show clearly that positive current charges.
 
     Returns
     -------
     Log
-        Positive current discharges, as far as the format says it.
+        Positive current discharges, as far as the format defines it.
 
     Raises
     ------
     InputError
-        If the input cannot be read, an option has no known value, or (with `refuse_turned`) the
-        sign of current is turned.
+        If the input cannot be read, an option has an unknown value, or (with `refuse_turned`)
+        the sign of current is inverted.
     """
-    # pyarrow is slow to import, and the service, which has the same options, does without.
-    from cangauge.logs.read import CaptureGivenError, read_log  # noqa: PLC0415
+    # pyarrow and cantools are slow to import; the service has these options and needs no logs.
+    from cangauge.bus.recording import log_of, open_recording  # noqa: PLC0415
+    from cangauge.bus.vehicle import load_vehicle  # noqa: PLC0415
+    from cangauge.logs.read import LogFile  # noqa: PLC0415
 
     source = known_temperature_source(temperature_source)
-    described = vehicle is not None or dbc is not None or map_file is not None
-    is_capture = False
-    try:
-        log = read_log(path, temperature_source=source, temperature_c=temperature_c)
-        if described:
+    recording = open_recording(path)
+    is_capture = not isinstance(recording, LogFile)
+    car = None
+    if vehicle is not None or dbc is not None or map_file is not None:
+        if is_capture:
+            car = load_vehicle(vehicle, dbc, map_file, temperature_c=temperature_c)
+        else:
             note_not_a_capture(path)
-    except CaptureGivenError:
-        if not described:
-            raise
-        # cantools is slow to import, and logs do without.
-        from cangauge.bus.capture_log import capture_to_log  # noqa: PLC0415
-        from cangauge.bus.vehicle import load_vehicle  # noqa: PLC0415
-
-        car = load_vehicle(vehicle, dbc, map_file, temperature_c=temperature_c)
-        log, is_capture = capture_to_log(path, car), True
-        if source is not None:
-            log = replace(log, temperature_source=source)
+    log = log_of(recording, car, temperature_c=temperature_c, temperature_source=source)
     if refuse_turned:
         refuse_single_row(log)
         refuse_turned_current(log, is_capture=is_capture)
@@ -139,12 +133,12 @@ def load_log(
 
 
 def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> None:
-    """Refuse, before any long work, outputs that cannot be written or that would overwrite input.
+    """Refuse, before any long work, outputs that cannot be written or would overwrite input.
 
     Parameters
     ----------
     outputs, inputs : iterable of Path
-        None among the outputs means that this one is not wanted.
+        None stands for an output that is not wanted.
 
     Raises
     ------
@@ -161,7 +155,7 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> Non
             raise InputError(
                 "this output is also an input", source=output, cure="name another file for it"
             )
-        # /dev/null may well be named twice.
+        # /dev/null may be named twice.
         if place in written and (place.is_file() or not place.exists()):
             raise InputError(
                 "two outputs have this name", source=output, cure="name two different files"
@@ -171,7 +165,7 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> Non
 
 
 def within(value: float, low: float, high: float, *, option: str, unit: str) -> float:
-    """Return `value` if it lies within low … high (NaN does not), else raise InputError."""
+    """Return `value` if it lies within low … high (NaN does not); else raise InputError."""
     if not low <= value <= high:
         raise InputError(
             f"must lie within {low:g} … {high:g} {unit}".rstrip(), field=option, value=value
@@ -180,7 +174,7 @@ def within(value: float, low: float, high: float, *, option: str, unit: str) -> 
 
 
 def refuse_single_row(recorded: Sized) -> None:
-    """Raise InputError for a log of one row: no charge can be counted over it."""
+    """Raise InputError for a log of one row: no charge can be counted."""
     if len(recorded) < 2:
         raise InputError(
             "a single row: charge is counted from one row to the next",
@@ -191,7 +185,7 @@ def refuse_single_row(recorded: Sized) -> None:
 
 def refuse_turned_current(log: Log, *, is_capture: bool) -> None:
     """Raise InputError if the data show clearly that positive current charges."""
-    # For the same reason as in `load_log`.
+    # Deferred as in `load_log`.
     from cangauge.logs.sign import require_discharge_positive  # noqa: PLC0415
 
     try:
@@ -199,7 +193,7 @@ def refuse_turned_current(log: Log, *, is_capture: bool) -> None:
     except InputError as error:
         if not is_capture:
             raise
-        # The frames are as they are; it is the map that must turn them.
+        # Recorded frames are never changed: the map inverts the sign.
         cure = "take the preset of this car, or set sign = -1 under [current] of the map file"
         raise InputError(
             error.problem, source=error.source, field=error.field, cure=cure
@@ -207,28 +201,15 @@ def refuse_turned_current(log: Log, *, is_capture: bool) -> None:
 
 
 def note_not_a_capture(path: Path) -> None:
-    """Say on stderr that the options for captures were not needed."""
+    """Note on stderr that the options for captures were not needed."""
     note(f"{path}: a log, not a capture: --vehicle, --dbc and --map do not apply to it")
 
 
 def known_temperature_source(given: str | None) -> TemperatureSource | None:
-    """Return the temperature source if it is a known one, None if none was given.
-
-    Raises
-    ------
-    InputError
-        If it is not known.
-    """
+    """Return the temperature source if one was given; raise InputError if it is not known."""
     if given is None:
         return None
-    if given not in TEMPERATURE_SOURCES:
-        raise InputError(
-            "not a known temperature source",
-            field="--temperature-source",
-            value=given,
-            cure=f"use one of: {', '.join(TEMPERATURE_SOURCES)}",
-        )
-    return cast("TemperatureSource", given)
+    return units.known_temperature_source(given, field="--temperature-source")
 
 
 # --- What the commands on a bus have in common: options

@@ -11,11 +11,11 @@ import typer
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from cangauge._formatting import duration, number
-from cangauge.bus.captures.capture import is_capture
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import bus_address, open_bus, parse_bus_options
 from cangauge.bus.publish import FrameIds, standard_filter
+from cangauge.bus.recording import open_recording
 from cangauge.bus.vehicle import Vehicle, load_vehicle
 from cangauge.cli.options import (
     BusDbcOption,
@@ -33,7 +33,7 @@ from cangauge.cli.options import (
 )
 from cangauge.cli.output import console, emit_json, note
 from cangauge.errors import InputError
-from cangauge.logs.read import read_log
+from cangauge.logs.read import LogFile
 from cangauge.replay.player import ReplaySettings, ReplayState, play
 from cangauge.replay.steps import CaptureSource, LogSource, Source
 from cangauge.service.config import DEFAULT_VEHICLE
@@ -134,9 +134,10 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
 
 
 def _source(recorded: Path, car: Vehicle | None, ids: FrameIds) -> Source:
-    if is_capture(recorded):
+    recording = open_recording(recorded)
+    if not isinstance(recording, LogFile):
         return CaptureSource(recorded, car, ids)
-    log = read_log(recorded)
+    log = recording.read()
     for remark in log.remarks:
         note(f"{recorded}: {remark}")
     return LogSource(log, car or load_vehicle(DEFAULT_VEHICLE))

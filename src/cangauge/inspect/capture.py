@@ -1,7 +1,4 @@
-"""What a pass over a capture shows, without knowing the car: ids, periods, protection, silence.
-
-`inspect_capture`: what frames a capture holds, whose they are, and whether they are whole.
-"""
+"""Inspect a capture: its frames by id, their periods and protection, and the matching presets."""
 
 from __future__ import annotations
 
@@ -15,31 +12,33 @@ from typing import Any, Final
 import can
 from can.typechecking import Channel
 
-from cangauge.bus.capture_log import capture_to_log, open_vehicle_capture
 from cangauge.bus.captures.capture import open_capture
 from cangauge.bus.captures.files import CaptureInfo
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.protection import GENERIC_RULE, LEAF_RULE, FrameChecker, Verdict
+from cangauge.bus.recording import capture_to_log, open_vehicle_capture
 from cangauge.bus.vehicle import PRESETS, Vehicle, preset_vehicle
 from cangauge.inspect.log import LogInspection, inspect_log
 
-# --- What a pass over a capture shows, without knowing the car: ids, periods, protection, si…
-
 GAP_S: Final = 1.0
-"""A bus that is silent for longer has a gap [s]."""
+"""Longest silence of a bus that is no gap [s]."""
 LISTED_GAPS: Final = 20
 MAX_IDS: Final = 4096
-"""More ids than any car has: what comes after them is only counted."""
+"""Ids that are described, more than any car has; frames of others are only counted."""
 INTERVALS: Final = 2000
-"""The period of an id is the median of its first so many intervals."""
+"""First intervals of an id whose median is its period."""
 LEARN_FRAMES: Final = 50
-"""The period by which a standing counter is judged is learnt from so many frames."""
+"""First frames of an id, from which the period of its alive counter is learnt."""
 AGREEING: Final = 0.9
-"""A rule's CRC protects an id when so much of its frames agree, …"""
+"""Least share of frames with a correct CRC for an id to be protected by a rule, …"""
 PAYLOADS: Final = 4
-"""… if they have at least so many different payloads: a constant one can agree by chance."""
+"""… which have at least this many different payloads: a constant one can agree by chance."""
 STANDING: Final = 0.02
-"""… but where more of its counters stand still, its counter is elsewhere, or it has none."""
+"""Largest share of repeated counters; above it the counter is elsewhere, or there is none."""
+PERIOD_TOLERANCE: Final = 0.3
+"""Largest difference of a period from a preset's [-]."""
+LONG_ENOUGH_S: Final = 2.0
+"""Length of a capture from which slow signals are expected [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,18 +50,18 @@ class IdSummary:
     id : str
         Hexadecimal; 8 digits for an extended id.
     bus : str
-        As in the capture; "" where it does not say.
+        As in the capture; "" where it names none.
     frames : int
     bytes : str
-        Lengths that were seen ("8", "5, 8").
+        Data lengths ("8", "5, 8").
     period_s : float or None
         Median interval [s].
     longest_s : float or None
         Longest interval [s].
     protection : str
-        "leaf" or "generic" where CRCs by that rule agree, else "".
+        "leaf" or "generic" where CRCs of that rule agree, else "".
     crc_errors, counter_jumps, frames_lost, counter_repeats : int or None
-        By that rule; None without it, the last three also where its counter is elsewhere.
+        By that rule; None without one, the last three also where its counter is elsewhere.
     """
 
     id: str
@@ -80,23 +79,130 @@ class IdSummary:
 
 @dataclass(frozen=True, slots=True)
 class Silence:
-    """Time without any frame: when the last frame before it came, and its length [s]."""
+    """An interval without any frame: stamp of the last frame before it, and its length [s]."""
 
     start_s: float
     length_s: float
 
 
-class Survey:
-    """Takes the frames of a capture, one after the other.
+@dataclass(frozen=True, slots=True)
+class PresetMatch:
+    """Whether a preset decodes the capture.
 
-    Attributes
+    Parameters
     ----------
-    first_s, last_s : float
-        Earliest and latest stamp [s]; NaN before the first frame.
-    error_frames, remote_frames, time_reversals, other_ids : int
-        Frames of these kinds; stamped earlier than the one before; of ids beyond `MAX_IDS`.
-    gaps : list of Silence
+    preset, about : str
+    matches : bool
+    because : str
+        Why, or why not.
+    samples : int
+    current_a, voltage_v, temperature_c, soc_pct : tuple of float, or None
+        Lowest and highest value decoded, [A] (positive = discharge), [V], [°C], [%].
     """
+
+    preset: str
+    about: str
+    matches: bool
+    because: str
+    samples: int
+    current_a: tuple[float, float] | None
+    voltage_v: tuple[float, float] | None
+    temperature_c: tuple[float, float] | None
+    soc_pct: tuple[float, float] | None
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureInspection:
+    """Findings of `inspect_capture`.
+
+    Parameters
+    ----------
+    name, source : str
+    info : CaptureInfo
+    start_s, duration_s : float
+        Stamp of the first frame, time to the last [s].
+    error_frames, remote_frames : int
+    time_reversals : int
+        Frames stamped earlier than the one before.
+    ids : tuple of IdSummary
+    other_ids : int
+        Frames of ids beyond the first `MAX_IDS`.
+    gaps : tuple of Silence
+        The first `LISTED_GAPS` silences longer than `GAP_S`.
+    presets : tuple of PresetMatch
+    log : LogInspection or None
+        With a vehicle: of the log that it makes of the capture.
+    """
+
+    name: str
+    source: str
+    info: CaptureInfo
+    start_s: float
+    duration_s: float
+    error_frames: int
+    remote_frames: int
+    time_reversals: int
+    ids: tuple[IdSummary, ...]
+    other_ids: int
+    gaps: tuple[Silence, ...]
+    presets: tuple[PresetMatch, ...]
+    log: LogInspection | None = None
+
+    @property
+    def matching(self) -> tuple[str, ...]:
+        """Names of the presets that match."""
+        return tuple(match.preset for match in self.presets if match.matches)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        plain = asdict(self)
+        info = plain.pop("info")
+        return {
+            "kind": "capture",
+            **info,
+            **plain,
+            "matching_presets": ", ".join(self.matching),
+            "log": None if self.log is None else self.log.to_dict(),
+        }
+
+
+def inspect_capture(path: str | PathLike[str], vehicle: Vehicle | None = None) -> CaptureInspection:
+    """Inspect a capture; with a vehicle, also the log that it makes of it.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or holds no usable frame; with a vehicle, also as `capture_to_log`.
+    """
+    path = Path(path)
+    capture = open_capture(path) if vehicle is None else open_vehicle_capture(path, vehicle)
+    survey, attempts = _Survey(), _Attempts()
+    for message in capture:
+        survey.take(message)
+        attempts.take(message)
+    log = None if vehicle is None else inspect_log(capture_to_log(path, vehicle))
+    return CaptureInspection(
+        name=path.name,
+        source=str(path),
+        info=capture.info,
+        start_s=survey.first_s,
+        duration_s=survey.last_s - survey.first_s,
+        error_frames=survey.error_frames,
+        remote_frames=survey.remote_frames,
+        time_reversals=survey.time_reversals,
+        ids=survey.summaries(),
+        other_ids=survey.other_ids,
+        gaps=tuple(survey.gaps),
+        presets=attempts.matches(survey),
+        log=log,
+    )
+
+
+# --- Frames by id, without knowing the car
+
+
+class _Survey:
+    """Statistics of the frames of a capture; attributes as of `CaptureInspection`."""
 
     def __init__(self) -> None:
         self.first_s = math.nan
@@ -148,7 +254,7 @@ class Survey:
         return max(found, key=lambda record: record.frames).period_s if found else None
 
     def summaries(self) -> tuple[IdSummary, ...]:
-        """Return what was seen of every id, by bus and id."""
+        """Return the summary of every id, ordered by bus and id."""
         ordered = sorted(self._records.items(), key=lambda item: (str(item[0][0]), *item[0][1:]))
         return tuple(
             record.summary(f"{number:08X}" if extended else f"{number:03X}", channel)
@@ -182,7 +288,7 @@ class _Trial:
 
 @dataclass(slots=True)
 class _IdRecord:
-    """What was seen of one id on one bus."""
+    """Frames of one id on one bus."""
 
     frames: int = 0
     lengths: set[int] = field(default_factory=set)
@@ -191,9 +297,9 @@ class _IdRecord:
     last_s: float = math.nan
     payloads: set[bytes] = field(default_factory=set)
     waiting: list[tuple[bytes, float]] = field(default_factory=list)
-    """First frames, kept until the period is known."""
+    """First frames, until the period is known."""
     trials: dict[str, _Trial] = field(default_factory=dict)
-    """Rules that still make sense, by name."""
+    """Rules that may still apply, by name."""
 
     def take(self, data: bytearray, time_s: float) -> None:
         if self.frames:
@@ -214,8 +320,8 @@ class _IdRecord:
         self._try_rules(data, time_s)
 
     def _start_trials(self) -> None:
-        # Losses only lengthen intervals: a quarter of them at least is the period. Frames with
-        # equal stamps tell none.
+        # Losses only lengthen intervals: at least a quarter of them is the period. Equal stamps
+        # show none.
         period_s = sorted(self.intervals)[len(self.intervals) // 4] if self.intervals else None
         for rule in (LEAF_RULE, GENERIC_RULE):
             self.trials[rule.name] = _Trial(FrameChecker(rule, period_s or None))
@@ -251,7 +357,7 @@ class _IdRecord:
         rule, trial = self._protection()
         counter = trial
         if trial is not None and trial.counter_repeats > STANDING * self.frames:
-            counter = None  # the CRC is right, but the counter is not where the rule has it
+            counter = None  # the CRC is correct, but the counter is not where the rule expects it
         return IdSummary(
             id=name,
             bus="" if channel is None else str(channel),
@@ -267,135 +373,7 @@ class _IdRecord:
         )
 
 
-# --- `inspect_capture`: what frames a capture holds, whose they are, and whether they are whole
-
-PERIOD_TOLERANCE: Final = 0.3
-"""A period may differ so much from a preset's."""
-LONG_ENOUGH_S: Final = 2.0
-"""Slow signals can be expected in captures from this length on [s]."""
-
-
-@dataclass(frozen=True, slots=True)
-class PresetMatch:
-    """Whether a preset makes sense of the capture.
-
-    Parameters
-    ----------
-    preset, about : str
-    matches : bool
-    because : str
-    samples : int
-    current_a, voltage_v, temperature_c, soc_pct : tuple of float, or None
-        Lowest and highest value decoded, [A] (positive = discharge), [V], [°C], [%].
-    """
-
-    preset: str
-    about: str
-    matches: bool
-    because: str
-    samples: int
-    current_a: tuple[float, float] | None
-    voltage_v: tuple[float, float] | None
-    temperature_c: tuple[float, float] | None
-    soc_pct: tuple[float, float] | None
-
-
-@dataclass(frozen=True, slots=True)
-class CaptureInspection:
-    """What `inspect_capture` finds.
-
-    Parameters
-    ----------
-    name, source : str
-    info : CaptureInfo
-    start_s, duration_s : float
-        Stamp of the first frame, time to the last [s].
-    error_frames, remote_frames : int
-    time_reversals : int
-        Frames stamped earlier than the one before.
-    ids : tuple of IdSummary
-    other_ids : int
-        Frames of ids beyond the first `MAX_IDS`.
-    gaps : tuple of Silence
-        The first `LISTED_GAPS` silences longer than `GAP_S`.
-    presets : tuple of PresetMatch
-    log : LogInspection or None
-        With a vehicle: of the samples that it makes of the capture.
-    """
-
-    name: str
-    source: str
-    info: CaptureInfo
-    start_s: float
-    duration_s: float
-    error_frames: int
-    remote_frames: int
-    time_reversals: int
-    ids: tuple[IdSummary, ...]
-    other_ids: int
-    gaps: tuple[Silence, ...]
-    presets: tuple[PresetMatch, ...]
-    log: LogInspection | None = None
-
-    @property
-    def matching(self) -> tuple[str, ...]:
-        """Names of the presets that match."""
-        return tuple(match.preset for match in self.presets if match.matches)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        info = self.info.to_dict()
-        return {
-            "kind": "capture",
-            "name": self.name,
-            "source": self.source,
-            **{key: value for key, value in info.items() if key != "remarks"},
-            "start_s": self.start_s,
-            "duration_s": self.duration_s,
-            "error_frames": self.error_frames,
-            "remote_frames": self.remote_frames,
-            "time_reversals": self.time_reversals,
-            "matching_presets": ", ".join(self.matching),
-            "other_ids": self.other_ids,
-            "ids": [asdict(each) for each in self.ids],
-            "gaps": [asdict(each) for each in self.gaps],
-            "presets": [asdict(each) for each in self.presets],
-            "remarks": info["remarks"],
-            "log": None if self.log is None else self.log.to_dict(),
-        }
-
-
-def inspect_capture(path: str | PathLike[str], vehicle: Vehicle | None = None) -> CaptureInspection:
-    """Inspect a capture; with a vehicle, also the log that its frames make.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, or holds no frame that can be used; with a vehicle, also as
-        `capture_to_log`.
-    """
-    path = Path(path)
-    capture = open_capture(path) if vehicle is None else open_vehicle_capture(path, vehicle)
-    survey, attempts = Survey(), _Attempts()
-    for message in capture:
-        survey.take(message)
-        attempts.take(message)
-    log = None if vehicle is None else inspect_log(capture_to_log(path, vehicle))
-    return CaptureInspection(
-        name=path.name,
-        source=str(path),
-        info=capture.info,
-        start_s=survey.first_s,
-        duration_s=survey.last_s - survey.first_s,
-        error_frames=survey.error_frames,
-        remote_frames=survey.remote_frames,
-        time_reversals=survey.time_reversals,
-        ids=survey.summaries(),
-        other_ids=survey.other_ids,
-        gaps=tuple(survey.gaps),
-        presets=attempts.matches(survey),
-        log=log,
-    )
+# --- Presets tried on the frames
 
 
 @dataclass(slots=True)
@@ -417,7 +395,7 @@ class _Attempt:
     """A preset tried on one bus of the capture."""
 
     def __init__(self, vehicle: Vehicle) -> None:
-        self.assembler = SampleDecoder(vehicle)
+        self.decoder = SampleDecoder(vehicle)
         self.samples = 0
         self.current = _Range()
         self.voltage = _Range()
@@ -425,13 +403,13 @@ class _Attempt:
         self.soc = _Range()
 
     def take(self, message: can.Message) -> None:
-        sample = self.assembler.handle(message)
+        sample = self.decoder.handle(message)
         if sample is not None:
             self.samples += 1
             self.current.take(sample.current_a)
             self.voltage.take(sample.voltage_v)
             self.temperature.take(sample.temperature_c)
-            self.soc.take(self.assembler.reference_soc_pct)
+            self.soc.take(self.decoder.reference_soc_pct)
 
 
 class _Attempts:
@@ -452,14 +430,14 @@ class _Attempts:
         for attempt in attempts.values():
             attempt.take(message)
 
-    def matches(self, survey: Survey) -> tuple[PresetMatch, ...]:
-        """Return how every preset did on the bus that suits it best."""
+    def matches(self, survey: _Survey) -> tuple[PresetMatch, ...]:
+        """Return the match of every preset, on the bus with most of its samples."""
         found: dict[str, PresetMatch] = {}
         for name in PRESETS:
             tries = [attempts[name] for attempts in self._buses.values()]
             best = max(tries, key=lambda attempt: attempt.samples, default=None)
             found[name] = self._match(name, best, survey)
-        # A relative that also finds its temperature explains more of the capture.
+        # A related preset that also finds its temperature explains more of the capture.
         with_temperature = {
             PRESETS[name].dbc for name, match in found.items() if match.temperature_c is not None
         }
@@ -472,7 +450,7 @@ class _Attempts:
             for name, match in found.items()
         )
 
-    def _match(self, name: str, attempt: _Attempt | None, survey: Survey) -> PresetMatch:
+    def _match(self, name: str, attempt: _Attempt | None, survey: _Survey) -> PresetMatch:
         problem = (
             "none of its frames"
             if attempt is None
@@ -491,9 +469,9 @@ class _Attempts:
         )
 
 
-def _problem(name: str, attempt: _Attempt, vehicle: Vehicle, survey: Survey) -> str:
+def _problem(name: str, attempt: _Attempt, vehicle: Vehicle, survey: _Survey) -> str:
     """Return why a preset does not match, or ""."""
-    counters = attempt.assembler.counters
+    counters = attempt.decoder.counters
     if not attempt.samples:
         return "no current in its frames" if counters.wanted else "none of its frames"
     if counters.crc_errors > 0.1 * counters.wanted:
@@ -506,12 +484,12 @@ def _problem(name: str, attempt: _Attempt, vehicle: Vehicle, survey: Survey) -> 
     return _period_problem(name, survey, long_enough=long_enough)
 
 
-def _period_problem(name: str, survey: Survey, *, long_enough: bool) -> str:
+def _period_problem(name: str, survey: _Survey, *, long_enough: bool) -> str:
     for number, expected_s in PRESETS[name].periods_s.items():
         period_s = survey.period_s(number)
         if period_s is None:
             if long_enough:
                 return f"no frames of 0x{number:X}"
         elif abs(period_s - expected_s) > PERIOD_TOLERANCE * expected_s:
-            return f"0x{number:X} comes every {period_s:.3g} s, not {expected_s:g} s"
+            return f"0x{number:X} has a period of {period_s:.3g} s, not {expected_s:g} s"
     return ""

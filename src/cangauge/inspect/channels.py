@@ -1,9 +1,4 @@
-"""Rates and gaps of a log.
-
-What one channel holds: range, step of quantisation, stretches where it is stuck.
-
-Charge moved, the capacity that it implies, and the resistance seen in steps.
-"""
+"""Figures of a log: timing, channels, charge, reference SoC and resistance."""
 
 from __future__ import annotations
 
@@ -16,10 +11,8 @@ from cangauge._typing import FloatArray
 from cangauge.logs.log import Log
 from cangauge.logs.sign import STEP_SPACING_S, charge_ah, current_steps, spaced_rows
 
-# --- Rates and gaps of a log
-
 GAP_S: Final = 2.0
-"""The delay line of the model does not bridge more [s]."""
+"""Longest interval that the delay line of the model bridges [s]; longer ones are gaps."""
 LISTED_GAPS: Final = 10
 
 
@@ -33,7 +26,7 @@ class Gap:
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """When the rows of a log are.
+    """Timing of the rows of a log.
 
     Parameters
     ----------
@@ -88,36 +81,42 @@ def describe_timing(time_s: FloatArray, gap_limit_s: float = GAP_S) -> Timing:
     )
 
 
-# --- What one channel holds: range, step of quantisation, stretches where it is stuck
+# --- Channels
 
 STUCK_S: Final = 10.0
-"""A channel that keeps one value for longer [s] while the other moves is stuck."""
+"""Shortest stretch of one value that may be stuck [s], …"""
 STUCK_ROWS: Final = 5
+"""… its fewest rows, …"""
 STUCK_JUMPS: Final = 3
-"""So many jumps of the other channel mean that this one is stuck."""
+"""… and the fewest jumps of the other channel within it."""
 JUMP_LIMIT_S: Final = 5.0
-"""Rows further apart [s] make no jump."""
+"""Longest interval between rows for a jump [s]."""
 END_S: Final = 2.0
-"""Jumps so near to the ends of a stretch [s] do not count."""
+"""Jumps this near to the ends of a stretch do not count [s]."""
 _FREQUENT: Final = (3, 6, 12, 50)
+"""Numbers of most frequent values whose differences are candidates for the quantum."""
 _MIN_PLACES: Final = 4
+"""Fewest occupied places of a grid."""
 _ON_PLACE: Final = 0.9
+"""Least share of the rows on a grid that hold the main value of their place."""
 _ON_GRID: Final = 0.95
+"""Least share of the rows on a grid."""
 _OFF_GRID: Final = 0.05
+"""Largest distance from a place of the grid, in quanta."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stuck:
-    """A stretch in which a channel did not move though it should have.
+    """A stretch in which a channel kept one value while the other one jumped.
 
     Parameters
     ----------
     start_s, duration_s : float
         Time of its first row, length [s].
     value : float
-        The value that it kept, in the channel's unit.
+        The constant value, in the channel's unit.
     why : str
-        What moved meanwhile, with figures.
+        Jumps of the other channel, with figures.
     """
 
     start_s: float
@@ -136,12 +135,11 @@ class Channel:
     minimum, maximum, median : float
         In `unit`.
     quantum : float or None
-        Step that all values are multiples of, apart from a constant, in `unit`; None if none
-        shows.
+        Quantization step, in `unit`; None if there is none.
     levels : int
-        Distinct values; 1 means that it never moves.
+        Distinct values; 1: constant.
     missing : int
-        Rows without a value (only the reference SoC may have such).
+        Rows without a value (only of the reference SoC).
     stuck : tuple of Stuck
     """
 
@@ -172,10 +170,10 @@ def describe_channel(values: FloatArray, unit: str, stuck: tuple[Stuck, ...] = (
 
 
 def quantum_of(values: FloatArray) -> float | None:
-    """Return the step of quantisation of finite values, or None if none shows.
+    """Return the quantization step of finite values, or None if there is none.
 
-    The largest step is taken on whose grid (through the most frequent value) 95 % of the values
-    lie, so that a few interpolated rows do not hide it. Candidates are differences between
+    It is the largest step on whose grid (through the most frequent value) 95 % of the values lie,
+    so that a few interpolated rows do not hide it. Candidates are differences between
     neighbouring values, of the frequent ones and of all.
 
     Parameters
@@ -197,7 +195,7 @@ def quantum_of(values: FloatArray) -> float | None:
         places, first = np.unique(np.rint(place[near]), return_index=True)
         if places.size < _MIN_PLACES or count[near].sum() < _ON_GRID * values.size:
             continue
-        # Many rows that share a place (64.98 and 65.00 on a grid of 65) show a finer step.
+        # Several values at one place (64.98 and 65.00 on a grid of 65) mean a finer step.
         at_most = np.maximum.reduceat(count[near], first).sum()
         if at_most >= _ON_PLACE * count[near].sum():
             return _refined(distinct[near] - origin, np.rint(place[near]), count[near])
@@ -210,7 +208,7 @@ def _some_steps(values: FloatArray) -> list[float]:
 
 
 def _refined(offsets: FloatArray, place: FloatArray, weight: FloatArray) -> float:
-    """Return the step of a grid by least squares over the values on it."""
+    """Return the step of a grid by least squares over the values on it, to five digits."""
     step = float(np.sum(weight * place * offsets) / np.sum(weight * place * place))
     return float(f"{step:.5g}")
 
@@ -220,18 +218,18 @@ def find_stuck(
 ) -> tuple[Stuck, ...]:
     """Return the stretches where a channel keeps one value while the other jumps.
 
-    Only jumps from one second to the next count, several and both ways: in a constant-current or a
-    constant-voltage phase the other channel drifts but does not jump.
+    Jumps are changes from one second to the next; several in both directions are needed, since in
+    a constant-current or constant-voltage phase the other channel drifts but does not jump.
 
     Parameters
     ----------
     log : Log
     values, other : arrays of shape (n,)
-        The channel that may be stuck, and the one that should move it.
+        The channel that may be stuck, and the one that it should follow.
     jump : float
-        What counts as a jump of `other` [its unit].
+        Smallest jump of `other`, in its unit.
     unit : str
-        Unit of `other`, for the words.
+        Unit of `other`, for the text.
     """
     rows = spaced_rows(log.time_s, STEP_SPACING_S)
     near = np.diff(log.time_s[rows]) <= JUMP_LIMIT_S
@@ -241,7 +239,7 @@ def find_stuck(
     found = []
     for first, last in _constant_runs(log.time_s, values):
         start, end = log.time_s[first], log.time_s[last - 1]
-        # Jumps at either end began or ended the stretch; those in one direction only relax.
+        # A jump at either end starts or ends the stretch; jumps in one direction are relaxation.
         ends = (start + END_S, end - END_S)
         ups, downs = (int(np.diff(np.searchsorted(jumps, ends))[0]) for jumps in (up, down))
         count = ups + downs
@@ -266,11 +264,12 @@ def _constant_runs(time_s: FloatArray, values: FloatArray) -> list[tuple[int, in
     return [(int(first[i]), int(last[i])) for i in chosen]
 
 
-# --- Charge moved, the capacity that it implies, and the resistance seen in steps
+# --- Charge, reference SoC and resistance
 
 MIN_SOC_SPAN_PCT: Final = 5.0
-"""Below this span of the reference SoC [%] no capacity is told: its steps weigh too much."""
+"""Least span of the reference SoC for a capacity [%]: its quantization weighs too much below."""
 MIN_STEPS: Final = 8
+"""Fewest clear steps of current for a resistance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,13 +279,13 @@ class Charge:
     Parameters
     ----------
     discharged_ah, charged_ah : float
-        Sums of the parts with positive and negative current [Ah], both ≥ 0.
+        Charge at positive and at negative current [Ah], both ≥ 0.
     net_ah : float
         Their difference, positive = taken out [Ah].
     span_ah : float
-        Largest less smallest charge state on the way [Ah].
+        Range of the charge state over the log [Ah].
     in_gaps_ah : float
-        Part of the moved charge (absolute) that lies in gaps and is only interpolated [Ah].
+        Absolute charge interpolated over gaps [Ah].
     """
 
     discharged_ah: float
@@ -303,7 +302,7 @@ class Soc:
     Parameters
     ----------
     coverage : float
-        Part of the rows that have it [-].
+        Share of the rows with a value [-].
     first_pct, last_pct, minimum_pct, maximum_pct : float
         [%].
     last_at_s : float
@@ -311,7 +310,7 @@ class Soc:
     longest_hole_s : float
         Longest time between finite values [s].
     implied_capacity_ah : float or None
-        Charge per 100 % of reference, by least squares [Ah]; None below 5 % of span.
+        Charge per 100 % of reference, by least squares [Ah]; None below 5 % span.
     """
 
     coverage: float
@@ -326,14 +325,14 @@ class Soc:
 
 @dataclass(frozen=True, slots=True)
 class Resistance:
-    """Ohmic resistance seen in steps of current about a second long.
+    """Ohmic resistance from steps of current over about a second.
 
     Parameters
     ----------
     median_ohm, lower_ohm, upper_ohm : float
-        Median and quartiles of −ΔU/ΔI [Ω]; negative when the sign of current is turned.
+        Median and quartiles of −ΔU/ΔI [Ω]; negative when the sign of current is inverted.
     steps : int
-        Steps that it is the median of.
+        Number of steps.
     """
 
     median_ohm: float
@@ -357,7 +356,7 @@ def describe_charge(log: Log, gap_limit_s: float) -> Charge:
 
 
 def describe_soc(log: Log) -> Soc | None:
-    """Return what the reference SoC covers, or None if the log has none."""
+    """Return figures of the reference SoC, or None if the log has none."""
     if log.soc_pct is None:
         return None
     known = np.flatnonzero(np.isfinite(log.soc_pct))
@@ -368,7 +367,7 @@ def describe_soc(log: Log) -> Soc | None:
     if np.ptp(soc) >= MIN_SOC_SPAN_PCT:
         taken = charge_ah(log)[known]
         slope = float(np.polyfit(soc - soc.mean(), taken, 1)[0])
-        capacity = abs(100.0 * slope)  # whichever way current counts
+        capacity = abs(100.0 * slope)  # for either sign of current
     holes = np.diff(log.time_s[known])
     return Soc(
         coverage=float(known.size / len(log)),
@@ -383,7 +382,7 @@ def describe_soc(log: Log) -> Soc | None:
 
 
 def describe_resistance(log: Log) -> Resistance | None:
-    """Return the resistance seen in steps of current, or None below eight clear steps."""
+    """Return the resistance from steps of current, or None below eight clear steps."""
     steps = current_steps(log)
     if steps.current_a.size < MIN_STEPS:
         return None

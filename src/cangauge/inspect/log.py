@@ -1,11 +1,7 @@
-"""What a log can and cannot identify, in words with figures.
-
-`inspect_log`: what a log holds, which way its current counts, what it can identify.
-"""
+"""Inspect a log: what it holds, its sign of current, and what it can identify."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any, Final, Literal
 
@@ -27,18 +23,33 @@ from cangauge.inspect.channels import (
 from cangauge.logs.log import Log
 from cangauge.logs.sign import SignFinding, charge_ah, correlation, sign_of_current, spaced_rows
 
-# --- What a log can and cannot identify, in words with figures
-
 Verdict = Literal["yes", "partly", "no"]
 
+# Smallest jumps of current and voltage for the search of stuck channels.
+CURRENT_JUMP_SHARE: Final = 0.05
+"""Of the range of current [-]."""
+VOLTAGE_QUANTA: Final = 4.0
+"""Of voltage, in quanta; a jump of current must move the voltage by as much."""
+VOLTAGE_SHARE: Final = 0.002
+"""Of voltage, relative to its median [-]."""
+LISTED_STRETCHES: Final = 5
+"""Stuck stretches of a channel that are listed in the warnings."""
+
+# Limits of the abilities.
 DELAYS_S: Final = (10.0, 30.0, 70.0)
 """Delays of the published model [s]."""
 SLOW_S: Final = 2.0
-ALIKE: Final = 0.9
-TEMPERATURE_SPAN_C: Final = 3.0
+"""Longest median interval at which delays can be identified [s]."""
+CORRELATED: Final = 0.9
+"""Correlation above which two influences are hard to separate [-]."""
+TEMPERATURE_SPAN_K: Final = 3.0
+"""Least span of temperature for its coefficient [K]."""
 REST_SHARE: Final = 0.02
+"""Current at rest, relative to the peak [-]."""
 REST_S: Final = 300.0
+"""Shortest rest that shows the rest voltage [s]."""
 WIDE_SOC_PCT: Final = 60.0
+"""Span of SoC that shows most of the voltage curve [%]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +61,7 @@ class Ability:
     topic : str
     verdict : {"yes", "partly", "no"}
     text : str
-        Why, with figures.
+        The reason, with figures.
     """
 
     topic: str
@@ -58,164 +69,9 @@ class Ability:
     text: str
 
 
-def judge_abilities(
-    log: Log,
-    *,
-    timing: Timing,
-    charge: Charge,
-    soc: Soc | None,
-    resistance: Resistance | None,
-    sign: SignFinding,
-) -> tuple[Ability, ...]:
-    """Say what the log can identify; the limits stand at the top of this module."""
-    return (
-        _sign(sign),
-        _voltage_curve(charge, soc),
-        _capacity(charge, soc),
-        _resistance(resistance),
-        *_delays(log, timing),
-        _temperature(log),
-        _start(log),
-        _rests(log),
-    )
-
-
-def _sign(sign: SignFinding) -> Ability:
-    return Ability("sign of current", "yes" if sign.sign else "no", sign.sentence)
-
-
-def _voltage_curve(charge: Charge, soc: Soc | None) -> Ability:
-    topic = "voltage curve over SoC"
-    if soc is None:
-        text = (
-            f"no reference SoC; the charge state spans {charge.span_ah:.3g} Ah:"
-            " give the capacity and the initial SoC"
-        )
-        return Ability(topic, "partly", text)
-    span = soc.maximum_pct - soc.minimum_pct
-    seen = f"SoC {soc.minimum_pct:.1f} … {soc.maximum_pct:.1f} % seen"
-    if span >= WIDE_SOC_PCT:
-        return Ability(topic, "yes", seen)
-    if span >= 5.0:
-        return Ability(topic, "partly", f"{seen}: only this part of the curve")
-    return Ability(topic, "no", f"{seen}: too little for a curve")
-
-
-def _capacity(charge: Charge, soc: Soc | None) -> Ability:
-    if soc is None or soc.implied_capacity_ah is None:
-        text = (
-            f"no reference SoC that moves by 5 %; at least {charge.span_ah:.3g} Ah, which is the"
-            " capacity if the log runs from full to empty"
-        )
-        return Ability("capacity", "no", text)
-    span = soc.maximum_pct - soc.minimum_pct
-    text = f"{soc.implied_capacity_ah:.4g} Ah per 100 % of reference, from {span:.1f} % of span"
-    return Ability("capacity", "yes" if span >= WIDE_SOC_PCT else "partly", text)
-
-
-def _resistance(resistance: Resistance | None) -> Ability:
-    if resistance is None:
-        return Ability("ohmic resistance", "no", "fewer than eight clear steps of current")
-    text = (
-        f"{resistance.median_ohm:.4g} Ω (quartiles {resistance.lower_ohm:.4g} …"
-        f" {resistance.upper_ohm:.4g}) in {resistance.steps} steps within about a second"
-    )
-    spread = abs(resistance.upper_ohm - resistance.lower_ohm)
-    steady = spread <= 0.5 * abs(resistance.median_ohm)
-    return Ability("ohmic resistance", "yes" if steady else "partly", text)
-
-
-def _delays(log: Log, timing: Timing) -> Iterator[Ability]:
-    topic = "delayed current terms"
-    longest = DELAYS_S[-1]
-    if timing.interval_median_s is None or timing.duration_s < 10.0 * longest:
-        text = f"{timing.duration_s:.0f} s is too short for delays up to {longest:.0f} s"
-        yield Ability(topic, "no", text)
-        return
-    if timing.interval_median_s > SLOW_S:
-        text = f"rows every {timing.interval_median_s:.3g} s are too slow for delays of 10 s"
-        yield Ability(topic, "no", text)
-        return
-    alike = _alikeness(log)
-    if alike is None:
-        yield Ability(topic, "no", "current does not vary")
-        return
-    text = f"currents {DELAYS_S[0]:.0f} s apart correlate by {alike:.2f}"
-    if alike > ALIKE:
-        yield Ability(topic, "partly", f"{text}: the terms are hard to tell apart")
-    else:
-        yield Ability(topic, "yes", text)
-
-
-def _alikeness(log: Log) -> float | None:
-    """Return the correlation of current with itself ten seconds before."""
-    # At rows about a second apart, not on a grid: a gap may last months.
-    rows = spaced_rows(log.time_s, 1.0)
-    rows = rows[log.time_s[rows] >= log.time_s[0] + DELAYS_S[0]]
-    now = log.current_a[rows]
-    before = np.interp(log.time_s[rows] - DELAYS_S[0], log.time_s, log.current_a)
-    if now.size <= 2 or np.ptp(now) == 0.0 or np.ptp(before) == 0.0:
-        return None
-    return correlation(now, before)
-
-
-def _temperature(log: Log) -> Ability:
-    topic = "temperature coefficient"
-    span = float(np.ptp(log.temperature_c))
-    where = {
-        "room": "; it is the ROOM's temperature, not the battery's",
-        "unknown": "; what it was measured on is not known",
-    }.get(log.temperature_source, f" ({log.temperature_source})")
-    if span == 0.0:
-        return Ability(topic, "no", f"temperature never changes{where}")
-    if span < TEMPERATURE_SPAN_C:
-        return Ability(topic, "no", f"temperature spans only {span:.1f} K{where}")
-    state = charge_ah(log)
-    alike = correlation(state, log.temperature_c)
-    text = f"temperature spans {span:.1f} K, correlated with charge by {alike:+.2f}{where}"
-    verdict: Verdict = "partly" if abs(alike) > ALIKE or where.startswith(";") else "yes"
-    return Ability(topic, verdict, text)
-
-
-def _start(log: Log) -> Ability:
-    limit = REST_SHARE * float(np.max(np.abs(log.current_a)))
-    first = log.current_a[log.time_s - log.time_s[0] <= DELAYS_S[0]]
-    at_start = float(np.max(np.abs(first)))
-    if at_start <= limit:
-        text = f"at most {at_start:.3g} A in the first 10 s: the first voltages are near rest"
-        return Ability("start from rest", "yes", text)
-    return Ability("start from rest", "no", f"up to {at_start:.3g} A in the first 10 s")
-
-
-def _rests(log: Log) -> Ability:
-    """Rests of some minutes anchor the rest voltage, and show an offset of the current sensor."""
-    topic = "rest voltage"
-    peak = float(np.max(np.abs(log.current_a)))
-    still = np.abs(log.current_a) <= REST_SHARE * peak
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], still, [False])).astype(np.int8)))
-    first, last = edges[::2], edges[1::2] - 1
-    length = log.time_s[last] - log.time_s[first]
-    rests = int((length >= REST_S).sum())
-    longest = float(length.max()) if length.size else 0.0
-    text = f"{rests} rests of 5 min or more, the longest {longest / 60.0:.1f} min"
-    return Ability(topic, "yes" if rests >= 3 else "partly" if rests else "no", text)
-
-
-# --- `inspect_log`: what a log holds, which way its current counts, what it can identify
-
-CURRENT_JUMP_SHARE: Final = 0.05
-"""A jump of current is at least this part of its range [-]."""
-VOLTAGE_QUANTA: Final = 4.0
-"""A jump of voltage, or what a jump of current must be worth, is at least so many quanta."""
-VOLTAGE_SHARE: Final = 0.002
-"""… and at least this part of the median voltage [-]."""
-LISTED_STRETCHES: Final = 5
-"""More stuck stretches of a channel are only counted in the warnings."""
-
-
 @dataclass(frozen=True, slots=True)
 class LogInspection:
-    """What `inspect_log` finds.
+    """Findings of `inspect_log`.
 
     Parameters
     ----------
@@ -232,9 +88,9 @@ class LogInspection:
     sign : SignFinding
     abilities : tuple of Ability
     remarks : tuple of str
-        What the reader changed or noticed.
+        Of the reader.
     warnings : tuple of str
-        What the user should look at.
+        Problems to check.
     """
 
     name: str
@@ -253,33 +109,13 @@ class LogInspection:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        parts: dict[str, Any] = {
-            "kind": "log",
-            "name": self.name,
-            "source": self.source,
-            "temperature_source": self.temperature_source,
-            "rows": self.rows,
-            "timing": asdict(self.timing),
-            "channels": {name: asdict(channel) for name, channel in self.channels.items()},
-            "charge": asdict(self.charge),
-            "soc": None if self.soc is None else asdict(self.soc),
-            "resistance": None if self.resistance is None else asdict(self.resistance),
-            "sign_of_current": self.sign.to_dict(),
-            "abilities": [asdict(ability) for ability in self.abilities],
-            "remarks": list(self.remarks),
-            "warnings": list(self.warnings),
-        }
-        return parts
+        plain = asdict(self)
+        del plain["sign"]
+        return {"kind": "log", **plain, "sign_of_current": self.sign.to_dict()}
 
 
 def inspect_log(log: Log) -> LogInspection:
-    """Inspect a log; pure.
-
-    Parameters
-    ----------
-    log : Log
-        Its current may count either way: that is one of the findings.
-    """
+    """Inspect a log; its current may have either sign, which is one of the findings."""
     timing = describe_timing(log.time_s)
     resistance = describe_resistance(log)
     channels = _channels(log, resistance)
@@ -297,8 +133,15 @@ def inspect_log(log: Log) -> LogInspection:
         soc=soc,
         resistance=resistance,
         sign=sign,
-        abilities=judge_abilities(
-            log, timing=timing, charge=charge, soc=soc, resistance=resistance, sign=sign
+        abilities=(
+            Ability("sign of current", "yes" if sign.sign else "no", sign.sentence),
+            _voltage_curve(charge, soc),
+            _capacity(charge, soc),
+            _resistance(resistance),
+            _delays(log, timing),
+            _temperature(log),
+            _start(log),
+            _rests(log),
         ),
         remarks=log.remarks,
         warnings=tuple(_warnings(log, timing, channels, charge, sign)),
@@ -338,23 +181,20 @@ def _warnings(
     charge: Charge,
     sign: SignFinding,
 ) -> list[str]:
-    found = [*_sign_warnings(sign), *_gap_warnings(timing, charge)]
+    found = []
+    if sign.sign < 0:
+        found.append("the sign of current is inverted: multiply current_a by -1")
+    elif sign.sign == 0:
+        found.append("the sign of current could not be confirmed: make sure that discharge is > 0")
+    found.extend(_gap_warnings(timing, charge))
     for name, channel in channels.items():
         found.extend(_stuck_warnings(name, channel))
     found.extend(
         f"{name} never changes" for name in ("current_a", "voltage_v") if channels[name].levels == 1
     )
     if log.temperature_source == "room":
-        found.append("the temperature is the room's: a cold or hot battery is not seen")
+        found.append("the temperature is the room's: the battery may be colder or hotter")
     return found
-
-
-def _sign_warnings(sign: SignFinding) -> list[str]:
-    if sign.sign < 0:
-        return ["the sign of current is turned: multiply current_a by -1"]
-    if sign.sign == 0:
-        return ["the sign of current could not be confirmed: make sure that discharge is > 0"]
-    return []
 
 
 def _gap_warnings(timing: Timing, charge: Charge) -> list[str]:
@@ -367,7 +207,7 @@ def _gap_warnings(timing: Timing, charge: Charge) -> list[str]:
     longest = timing.longest_gaps[0]
     return [
         f"{timing.gap_count} gaps of more than {limit}, the longest {longest.length_s:.4g} s at"
-        f" {longest.start_s:.1f} s; {charge.in_gaps_ah:.3g} Ah lie in gaps"
+        f" {longest.start_s:.1f} s; {charge.in_gaps_ah:.3g} Ah are interpolated over gaps"
     ]
 
 
@@ -379,3 +219,116 @@ def _stuck_warnings(name: str, channel: Channel) -> list[str]:
     ]
     more = len(channel.stuck) - LISTED_STRETCHES
     return [*found, f"{name}: {more} more stuck stretches"] if more > 0 else found
+
+
+def _voltage_curve(charge: Charge, soc: Soc | None) -> Ability:
+    topic = "voltage curve over SoC"
+    if soc is None:
+        text = (
+            f"no reference SoC; the charge state spans {charge.span_ah:.3g} Ah:"
+            " the capacity and the initial SoC must be given"
+        )
+        return Ability(topic, "partly", text)
+    span = soc.maximum_pct - soc.minimum_pct
+    covered = f"SoC covers {soc.minimum_pct:.1f} … {soc.maximum_pct:.1f} %"
+    if span >= WIDE_SOC_PCT:
+        return Ability(topic, "yes", covered)
+    if span >= 5.0:
+        return Ability(topic, "partly", f"{covered}: only this part of the curve")
+    return Ability(topic, "no", f"{covered}: too little for a curve")
+
+
+def _capacity(charge: Charge, soc: Soc | None) -> Ability:
+    if soc is None or soc.implied_capacity_ah is None:
+        text = (
+            f"no reference SoC that spans 5 %; at least {charge.span_ah:.3g} Ah, the capacity if"
+            " the log runs from full to empty"
+        )
+        return Ability("capacity", "no", text)
+    span = soc.maximum_pct - soc.minimum_pct
+    text = f"{soc.implied_capacity_ah:.4g} Ah per 100 % of reference SoC, over {span:.1f} %"
+    return Ability("capacity", "yes" if span >= WIDE_SOC_PCT else "partly", text)
+
+
+def _resistance(resistance: Resistance | None) -> Ability:
+    if resistance is None:
+        return Ability("ohmic resistance", "no", "fewer than eight clear steps of current")
+    text = (
+        f"{resistance.median_ohm:.4g} Ω (quartiles {resistance.lower_ohm:.4g} …"
+        f" {resistance.upper_ohm:.4g}) from {resistance.steps} steps of current over about a second"
+    )
+    spread = abs(resistance.upper_ohm - resistance.lower_ohm)
+    steady = spread <= 0.5 * abs(resistance.median_ohm)
+    return Ability("ohmic resistance", "yes" if steady else "partly", text)
+
+
+def _delays(log: Log, timing: Timing) -> Ability:
+    topic = "delayed current terms"
+    longest = DELAYS_S[-1]
+    if timing.interval_median_s is None or timing.duration_s < 10.0 * longest:
+        text = f"{timing.duration_s:.0f} s is too short for delays up to {longest:.0f} s"
+        return Ability(topic, "no", text)
+    if timing.interval_median_s > SLOW_S:
+        text = f"rows every {timing.interval_median_s:.3g} s are too slow for delays of 10 s"
+        return Ability(topic, "no", text)
+    correlated = _autocorrelation(log)
+    if correlated is None:
+        return Ability(topic, "no", "current does not vary")
+    text = f"currents {DELAYS_S[0]:.0f} s apart correlate by {correlated:.2f}"
+    if correlated > CORRELATED:
+        return Ability(topic, "partly", f"{text}: the terms are hard to separate")
+    return Ability(topic, "yes", text)
+
+
+def _autocorrelation(log: Log) -> float | None:
+    """Return the correlation of current with itself ten seconds before."""
+    # At rows about a second apart, not on a grid: a gap may last months.
+    rows = spaced_rows(log.time_s, 1.0)
+    rows = rows[log.time_s[rows] >= log.time_s[0] + DELAYS_S[0]]
+    now = log.current_a[rows]
+    before = np.interp(log.time_s[rows] - DELAYS_S[0], log.time_s, log.current_a)
+    if now.size <= 2 or np.ptp(now) == 0.0 or np.ptp(before) == 0.0:
+        return None
+    return correlation(now, before)
+
+
+def _temperature(log: Log) -> Ability:
+    topic = "temperature coefficient"
+    span = float(np.ptp(log.temperature_c))
+    where = {
+        "room": "; it is the ROOM's temperature, not the battery's",
+        "unknown": "; where it was measured is not known",
+    }.get(log.temperature_source, f" ({log.temperature_source})")
+    if span == 0.0:
+        return Ability(topic, "no", f"temperature never changes{where}")
+    if span < TEMPERATURE_SPAN_K:
+        return Ability(topic, "no", f"temperature spans only {span:.1f} K{where}")
+    with_charge = correlation(charge_ah(log), log.temperature_c)
+    text = f"temperature spans {span:.1f} K, correlated with charge by {with_charge:+.2f}{where}"
+    doubtful = abs(with_charge) > CORRELATED or where.startswith(";")
+    verdict: Verdict = "partly" if doubtful else "yes"
+    return Ability(topic, verdict, text)
+
+
+def _start(log: Log) -> Ability:
+    limit = REST_SHARE * float(np.max(np.abs(log.current_a)))
+    first = log.current_a[log.time_s - log.time_s[0] <= DELAYS_S[0]]
+    at_start = float(np.max(np.abs(first)))
+    if at_start <= limit:
+        text = f"at most {at_start:.3g} A in the first 10 s: the first voltages are near rest"
+        return Ability("start from rest", "yes", text)
+    return Ability("start from rest", "no", f"up to {at_start:.3g} A in the first 10 s")
+
+
+def _rests(log: Log) -> Ability:
+    """Judge the rests: they show the rest voltage and an offset of the current sensor."""
+    topic = "rest voltage"
+    peak = float(np.max(np.abs(log.current_a)))
+    still = np.abs(log.current_a) <= REST_SHARE * peak
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], still, [False])).astype(np.int8)))
+    first, last = edges[::2], edges[1::2] - 1
+    length = log.time_s[last] - log.time_s[first]
+    rests = int((length >= REST_S).sum())
+    longest = float(length.max()) if length.size else 0.0
+    text = f"{rests} rests of 5 min or more, the longest {longest / 60.0:.1f} min"
+    return Ability(topic, "yes" if rests >= 3 else "partly" if rests else "no", text)

@@ -1,1 +1,1 @@
-"""Files → canonical log: one reader a file."""
+"""Log files of any known format → `Log` with canonical units."""

@@ -1,4 +1,4 @@
-"""Columns of numbers out of delimited text, by pyarrow, with errors that name row and value."""
+"""Columns of numbers from delimited text, with errors that name row and value."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pyarrow.csv as pacsv
 from cangauge._io import MAX_LOG_COLUMNS, MAX_LOG_ROWS, MAX_ODD_ROWS
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.logs.file_content import FileContent, cells
+from cangauge.logs.file_content import FileContent, split_cells
 
 _MISSING: Final = pa.array(
     ["", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "1.#qnan", "-1.#ind"]
@@ -28,10 +28,10 @@ class Columns:
     Parameters
     ----------
     text : dict of str to pyarrow.ChunkedArray
-        The cells as text, by the name that was asked for.
+        The cells as text, by the requested name.
     label : dict of str to str
-        The column's heading in the file.
-    path : Path
+        The column's heading in the file, by the requested name.
+    source : str
         The file.
     decimal_comma : bool
         Whether `391,4` means 391.4.
@@ -41,7 +41,7 @@ class Columns:
 
     text: dict[str, Any]
     label: dict[str, str]
-    path: object
+    source: str
     decimal_comma: bool
     remarks: tuple[str, ...]
 
@@ -61,10 +61,17 @@ class Columns:
         try:
             return np.asarray(pc.cast(trimmed, pa.float64()).to_numpy(), dtype=np.float64)
         except pa.ArrowInvalid as error:
-            row, value = _first_bad(trimmed)
+            row, value = next(
+                (
+                    (row, value)
+                    for row, value in enumerate(trimmed.to_pylist(), start=1)
+                    if value is not None and not _is_number(value)
+                ),
+                (1, str(trimmed[0])),
+            )
             raise InputError(
                 f"row {row} is not a number",
-                source=str(self.path),
+                source=self.source,
                 field=self.label[name],
                 value=value,
                 cure="correct the cell, or leave it empty where the value is unknown",
@@ -81,17 +88,16 @@ def read_columns(
 ) -> Columns:
     """Read some columns of the lines after the first `skip_lines`.
 
-    Lines that do not have as many cells as the first one are an error, except at the end: a last
-    line that was cut off and closing remarks of the exporter are left out, with a remark.
+    A line with another number of cells than the first row is an error, except at the end: a cut
+    last line and closing remarks of the exporter are left out, with a remark.
 
     Parameters
     ----------
     content : FileContent
-        The unpacked file.
     wanted : mapping of str to int
-        Index of the column [0-based] by the name to give it.
+        Index of the column, from 0, by the name to give it.
     header : list of str
-        Headings, for messages and to see whether the first line of data is complete.
+        Headings, for messages and to check that the first row is complete.
     delimiter : str
         One character.
     skip_lines : int
@@ -105,20 +111,21 @@ def read_columns(
     width = _width(content, header, delimiter, skip_lines)
     odd: list[Any] = []
 
-    def keep_aside(row: Any) -> str:
+    def collect(row: Any) -> str:
         odd.append(row)
         return "skip" if len(odd) < MAX_ODD_ROWS else "error"
 
     names = [f"c{index}" for index in range(width)]
     include = [names[index] for index in wanted.values()]
+    data = content.read()
     try:
         table = pacsv.read_csv(
-            pa.BufferReader(content.data),
-            # One thread: only then are odd rows numbered.
+            pa.BufferReader(data),
+            # One thread: pyarrow numbers odd rows only then.
             read_options=pacsv.ReadOptions(
                 use_threads=False, column_names=names, skip_rows=skip_lines
             ),
-            parse_options=pacsv.ParseOptions(delimiter=delimiter, invalid_row_handler=keep_aside),
+            parse_options=pacsv.ParseOptions(delimiter=delimiter, invalid_row_handler=collect),
             convert_options=pacsv.ConvertOptions(
                 include_columns=include,
                 column_types=dict.fromkeys(include, pa.string()),
@@ -135,11 +142,14 @@ def read_columns(
             f"more than the {MAX_LOG_ROWS} rows that a log may have",
             source=content.path,
             value=table.num_rows,
-            cure="cut it into parts",
+            cure="split it",
         )
     if not table.num_rows:
-        raise InputError(
-            "there are no rows below the header", source=content.path, cure="check the export"
+        raise _no_rows(content)
+    remarks = _remarks_on_odd_rows(odd, table.num_rows, skip_lines, content)
+    if not data.endswith((b"\n", b"\r")):
+        remarks.append(
+            "the last line has no line end: if the file was cut off, its last value may be short"
         )
     text = {name: table.column(f"c{index}") for name, index in wanted.items()}
     return Columns(
@@ -148,12 +158,10 @@ def read_columns(
             name: header[index] if index < len(header) else f"column {index + 1}"
             for name, index in wanted.items()
         },
-        path=content.path,
-        decimal_comma=delimiter != "," and _has_decimal_comma(text),
-        remarks=(
-            *_judge_odd_rows(odd, table.num_rows, skip_lines, content),
-            *_unended(content),
-        ),
+        source=str(content.path),
+        decimal_comma=delimiter != ","
+        and any(pc.any(pc.match_substring(column, ",")).as_py() for column in text.values()),
+        remarks=tuple(remarks),
     )
 
 
@@ -161,10 +169,8 @@ def _width(content: FileContent, header: list[str], delimiter: str, skip_lines: 
     """Return the number of cells of the first data row: headers can be shorter than rows."""
     first = next((line for line in content.head[skip_lines:] if line.strip()), None)
     if first is None:
-        raise InputError(
-            "there are no rows below the header", source=content.path, cure="check the export"
-        )
-    width = len(cells(first, delimiter))
+        raise _no_rows(content)
+    width = len(split_cells(first, delimiter))
     if width > MAX_LOG_COLUMNS:
         raise InputError(
             f"more than the {MAX_LOG_COLUMNS} columns that a log may have",
@@ -182,27 +188,21 @@ def _width(content: FileContent, header: list[str], delimiter: str, skip_lines: 
     return width
 
 
-def _judge_odd_rows(
+def _remarks_on_odd_rows(
     odd: list[Any], rows: int, skip_lines: int, content: FileContent
-) -> tuple[str, ...]:
-    if not odd:
-        return ()
-    # Rows are numbered from 1, those skipped above included; only the last ones may be odd.
+) -> list[str]:
+    # pyarrow numbers rows from 1, skipped lines included; only the last ones may be odd.
     last = skip_lines + rows + len(odd)
-    tail = {last - back for back in range(len(odd))}
     remarks = []
-    cut_off = 0
     for row in odd:
         closing = row.actual_columns == 1 and not _is_number(row.text)
-        is_last = row.number == last
-        if row.number in tail and closing:
+        if row.number > last - len(odd) and closing:
             remarks.append(f"closing line left out: {row.text.strip()[:60]!r}")
-        elif is_last and row.actual_columns < row.expected_columns:
-            cut_off += 1
+        elif row.number == last and row.actual_columns < row.expected_columns:
             remarks.append("the last line is cut off and was left out: the file may be incomplete")
         else:
             raise _odd_row(row, skip_lines, content)
-    return tuple(remarks)
+    return remarks
 
 
 def _odd_row(row: Any, skip_lines: int, content: FileContent) -> InputError:
@@ -214,15 +214,10 @@ def _odd_row(row: Any, skip_lines: int, content: FileContent) -> InputError:
     )
 
 
-def _unended(content: FileContent) -> tuple[str, ...]:
-    """Say that the last value may be cut: half a number is a number too."""
-    if content.data.endswith((b"\n", b"\r")):
-        return ()
-    return ("the last line has no line end: if the file was cut off, its last value may be short",)
-
-
-def _has_decimal_comma(text: Mapping[str, Any]) -> bool:
-    return any(pc.any(pc.match_substring(column, ",")).as_py() for column in text.values())
+def _no_rows(content: FileContent) -> InputError:
+    return InputError(
+        "there are no rows below the header", source=content.path, cure="check the export"
+    )
 
 
 def _is_number(text: str) -> bool:
@@ -231,10 +226,3 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _first_bad(column: Any) -> tuple[int, str]:
-    for row, value in enumerate(column.to_pylist(), start=1):
-        if value is not None and not _is_number(value):
-            return row, value
-    return 1, str(column[0])

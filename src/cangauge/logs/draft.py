@@ -1,83 +1,54 @@
-"""The last step of every reader: missing values, units, order of time → Log."""
+"""What a reader found, before it is checked; the checks that make it a log."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
-from cangauge._typing import FloatArray
+from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import InputError
-from cangauge.logs.file_content import FileContent
-from cangauge.logs.log import Log, TemperatureSource
-from cangauge.logs.units import refuse_wrong_units
+from cangauge.logs.units import REQUIRED, TemperatureSource, refuse_wrong_units
 
-REQUIRED: Final = ("time_s", "current_a", "voltage_v", "temperature_c")
-MAX_MISSING_SHARE: Final = 0.05
-"""More incomplete rows than this are an error even where dropping them is the rule."""
+MAX_INCOMPLETE: Final = 0.05
+"""Largest part of incomplete rows that is dropped, where dropping is the rule [-]."""
 
 
 @dataclass(slots=True)
 class DraftLog:
-    """What a reader found in a file, before it is checked.
+    """Columns of a log as found in a file or table.
 
     Parameters
     ----------
-    content : FileContent
-        The file.
+    name : str
+        Short name of the log.
+    source : str
+        Path of the file; "" for a table in memory.
     values : dict of str to array of shape (n,)
-        `time_s`, `current_a` (positive = discharge), `voltage_v`, `temperature_c` and maybe
+        `time_s`, `current_a` (positive = discharge), `voltage_v`, `temperature_c` and optionally
         `soc_pct`, in canonical units, NaN where missing.
     labels : dict of str to str
         Heading in the file by field, for messages.
     temperature_source : str
         What the temperature was measured on.
     drop_incomplete : bool
-        Whether rows that lack a required value are dropped (with a remark) or an error.
+        Drop rows that lack a required value (with a remark) instead of refusing them.
     sign_unknown : bool
-        Whether the format does not say which way it counts current.
+        The format does not define the sign of current.
     remarks : list of str
         What the reader changed or noticed.
     """
 
-    content: FileContent
-    values: dict[str, FloatArray]
+    name: str
+    source: str
+    values: dict[str, FloatArray] = field(default_factory=dict)
     labels: dict[str, str] = field(default_factory=dict)
     temperature_source: TemperatureSource = "unknown"
     drop_incomplete: bool = False
     sign_unknown: bool = False
     remarks: list[str] = field(default_factory=list)
-
-    def to_log(self, temperature_c: float | None = None) -> Log:
-        """Check the draft and return it as a Log.
-
-        Rows whose time stamp equals the one before are dropped (the first stays), with a remark.
-
-        Parameters
-        ----------
-        temperature_c : float, optional
-            Constant temperature [°C] to use, whatever the file says.
-
-        Raises
-        ------
-        InputError
-            No temperature, missing or infinite values, wrong units, time that runs backwards.
-        """
-        self._settle_temperature(temperature_c)
-        self._settle_missing()
-        self._settle_time()
-        self.remarks.extend(
-            refuse_wrong_units(self.values, source=self.content.path, labels=self.labels)
-        )
-        return Log(
-            **self.values,
-            name=self.content.stem,
-            source=str(self.content.path),
-            temperature_source=self.temperature_source,
-            remarks=(*self.content.remarks, *self.remarks),
-        )
 
     def require(self, *fields: str, headings: Sequence[str]) -> None:
         """Raise InputError if one of these fields was not found under any heading."""
@@ -87,66 +58,97 @@ class DraftLog:
                 raise self._error(
                     name,
                     f"no column of this file gives it (it has: {shown})",
-                    None,
-                    cure="check the export, or make a canonical log of it",
+                    cure="check the export, or convert it to a canonical log",
                 )
 
-    def keep(self, rows: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> None:
+    def keep(self, rows: BoolArray) -> None:
         """Keep only the rows of a mask of shape (n,)."""
         self.values = {name: values[rows] for name, values in self.values.items()}
 
-    def _settle_temperature(self, given_c: float | None) -> None:
+    def negate_current(self, because: str) -> None:
+        """Turn the sign of the stored current, with a remark."""
+        self.values["current_a"] = 0.0 - self.values["current_a"]  # no -0.0
+        self.remarks.append(f"current negated: {because}")
+
+    def checked(self, temperature_c: float | None = None) -> dict[str, Any]:
+        """Check all values and return the arguments of `Log`.
+
+        Rows whose time stamp equals the one before are dropped (the first stays), with a remark.
+
+        Parameters
+        ----------
+        temperature_c : float, optional
+            Constant temperature [°C], in place of the file's.
+
+        Raises
+        ------
+        InputError
+            No temperature, missing or infinite values, wrong units, time that runs backwards.
+        """
+        self._set_temperature(temperature_c)
+        self._check_missing()
+        self._check_time()
+        self.remarks.extend(refuse_wrong_units(self.values, source=self._where, labels=self.labels))
+        return {
+            **self.values,
+            "name": self.name,
+            "source": self.source,
+            "temperature_source": self.temperature_source,
+            "remarks": tuple(self.remarks),
+        }
+
+    def _set_temperature(self, given_c: float | None) -> None:
         if given_c is not None:
-            replaced = " in place of the file's" if "temperature_c" in self.values else ""
+            replaced = f" in place of the {self._kind}'s" if "temperature_c" in self.values else ""
             self.remarks.append(f"temperature {given_c:g} °C as given{replaced}")
             self.values["temperature_c"] = np.full(self.values["time_s"].size, given_c)
             self.temperature_source = "unknown"
         elif "temperature_c" not in self.values:
             raise self._error(
                 "temperature_c",
-                "the file holds no temperature",
-                None,
-                cure="add this column [°C], or give a constant with --temperature",
+                f"the {self._kind} holds no temperature",
+                cure="add this column [°C], or give a constant with "
+                + ("--temperature" if self.source else "temperature_c"),
             )
 
-    def _settle_missing(self) -> None:
-        soc = self.values.get("soc_pct")
-        if soc is not None and np.isinf(soc).any():
-            row = int(np.flatnonzero(np.isinf(soc))[0])
-            raise self._error("soc_pct", f"row {row + 1} is not finite", float(soc[row]))
+    def _check_missing(self) -> None:
         incomplete = np.zeros(self.values["time_s"].size, dtype=bool)
         for name in REQUIRED:
-            values = self.values[name]
-            bad = ~np.isfinite(values)
-            infinite = np.isinf(values)
-            if infinite.any() or (bad.any() and not self.drop_incomplete):
-                rows = np.flatnonzero(infinite if infinite.any() else bad)
-                raise self._error(
-                    name,
-                    f"row {rows[0] + 1} holds no number ({rows.size} such rows of {bad.size})",
-                    float(values[rows[0]]),
-                    cure="fill or drop these rows in the file",
-                )
-            if bad.all():
-                raise self._error(name, "the column is empty", None, cure="check the export")
-            incomplete |= bad
+            missing = np.isnan(self.values[name])
+            self._refuse_rows(name, np.isinf(self.values[name]))
+            if not self.drop_incomplete:
+                self._refuse_rows(name, missing)
+            if missing.all():
+                raise self._error(name, "the column is empty", cure="check the export")
+            incomplete |= missing
+        if "soc_pct" in self.values:
+            self._refuse_rows("soc_pct", np.isinf(self.values["soc_pct"]))
         count = int(incomplete.sum())
         if not count:
             return
-        if count > MAX_MISSING_SHARE * incomplete.size:
+        if count > MAX_INCOMPLETE * incomplete.size:
             raise self._error(
                 None,
                 f"{count} of {incomplete.size} rows lack time, current, voltage or temperature",
-                None,
                 cure="check the export",
             )
         self.remarks.append(
             f"{count} rows without time, current, voltage or temperature dropped"
-            f" (the first is row {int(np.flatnonzero(incomplete)[0]) + 1})"
+            f" (the first is row {int(np.argmax(incomplete)) + 1})"
         )
         self.keep(~incomplete)
 
-    def _settle_time(self) -> None:
+    def _refuse_rows(self, name: str, bad: BoolArray) -> None:
+        if bad.any():
+            row = int(np.argmax(bad))
+            raise self._error(
+                name,
+                f"row {row + 1} holds no number ({bad.sum()} such rows of {bad.size})",
+                float(self.values[name][row]),
+                cure=f"fill or drop these rows in the {self._kind}",
+            )
+
+    def _check_time(self) -> None:
         time = self.values["time_s"]
         step = np.diff(time)
         back = np.flatnonzero(step < 0.0)
@@ -155,26 +157,32 @@ class DraftLog:
             raise self._error(
                 "time_s",
                 f"time runs backwards at row {row + 1} ({back.size} such rows;"
-                f" {time[row - 1]:.6f} s comes before)",
+                f" the row before has {time[row - 1]:.6f} s)",
                 float(time[row]),
                 cure="sort the rows by time, or split the file into one log each",
             )
-        same = np.flatnonzero(step == 0.0)
-        if same.size:
+        same = np.concatenate(([False], step == 0.0))
+        if same.any():
             self.remarks.append(
-                f"{same.size} rows with the time stamp of the row before dropped"
-                f" (the first is row {int(same[0]) + 2})"
+                f"{same.sum()} rows with the time stamp of the row before dropped"
+                f" (the first is row {int(np.argmax(same)) + 1})"
             )
-            keep = np.ones(time.size, dtype=bool)
-            keep[same + 1] = False
-            self.keep(keep)
+            self.keep(~same)
+
+    @property
+    def _kind(self) -> str:
+        return "file" if self.source else "table"
+
+    @property
+    def _where(self) -> str:
+        return self.source or self.name
 
     def _error(
-        self, name: str | None, problem: str, value: float | None, cure: str | None = None
+        self, name: str | None, problem: str, value: float | None = None, *, cure: str
     ) -> InputError:
         return InputError(
             problem,
-            source=self.content.path,
+            source=self._where,
             field=None if name is None else self.labels.get(name, name),
             value=value,
             cure=cure,

@@ -1,19 +1,25 @@
-"""What is in a file: bytes unpacked from gzip and zip, text decoded, the beginning to judge by."""
+"""A log file's content: gzip and zip unpacked, text decoded, the beginning to recognise it by."""
 
 from __future__ import annotations
 
 import csv
-import gzip
 import io
 import struct
 import zipfile
 import zlib
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import Final, cast
 
-from cangauge._io import GZIP, MAX_LOG_BYTES, Bounded, read_bounded, unpacks_to
+from cangauge._io import (
+    MAX_LOG_BYTES,
+    bounded,
+    open_unpacked,
+    read_all,
+    read_beginning,
+)
 from cangauge.errors import InputError
 
 _ZIP: Final = b"PK\x03\x04"
@@ -22,44 +28,91 @@ _DELIMITERS: Final = ("\t", ";", ",")
 _HEAD_BYTES: Final = 64 * 1024
 _HEAD_LINES: Final = 60
 _D3_MEMBER: Final = "test data.txt"
-_WHAT: Final = "a log"
-# LZMA in a zip says itself how much memory it wants; no exporter uses it.
+# An LZMA member chooses how much memory its reader needs; no exporter writes one.
 _ZIP_METHODS: Final = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_DAMAGE: Final = (EOFError, OSError, zlib.error, zipfile.BadZipFile, struct.error, ValueError)
 
 
-@dataclass(frozen=True, slots=True)
 class FileContent:
-    r"""The unpacked content of one file.
+    """The unpacked content of one file: its beginning at once, the rest on demand.
 
     Parameters
     ----------
+    path : path-like
+
+    Attributes
+    ----------
     path : Path
-        The file as the user named it.
-    data : bytes
-        Its content, unpacked; text is UTF-8 with `\n` or `\r\n` line ends.
-    stem : str
-        Name without folder and suffixes (of the member, for a zip).
+        As given.
+    name : str
+        File name without folder and suffixes (of the member, for a zip).
     head : tuple of str
-        The first lines, without line ends; empty when the content is not text.
-    remarks : tuple of str
-        What unpacking noticed.
+        The first lines, without line ends; empty for binary content.
+    is_parquet : bool
+
+    Raises
+    ------
+    InputError
+        If the file is absent, unreadable, empty or damaged from its start, or if a zip holds
+        several files.
     """
 
-    path: Path
-    data: bytes
-    stem: str
-    head: tuple[str, ...]
-    remarks: tuple[str, ...] = ()
+    def __init__(self, path: str | PathLike[str]) -> None:
+        self.path = Path(path)
+        self.name = _stem(self.path.name)
+        with self._open() as file:
+            beginning = read_beginning(file, _HEAD_BYTES)
+        if not beginning:
+            with self._open() as file:
+                file.read(1)  # raises if the file is damaged, not empty
+        if not beginning.strip():
+            raise InputError("the file is empty", source=self.path, cure="check the export")
+        self.is_parquet = beginning.startswith(_PARQUET)
+        self.head = () if self.is_parquet else _first_lines(beginning)
 
     @property
-    def is_parquet(self) -> bool:
-        """Whether the content begins like a Parquet file."""
-        return self.data.startswith(_PARQUET)
+    def first_line(self) -> str:
+        """The first line that is not blank; "" for binary content."""
+        return next((line for line in self.head if line.strip()), "")
 
-    @property
-    def delimiter(self) -> str | None:
-        """Delimiter of the first line that has one: tab, `;` or `,` in this order."""
-        return delimiter_of(self.head[0]) if self.head else None
+    def read(self) -> bytes:
+        r"""Return the whole content; text as UTF-8 with `\n` or `\r\n` line ends.
+
+        Raises
+        ------
+        InputError
+            If the file is damaged, or larger than a log may be.
+        """
+        with self._open() as file:
+            data = read_all(file, self.path, MAX_LOG_BYTES, "a log")
+        return data if self.is_parquet else _as_utf8(data)
+
+    @contextmanager
+    def _open(self) -> Iterator[io.BufferedReader]:
+        kind = ""
+        try:
+            with open_unpacked(self.path, MAX_LOG_BYTES) as file:
+                kind = "" if file.seekable() else "gzip "
+                if not file.peek(len(_ZIP)).startswith(_ZIP):
+                    yield file
+                    return
+                kind = "zip "
+                packed = io.BytesIO(read_all(file, self.path, MAX_LOG_BYTES, "a log"))
+            with zipfile.ZipFile(packed) as archive:
+                member = _only_member(archive, self.path)
+                self.name = _stem(Path(member.filename).name)
+                size = packed.getbuffer().nbytes
+                with archive.open(member) as content:
+                    unpacked = cast("io.BufferedIOBase", content)
+                    yield bounded(unpacked, self.path, MAX_LOG_BYTES, size)
+        except _DAMAGE as error:
+            raise InputError(
+                f"the {kind}file is cut off or damaged ({error})",
+                source=self.path,
+                cure="fetch it again",
+            ) from error
+        except (RuntimeError, NotImplementedError) as error:  # encrypted; unknown compression
+            raise InputError(f"the zip cannot be unpacked: {error}", source=self.path) from error
 
 
 def delimiter_of(line: str) -> str | None:
@@ -67,66 +120,13 @@ def delimiter_of(line: str) -> str | None:
     return next((mark for mark in _DELIMITERS if mark in line), None)
 
 
-def cells(line: str, delimiter: str) -> list[str]:
+def split_cells(line: str, delimiter: str) -> list[str]:
     """Split a line into cells without blanks and quotes around them."""
     reader = csv.reader([line], delimiter=delimiter, skipinitialspace=True)
     return [cell.strip() for cell in next(reader, [])]
 
 
-def read_file_content(path: str | PathLike[str]) -> FileContent:
-    """Read a file whole, unpack gzip and zip, decode text.
-
-    Raises
-    ------
-    InputError
-        If the file is absent, unreadable, empty, cut off or damaged, or if a zip does not say
-        which of its files is meant.
-    """
-    path = Path(path)
-    data, stem, remarks = read_bounded(path, MAX_LOG_BYTES, _WHAT), _stem(path.name), ()
-    if data.startswith(GZIP):
-        data = _gunzip(data, path)
-    if data.startswith(_ZIP):
-        data, stem = _unzip(data, path)
-    if not data.strip():
-        raise InputError("the file is empty", source=path, cure="check the export")
-    if data.startswith(_PARQUET):
-        return FileContent(path, data, stem, (), remarks)
-    data = _as_utf8(data)
-    return FileContent(path, data, stem, _head(data), remarks)
-
-
-def _gunzip(data: bytes, path: Path) -> bytes:
-    try:
-        with gzip.GzipFile(fileobj=io.BytesIO(data)) as packed:
-            return _read_all(packed, path, len(data))
-    except (EOFError, OSError, zlib.error) as error:
-        raise InputError(
-            f"the gzip file is cut off or damaged ({error})", source=path, cure="fetch it again"
-        ) from error
-
-
-def _read_all(packed: io.BufferedIOBase, path: Path, packed_bytes: int) -> bytes:
-    limit = min(MAX_LOG_BYTES, unpacks_to(packed_bytes))
-    return io.BufferedReader(Bounded(packed, path, limit)).read()
-
-
-def _unzip(data: bytes, path: Path) -> tuple[bytes, str]:
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            member = _member(archive, path)
-            with archive.open(member) as packed:
-                content = _read_all(cast("io.BufferedIOBase", packed), path, len(data))
-            return content, _stem(Path(member.filename).name)
-    except (zipfile.BadZipFile, EOFError, OSError, zlib.error, ValueError, struct.error) as error:
-        raise InputError(
-            f"the zip file is cut off or damaged ({error})", source=path, cure="fetch it again"
-        ) from error
-    except (RuntimeError, NotImplementedError) as error:  # encrypted; unknown compression
-        raise InputError(f"the zip cannot be unpacked: {error}", source=path) from error
-
-
-def _member(archive: zipfile.ZipFile, path: Path) -> zipfile.ZipInfo:
+def _only_member(archive: zipfile.ZipFile, path: Path) -> zipfile.ZipInfo:
     files = [
         info
         for info in archive.infolist()
@@ -136,21 +136,22 @@ def _member(archive: zipfile.ZipFile, path: Path) -> zipfile.ZipInfo:
     # A vehicle's zip of the ANL D3 data base holds documents beside the test data.
     tests = [info for info in files if info.filename.lower().endswith(_D3_MEMBER)]
     chosen = tests or files
-    if len(chosen) == 1 and chosen[0].compress_type in _ZIP_METHODS:
-        return chosen[0]
-    if len(chosen) == 1:
+    if len(chosen) != 1:
+        names = ", ".join(info.filename for info in chosen[:4])
+        more = ", …" if len(chosen) > 4 else ""
         raise InputError(
-            "the zip packs in another way than deflate",
+            f"the zip holds {len(chosen)} files ({names}{more})" if chosen else "the zip is empty",
+            source=path,
+            cure="unpack it and name one of them",
+        )
+    if chosen[0].compress_type not in _ZIP_METHODS:
+        raise InputError(
+            "the zip uses another compression than deflate",
             source=path,
             value=chosen[0].compress_type,
-            cure="unpack it yourself",
+            cure="unpack it first",
         )
-    names = ", ".join(info.filename for info in chosen[:4]) + (", …" if len(chosen) > 4 else "")
-    raise InputError(
-        f"the zip holds {len(chosen)} files ({names})" if chosen else "the zip is empty",
-        source=path,
-        cure="unpack it and name one of them",
-    )
+    return chosen[0]
 
 
 def _as_utf8(data: bytes) -> bytes:
@@ -165,8 +166,11 @@ def _as_utf8(data: bytes) -> bytes:
     return data
 
 
-def _head(data: bytes) -> tuple[str, ...]:
-    text = data[:_HEAD_BYTES].decode("utf-8", errors="ignore")
+def _first_lines(beginning: bytes) -> tuple[str, ...]:
+    if len(beginning) >= _HEAD_BYTES:
+        # The last line may be cut within a character, which would make it look like latin-1.
+        beginning = beginning[: beginning.rfind(b"\n") + 1] or beginning
+    text = _as_utf8(beginning).decode("utf-8", errors="ignore")
     if "\x00" in text:
         return ()
     return tuple(text.replace("\r\n", "\n").replace("\r", "\n").split("\n")[:_HEAD_LINES])

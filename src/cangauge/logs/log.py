@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass, field, replace
-from typing import Literal, Self, get_args
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from cangauge._typing import FloatArray
+from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.errors import InputError
+from cangauge.logs.units import (
+    REQUIRED,
+    TEMPERATURE_SOURCES,
+    TemperatureSource,
+    known_temperature_source,
+)
 
-TemperatureSource = Literal["cell", "pack", "coolant", "room", "unknown"]
-TEMPERATURE_SOURCES: tuple[str, ...] = get_args(TemperatureSource)
+__all__ = ["TEMPERATURE_SOURCES", "Log", "TemperatureSource"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,6 +52,23 @@ class Log:
     InputError
         If the arrays are empty, differ in length, hold NaN or infinities (except `soc_pct`), or
         if time does not increase.
+
+    See Also
+    --------
+    Log.from_dataframe : The log of a pandas, polars or pyarrow table.
+
+    Notes
+    -----
+    A log offers the Arrow PyCapsule interface: `polars.DataFrame(log)`, `pyarrow.table(log)` and
+    every other library that reads it take a log as a table.
+
+    Examples
+    --------
+    >>> log = Log([0, 1, 2], [10, 20, 0], [380, 379, 381], [21, 21, 21], soc_pct=[80, 80, 79.9])
+    >>> len(log), log.duration_s
+    (3, 2.0)
+    >>> log.to_arrow().column_names
+    ['time_s', 'current_a', 'voltage_v', 'temperature_c', 'soc_pct']
     """
 
     time_s: FloatArray
@@ -59,7 +82,7 @@ class Log:
     remarks: tuple[str, ...] = field(default=())
 
     def __post_init__(self) -> None:
-        for channel in ("time_s", "current_a", "voltage_v", "temperature_c", "soc_pct"):
+        for channel in (*REQUIRED, "soc_pct"):
             values = getattr(self, channel)
             if values is not None:
                 object.__setattr__(self, channel, _read_only(values))
@@ -76,7 +99,7 @@ class Log:
                 raise InputError(
                     f"has {values.size} values where time_s has {n}", source=where, field=channel
                 )
-        for channel in ("time_s", "current_a", "voltage_v", "temperature_c"):
+        for channel in REQUIRED:
             values = getattr(self, channel)
             bad = np.flatnonzero(~np.isfinite(values))
             if bad.size:
@@ -85,19 +108,114 @@ class Log:
                     source=where,
                     field=channel,
                     value=float(values[bad[0]]),
-                    cure="fill or drop these rows in the file",
+                    cure="fill or drop these rows",
                 )
         back = np.flatnonzero(np.diff(self.time_s) <= 0.0)
         if back.size:
             row = int(back[0]) + 1
             raise InputError(
-                f"time does not increase at row {row + 1}"
-                f" ({back.size} such rows; {self.time_s[row - 1]:.6f} s comes before)",
+                f"time does not increase at row {row + 1} ({back.size} such rows;"
+                f" the row before has {self.time_s[row - 1]:.6f} s)",
                 source=where,
                 field="time_s",
                 value=float(self.time_s[row]),
                 cure="sort the rows by time and drop duplicated stamps",
             )
+
+    @classmethod
+    def from_dataframe(
+        cls,
+        table: Any,
+        *,
+        name: str = "log",
+        temperature_c: float | None = None,
+        temperature_source: TemperatureSource | None = None,
+    ) -> Self:
+        """Return the log of a pandas, polars or pyarrow table.
+
+        The values are checked as those of a file: missing values, wrong units and time that runs
+        backwards raise; rows that repeat a time stamp are dropped with a remark.
+
+        Parameters
+        ----------
+        table : DataFrame or Table
+            Anything with the Arrow PyCapsule interface (`__arrow_c_stream__`). Columns in any
+            order and case: `time_s` [s], `current_a` [A, positive = discharge], `voltage_v` [V],
+            `temperature_c` [°C], optionally `soc_pct` [%] and `temperature_source`.
+        name : str
+            Short name of the log.
+        temperature_c : float, optional
+            Constant temperature [°C], in place of a column.
+        temperature_source : {"cell", "pack", "coolant", "room", "unknown"}, optional
+            What the temperature was measured on, in place of the table's own word.
+
+        Raises
+        ------
+        InputError
+            Names the column, the row (from 1) and the value.
+        TypeError
+            If the object is no table.
+
+        Examples
+        --------
+        >>> import pyarrow as pa
+        >>> table = pa.table({"Time_s": [0.0, 1.0], "current_A": [5.0, 6.0], "voltage_V": [380, 379]})
+        >>> log = Log.from_dataframe(table, temperature_c=21.0)
+        >>> log.voltage_v
+        array([380., 379.])
+        """  # noqa: E501 - an example to copy
+        # Deferred: pyarrow takes 0.3 s to import, and the live service needs no tables.
+        import pyarrow as pa  # noqa: PLC0415
+
+        from cangauge.logs.arrow import check_types, draft_from_table, find_fields  # noqa: PLC0415
+
+        arrow = pa.table(table)
+        names = [each for each in arrow.column_names if not each.startswith("__index_level_")]
+        places = find_fields(names, name)
+        arrow = arrow.select(names)
+        check_types(arrow.schema, places, name)
+        draft = draft_from_table(arrow, places, names, name=name, source="")
+        fields = draft.checked(temperature_c)
+        if temperature_source is not None:
+            fields["temperature_source"] = known_temperature_source(temperature_source)
+        return cls(**fields)
+
+    def to_arrow(self) -> Any:
+        """Return a pyarrow.Table of the columns; missing SoC is null.
+
+        The temperature source, where known, is metadata of the schema.
+        """
+        from cangauge.logs.arrow import build_table  # noqa: PLC0415 - pyarrow, as above
+
+        columns = {channel: getattr(self, channel) for channel in REQUIRED}
+        if self.soc_pct is not None:
+            columns["soc_pct"] = self.soc_pct
+        return build_table(columns, self.temperature_source)
+
+    def to_pandas(self) -> Any:
+        """Return a pandas.DataFrame of the columns; missing SoC is NaN.
+
+        Raises
+        ------
+        InputError
+            If pandas is not installed.
+        """
+        _require("pandas")
+        return self.to_arrow().to_pandas()
+
+    def to_polars(self) -> Any:
+        """Return a polars.DataFrame of the columns; missing SoC is null.
+
+        Raises
+        ------
+        InputError
+            If polars is not installed.
+        """
+        return _require("polars").from_arrow(self.to_arrow())
+
+    def __arrow_c_stream__(self, requested_schema: Any = None) -> Any:
+        """Export the columns through the Arrow PyCapsule interface."""
+        return self.to_arrow().__arrow_c_stream__(requested_schema)
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -115,7 +233,7 @@ class Log:
         rows = np.flatnonzero(np.isfinite(self.soc_pct))
         return (int(rows[0]), float(self.soc_pct[rows[0]])) if rows.size else None
 
-    def rows(self, keep: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Self:
+    def rows(self, keep: BoolArray | IntArray | slice) -> Self:
         """Return the log of the rows that `keep` selects (mask, indices or slice)."""
         return replace(
             self,
@@ -131,3 +249,12 @@ def _read_only(values: ArrayLike) -> FloatArray:
     array = np.array(values, dtype=np.float64, copy=True)
     array.flags.writeable = False
     return array
+
+
+def _require(package: str) -> Any:
+    try:
+        return importlib.import_module(package)
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"{package} is not installed", cure=f"install it: pip install {package}"
+        ) from error

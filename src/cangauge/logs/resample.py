@@ -1,14 +1,6 @@
-"""A reported temperature without its steps.
+"""Prepare a log for a fit or diagnosis: undo the steps of its temperature, average fast rows.
 
-A battery's sensor shows whole degrees, or quarters of one, while its temperature moves by less in
-an hour: the report stands, and is wrong by up to half a step for as long. With a coefficient of
-tenths of a volt per kelvin (the published one: 0.74) that is more than most causes do, and it lasts
-as long as they do. Where the report changes, though, the temperature is known: half-way.
-
-Fast logs for a diagnosis: stretches of a twentieth of a second, averaged.
-
-A diagnosis tries hundreds of shapes of effects over all samples of a log. None of them lasts less
-than a few tenths of a second, while a car's bus brings a hundred samples a second.
+Both look ahead: they are for offline use, not for the service.
 """
 
 from __future__ import annotations
@@ -16,75 +8,72 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cangauge._typing import FloatArray
+from cangauge._typing import FloatArray, IntArray
 from cangauge.logs.log import Log
 
-# --- A reported temperature without its steps
-
-STANDS_S = 60.0
-"""A report that stands for so long [s] is right in its middle; a shorter one is the noise of a
-temperature between two steps."""
-
-
-STEPPED_PART = 0.5
-"""A temperature that changes at this part of the rows or more is not reported in steps."""
+PLATEAU_S = 60.0
+"""A reported value that lasts this long [s] is taken as exact in the middle of its plateau; a
+shorter plateau is noise of a temperature between two steps."""
+STEPPED_SHARE = 0.5
+"""A temperature that changes at this part of the rows or more is not quantized [-]."""
+ENOUGH_HZ = 20.0
+"""Rate of an averaged log [Hz]. A log below twice this rate is returned as it is."""
 
 
 def dequantize(log: Log) -> Log:
-    """Return a log with the temperature that its reports are the steps of.
+    """Return a log whose quantized temperature is interpolated between its steps.
 
-    Straight lines from change to change, through the middle of what stands in between, and nowhere
-    further from the report than half of its usual step: a jump, as after a pause, stays one. Looks
-    ahead, so it is for a diagnosis or a fit, not for the service. A temperature that never changes
-    stays, and so does one that nearly always does.
+    A sensor reports whole or quarter degrees while the temperature may move by less in an hour:
+    the report is wrong by up to half a step for as long. With a coefficient of tenths of a volt
+    per kelvin (0.74 V/K in the published model) that exceeds most effects. At a step, the
+    temperature is known: half-way.
+
+    Lines run from step to step through the middle of long plateaus, never further from the report
+    than half of its usual step, so that a jump, as after an unobserved interval, stays one. A
+    temperature that never changes, or changes at most rows, is kept.
     """
     time_s, reported = log.time_s, log.temperature_c
     change = np.flatnonzero(np.diff(reported))
-    if not 0 < change.size < STEPPED_PART * len(log):
+    if not 0 < change.size < STEPPED_SHARE * len(log):
         return log
     half_step = 0.5 * usual_step_k(log)
     first, last = np.append(0, change + 1), np.append(change, len(log) - 1)
-    stands = time_s[last] - time_s[first] >= STANDS_S
-    stands[[0, -1]] = True  # before the first change and after the last nothing else is known
-    knots_s = np.append(_between(time_s, change), 0.5 * (time_s[first] + time_s[last])[stands])
-    knots_c = np.append(_between(reported, change), reported[first][stands])
+    plateau = time_s[last] - time_s[first] >= PLATEAU_S
+    plateau[[0, -1]] = True  # nothing else is known before the first step and after the last
+    knots_s = np.append(_midpoints(time_s, change), 0.5 * (time_s[first] + time_s[last])[plateau])
+    knots_c = np.append(_midpoints(reported, change), reported[first][plateau])
     order = np.argsort(knots_s, kind="stable")
     line = np.interp(time_s, knots_s[order], knots_c[order])
-    between = np.clip(line, reported - half_step, reported + half_step)
-    return replace(log, temperature_c=between)
+    bounded = np.clip(line, reported - half_step, reported + half_step)
+    return replace(log, temperature_c=bounded)
 
 
 def usual_step_k(log: Log) -> float:
-    """Return by how much a log's reported temperature usually changes at once [K]; 0 if never."""
+    """Return the median step of a log's reported temperature [K]; 0 if it never changes."""
     steps = np.abs(np.diff(log.temperature_c))
     changed = steps > 0.0
     return float(np.median(steps[changed])) if changed.any() else 0.0
 
 
-def _between(values: FloatArray, change: NDArray[np.intp]) -> FloatArray:
-    """Return the middle of the two values at each change."""
+def _midpoints(values: FloatArray, change: IntArray) -> FloatArray:
     return np.asarray(0.5 * (values[change] + values[change + 1]))
 
 
-# --- Fast logs for a diagnosis: stretches of a twentieth of a second, averaged
-
-ENOUGH_HZ = 20.0
-"""Stretches a second [Hz]. A log with less than twice as many samples is taken as it is."""
-
-
 def resample(log: Log) -> Log:
-    """Return a log with no more rows than a diagnosis can use.
+    """Return a log averaged over bins of 1 / `ENOUGH_HZ`.
 
-    The means of all signals over a stretch stand at the mean of its times, so nothing is late
-    against another and the charge stays; pauses stay pauses. The reference SoC is the first that
-    each stretch tells: it may come more slowly than the current.
+    A diagnosis tries hundreds of effects over all samples; none of them acts within less than a
+    few tenths of a second, while a car's bus brings a hundred samples a second.
+
+    Each row is the mean of all signals at the mean time of its bin: no signal is delayed against
+    another, charge and unobserved intervals are kept. The reference SoC is the first finite value
+    of each bin.
     """
     if len(log) < 2 or float(np.median(np.diff(log.time_s))) * 2.0 * ENOUGH_HZ > 1.0:
         return log
-    stretch = np.floor((log.time_s - log.time_s[0]) * ENOUGH_HZ)
-    first = np.flatnonzero(np.diff(stretch, prepend=-1.0))
+    bins = np.floor((log.time_s - log.time_s[0]) * ENOUGH_HZ)
+    first = np.flatnonzero(np.diff(bins, prepend=-1.0))
     counts = np.diff(first, append=len(log))
 
     def mean(values: FloatArray) -> FloatArray:
@@ -96,14 +85,14 @@ def resample(log: Log) -> Log:
         current_a=mean(log.current_a),
         voltage_v=mean(log.voltage_v),
         temperature_c=mean(log.temperature_c),
-        soc_pct=None if log.soc_pct is None else _first_known(log.soc_pct, first),
+        soc_pct=None if log.soc_pct is None else _first_finite(log.soc_pct, first),
     )
 
 
-def _first_known(values: FloatArray, first: NDArray[np.intp]) -> FloatArray:
-    """Return the first finite value of each stretch, NaN where there is none."""
+def _first_finite(values: FloatArray, first: IntArray) -> FloatArray:
+    """Return the first finite value of each bin, NaN where there is none."""
     known = np.flatnonzero(np.isfinite(values))
     found = np.full(first.size, np.nan)
-    stretch, at = np.unique(np.searchsorted(first, known, side="right") - 1, return_index=True)
-    found[stretch] = values[known[at]]
+    bins, at = np.unique(np.searchsorted(first, known, side="right") - 1, return_index=True)
+    found[bins] = values[known[at]]
     return found

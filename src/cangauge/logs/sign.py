@@ -1,35 +1,28 @@
 """The sign of current, found from the data: positive should discharge.
 
-Three kinds of evidence, each with its figures in words:
+Three kinds of evidence:
 
-- **steps**: when current rises by a step, the voltage of a battery that discharges falls (ohmic
-  drop). Every clear step is one vote; a sign test tells how likely the votes are by chance.
-- **charge**: over hours, voltage follows the charge that is left.
+- **steps**: when current rises by a step, the voltage of a discharging battery falls (ohmic drop).
+  Every clear step is a vote; a sign test gives the probability of the votes by chance.
+- **charge**: over hours, voltage follows the remaining charge.
 - **SoC**: a reference SoC falls as charge is taken out.
 
-The confidence adds up what each kind is worth (a decade of odds per unit of weight) and is a
-ranking figure, not a measured frequency; weights are capped so that no kind decides alone against
-another.
-
-What readers do about the sign of current.
+The confidence adds the weights of the three, each a decade of odds per unit. It ranks findings and
+is not a measured frequency; weights are capped so that no kind decides alone against another.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
-from cangauge._typing import FloatArray
+from cangauge._typing import FloatArray, IntArray
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
 
-# --- The sign of current, found from the data: positive should discharge
-
-IntArray = NDArray[np.intp]
 Kind = Literal["steps", "charge", "soc"]
 
 STEP_SPACING_S: Final = 1.0
@@ -40,12 +33,12 @@ STEP_SHARE: Final = 0.05
 """A step is at least this part of the range of current."""
 MAX_STEPS: Final = 400
 VOTES_PER_FREE_ONE: Final = 3.0
-"""So many votes count as one independent one: no wrong sign in random windows of real logs."""
+"""Votes that count as one independent vote: no wrong sign in random windows of real logs."""
 CLEAR_SHARE: Final = 0.75
-"""Below this share of agreeing votes [-] steps say nothing."""
+"""Least share of agreeing votes for steps to count [-]."""
 MOST_CONFIDENT: Final = 0.9999
 SURE_WEIGHT: Final = 2.0
-"""Below this weight (confidence 0.99) the sign stays open."""
+"""Least weight for a sign (confidence 0.99); below it the sign stays open."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +60,7 @@ class Steps:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What one kind of evidence says.
+    """One kind of evidence for the sign.
 
     Parameters
     ----------
@@ -75,7 +68,7 @@ class Evidence:
     weight : float
         Decades of odds, positive when positive current discharges [-].
     text : str
-        The figures in words.
+        The figures as a phrase.
     """
 
     kind: Kind
@@ -85,14 +78,14 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True)
 class SignFinding:
-    """Which way current is counted in a log.
+    """The sign convention of a log's current.
 
     Parameters
     ----------
     sign : {+1, -1, 0}
-        +1: positive current discharges (as it should); -1: it charges; 0: cannot be told.
+        +1: positive current discharges (as it should); -1: it charges; 0: undetermined.
     confidence : float
-        0.5 (a coin) to 0.9999 [-]; see the module's docstring.
+        0.5 (no evidence) to 0.9999 [-]; see the module's docstring.
     evidence : tuple of Evidence
     """
 
@@ -102,44 +95,29 @@ class SignFinding:
 
     @property
     def strongest(self) -> Evidence:
-        """The evidence that speaks most for the finding."""
+        """The strongest evidence for the finding."""
         return max(self.evidence, key=lambda item: item.weight * (self.sign or 1))
 
     @property
     def sentence(self) -> str:
-        """Say the finding and its grounds in one line."""
-        what = {
+        """The finding and its evidence in one line."""
+        finding = {
             1: "positive current discharges",
-            -1: "positive current CHARGES: the sign is turned",
-            0: "the sign of current cannot be told from this log",
+            -1: "positive current CHARGES: the sign is inverted",
+            0: "the sign of current cannot be determined from this log",
         }[self.sign]
-        grounds = "; ".join(item.text for item in self.evidence)
-        return f"{what} (confidence {self.confidence:.4g}): {grounds}"
+        evidence = "; ".join(item.text for item in self.evidence)
+        return f"{finding} (confidence {self.confidence:.4g}): {evidence}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        return {
-            "sign": self.sign,
-            "confidence": self.confidence,
-            "sentence": self.sentence,
-            "evidence": [
-                {"kind": item.kind, "weight": item.weight, "text": item.text}
-                for item in self.evidence
-            ],
-        }
+        return {**asdict(self), "sentence": self.sentence}
 
 
 def sign_of_current(log: Log) -> SignFinding:
     """Find from the data whether positive current discharges.
 
-    Parameters
-    ----------
-    log : Log
-        Current in whatever sign.
-
-    Returns
-    -------
-    SignFinding
+    The log's current may have either sign.
     """
     evidence = (_from_steps(log), _from_charge(log), _from_soc(log))
     weight = sum(item.weight for item in evidence)
@@ -154,18 +132,15 @@ def sign_of_current(log: Log) -> SignFinding:
 
 
 def require_discharge_positive(log: Log) -> None:
-    """Raise InputError if the data say clearly that positive current charges.
-
-    For commands that would compute nonsense from such a log.
-    """
+    """Raise InputError if the data show clearly that positive current charges."""
     finding = sign_of_current(log)
     if finding.sign < 0:
-        ground = finding.strongest
+        evidence = finding.strongest
         cure = "multiply the column by -1: positive current discharges"
-        if ground.kind == "soc":
+        if evidence.kind == "soc":
             cure += "; or, if the current is right, correct soc_pct or leave it out"
         raise InputError(
-            f"the sign of current is turned: {ground.text}",
+            f"the sign of current is inverted: {evidence.text}",
             source=log.source or log.name,
             field="current_a",
             cure=cure,
@@ -203,7 +178,7 @@ def _from_steps(log: Log) -> Evidence:
         else f"voltage moved with current in {rose} of {cast} steps"
     )
     share = larger / cast
-    # Steps follow one another and share slow voltage changes: votes count for fewer.
+    # Successive steps share slow voltage changes: they are fewer independent votes.
     free = max(1, round(cast / VOTES_PER_FREE_ONE))
     chance = 2.0 * float(special.bdtrc(round(share * free) - 1, free, 0.5))
     weight = min(6.0, -float(np.log10(chance))) if share >= CLEAR_SHARE and chance < 1.0 else 0.0
@@ -251,7 +226,7 @@ def correlation(a: FloatArray, b: FloatArray) -> float:
 
 
 def _ranks(values: FloatArray) -> FloatArray:
-    """Return ranks from 0; equal values share the mean of theirs."""
+    """Return ranks from 0; equal values share their mean rank."""
     _, place, count = np.unique(values, return_inverse=True, return_counts=True)
     mean_rank = np.cumsum(count) - (count + 1) / 2.0
     return np.asarray(mean_rank[place], dtype=np.float64)
@@ -271,17 +246,14 @@ def spaced_rows(time_s: FloatArray, spacing_s: float) -> IntArray:
     return np.concatenate(([0], np.flatnonzero(np.diff(slot) > 0.0) + 1)).astype(np.intp)
 
 
-# --- What readers do about the sign of current
-
-
 def resolve_sign(log: Log, *, stored_sign_unknown: bool) -> Log:
-    """Check the sign of current against the data; turn it only where the format leaves it open.
+    """Check the sign of current against the data; invert it only where the format leaves it open.
 
     Parameters
     ----------
     log : Log
     stored_sign_unknown : bool
-        Whether the format does not say which way current is counted (copies from CAN).
+        The format does not define the sign of current (copies from CAN).
 
     Returns
     -------
@@ -293,9 +265,9 @@ def resolve_sign(log: Log, *, stored_sign_unknown: bool) -> Log:
         text = f"current negated, sign found from the data: {finding.strongest.text}"
         return replace(log, current_a=0.0 - log.current_a, remarks=(*log.remarks, text))
     if stored_sign_unknown and finding.sign == 0:
-        text = "sign of current unknown and not to be told from the data: kept as stored"
+        text = "sign of current unknown and undetermined by the data: kept as stored"
     elif finding.sign < 0:
-        text = f"current looks turned and was kept as stored: {finding.sentence}"
+        text = f"current looks inverted and was kept as stored: {finding.sentence}"
     else:
         return log
     return replace(log, remarks=(*log.remarks, text))

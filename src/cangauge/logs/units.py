@@ -1,14 +1,13 @@
-"""Which column is a voltage: it moves when the current does, a temperature does not.
+"""Units of a log's quantities: conversion of stated ones, refusal of those that values contradict.
 
-Units: those that headers state are converted, those that values betray are refused.
-
-So is a voltage that has changed places with the temperature: its values look like kelvin.
+A voltage that is swapped with the temperature is refused too: its values look like kelvin. The
+voltage is the one whose steps follow those of the current.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final
+from typing import Final, Literal, cast, get_args
 
 import numpy as np
 
@@ -16,39 +15,11 @@ from cangauge._io import MAX_LOG_SPAN_S, MAX_STAMP_S
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 
-# --- Which column is a voltage: it moves when the current does, a temperature does not
+TemperatureSource = Literal["cell", "pack", "coolant", "room", "unknown"]
+TEMPERATURE_SOURCES: Final[tuple[str, ...]] = get_args(TemperatureSource)
 
-LARGE_SHARE: Final = 0.25
-"""This part of the rows, those with the largest changes of current, is asked [-]."""
-LEAST_ROWS: Final = 20
-FOLLOWS: Final = 0.7
-"""Agreement from which a column follows the current [-]: in real drives voltages agree by 0.89 and
-more, temperatures by 0.01; under a constant current voltages agree by 0.6 at most."""
-
-
-def follows_current(current_a: FloatArray, values: FloatArray) -> bool:
-    """Whether a column's steps have the sign of the current's steps, or all the opposite one.
-
-    Only signs count, so that neither a unit nor a few wrong rows matter. False where the current
-    hardly changes, as in a cycler's discharge.
-
-    Parameters
-    ----------
-    current_a, values : arrays of shape (n,)
-        In any unit.
-    """
-    change = np.diff(current_a)
-    size = np.abs(change)
-    if size.size < LEAST_ROWS:
-        return False
-    large = (size >= np.quantile(size, 1.0 - LARGE_SHARE)) & (size > 0.0)
-    if np.count_nonzero(large) < LEAST_ROWS:
-        return False
-    agreement = np.mean(np.sign(change[large]) * np.sign(np.diff(values)[large]))
-    return bool(abs(agreement) >= FOLLOWS)
-
-
-# --- Units: those that headers state are converted, those that values betray are refused
+REQUIRED: Final = ("time_s", "current_a", "voltage_v", "temperature_c")
+"""Columns of every log."""
 
 # Spelling (lower case, without blanks) -> (factor, offset) to the unit of the canonical log.
 _UNITS: Final[dict[str, dict[str, tuple[float, float]]]] = {
@@ -77,7 +48,7 @@ _UNITS: Final[dict[str, dict[str, tuple[float, float]]]] = {
     },
 }
 
-# What a battery's log can hold: a cell of 2 V to a truck's pack of 1000 V.
+# Plausible values, from a cell of 2 V to a truck's pack of 1000 V.
 MAX_VOLTAGE_V: Final = 1500.0
 MAX_CURRENT_A: Final = 2000.0
 MAX_INTERVAL_S: Final = 90.0
@@ -87,11 +58,33 @@ HOTTEST_C: Final = 120.0
 UNUSUALLY_HOT_C: Final = 62.0
 ZERO_C_IN_K: Final = 273.15
 MAX_HOURS_AT_PEAK: Final = 100.0
-"""A charge larger than this many hours of the largest current is no battery's."""
-
+"""Largest charge, in hours of the largest current [h]."""
 _EPOCH_MS: Final = 1e11
 
+# Of the steps of current that decide whether a column follows it.
+LARGE_SHARE: Final = 0.25
+"""Part of the rows that is compared: those with the largest steps of current [-]."""
+LEAST_ROWS: Final = 20
+FOLLOWS: Final = 0.7
+"""Agreement from which a column follows the current [-]. Real drives: voltages at least 0.89,
+temperatures at most 0.01; voltages under constant current at most 0.6."""
+
 _Refuse = Callable[[str, str, float, str], InputError]
+
+
+def known_temperature_source(
+    word: str, *, source: str | None = None, field: str = "temperature_source"
+) -> TemperatureSource:
+    """Return the word if it names a temperature source, else raise InputError."""
+    if word not in TEMPERATURE_SOURCES:
+        raise InputError(
+            "not a known temperature source",
+            source=source,
+            field=field,
+            value=word,
+            cure=f"use one of: {', '.join(TEMPERATURE_SOURCES)}",
+        )
+    return cast("TemperatureSource", word)
 
 
 def convert(
@@ -104,7 +97,7 @@ def convert(
     values : array of shape (n,)
     field : {"time_s", "current_a", "voltage_v", "temperature_c", "soc_pct"}
     unit : str
-        As in the header; "" is taken for the canonical unit.
+        As in the header; "" means the canonical unit.
     source, label : object, str
         File and heading, for messages.
 
@@ -112,7 +105,7 @@ def convert(
     -------
     array of shape (n,)
     str or None
-        A remark when something had to be converted.
+        A remark if the values were converted.
 
     Raises
     ------
@@ -125,13 +118,12 @@ def convert(
     try:
         factor, offset = _UNITS[field][spelling]
     except KeyError:
-        known = ", ".join(_UNITS[field])
         raise InputError(
             f"the unit is not known for {field}",
             source=str(source),
             field=label,
             value=unit,
-            cure=f"convert it to one of: {known}",
+            cure=f"convert it to one of: {', '.join(_UNITS[field])}",
         ) from None
     if (factor, offset) == (1.0, 0.0):
         return values, None
@@ -143,19 +135,19 @@ def refuse_wrong_units(
 ) -> tuple[str, ...]:
     """Raise InputError if the values cannot be in the canonical units.
 
-    Judged on medians, so that a few odd rows do not decide, then on single impossible values.
+    Medians are judged first, so that a few odd rows do not decide, then single impossible values.
 
     Parameters
     ----------
     values : dict of str to array of shape (n,)
-        `time_s`, `current_a`, `voltage_v`, `temperature_c` (finite) and maybe `soc_pct`.
+        `time_s`, `current_a`, `voltage_v`, `temperature_c` (finite) and optionally `soc_pct`.
     source, labels : object, dict of str to str
         File, and heading by field, for messages.
 
     Returns
     -------
     tuple of str
-        Remarks on values that are possible but unusual.
+        Remarks on possible but unusual values.
     """
 
     def refuse(field: str, problem: str, value: float, cure: str) -> InputError:
@@ -164,13 +156,35 @@ def refuse_wrong_units(
         )
 
     _check_time(values, refuse)
-    # First: a temperature below 1 °C in place of the voltage looks like kilovolts or turned.
+    # Before the voltage: a temperature below 1 °C in its place looks like kilovolts or turned.
     _check_swapped(values, labels.get("voltage_v", "voltage_v"), refuse)
     _check_voltage(values["voltage_v"], refuse)
     _check_current(values["current_a"], refuse)
     if "soc_pct" in values:
         _check_soc(values["soc_pct"], refuse)
     return _check_temperature(values, refuse)
+
+
+def follows_current(current_a: FloatArray, values: FloatArray) -> bool:
+    """Return whether a column's steps have the sign of the current's, or all the opposite one.
+
+    Only signs count: neither a unit nor a few wrong rows matter. False where the current hardly
+    changes, as in a cycler's discharge.
+
+    Parameters
+    ----------
+    current_a, values : arrays of shape (n,)
+        In any unit.
+    """
+    change = np.diff(current_a)
+    size = np.abs(change)
+    if size.size < LEAST_ROWS:
+        return False
+    large = (size >= np.quantile(size, 1.0 - LARGE_SHARE)) & (size > 0.0)
+    if np.count_nonzero(large) < LEAST_ROWS:
+        return False
+    agreement = np.mean(np.sign(change[large]) * np.sign(np.diff(values)[large]))
+    return bool(abs(agreement) >= FOLLOWS)
 
 
 def _check_time(values: dict[str, FloatArray], refuse: _Refuse) -> None:
@@ -182,7 +196,23 @@ def _check_time(values: dict[str, FloatArray], refuse: _Refuse) -> None:
         raise refuse(
             "time_s", "time looks like milliseconds since 1970", float(time[0]), "divide it by 1000"
         )
-    _check_span(time, refuse)
+    far = np.flatnonzero(np.abs(time) > MAX_STAMP_S)
+    if far.size:
+        raise refuse(
+            "time_s",
+            f"row {far[0] + 1} is no time in seconds",
+            float(time[far[0]]),
+            "correct or remove the row",
+        )
+    if time[-1] - time[0] > MAX_LOG_SPAN_S:
+        row = int(np.argmax(np.diff(time))) + 1
+        raise refuse(
+            "time_s",
+            f"the log lasts {(time[-1] - time[0]) / 86400.0:.0f} days; its longest step ends at"
+            f" row {row + 1}",
+            float(time[row]),
+            "if the clock was set there, split the log there",
+        )
     if interval > MAX_INTERVAL_S:
         raise refuse(
             "time_s",
@@ -195,51 +225,39 @@ def _check_time(values: dict[str, FloatArray], refuse: _Refuse) -> None:
             "time_s",
             f"rows are {interval:g} apart: time looks like hours or days",
             interval,
-            "give it in seconds",
+            "convert it to seconds",
         )
-    whole = bool(np.all(time == np.rint(time)))
-    peak = float(np.max(np.abs(values["current_a"])))
-    # A steady drain can last for weeks; a drive that varies so much cannot.
-    varied = float(np.mean(np.abs(values["current_a"]))) < 0.5 * peak
-    if whole and varied and interval >= 5.0:
-        charge = np.cumsum(values["current_a"][:-1] * np.diff(time))
-        hours = float(np.ptp(charge)) / 3600.0 / peak
-        if hours > MAX_HOURS_AT_PEAK:
-            raise refuse(
-                "time_s",
-                f"the charge moved is {hours:.0f} h of the largest current:"
-                " time looks like milliseconds",
-                interval,
-                "divide it by 1000",
-            )
+    _check_charge(time, values["current_a"], interval, refuse)
 
 
-def _check_span(time: FloatArray, refuse: _Refuse) -> None:
-    far = np.flatnonzero(np.abs(time) > MAX_STAMP_S)
-    if far.size:
-        raise refuse(
-            "time_s", f"row {far[0] + 1} is no time in seconds", float(time[far[0]]), "correct it"
-        )
-    if time[-1] - time[0] <= MAX_LOG_SPAN_S:
+def _check_charge(time: FloatArray, current: FloatArray, interval: float, refuse: _Refuse) -> None:
+    """Refuse a fast log in milliseconds: it moves more charge than a battery holds."""
+    peak = float(np.max(np.abs(current)))
+    # A steady drain can last for weeks; a drive that varies this much cannot.
+    varied = float(np.mean(np.abs(current))) < 0.5 * peak
+    if not varied or interval < 5.0 or not np.all(time == np.rint(time)):
         return
-    row = int(np.argmax(np.diff(time))) + 1
-    raise refuse(
-        "time_s",
-        f"the log lasts {(time[-1] - time[0]) / 86400.0:.0f} days; its longest step ends at row"
-        f" {row + 1}",
-        float(time[row]),
-        "if the clock was set there, cut the log there",
-    )
+    charge = np.cumsum(current[:-1] * np.diff(time))
+    hours = float(np.ptp(charge)) / 3600.0 / peak
+    if hours > MAX_HOURS_AT_PEAK:
+        raise refuse(
+            "time_s",
+            f"the charge moved is {hours:.0f} h of the largest current:"
+            " time looks like milliseconds",
+            interval,
+            "divide it by 1000",
+        )
 
 
 def _check_swapped(values: dict[str, FloatArray], voltage_label: str, refuse: _Refuse) -> None:
     temperature = float(np.median(values["temperature_c"]))
-    if temperature <= HOTTEST_C or not _maybe_temperature(values["voltage_v"]):
+    if temperature <= HOTTEST_C or not _may_be_temperature(values["voltage_v"]):
         return
-    temperature_follows, voltage_follows = _followers(values)
+    temperature_follows = follows_current(values["current_a"], values["temperature_c"])
+    voltage_follows = follows_current(values["current_a"], values["voltage_v"])
     swapped = temperature_follows and not voltage_follows
     if not temperature_follows and not voltage_follows:
-        # The range tells, where it is no battery's in kelvin either. What never varies is a code.
+        # The range decides, unless it is a battery's in kelvin. A constant is a code.
         in_kelvin = COLDEST_C <= temperature - ZERO_C_IN_K <= UNUSUALLY_HOT_C
         varies = float(np.ptp(values["temperature_c"])) > 0.0
         swapped = varies and not in_kelvin and temperature <= MAX_VOLTAGE_V
@@ -252,15 +270,8 @@ def _check_swapped(values: dict[str, FloatArray], voltage_label: str, refuse: _R
         )
 
 
-def _maybe_temperature(values: FloatArray) -> bool:
+def _may_be_temperature(values: FloatArray) -> bool:
     return bool(COLDEST_C <= np.median(values) <= UNUSUALLY_HOT_C)
-
-
-def _followers(values: dict[str, FloatArray]) -> tuple[bool, bool]:
-    """Whether the temperature follows the current, and whether the voltage does."""
-    current = values["current_a"]
-    temperature, voltage = values["temperature_c"], values["voltage_v"]
-    return follows_current(current, temperature), follows_current(current, voltage)
 
 
 def _check_voltage(voltage: FloatArray, refuse: _Refuse) -> None:
@@ -272,7 +283,7 @@ def _check_voltage(voltage: FloatArray, refuse: _Refuse) -> None:
             "voltage_v", "the median voltage is not positive", middle, "check column and polarity"
         )
     if middle < 1.0:
-        raise refuse("voltage_v", "voltage looks like kilovolts", middle, "give it in volts")
+        raise refuse("voltage_v", "voltage looks like kilovolts", middle, "convert it to volts")
     row = int(np.argmax(np.abs(voltage)))
     if abs(voltage[row]) > MAX_VOLTAGE_V:
         raise refuse(
@@ -285,29 +296,29 @@ def _check_voltage(voltage: FloatArray, refuse: _Refuse) -> None:
 
 def _check_current(current: FloatArray, refuse: _Refuse) -> None:
     row = int(np.argmax(np.abs(current)))
-    if abs(current[row]) > MAX_CURRENT_A:
-        share = float(np.mean(np.abs(current) > MAX_CURRENT_A))
-        if share < 0.001 and current.size > 1000:
-            raise refuse(
-                "current_a",
-                f"row {row + 1} is not a battery's current",
-                float(current[row]),
-                "remove the row: codes such as 65535 mean 'not available'",
-            )
+    if abs(current[row]) <= MAX_CURRENT_A:
+        return
+    share = float(np.mean(np.abs(current) > MAX_CURRENT_A))
+    if share < 0.001 and current.size > 1000:
         raise refuse(
             "current_a",
-            f"current exceeds {MAX_CURRENT_A:g} A in row {row + 1}: it looks like milliamperes",
+            f"row {row + 1} is not a battery's current",
             float(current[row]),
-            "divide it by 1000",
+            "remove the row: codes such as 65535 mean 'not available'",
         )
+    raise refuse(
+        "current_a",
+        f"current exceeds {MAX_CURRENT_A:g} A in row {row + 1}: it looks like milliamperes",
+        float(current[row]),
+        "divide it by 1000",
+    )
 
 
 def _check_temperature(values: dict[str, FloatArray], refuse: _Refuse) -> tuple[str, ...]:
     temperature = values["temperature_c"]
     middle = float(np.median(temperature))
     if middle > HOTTEST_C:
-        follows, voltage_follows = _followers(values)
-        if follows:
+        if follows_current(values["current_a"], temperature):
             raise refuse(
                 "temperature_c",
                 "it moves when the current does, as a voltage",
@@ -316,12 +327,13 @@ def _check_temperature(values: dict[str, FloatArray], refuse: _Refuse) -> tuple[
             )
         if 200.0 <= middle <= 400.0:
             cure = "subtract 273.15"
-            if not voltage_follows and _maybe_temperature(values["voltage_v"]):
-                cure += ", or exchange it with the voltage if these two are swapped"
+            voltage_follows = follows_current(values["current_a"], values["voltage_v"])
+            if not voltage_follows and _may_be_temperature(values["voltage_v"]):
+                cure += ", or exchange it with the voltage if the two are swapped"
             raise refuse("temperature_c", "temperature looks like kelvin", middle, cure)
     if not COLDEST_C <= middle <= HOTTEST_C:
         raise refuse(
-            "temperature_c", "this is no battery's temperature in °C", middle, "give it in °C"
+            "temperature_c", "this is no battery's temperature in °C", middle, "convert it to °C"
         )
     odd = np.flatnonzero((temperature < COLDEST_C) | (temperature > HOTTEST_C))
     if odd.size:
@@ -346,9 +358,9 @@ def _check_soc(soc: FloatArray, refuse: _Refuse) -> None:
             "soc_pct",
             "SoC looks like a fraction of 1",
             high,
-            "multiply it by 100 (or leave it out if it truly stays below 1 %)",
+            "multiply it by 100 (or leave it out if it stays below 1 %)",
         )
     if high > 110.0 or low < -10.0:
         value = high if high > 110.0 else low
         row = int(np.flatnonzero(soc == value)[0]) + 1
-        raise refuse("soc_pct", f"SoC of row {row} is not within 0–100 %", value, "give it in %")
+        raise refuse("soc_pct", f"SoC of row {row} is not within 0–100 %", value, "convert it to %")

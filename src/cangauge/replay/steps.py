@@ -25,11 +25,11 @@ from typing import NamedTuple, Protocol
 import can
 import numpy as np
 
-from cangauge.bus.capture_log import open_vehicle_capture
 from cangauge.bus.captures.capture import open_capture
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.publish import FrameIds
+from cangauge.bus.recording import open_vehicle_capture
 from cangauge.bus.time_source import ReceiveTime, ReplayClock, is_clock, whole_us
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError

@@ -14,7 +14,7 @@ import numpy as np
 from can.typechecking import Channel
 
 from cangauge._typing import FloatArray
-from cangauge.bus.capture_log import open_vehicle_capture
+from cangauge.bus.recording import open_vehicle_capture
 from cangauge.bus.time_source import REPLAY_CLOCK_ID, TimeSourceName, is_clock
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError

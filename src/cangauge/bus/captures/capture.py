@@ -1,4 +1,4 @@
-"""`open_capture`: any capture file that cangauge knows → messages, by content, not by suffix."""
+"""Read a capture of any known format as messages; recognised by content, not by suffix."""
 
 from __future__ import annotations
 
@@ -25,23 +25,24 @@ from cangauge.bus.captures.readers import (
 from cangauge.errors import InputError
 
 CLOCK_ID: Final = 0x1DB
-"""Without time stamps, time is counted in frames of this id (Nissan Leaf) …"""
+"""Without time stamps, frames of this id (Nissan Leaf) count time, …"""
 CLOCK_PERIOD_S: Final = 0.010
-"""… each of which is taken to come so long after the one before [s]."""
+"""… one each period [s]."""
 
 FEW_MALFORMED: Final = 100
-"""More malformed lines than this and than frames: the file is something else, or junk."""
+"""A file with more malformed lines than this, and than frames, is refused."""
 _HEAD_LINES: Final = 400
 
-_KNOWN = (
-    "known are: candump (log, and screen output), CRTD, Vector ASC and BLF, PEAK TRC, ASAM MF4,"
+KNOWN_CAPTURES: Final = (
+    "candump (log, and screen output), CRTD, Vector ASC and BLF, PEAK TRC, ASAM MF4,"
     " python-can's CSV, tab-separated tables, and text of seconds, id, length, bytes; each may be"
     " gzipped"
 )
+_CURE: Final = f"known are: {KNOWN_CAPTURES}"
 
 
 class Capture:
-    """A capture file: iterate over it for its messages, as often as needed.
+    """A capture file: iterable over its messages, any number of times.
 
     Time stamps are in seconds, as recorded: from 1970, from the start of the capture or of the
     logger. In a capture without stamps, time is counted from 0 in frames of the clock's id;
@@ -54,7 +55,7 @@ class Capture:
     clock : tuple of int and float
         Id of the frames that count time where there are no stamps, and their period [s].
     parts : sequence of Path
-        The files that `path` stands for; by default itself.
+        The files for which `path` stands; by default itself.
     """
 
     def __init__(
@@ -84,7 +85,7 @@ class Capture:
 
     @property
     def info(self) -> CaptureInfo:
-        """What the latest reading showed so far; complete after its end."""
+        """What the latest iteration has shown so far; complete after its end."""
         return CaptureInfo(
             format=self._kind.name,
             stamps=self.stamps,
@@ -101,7 +102,7 @@ class Capture:
         if self.stamps == "none":
             number, period_s = self._clock
             return [
-                "no time stamps: time is counted from 0 in frames of"
+                "no time stamps: time is counted from 0 by frames of"
                 f" 0x{number:X}, one every {1000.0 * period_s:g} ms"
             ]
         return []
@@ -112,8 +113,8 @@ class Capture:
         Raises
         ------
         InputError
-            If the file cannot be read, holds no frames or is mostly junk (names the first line
-            that is), or has neither stamps nor frames of the clock's id.
+            If the file cannot be read, holds no frames or mostly malformed lines (names the
+            first), or has neither stamps nor frames of the clock's id.
         """
         self._reset()
         if isinstance(self._kind, TextFormat):
@@ -132,7 +133,7 @@ class Capture:
                 channels.add(message.channel)
                 if len(channels) > MAX_BUSES:
                     raise InputError(
-                        f"frames of more than {MAX_BUSES} buses", source=self.path, cure=_KNOWN
+                        f"frames of more than {MAX_BUSES} buses", source=self.path, cure=_CURE
                     )
             yield message
         self._finish()
@@ -147,7 +148,7 @@ class Capture:
                 if parse is None:
                     raise _unknown(path)
             if not line.endswith("\n") and not kind.states_length and line.strip():
-                # The last line: it could have lost bytes without showing it.
+                # The last line may have lost bytes, and its format does not show it.
                 self._cut_off = True
                 self._skip(lines.number)
                 continue
@@ -163,7 +164,7 @@ class Capture:
                         f"{MAX_IDLE_LINES} lines in a row hold no frame",
                         source=self.path,
                         value=f"up to line {lines.number}",
-                        cure="cut them out",
+                        cure="remove them",
                     )
                 continue
             idle = 0
@@ -190,7 +191,7 @@ class Capture:
                 yield message
         except DAMAGE as error:
             self._cut_off = True
-            # A part without a frame, begun just before the power went, costs only itself.
+            # An empty last part, begun just before power was lost, does not spoil the others.
             if not self._frames and path == self._parts[-1]:
                 raise InputError(
                     f"the {kind.name} file is damaged ({type(error).__name__}: {error})",
@@ -231,7 +232,7 @@ class Capture:
 
     def _finish(self) -> None:
         if not self._frames:
-            raise InputError("the capture holds no frames", source=self.path, cure=_KNOWN)
+            raise InputError("the capture holds no frames", source=self.path, cure=_CURE)
         if self._malformed > self._frames:
             raise self._junk()
         if self._malformed:
@@ -241,29 +242,46 @@ class Capture:
             self._remarks.append(f"the file is cut off after {self._frames} frames")
 
 
-def open_capture(
+def find_capture(
     path: str | PathLike[str], *, clock: tuple[int, float] = (CLOCK_ID, CLOCK_PERIOD_S)
-) -> Capture:
-    """Find out what kind of capture a file is, or the parts of a recording are (see `parts`).
+) -> Capture | None:
+    """Return the capture of a file or of the parts of a recording; None if it is no capture.
 
     Parameters
     ----------
     path : path-like
+        A file, or the name of a run (see `run_path`).
     clock : tuple of int and float
         Id of the frames that count time where there are no stamps, and their period [s].
 
     Raises
     ------
     InputError
-        If it cannot be read, or is no known kind of capture.
+        If it cannot be read.
     """
     path = Path(path)
     parts = parts_of_run(path)
     kinds = (_recognise(read_head(part)) for part in parts or [path])
     kind = next((each for each in kinds if each is not None), None)
-    if kind is None:
-        raise _unknown(path)
-    return Capture(path, kind, clock, parts)
+    return None if kind is None else Capture(path, kind, clock, parts)
+
+
+def open_capture(
+    path: str | PathLike[str], *, clock: tuple[int, float] = (CLOCK_ID, CLOCK_PERIOD_S)
+) -> Capture:
+    """Return the capture of a file or of the parts of a recording.
+
+    Parameters as of `find_capture`.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or is no known kind of capture.
+    """
+    capture = find_capture(path, clock=clock)
+    if capture is None:
+        raise _unknown(Path(path))
+    return capture
 
 
 def read_capture(path: str | PathLike[str]) -> Iterator[can.Message]:
@@ -272,10 +290,9 @@ def read_capture(path: str | PathLike[str]) -> Iterator[can.Message]:
 
 
 def is_capture(path: str | PathLike[str]) -> bool:
-    """Return whether a file is a capture of a known kind; False also where it cannot be read."""
-    path = Path(path)
+    """Return whether a file is a capture of a known kind; False also if it cannot be read."""
     try:
-        return any(_recognise(read_head(part)) for part in parts_of_run(path) or [path])
+        return find_capture(path) is not None
     except InputError:
         return False
 
@@ -293,7 +310,7 @@ def _recognise(head: bytes) -> TextFormat | LibraryFormat | None:
 
 
 def _score(kind: TextFormat, lines: list[str]) -> int:
-    """Return how many of the lines are frames; 0 if fewer are than are not."""
+    """Return the number of lines that are frames; 0 if most are malformed."""
     parse = kind.parser(lines[0])
     if parse is None:
         return 0
@@ -307,4 +324,4 @@ def _score(kind: TextFormat, lines: list[str]) -> int:
 
 
 def _unknown(path: Path) -> InputError:
-    return InputError("the file is not a known kind of capture", source=path, cure=_KNOWN)
+    return InputError("the file is not a known kind of capture", source=path, cure=_CURE)

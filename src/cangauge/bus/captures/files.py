@@ -1,12 +1,4 @@
-"""What a capture file is and what reading it noticed.
-
-Recordings in parts: `drive-0003-000001.log`, `drive-0003-000002.log`, … are `drive-0003.log`.
-
-`cangauge run` begins a new file now and then, and numbers its runs, so that nothing recorded
-before is overwritten. The parts of one run are one capture.
-
-Files as streams of bytes or lines: unpacked, bounded in memory, ends that are cut off noted.
-"""
+"""Capture files: what reading them showed, recordings in parts, lines of damaged files."""
 
 from __future__ import annotations
 
@@ -16,19 +8,22 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, cast
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
-from cangauge._io import GZIP, MAX_CAPTURE_BYTES, MAX_LINE, gunzip_bounded, open_regular
+from cangauge._io import MAX_CAPTURE_BYTES, MAX_LINE, open_unpacked, read_beginning
 
-# --- What a capture file is and what reading it noticed
+if TYPE_CHECKING:
+    from _typeshed import WriteableBuffer
 
 Stamps = Literal["us", "ms", "none"]
 """Resolution of time stamps: microseconds or finer, whole milliseconds, or no stamps at all."""
 
+_HEAD_BYTES: Final = 64 * 1024
+
 
 @dataclass(frozen=True, slots=True)
 class CaptureInfo:
-    """What reading a capture showed, so far.
+    """What reading a capture has shown so far.
 
     Parameters
     ----------
@@ -38,13 +33,13 @@ class CaptureInfo:
     frames : int
         Frames read, error and remote frames included.
     malformed : int
-        Lines or frames that were skipped because they make no sense.
+        Lines or frames skipped as malformed.
     first_malformed : int or None
         Number of the first such line, from 1.
     cut_off : bool
-        Whether the file ends in the middle of something.
+        Whether the file ends within a line or frame.
     remarks : tuple of str
-        What a user should know, in words.
+        For the user.
     """
 
     format: str
@@ -55,20 +50,10 @@ class CaptureInfo:
     cut_off: bool = False
     remarks: tuple[str, ...] = ()
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as plain values."""
-        return {
-            "format": self.format,
-            "stamps": self.stamps,
-            "frames": self.frames,
-            "malformed": self.malformed,
-            "first_malformed": self.first_malformed,
-            "cut_off": self.cut_off,
-            "remarks": list(self.remarks),
-        }
 
-
-# --- Recordings in parts: `drive-0003-000001.log`, `drive-0003-000002.log`, … are `drive-000…
+# --- Recordings in parts. `cangauge run` starts a new file now and then and numbers its runs, so
+# that no recording is overwritten. `drive-0003-000001.log`, `drive-0003-000002.log`, … are the
+# parts of run 3 of `drive.log`, and `drive-0003.log` stands for all of them: one capture.
 
 _RUN: Final = r"(?P<run>\d{4,9})"
 _PART: Final = r"(?P<part>\d{6,9})"
@@ -95,7 +80,7 @@ def run_path(path: Path, run: int) -> Path:
 
 
 def all_parts(path: Path) -> list[Part]:
-    """Return the parts of all runs of the recording `path`, in order; none if it has none."""
+    """Return the parts of all runs of the recording `path`, in order."""
     stem, suffix = _split(path)
     pattern = re.compile(f"{re.escape(stem)}-{_RUN}-{_PART}{re.escape(suffix)}")
     try:
@@ -111,17 +96,16 @@ def all_parts(path: Path) -> list[Part]:
 
 
 def parts_of_run(path: Path) -> list[Path]:
-    """Return the files that a run's name, as `run_path` returns it, stands for.
+    """Return the files for which the name of a run (see `run_path`) stands.
 
-    There are none where there is a file of that name, or where it is no run's name.
+    Empty where a file has that name, or where it is no run's name.
     """
     stem, suffix = _split(path)
     match = re.fullmatch(f"(?P<stem>.*)-{_RUN}", stem)
     try:
-        is_run = match is not None and not path.exists()
+        if match is None or path.exists():
+            return []
     except OSError:  # a name that is too long
-        return []
-    if match is None or not is_run:
         return []
     base = path.with_name(match["stem"] + suffix)
     return [each.path for each in all_parts(base) if each.run == int(match["run"])]
@@ -129,58 +113,24 @@ def parts_of_run(path: Path) -> list[Path]:
 
 def _split(path: Path) -> tuple[str, str]:
     """Return name and suffix, the latter with .gz's ("drive.log.gz": "drive", ".log.gz")."""
-    name = path.name
     suffix = path.suffix
     if suffix.lower() == ".gz":
-        suffix = Path(name.removesuffix(suffix)).suffix + suffix
-    return name.removesuffix(suffix) if suffix else name, suffix
+        suffix = Path(path.name.removesuffix(suffix)).suffix + suffix
+    return path.name.removesuffix(suffix) if suffix else path.name, suffix
 
 
-# --- Files as streams of bytes or lines: unpacked, bounded in memory, ends that are cut off …
-
-if TYPE_CHECKING:
-    from _typeshed import WriteableBuffer
-
-HEAD_BYTES: Final = 64 * 1024
+# --- Content
 
 
 def open_bytes(path: Path) -> io.BufferedReader:
-    """Open a file, unpacking gzip whatever its name.
-
-    Raises
-    ------
-    InputError
-        If it is absent, not a regular file or cannot be read; while reading, if it unpacks
-        without bounds (see `cangauge._io`).
-    """
-    file = open_regular(path)
-    packed = file.read(2) == GZIP
-    file.seek(0)
-    if packed:
-        return gunzip_bounded(file, path, MAX_CAPTURE_BYTES)
-    return cast("io.BufferedReader", file)
+    """Open a capture file, unpacking gzip whatever its name; see `open_unpacked`."""
+    return open_unpacked(path, MAX_CAPTURE_BYTES)
 
 
 def read_head(path: Path) -> bytes:
-    """Return the unpacked beginning of a file, as much as can be read of it.
-
-    Raises
-    ------
-    InputError
-        As `open_bytes`.
-    """
-    head = bytearray()
+    """Return the unpacked beginning of a file, as much of it as can be read."""
     with open_bytes(path) as file:
-        while len(head) < HEAD_BYTES:
-            try:
-                # Step by step: what stands before a break in a gzip file is given out first.
-                part = file.read1(HEAD_BYTES)
-            except (EOFError, OSError, zlib.error):
-                break
-            if not part:
-                break
-            head += part
-    return bytes(head)
+        return read_beginning(file, _HEAD_BYTES)
 
 
 class LineStream:
@@ -200,7 +150,7 @@ class LineStream:
         self.cut_off = False
 
     def __iter__(self) -> Iterator[str]:
-        """Yield the lines with their line ends; an overlong line comes in pieces."""
+        """Yield the lines with their line ends; a line beyond `MAX_LINE` comes in pieces."""
         with open_bytes(self._path) as raw:
             salvage = _Salvage(raw, self)
             text = io.TextIOWrapper(io.BufferedReader(salvage), "latin-1", newline="\n")
@@ -210,7 +160,7 @@ class LineStream:
 
 
 class _Salvage(io.RawIOBase):
-    """Reads in small steps and ends quietly where the file below breaks off."""
+    """A stream that ends, instead of raising, where the file below breaks off."""
 
     def __init__(self, raw: io.BufferedIOBase, owner: LineStream) -> None:
         self._raw = raw
@@ -222,7 +172,7 @@ class _Salvage(io.RawIOBase):
     def readinto(self, buffer: WriteableBuffer, /) -> int:
         view = memoryview(buffer)
         try:
-            # One step at a time: what stands before the break is given out first.
+            # `read1`: the content before the break is delivered before the error.
             part = self._raw.read1(view.nbytes)
         except (EOFError, OSError, zlib.error):
             self._owner.cut_off = True

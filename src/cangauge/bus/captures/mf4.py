@@ -1,8 +1,8 @@
-"""ASAM MF4, read in a process of its own.
+"""ASAM MF4, read in a child process with bounded memory and time.
 
-An MF4 file is a web of blocks that point at one another, and asammdf follows them wherever they
-lead: for ever, into gigabytes, or into errors of every kind. So it reads in a child that may have
-only so much memory and is ended when it gives nothing for too long; frames come back by a pipe.
+The blocks of an MF4 file point at one another, and asammdf follows the pointers of a damaged file
+for ever, into gigabytes, or into errors of every kind. The child sends frames through a pipe and is
+killed if it sends nothing for too long.
 """
 
 from __future__ import annotations
@@ -38,10 +38,9 @@ _FLAGS: Final = (
 )
 _NO_CHANNEL: Final = -(1 << 31)
 _BLOCK: Final = struct.Struct("<cI")
-"""What it is, and how many bytes of it follow."""
+"""Kind of block, and the number of bytes that follow."""
 _FRAMES, _END, _DAMAGED, _MISSING = b"F", b"E", b"D", b"M"
-_AT_ONCE: Final = 500
-"""Frames in a block."""
+_FRAMES_PER_BLOCK: Final = 500
 
 
 def mf4_messages(path: Path) -> Iterator[can.Message]:
@@ -86,14 +85,14 @@ def _received(
             yield message
     if what == _END:
         return
-    said = data.decode("utf-8", errors="replace")
+    reason = data.decode("utf-8", errors="replace")
     if what == _MISSING:
         raise InputError(
-            f"reading ASAM MF4 needs another package: {said}",
+            f"reading ASAM MF4 needs another package: {reason}",
             source=path,
             cure="pip install 'cangauge[mf4]'",
         )
-    raise ValueError(said)
+    raise ValueError(reason)
 
 
 def _next_block(child: subprocess.Popen[bytes], patience_s: float) -> tuple[bytes, bytes]:
@@ -135,7 +134,7 @@ def _packed(message: can.Message) -> bytes:
 
 
 def _child(path: str, out: BinaryIO) -> None:
-    """Read the file and send what is in it; whatever goes wrong is said by the last block."""
+    """Send the frames of a file; the last block reports the end or the error."""
 
     def send(what: bytes, data: bytes) -> None:
         out.write(_BLOCK.pack(what, len(data)) + data)
@@ -146,14 +145,14 @@ def _child(path: str, out: BinaryIO) -> None:
     try:
         for message in can.MF4Reader(path):
             frames.append(_packed(message))
-            if len(frames) == _AT_ONCE:
+            if len(frames) == _FRAMES_PER_BLOCK:
                 send(_FRAMES, b"".join(frames))
                 frames.clear()
     except NotImplementedError as error:
         last = (_MISSING, str(error).encode())
-    except Exception as error:  # noqa: BLE001 - asammdf raises whatever its own code runs into
-        said = f"{type(error).__name__}: {error}".splitlines()[0][:200]
-        last = (_DAMAGED, said.encode("utf-8", errors="replace"))
+    except Exception as error:  # noqa: BLE001 - asammdf raises any kind of error on damage
+        reason = f"{type(error).__name__}: {error}".splitlines()[0][:200]
+        last = (_DAMAGED, reason.encode("utf-8", errors="replace"))
     send(_FRAMES, b"".join(frames))
     send(*last)
 
@@ -170,5 +169,5 @@ def _limit_memory() -> None:
 if __name__ == "__main__":
     _limit_memory()
     _child(sys.argv[1], sys.stdout.buffer)
-    # Not by way of the destructors of half-read files, which may take long or fail.
+    # Skip the destructors of half-read files, which may take long or fail.
     os._exit(0)

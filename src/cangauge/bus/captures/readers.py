@@ -1,13 +1,7 @@
-"""Vector BLF, checked before python-can reads it.
+"""Readers of capture formats: text formats line by line, binary and vendor formats by python-can.
 
-A BLF file is a row of objects, most of them containers of more objects, packed by zlib. python-can
-believes every size in it: an object of no length holds it for ever, and a container unpacks to
-whatever it likes. Here containers are unpacked within bounds, sizes are checked, and what comes
-out goes on as containers that are not packed.
-
-Captures that python-can reads: Vector ASC and BLF, PEAK TRC, ASAM MF4, python-can's CSV.
-
-The text formats that are read line by line: what a line looks like, what a frame is in it.
+A hostile or damaged file must neither hang nor exhaust memory: sizes in a BLF file are checked
+before python-can uses them, lines are of bounded length, MF4 is read in a child process.
 """
 
 from __future__ import annotations
@@ -29,7 +23,9 @@ from cangauge._io import MAX_BLF_OBJECT, MAX_LINE
 from cangauge.bus.captures.files import Stamps, open_bytes
 from cangauge.bus.captures.mf4 import mf4_messages
 
-# --- Vector BLF, checked before python-can reads it
+# --- Vector BLF, checked before python-can reads it. A BLF file is a row of objects, most of them
+# containers of more objects, packed by zlib. python-can trusts every size in it: an object of no
+# length makes it loop for ever, and a container unpacks to any size.
 
 _OBJECT: Final = struct.Struct("<4sHHLL")
 """Signature, length of the header, its version, length of the object, type."""
@@ -42,11 +38,11 @@ _CONTAINER_TYPE: Final = 10
 _PLAIN, _ZLIB = 0, 2
 _MAX_FILE_HEADER: Final = 64 * 1024
 _WINDOW: Final = 8
-"""The signature of an object ends at most so many bytes after the object before."""
+"""The signature of an object ends at most this many bytes after the object before."""
 
 
 class CheckedBlf:
-    """A BLF file as python-can reads it: `read` and `close` alone, and all sizes true.
+    """A BLF file for python-can's reader, with checked sizes and unpacked containers.
 
     Parameters
     ----------
@@ -61,13 +57,13 @@ class CheckedBlf:
     def __init__(self, raw: io.BufferedIOBase) -> None:
         self._raw = raw
         self._objects = bytearray()
-        """Unpacked, from the first object that is not complete yet."""
+        """Unpacked content from the first incomplete object on."""
         self._ready = memoryview(self._header())
 
     def read(self, size: int = -1, /) -> bytes:
         """Return the next bytes; fewer at the end of the file."""
         if size < 0:
-            raise ValueError("something has a negative length")
+            raise ValueError("a negative length")
         parts = []
         while size > 0:
             if not self._ready:
@@ -93,7 +89,7 @@ class CheckedBlf:
         return head + self._raw.read(length - len(head))
 
     def _next(self) -> bytes:
-        """Return a container of the next whole objects; b"" at the end of the file."""
+        """Return an unpacked container of the next whole objects; b"" at the end of the file."""
         while True:
             content = self._container()
             if content is None:
@@ -111,7 +107,7 @@ class CheckedBlf:
                 return head + body + bytes(length % 4)
 
     def _container(self) -> bytes | None:
-        """Return what the next container holds, unpacked; None at the end of the file."""
+        """Return the unpacked content of the next container; None at the end of the file."""
         while True:
             head = self._raw.read(_OBJECT.size)
             if not head:
@@ -132,7 +128,7 @@ class CheckedBlf:
             found = self._objects.find(_SIGNATURE, place, place + _WINDOW)
             if found < 0:
                 if place + _WINDOW <= size:
-                    raise ValueError("something that is no object")
+                    raise ValueError("data that are no object")
                 return place
             if found + _OBJECT.size > size:
                 return place
@@ -145,7 +141,7 @@ class CheckedBlf:
 def _kind_and_length(data: bytes | bytearray, place: int) -> tuple[int, int]:
     signature, _, _, length, kind = _OBJECT.unpack_from(data, place)
     if signature != _SIGNATURE:
-        raise ValueError("something that is no object")
+        raise ValueError("data that are no object")
     if not _OBJECT.size <= length <= MAX_BLF_OBJECT:
         raise ValueError(f"an object of {length} bytes")
     return kind, length
@@ -153,7 +149,7 @@ def _kind_and_length(data: bytes | bytearray, place: int) -> tuple[int, int]:
 
 def _unpacked(body: bytes) -> bytes:
     if len(body) < _CONTAINER.size:
-        raise ValueError("a container of nothing")
+        raise ValueError("an empty container")
     method, _ = _CONTAINER.unpack_from(body)
     content = body[_CONTAINER.size :]
     if method == _PLAIN:
@@ -166,12 +162,12 @@ def _unpacked(body: bytes) -> bytes:
     return content
 
 
-# --- Captures that python-can reads: Vector ASC and BLF, PEAK TRC, ASAM MF4, python-can's CSV
+# --- Formats that python-can reads
 
-# Its readers log a line for every object that they do not know: a hostile file has millions.
+# Its readers log a line for every unknown object: a hostile file has millions.
 logging.getLogger("can").addHandler(logging.NullHandler())
 
-# What python-can's readers raise on damaged files.
+# Errors of python-can's readers on damaged files.
 DAMAGE: Final = (
     ValueError,
     LookupError,
@@ -196,7 +192,7 @@ class LibraryFormat:
         Class of python-can that takes a file object.
     is_text : bool
     matches : callable
-        Whether the beginning of a file looks like it.
+        Returns whether the beginning of a file is of this format.
     """
 
     name: str
@@ -240,7 +236,7 @@ LIBRARY_FORMATS: Final = (
 
 
 class _Lines:
-    """The lines of a text, as python-can iterates over them, of bounded length."""
+    """The lines of a text for python-can's readers, of bounded length."""
 
     def __init__(self, raw: io.BufferedReader) -> None:
         self._text = io.TextIOWrapper(raw, "utf-8", errors="replace")
@@ -261,7 +257,7 @@ class _Lines:
 
 
 def library_messages(kind: LibraryFormat, path: Path) -> Iterator[can.Message]:
-    """Yield the frames of a file; raises one of `DAMAGE` where it breaks off.
+    """Yield the frames of a file; raise one of `DAMAGE` where it breaks off.
 
     Raises
     ------
@@ -276,10 +272,10 @@ def library_messages(kind: LibraryFormat, path: Path) -> Iterator[can.Message]:
         yield from kind.reader(file)
 
 
-# --- The text formats that are read line by line: what a line looks like, what a frame is in it
+# --- Text formats that are read line by line
 
 Parser = Callable[[str], can.Message | None]
-"""Takes a line; returns its frame, or None for a line that holds none; ValueError: malformed."""
+"""Returns the frame of a line, None for a line without one; raises ValueError if malformed."""
 
 _MAX_STANDARD_ID: Final = 0x7FF
 _ERROR_FLAG: Final = 0x20000000
@@ -287,17 +283,17 @@ _ERROR_FLAG: Final = 0x20000000
 
 @dataclass(frozen=True, slots=True)
 class TextFormat:
-    """One way of writing frames as text.
+    """A text format with one frame a line.
 
     Parameters
     ----------
     name : str
     stamps : {"us", "ms", "none"}
     states_length : bool
-        Whether a line says how many bytes it holds, so that a cut one shows.
+        Whether a line states its number of bytes, so that a cut line is recognised.
     parser : callable
-        Takes the first line of the file and returns the parser of lines, or None if the first
-        line is not of this format (for formats with a header).
+        Takes the first line of the file; returns the parser of lines, or None if the first line
+        is not of this format (for formats with a header).
     """
 
     name: str
@@ -314,7 +310,7 @@ def _data(text: str, length: int) -> bytes:
 
 
 def _id(text: str) -> tuple[int, bool]:
-    """Return id and whether it is extended, where every id is written with 8 digits."""
+    """Return id and whether it is extended, for formats that write all ids with 8 digits."""
     number = int(text, 16)
     if number > 0x1FFFFFFF:
         raise ValueError("no such id")
@@ -399,7 +395,7 @@ def _crtd(_first: str) -> Parser:
 
 
 #  (1436509052.249713)  can0  1DB   [8]  00 04 C2 62 00 00 03 B6
-# Possessive (++): a line of 16,000 blanks must not be tried in every way to part them.
+# Possessive (++): no backtracking over a line of 16,000 blanks.
 _CANDUMP = re.compile(
     r"\s*+(?:\((\d++\.\d++)\)\s*+)?(\S++)\s++(?:[RT]X(?:\s++[-BE](?=\s))*+\s++)?"
     r"([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
@@ -414,7 +410,7 @@ def _candump(*, with_stamps: bool) -> Callable[[str], Parser | None]:
             if match is None:
                 return _blank(line)
             if (match[1] is not None) is not with_stamps:
-                raise ValueError("some lines have stamps and some have not")
+                raise ValueError("only some lines have stamps")
             number, length = int(match[3], 16), int(match[4])
             remote = match[5] == "remote request"
             is_error = len(match[3]) == 8 and bool(number & _ERROR_FLAG)
@@ -467,13 +463,7 @@ def _candump_log(_first: str) -> Parser:
 
 
 def _blank(line: str) -> can.Message | None:
-    """Return None for a line without content.
-
-    Raises
-    ------
-    ValueError
-        For any other line.
-    """
+    """Return None for a blank line; raise ValueError for any other."""
     if line.strip():
         raise ValueError("not a frame")
     return None
@@ -487,4 +477,4 @@ TEXT_FORMATS: Final = (
     TextFormat("candump with stamps", "us", True, parser=_candump(with_stamps=True)),
     TextFormat("candump without stamps", "none", True, parser=_candump(with_stamps=False)),
 )
-"""Tried in this order; the one that makes most sense of the beginning of a file is taken."""
+"""The one with most frames in the beginning of a file is taken, the first of equals."""

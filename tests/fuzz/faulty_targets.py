@@ -1,4 +1,4 @@
-"""Targets that do what the supervisor must notice."""
+"""Targets that fail in every way that the supervisor must notice."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ HANGS, DIES, RAISES, GROWS = 13, 29, 41, 47
 
 
 def targets() -> tuple[Target, ...]:
-    return (Target("naughty", _make, _run, 1.0),)
+    return (Target("faulty", _make, _run, 1.0),)
 
 
 def _make(rng: Random) -> bytes:
     return _make.numbers[rng.random()]  # type: ignore[attr-defined]
 
 
-# The generator is named by seed, target and number: the first draw tells which number it is.
+# The generator is named by seed, target and number: the first draw identifies the number.
 _make.numbers = {  # type: ignore[attr-defined]
-    Random(f"1/naughty/{number}").random(): bytes([number])  # noqa: S311 - no secret
+    Random(f"1/faulty/{number}").random(): bytes([number])  # noqa: S311 - no secret
     for number in range(60)
 }
 

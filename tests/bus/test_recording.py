@@ -1,7 +1,8 @@
-"""Capture + vehicle → samples and log."""
+"""Recordings: log or capture; captures decoded by a vehicle into samples and logs."""
 
 from __future__ import annotations
 
+import gzip
 import math
 from pathlib import Path
 
@@ -9,15 +10,23 @@ import can
 import numpy as np
 import pytest
 
-from cangauge.bus.capture_log import capture_samples, capture_to_log
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import LEAF_RULE
+from cangauge.bus.recording import (
+    capture_samples,
+    capture_to_log,
+    open_recording,
+    read_recording,
+)
 from cangauge.bus.time_source import ClockFrames, ReceiveTime
 from cangauge.bus.vehicle import Vehicle, load_vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.validity import Sample
 from cangauge.inspect.capture import inspect_capture
+from cangauge.logs.canonical import write_log
+from cangauge.logs.log import Log
+from cangauge.logs.read import LogFile
 
 CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID = 0x400, 0x401, 0x402
 
@@ -46,6 +55,74 @@ def record(path: Path, frames: list[can.Message]) -> Path:
     return path
 
 
+def test_content_decides_between_log_and_capture(tmp_path: Path, generic: Vehicle) -> None:
+    capture = record(tmp_path / "drive.log", drive(generic)).rename(tmp_path / "drive.csv")
+    write_log(capture_to_log(capture, generic), tmp_path / "drive.parquet")
+    log = (tmp_path / "drive.parquet").rename(tmp_path / "drive.blf")
+    assert isinstance(open_recording(log), LogFile)
+    assert not isinstance(open_recording(capture), LogFile)
+    by_capture, by_log = read_recording(capture, generic), read_recording(log)
+    for channel in ("time_s", "current_a", "voltage_v", "temperature_c", "soc_pct"):
+        np.testing.assert_array_equal(getattr(by_capture, channel), getattr(by_log, channel))
+
+
+def test_a_capture_needs_a_vehicle(tmp_path: Path, generic: Vehicle) -> None:
+    path = record(tmp_path / "drive.log", drive(generic))
+    with pytest.raises(InputError, match="CAN capture, not a log; give --vehicle") as caught:
+        read_recording(path)
+    assert caught.value.source == str(path)
+
+
+def test_a_log_with_a_vehicle_gets_a_remark(tmp_path: Path, generic: Vehicle) -> None:
+    write_log(Log([0, 1], [10, 30], [380, 378], [21, 21]), tmp_path / "drive.csv")
+    log = read_recording(tmp_path / "drive.csv", generic)
+    assert log.remarks == ("a log, not a capture: no vehicle is needed",)
+
+
+@pytest.mark.parametrize("kind", ["log", "capture"])
+def test_temperature_and_its_source_can_be_given(
+    tmp_path: Path, generic: Vehicle, kind: str
+) -> None:
+    path = record(tmp_path / "drive.log", drive(generic))
+    if kind == "log":
+        path = tmp_path / "drive.csv"
+        write_log(Log([0, 1], [10, 30], [380, 378], [21, 21], temperature_source="pack"), path)
+    log = read_recording(path, generic, temperature_c=7.0, temperature_source="room")
+    assert set(log.temperature_c) == {7.0}
+    assert log.temperature_source == "room"
+    assert read_recording(path, generic, temperature_c=7.0).temperature_source == "unknown"
+    with pytest.raises(InputError, match="not a known temperature source"):
+        read_recording(path, generic, temperature_source="oven")  # type: ignore[arg-type]
+
+
+def test_a_packed_capture_that_is_cut_off_is_read(tmp_path: Path, generic: Vehicle) -> None:
+    whole = record(tmp_path / "drive.log", drive(generic)).read_bytes()
+    path = tmp_path / "drive.log.gz"
+    path.write_bytes(gzip.compress(whole)[:-200])
+    log = read_recording(path, generic)
+    assert 100 < len(log) < 200
+    assert any("cut off" in remark for remark in log.remarks)
+
+
+def test_neither_log_nor_capture_names_both_kinds(tmp_path: Path) -> None:
+    path = tmp_path / "notes.txt"
+    path.write_text("hello\nworld\n")
+    with pytest.raises(InputError, match=r"first line: not a known kind of log, nor") as caught:
+        read_recording(path)
+    assert caught.value.value == "hello"
+    assert "canonical Parquet" in str(caught.value.cure)
+    assert "candump" in str(caught.value.cure)
+
+
+@pytest.mark.real
+def test_every_real_capture_needs_a_vehicle(shared_data: Path) -> None:
+    paths = sorted((shared_data / "leaf_can").glob("*.gz"))
+    assert len(paths) == 9
+    for path in paths:
+        with pytest.raises(InputError, match="this is a CAN capture, not a log"):
+            read_recording(path)
+
+
 def test_a_recorded_drive_becomes_a_log(tmp_path: Path, generic: Vehicle) -> None:
     log = capture_to_log(record(tmp_path / "drive.log", drive(generic)), generic)
     assert len(log) == 200
@@ -66,12 +143,12 @@ def test_samples_are_those_of_the_live_service_to_the_last_bit(
         f for f in drive(generic) if not (f.arbitration_id == VOLTAGE_ID and f.timestamp < 1003)
     ]
     path = record(tmp_path / "drive.log", frames)
-    live, clock, assembler = [], ReceiveTime(), SampleDecoder(generic)
+    live, clock, decoder = [], ReceiveTime(), SampleDecoder(generic)
     for message in can.LogReader(path):
         time_s = clock.time_of(message)
         assert time_s is not None
         message.timestamp = time_s
-        if (sample := assembler.handle(message)) is not None:
+        if (sample := decoder.handle(message)) is not None:
             live.append(sample)
     offline = list(capture_samples(path, generic))
     assert len(live) == len(offline) == 200
@@ -81,17 +158,17 @@ def test_samples_are_those_of_the_live_service_to_the_last_bit(
 def test_the_replay_clock_gives_the_logs_own_time(tmp_path: Path, generic: Vehicle) -> None:
     clock, frames = ClockFrames(), []
     for frame in drive(generic, start_s=-10.0):
-        told = clock.at(round(frame.timestamp * 1e6))
+        tick = clock.at(round(frame.timestamp * 1e6))
         frame.timestamp = 5000.0 + frame.timestamp / 10.0  # replayed ten times faster
-        told.timestamp, told.channel = frame.timestamp, "can0"
-        frames += [told, frame]
+        tick.timestamp, tick.channel = frame.timestamp, "can0"
+        frames += [tick, frame]
     path = record(tmp_path / "replay.log", frames)
     log = capture_to_log(path, generic, source="replay-clock")
     assert log.time_s.tolist() == [round(-10e6 + n * 1e5) / 1e6 for n in range(200)]
     assert capture_to_log(path, generic).duration_s == pytest.approx(1.99)
 
 
-def test_voltage_that_misses_is_interpolated_or_left_out(tmp_path: Path, generic: Vehicle) -> None:
+def test_missing_voltage_is_interpolated_or_dropped(tmp_path: Path, generic: Vehicle) -> None:
     def kept(frame: can.Message) -> bool:
         time_s = frame.timestamp - 1000.0
         missing = time_s < 0.25 or 5.05 < time_s < 5.45 or 10.05 < time_s < 14.05
@@ -103,7 +180,7 @@ def test_voltage_that_misses_is_interpolated_or_left_out(tmp_path: Path, generic
     log = capture_to_log(path, generic)
     assert len(log) == 200 - 3 - 40
     assert "4 samples without voltage: interpolated" in log.remarks
-    assert "43 samples without voltage left out" in log.remarks
+    assert "43 samples without voltage dropped" in log.remarks
     assert log.voltage_v[log.time_s > 1005.0][0] == 380.0
     assert log.time_s[0] == pytest.approx(1000.3)
 
@@ -136,13 +213,13 @@ def test_no_temperature_at_all_asks_for_one(tmp_path: Path, generic: Vehicle) ->
     assert set(log.temperature_c) == {7.0}
 
 
-def test_losses_and_refusals_are_told(tmp_path: Path, generic: Vehicle) -> None:
+def test_losses_and_refusals_are_remarks(tmp_path: Path, generic: Vehicle) -> None:
     frames = drive(generic)
     currents = [frame for frame in frames if frame.arbitration_id == CURRENT_ID]
     currents[50].data[0] ^= 1
     frames = [frame for frame in frames if frame is not currents[100]]
     log = capture_to_log(record(tmp_path / "x.log", frames), generic)
-    assert "1 frames refused: CRC wrong" in log.remarks
+    assert "1 frames refused: wrong CRC" in log.remarks
     assert "1 counter jumps: at least 1 frames lost" in log.remarks
     assert len(log) == 198
 
@@ -169,7 +246,7 @@ def test_of_several_buses_the_one_with_most_samples_is_taken(
     assert not any("refused" in remark for remark in log.remarks)
 
 
-def test_the_wrong_vehicle_is_told(tmp_path: Path, generic: Vehicle) -> None:
+def test_the_wrong_vehicle_is_refused(tmp_path: Path, generic: Vehicle) -> None:
     path = record(tmp_path / "x.log", drive(generic))
     with pytest.raises(InputError, match=r"no frames of 0x1DB \(BATTERY_1DB\)") as caught:
         capture_to_log(path, load_vehicle("leaf_ze0"))
@@ -183,7 +260,7 @@ def test_a_wrong_sign_in_the_map_is_seen_in_the_data(tmp_path: Path, generic: Ve
         'temperature.signal = "temperature_c"\n'
     )
     turned = load_vehicle(dbc=generic.dbc_files[0], map_file=tmp_path / "turned.toml")
-    assert any("current looks turned" in each for each in capture_to_log(path, turned).remarks)
+    assert any("current looks inverted" in each for each in capture_to_log(path, turned).remarks)
     assert not any("turned" in each for each in capture_to_log(path, generic).remarks)
 
 
@@ -199,27 +276,25 @@ def test_a_wrong_scale_in_the_map_is_refused(tmp_path: Path, generic: Vehicle) -
     assert caught.value.field == "voltage_v"
 
 
-def test_time_that_stands_still_is_refused(tmp_path: Path, generic: Vehicle) -> None:
+def test_time_that_does_not_advance_is_refused(tmp_path: Path, generic: Vehicle) -> None:
     frames = drive(generic)
     for frame in frames:
         frame.timestamp = 5.0
-    with pytest.raises(InputError, match="stands still"):
+    with pytest.raises(InputError, match="does not advance"):
         capture_to_log(record(tmp_path / "x.log", frames), generic)
 
 
-def test_stamps_out_of_order_are_dropped_until_time_goes_on(
-    tmp_path: Path, generic: Vehicle
-) -> None:
+def test_late_stamps_are_dropped_until_time_advances(tmp_path: Path, generic: Vehicle) -> None:
     frames = drive(generic)
     for frame in frames:
         if 1010.0 <= frame.timestamp < 1010.45:
             frame.timestamp -= 0.5  # five samples arrive late
     log = capture_to_log(record(tmp_path / "x.log", frames), generic)
     assert len(log) == 195
-    assert "5 samples with time not going on dropped" in log.remarks
+    assert "5 samples dropped whose time does not advance" in log.remarks
 
 
-def test_inspection_tells_frames_protection_and_vehicle(tmp_path: Path, generic: Vehicle) -> None:
+def test_inspection_lists_frames_protection_and_vehicle(tmp_path: Path, generic: Vehicle) -> None:
     frames = drive(generic)
     frames = [f for f in frames if not 1005.0 < f.timestamp < 1007.95]
     frames.append(can.Message(timestamp=1021.0, is_error_frame=True, channel="can0"))
@@ -260,7 +335,7 @@ def test_inspection_with_a_vehicle_has_the_log_too(tmp_path: Path, generic: Vehi
     assert found.to_dict()["log"]["rows"] == 200
 
 
-def test_inspection_of_somebody_elses_frames(tmp_path: Path) -> None:
+def test_inspection_of_unknown_frames(tmp_path: Path) -> None:
     frames = [
         can.Message(
             timestamp=n / 10,

@@ -1,4 +1,4 @@
-"""A temperature that is reported in steps is read between them, and nowhere else."""
+"""A quantized temperature is interpolated between its steps, and only there."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_most_of_the_steps_error_is_gone(step_c: float, noise_c: float) -> None:
 
 @pytest.mark.parametrize("pause_s", [0.0, 600.0, 86_400.0])
 def test_it_is_never_further_from_the_report_than_half_a_step(pause_s: float) -> None:
-    """Above all not where the temperature jumped while nothing was recorded."""
+    """In particular where the temperature jumped during an unobserved interval."""
     seen = reported(np.concatenate((warming() + 15.0, warming())), 0.5, 0.01)
     read = dequantize(log_of(seen, pause_s)).temperature_c
     assert np.max(np.abs(read - seen)) <= 0.25 + 1e-9

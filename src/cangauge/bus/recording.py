@@ -1,0 +1,436 @@
+"""Read a recording: a log of any format, or a capture decoded by its vehicle.
+
+A capture becomes samples exactly as the live service makes them, and a log by filling the values
+that single samples lack.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from can.typechecking import Channel
+
+from cangauge._typing import BoolArray, FloatArray
+from cangauge.bus.captures.capture import (
+    CLOCK_ID,
+    CLOCK_PERIOD_S,
+    KNOWN_CAPTURES,
+    Capture,
+    find_capture,
+    open_capture,
+)
+from cangauge.bus.captures.files import CaptureInfo, parts_of_run
+from cangauge.bus.decoder import FrameStatistics, SampleDecoder
+from cangauge.bus.time_source import TimeSource, TimeSourceName, time_source
+from cangauge.bus.vehicle import Vehicle
+from cangauge.errors import InputError
+from cangauge.estimate.validity import Sample
+from cangauge.logs.log import Log, TemperatureSource
+from cangauge.logs.read import KNOWN_LOGS, LogFile, not_recognised, open_log
+from cangauge.logs.sign import resolve_sign
+from cangauge.logs.units import known_temperature_source, refuse_wrong_units
+
+VOLTAGE_FILL_S: Final = 1.0
+"""Longest time between two voltages for interpolation [s]; rows further from one are dropped."""
+
+
+def read_recording(
+    path: str | PathLike[str],
+    vehicle: Vehicle | None = None,
+    *,
+    temperature_c: float | None = None,
+    temperature_source: TemperatureSource | None = None,
+) -> Log:
+    """Read a log, or a CAN capture by its vehicle, whatever the file is called.
+
+    Logs: canonical Parquet and CSV, ANL D3 tests, BMW i3 trips, exports of Arbin, Bitrode and
+    VisuaLCN cyclers; plain, gzipped or in a zip. Captures: candump, CRTD, ASC, BLF, TRC, MF4, CSV;
+    plain or gzipped. `Log.remarks` lists all that was dropped, converted or assumed.
+
+    Parameters
+    ----------
+    path : path-like
+    vehicle : Vehicle, optional
+        Decodes a capture (`load_vehicle`). A log does not need it; it is then ignored with a
+        remark.
+    temperature_c : float, optional
+        Constant temperature [°C], in place of the recording's own.
+    temperature_source : {"cell", "pack", "coolant", "room", "unknown"}, optional
+        What the temperature was measured on, in place of the recording's own word.
+
+    Returns
+    -------
+    Log
+        Positive current discharges. `soc_pct` of a capture is the car's own, if it sends one.
+
+    Raises
+    ------
+    InputError
+        File absent, empty, damaged or of no known format; a capture without a vehicle; missing
+        column or signal; wrong unit; time that runs backwards; missing values.
+
+    See Also
+    --------
+    cangauge.Log.from_dataframe : A log from a table in memory.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import mkdtemp
+    >>> from cangauge.logs.canonical import write_log
+    >>> path = Path(mkdtemp()) / "drive.parquet"
+    >>> write_log(Log([0, 1], [10, 30], [380, 378], [21, 21]), path)
+    >>> log = read_recording(path)
+    >>> log.name, log.current_a
+    ('drive', array([10., 30.]))
+    """
+    return log_of(
+        open_recording(path),
+        vehicle,
+        temperature_c=temperature_c,
+        temperature_source=temperature_source,
+    )
+
+
+def log_of(
+    recording: LogFile | Capture,
+    vehicle: Vehicle | None,
+    *,
+    temperature_c: float | None,
+    temperature_source: TemperatureSource | None,
+) -> Log:
+    """Read an opened recording; see `read_recording`."""
+    if temperature_source is not None:
+        known_temperature_source(temperature_source)
+    if isinstance(recording, LogFile):
+        log = recording.read(temperature_c=temperature_c, temperature_source=temperature_source)
+        if vehicle is not None:
+            log = replace(log, remarks=(*log.remarks, "a log, not a capture: no vehicle is needed"))
+        return log
+    if vehicle is None:
+        raise capture_without_vehicle(recording.path)
+    if temperature_c is not None:
+        vehicle = replace(
+            vehicle,
+            temperature=None,
+            fixed_temperature_c=temperature_c,
+            temperature_source="unknown",
+        )
+    log = capture_to_log(recording.path, vehicle)
+    if temperature_source is not None:
+        log = replace(log, temperature_source=temperature_source)
+    return log
+
+
+def open_recording(path: str | PathLike[str]) -> LogFile | Capture:
+    """Find out whether a file is a log or a capture, from its beginning.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or is neither.
+    """
+    path = Path(path)
+    if parts_of_run(path):
+        return open_capture(path)
+    log_file = open_log(path)
+    if log_file.reader is not None:
+        return log_file
+    capture = find_capture(path)
+    if capture is None:
+        raise not_recognised(
+            log_file,
+            "not a known kind of log, nor of capture",
+            f"known logs: {KNOWN_LOGS}; known captures (with --vehicle or --dbc and --map):"
+            f" {KNOWN_CAPTURES}",
+        )
+    return capture
+
+
+def capture_without_vehicle(path: str | PathLike[str]) -> InputError:
+    """Return the error for a capture whose vehicle is not given."""
+    return InputError(
+        "this is a CAN capture, not a log",
+        source=path,
+        cure="give --vehicle, or --dbc and --map",
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CaptureSamples:
+    """All samples of a capture, as the live service makes them without a model.
+
+    With a model the service also drops values that are impossible for its pack; see
+    `plausibility`.
+
+    Parameters
+    ----------
+    time_s, current_a : array of shape (n,)
+        Bus time [s], current [A], positive = discharge.
+    voltage_v, temperature_c : array of shape (n,)
+        [V], [°C]; NaN where the sample has none.
+    soc_pct : array of shape (n,)
+        The car's own SoC when the sample was made [%]; NaN where there is none.
+    counters : FrameStatistics
+        Of the frames of the chosen bus.
+    info : CaptureInfo
+        Of the file.
+    remarks : tuple of str
+        Losses and refusals, for the user.
+    """
+
+    time_s: FloatArray
+    current_a: FloatArray
+    voltage_v: FloatArray
+    temperature_c: FloatArray
+    soc_pct: FloatArray
+    counters: FrameStatistics
+    info: CaptureInfo
+    remarks: tuple[str, ...]
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return int(self.time_s.size)
+
+    def __iter__(self) -> Iterator[Sample]:
+        """Yield the samples."""
+        columns = (self.time_s, self.current_a, self.voltage_v, self.temperature_c)
+        yield from map(Sample._make, zip(*(column.tolist() for column in columns), strict=True))
+
+
+def open_vehicle_capture(path: str | PathLike[str], vehicle: Vehicle) -> Capture:
+    """Open a capture; without stamps, the vehicle's current message counts time."""
+    period_s = vehicle.messages[vehicle.current.key].period_s
+    if period_s is None:
+        return open_capture(path, clock=(CLOCK_ID, CLOCK_PERIOD_S))
+    return open_capture(path, clock=(vehicle.current.arbitration_id, period_s))
+
+
+def capture_samples(
+    path: str | PathLike[str], vehicle: Vehicle, *, source: TimeSourceName = "receive"
+) -> CaptureSamples:
+    """Return the samples of a capture, bit for bit as the live service makes them of the frames.
+
+    Each bus in the capture has its own decoder; the bus with most samples is returned.
+
+    Parameters
+    ----------
+    path : path-like
+    vehicle : Vehicle
+    source : {"receive", "replay-clock"}
+        Bus time: the recorded stamps, or the log time in REPLAY_CLOCK frames.
+
+    Raises
+    ------
+    InputError
+        If the capture cannot be read, or gives no sample.
+    """
+    capture = open_vehicle_capture(path, vehicle)
+    clock = time_source(source)
+    buses = _decode(capture, vehicle, clock)
+    channel, bus = max(buses.items(), key=lambda item: len(item[1].values), default=(None, None))
+    if bus is None or not bus.values:
+        raise _no_samples(path, vehicle, bus)
+    time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(bus.values).reshape(-1, 5).T
+    remarks = [*capture.info.remarks, *_losses(bus.decoder.counters)]
+    if sum(bool(other.values) for other in buses.values()) > 1:
+        remarks.append(f"several buses carry the frames: bus {channel} is used, which has most")
+    if clock.beginnings:
+        remarks.append(f"the replay clock starts again {clock.beginnings} times")
+    return CaptureSamples(
+        time_s=time_s,
+        current_a=current_a,
+        voltage_v=voltage_v,
+        temperature_c=temperature_c,
+        soc_pct=soc_pct,
+        counters=bus.decoder.counters,
+        info=capture.info,
+        remarks=tuple(remarks),
+    )
+
+
+class _Bus:
+    """One bus of a capture: its decoder and the decoded values."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self.decoder = SampleDecoder(vehicle)
+        # Time, current, voltage, temperature and the car's SoC of each sample in turn.
+        self.values = array("d")
+
+    def add(self, sample: Sample | None) -> None:
+        if sample is not None:
+            self.values.extend(sample)
+            self.values.append(self.decoder.reference_soc_pct)
+
+
+def _decode(capture: Capture, vehicle: Vehicle, clock: TimeSource) -> dict[Channel | None, _Bus]:
+    buses: dict[Channel | None, _Bus] = {}
+    for message in capture:
+        time_s = clock.time_of(message)
+        if time_s is None:
+            continue
+        message.timestamp = time_s
+        bus = buses.get(message.channel)
+        if bus is None:
+            bus = buses[message.channel] = _Bus(vehicle)
+        bus.add(bus.decoder.handle(message))
+    for bus in buses.values():
+        bus.add(bus.decoder.flush())
+    return buses
+
+
+def _no_samples(path: str | PathLike[str], vehicle: Vehicle, bus: _Bus | None) -> InputError:
+    name = f"0x{vehicle.current.arbitration_id:X} ({vehicle.current.message})"
+    counters = None if bus is None else bus.decoder.counters
+    if counters is None or not counters.messages[vehicle.current.key].wanted:
+        problem = f"the capture holds no frames of {name}, which carries the current"
+    else:
+        problem = f"the frames of {name} give no current ({'; '.join(_losses(counters))})"
+    return InputError(
+        problem,
+        source=path,
+        cure="check the vehicle; `cangauge inspect` lists the frames of a capture",
+    )
+
+
+def _losses(counters: FrameStatistics) -> list[str]:
+    losses = [
+        f"{count} {text}"
+        for count, text in (
+            (counters.crc_errors, "frames refused: wrong CRC"),
+            (counters.counter_repeats, "frames refused: repeated counter"),
+            (counters.short, "frames refused: too short"),
+            (counters.not_available, "values refused: code for 'not available'"),
+        )
+        if count
+    ]
+    if counters.counter_jumps:
+        losses.append(
+            f"{counters.counter_jumps} counter jumps: at least {counters.frames_lost} frames lost"
+        )
+    return losses
+
+
+def capture_to_log(
+    path: str | PathLike[str], vehicle: Vehicle, *, source: TimeSourceName = "receive"
+) -> Log:
+    """Return a capture as a log; `soc_pct` is the car's own, if it sends one.
+
+    A log has every value in every row. Time stamps that do not increase are dropped; voltage is
+    interpolated over at most `VOLTAGE_FILL_S`; temperature is the latest one, before the first
+    the first. Remarks count these rows and the lost frames.
+
+    Parameters
+    ----------
+    path : path-like
+    vehicle : Vehicle
+    source : {"receive", "replay-clock"}
+        Bus time: the recorded stamps, or the log time in REPLAY_CLOCK frames.
+
+    Raises
+    ------
+    InputError
+        If the capture cannot be read, gives no sample, no voltage or no temperature, holds
+        several replays one after the other, or values that are no battery's.
+    """
+    samples = capture_samples(path, vehicle, source=source)
+    path = Path(path)
+    remarks = list(samples.remarks)
+    # Stamps larger than all before them.
+    latest_s = np.concatenate([[-np.inf], np.maximum.accumulate(samples.time_s)[:-1]])
+    keep = samples.time_s > latest_s
+    dropped = np.count_nonzero(~keep)
+    if dropped > 0.5 * keep.size:
+        raise InputError(
+            "time runs backwards or does not advance in the capture",
+            source=path,
+            cure="split it where time starts again; record with absolute stamps (candump -l, not"
+            " -td); of a replay at full speed, take the replay clock as time",
+        )
+    if dropped:
+        remarks.append(f"{dropped} samples dropped whose time does not advance")
+    time_s, soc_pct = samples.time_s[keep], samples.soc_pct[keep]
+    voltage_v = _filled_voltage(time_s, samples.voltage_v[keep], path, vehicle, remarks)
+    temperature_c = _filled_temperature(samples.temperature_c[keep], path, vehicle, remarks)
+    complete = np.isfinite(voltage_v)
+    values = {
+        "time_s": time_s[complete],
+        "current_a": samples.current_a[keep][complete],
+        "voltage_v": voltage_v[complete],
+        "temperature_c": temperature_c[complete],
+    }
+    if np.isfinite(soc_pct[complete]).any():
+        values["soc_pct"] = soc_pct[complete]
+    log = Log(
+        **values,
+        name=path.name.split(".")[0],
+        source=str(path),
+        temperature_source=vehicle.temperature_source,
+        remarks=tuple(remarks),
+    )
+    refuse_wrong_units(values, source=path, labels=_labels(vehicle))
+    return resolve_sign(log, stored_sign_unknown=False)
+
+
+def _filled_voltage(
+    time_s: FloatArray, voltage_v: FloatArray, path: Path, vehicle: Vehicle, remarks: list[str]
+) -> FloatArray:
+    known = np.flatnonzero(np.isfinite(voltage_v))
+    if not known.size:
+        raise InputError(
+            "the capture gives no voltage that pairs with a current",
+            source=path,
+            field=vehicle.voltage.message,
+            cure="check the mapping, and pair_within_s",
+        )
+    missing = np.flatnonzero(~np.isfinite(voltage_v))
+    if not missing.size:
+        return voltage_v
+    filled = voltage_v.copy()
+    right = np.searchsorted(known, missing)
+    inside = (right > 0) & (right < known.size)
+    left_row, right_row = known[right[inside] - 1], known[right[inside]]
+    near = time_s[right_row] - time_s[left_row] <= VOLTAGE_FILL_S
+    rows = missing[inside][near]
+    filled[rows] = np.interp(time_s[rows], time_s[known], voltage_v[known])
+    if rows.size:
+        remarks.append(f"{rows.size} samples without voltage: interpolated")
+    if missing.size > rows.size:
+        remarks.append(f"{missing.size - rows.size} samples without voltage dropped")
+    return filled
+
+
+def _filled_temperature(
+    temperature_c: FloatArray, path: Path, vehicle: Vehicle, remarks: list[str]
+) -> FloatArray:
+    known: BoolArray = np.isfinite(temperature_c)
+    if not known.any():
+        raise InputError(
+            "the capture gives no temperature",
+            source=path,
+            field=None if vehicle.temperature is None else vehicle.temperature.message,
+            cure="give --temperature °C",
+        )
+    if known.all():
+        return temperature_c
+    rows = np.flatnonzero(known)
+    latest = np.searchsorted(rows, np.arange(known.size), side="right") - 1
+    remarks.append(f"{np.count_nonzero(~known)} samples without temperature: the nearest is used")
+    return np.asarray(temperature_c[rows[np.maximum(latest, 0)]])
+
+
+def _labels(vehicle: Vehicle) -> dict[str, str]:
+    signals = {
+        "current_a": vehicle.current,
+        "voltage_v": vehicle.voltage,
+        "temperature_c": vehicle.temperature,
+        "soc_pct": vehicle.soc_reference,
+    }
+    names = {field: each.codec.name for field, each in signals.items() if each is not None}
+    return {"time_s": "time stamps", **names}
