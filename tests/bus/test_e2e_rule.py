@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge.bus.database import Field
-from cangauge.bus.mapping import CheckMap, MessageMap
+from cangauge.bus.mapping import CheckMap, MessageMap, Overrides
 from cangauge.bus.protection import (
     LEAF_RULE,
     PROFILES,
@@ -20,7 +20,7 @@ from cangauge.bus.protection import (
     Protection,
     Verdict,
 )
-from cangauge.bus.vehicle import Overrides, Vehicle, load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 
 IDS = bytes(range(0x40, 0x50))
@@ -219,7 +219,7 @@ def folder(tmp_path: Path) -> Path:
 
 def load(folder: Path, more: str = "", overrides: Overrides | None = None) -> Vehicle:
     (folder / "car.toml").write_text(MAP + more)
-    return load_vehicle(map_file=folder / "car.toml", overrides=overrides or Overrides())
+    return Vehicle.load(map=folder / "car.toml", overrides=overrides or Overrides())
 
 
 def test_a_map_file_chooses_a_profile_for_each_message(folder: Path) -> None:
@@ -252,7 +252,7 @@ def test_a_configuration_goes_before_the_mapping(folder: Path) -> None:
     assert vehicle.messages[0x100].rule == RULES["02"]
     assert vehicle.messages[0x100].period_s == 0.1
     assert vehicle.voltage.checks.highest == 410.0
-    leaf = load_vehicle(
+    leaf = Vehicle.load(
         "leaf_aze0",
         overrides=Overrides("run.toml", messages={"BATTERY_1DB": MessageMap(period_s=0.02)}),
     )

@@ -12,15 +12,15 @@ from hypothesis import strategies as st
 
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.encoder import FrameEncoder
-from cangauge.bus.vehicle import Vehicle, load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.validity import Sample
 from cangauge.logs.log import Log
 
 VEHICLES = {
-    "generic": load_vehicle("generic"),
-    "leaf_ze0": load_vehicle("leaf_ze0"),
-    "leaf_ze1": load_vehicle("leaf_ze1", temperature_c=18.0),
+    "generic": Vehicle.load("generic"),
+    "leaf_ze0": Vehicle.load("leaf_ze0"),
+    "leaf_ze1": Vehicle.load("leaf_ze1", temperature_c=18.0),
 }
 
 
@@ -52,7 +52,7 @@ def through_frames(vehicle: Vehicle, log: Log) -> tuple[list[Sample], list[float
             if made is not None:
                 samples.append(made)
                 references.append(assembler.reference_soc_pct)
-    counters = assembler.counters
+    counters = assembler.statistics
     assert counters.crc_errors == counters.counter_repeats == counters.frames_lost == 0
     return samples, references
 
@@ -144,7 +144,7 @@ def test_missing_values() -> None:
     assert made is not None
     assert made.current_a == 1.0
     assert math.isnan(made.voltage_v)
-    assert assembler.counters.not_available == 1
+    assert assembler.statistics.not_available == 1
 
 
 @pytest.mark.parametrize(
@@ -210,6 +210,6 @@ def test_multiplexed_current_cannot_be_replayed(tmp_path: Path) -> None:
     (tmp_path / "x.toml").write_text(
         'dbc = "x.dbc"\ncurrent.signal = "i"\nvoltage.signal = "u"\ntemperature.fixed_c = 20\n'
     )
-    vehicle = load_vehicle(map_file=tmp_path / "x.toml")
+    vehicle = Vehicle.load(map=tmp_path / "x.toml")
     with pytest.raises(InputError, match="multiplexed"):
         FrameEncoder(vehicle)

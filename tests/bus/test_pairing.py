@@ -76,7 +76,8 @@ def test_what_was_given_up_is_counted() -> None:
         pairing.voltage(float(n), 400.0)
     pairing.current(10.0, 1.0, 20.0)
     pairing.current(11.0, 1.0, 20.0)
-    assert (pairing.voltage_unpaired, pairing.current_unpaired) == (3, 1)
+    statistics = pairing.statistics
+    assert (statistics.voltage_unpaired, statistics.current_unpaired) == (3, 1)
 
 
 def _numbered(steps: list[tuple[int, str]]) -> list[tuple[float, str, float]]:

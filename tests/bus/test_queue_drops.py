@@ -11,7 +11,8 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.connection import BusConnection, backend_capabilities, queue_drops
+from cangauge.bus.backend import backend_capabilities, queue_drops
+from cangauge.bus.connection import BusConnection
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 
 linux_only = pytest.mark.skipif(sys.platform != "linux", reason="the count is Linux's")

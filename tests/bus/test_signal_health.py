@@ -9,22 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cangauge.bus.plausibility import Fault, SignalChecks, SignalHealth, Trust
+from cangauge.bus.plausibility import Fault, SignalChecks, SignalHealth, SignalState
 
 NAN = math.nan
 
 
-def feed(health: SignalHealth, value: float, time_s: float) -> float:
-    """As `InputHealth` does: the value that goes on, or NaN."""
-    fault = health.judge(value, time_s)
-    if fault is Fault.NONE:
-        return value if health.take(value, time_s) else NAN
-    health.fail(fault)
-    return NAN
-
-
 def passed(health: SignalHealth, values: list[float], step_s: float = 0.1) -> list[float]:
-    return [feed(health, value, step_s * number) for number, value in enumerate(values)]
+    return [health.update(value, step_s * number) for number, value in enumerate(values)]
 
 
 def same(left: list[float], right: list[float]) -> bool:
@@ -36,14 +27,14 @@ def same(left: list[float], right: list[float]) -> bool:
 def test_the_first_good_value_is_used_and_failures_before_it_do_not_matter() -> None:
     health = SignalHealth(SignalChecks())
     assert same(passed(health, [NAN] * 20 + [1.0]), [NAN] * 20 + [1.0])
-    assert health.trust is Trust.VALID
+    assert health.state is SignalState.VALID
 
 
 def test_a_few_failures_cost_their_own_values_only() -> None:
     health = SignalHealth(SignalChecks(invalid_after=5))
     values = [1.0, NAN, NAN, NAN, NAN, 2.0, 3.0]
     assert same(passed(health, values), values)
-    assert health.trust is Trust.VALID
+    assert health.state is SignalState.VALID
 
 
 def test_several_failures_in_a_row_need_several_good_values() -> None:
@@ -55,7 +46,7 @@ def test_several_failures_in_a_row_need_several_good_values() -> None:
 
 def test_while_invalid_it_is_not_usable_and_says_why() -> None:
     health = SignalHealth(SignalChecks(invalid_after=2))
-    feed(health, 1.0, 0.0)
+    health.update(1.0, 0.0)
     health.fail(Fault.PROTECTION)
     assert health.is_usable(0.1)
     health.fail(Fault.PROTECTION)
@@ -65,12 +56,12 @@ def test_while_invalid_it_is_not_usable_and_says_why() -> None:
 
 def test_copies_of_frames_do_not_keep_a_signal_from_coming_back() -> None:
     health = SignalHealth(SignalChecks(invalid_after=2, valid_after=3))
-    feed(health, 1.0, 0.0)
+    health.update(1.0, 0.0)
     health.fail(Fault.PROTECTION)
     health.fail(Fault.PROTECTION)
     used = []
     for number in range(3):
-        used.append(feed(health, 2.0, 0.1 * number))
+        used.append(health.update(2.0, 0.1 * number))
         health.fail(Fault.REPEATED)
     assert same(used, [NAN, NAN, 2.0])
 
@@ -117,17 +108,17 @@ def test_a_spike_is_refused_and_a_lasting_step_is_believed_once_it_can_be() -> N
 
 def test_after_a_pause_a_signal_may_be_elsewhere() -> None:
     health = SignalHealth(SignalChecks(max_jump=5.0, max_rate_per_s=1.0))
-    assert feed(health, 20.0, 0.0) == 20.0
-    assert math.isnan(feed(health, 40.0, 14.9))
-    assert feed(health, 40.0, 15.1) == 40.0
+    assert health.update(20.0, 0.0) == 20.0
+    assert math.isnan(health.update(40.0, 14.9))
+    assert health.update(40.0, 15.1) == 40.0
 
 
 def test_a_stated_time_out_holds_as_it_is() -> None:
     health = SignalHealth(SignalChecks(timeout_s=0.2), 0.1)
-    feed(health, 1.0, 10.0)
+    health.update(1.0, 10.0)
     assert health.is_usable(10.2)
     assert not health.is_usable(10.21)
-    feed(health, 1.0, 50.0)  # old is not invalid: the next good value is used
+    health.update(1.0, 50.0)  # old is not invalid: the next good value is used
     assert health.is_usable(50.0)
 
 
@@ -159,13 +150,13 @@ def test_pauses_and_losses_are_no_period() -> None:
     now_s = 0.0
     for number in range(200):
         now_s += 3600.0 if number == 150 else 0.01 * (1 + number % 2)  # half of them lost
-        feed(health, 1.0, now_s)
+        health.update(1.0, now_s)
     assert health.period_s == pytest.approx(0.015, rel=0.2)
 
 
 def test_time_that_runs_backwards_does_not_make_old_values_young() -> None:
     health = SignalHealth(SignalChecks(timeout_s=2.0))
-    feed(health, 1.0, 5000.0)
+    health.update(1.0, 5000.0)
     health.rewind(3.0)
     assert health.is_usable(5.0)
     assert not health.is_usable(5.1)

@@ -7,14 +7,14 @@ from collections.abc import Callable, Iterable
 
 import pytest
 
-from cangauge.bus.plausibility import Pack, StuckPair
+from cangauge.bus.plausibility import Pack, StuckDetector, stuck_detectors
 
 PACK = Pack(resistance_ohm=0.1, error_std_v=0.5, capacity_ah=50.0, usual_v=370.0)
 RATE_HZ = 10.0
 
 
-def pair(step: float = 0.5) -> StuckPair:
-    return StuckPair(
+def pair(step: float = 0.5) -> tuple[StuckDetector, StuckDetector]:
+    return stuck_detectors(
         PACK, current_step_a=step, voltage_step_v=step, current_after_s=10.0, voltage_after_s=10.0
     )
 
@@ -30,12 +30,12 @@ def watched(
     step: float = 0.5,
 ) -> tuple[float | None, float | None]:
     """When current and voltage were first called stuck [s]."""
-    watch = pair(step)
+    detectors = pair(step)
     found: list[float | None] = [None, None]
     for now_s in times(seconds):
         stuck = (
-            watch.current(rounded(current(now_s), step), now_s),
-            watch.voltage(rounded(voltage(now_s), step), now_s),
+            detectors[0].update(rounded(current(now_s), step), now_s),
+            detectors[1].update(rounded(voltage(now_s), step), now_s),
         )
         for which, is_stuck in enumerate(stuck):
             if is_stuck and found[which] is None:
@@ -96,19 +96,19 @@ def test_a_meters_noise_beside_a_current_of_0_is_no_proof(noise_v: float) -> Non
 
 def test_a_coarse_voltage_is_given_its_own_step() -> None:
     """A voltage in steps of 5 V stands still under currents of ±20 A: 2 V."""
-    watch = pair(0.01)
+    current, voltage = pair(0.01)
     for now_s in times(600.0):
         current_a = 20.0 * math.sin(now_s / 3.0) + (100.0 if now_s < 60.0 else 0.0)
-        watch.current(rounded(current_a, 0.01), now_s)
-        assert not watch.voltage(rounded(370.0 - 0.1 * current_a, 5.0), now_s)
+        current.update(rounded(current_a, 0.01), now_s)
+        assert not voltage.update(rounded(370.0 - 0.1 * current_a, 5.0), now_s)
 
 
 def test_a_signal_that_moves_again_is_watched_anew() -> None:
-    watch = pair()
+    current, voltage = pair()
     verdicts = []
     for now_s in times(200.0):
         frozen = 60.0 <= now_s < 150.0
-        watch.current(rounded(driving(now_s)), now_s)
-        verdicts.append(watch.voltage(rounded(under_load(60.0 if frozen else now_s)), now_s))
+        current.update(rounded(driving(now_s)), now_s)
+        verdicts.append(voltage.update(rounded(under_load(60.0 if frozen else now_s)), now_s))
     assert verdicts[1490]
     assert not any(verdicts[1520:])

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from cangauge.bus.protection import LEAF_RULE
-from cangauge.bus.vehicle import PRESETS, Vehicle, load_vehicle
+from cangauge.bus.vehicle import PRESETS, Vehicle
 from cangauge.errors import InputError
 
 DBC = """VERSION ""
@@ -59,13 +59,13 @@ def own(tmp_path: Path) -> Path:
 def load(folder: Path, text: str | None = None, **options: float) -> Vehicle:
     if text is not None:
         (folder / "car.toml").write_text(text)
-    return load_vehicle(dbc=folder / "car.dbc", map_file=folder / "car.toml", **options)
+    return Vehicle.load(dbc=folder / "car.dbc", map=folder / "car.toml", **options)
 
 
 @pytest.mark.parametrize("name", list(PRESETS))
 def test_every_preset_loads_and_wants_its_three_signals(name: str) -> None:
     temperature_c = 20.0 if PRESETS[name].lacks_temperature else None
-    vehicle = load_vehicle(name, temperature_c=temperature_c)
+    vehicle = Vehicle.load(name, temperature_c=temperature_c)
     assert vehicle.current.codec.unit == "A"
     assert vehicle.voltage.codec.unit == "V"
     assert vehicle.soc_reference is not None
@@ -81,13 +81,13 @@ def test_every_preset_loads_and_wants_its_three_signals(name: str) -> None:
 
 
 def test_presets_are_known_in_any_spelling() -> None:
-    assert load_vehicle("Leaf-ZE0").name == "Nissan Leaf ZE0"
-    assert load_vehicle("leaf_ze0").messages[0x1DB].rule is LEAF_RULE
+    assert Vehicle.load("Leaf-ZE0").name == "Nissan Leaf ZE0"
+    assert Vehicle.load("leaf_ze0").messages[0x1DB].rule is LEAF_RULE
 
 
 def test_a_car_without_temperature_on_its_bus_asks_for_one() -> None:
     with pytest.raises(InputError, match="no pack temperature") as caught:
-        load_vehicle("leaf_ze1")
+        Vehicle.load("leaf_ze1")
     assert caught.value.field == "--vehicle"
     assert "--temperature" in str(caught.value.cure)
 
@@ -95,26 +95,26 @@ def test_a_car_without_temperature_on_its_bus_asks_for_one() -> None:
 @pytest.mark.parametrize("temperature_c", [math.nan, math.inf, 300.0, -61.0])
 def test_a_fixed_temperature_must_be_one(temperature_c: float) -> None:
     with pytest.raises(InputError, match="--temperature"):
-        load_vehicle("leaf_ze1", temperature_c=temperature_c)
+        Vehicle.load("leaf_ze1", temperature_c=temperature_c)
 
 
 def test_an_unknown_vehicle_is_answered_with_the_closest() -> None:
     with pytest.raises(InputError, match="did you mean leaf_ze0") as caught:
-        load_vehicle("leafze0")
+        Vehicle.load("leafze0")
     assert caught.value.value == "leafze0"
     with pytest.raises(InputError, match="known are generic, leaf_ze0"):
-        load_vehicle("tesla")
+        Vehicle.load("tesla")
 
 
 def test_what_is_given_must_be_complete_and_not_too_much(own: Path) -> None:
     with pytest.raises(InputError, match="no vehicle is given"):
-        load_vehicle()
-    with pytest.raises(InputError, match=r"--map.*does not say which signals"):
-        load_vehicle(dbc=own / "car.dbc")
+        Vehicle.load()
+    with pytest.raises(InputError, match=r"--map.*does not name the signals"):
+        Vehicle.load(dbc=own / "car.dbc")
     with pytest.raises(InputError, match=r"dbc: is missing"):
-        load_vehicle(map_file=own / "car.toml")
+        Vehicle.load(map=own / "car.toml")
     with pytest.raises(InputError, match="given together"):
-        load_vehicle("generic", dbc=own / "car.dbc")
+        Vehicle.load("generic", dbc=own / "car.dbc")
 
 
 def test_own_dbc_and_map(own: Path) -> None:
@@ -132,7 +132,7 @@ def test_own_dbc_and_map(own: Path) -> None:
 
 def test_the_dbc_may_stand_in_the_map_file(own: Path) -> None:
     (own / "car.toml").write_text('dbc = "car.dbc"\n' + MAP)
-    assert load_vehicle(map_file=own / "car.toml").dbc_files == (str(own / "car.dbc"),)
+    assert Vehicle.load(map=own / "car.toml").dbc_files == (str(own / "car.dbc"),)
 
 
 def test_signals_may_come_from_two_dbc_files(own: Path) -> None:
@@ -280,7 +280,7 @@ def test_a_map_that_is_too_large_or_absent(own: Path) -> None:
     with pytest.raises(InputError, match="larger than"):
         load(own)
     with pytest.raises(InputError, match="no such file"):
-        load_vehicle(dbc=own / "car.dbc", map_file=own / "absent.toml")
+        Vehicle.load(dbc=own / "car.dbc", map=own / "absent.toml")
 
 
 def test_a_map_without_temperature_asks_for_one(own: Path) -> None:

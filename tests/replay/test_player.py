@@ -20,7 +20,7 @@ from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.publish import FrameIds, SocPublisher, standard_filter
 from cangauge.bus.time_source import is_clock
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import CangaugeError, InputError
 from cangauge.estimate.offline import run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
@@ -48,7 +48,7 @@ def play_log(
     channel: str, seconds: float, settings: ReplaySettings, preset: str = "generic"
 ) -> ReplayState:
     with virtual_port(channel, SOC_FRAMES) as port:
-        source = LogSource(short_log(seconds), load_vehicle(preset))
+        source = LogSource(short_log(seconds), Vehicle.load(preset))
         return play(port, source, settings, stop=never)
 
 
@@ -59,7 +59,7 @@ def play_log(
 def test_the_replayed_soc_is_the_offline_one_within_the_quantisation_bound(
     preset: str, method: str
 ) -> None:
-    vehicle, log, model = load_vehicle(preset), short_log(200.0), leaf_model()
+    vehicle, log, model = Vehicle.load(preset), short_log(200.0), leaf_model()
     estimator = EstimatorSettings(method=method, initial_soc_pct=80.0)  # type: ignore[arg-type] # parametrised
     settings = GaugeSettings(estimator, "replay-clock")
     with virtual_service(f"{preset}{method}", settings, vehicle=vehicle) as service:
@@ -78,7 +78,7 @@ def test_the_replayed_soc_is_the_offline_one_within_the_quantisation_bound(
 
 def test_the_bound_is_what_its_equation_says() -> None:
     log, model = short_log(200.0), leaf_model()
-    bound = quantisation_bound(load_vehicle("leaf_aze0"), model, log)
+    bound = quantisation_bound(Vehicle.load("leaf_aze0"), model, log)
     # 0.25 A over the log's length; no stamp of this log needs rounding.
     assert bound.coulomb_pct == pytest.approx(0.25 * log.duration_s / 36.0 / 51.5, rel=1e-6)
     resistance = 0.1032 + 0.01501 + 0.009697 + 0.004652
@@ -124,7 +124,7 @@ def test_nobody_listening_is_told_in_one_line() -> None:
 def test_a_service_for_another_vehicle_is_told() -> None:
     settings = ReplaySettings(speed=math.inf, wait_s=3.0, acknowledge_s=0.5)
     with (
-        virtual_service("other", REPLAYED, vehicle=load_vehicle("leaf_aze0")),
+        virtual_service("other", REPLAYED, vehicle=Vehicle.load("leaf_aze0")),
         pytest.raises(CangaugeError, match=r"0 of \d+ samples sent have been processed"),
     ):
         play_log("other", 100.0, settings)
@@ -135,7 +135,7 @@ def test_a_second_sender_on_the_bus_is_told() -> None:
         stop = threading.Event()
 
         def intrude() -> None:
-            encoder = FrameEncoder(load_vehicle("generic"))
+            encoder = FrameEncoder(Vehicle.load("generic"))
             for sample in itertools.cycle(samples_of(short_log(20.0))):
                 if stop.is_set():
                     return
@@ -172,8 +172,8 @@ class LossyBus:
 def test_a_frame_lost_on_the_way_does_not_pass_unnoticed() -> None:
     settings = ReplaySettings(speed=math.inf, wait_s=3.0, acknowledge_s=0.5)
     bus = LossyBus(open_bus(BusAddress("virtual", "lossy"), SOC_FRAMES), {200, 400, 401, 402})
-    source = LogSource(short_log(30.0), load_vehicle("leaf_aze0"))
-    with virtual_service("lossy", REPLAYED, vehicle=load_vehicle("leaf_aze0")) as service:
+    source = LogSource(short_log(30.0), Vehicle.load("leaf_aze0"))
+    with virtual_service("lossy", REPLAYED, vehicle=Vehicle.load("leaf_aze0")) as service:
         port = BusConnection(bus, "lossy")  # type: ignore[arg-type] # has what is used of a bus
         with port, pytest.raises(CangaugeError, match="of 300 samples sent have been processed"):
             play(port, source, settings, stop=never)
@@ -204,7 +204,7 @@ def test_frames_under_way_are_bounded() -> None:
     thread = threading.Thread(target=receive)
     with BusConnection(bus, "window") as port:
         thread.start()
-        source = LogSource(short_log(50.0), load_vehicle("generic"))
+        source = LogSource(short_log(50.0), Vehicle.load("generic"))
         state = play(port, source, MAX, stop=never)
     thread.join()
     receiver.shutdown()
@@ -263,7 +263,7 @@ def test_at_n_times_the_speed_the_estimate_is_the_same() -> None:
         assert waits(lambda: service.gauge.samples == 400)
     assert state.seconds == pytest.approx(39.9 / 40.0, abs=0.1)
     assert state.acknowledged is None
-    sent = FrameEncoder(load_vehicle("generic")).quantise(log)
+    sent = FrameEncoder(Vehicle.load("generic")).quantise(log)
     offline = run_estimator(samples_of(sent), model, EstimatorSettings()).soc_pct
     assert [estimate.soc_pct for _, estimate in service.rows] == offline.tolist()
 
@@ -278,7 +278,7 @@ def test_in_real_time_nobody_needs_to_listen_and_no_clock_is_sent() -> None:
 
 def test_looping_goes_on_until_it_is_stopped() -> None:
     with virtual_service("loop", REPLAYED) as service, virtual_port("loop", SOC_FRAMES) as port:
-        source = LogSource(short_log(5.0), load_vehicle("generic"))
+        source = LogSource(short_log(5.0), Vehicle.load("generic"))
         settings = ReplaySettings(speed=math.inf, loop=True)
         state = play(port, source, settings, stop=lambda: service.gauge.samples >= 220)
         assert state.samples >= 220
@@ -306,7 +306,7 @@ def test_ids_can_be_others() -> None:
     filters = [standard_filter(0x111), standard_filter(0x112)]
     settings = GaugeSettings(time_source="replay-clock", ids=ids)
     with virtual_service("ids", settings), virtual_port("ids", filters) as port:
-        source = LogSource(short_log(10.0), load_vehicle("generic"))
+        source = LogSource(short_log(10.0), Vehicle.load("generic"))
         state = play(port, source, ReplaySettings(math.inf, ids=ids), stop=never)
     assert state.acknowledged == 100
     assert state.soc is not None
@@ -315,7 +315,7 @@ def test_ids_can_be_others() -> None:
 @pytest.mark.real
 def test_a_real_leafs_capture_at_full_speed(shared_data: Path) -> None:
     path = shared_data / "leaf_can" / "ZE0w24kWhstock.log.gz"
-    vehicle = load_vehicle("leaf_ze0")
+    vehicle = Vehicle.load("leaf_ze0")
     with virtual_service("leaf", REPLAYED, vehicle=vehicle) as service:
         assert isinstance(service, Service)
         with virtual_port("leaf", SOC_FRAMES) as port:

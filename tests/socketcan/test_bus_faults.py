@@ -18,12 +18,13 @@ from typing import Self
 import can
 import pytest
 
+from bus_log import BusLog
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, has_socketcan, open_bus
 from cangauge.bus.publish import SocDetail, SocEstimate, SocReader, standard_filter
 from cangauge.bus.reconnect import LONGEST_PAUSE_S, ReconnectingBus
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.settings import EstimatorSettings
@@ -63,19 +64,27 @@ def _vcan0() -> Iterator[None]:
         ip("del", "vcan7")
 
 
-class Lasting(Service):
-    """The service on a port that lasts; what the port says is kept."""
+class Reconnecting(Service):
+    """The service on a reconnecting bus; its log is kept."""
 
     def __init__(self, address: BusAddress = VCAN, *, wait: bool = False) -> None:
         known = GaugeSettings(EstimatorSettings(initial_soc_pct=80.0))
-        gauge = Gauge(load_vehicle("generic"), leaf_model(), known)
-        self.lines: list[str] = []
-        port = ReconnectingBus(address, gauge.filters, self.lines.append)
+        gauge = Gauge(Vehicle.load("generic"), leaf_model(), known)
+        self.log = BusLog()
+        port = ReconnectingBus(address, gauge.filters)
         port.open(wait=wait)
         super().__init__(port, gauge, LoopSettings(timeout_s=STALE_S))
 
+    def __enter__(self) -> Self:
+        self.log.__enter__()
+        return super().__enter__()
+
+    def __exit__(self, *error: object) -> None:
+        super().__exit__(*error)
+        self.log.__exit__()
+
     @property
-    def lasting(self) -> ReconnectingBus:
+    def bus(self) -> ReconnectingBus:
         assert isinstance(self.port, ReconnectingBus)
         return self.port
 
@@ -98,8 +107,8 @@ class Pack:
         self._thread.join(10.0)
 
     def _run(self) -> None:
-        encoder = FrameEncoder(load_vehicle("generic"))
-        port = ReconnectingBus(self._address, [], lambda _line: None)
+        encoder = FrameEncoder(Vehicle.load("generic"))
+        port = ReconnectingBus(self._address, [])
         port.open(wait=True)
         with port:
             for sample in samples_of(short_log(600.0)):
@@ -139,7 +148,7 @@ def is_stale(told: SocEstimate) -> bool:
 
 @pytest.mark.parametrize("kind", ["down", "removed"])
 def test_an_interface_that_goes_and_comes_back(kind: str) -> None:
-    with Lasting() as live:
+    with Reconnecting() as live:
         with Pack():
             assert waits(lambda: live.gauge.samples >= 50)
         before = live.gauge.latest.soc_pct
@@ -147,18 +156,18 @@ def test_an_interface_that_goes_and_comes_back(kind: str) -> None:
             ip("set", "vcan0", "down")
         else:
             ip("del", "vcan0")
-        assert waits(lambda: live.lasting.is_away)
+        assert waits(lambda: live.bus.is_away)
         cpu_s = time.process_time()
         time.sleep(2.0)
         # The whole program's, this test's included; a loop that spins takes two seconds.
         assert time.process_time() - cpu_s < 0.5
         assert live.error is None
-        assert live.lasting.is_away
+        assert live.bus.is_away
         if kind == "down":
             ip("set", "vcan0", "up")
         else:
             add("vcan0")
-        assert waits(lambda: not live.lasting.is_away, LONGEST_PAUSE_S + 0.5)
+        assert waits(lambda: not live.bus.is_away, LONGEST_PAUSE_S + 0.5)
         with Listener() as listener:
             told = listener.next()
             assert is_stale(told)  # it goes on publishing, and says how old that is
@@ -170,40 +179,40 @@ def test_an_interface_that_goes_and_comes_back(kind: str) -> None:
             assert not is_stale(told)
             assert told.soc_pct == pytest.approx(before, abs=0.5)
     assert live.error is None
-    assert live.lasting.losses == 1
-    assert live.lasting.away_s >= 2.0
-    assert 1 <= len(live.lines) <= 3
-    assert live.lines[0].startswith("warning: socketcan vcan0: ")
+    assert live.bus.losses == 1
+    assert live.bus.away_s >= 2.0
+    assert [each for each in live.log.events if each != "bus.away"] == ["bus.lost", "bus.back"]
+    assert live.log.lines[0].startswith("socketcan vcan0: ")
 
 
 def test_an_interface_that_comes_and_goes() -> None:
-    with Lasting() as live, Pack():
+    with Reconnecting() as live, Pack():
         for _ in range(5):
             ip("set", "vcan0", "down")
             time.sleep(0.05)
             ip("set", "vcan0", "up")
             time.sleep(0.25)
-        assert waits(lambda: not live.lasting.is_away)
+        assert waits(lambda: not live.bus.is_away)
         samples = live.gauge.samples
         assert waits(lambda: live.gauge.samples >= samples + 20)
     assert live.error is None
     assert live.summary is not None
-    assert 1 <= live.lasting.losses <= 5
-    assert len(live.lines) <= live.summary.seconds + 1.0
+    assert 1 <= live.bus.losses <= 5
+    assert live.log.events.count("bus.lost") <= live.summary.seconds + 1.0
 
 
 def test_a_bus_that_does_not_exist_yet() -> None:
     address = BusAddress("socketcan", "vcan7")
     with pytest.raises(InputError, match="vcan7"):
-        Lasting(address)
-    with Lasting(address, wait=True) as live, Pack(address):
+        Reconnecting(address)
+    with Reconnecting(address, wait=True) as live, Pack(address):
         time.sleep(0.5)
-        assert live.lasting.is_away
+        assert live.bus.is_away
         add("vcan7")
         assert waits(lambda: live.gauge.samples >= 20)
     assert live.error is None
-    assert live.lasting.losses == 0
-    assert "waiting for it" in live.lines[0]
+    assert live.bus.losses == 0
+    assert live.log.events[-1] == "bus.back"
 
 
 def test_an_interface_that_is_down_is_told_when_it_is_opened() -> None:
@@ -238,7 +247,7 @@ def send_error(classes: int, data: bytes = bytes(8)) -> None:
 
 
 def test_error_frames_are_counted_by_kind_and_bus_off_is_told() -> None:
-    with Lasting() as live, Pack():
+    with Reconnecting() as live, Pack():
         assert waits(lambda: live.gauge.samples >= 10)
         for _ in range(5):
             send_error(0x088)
@@ -247,21 +256,21 @@ def test_error_frames_are_counted_by_kind_and_bus_off_is_told() -> None:
         assert live.port.error_kinds == {
             "protocol": 5, "bus_error": 5, "controller_receive_overflow": 1,
         }  # fmt: skip
-        assert live.lines == []
+        assert live.log.lines == []
         send_error(0x040)
         assert waits(lambda: live.port.error_kinds["bus_off"] == 1)
-        assert waits(lambda: bool(live.lines))
-        assert "bus-off" in live.lines[0]
+        assert waits(lambda: bool(live.log.lines))
+        assert "bus-off" in live.log.lines[0]
         send_error(0x100)
         frames = live.gauge.counts.frames
         assert waits(lambda: live.gauge.counts.frames > frames + 20)
         assert not live.port.is_off
     assert live.error is None
-    assert live.lasting.losses == 0
+    assert live.bus.losses == 0
 
 
 def test_two_thousand_error_frames_keep_nothing_from_the_estimate() -> None:
-    with Lasting() as live, Pack() as pack:
+    with Reconnecting() as live, Pack() as pack:
         assert waits(lambda: live.gauge.samples >= 10)
         with socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw:
             raw.bind(("vcan0",))
@@ -293,10 +302,10 @@ def test_the_kernel_stamps_when_a_frame_comes_in_and_not_when_it_is_read() -> No
 
 
 def test_two_services_notice_each_other() -> None:
-    with Lasting() as one:
+    with Reconnecting() as one:
         time.sleep(0.5)
         assert one.warnings == []
-        with Lasting() as two:
+        with Reconnecting() as two:
             assert waits(lambda: bool(one.warnings) and bool(two.warnings))
     assert "somebody else sends 0x5A" in one.warnings[0]
 
@@ -359,7 +368,7 @@ def _wait_until_worked_off() -> None:
 
 def _overflow() -> int:
     """Send until a receive queue as large as the service's has overflowed; return how many."""
-    encoder, sent = FrameEncoder(load_vehicle("generic")), 0
+    encoder, sent = FrameEncoder(Vehicle.load("generic")), 0
     frames = [frame for each in samples_of(short_log(200.0)) for frame in encoder.encode(each)]
     with (
         BusConnection(open_bus(VCAN), "witness") as witness,

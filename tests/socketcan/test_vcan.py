@@ -14,11 +14,12 @@ import can
 import numpy as np
 import pytest
 
-from cangauge.bus.connection import BusConnection, NothingWaitsError, pending_frames
+from cangauge.bus.backend import NoPendingFrameError, pending_frames
+from cangauge.bus.connection import BusConnection
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, has_socketcan, open_bus
 from cangauge.bus.publish import FrameIds, SocEstimate, SocReader, standard_filter
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.offline import run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
@@ -60,7 +61,7 @@ def replay_port() -> Iterator[BusConnection]:
 
 
 def service(preset: str, settings: GaugeSettings, record: Recorder | None = None) -> Service:
-    gauge = Gauge(load_vehicle(preset), leaf_model(), settings)
+    gauge = Gauge(Vehicle.load(preset), leaf_model(), settings)
     return Service(
         BusConnection(open_bus(VCAN, gauge.filters), str(VCAN)), gauge, LoopSettings(), record
     )
@@ -101,7 +102,7 @@ def test_frames_read_without_asking_are_those_of_python_can(
         while (message := theirs.recv(0.5)) is not None:
             expected.append(message)
         found = [waiting.next() for _ in expected]
-        with pytest.raises(NothingWaitsError):
+        with pytest.raises(NoPendingFrameError):
             waiting.next()
         waiting.close()
     # The kernel's filters let pass two of the sent ones less, and every error frame.
@@ -118,7 +119,7 @@ def test_the_default_bus_is_vcan0() -> None:
 def test_a_log_at_full_speed_within_the_bound_and_bit_for_bit(
     replay_port: BusConnection, tmp_path: Path, preset: str
 ) -> None:
-    log, vehicle, path = short_log(60.0), load_vehicle(preset), tmp_path / "vcan0.log"
+    log, vehicle, path = short_log(60.0), Vehicle.load(preset), tmp_path / "vcan0.log"
     estimator = EstimatorSettings(initial_soc_pct=80.0)
     settings = GaugeSettings(estimator, "replay-clock")
     with Recorder(path) as recorder, service(preset, settings, recorder) as live:
@@ -141,20 +142,20 @@ def test_in_real_time_the_kernels_stamps_are_bus_time(
     log, path = short_log(6.01), tmp_path / "vcan0.log"
     with Recorder(path) as recorder, service("generic", GaugeSettings(), recorder) as live:
         state = play(
-            replay_port, LogSource(log, load_vehicle("generic")), ReplaySettings(), stop=never
+            replay_port, LogSource(log, Vehicle.load("generic")), ReplaySettings(), stop=never
         )
         assert waits(lambda: live.gauge.samples == len(log))
     assert state.seconds == pytest.approx(6.0, abs=0.1)
     times = np.array([time_s for time_s, _ in live.rows])
     assert np.max(np.abs(times - times[0] - log.time_s)) < 0.1
-    recorded = estimate_capture(path, load_vehicle("generic"), leaf_model())
+    recorded = estimate_capture(path, Vehicle.load("generic"), leaf_model())
     assert recorded.time_source == "receive"
     assert recorded.table.time_s.tolist() == times.tolist()
     assert recorded.table.soc_pct.tolist() == [each.soc_pct for _, each in live.rows]
 
 
 def test_the_kernel_filters_the_wanted_ids() -> None:
-    gauge = Gauge(load_vehicle("leaf_aze0"), leaf_model())
+    gauge = Gauge(Vehicle.load("leaf_aze0"), leaf_model())
     bus = open_bus(VCAN, gauge.filters)
     raw = bus.socket.getsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, 64)  # type: ignore[attr-defined] # SocketcanBus
     assert len(raw) == 8 * 3
@@ -173,7 +174,7 @@ def test_the_kernel_filters_the_wanted_ids() -> None:
 
 def test_unwanted_traffic_costs_no_wanted_frame(replay_port: BusConnection, tmp_path: Path) -> None:
     """2,000 unwanted frames for 100 wanted ones, as fast as they can be sent."""
-    encoder, path = FrameEncoder(load_vehicle("leaf_aze0")), tmp_path / "busy.log"
+    encoder, path = FrameEncoder(Vehicle.load("leaf_aze0")), tmp_path / "busy.log"
     time_s = 1.7e9
     with Recorder(path) as recorder:
         for sample in samples_of(short_log(10.0)):
@@ -189,7 +190,7 @@ def test_unwanted_traffic_costs_no_wanted_frame(replay_port: BusConnection, tmp_
                     )
                 )
             time_s += 0.01
-    vehicle = load_vehicle("leaf_aze0")
+    vehicle = Vehicle.load("leaf_aze0")
     settings = GaugeSettings(time_source="replay-clock")
     with service("leaf_aze0", settings) as live:
         state = play(replay_port, CaptureSource(path, vehicle), MAX, stop=never)
@@ -202,7 +203,7 @@ def test_what_is_published_can_be_read_by_others(replay_port: BusConnection) -> 
     listener = can.Bus("vcan0", interface="socketcan", ignore_config=True, can_filters=SOC_FRAMES)
     with service("generic", GaugeSettings(time_source="replay-clock")) as live:
         log = short_log(20.0)
-        play(replay_port, LogSource(log, load_vehicle("generic")), MAX, stop=never)
+        play(replay_port, LogSource(log, Vehicle.load("generic")), MAX, stop=never)
         assert waits(lambda: live.gauge.samples == len(log))
         time.sleep(0.3)
     reader = SocReader(FrameIds())
@@ -252,7 +253,7 @@ def test_both_commands_and_a_bus_that_goes_down(tmp_path: Path) -> None:
     assert ended.code == 0
     assert ended.json["bus_losses"] == 1
     # What was recorded until then is there.
-    recorded = estimate_capture(record, load_vehicle("generic"), leaf_model())
+    recorded = estimate_capture(record, Vehicle.load("generic"), leaf_model())
     assert recorded.table.soc_pct.size == 200
 
 
@@ -267,7 +268,7 @@ def test_a_real_trip_within_the_bound_and_bit_for_bit(shared_data: Path) -> None
     model = identify(read_trips(folder, ["A01", "A03", "A05"])).model
     trip = read_trips(folder, ["A02"])[0].rows(slice(0, 6000))
     for preset in ("generic", "leaf_aze0"):
-        result = compare(trip, load_vehicle(preset), model, VCAN)
+        result = compare(trip, Vehicle.load(preset), model, VCAN)
         assert result.samples == 6000
         assert result.lost == 0
         assert result.is_bit_for_bit

@@ -132,7 +132,7 @@ def capture_samples(
     if bus is None or not len(bus):
         raise _no_samples(Path(path), vehicle, bus)
     time_s, current_a, voltage_v, temperature_c, soc_pct = bus.columns()
-    info, counters = capture.info, bus.assembler.counters
+    info, counters = capture.info, bus.assembler.statistics
     remarks = [*info.remarks, *_fate(counters)]
     if sum(len(other) > 0 for other in buses.values()) > 1:
         remarks.append(f"several buses carry the frames: bus {channel} is used, which has most")
@@ -226,7 +226,7 @@ def _decode(capture: Capture, vehicle: Vehicle, clock: TimeSource) -> dict[Chann
 
 def _no_samples(path: Path, vehicle: Vehicle, bus: _Bus | None) -> InputError:
     name = f"0x{vehicle.current.arbitration_id:X} ({vehicle.current.message})"
-    counters = None if bus is None else bus.assembler.counters
+    counters = None if bus is None else bus.assembler.statistics
     if counters is None or not counters.messages[vehicle.current.key].wanted:
         problem = f"the capture holds no frames of {name}, which has the current"
     else:

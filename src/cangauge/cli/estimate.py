@@ -398,9 +398,9 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
         if not described:
             raise
         # cantools is slow to import, and logs do without.
-        from cangauge.bus.vehicle import load_vehicle  # noqa: PLC0415
+        from cangauge.bus.vehicle import Vehicle  # noqa: PLC0415
 
-        car = load_vehicle(vehicle, dbc, map_file, temperature_c=temperature)
+        car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature)
         source = known_temperature_source(temperature_source) or "unknown"
         done = from_capture(log_path, car, model, replace(settings, temperature_source=source))
     else:

@@ -100,12 +100,12 @@ def _inspect_capture(
     temperature_c: float | None,
 ) -> CaptureInspection:
     # Imported here: python-can and cantools are slow to import, and logs do without.
-    from cangauge.bus.vehicle import load_vehicle  # noqa: PLC0415
+    from cangauge.bus.vehicle import Vehicle  # noqa: PLC0415
     from cangauge.inspect.capture import inspect_capture  # noqa: PLC0415
 
     car = None
     if vehicle is not None or dbc is not None or map_file is not None:
-        car = load_vehicle(vehicle, dbc, map_file, temperature_c=temperature_c)
+        car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature_c)
     return inspect_capture(path, car)
 
 

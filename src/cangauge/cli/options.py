@@ -124,9 +124,9 @@ def load_log(
             raise
         # cantools is slow to import, and logs do without.
         from cangauge.bus.capture_log import capture_to_log  # noqa: PLC0415
-        from cangauge.bus.vehicle import load_vehicle  # noqa: PLC0415
+        from cangauge.bus.vehicle import Vehicle  # noqa: PLC0415
 
-        car = load_vehicle(vehicle, dbc, map_file, temperature_c=temperature_c)
+        car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature_c)
         log, is_capture = capture_to_log(path, car), True
         if source is not None:
             log = replace(log, temperature_source=source)

@@ -16,7 +16,7 @@ from cangauge.bus.connection import BusConnection
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import bus_address, open_bus, parse_bus_options
 from cangauge.bus.publish import FrameIds, standard_filter
-from cangauge.bus.vehicle import Vehicle, load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.options import (
     BusDbcOption,
     BusMapOption,
@@ -111,7 +111,7 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
     described = (vehicle, dbc, map_file) != (None, None, None)
     car: Vehicle | None = None
     if described:
-        car = load_vehicle(vehicle, dbc, map_file, temperature_c=temperature)
+        car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature)
     source = _source(recorded, car, ids)
     address = bus_address(interface, channel, parse_bus_options(bus_option or []))
     with ExitStack() as stack:
@@ -139,7 +139,7 @@ def _source(recorded: Path, car: Vehicle | None, ids: FrameIds) -> Source:
     log = read_log(recorded)
     for remark in log.remarks:
         note(f"{recorded}: {remark}")
-    return LogSource(log, car or load_vehicle(DEFAULT_VEHICLE))
+    return LogSource(log, car or Vehicle.load(DEFAULT_VEHICLE))
 
 
 def _speed(text: str) -> float:

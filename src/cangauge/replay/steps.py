@@ -274,12 +274,12 @@ class _SampleCounter:
     samples: int = 0
 
     def __post_init__(self) -> None:
-        self._assembler = SampleDecoder(self.vehicle)
+        self._decoder = SampleDecoder(self.vehicle)
 
     def after(self, frames: Iterable[can.Message]) -> int:
         """Return how many samples there are after these frames."""
         for frame in frames:
-            if self._assembler.handle(frame) is not None:
+            if self._decoder.handle(frame) is not None:
                 self.samples += 1
         return self.samples
 

@@ -193,7 +193,7 @@ class EstimateStream:
     @property
     def counts(self) -> FrameCounts:
         """What happened to the frames so far."""
-        now = self._assembler.counters
+        now = self._assembler.statistics
         return self._past + FrameCounts(
             frames=now.frames,
             samples=now.samples,
@@ -211,7 +211,7 @@ class EstimateStream:
     @property
     def counters(self) -> FrameStatistics:
         """The same in detail, of the log that is running."""
-        return self._assembler.counters
+        return self._assembler.statistics
 
     @property
     def reference_soc_pct(self) -> float:
@@ -300,7 +300,7 @@ class EstimateStream:
         """
         sample = self.latest_sample
         estimate = self._latest if self._estimated is None else self._estimated
-        missing = self._assembler.health.reasons(now_s)
+        missing = self._assembler.reasons(now_s)
         reasons = estimate.reasons
         if sample is not None and math.isnan(sample.voltage_v):
             reasons &= ~Reason.VOLTAGE_MISSING

@@ -11,13 +11,8 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.connection import (
-    AT_ONCE,
-    BusConnection,
-    BusError,
-    NothingWaitsError,
-    pending_frames,
-)
+from cangauge.bus.backend import NoPendingFrameError, pending_frames
+from cangauge.bus.connection import AT_ONCE, BusConnection, BusError
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.publish import standard_filter
 from live import BrokenBus, network_down, same_frames, unpack_error
@@ -94,7 +89,7 @@ def test_the_frames_are_those_of_python_can(
             message = waiting.next()
             if message is not None:
                 found.append(message)
-        with pytest.raises(NothingWaitsError):
+        with pytest.raises(NoPendingFrameError):
             waiting.next()
         waiting.close()
     assert (
@@ -115,13 +110,13 @@ def test_other_filters_hold_from_the_next_frame_on() -> None:
     ):
         for _ in range(2):
             sender.send(frame)
-            assert port.receive_waiting(0.2) == []
+            assert port.receive_pending(0.2) == []
         port.set_filters([standard_filter(0x55)])
         sender.send(frame)
-        assert len(port.receive_waiting(0.2)) == 1
+        assert len(port.receive_pending(0.2)) == 1
         port.set_filters(FILTERS)
         sender.send(frame)
-        assert port.receive_waiting(0.2) == []
+        assert port.receive_pending(0.2) == []
 
 
 @linux_only
@@ -141,7 +136,7 @@ def test_what_is_no_frame_is_counted_and_passed_over() -> None:
         sender.send(good)
         for _ in junk:
             assert theirs.receive(0.2) is None
-        assert len(ours.receive_waiting(0.2)) == 1
+        assert len(ours.receive_pending(0.2)) == 1
         assert ours.garbled == theirs.garbled == len(junk)
 
 
@@ -152,14 +147,14 @@ def test_many_that_wait_come_in_parts_and_in_order_and_nothing_is_waited_for() -
         for number in range(3 * AT_ONCE + 1):
             sender.send(can.Message(arbitration_id=number, is_extended_id=False))
         began_s = time.monotonic()
-        parts = [port.receive_waiting(5.0) for _ in range(4)]
+        parts = [port.receive_pending(5.0) for _ in range(4)]
         assert time.monotonic() - began_s < 1.0
         assert [len(each) for each in parts] == [AT_ONCE, AT_ONCE, AT_ONCE, 1]
         assert [each.arbitration_id for part in parts for each in part] == list(
             range(3 * AT_ONCE + 1)
         )
         began_s = time.monotonic()
-        assert port.receive_waiting(0.2) == []
+        assert port.receive_pending(0.2) == []
         assert 0.19 < time.monotonic() - began_s < 1.0
 
 
@@ -172,7 +167,7 @@ def test_a_closed_port_leaves_no_descriptor_behind() -> None:
     before = descriptors()
     for _ in range(3):
         with BusConnection(open_bus(address), "rx") as port:
-            port.receive_waiting(0.0)
+            port.receive_pending(0.0)
     assert descriptors() == before
 
 
@@ -180,10 +175,10 @@ def test_a_bus_whose_socket_is_not_known_gives_one_frame_at_a_time() -> None:
     frame = can.Message(arbitration_id=1)
     script: list[object] = [frame, frame, None, unpack_error(), frame, network_down()]
     port = BusConnection(BrokenBus(script), "x")  # type: ignore[arg-type] # what is used of one
-    assert [len(port.receive_waiting(0.0)) for _ in range(5)] == [1, 1, 0, 0, 1]
+    assert [len(port.receive_pending(0.0)) for _ in range(5)] == [1, 1, 0, 0, 1]
     assert port.garbled == 1
     with pytest.raises(BusError):
-        port.receive_waiting(0.0)
+        port.receive_pending(0.0)
 
 
 class Script:
@@ -193,7 +188,7 @@ class Script:
         self._steps = list(steps)
 
     def next(self) -> can.Message | None:
-        step = self._steps.pop(0) if self._steps else NothingWaitsError()
+        step = self._steps.pop(0) if self._steps else NoPendingFrameError()
         if isinstance(step, BaseException):
             raise step
         return step  # type: ignore[return-value] # a message or None
@@ -211,17 +206,17 @@ class Script:
 def test_an_error_takes_no_frame_with_it_that_was_read_before() -> None:
     frame = can.Message(arbitration_id=1)
     port = BusConnection(BrokenBus([]), "x")  # type: ignore[arg-type] # what is used of one
-    port._waiting = Script(frame, unpack_error(), None, frame, network_down())
-    assert port.receive_waiting(0.0) == [frame, frame]
+    port._pending = Script(frame, unpack_error(), None, frame, network_down())
+    assert port.receive_pending(0.0) == [frame, frame]
     assert port.garbled == 1
     for _ in range(2):
         with pytest.raises(BusError, match="Network is down"):
-            port.receive_waiting(0.0)
+            port.receive_pending(0.0)
 
 
 def test_frames_after_an_error_frame_wait_for_the_next_call() -> None:
     frame, error = can.Message(arbitration_id=1), can.Message(is_error_frame=True)
     port = BusConnection(BrokenBus([]), "x")  # type: ignore[arg-type] # what is used of one
-    port._waiting = Script(frame, error, error, frame, frame)
-    assert [len(port.receive_waiting(0.0)) for _ in range(4)] == [1, 0, 2, 0]
+    port._pending = Script(frame, error, error, frame, frame)
+    assert [len(port.receive_pending(0.0)) for _ in range(4)] == [1, 0, 2, 0]
     assert port.error_frames == 2

@@ -11,7 +11,7 @@ import pytest
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import LEAF_RULE
-from cangauge.bus.vehicle import EXTENDED, Vehicle, load_vehicle
+from cangauge.bus.vehicle import EXTENDED, Vehicle
 from cangauge.estimate.validity import Sample
 
 CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID, SOC_ID = 0x400, 0x401, 0x402, 0x403
@@ -19,12 +19,12 @@ CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID, SOC_ID = 0x400, 0x401, 0x402, 0x403
 
 @pytest.fixture(scope="module")
 def generic() -> Vehicle:
-    return load_vehicle("generic")
+    return Vehicle.load("generic")
 
 
 @pytest.fixture(scope="module")
 def leaf() -> Vehicle:
-    return load_vehicle("leaf_ze0")
+    return Vehicle.load("leaf_ze0")
 
 
 def frames_of(
@@ -52,8 +52,8 @@ def test_every_sample_arrives_with_its_temperature_and_soc(generic: Vehicle) -> 
     assert [each.current_a for each in samples] == [float(n) for n in range(10)]
     assert all(each.temperature_c == 20.0 for each in samples)
     assert assembler.reference_soc_pct == 50.0
-    assert assembler.counters.samples == 10
-    assert assembler.last_update_s == {
+    assert assembler.statistics.samples == 10
+    assert {role: each.latest_s for role, each in assembler.health.items()} == {
         "current": 0.9,
         "voltage": 0.9,
         "temperature": 0.0,
@@ -63,11 +63,11 @@ def test_every_sample_arrives_with_its_temperature_and_soc(generic: Vehicle) -> 
 
 def test_only_wanted_ids_are_looked_at(generic: Vehicle) -> None:
     assembler = SampleDecoder(generic)
-    assert assembler.wanted_ids == (CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID, SOC_ID)
+    assert generic.wanted_ids == (CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID, SOC_ID)
     strange = can.Message(arbitration_id=0x123, is_extended_id=False, data=b"\xff" * 8)
     assert assembler.handle(strange) is None
-    assert assembler.counters.frames == 1
-    assert assembler.counters.wanted == 0
+    assert assembler.statistics.frames == 1
+    assert assembler.statistics.wanted == 0
 
 
 @pytest.mark.parametrize("kind", ["is_extended_id", "is_remote_frame", "is_error_frame"])
@@ -77,8 +77,8 @@ def test_extended_remote_and_error_frames_are_not_taken(generic: Vehicle, kind: 
         setattr(frame, kind, True)
         assert assembler.handle(frame) is None
     assert assembler.flush() is None
-    assert assembler.counters.wanted == 0
-    assert assembler.counters.ignored == (0 if kind == "is_extended_id" else 22)
+    assert assembler.statistics.wanted == 0
+    assert assembler.statistics.ignored == (0 if kind == "is_extended_id" else 22)
 
 
 def test_damaged_and_short_frames_are_refused_and_counted(generic: Vehicle) -> None:
@@ -91,7 +91,7 @@ def test_damaged_and_short_frames_are_refused_and_counted(generic: Vehicle) -> N
     assert last is not None
     currents = [each.current_a for each in (*samples, last)]
     assert currents == [0.0, 1.0, 2.0, 4.0, 6.0, 7.0, 8.0, 9.0]
-    fate = assembler.counters.messages[CURRENT_ID]
+    fate = assembler.statistics.messages[CURRENT_ID]
     assert (fate.crc_errors, fate.short) == (1, 1)
     # The short one is missing from the counters' view; the damaged one is not counted again.
     assert (fate.counter_jumps, fate.frames_lost) == (1, 1)
@@ -102,7 +102,7 @@ def test_repeated_frames_are_refused(generic: Vehicle) -> None:
     assembler = SampleDecoder(generic)
     samples = feed(assembler, [frame for frame in frames for _ in range(2)])
     assert [each.current_a for each in samples] == [0.0, 1.0, 2.0, 3.0, 4.0]
-    assert assembler.counters.counter_repeats == len(frames)
+    assert assembler.statistics.counter_repeats == len(frames)
 
 
 def test_neighbours_of_lost_frames_are_used(generic: Vehicle) -> None:
@@ -114,8 +114,8 @@ def test_neighbours_of_lost_frames_are_used(generic: Vehicle) -> None:
     assembler = SampleDecoder(generic)
     samples = feed(assembler, frames)
     assert [each.current_a for each in samples] == [0.0, 1.0, 2.0, 6.0, 7.0, 8.0, 9.0]
-    assert assembler.counters.counter_jumps == 2
-    assert assembler.counters.frames_lost == 6
+    assert assembler.statistics.counter_jumps == 2
+    assert assembler.statistics.frames_lost == 6
 
 
 def test_longer_frames_are_read_by_their_first_bytes(generic: Vehicle) -> None:
@@ -159,10 +159,10 @@ def test_reference_soc_is_nan_when_it_is_old(generic: Vehicle) -> None:
 
 
 def test_fixed_temperature_needs_no_frame() -> None:
-    vehicle = load_vehicle("generic", temperature_c=12.5)
+    vehicle = Vehicle.load("generic", temperature_c=12.5)
     assembler = SampleDecoder(vehicle)
-    assert TEMPERATURE_ID not in assembler.wanted_ids
-    samples = feed(assembler, frames_of(load_vehicle("generic"), 20, step_s=5.0))
+    assert TEMPERATURE_ID not in vehicle.wanted_ids
+    samples = feed(assembler, frames_of(Vehicle.load("generic"), 20, step_s=5.0))
     assert {each.temperature_c for each in samples} == {12.5}
 
 
@@ -172,7 +172,7 @@ def test_a_log_that_starts_again_is_decoded_again(generic: Vehicle) -> None:
     first = feed(assembler, frames)
     second = feed(assembler, frames_of(generic, 16))
     assert first == second
-    assert assembler.counters.time_reversals > 0
+    assert assembler.statistics.time_reversals > 0
 
 
 def test_old_values_do_not_hold_for_ever_when_time_starts_again(generic: Vehicle) -> None:
@@ -205,9 +205,9 @@ def test_leaf_turns_the_sign_and_refuses_codes_of_wake_up(leaf: Vehicle) -> None
     assert sample is not None
     assert (sample.time_s, sample.current_a, sample.voltage_v) == (0.02, 9.5, 373.0)
     assert math.isnan(sample.temperature_c)
-    assert assembler.counters.not_available == 3
-    assert assembler.counters.current_unpaired == 1
-    assert assembler.last_update_s["voltage"] == 0.02
+    assert assembler.statistics.not_available == 3
+    assert assembler.statistics.current_unpaired == 1
+    assert assembler.health["voltage"].latest_s == 0.02
 
 
 def test_leaf_takes_the_average_of_the_multiplexed_temperatures(leaf: Vehicle) -> None:
@@ -220,7 +220,7 @@ def test_leaf_takes_the_average_of_the_multiplexed_temperatures(leaf: Vehicle) -
     sample = assembler.handle(leaf_frame("FDA0BAAA00000000", 0.3, 2))
     assert sample is not None
     assert sample.temperature_c == 0x56 / 2 - 40
-    assert assembler.last_update_s["temperature"] == 0.1
+    assert assembler.health["temperature"].latest_s == 0.1
 
 
 def test_an_extended_id_is_wanted_where_the_dbc_means_it(generic: Vehicle) -> None:
@@ -228,7 +228,7 @@ def test_an_extended_id_is_wanted_where_the_dbc_means_it(generic: Vehicle) -> No
     messages = {**generic.messages, signal.key: generic.messages[CURRENT_ID]}
     vehicle = replace(generic, current=signal, messages=messages)
     assembler = SampleDecoder(vehicle)
-    assert assembler.wanted_ids[0] == 0x18FF0001
+    assert vehicle.wanted_ids[0] == 0x18FF0001
     assert vehicle.filters[0] == {
         "can_id": 0x18FF0001,
         "can_mask": 0x1FFFFFFF,
@@ -237,12 +237,10 @@ def test_an_extended_id_is_wanted_where_the_dbc_means_it(generic: Vehicle) -> No
     assert len(feed(assembler, frames_of(vehicle))) == 10
 
 
-def test_counters_as_plain_values(generic: Vehicle) -> None:
-    assembler = SampleDecoder(generic)
-    feed(assembler, frames_of(generic))
-    told = assembler.counters.to_dict()
-    assert told["samples"] == 10
-    assert told["wanted"] == told["frames"] == 22
-    messages = told["messages"]
-    assert isinstance(messages, dict)
-    assert messages["0x400"]["wanted"] == 10
+def test_totals_are_sums_over_the_messages(generic: Vehicle) -> None:
+    decoder = SampleDecoder(generic)
+    feed(decoder, frames_of(generic))
+    statistics = decoder.statistics
+    assert statistics.samples == 10
+    assert statistics.wanted == statistics.frames == 22
+    assert statistics.messages[CURRENT_ID].wanted == 10
