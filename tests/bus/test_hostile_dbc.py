@@ -1,4 +1,4 @@
-"""DBC files that are broken, strange or made to do harm: refused, soon, in one line."""
+"""Broken, unusual and hostile DBC files: refused quickly, in one line."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def load(folder: Path, content: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "text"),
     [
         ("BO_ 1 X: 100000000 Y\n", "a message that is too long"),
         ("BO_\t1\tX\t:\t100000000Y\n", "a message that is too long"),
@@ -64,10 +64,10 @@ def load(folder: Path, content: bytes) -> None:
         ("\x00" * 100, "not a DBC"),
     ],
 )
-def test_refused_in_bounded_time_and_memory(tmp_path: Path, content: str, told: str) -> None:
+def test_refused_in_bounded_time_and_memory(tmp_path: Path, content: str, text: str) -> None:
     tracemalloc.start()
     start = time.process_time()
-    with pytest.raises(InputError, match=told) as caught:
+    with pytest.raises(InputError, match=text) as caught:
         load(tmp_path, content.encode())
     elapsed = time.process_time() - start
     peak = tracemalloc.get_traced_memory()[1]
@@ -77,7 +77,7 @@ def test_refused_in_bounded_time_and_memory(tmp_path: Path, content: str, told: 
     assert peak < 50 * MAX_DBC_BYTES
 
 
-def test_a_circle_of_multiplexers_is_no_endless_loop(tmp_path: Path) -> None:
+def test_a_circle_of_multiplexers_is_refused(tmp_path: Path) -> None:
     text = (
         "BO_ 256 M: 8 X\n"
         ' SG_ a m1M : 0|8@1+ (1,0) [0|0] "A" X\n'
@@ -92,20 +92,20 @@ def test_a_circle_of_multiplexers_is_no_endless_loop(tmp_path: Path) -> None:
         Vehicle.load(map=tmp_path / "x.toml")
 
 
-def test_umlauts_of_windows_tools_and_byte_order_marks_are_read(tmp_path: Path) -> None:
+def test_windows_umlauts_and_byte_order_marks_are_read(tmp_path: Path) -> None:
     load(tmp_path, (GOOD + 'CM_ "Größe in °C";\n').encode("cp1252"))
     load(tmp_path, b"\xef\xbb\xbf" + GOOD.encode())
     load(tmp_path, GOOD.replace("\n", "\r\n").encode())
 
 
-def test_absent_and_folder(tmp_path: Path) -> None:
+def test_absent_files_and_folders_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         load_dbc(tmp_path / "absent.dbc")
     with pytest.raises(InputError, match="this is a folder"):
         load_dbc(tmp_path)
 
 
-def test_messages_defined_twice_make_no_noise(
+def test_messages_defined_twice_print_nothing(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     load(tmp_path, (GOOD * 3).encode())

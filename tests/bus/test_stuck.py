@@ -1,4 +1,4 @@
-"""A signal that stands still while the other one proves that it should move."""
+"""Stuck detection: a constant signal while its partner swings."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def watched(
     seconds: float,
     step: float = 0.5,
 ) -> tuple[float | None, float | None]:
-    """When current and voltage were first called stuck [s]."""
+    """Return when current and voltage first count as stuck [s]."""
     detectors = pair(step)
     found: list[float | None] = [None, None]
     for now_s in times(seconds):
@@ -59,14 +59,14 @@ def test_a_moving_pair_is_not_stuck() -> None:
     assert watched(driving, under_load, 600.0) == (None, None)
 
 
-def test_a_voltage_that_freezes_while_the_current_swings() -> None:
+def test_a_frozen_voltage_is_stuck_while_the_current_swings() -> None:
     current, voltage = watched(driving, lambda t: under_load(min(t, 60.0)), 200.0)
     assert current is None
     assert voltage is not None
     assert 70.0 <= voltage <= 110.0
 
 
-def test_a_current_that_freezes_while_the_voltage_swings() -> None:
+def test_a_frozen_current_is_stuck_while_the_voltage_swings() -> None:
     current, voltage = watched(lambda t: driving(min(t, 60.0)), under_load, 200.0)
     assert voltage is None
     assert current is not None
@@ -74,13 +74,13 @@ def test_a_current_that_freezes_while_the_voltage_swings() -> None:
 
 
 def test_at_rest_nothing_is_stuck() -> None:
-    # The current's last step flickers; the voltage stands still for hours.
+    # The last bit of the current flickers; the voltage is constant for hours.
     assert watched(lambda t: 0.5 * (int(t) % 3), lambda _: 380.0, 7200.0) == (None, None)
 
 
 def test_a_charge_at_constant_current_is_not_stuck() -> None:
     assert watched(lambda _: -20.0, lambda t: 350.0 + 0.01 * t, 7200.0) == (None, None)
-    # Nor is what follows a step of the current: slow polarisation, one way.
+    # Nor is the relaxation after a step of the current: it drifts one way.
     assert watched(lambda _: 0.0, lambda t: 380.0 - 8.0 * math.exp(-t / 30.0), 600.0) == (
         None,
         None,
@@ -88,14 +88,14 @@ def test_a_charge_at_constant_current_is_not_stuck() -> None:
 
 
 @pytest.mark.parametrize("noise_v", [0.5, 1.5])
-def test_a_meters_noise_beside_a_current_of_0_is_no_proof(noise_v: float) -> None:
-    # Worst case: noise that always turns, three times the model's error.
+def test_voltage_noise_at_zero_current_proves_nothing(noise_v: float) -> None:
+    # Worst case: alternating noise of up to three times the model error.
     noisy = watched(lambda _: 0.0, lambda t: 370.0 + noise_v * (-1) ** int(10.0 * t), 3600.0, 0.01)
     assert noisy == (None, None)
 
 
-def test_a_coarse_voltage_is_given_its_own_step() -> None:
-    """A voltage in steps of 5 V stands still under currents of ±20 A: 2 V."""
+def test_a_coarse_voltage_needs_larger_swings() -> None:
+    """A voltage in steps of 5 V is constant under currents of ±20 A: 2 V."""
     current, voltage = pair(0.01)
     for now_s in times(600.0):
         current_a = 20.0 * math.sin(now_s / 3.0) + (100.0 if now_s < 60.0 else 0.0)
@@ -103,7 +103,7 @@ def test_a_coarse_voltage_is_given_its_own_step() -> None:
         assert not voltage.update(rounded(370.0 - 0.1 * current_a, 5.0), now_s)
 
 
-def test_a_signal_that_moves_again_is_watched_anew() -> None:
+def test_a_signal_that_changes_again_is_no_longer_stuck() -> None:
     current, voltage = pair()
     verdicts = []
     for now_s in times(200.0):

@@ -1,4 +1,4 @@
-"""Replay and service on one bus: nothing lost, timing kept, clear words when nobody listens."""
+"""Replay to a service on one bus: no loss, recorded timing, errors without a receiver."""
 
 from __future__ import annotations
 
@@ -56,9 +56,7 @@ def play_log(
     ("preset", "method"),
     [("generic", "ekf"), ("generic", "newton"), ("generic", "coulomb"), ("leaf_aze0", "ekf")],
 )
-def test_the_replayed_soc_is_the_offline_one_within_the_quantisation_bound(
-    preset: str, method: str
-) -> None:
+def test_replayed_soc_is_offline_soc_within_the_bound(preset: str, method: str) -> None:
     vehicle, log, model = Vehicle.load(preset), short_log(200.0), leaf_model()
     estimator = EstimatorSettings(method=method, initial_soc_pct=80.0)  # type: ignore[arg-type] # parametrised
     settings = GaugeSettings(estimator, "replay-clock")
@@ -72,11 +70,11 @@ def test_the_replayed_soc_is_the_offline_one_within_the_quantisation_bound(
     limit = {"ekf": bound.ekf_pct, "newton": bound.newton_pct, "coulomb": bound.coulomb_pct}
     worst = float(np.max(np.abs(live - offline)))
     assert worst <= limit[method] + 1e-9
-    # The bound is no empty word: rounding does show, and the bound is not far above it.
+    # The bound is tight: quantization shows, not far below it.
     assert worst > limit[method] / 100.0
 
 
-def test_the_bound_is_what_its_equation_says() -> None:
+def test_the_bound_follows_its_equation() -> None:
     log, model = short_log(200.0), leaf_model()
     bound = quantisation_bound(Vehicle.load("leaf_aze0"), model, log)
     # 0.25 A over the log's length; no stamp of this log needs rounding.
@@ -88,7 +86,7 @@ def test_the_bound_is_what_its_equation_says() -> None:
     assert bound.ekf_pct == bound.coulomb_pct + bound.newton_pct
 
 
-def test_started_before_the_service_it_waits_and_loses_nothing() -> None:
+def test_a_replay_waits_for_the_service_without_loss() -> None:
     result: list[ReplayState] = []
     player = threading.Thread(target=lambda: result.append(play_log("early", 30.0, MAX)))
     player.start()
@@ -99,7 +97,7 @@ def test_started_before_the_service_it_waits_and_loses_nothing() -> None:
     assert result[0].acknowledged == 300
 
 
-def test_one_replay_after_the_other() -> None:
+def test_successive_replays_give_equal_estimates() -> None:
     with virtual_service("twice", REPLAYED) as service:
         first = play_log("twice", 20.0, MAX)
         second = play_log("twice", 20.0, MAX)
@@ -108,12 +106,12 @@ def test_one_replay_after_the_other() -> None:
     assert soc[:200] == soc[200:]
 
 
-def test_a_log_of_a_prime_number_of_rows_is_acknowledged_to_the_last() -> None:
+def test_the_last_samples_are_acknowledged() -> None:
     with virtual_service("prime", REPLAYED):
         assert play_log("prime", 10.1, MAX).acknowledged == 101
 
 
-def test_nobody_listening_is_told_in_one_line() -> None:
+def test_a_missing_receiver_is_an_error_of_one_line() -> None:
     settings = ReplaySettings(speed=math.inf, acknowledge_s=0.4)
     with pytest.raises(CangaugeError, match="--time-source replay-clock") as caught:
         play_log("alone", 10.0, settings)
@@ -121,7 +119,7 @@ def test_nobody_listening_is_told_in_one_line() -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_service_for_another_vehicle_is_told() -> None:
+def test_a_service_for_another_vehicle_is_an_error() -> None:
     settings = ReplaySettings(speed=math.inf, wait_s=3.0, acknowledge_s=0.5)
     with (
         virtual_service("other", REPLAYED, vehicle=Vehicle.load("leaf_aze0")),
@@ -130,7 +128,7 @@ def test_a_service_for_another_vehicle_is_told() -> None:
         play_log("other", 100.0, settings)
 
 
-def test_a_second_sender_on_the_bus_is_told() -> None:
+def test_a_second_sender_on_the_bus_is_an_error() -> None:
     with virtual_service("crowd", REPLAYED), virtual_port("crowd") as intruder:
         stop = threading.Event()
 
@@ -145,7 +143,7 @@ def test_a_second_sender_on_the_bus_is_told() -> None:
         other = threading.Thread(target=intrude)
         other.start()
         try:
-            with pytest.raises(CangaugeError, match=r"somebody else|have been processed"):
+            with pytest.raises(CangaugeError, match=r"another program|have been processed"):
                 play_log("crowd", 100.0, MAX)
         finally:
             stop.set()
@@ -153,7 +151,7 @@ def test_a_second_sender_on_the_bus_is_told() -> None:
 
 
 class LossyBus:
-    """Passes to another bus all but some frames."""
+    """Drops some of the frames sent."""
 
     def __init__(self, bus: can.BusABC, lose: set[int]) -> None:
         self._bus = bus
@@ -169,7 +167,7 @@ class LossyBus:
         return getattr(self._bus, name)
 
 
-def test_a_frame_lost_on_the_way_does_not_pass_unnoticed() -> None:
+def test_lost_frames_are_an_error() -> None:
     settings = ReplaySettings(speed=math.inf, wait_s=3.0, acknowledge_s=0.5)
     bus = LossyBus(open_bus(BusAddress("virtual", "lossy"), SOC_FRAMES), {200, 400, 401, 402})
     source = LogSource(short_log(30.0), Vehicle.load("leaf_aze0"))
@@ -181,7 +179,7 @@ def test_a_frame_lost_on_the_way_does_not_pass_unnoticed() -> None:
 
 
 def test_frames_under_way_are_bounded() -> None:
-    """No more waits in the receiver's socket than a default buffer holds."""
+    """The receiver's queue stays below what a default socket buffer holds."""
     bus = open_bus(BusAddress("virtual", "window"), SOC_FRAMES)
     receiver = open_bus(BusAddress("virtual", "window"))
     publisher = SocPublisher(acknowledge_every=1)
@@ -227,7 +225,7 @@ def test_recorded_timing_is_kept(tmp_path: Path, speed: float, seconds: float) -
     with Recorder(path) as recorder:
         for frame in frames:
             recorder.write(frame)
-    # Other tests may have the cores for a moment: a player that keeps time does so in one of three.
+    # Other tests may occupy the cores: one of three attempts must keep time.
     for attempt in range(3):
         late = lateness(path, frames, speed, f"timing{speed}-{attempt}")
         if np.quantile(np.abs(late), 0.9) < 0.02:
@@ -240,7 +238,7 @@ def test_recorded_timing_is_kept(tmp_path: Path, speed: float, seconds: float) -
 def lateness(
     path: Path, frames: Sequence[can.Message], speed: float, channel: str
 ) -> NDArray[np.float64]:
-    """Play a capture and return by how much each frame came late after the first [s]."""
+    """Play a capture; return the delay of each frame relative to the first [s]."""
     with virtual_port(channel) as listener, virtual_port(channel, SOC_FRAMES) as port:
         state = play(port, CaptureSource(path), ReplaySettings(speed), stop=never)
         heard = collect(listener, 0.2)
@@ -256,7 +254,7 @@ def lateness(
     )
 
 
-def test_at_n_times_the_speed_the_estimate_is_the_same() -> None:
+def test_the_estimate_does_not_depend_on_the_speed() -> None:
     log, model = short_log(40.0), leaf_model()
     with virtual_service("fast", REPLAYED) as service:
         state = play_log("fast", 40.0, ReplaySettings(speed=40.0, wait_s=3.0))
@@ -268,7 +266,7 @@ def test_at_n_times_the_speed_the_estimate_is_the_same() -> None:
     assert [estimate.soc_pct for _, estimate in service.rows] == offline.tolist()
 
 
-def test_in_real_time_nobody_needs_to_listen_and_no_clock_is_sent() -> None:
+def test_real_time_needs_no_receiver_and_no_clock() -> None:
     with virtual_port("radio") as listener:
         state = play_log("radio", 1.0, ReplaySettings())
         heard = collect(listener, 0.1)
@@ -276,7 +274,7 @@ def test_in_real_time_nobody_needs_to_listen_and_no_clock_is_sent() -> None:
     assert not any(is_clock(each) for each in heard)
 
 
-def test_looping_goes_on_until_it_is_stopped() -> None:
+def test_a_loop_runs_until_stopped() -> None:
     with virtual_service("loop", REPLAYED) as service, virtual_port("loop", SOC_FRAMES) as port:
         source = LogSource(short_log(5.0), Vehicle.load("generic"))
         settings = ReplaySettings(speed=math.inf, loop=True)
@@ -294,14 +292,14 @@ def test_full_speed_needs_the_vehicle_of_a_capture(tmp_path: Path) -> None:
         play(port, CaptureSource(path), MAX, stop=never)
 
 
-def test_fd_frames_need_a_bus_for_them(tmp_path: Path) -> None:
+def test_fd_frames_need_an_fd_bus(tmp_path: Path) -> None:
     path = tmp_path / "fd.log"
     path.write_text("(1.000000) can0 123##000112233445566778899AABB\n")
     with virtual_port("classic") as port, pytest.raises(InputError, match="fd=true"):
         play(port, CaptureSource(path), ReplaySettings(), stop=never)
 
 
-def test_ids_can_be_others() -> None:
+def test_ids_are_configurable() -> None:
     ids = FrameIds(0x111, 0x112, 0x113)
     filters = [standard_filter(0x111), standard_filter(0x112)]
     settings = GaugeSettings(time_source="replay-clock", ids=ids)

@@ -1,4 +1,4 @@
-"""What is sent, and when in log time."""
+"""Steps of logs and captures: frames and log time."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_each_row_is_one_sample_at_its_time(preset: str) -> None:
     assert [step.samples for step in steps] == list(range(1, len(log) + 1))
 
 
-def test_played_again_time_and_counters_go_on() -> None:
+def test_time_and_counters_continue_in_a_loop() -> None:
     log = short_log(2.0)
     source = LogSource(log, Vehicle.load("generic"))
     steps = list(islice(source.steps(loop=True), 3 * len(log)))
@@ -48,7 +48,7 @@ def test_played_again_time_and_counters_go_on() -> None:
     assert [each.data[-2] >> 4 for each in currents] == [number % 16 for number in range(60)]
 
 
-def test_a_value_that_fits_into_no_frame_is_refused_before_anything_is_sent() -> None:
+def test_a_value_out_of_range_is_refused_before_sending() -> None:
     log = short_log(2.0)
     high = log.voltage_v + 300.0
     too_high = type(log)(log.time_s, log.current_a, high, log.temperature_c, log.soc_pct)
@@ -56,7 +56,7 @@ def test_a_value_that_fits_into_no_frame_is_refused_before_anything_is_sent() ->
         LogSource(too_high, Vehicle.load("leaf_aze0"))
 
 
-def test_a_captures_frames_are_sent_as_they_were(tmp_path: Path) -> None:
+def test_a_captures_frames_are_sent_unchanged(tmp_path: Path) -> None:
     frames = [frame(1.7e9 + 0.013 * n, 0x100 + n % 3, bytes([n])) for n in range(30)]
     path = write(tmp_path / "a.log", frames)
     steps = list(CaptureSource(path).steps(loop=False))

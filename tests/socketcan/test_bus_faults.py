@@ -90,7 +90,7 @@ class Reconnecting(Service):
 
 
 class Pack:
-    """Sends a drive in real time, 50 samples a second, whenever there is a bus."""
+    """Sends a drive in real time, 50 samples a second, while there is a bus."""
 
     def __init__(self, address: BusAddress = VCAN) -> None:
         self._address = address
@@ -122,7 +122,7 @@ class Pack:
 
 
 class Listener:
-    """Reads what is published, on a bus opened when it is asked."""
+    """Reads the published estimates."""
 
     def __init__(self) -> None:
         self._bus = open_bus(VCAN, [standard_filter(0x5A0)])
@@ -147,7 +147,7 @@ def is_stale(told: SocEstimate) -> bool:
 
 
 @pytest.mark.parametrize("kind", ["down", "removed"])
-def test_an_interface_that_goes_and_comes_back(kind: str) -> None:
+def test_an_interface_that_is_lost_and_returns(kind: str) -> None:
     with Reconnecting() as live:
         with Pack():
             assert waits(lambda: live.gauge.samples >= 50)
@@ -159,7 +159,7 @@ def test_an_interface_that_goes_and_comes_back(kind: str) -> None:
         assert waits(lambda: live.bus.is_away)
         cpu_s = time.process_time()
         time.sleep(2.0)
-        # The whole program's, this test's included; a loop that spins takes two seconds.
+        # CPU time of the whole program, this test included; a busy loop takes two seconds.
         assert time.process_time() - cpu_s < 0.5
         assert live.error is None
         assert live.bus.is_away
@@ -170,7 +170,7 @@ def test_an_interface_that_goes_and_comes_back(kind: str) -> None:
         assert waits(lambda: not live.bus.is_away, LONGEST_PAUSE_S + 0.5)
         with Listener() as listener:
             told = listener.next()
-            assert is_stale(told)  # it goes on publishing, and says how old that is
+            assert is_stale(told)  # it keeps publishing, with the age
             assert told.soc_pct == pytest.approx(before, abs=0.01)
             samples = live.gauge.samples
             with Pack():
@@ -185,7 +185,7 @@ def test_an_interface_that_goes_and_comes_back(kind: str) -> None:
     assert live.log.lines[0].startswith("socketcan vcan0: ")
 
 
-def test_an_interface_that_comes_and_goes() -> None:
+def test_an_interface_that_flaps() -> None:
     with Reconnecting() as live, Pack():
         for _ in range(5):
             ip("set", "vcan0", "down")
@@ -215,15 +215,15 @@ def test_a_bus_that_does_not_exist_yet() -> None:
     assert live.log.events[-1] == "bus.back"
 
 
-def test_an_interface_that_is_down_is_told_when_it_is_opened() -> None:
+def test_opening_an_interface_that_is_down_is_an_error() -> None:
     ip("set", "vcan0", "down")
     with pytest.raises(InputError, match="is down") as caught:
         open_bus(VCAN)
     assert "ip link set vcan0 up" in str(caught.value)
 
 
-def test_trying_in_vain_leaks_no_descriptor(caplog: pytest.LogCaptureFixture) -> None:
-    # What the driver logs holds its errors, and they the sockets; only pytest keeps it.
+def test_failed_attempts_leak_no_descriptor(caplog: pytest.LogCaptureFixture) -> None:
+    # pytest keeps log records, which keep the errors and their sockets.
     caplog.set_level(logging.CRITICAL + 1, "can")
 
     def descriptors() -> int:
@@ -246,7 +246,7 @@ def send_error(classes: int, data: bytes = bytes(8)) -> None:
         raw.send(struct.pack("=IB3x8s", socket.CAN_ERR_FLAG | classes, 8, data))
 
 
-def test_error_frames_are_counted_by_kind_and_bus_off_is_told() -> None:
+def test_error_frames_are_counted_and_bus_off_is_logged() -> None:
     with Reconnecting() as live, Pack():
         assert waits(lambda: live.gauge.samples >= 10)
         for _ in range(5):
@@ -269,7 +269,7 @@ def test_error_frames_are_counted_by_kind_and_bus_off_is_told() -> None:
     assert live.bus.losses == 0
 
 
-def test_two_thousand_error_frames_keep_nothing_from_the_estimate() -> None:
+def test_two_thousand_error_frames_cost_no_sample() -> None:
     with Reconnecting() as live, Pack() as pack:
         assert waits(lambda: live.gauge.samples >= 10)
         with socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw:
@@ -286,7 +286,7 @@ def test_two_thousand_error_frames_keep_nothing_from_the_estimate() -> None:
     assert live.gauge.counts.lost == live.port.queue_drops == 0
 
 
-def test_the_kernel_stamps_when_a_frame_comes_in_and_not_when_it_is_read() -> None:
+def test_the_kernel_stamps_frames_on_arrival() -> None:
     with (
         BusConnection(open_bus(VCAN), "receiver") as port,
         BusConnection(open_bus(VCAN), "sender") as sender,
@@ -297,11 +297,11 @@ def test_the_kernel_stamps_when_a_frame_comes_in_and_not_when_it_is_read() -> No
         time.sleep(0.5)
         message = port.receive(1.0)
     assert message is not None
-    # Stamps have nanoseconds, this clock too; half a second would be the reading.
+    # Reading happens half a second later.
     assert before_s - 0.001 <= message.timestamp <= sent_s + 0.05
 
 
-def test_two_services_notice_each_other() -> None:
+def test_two_services_detect_each_other() -> None:
     with Reconnecting() as one:
         time.sleep(0.5)
         assert one.warnings == []
@@ -310,8 +310,8 @@ def test_two_services_notice_each_other() -> None:
     assert "somebody else sends 0x5A" in one.warnings[0]
 
 
-def test_one_service_through_overflow_signals_and_a_bus_that_is_down(tmp_path: Path) -> None:
-    """Processes start slowly in a guest, so one is led through all of it."""
+def test_overflow_signals_and_a_bus_that_is_down(tmp_path: Path) -> None:
+    """One process for all: processes start slowly in a guest."""
     config = tmp_path / "car.toml"
     config.write_text(f'model = "{leaf_model_path()}"\nchannel = "vcan0"\n')
     ip("set", "vcan0", "down")
@@ -319,7 +319,7 @@ def test_one_service_through_overflow_signals_and_a_bus_that_is_down(tmp_path: P
     live.wait_for("waiting for it")
     ip("set", "vcan0", "up")
     live.wait_for("there after")
-    # A pause of the process: what does not fit the queue is lost, and counted.
+    # A pause of the process: frames beyond the queue are lost and counted.
     live.process.send_signal(signal.SIGSTOP)
     burst = _overflow()
     live.process.send_signal(signal.SIGCONT)
@@ -354,7 +354,7 @@ def test_one_service_through_overflow_signals_and_a_bus_that_is_down(tmp_path: P
 
 
 def _wait_until_worked_off() -> None:
-    """Wait until the count of samples that the service tells stands still."""
+    """Wait until the service's sample count no longer changes."""
     reader, before = SocReader(), -1
     with open_bus(VCAN, [standard_filter(0x5A1)]) as listener:
         while (frame := listener.recv(3.0)) is not None:
@@ -367,7 +367,7 @@ def _wait_until_worked_off() -> None:
 
 
 def _overflow() -> int:
-    """Send until a receive queue as large as the service's has overflowed; return how many."""
+    """Send until a receive queue as large as the service's overflows; return the count."""
     encoder, sent = FrameEncoder(Vehicle.load("generic")), 0
     frames = [frame for each in samples_of(short_log(200.0)) for frame in encoder.encode(each)]
     with (

@@ -1,4 +1,4 @@
-"""The live side on a real SocketCAN interface: kernel filters, counts, bits, a bus that goes."""
+"""Replay and service on a real SocketCAN interface: filters, counts, bits, loss."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def service(preset: str, settings: GaugeSettings, record: Recorder | None = None
 
 @pytest.mark.parametrize("filters", [None, SOC_FRAMES], ids=["all", "filtered"])
 @pytest.mark.parametrize("options", [{"fd": True}, {"fd": False}], ids=["fd", "classic"])
-def test_frames_read_without_asking_are_those_of_python_can(
+def test_pending_frames_equal_those_of_python_can(
     options: dict[str, bool], filters: list[can.typechecking.CanFilter] | None
 ) -> None:
     address = BusAddress("socketcan", "vcan0", {**options, "receive_own_messages": True})
@@ -91,21 +91,21 @@ def test_frames_read_without_asking_are_those_of_python_can(
         open_bus(address, []) as sender,
         socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw,
     ):
-        waiting = pending_frames(ours)
-        assert waiting is not None
+        pending = pending_frames(ours)
+        assert pending is not None
         for frame in sent:
             sender.send(frame)
-        ours.send(sent[0])  # one's own, that comes back
+        ours.send(sent[0])  # an own frame, received as an echo
         raw.bind(("vcan0",))
         raw.send(struct.pack("=IB3x8s", 0x20000040, 8, bytes(8)))  # bus-off
         expected = []
         while (message := theirs.recv(0.5)) is not None:
             expected.append(message)
-        found = [waiting.next() for _ in expected]
+        found = [pending.next() for _ in expected]
         with pytest.raises(NoPendingFrameError):
-            waiting.next()
-        waiting.close()
-    # The kernel's filters let pass two of the sent ones less, and every error frame.
+            pending.next()
+        pending.close()
+    # The kernel's filters drop two of the sent frames, and no error frame.
     assert len(expected) == len(sent) + 2 - (0 if filters is None else 2)
     assert [each.is_error_frame for each in expected].count(True) == 1
     assert same_frames([each for each in found if each is not None], expected)
@@ -136,9 +136,7 @@ def test_a_log_at_full_speed_within_the_bound_and_bit_for_bit(
     assert np.array_equal(recorded.table.residual_v, residual, equal_nan=True)
 
 
-def test_in_real_time_the_kernels_stamps_are_bus_time(
-    replay_port: BusConnection, tmp_path: Path
-) -> None:
+def test_real_time_uses_the_kernels_stamps(replay_port: BusConnection, tmp_path: Path) -> None:
     log, path = short_log(6.01), tmp_path / "vcan0.log"
     with Recorder(path) as recorder, service("generic", GaugeSettings(), recorder) as live:
         state = play(
@@ -196,10 +194,10 @@ def test_unwanted_traffic_costs_no_wanted_frame(replay_port: BusConnection, tmp_
         state = play(replay_port, CaptureSource(path, vehicle), MAX, stop=never)
     assert state.acknowledged == state.samples == 100
     assert live.gauge.counts.lost == 0
-    assert live.gauge.counts.frames < 150  # the rest never left the kernel
+    assert live.gauge.counts.frames < 150  # the rest is dropped in the kernel
 
 
-def test_what_is_published_can_be_read_by_others(replay_port: BusConnection) -> None:
+def test_others_can_read_the_published_frames(replay_port: BusConnection) -> None:
     listener = can.Bus("vcan0", interface="socketcan", ignore_config=True, can_filters=SOC_FRAMES)
     with service("generic", GaugeSettings(time_source="replay-clock")) as live:
         log = short_log(20.0)
@@ -220,13 +218,13 @@ def test_what_is_published_can_be_read_by_others(replay_port: BusConnection) -> 
 def test_a_bus_that_does_not_exist(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="nosuch0") as caught:
         open_bus(BusAddress("socketcan", "nosuch0"))
-    assert "vcan0" in str(caught.value)  # what there is instead
+    assert "vcan0" in str(caught.value)  # the existing one
     with pytest.raises(InputError, match="nosuch0"):
         bus_address(None, "nosuch0")
 
 
-def test_both_commands_and_a_bus_that_goes_down(tmp_path: Path) -> None:
-    """Processes start slowly in a guest, so the commands are gone through once, in one test."""
+def test_both_commands_until_the_bus_goes_down(tmp_path: Path) -> None:
+    """One test for both commands: processes start slowly in a guest."""
     from cangauge.logs.canonical import write_log  # noqa: PLC0415 - pyarrow, for this test alone
 
     log_path, record = tmp_path / "drive.parquet", tmp_path / "drive.log"
@@ -252,7 +250,7 @@ def test_both_commands_and_a_bus_that_goes_down(tmp_path: Path) -> None:
         subprocess.run(["ip", "link", "set", "vcan0", "up"], check=True)
     assert ended.code == 0
     assert ended.json["bus_losses"] == 1
-    # What was recorded until then is there.
+    # The recording until then is complete.
     recorded = estimate_capture(record, Vehicle.load("generic"), leaf_model())
     assert recorded.table.soc_pct.size == 200
 
@@ -260,7 +258,7 @@ def test_both_commands_and_a_bus_that_goes_down(tmp_path: Path) -> None:
 @pytest.mark.real
 @pytest.mark.slow
 def test_a_real_trip_within_the_bound_and_bit_for_bit(shared_data: Path) -> None:
-    """One of the trips; `benchmarks/bus_trips.py` does them all."""
+    """One trip; `benchmarks/bus_trips.py` plays them all."""
     from bus_trips import compare  # noqa: PLC0415 - needs the real data
     from real_trips import identify, read_trips  # noqa: PLC0415
 

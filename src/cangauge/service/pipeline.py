@@ -16,7 +16,7 @@ from can.typechecking import CanFilter
 
 from cangauge.bus.decoder import FrameStatistics, SampleDecoder
 from cangauge.bus.plausibility import MISSED_AT_LEAST, Pack
-from cangauge.bus.publish import FrameIds, SocPublisher, standard_filter
+from cangauge.bus.publish import ACKNOWLEDGE_EVERY, FrameIds, SocPublisher, standard_filter
 from cangauge.bus.time_source import (
     REPLAY_CLOCK_ID,
     ReceiveTime,
@@ -345,9 +345,6 @@ def _filled(settings: EstimatorSettings, vehicle: Vehicle) -> EstimatorSettings:
 
 
 # --- The gauge: frames in, frames out. Pure: no bus, no clock; whoever has both is `loop`
-
-ACKNOWLEDGE_EVERY: Final = 4
-"""Samples between two SOC_DETAIL at most, under the replay clock: `replay` waits for them."""
 
 
 @dataclass(frozen=True)
