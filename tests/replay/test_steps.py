@@ -73,8 +73,8 @@ def test_own_frames_in_a_capture_are_left_out_and_its_replay_clock_is_time(
     frames = []
     for number in range(5):
         mark = clock.at(1_000_000 * number)
-        told = publisher.estimate_frame(NOTHING_YET)
-        for each in (mark, frame(0.0, data=bytes([number])), told):
+        published = publisher.estimate_frame(NOTHING_YET)
+        for each in (mark, frame(0.0, data=bytes([number])), published):
             each.timestamp = 1.7e9 + 1e-3 * len(frames)
             frames.append(each)
     source = CaptureSource(write(tmp_path / "a.log", frames))

@@ -1,5 +1,5 @@
-"""What befalls a real SocketCAN interface, and the service on it: down, removed, overrun, told of
-errors, shared with a second service; and the signals meanwhile."""
+"""Faults of a real SocketCAN interface under the service: down, removed, overrun, error frames, a
+second service, signals."""
 
 from __future__ import annotations
 
@@ -142,8 +142,8 @@ class Listener:
         return content
 
 
-def is_stale(told: SocEstimate) -> bool:
-    return told.status is Status.INVALID and bool(told.reasons & Reason.INPUT_STALE)
+def is_stale(estimate: SocEstimate) -> bool:
+    return estimate.status is Status.INVALID and bool(estimate.reasons & Reason.INPUT_STALE)
 
 
 @pytest.mark.parametrize("kind", ["down", "removed"])
@@ -169,15 +169,15 @@ def test_an_interface_that_is_lost_and_returns(kind: str) -> None:
             add("vcan0")
         assert waits(lambda: not live.bus.is_away, LONGEST_PAUSE_S + 0.5)
         with Listener() as listener:
-            told = listener.next()
-            assert is_stale(told)  # it keeps publishing, with the age
-            assert told.soc_pct == pytest.approx(before, abs=0.01)
+            estimate = listener.next()
+            assert is_stale(estimate)  # it keeps publishing, with the age
+            assert estimate.soc_pct == pytest.approx(before, abs=0.01)
             samples = live.gauge.samples
             with Pack():
                 assert waits(lambda: live.gauge.samples >= samples + 20)
-                told = [listener.next() for _ in range(30)][-1]
-            assert not is_stale(told)
-            assert told.soc_pct == pytest.approx(before, abs=0.5)
+                estimate = [listener.next() for _ in range(30)][-1]
+            assert not is_stale(estimate)
+            assert estimate.soc_pct == pytest.approx(before, abs=0.5)
     assert live.error is None
     assert live.bus.losses == 1
     assert live.bus.away_s >= 2.0

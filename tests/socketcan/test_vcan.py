@@ -209,10 +209,10 @@ def test_others_can_read_the_published_frames(replay_port: BusConnection) -> Non
     while (message := listener.recv(0.1)) is not None:
         frames.append(message)
     listener.shutdown()
-    told = [each for each in map(reader.read, frames) if isinstance(each, SocEstimate)]
+    published = [each for each in map(reader.read, frames) if isinstance(each, SocEstimate)]
     assert reader.refused == 0
-    assert len(told) >= len(log)  # every 100 ms of bus time
-    assert told[-1].soc_pct == pytest.approx(live.rows[-1][1].soc_pct, abs=0.001)
+    assert len(published) >= len(log)  # every 100 ms of bus time
+    assert published[-1].soc_pct == pytest.approx(live.rows[-1][1].soc_pct, abs=0.001)
 
 
 def test_a_bus_that_does_not_exist(tmp_path: Path) -> None:

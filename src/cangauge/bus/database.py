@@ -277,22 +277,52 @@ def signal_codec(
     InputError
         If the signal does not fit into its message or cannot be a number.
     """
-    _check_layout(message, signal, source, field)
-    is_float = signal.conversion.is_float
+    bits = _bits(message, signal, source, field)
+    conditions: list[Condition] = []
+    selector = signal
+    while (name := selector.multiplexer_signal) is not None:
+        values = frozenset(selector.multiplexer_ids or ())
+        found = _signal(message, name)
+        if found is None:
+            raise InputError(
+                f"{selector.name} is multiplexed by a signal that {message.name} does not have",
+                source=str(source),
+                field=field,
+                value=name,
+                cure="correct the DBC",
+            )
+        if len(conditions) > len(message.signals):
+            raise InputError("signals are multiplexed in a circle", source=str(source), field=field)
+        conditions.append(Condition(_bits(message, found, source, field), values))
+        selector = found
+    for name, value in (when or {}).items():
+        found = _signal(message, name)
+        if found is None:
+            raise InputError(
+                f"message {message.name} has no such signal",
+                source=str(source),
+                field=f"{field}.when",
+                value=name,
+            )
+        selector_bits = _bits(message, found, source, field)
+        raw = value & ((1 << selector_bits.width) - 1)
+        conditions.append(Condition(selector_bits, frozenset({raw})))
+    conversion = signal.conversion
     return SignalCodec(
         name=signal.name,
         unit=(signal.unit or "").strip(),
-        field=Field.of(signal, message.length),
-        is_signed=signal.is_signed and not is_float,
-        float_format=_FLOATS[signal.length] if is_float else "",
-        factor=float(signal.conversion.scale),
-        offset=float(signal.conversion.offset),
+        field=bits,
+        is_signed=signal.is_signed and not conversion.is_float,
+        float_format=_FLOATS[signal.length] if conversion.is_float else "",
+        factor=float(conversion.scale),
+        offset=float(conversion.offset),
         not_available=_codes_of_no_value(signal) | frozenset(not_available),
-        conditions=(
-            *_multiplexers(message, signal, source, field),
-            *_conditions(message, when or {}, source, field),
-        ),
+        conditions=tuple(conditions),
     )
+
+
+def _signal(message: Message, name: str) -> Signal | None:
+    return next((each for each in message.signals if each.name == name), None)
 
 
 def _codes_of_no_value(signal: Signal) -> frozenset[int]:
@@ -302,20 +332,17 @@ def _codes_of_no_value(signal: Signal) -> frozenset[int]:
     return frozenset(int(raw) for raw, name in names.items() if _NOT_A_VALUE.search(str(name)))
 
 
-def _check_layout(message: Message, signal: Signal, source: object, field: str) -> None:
-    place = Field.of(signal, message.length)
+def _bits(message: Message, signal: Signal, source: object, field: str) -> Field:
+    """Return the bits of a signal; refuse a layout or conversion that is impossible."""
+    bits, conversion = Field.of(signal, message.length), signal.conversion
     problem = ""
-    if signal.length < 1 or place.shift < 0 or place.shift + place.width > 8 * message.length:
+    if signal.length < 1 or bits.shift < 0 or bits.shift + bits.width > 8 * message.length:
         problem = f"the signal does not fit into the {message.length} bytes of {message.name}"
-    elif signal.conversion.is_float and signal.length not in _FLOATS:
+    elif conversion.is_float and signal.length not in _FLOATS:
         problem = f"a float of {signal.length} bits is not possible"
-    elif not signal.conversion.is_float and signal.length > 64:
+    elif not conversion.is_float and signal.length > 64:
         problem = f"a number of {signal.length} bits is not possible"
-    elif not (
-        math.isfinite(signal.conversion.scale)
-        and math.isfinite(signal.conversion.offset)
-        and signal.conversion.scale != 0
-    ):
+    elif not (0.0 < abs(conversion.scale) < math.inf and math.isfinite(conversion.offset)):
         problem = "factor and offset must be finite and the factor not 0"
     if problem:
         raise InputError(
@@ -325,47 +352,7 @@ def _check_layout(message: Message, signal: Signal, source: object, field: str) 
             value=signal.name,
             cure="correct the DBC",
         )
-
-
-def _multiplexers(message: Message, signal: Signal, source: object, field: str) -> list[Condition]:
-    conditions: list[Condition] = []
-    while signal.multiplexer_signal is not None:
-        name = signal.multiplexer_signal
-        selector = next((each for each in message.signals if each.name == name), None)
-        if selector is None:
-            raise InputError(
-                f"{signal.name} is multiplexed by a signal that {message.name} does not have",
-                source=str(source),
-                field=field,
-                value=name,
-                cure="correct the DBC",
-            )
-        if len(conditions) > len(message.signals):
-            raise InputError("signals are multiplexed in a circle", source=str(source), field=field)
-        _check_layout(message, selector, source, field)
-        values = frozenset(signal.multiplexer_ids or ())
-        conditions.append(Condition(Field.of(selector, message.length), values))
-        signal = selector
-    return conditions
-
-
-def _conditions(
-    message: Message, when: dict[str, int], source: object, field: str
-) -> list[Condition]:
-    conditions = []
-    for name, value in when.items():
-        selector = next((each for each in message.signals if each.name == name), None)
-        if selector is None:
-            raise InputError(
-                f"message {message.name} has no such signal",
-                source=str(source),
-                field=f"{field}.when",
-                value=name,
-            )
-        _check_layout(message, selector, source, field)
-        place = Field.of(selector, message.length)
-        conditions.append(Condition(place, frozenset({value & ((1 << place.width) - 1)})))
-    return conditions
+    return bits
 
 
 MAX_MESSAGES: Final = 20_000
@@ -450,13 +437,19 @@ def find_message(database: Database, message: str | int, *, source: object, fiel
             value=message,
             cure="keep one of them",
         )
-    if wanted is None:
-        names = closest(str(message), (candidate.name for candidate in database.messages))
-        cure = f"did you mean {names}?" if names else _message_list(database)
-    else:
-        cure = _message_list(database)
+    near = (
+        closest(str(message), (each.name for each in database.messages)) if wanted is None else ""
+    )
+    shown = ", ".join(f"{each.name} (0x{each.frame_id:X})" for each in database.messages[:6])
+    more = len(database.messages) - 6
     raise InputError(
-        "the DBC has no such message", source=str(source), field=field, value=message, cure=cure
+        "the DBC has no such message",
+        source=str(source),
+        field=field,
+        value=message,
+        cure=f"did you mean {near}?"
+        if near
+        else f"its messages are {shown}" + (f" and {more} more" if more > 0 else ""),
     )
 
 
@@ -472,9 +465,9 @@ def find_signal(
     """
     if message is not None:
         owner = find_message(database, message, source=source, field=f"{field}.message")
-        for candidate in owner.signals:
-            if candidate.name == signal:
-                return owner, candidate
+        found = _signal(owner, signal)
+        if found is not None:
+            return owner, found
         raise InputError(
             f"message {owner.name} has no such signal",
             source=str(source),
@@ -561,11 +554,7 @@ def _as_id(message: str | int) -> int | None:
 
 
 def _signal_cure(database: Database, owner: Message, signal: str) -> str:
-    elsewhere = [
-        other.name
-        for other in database.messages
-        if any(candidate.name == signal for candidate in other.signals)
-    ]
+    elsewhere = [other.name for other in database.messages if _signal(other, signal)]
     if elsewhere:
         return f"it is in {', '.join(elsewhere[:3])}"
     names = [candidate.name for candidate in owner.signals]
@@ -574,12 +563,6 @@ def _signal_cure(database: Database, owner: Message, signal: str) -> str:
         return f"did you mean {near}?"
     shown = ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
     return f"it has {shown}" if shown else "it has no signals at all"
-
-
-def _message_list(database: Database) -> str:
-    names = [f"{message.name} (0x{message.frame_id:X})" for message in database.messages]
-    shown = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
-    return f"its messages are {shown}"
 
 
 def _first_line(error: Exception) -> str:

@@ -281,54 +281,34 @@ def _refusal(address: BusAddress, error: BaseException) -> InputError:
     while not isinstance(cause, OSError) and cause.__cause__ is not None:
         cause = cause.__cause__
     code = cause.errno if isinstance(cause, OSError) else None
-    channel, interface = address.channel, address.interface
-    if code in {errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT} and interface == "socketcan":
-        return InputError(
-            "this machine has no SocketCAN",
-            field="--interface",
-            value=interface,
-            cure="use another interface, e.g. --interface udp_multicast",
-        )
-    if code in {errno.ENODEV, errno.ENXIO, errno.ENOENT}:
-        cure = f"check the name{_socketcan_names()}" if interface == "socketcan" else "check it"
-        return InputError(
-            f"{interface} has no such bus", field="--channel", value=channel, cure=cure
-        )
-    if code in {errno.EPERM, errno.EACCES}:
-        return InputError(
-            f"no permission to open this bus ({interface})",
-            field="--channel",
-            value=channel,
-            cure="run as a user with that permission",
-        )
-    if code in {errno.ENETUNREACH, errno.EADDRNOTAVAIL} and interface == "udp_multicast":
-        return InputError(
-            "no network interface of this machine carries multicast",
-            field="--interface",
-            value=interface,
-            cure="bring a network interface up, or use SocketCAN",
-        )
-    missing = isinstance(error, can.CanInterfaceNotImplementedError | ImportError | NameError)
+    interface = address.interface
     reason = " ".join(str(cause).split()) or type(cause).__name__
-    if missing or any(word in reason for word in ("library", "module", "install")):
-        return DriverMissingError(
-            f"a library for this interface is missing ({reason})",
-            field="--interface",
-            value=interface,
-            cure=_library_cure(interface),
-        )
-    return InputError(
-        f"{interface} cannot open this bus ({reason})",
-        field="--channel",
-        value=channel,
-        cure="check channel and --bus-option",
-    )
-
-
-def _library_cure(interface: str) -> str:
-    if interface == "udp_multicast":
-        return "install msgpack (pip install 'python-can[multicast]')"
-    return f"install the library that python-can's documentation names for {interface}"
+    if code in {errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT} and interface == "socketcan":
+        problem = "this machine has no SocketCAN"
+        cure = "use another interface, e.g. --interface udp_multicast"
+        return InputError(problem, field="--interface", value=interface, cure=cure)
+    if code in {errno.ENETUNREACH, errno.EADDRNOTAVAIL} and interface == "udp_multicast":
+        problem = "no network interface of this machine carries multicast"
+        cure = "bring a network interface up, or use SocketCAN"
+        return InputError(problem, field="--interface", value=interface, cure=cure)
+    if code in {errno.ENODEV, errno.ENXIO, errno.ENOENT}:
+        problem = f"{interface} has no such bus"
+        cure = f"check the name{_socketcan_names()}" if interface == "socketcan" else "check it"
+    elif code in {errno.EPERM, errno.EACCES}:
+        problem = f"no permission to open this bus ({interface})"
+        cure = "run as a user with that permission"
+    elif isinstance(error, can.CanInterfaceNotImplementedError | ImportError | NameError) or any(
+        word in reason for word in ("library", "module", "install")
+    ):
+        problem = f"a library for this interface is missing ({reason})"
+        cure = f"install the library that python-can's documentation names for {interface}"
+        if interface == "udp_multicast":
+            cure = "install msgpack (pip install 'python-can[multicast]')"
+        return DriverMissingError(problem, field="--interface", value=interface, cure=cure)
+    else:
+        problem = f"{interface} cannot open this bus ({reason})"
+        cure = "check channel and --bus-option"
+    return InputError(problem, field="--channel", value=address.channel, cure=cure)
 
 
 def _socketcan_names() -> str:
