@@ -66,7 +66,7 @@ def test_a_captures_frames_are_sent_unchanged(tmp_path: Path) -> None:
     assert all(step.is_wanted for step in steps)
 
 
-def test_own_frames_in_a_capture_are_left_out_and_its_replay_clock_is_time(
+def test_own_frames_of_a_capture_only_give_its_time(
     tmp_path: Path,
 ) -> None:
     publisher, clock = SocPublisher(), ClockFrames()
@@ -96,7 +96,7 @@ def test_several_replays_in_one_capture_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.real
-def test_samples_of_a_real_capture_are_counted_as_the_receiver_does(shared_data: Path) -> None:
+def test_samples_of_a_capture_are_counted_as_received(shared_data: Path) -> None:
     from cangauge.bus.capture_log import capture_samples  # noqa: PLC0415 - needs the real data
 
     path = shared_data / "leaf_can" / "ZE0w24kWhstock.log.gz"

@@ -31,6 +31,9 @@ bus is back but before the next attempt are lost."""
 STEADY_S: Final = 5.0
 """A bus lost after this time in use [s] is retried at once; one that flaps keeps its pause."""
 
+REPORT_AFTER_S: Final = 1.0
+"""Time without a bus after which failed attempts are logged [s]: a short outage needs one line."""
+
 _LOG = logging.getLogger(__name__)
 _Received = TypeVar("_Received")
 Opener = Callable[[BusAddress, Sequence[CanFilter] | None], can.BusABC]
@@ -212,8 +215,9 @@ class ReconnectingBus(BusConnection):
         away_s = now_s - self._since_s
         if isinstance(outcome, str):
             self._schedule_attempt()
-            text = f"away for {away_s:.0f} s ({outcome}); trying again"
-            self._log("bus.away", logging.WARNING, text)
+            if away_s >= REPORT_AFTER_S:
+                text = f"away for {away_s:.0f} s ({outcome}); trying again"
+                self._log("bus.away", logging.WARNING, text)
             return
         self._attach(outcome)
         self._away_s += away_s
