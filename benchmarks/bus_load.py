@@ -38,7 +38,7 @@ from rich.table import Table
 from cangauge._resources import shared_file
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, open_bus
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.offline import estimate_log
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Sample
@@ -134,7 +134,7 @@ def load(seconds: float) -> tuple[Result, list[Row]]:
 
 def send_load(seconds: float) -> Result:
     """Send wanted frames (current and voltage at 100 Hz) among others, evenly."""
-    encoder = FrameEncoder(load_vehicle("generic"))
+    encoder = FrameEncoder(Vehicle.load("generic"))
     others = itertools.cycle(
         can.Message(arbitration_id=0x200 + number, is_extended_id=False, data=bytes(8))
         for number in range(100)
@@ -270,7 +270,7 @@ def memory(hours: float = 24.0) -> tuple[Result, list[Row]]:
 
 
 def _live_a_day(pipe: Any, hours: float) -> None:
-    vehicle = load_vehicle("generic")
+    vehicle = Vehicle.load("generic")
     gauge = Gauge(vehicle, Model.load(model_path()), GaugeSettings())
     encoder = FrameEncoder(vehicle)
     log = long_log()

@@ -28,7 +28,7 @@ from rich.table import Table
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.publish import standard_filter
-from cangauge.bus.vehicle import Vehicle, load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.offline import run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate
@@ -148,7 +148,7 @@ def main() -> int:
         return 2
     sys.stderr.write("fitting the model on the training trips …\n")
     model = identify(read_trips(options.data, TRAINING)).model
-    address, vehicle = bus_address(), load_vehicle(options.vehicle)
+    address, vehicle = bus_address(), Vehicle.load(options.vehicle)
     rows = []
     for trip in read_trips(options.data, options.trip or TEST):
         if trip.duration_s > JUDGED_S:

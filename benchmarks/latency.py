@@ -41,7 +41,7 @@ from cangauge._resources import shared_file
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.time_source import ClockFrames
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.validity import Sample
 from cangauge.replay.player import Pacer
 from faults.line import udp
@@ -143,7 +143,7 @@ def _latencies(address: BusAddress, seconds: float) -> list[float]:
 
 
 def _send_samples(address: BusAddress, seconds: float) -> None:
-    encoder, clock = FrameEncoder(load_vehicle("generic")), ClockFrames()
+    encoder, clock = FrameEncoder(Vehicle.load("generic")), ClockFrames()
     bus, pacer = open_bus(address), Pacer(1.0, lambda: False)
     for number in range(int(seconds * SAMPLE_HZ)):
         time_us = number * 1_000_000 // SAMPLE_HZ
@@ -302,7 +302,7 @@ def _flood(
     pipe: Connection, address: BusAddress, rate_hz: float, seconds: float, share: float
 ) -> None:
     """Send current and voltage in turn among foreign frames, evenly."""
-    encoder, bus = FrameEncoder(load_vehicle("generic")), open_bus(address, [])
+    encoder, bus = FrameEncoder(Vehicle.load("generic")), open_bus(address, [])
     every = round(1.0 / share)
     # Made before: counters go round after 16 samples, so the frames repeat.
     ready = [

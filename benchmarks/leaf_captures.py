@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cangauge.bus.recording import capture_to_log
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.offline import estimate_log
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Reason
@@ -48,7 +48,7 @@ WHY = """Why they differ:
 
 def compare(folder: Path) -> list[dict[str, object]]:
     """Return a row per capture."""
-    vehicle, model = load_vehicle("leaf_ze0", None, None), leaf_2012_model_file()
+    vehicle, model = Vehicle.load("leaf_ze0", None, None), leaf_2012_model_file()
     rows: list[dict[str, object]] = []
     for name in CAPTURES:
         log = capture_to_log(folder / name, vehicle)

@@ -42,7 +42,7 @@ from cangauge._resources import shared_file
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.publish import FrameIds, SocEstimate, SocReader
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate, Reason, Sample
 from cangauge.model.model_file import Model
@@ -135,7 +135,7 @@ class Life:
     def __init__(self, model: Model, path: Path | None) -> None:
         self.now_s = EPOCH_S
         settings = GaugeSettings(EstimatorSettings(initial_soc_pct=START_PCT - 15.0))
-        self.gauge = Gauge(load_vehicle("generic"), model, settings)
+        self.gauge = Gauge(Vehicle.load("generic"), model, settings)
         self.keeper: StateKeeper | None = None
         if path is not None:
             self.keeper = StateKeeper(
@@ -174,7 +174,7 @@ def in_process(kills: int, seed: int, folder: Path, console: Console) -> Result:
     away = np.ceil(rng.uniform(0.2, 3.0, kills + 1) * RATE_HZ).astype(int)
     samples = drive(float(lives.sum() + away.sum()) / RATE_HZ, model, seed)
     flowed, net = flowed_pct(samples, model.capacity_ah)
-    encoder, other = (FrameEncoder(load_vehicle("generic")) for _ in range(2))
+    encoder, other = (FrameEncoder(Vehicle.load("generic")) for _ in range(2))
     whole, life = Life(model, None), Life(model, path)
     life.begin(EPOCH_S)
     restarts, begun = [], None
@@ -320,7 +320,7 @@ class Player(threading.Thread):
 
     def run(self) -> None:
         """Send, and listen in between."""
-        encoder = FrameEncoder(load_vehicle("generic"))
+        encoder = FrameEncoder(Vehicle.load("generic"))
         began_s = time.monotonic()
         for number, sample in enumerate(self._samples):
             for frame in encoder.encode(sample):

@@ -22,7 +22,7 @@ import pytest
 from cangauge._resources import shared_file
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.open import BusAddress, open_bus
-from cangauge.bus.vehicle import Vehicle, load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.app import main
 from cangauge.estimate.validity import Estimate
 from cangauge.logs.log import Log
@@ -111,7 +111,7 @@ def virtual_service(
     vehicle: Vehicle | None = None,
     record: Any = None,
 ) -> Service:
-    gauge = Gauge(vehicle or load_vehicle("generic"), leaf_model(), settings)
+    gauge = Gauge(vehicle or Vehicle.load("generic"), leaf_model(), settings)
     port = virtual_port(channel, gauge.filters)
     return Service(port, gauge, loop or LoopSettings(), record)
 

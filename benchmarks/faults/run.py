@@ -15,7 +15,7 @@ import cantools
 
 from cangauge._resources import shared_file
 from cangauge.bus.time_source import ClockFrames
-from cangauge.bus.vehicle import Vehicle, load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import CangaugeError
 from cangauge.replay.player import Pacer
 from faults.drive import ROLES, Event, events
@@ -105,7 +105,7 @@ def _played(fault: Fault, stage: Stage, sender: Wire, listener: Listener, rng: R
 def the_vehicle(fault: Fault, folder: Path) -> Vehicle:
     """Return the vehicle whose frames are played."""
     names = vehicle_config(fault.vehicle, folder)
-    return load_vehicle(names.get("vehicle"), names.get("dbc"), names.get("map"))
+    return Vehicle.load(names.get("vehicle"), names.get("dbc"), names.get("map"))
 
 
 class _Player:

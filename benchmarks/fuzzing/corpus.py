@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 
 from cangauge._resources import shared_file
 from cangauge.bus.encoder import FrameEncoder
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.validity import Sample
 from cangauge.model.effects.base import Pack, Parameter
 from cangauge.model.effects.library import LIBRARY, effect_entries
@@ -218,7 +218,7 @@ def zipped(name: str, data: bytes) -> bytes:
 @cache
 def leaf_frames() -> tuple[can.Message, ...]:
     """Return the frames that a Leaf with these rows would send."""
-    encoder = FrameEncoder(load_vehicle("leaf_aze0"))
+    encoder = FrameEncoder(Vehicle.load("leaf_aze0"))
     frames: list[can.Message] = []
     for t, i, u, temp, soc in log_rows():
         for frame in encoder.encode(Sample(1000.0 + t, i, u, temp), soc):

@@ -26,7 +26,7 @@ from cangauge.bus.protection import GENERIC_RULE
 from cangauge.bus.publish import SocPublisher, SocReader
 from cangauge.bus.recording import capture_to_log
 from cangauge.bus.time_source import ClockFrames
-from cangauge.bus.vehicle import Vehicle, load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.estimator import Estimator
 from cangauge.estimate.offline import estimate_log
 from cangauge.estimate.settings import EstimatorSettings
@@ -143,10 +143,10 @@ def _run_speed(data: bytes) -> bool:
 def _vehicles() -> tuple[Vehicle, ...]:
     folder = _folder()
     return (
-        load_vehicle("leaf_aze0"),
-        load_vehicle("generic"),
-        load_vehicle("leaf_ze1", temperature_c=20.0),
-        load_vehicle(map_file=folder / "car.toml"),
+        Vehicle.load("leaf_aze0"),
+        Vehicle.load("generic"),
+        Vehicle.load("leaf_ze1", temperature_c=20.0),
+        Vehicle.load(map=folder / "car.toml"),
     )
 
 
@@ -285,7 +285,7 @@ def _run_dbc(data: bytes) -> bool:
     with _file(data, "mutant.dbc") as path:
         load_dbc(path)
         if b"PackCurrent" in data:
-            car = load_vehicle(dbc=path, map_file=_own_map())
+            car = Vehicle.load(dbc=path, map=_own_map())
             stream = EstimateStream(car, _model())
             for key in car.messages:
                 for length in (0, 8, 64):
@@ -314,7 +314,7 @@ def _make_map(rng: Random) -> bytes:
 
 def _run_map(data: bytes) -> bool:
     with _file(data, "map.toml") as path:
-        load_vehicle(map_file=path)
+        Vehicle.load(map=path)
     return True
 
 

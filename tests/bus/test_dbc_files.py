@@ -1,4 +1,4 @@
-"""The DBC files that ship: strict, complete, and meaning what the facts say."""
+"""The DBC files of the project: strict, complete, agreeing with recorded frames."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_loads_strictly_with_a_comment_for_every_message(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_names_are_unique_so_that_a_map_file_need_not_name_the_message(name: str) -> None:
+def test_signal_names_are_unique(name: str) -> None:
     names = [
         signal.name
         for message in database(name).messages
@@ -79,7 +79,7 @@ def test_leaf_temperatures_are_multiplexed() -> None:
         assert leaf.decode_message("BATTERY_5C0", data)[name] == data[2] / 2 - 40
 
 
-def test_estimate_frames_say_what_the_estimator_says() -> None:
+def test_status_and_reasons_agree_with_the_estimator() -> None:
     soc = database("soc_estimate.dbc")
     message = soc.get_message_by_name("SOC_ESTIMATE")
     status = message.get_signal_by_name("status").choices
@@ -105,7 +105,7 @@ def test_replay_clock_holds_any_time(microseconds: int) -> None:
     assert decoded["crc_clock"] == CRC_ONLY_RULE.crc(data)
 
 
-def test_counter_and_crc_are_where_the_rule_puts_them() -> None:
+def test_counter_and_crc_are_where_the_rule_has_them() -> None:
     for message in database("generic_pack.dbc").messages:
         data = GENERIC_RULE.protect(bytes(message.length), 11)
         values = message.decode(data, decode_choices=False)
@@ -116,7 +116,7 @@ def test_counter_and_crc_are_where_the_rule_puts_them() -> None:
 
 
 @pytest.mark.parametrize("name", ["SOC_ESTIMATE", "SOC_DETAIL"])
-def test_the_dbc_says_how_what_is_published_is_protected(name: str) -> None:
+def test_the_dbc_states_the_protection_of_published_frames(name: str) -> None:
     message = database("soc_estimate.dbc").get_message_by_name(name)
     attributes = message.dbc.attributes
     assert attributes["E2EProfile"].value == "02"

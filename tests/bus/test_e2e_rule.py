@@ -1,4 +1,4 @@
-"""AUTOSAR's profiles and plain counters: what is refused, what is a loss, what does not fit."""
+"""AUTOSAR E2E profiles and plain counters, in code, map files and configurations."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge.bus.database import Field
-from cangauge.bus.mapping import CheckMap, MessageMap
+from cangauge.bus.mapping import CheckMap, MessageMap, Overrides
 from cangauge.bus.protection import (
     LEAF_RULE,
     PROFILES,
@@ -20,7 +20,7 @@ from cangauge.bus.protection import (
     Protection,
     Verdict,
 )
-from cangauge.bus.vehicle import Overrides, Vehicle, load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 
 IDS = bytes(range(0x40, 0x50))
@@ -54,7 +54,7 @@ def frames(name: str, counters: list[int]) -> list[bytes]:
 
 
 @each_rule
-def test_whole_frames_in_a_row_are_good_also_where_the_counter_goes_round(name: str) -> None:
+def test_successive_frames_are_good_across_a_wrap(name: str) -> None:
     rule = RULES[name]
     checker = FrameChecker(rule, 0.01)
     start = rule.modulus - 3
@@ -77,9 +77,7 @@ def test_any_flipped_bit_of_the_protected_bytes_is_refused(name: str) -> None:
 
 @each_profile
 @given(st.binary(min_size=24, max_size=24), st.integers(0, 2**40))
-def test_any_content_survives_and_the_data_id_is_covered(
-    name: str, content: bytes, counter: int
-) -> None:
+def test_the_crc_covers_content_and_data_id(name: str, content: bytes, counter: int) -> None:
     rule = RULES[name]
     assert isinstance(rule, E2eRule)
     frame = rule.protect(content[: length_of(name)], counter)
@@ -102,7 +100,7 @@ def test_any_content_survives_and_the_data_id_is_covered(
 
 
 @each_rule
-def test_a_standing_counter_is_refused_and_a_jump_is_loss(name: str) -> None:
+def test_a_repeated_counter_is_refused_and_a_jump_is_a_loss(name: str) -> None:
     checker = FrameChecker(RULES[name], 0.01)
     first, copy, later = frames(name, [1, 1, 5])
     assert checker.check(first, 0.00) is Verdict.GOOD
@@ -111,12 +109,12 @@ def test_a_standing_counter_is_refused_and_a_jump_is_loss(name: str) -> None:
     assert checker.lost == 3
 
 
-def test_a_wide_counter_that_begins_anew_is_no_loss() -> None:
+def test_a_wide_counter_that_restarts_is_no_loss() -> None:
     checker = FrameChecker(RULES["04"], 0.01)
     last, anew = frames("04", [700, 0])
     assert checker.check(last, 1.0) is Verdict.GOOD
     assert checker.check(anew, 1.01) is Verdict.GOOD
-    # But where there was time enough, so many are missing.
+    # With enough time in between it is a loss.
     checker = FrameChecker(RULES["05"], 0.01)
     last, later = frames("05", [100, 50])
     checker.check(last, 0.0)
@@ -125,7 +123,7 @@ def test_a_wide_counter_that_begins_anew_is_no_loss() -> None:
 
 
 class Crc8OfProfile1(crccheck.crc.Crc8Base):
-    """SAE J1850 as the profile has it: begun with 0, nothing turned at the end."""
+    """CRC-8 SAE J1850 with initial value 0 and no final XOR, as in profile 1."""
 
     _poly = 0x1D
 
@@ -180,13 +178,13 @@ def test_profiles_4_and_7_need_can_fd() -> None:
         ({"name": "e2e_05", "header_byte": -1}, "header_byte"),
     ],
 )
-def test_figures_that_a_profile_cannot_have(figures: dict[str, object], field: str) -> None:
+def test_values_that_a_profile_does_not_allow_are_refused(
+    figures: dict[str, object], field: str
+) -> None:
     with pytest.raises(InputError) as caught:
         E2eRule(**figures)  # type: ignore[arg-type] # parametrised
     assert caught.value.field == field
 
-
-# --- chosen in a mapping or a configuration -------------------------------------------------
 
 DBC = """VERSION ""
 
@@ -219,7 +217,7 @@ def folder(tmp_path: Path) -> Path:
 
 def load(folder: Path, more: str = "", overrides: Overrides | None = None) -> Vehicle:
     (folder / "car.toml").write_text(MAP + more)
-    return load_vehicle(map_file=folder / "car.toml", overrides=overrides or Overrides())
+    return Vehicle.load(map=folder / "car.toml", overrides=overrides or Overrides())
 
 
 def test_a_map_file_chooses_a_profile_for_each_message(folder: Path) -> None:
@@ -241,7 +239,7 @@ def test_a_counter_is_named_by_its_signal(folder: Path) -> None:
     assert not rule.is_whole(b"\0\x0f" + bytes(6))
 
 
-def test_a_configuration_goes_before_the_mapping(folder: Path) -> None:
+def test_a_configuration_overrides_the_map_file(folder: Path) -> None:
     more = '[messages.Fast]\nprotection = "e2e_01"\ndata_id = 291\nperiod_s = 0.1\n'
     overrides = Overrides(
         "run.toml",
@@ -252,7 +250,7 @@ def test_a_configuration_goes_before_the_mapping(folder: Path) -> None:
     assert vehicle.messages[0x100].rule == RULES["02"]
     assert vehicle.messages[0x100].period_s == 0.1
     assert vehicle.voltage.checks.highest == 410.0
-    leaf = load_vehicle(
+    leaf = Vehicle.load(
         "leaf_aze0",
         overrides=Overrides("run.toml", messages={"BATTERY_1DB": MessageMap(period_s=0.02)}),
     )
@@ -261,7 +259,7 @@ def test_a_configuration_goes_before_the_mapping(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("more", "field", "told"),
+    ("more", "field", "text"),
     [
         ('protection = "e2e_05"', "data_id", "is missing"),
         ('protection = "e2e_02"', "data_id_list", "is missing"),
@@ -280,19 +278,21 @@ def test_a_configuration_goes_before_the_mapping(folder: Path) -> None:
         ('protection = "e2e_03"', "protection", "e2e_11"),
     ],
 )
-def test_mistakes_are_named(folder: Path, more: str, field: str, told: str) -> None:
-    with pytest.raises(InputError, match=told) as caught:
+def test_mistakes_in_protection_name_field_and_file(
+    folder: Path, more: str, field: str, text: str
+) -> None:
+    with pytest.raises(InputError, match=text) as caught:
         load(folder, f"[messages.Fast]\n{more}\n")
     assert caught.value.field == f"messages.Fast.{field}"
     assert caught.value.source == str(folder / "car.toml")
 
 
-def test_mistakes_of_a_configuration_are_told_as_its_own(folder: Path) -> None:
+def test_mistakes_in_a_configuration_name_its_file(folder: Path) -> None:
     overrides = Overrides("run.toml", messages={"Fast": MessageMap(protection="e2e_05")})
     with pytest.raises(InputError, match="data_id") as caught:
         load(folder, "", overrides)
     assert caught.value.source == "run.toml"
 
 
-def test_every_profile_of_the_library_can_be_named() -> None:
+def test_every_profile_of_the_library_is_known() -> None:
     assert set(PROFILES) == {f"e2e_{number}" for number in MODULI}

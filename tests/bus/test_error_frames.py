@@ -1,11 +1,11 @@
-"""What error frames tell, against linux/can/error.h."""
+"""Kinds of SocketCAN error frames (linux/can/error.h)."""
 
 from __future__ import annotations
 
 import can
 import pytest
 
-from cangauge.bus.connection import error_kinds
+from cangauge.bus.backend import error_kinds
 
 
 @pytest.mark.parametrize(
@@ -26,7 +26,7 @@ from cangauge.bus.connection import error_kinds
         (0x044, b"\x00\x20", ["bus_off", "transmit_passive"]),
     ],
 )
-def test_kinds(classes: int, data: bytes, kinds: list[str]) -> None:
+def test_classes_and_states_have_their_kinds(classes: int, data: bytes, kinds: list[str]) -> None:
     message = can.Message(
         arbitration_id=classes, is_extended_id=False, is_error_frame=True, data=data
     )

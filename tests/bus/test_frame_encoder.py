@@ -12,15 +12,15 @@ from hypothesis import strategies as st
 
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.encoder import FrameEncoder
-from cangauge.bus.vehicle import Vehicle, load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.validity import Sample
 from cangauge.logs.log import Log
 
 VEHICLES = {
-    "generic": load_vehicle("generic"),
-    "leaf_ze0": load_vehicle("leaf_ze0"),
-    "leaf_ze1": load_vehicle("leaf_ze1", temperature_c=18.0),
+    "generic": Vehicle.load("generic"),
+    "leaf_ze0": Vehicle.load("leaf_ze0"),
+    "leaf_ze1": Vehicle.load("leaf_ze1", temperature_c=18.0),
 }
 
 
@@ -52,7 +52,7 @@ def through_frames(vehicle: Vehicle, log: Log) -> tuple[list[Sample], list[float
             if made is not None:
                 samples.append(made)
                 references.append(assembler.reference_soc_pct)
-    counters = assembler.counters
+    counters = assembler.statistics
     assert counters.crc_errors == counters.counter_repeats == counters.frames_lost == 0
     return samples, references
 
@@ -65,7 +65,7 @@ def rows_of(log: Log) -> list[Sample]:
 @pytest.mark.parametrize("name", list(VEHICLES))
 @settings(max_examples=60, deadline=None)
 @given(log=logs)
-def test_the_decoder_gets_the_quantised_log_to_the_last_bit(name: str, log: Log) -> None:
+def test_the_decoder_gives_the_quantised_log_bit_for_bit(name: str, log: Log) -> None:
     vehicle = VEHICLES[name]
     encoder = FrameEncoder(vehicle)
     encoder.check_range(log)
@@ -82,7 +82,7 @@ def test_the_decoder_gets_the_quantised_log_to_the_last_bit(name: str, log: Log)
 @pytest.mark.parametrize("name", list(VEHICLES))
 @settings(max_examples=60, deadline=None)
 @given(log=logs)
-def test_rounding_stays_within_the_stated_bound(name: str, log: Log) -> None:
+def test_quantization_stays_within_the_bound(name: str, log: Log) -> None:
     encoder = FrameEncoder(VEHICLES[name])
     bound, quantised = encoder.quantisation(), encoder.quantise(log)
     for field in ("time_s", "current_a", "voltage_v", "temperature_c", "soc_pct"):
@@ -105,7 +105,7 @@ def test_the_bounds_are_those_of_the_dbc() -> None:
     assert leaf == {"current_a": 0.25, "voltage_v": 0.25, "soc_pct": 0.05, "time_s": 0.5e-6}
 
 
-def test_slow_frames_go_first_and_only_when_due() -> None:
+def test_slow_frames_come_first_and_only_when_due() -> None:
     encoder = FrameEncoder(VEHICLES["generic"])
 
     def ids(time_s: float, temperature_c: float = 20.0) -> list[int]:
@@ -121,7 +121,7 @@ def test_slow_frames_go_first_and_only_when_due() -> None:
     assert ids(0.0, 20.02) == [0x402, 0x403, 0x400, 0x401]  # a log that starts again
 
 
-def test_counters_run_per_message_and_stamps_are_the_samples() -> None:
+def test_counters_run_per_message_with_sample_times() -> None:
     encoder = FrameEncoder(VEHICLES["generic"])
     counters: dict[int, list[int]] = {}
     for n in range(40):
@@ -133,7 +133,7 @@ def test_counters_run_per_message_and_stamps_are_the_samples() -> None:
     assert counters[0x402] == [0, 1, 2, 3]
 
 
-def test_missing_values() -> None:
+def test_missing_values_get_their_code() -> None:
     generic = FrameEncoder(VEHICLES["generic"])
     sent = generic.encode(Sample(0.0, 1.0, math.nan, math.nan), math.nan)
     assert [message.arbitration_id for message in sent] == [0x400]
@@ -144,7 +144,7 @@ def test_missing_values() -> None:
     assert made is not None
     assert made.current_a == 1.0
     assert math.isnan(made.voltage_v)
-    assert assembler.counters.not_available == 1
+    assert assembler.statistics.not_available == 1
 
 
 @pytest.mark.parametrize(
@@ -157,7 +157,7 @@ def test_missing_values() -> None:
         ("soc_pct", 103.0, "soc_pct of BATTERY_55B"),
     ],
 )
-def test_a_log_that_does_not_fit_is_refused_before_it_is_sent(
+def test_a_log_that_does_not_fit_is_refused_before_sending(
     field: str, value: float, signal: str
 ) -> None:
     rows = {"current_a": 1.0, "voltage_v": 380.0, "temperature_c": 20.0, "soc_pct": 50.0}
@@ -176,7 +176,7 @@ def test_a_log_that_does_not_fit_is_refused_before_it_is_sent(
 
 @given(value=st.floats(-700.0, 700.0))
 @settings(deadline=None)
-def test_what_the_check_lets_through_can_be_sent_and_nothing_else(value: float) -> None:
+def test_the_check_accepts_exactly_what_can_be_sent(value: float) -> None:
     log = Log(np.zeros(1), np.array([value]), np.array([380.0]), np.array([20.0]))
     encoder = FrameEncoder(VEHICLES["leaf_ze0"])
     try:
@@ -210,6 +210,6 @@ def test_multiplexed_current_cannot_be_replayed(tmp_path: Path) -> None:
     (tmp_path / "x.toml").write_text(
         'dbc = "x.dbc"\ncurrent.signal = "i"\nvoltage.signal = "u"\ntemperature.fixed_c = 20\n'
     )
-    vehicle = load_vehicle(map_file=tmp_path / "x.toml")
+    vehicle = Vehicle.load(map=tmp_path / "x.toml")
     with pytest.raises(InputError, match="multiplexed"):
         FrameEncoder(vehicle)

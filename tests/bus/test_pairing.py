@@ -1,4 +1,4 @@
-"""Current and voltage → samples."""
+"""Pairing of currents and voltages into samples."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ def brief(samples: list[Sample]) -> list[tuple[float, float, float | None]]:
     ]
 
 
-def test_pairs_in_either_order_with_the_time_of_the_current() -> None:
+def test_pairs_form_in_either_order_at_the_currents_time() -> None:
     assert brief(run([(1.0, "I", 5), (1.01, "U", 400)])) == [(1.0, 5, 400)]
     assert brief(run([(1.0, "U", 400), (1.01, "I", 5)])) == [(1.01, 5, 400)]
 
 
-def test_exactly_the_limit_pairs_and_more_does_not() -> None:
+def test_the_limit_is_inclusive() -> None:
     assert brief(run([(1.0, "I", 5), (1.02, "U", 400)])) == [(1.0, 5, 400)]
     assert brief(run([(1.0, "I", 5), (1.021, "U", 400)])) == [(1.0, 5, None)]
     assert brief(run([(1e9, "I", 5), (1e9 + 0.02, "U", 400)])) == [(1e9, 5, 400)]
 
 
-def test_every_value_is_used_once() -> None:
+def test_each_value_is_used_once() -> None:
     frames = [(0.0, "I", 1.0), (0.001, "U", 400.0), (0.002, "I", 2.0), (0.003, "I", 3.0)]
     assert brief(run(frames)) == [(0.0, 1, 400), (0.002, 2, None), (0.003, 3, None)]
 
 
-def test_current_comes_through_where_voltage_is_missing() -> None:
+def test_currents_without_voltage_become_samples() -> None:
     frames = [(0.1 * n, "I", float(n)) for n in range(5)]
     assert brief(run(frames)) == [(0.1 * n, n, None) for n in range(5)]
 
@@ -63,20 +63,21 @@ def test_a_late_voltage_releases_the_current_at_once() -> None:
     assert pairing.current(0.11, 2.0, 20.0) == Sample(0.11, 2.0, 400.0, 20.0)
 
 
-def test_time_that_runs_backwards_makes_no_pair() -> None:
+def test_no_pair_forms_across_a_step_back_in_time() -> None:
     assert brief(run([(100.0, "I", 1.0), (0.0, "U", 400.0), (0.01, "I", 2.0)])) == [
         (100.0, 1, None),
         (0.01, 2, 400),
     ]
 
 
-def test_what_was_given_up_is_counted() -> None:
+def test_unpaired_values_are_counted() -> None:
     pairing = Pairing(WITHIN_S)
     for n in range(3):
         pairing.voltage(float(n), 400.0)
     pairing.current(10.0, 1.0, 20.0)
     pairing.current(11.0, 1.0, 20.0)
-    assert (pairing.voltage_unpaired, pairing.current_unpaired) == (3, 1)
+    statistics = pairing.statistics
+    assert (statistics.voltage_unpaired, statistics.current_unpaired) == (3, 1)
 
 
 def _numbered(steps: list[tuple[int, str]]) -> list[tuple[float, str, float]]:

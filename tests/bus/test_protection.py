@@ -1,4 +1,4 @@
-"""Counter and CRC."""
+"""CRC, alive counter and the check of successive frames."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class LeafCrc(crccheck.crc.Crc8Base):
     _poly, _initvalue, _xor_output = 0x85, 0x00, 0x00
 
 
-def test_crcs_are_the_published_ones() -> None:
+def test_the_crc_has_the_published_check_value() -> None:
     text = b"123456789"
     assert GENERIC_RULE.crc(text + b"?") == 0x4B == crccheck.crc.Crc8SaeJ1850.calc(text)
 
@@ -50,7 +50,7 @@ def test_a_protected_frame_is_good_and_keeps_its_other_bits(
     assert FrameChecker(rule).check(data, 0.0) is Verdict.GOOD
     assert rule.counter(data) == counter % rule.modulus
     assert rule.protect(data, counter) == data
-    mask = rule.counter_mask << rule.counter_shift
+    mask = (rule.modulus - 1) << rule.counter_shift
     for place, (old, new) in enumerate(zip(payload, data, strict=True)):
         if place == rule.counter_byte % len(payload):
             assert (old ^ new) & ~mask == 0
@@ -69,7 +69,7 @@ def test_any_flipped_bit_is_refused(
 
 
 @given(rule=rules, lost=st.integers(0, 14), start=st.integers(0, 15))
-def test_a_jump_counts_what_is_missing(rule: ProtectionRule, lost: int, start: int) -> None:
+def test_a_jump_counts_the_missing_frames(rule: ProtectionRule, lost: int, start: int) -> None:
     lost %= rule.modulus - 1
     checker = FrameChecker(rule)
     checker.check(rule.protect(bytes(8), start), 0.0)
@@ -79,7 +79,7 @@ def test_a_jump_counts_what_is_missing(rule: ProtectionRule, lost: int, start: i
         assert checker.lost == lost
 
 
-def test_a_standing_counter_is_refused_as_long_as_it_stands() -> None:
+def test_a_repeated_counter_is_refused() -> None:
     checker = FrameChecker(LEAF_RULE, period_s=0.01)
     frame = LEAF_RULE.protect(bytes(8), 2)
     verdicts = [checker.check(frame, 0.01 * n) for n in range(50)]
@@ -87,7 +87,7 @@ def test_a_standing_counter_is_refused_as_long_as_it_stands() -> None:
     assert checker.check(LEAF_RULE.protect(bytes(8), 3), 0.5) is Verdict.GOOD
 
 
-def test_a_counter_that_can_have_gone_round_is_a_loss() -> None:
+def test_a_counter_that_may_have_wrapped_is_a_loss() -> None:
     checker = FrameChecker(LEAF_RULE, period_s=0.01)
     frame = LEAF_RULE.protect(bytes(8), 2)
     assert checker.check(frame, 0.0) is Verdict.GOOD
@@ -95,13 +95,13 @@ def test_a_counter_that_can_have_gone_round_is_a_loss() -> None:
     assert checker.lost == 3
 
 
-def test_without_a_period_a_standing_counter_is_refused_until_a_silence() -> None:
+def test_without_a_period_a_silence_ends_repetition() -> None:
     checker = FrameChecker(GENERIC_RULE)
     frame = GENERIC_RULE.protect(bytes(6), 2)
     checker.check(frame, 0.0)
     assert checker.check(frame, 1.5) is Verdict.REPEATED
     assert checker.check(frame, 3.0) is Verdict.REPEATED
-    # The sender began anew: after a silence any counter will do.
+    # The sender restarted: any counter is good after a silence.
     assert checker.check(frame, 103.0) is Verdict.AFTER_LOSS
 
 

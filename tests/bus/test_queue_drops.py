@@ -1,4 +1,4 @@
-"""The kernel's count of frames that found the receive queue full, on real sockets."""
+"""Frames dropped by full receive queues, and backend capabilities, on real sockets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.connection import BusConnection, backend_capabilities, queue_drops
+from cangauge.bus.backend import backend_capabilities, queue_drops
+from cangauge.bus.connection import BusConnection
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 
 linux_only = pytest.mark.skipif(sys.platform != "linux", reason="the count is Linux's")
@@ -42,14 +43,14 @@ def test_every_frame_is_received_or_counted() -> None:
     assert port.queue_drops == dropped  # also when it is closed
 
 
-def test_where_nobody_counts_it_says_so() -> None:
+def test_without_a_count_the_drops_are_none() -> None:
     with BusConnection(open_bus(BusAddress("virtual", "drops")), "virtual") as port:
         assert port.queue_drops is None
     assert port.queue_drops is None
 
 
 @linux_only
-def test_a_descriptor_that_is_no_socket() -> None:
+def test_a_bus_without_a_socket_has_no_count() -> None:
     class DeviceBus:
         def fileno(self) -> int:
             return descriptor
@@ -68,7 +69,7 @@ def descriptors() -> int:
 
 
 @linux_only
-def test_the_kernel_stamps_multicast_when_it_comes_in() -> None:
+def test_the_kernel_stamps_multicast_on_arrival() -> None:
     address = multicast()
     assert backend_capabilities(address).stamps == "kernel"
     with (
@@ -84,7 +85,7 @@ def test_the_kernel_stamps_multicast_when_it_comes_in() -> None:
     assert before_s - 0.001 <= message.timestamp <= sent_s + 0.1
 
 
-def test_what_interfaces_do() -> None:
+def test_capabilities_by_interface() -> None:
     virtual = backend_capabilities(BusAddress("virtual", "x"))
     assert (virtual.stamps, virtual.echoes) == ("sender", False)
     pcan = backend_capabilities(BusAddress("pcan", "PCAN_USBBUS1", {"receive_own_messages": True}))

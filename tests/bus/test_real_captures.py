@@ -14,7 +14,7 @@ from cangauge.bus.database import load_dbc
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.protection import LEAF_RULE
 from cangauge.bus.recording import capture_samples, capture_to_log
-from cangauge.bus.vehicle import Vehicle, load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.inspect.capture import inspect_capture
 
 pytestmark = pytest.mark.real
@@ -66,9 +66,9 @@ WAKE_UP = {  # file: (currents, voltages) not available in 0x1DB
     LOSSY: (1, 16),
 }
 VEHICLES = {
-    "leaf_ze0": load_vehicle("leaf_ze0"),
-    "leaf_aze0": load_vehicle("leaf_aze0"),
-    "leaf_ze1": load_vehicle("leaf_ze1", temperature_c=20.0),
+    "leaf_ze0": Vehicle.load("leaf_ze0"),
+    "leaf_aze0": Vehicle.load("leaf_aze0"),
+    "leaf_ze1": Vehicle.load("leaf_ze1", temperature_c=20.0),
 }
 
 

@@ -20,7 +20,7 @@ from cangauge.bus.recording import (
     read_recording,
 )
 from cangauge.bus.time_source import ClockFrames, ReceiveTime
-from cangauge.bus.vehicle import Vehicle, load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.validity import Sample
 from cangauge.inspect.capture import inspect_capture
@@ -33,7 +33,7 @@ CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID = 0x400, 0x401, 0x402
 
 @pytest.fixture(scope="module")
 def generic() -> Vehicle:
-    return load_vehicle("generic")
+    return Vehicle.load("generic")
 
 
 def drive(vehicle: Vehicle, seconds: float = 20.0, start_s: float = 1000.0) -> list[can.Message]:
@@ -209,7 +209,7 @@ def test_no_temperature_at_all_asks_for_one(tmp_path: Path, generic: Vehicle) ->
     with pytest.raises(InputError, match="no temperature") as caught:
         capture_to_log(path, generic)
     assert "--temperature" in str(caught.value.cure)
-    log = capture_to_log(path, load_vehicle("generic", temperature_c=7.0))
+    log = capture_to_log(path, Vehicle.load("generic", temperature_c=7.0))
     assert set(log.temperature_c) == {7.0}
 
 
@@ -249,7 +249,7 @@ def test_of_several_buses_the_one_with_most_samples_is_taken(
 def test_the_wrong_vehicle_is_refused(tmp_path: Path, generic: Vehicle) -> None:
     path = record(tmp_path / "x.log", drive(generic))
     with pytest.raises(InputError, match=r"no frames of 0x1DB \(BATTERY_1DB\)") as caught:
-        capture_to_log(path, load_vehicle("leaf_ze0"))
+        capture_to_log(path, Vehicle.load("leaf_ze0"))
     assert caught.value.source == str(path)
 
 
@@ -259,7 +259,7 @@ def test_a_wrong_sign_in_the_map_is_seen_in_the_data(tmp_path: Path, generic: Ve
         'current.signal = "current_a"\ncurrent.sign = -1\nvoltage.signal = "voltage_v"\n'
         'temperature.signal = "temperature_c"\n'
     )
-    turned = load_vehicle(dbc=generic.dbc_files[0], map_file=tmp_path / "turned.toml")
+    turned = Vehicle.load(dbc=generic.dbc_files[0], map=tmp_path / "turned.toml")
     assert any("current looks inverted" in each for each in capture_to_log(path, turned).remarks)
     assert not any("turned" in each for each in capture_to_log(path, generic).remarks)
 
@@ -270,7 +270,7 @@ def test_a_wrong_scale_in_the_map_is_refused(tmp_path: Path, generic: Vehicle) -
         'current.signal = "current_a"\nvoltage.signal = "voltage_v"\nvoltage.scale = 1000\n'
         'temperature.signal = "temperature_c"\n'
     )
-    vehicle = load_vehicle(dbc=generic.dbc_files[0], map_file=tmp_path / "milli.toml")
+    vehicle = Vehicle.load(dbc=generic.dbc_files[0], map=tmp_path / "milli.toml")
     with pytest.raises(InputError, match="millivolts") as caught:
         capture_to_log(path, vehicle)
     assert caught.value.field == "voltage_v"

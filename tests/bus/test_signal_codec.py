@@ -1,4 +1,4 @@
-"""One signal ↔ bits."""
+"""Codec of one signal, against cantools."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ def layouts(draw: st.DrawFn) -> tuple[str, Message]:
 def test_decodes_as_cantools_does(layout: tuple[str, Message], data: bytes) -> None:
     _, message = layout
     signal = message.signals[0]
-    assume(signal.length <= 48)  # beyond 2^53 a float holds not every raw number
+    assume(signal.length <= 48)  # a float does not hold every raw number beyond 2^53
     found = signal_codec(message, signal, source="x", field="f")
     assert found.decode(data) == message.decode(data)["s"]
 
 
 @settings(max_examples=300, deadline=None)
 @given(layout=layouts(), data=st.binary(min_size=8, max_size=8))
-def test_encoding_is_the_inverse_and_touches_no_other_bit(
+def test_encoding_inverts_decoding_in_its_own_bits(
     layout: tuple[str, Message], data: bytes
 ) -> None:
     _, message = layout
@@ -79,7 +79,7 @@ def test_rounds_to_the_nearest_step(value: float, factor: float) -> None:
 
 
 @pytest.mark.parametrize(("width", "kind"), [(32, 1), (64, 2)])
-def test_floats(width: int, kind: int) -> None:
+def test_floats_are_exact(width: int, kind: int) -> None:
     found = codec(
         f' SG_ s : 0|{width}@1- (2,1) [0|0] "A" X', more=f"SIG_VALTYPE_ 100 s : {kind};\n"
     )
@@ -96,7 +96,7 @@ def test_floats(width: int, kind: int) -> None:
 @pytest.mark.parametrize(
     "name", ["not available", "SNA", "NotAvailable", "invalid", "Signal_Invalid", "Init", "ERROR"]
 )
-def test_codes_that_value_tables_call_no_value(name: str) -> None:
+def test_not_available_codes_of_value_tables(name: str) -> None:
     found = codec(
         ' SG_ s : 7|10@0+ (0.5,0) [0|0] "V" X', more=f'VAL_ 100 s 1023 "{name}" 3 "three" ;\n'
     )
@@ -111,7 +111,7 @@ def test_codes_that_value_tables_call_no_value(name: str) -> None:
     assert caught.value.field == "s"
 
 
-def test_an_enumeration_has_no_such_codes() -> None:
+def test_an_enumeration_has_no_not_available_codes() -> None:
     found = codec(
         ' SG_ s : 0|2@1+ (1,0) [0|3] "" X', more='VAL_ 100 s 0 "init" 1 "valid" 3 "invalid" ;\n'
     )
@@ -129,7 +129,7 @@ def test_values_that_do_not_fit_are_refused() -> None:
     assert found.decode(payload) == -128.0
 
 
-def test_nested_multiplexers_all_count() -> None:
+def test_nested_multiplexers_must_all_match() -> None:
     signals = """ SG_ top M : 0|4@1+ (1,0) [0|0] "" X
  SG_ sub m1M : 4|4@1+ (1,0) [0|0] "" X
  SG_ s m2 : 8|8@1+ (1,0) [0|0] "A" X"""

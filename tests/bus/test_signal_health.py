@@ -9,22 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cangauge.bus.plausibility import Fault, SignalChecks, SignalHealth, Trust
+from cangauge.bus.plausibility import Fault, SignalChecks, SignalHealth, SignalState
 
 NAN = math.nan
 
 
-def feed(health: SignalHealth, value: float, time_s: float) -> float:
-    """As `InputHealth` does: the value that goes on, or NaN."""
-    fault = health.judge(value, time_s)
-    if fault is Fault.NONE:
-        return value if health.take(value, time_s) else NAN
-    health.fail(fault)
-    return NAN
-
-
 def passed(health: SignalHealth, values: list[float], step_s: float = 0.1) -> list[float]:
-    return [feed(health, value, step_s * number) for number, value in enumerate(values)]
+    return [health.update(value, step_s * number) for number, value in enumerate(values)]
 
 
 def same(left: list[float], right: list[float]) -> bool:
@@ -33,29 +24,29 @@ def same(left: list[float], right: list[float]) -> bool:
     )
 
 
-def test_the_first_good_value_is_used_and_failures_before_it_do_not_matter() -> None:
+def test_the_first_good_value_is_used_after_any_failures() -> None:
     health = SignalHealth(SignalChecks())
     assert same(passed(health, [NAN] * 20 + [1.0]), [NAN] * 20 + [1.0])
-    assert health.trust is Trust.VALID
+    assert health.state is SignalState.VALID
 
 
-def test_a_few_failures_cost_their_own_values_only() -> None:
+def test_a_few_failures_cost_only_their_own_values() -> None:
     health = SignalHealth(SignalChecks(invalid_after=5))
     values = [1.0, NAN, NAN, NAN, NAN, 2.0, 3.0]
     assert same(passed(health, values), values)
-    assert health.trust is Trust.VALID
+    assert health.state is SignalState.VALID
 
 
-def test_several_failures_in_a_row_need_several_good_values() -> None:
+def test_recovery_needs_consecutive_good_values() -> None:
     health = SignalHealth(SignalChecks(invalid_after=3, valid_after=2))
     values = [1.0, NAN, NAN, NAN, 2.0, NAN, 3.0, 4.0, 5.0]
     assert same(passed(health, values), [1.0, *[NAN] * 6, 4.0, 5.0])
     assert not health.is_failing
 
 
-def test_while_invalid_it_is_not_usable_and_says_why() -> None:
+def test_an_invalid_signal_is_not_usable_and_has_a_cause() -> None:
     health = SignalHealth(SignalChecks(invalid_after=2))
-    feed(health, 1.0, 0.0)
+    health.update(1.0, 0.0)
     health.fail(Fault.PROTECTION)
     assert health.is_usable(0.1)
     health.fail(Fault.PROTECTION)
@@ -63,14 +54,14 @@ def test_while_invalid_it_is_not_usable_and_says_why() -> None:
     assert (health.is_failing, health.fault) == (True, Fault.PROTECTION)
 
 
-def test_copies_of_frames_do_not_keep_a_signal_from_coming_back() -> None:
+def test_repeated_frames_do_not_prevent_recovery() -> None:
     health = SignalHealth(SignalChecks(invalid_after=2, valid_after=3))
-    feed(health, 1.0, 0.0)
+    health.update(1.0, 0.0)
     health.fail(Fault.PROTECTION)
     health.fail(Fault.PROTECTION)
     used = []
     for number in range(3):
-        used.append(feed(health, 2.0, 0.1 * number))
+        used.append(health.update(2.0, 0.1 * number))
         health.fail(Fault.REPEATED)
     assert same(used, [NAN, NAN, 2.0])
 
@@ -80,8 +71,9 @@ def test_copies_of_frames_do_not_keep_a_signal_from_coming_back() -> None:
     st.integers(1, 6),
     st.integers(1, 6),
 )
-def test_the_rule_of_debouncing(good: list[bool], invalid_after: int, valid_after: int) -> None:
-    """Against the rule said the other way round, over the whole past."""
+def test_debouncing_agrees_with_a_model_over_the_past(
+    good: list[bool], invalid_after: int, valid_after: int
+) -> None:
     checks = SignalChecks(invalid_after=invalid_after, valid_after=valid_after)
     used = passed(SignalHealth(checks), [float(n) if ok else NAN for n, ok in enumerate(good)])
     trusted, known = True, False
@@ -99,35 +91,35 @@ def test_the_rule_of_debouncing(good: list[bool], invalid_after: int, valid_afte
     assert [not math.isnan(value) for value in used] == expected
 
 
-def test_ranges() -> None:
+def test_values_out_of_range_are_refused() -> None:
     health = SignalHealth(SignalChecks(lowest=-1.0, highest=5.0))
     values = [-1.0, 5.0, 5.1, -1.1, math.inf, 0.0]
     assert same(passed(health, values), [-1.0, 5.0, NAN, NAN, NAN, 0.0])
 
 
-def test_a_spike_is_refused_and_a_lasting_step_is_believed_once_it_can_be() -> None:
+def test_a_spike_is_refused_and_a_lasting_step_accepted() -> None:
     checks = SignalChecks(max_jump=5.0, max_rate_per_s=1.0)
     health = SignalHealth(checks)
     assert same(passed(health, [20.0, 60.0, 20.5, 21.0]), [20.0, NAN, 20.5, 21.0])
     health = SignalHealth(checks)
     used = passed(health, [20.0, *[28.0] * 40])
-    # 3 s after the latest good value 28 is possible; then three of them in a row.
+    # 28 is possible 3 s after the latest good value; then three are needed.
     assert next(n for n, value in enumerate(used) if value == 28.0) == 30 + 2
 
 
-def test_after_a_pause_a_signal_may_be_elsewhere() -> None:
+def test_the_rate_limit_widens_with_time() -> None:
     health = SignalHealth(SignalChecks(max_jump=5.0, max_rate_per_s=1.0))
-    assert feed(health, 20.0, 0.0) == 20.0
-    assert math.isnan(feed(health, 40.0, 14.9))
-    assert feed(health, 40.0, 15.1) == 40.0
+    assert health.update(20.0, 0.0) == 20.0
+    assert math.isnan(health.update(40.0, 14.9))
+    assert health.update(40.0, 15.1) == 40.0
 
 
-def test_a_stated_time_out_holds_as_it_is() -> None:
+def test_a_stated_time_out_is_exact() -> None:
     health = SignalHealth(SignalChecks(timeout_s=0.2), 0.1)
-    feed(health, 1.0, 10.0)
+    health.update(1.0, 10.0)
     assert health.is_usable(10.2)
     assert not health.is_usable(10.21)
-    feed(health, 1.0, 50.0)  # old is not invalid: the next good value is used
+    health.update(1.0, 50.0)  # old is not invalid: the next good value is used
     assert health.is_usable(50.0)
 
 
@@ -135,9 +127,7 @@ def test_a_stated_time_out_holds_as_it_is() -> None:
     ("period_s", "timeout_s"),
     [(0.01, 0.5), (0.1, 1.0), (0.5, 2.0), (1.0, 3.0), (10.0, 30.0)],
 )
-def test_the_time_out_comes_from_the_period_stated_or_learned(
-    period_s: float, timeout_s: float
-) -> None:
+def test_the_time_out_follows_the_period(period_s: float, timeout_s: float) -> None:
     checks = SignalChecks(usual_timeout_s=2.0)
     assert SignalHealth(checks, period_s).timeout_s == pytest.approx(timeout_s)
     learned = SignalHealth(checks)
@@ -146,7 +136,7 @@ def test_the_time_out_comes_from_the_period_stated_or_learned(
     assert learned.timeout_s == pytest.approx(timeout_s)
 
 
-def test_what_is_sent_when_it_changes_never_times_out_sooner_than_usual() -> None:
+def test_a_signal_sent_on_change_keeps_its_usual_time_out() -> None:
     health = SignalHealth(SignalChecks(usual_timeout_s=10.0), is_cyclic=False)
     passed(health, [1.0] * 50, 0.1)
     assert health.timeout_s == 10.0
@@ -154,18 +144,18 @@ def test_what_is_sent_when_it_changes_never_times_out_sooner_than_usual() -> Non
     assert health.timeout_s > 30.0
 
 
-def test_pauses_and_losses_are_no_period() -> None:
+def test_pauses_and_losses_do_not_distort_the_period() -> None:
     health = SignalHealth(SignalChecks(usual_timeout_s=2.0))
     now_s = 0.0
     for number in range(200):
         now_s += 3600.0 if number == 150 else 0.01 * (1 + number % 2)  # half of them lost
-        feed(health, 1.0, now_s)
+        health.update(1.0, now_s)
     assert health.period_s == pytest.approx(0.015, rel=0.2)
 
 
-def test_time_that_runs_backwards_does_not_make_old_values_young() -> None:
+def test_a_step_back_in_time_does_not_refresh_old_values() -> None:
     health = SignalHealth(SignalChecks(timeout_s=2.0))
-    feed(health, 1.0, 5000.0)
+    health.update(1.0, 5000.0)
     health.rewind(3.0)
     assert health.is_usable(5.0)
     assert not health.is_usable(5.1)

@@ -1,4 +1,4 @@
-"""Presets, DBC and map files: what is found, and what users are told when it is not."""
+"""Presets, DBC and map files: bound signals, and errors that name field and cure."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from cangauge.bus.protection import LEAF_RULE
-from cangauge.bus.vehicle import PRESETS, Vehicle, load_vehicle
+from cangauge.bus.vehicle import PRESETS, Vehicle
 from cangauge.errors import InputError
 
 DBC = """VERSION ""
@@ -59,13 +59,13 @@ def own(tmp_path: Path) -> Path:
 def load(folder: Path, text: str | None = None, **options: float) -> Vehicle:
     if text is not None:
         (folder / "car.toml").write_text(text)
-    return load_vehicle(dbc=folder / "car.dbc", map_file=folder / "car.toml", **options)
+    return Vehicle.load(dbc=folder / "car.dbc", map=folder / "car.toml", **options)
 
 
 @pytest.mark.parametrize("name", list(PRESETS))
 def test_every_preset_loads_and_wants_its_three_signals(name: str) -> None:
     temperature_c = 20.0 if PRESETS[name].lacks_temperature else None
-    vehicle = load_vehicle(name, temperature_c=temperature_c)
+    vehicle = Vehicle.load(name, temperature_c=temperature_c)
     assert vehicle.current.codec.unit == "A"
     assert vehicle.voltage.codec.unit == "V"
     assert vehicle.soc_reference is not None
@@ -81,43 +81,43 @@ def test_every_preset_loads_and_wants_its_three_signals(name: str) -> None:
 
 
 def test_presets_are_known_in_any_spelling() -> None:
-    assert load_vehicle("Leaf-ZE0").name == "Nissan Leaf ZE0"
-    assert load_vehicle("leaf_ze0").messages[0x1DB].rule is LEAF_RULE
+    assert Vehicle.load("Leaf-ZE0").name == "Nissan Leaf ZE0"
+    assert Vehicle.load("leaf_ze0").messages[0x1DB].rule is LEAF_RULE
 
 
 def test_a_car_without_temperature_on_its_bus_asks_for_one() -> None:
     with pytest.raises(InputError, match="no pack temperature") as caught:
-        load_vehicle("leaf_ze1")
+        Vehicle.load("leaf_ze1")
     assert caught.value.field == "--vehicle"
     assert "--temperature" in str(caught.value.cure)
 
 
 @pytest.mark.parametrize("temperature_c", [math.nan, math.inf, 300.0, -61.0])
-def test_a_fixed_temperature_must_be_one(temperature_c: float) -> None:
+def test_a_fixed_temperature_must_be_plausible(temperature_c: float) -> None:
     with pytest.raises(InputError, match="--temperature"):
-        load_vehicle("leaf_ze1", temperature_c=temperature_c)
+        Vehicle.load("leaf_ze1", temperature_c=temperature_c)
 
 
-def test_an_unknown_vehicle_is_answered_with_the_closest() -> None:
+def test_an_unknown_vehicle_suggests_the_closest() -> None:
     with pytest.raises(InputError, match="did you mean leaf_ze0") as caught:
-        load_vehicle("leafze0")
+        Vehicle.load("leafze0")
     assert caught.value.value == "leafze0"
     with pytest.raises(InputError, match="known are generic, leaf_ze0"):
-        load_vehicle("tesla")
+        Vehicle.load("tesla")
 
 
-def test_what_is_given_must_be_complete_and_not_too_much(own: Path) -> None:
+def test_incomplete_or_contradictory_options_are_refused(own: Path) -> None:
     with pytest.raises(InputError, match="no vehicle is given"):
-        load_vehicle()
-    with pytest.raises(InputError, match=r"--map.*does not say which signals"):
-        load_vehicle(dbc=own / "car.dbc")
+        Vehicle.load()
+    with pytest.raises(InputError, match=r"--map.*does not name the signals"):
+        Vehicle.load(dbc=own / "car.dbc")
     with pytest.raises(InputError, match=r"dbc: is missing"):
-        load_vehicle(map_file=own / "car.toml")
+        Vehicle.load(map=own / "car.toml")
     with pytest.raises(InputError, match="given together"):
-        load_vehicle("generic", dbc=own / "car.dbc")
+        Vehicle.load("generic", dbc=own / "car.dbc")
 
 
-def test_own_dbc_and_map(own: Path) -> None:
+def test_a_dbc_with_a_map_file_gives_a_vehicle(own: Path) -> None:
     vehicle = load(own)
     assert vehicle.name == "my car"
     assert vehicle.wanted_ids == (256, 0x18FF0B7E)
@@ -130,9 +130,9 @@ def test_own_dbc_and_map(own: Path) -> None:
     assert vehicle.soc_reference is None
 
 
-def test_the_dbc_may_stand_in_the_map_file(own: Path) -> None:
+def test_the_map_file_may_name_the_dbc(own: Path) -> None:
     (own / "car.toml").write_text('dbc = "car.dbc"\n' + MAP)
-    assert load_vehicle(map_file=own / "car.toml").dbc_files == (str(own / "car.dbc"),)
+    assert Vehicle.load(map=own / "car.toml").dbc_files == (str(own / "car.dbc"),)
 
 
 def test_signals_may_come_from_two_dbc_files(own: Path) -> None:
@@ -153,7 +153,7 @@ def test_units_of_the_dbc_are_converted(own: Path) -> None:
     ) == pytest.approx(19.95)
 
 
-def test_the_sign_turns_the_converted_value(own: Path) -> None:
+def test_the_sign_applies_after_conversion(own: Path) -> None:
     text = MAP.replace("PackTemperature", "CoolantKelvin") + "sign = -1\n"
     temperature = load(own, text).temperature
     assert temperature is not None
@@ -161,7 +161,7 @@ def test_the_sign_turns_the_converted_value(own: Path) -> None:
     assert temperature.decode(payload) == pytest.approx(-19.95)
 
 
-def test_a_strange_unit_must_be_explained(own: Path) -> None:
+def test_an_unknown_unit_is_refused(own: Path) -> None:
     text = MAP.replace("PackTemperature", "OddUnit")
     with pytest.raises(InputError, match=r"temperature\.signal.*OddUnit.*furlong") as caught:
         load(own, text)
@@ -169,20 +169,20 @@ def test_a_strange_unit_must_be_explained(own: Path) -> None:
     assert load(own, text + "scale = 2\noffset = -40\n").temperature is not None
 
 
-def test_wrong_sign_and_scale_of_a_dbc_can_be_put_right(own: Path) -> None:
+def test_the_map_file_corrects_sign_and_scale(own: Path) -> None:
     text = MAP.replace("sign = -1", "sign = -1\nscale = 0.5\noffset = 3.0")
     payload = bytes.fromhex("FF380FA000000000")
     assert load(own, text).current.decode(payload) == pytest.approx(0.5 * 20.0 + 3.0)
 
 
-def test_fixed_temperature_in_the_map(own: Path) -> None:
+def test_the_map_file_may_fix_the_temperature(own: Path) -> None:
     vehicle = load(own, MAP.replace('signal = "PackTemperature"', "fixed_c = 21.5"))
     assert vehicle.temperature is None
     assert vehicle.fixed_temperature_c == 21.5
     assert load(own, temperature_c=5.0).fixed_temperature_c == 5.0
 
 
-def test_codes_and_conditions_of_the_map(own: Path) -> None:
+def test_the_map_file_adds_codes_and_conditions(own: Path) -> None:
     text = MAP.replace(
         "[temperature]", "not_available = [9999]\nwhen = { Counter = 3 }\n\n[temperature]"
     )
@@ -192,7 +192,7 @@ def test_codes_and_conditions_of_the_map(own: Path) -> None:
     assert not voltage.is_in(bytes([0, 0, 0, 0, 0, 0, 2, 0]))
 
 
-def test_own_protection_rules(own: Path) -> None:
+def test_the_map_file_defines_protection_rules(own: Path) -> None:
     text = MAP + (
         '\n[messages.0x100]\nprotection = "mine"\nperiod_s = 0.5\n'
         "[rules.mine]\npolynomial = 0x2F\ninitial = 0xFF\ncounter_bits = 4\n"
@@ -204,7 +204,7 @@ def test_own_protection_rules(own: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "field", "told"),
+    ("old", "new", "field", "text"),
     [
         ('signal = "PackCurrent"', 'signal = "PackCurent"', "current.signal", "mean PackCurrent"),
         ('"PackVoltage"', '"PackTension"', "voltage.signal", "no such signal"),
@@ -231,19 +231,19 @@ def test_own_protection_rules(own: Path) -> None:
     ],
 )
 def test_mistakes_in_a_map_name_field_and_cure(
-    own: Path, old: str, new: str, field: str, told: str
+    own: Path, old: str, new: str, field: str, text: str
 ) -> None:
     assert old in MAP
     with pytest.raises(InputError) as caught:
         load(own, MAP.replace(old, new, 1))
     assert caught.value.field == field
-    assert told in str(caught.value)
+    assert text in str(caught.value)
     assert caught.value.source is not None
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("more", "field", "told"),
+    ("more", "field", "text"),
     [
         ('[messages.BMS_Status]\nprotection = "laef"', "messages.BMS_Status.protection", "known"),
         ('[messages.Nonsense]\nprotection = "leaf"', "messages.Nonsense", "no such message"),
@@ -257,15 +257,15 @@ def test_mistakes_in_a_map_name_field_and_cure(
         ("[rules.r]\n", "rules.r.polynomial", "is missing"),
     ],
 )
-def test_mistakes_in_protection(own: Path, more: str, field: str, told: str) -> None:
+def test_mistakes_in_protection_name_the_field(own: Path, more: str, field: str, text: str) -> None:
     with pytest.raises(InputError) as caught:
         load(own, MAP + "\n" + more + "\n")
     assert caught.value.field == field
-    assert told in str(caught.value)
+    assert text in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "text"),
     [
         (b"a = ", "not TOML"),
         (b"\xff\xfe\x00", "not TOML"),
@@ -273,19 +273,19 @@ def test_mistakes_in_protection(own: Path, more: str, field: str, told: str) -> 
         (b"", "missing"),
     ],
 )
-def test_what_is_no_map(own: Path, content: bytes, told: str) -> None:
+def test_a_file_that_is_no_map_is_refused(own: Path, content: bytes, text: str) -> None:
     (own / "car.toml").write_bytes(content)
-    with pytest.raises(InputError, match=told) as caught:
+    with pytest.raises(InputError, match=text) as caught:
         load(own)
     assert caught.value.source == str(own / "car.toml")
 
 
-def test_a_map_that_is_too_large_or_absent(own: Path) -> None:
+def test_a_large_or_absent_map_is_refused(own: Path) -> None:
     (own / "car.toml").write_bytes(b"#" * 300_000)
     with pytest.raises(InputError, match="larger than"):
         load(own)
     with pytest.raises(InputError, match="no such file"):
-        load_vehicle(dbc=own / "car.dbc", map_file=own / "absent.toml")
+        Vehicle.load(dbc=own / "car.dbc", map=own / "absent.toml")
 
 
 def test_a_map_without_temperature_asks_for_one(own: Path) -> None:

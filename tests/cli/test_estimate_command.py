@@ -15,7 +15,7 @@ import pyarrow.parquet
 import pytest
 
 from cangauge.bus.encoder import FrameEncoder
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.estimate import write_estimates
 from cangauge.estimate.offline import estimate_log, samples_of
 from cangauge.estimate.settings import EstimatorSettings
@@ -248,7 +248,7 @@ def capture(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The part of a discharge, as frames of the generic pack."""
     log = read_log(made / "part.csv")
     path = tmp_path_factory.mktemp("capture") / "drive.log"
-    encoder = FrameEncoder(load_vehicle("generic"))
+    encoder = FrameEncoder(Vehicle.load("generic"))
     with can.Logger(path) as writer:
         for sample, soc in zip(samples_of(log), log.soc_pct.tolist(), strict=True):
             for frame in encoder.encode(sample, soc):
@@ -271,7 +271,7 @@ def test_a_capture_is_estimated_as_the_service_does(
     assert found["frames"]["lost"] == 0
     assert found["soc_mae_pct"] is not None
     table = pa.parquet.read_table(out)
-    live = estimate_capture(capture, load_vehicle("generic"), Model.load(made / "model.json")).table
+    live = estimate_capture(capture, Vehicle.load("generic"), Model.load(made / "model.json")).table
     assert len(table) == found["rows"] == len(read_log(made / "part.csv"))
     for name in COLUMNS[1:7]:
         assert np.array_equal(table[name].to_numpy(), getattr(live, name), equal_nan=True)
@@ -282,7 +282,7 @@ def test_a_capture_of_another_pack_or_with_turned_current(
 ) -> None:
     model = ("-m", made / "model.json", "-o", tmp_path / "soc.csv")
     refused(run("estimate", capture, *model), "CAN capture", "--vehicle")
-    vehicle = load_vehicle("generic")
+    vehicle = Vehicle.load("generic")
     current = vehicle.current
     text = f"""
 name = "turned"

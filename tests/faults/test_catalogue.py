@@ -9,7 +9,7 @@ from random import Random
 
 import pytest
 
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from faults.catalogue import EVERYTHING, ON_UDP, ON_VCAN
 from faults.drive import Event, Profile, events
 from faults.fault import Fault
@@ -30,7 +30,7 @@ OF_FRAMES = [
 def played(fault: Fault, folder: Path, seed: int) -> tuple[list[Event], list[Event]]:
     """The frames of a fault, and those without it."""
     names = vehicle_config(fault.vehicle, folder)
-    vehicle = load_vehicle(names.get("vehicle"), names.get("dbc"), names.get("map"))
+    vehicle = Vehicle.load(names.get("vehicle"), names.get("dbc"), names.get("map"))
     rng = Random(seed)  # noqa: S311 - must be repeatable
     found = events(fault.profile, vehicle, values=fault.values, untrue=fault.untrue, rng=rng)
     if fault.frames is not None:

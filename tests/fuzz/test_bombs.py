@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from cangauge.bus.captures.capture import read_capture
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.inspect.capture import inspect_capture
 from cangauge.logs.read import read_log
@@ -244,7 +244,7 @@ def test_configurations(tmp_path: Path, text: str) -> None:
     path.write_text(text)
     message = refused(lambda: load_config(path).load_vehicle())
     assert message or text.startswith(('model = "x', "bus_options"))
-    assert refused(lambda: load_vehicle(map_file=path))
+    assert refused(lambda: Vehicle.load(map=path))
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 
 from cangauge.bus.captures.capture import is_capture, open_capture
 from cangauge.bus.database import load_dbc
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
@@ -23,7 +23,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "log": read_log,
     "capture": open_capture,
     "dbc": load_dbc,
-    "map": lambda path: load_vehicle(map_file=path),
+    "map": lambda path: Vehicle.load(map=path),
     "config": load_config,
     "model": Model.load,
     "speed": read_speed,

@@ -15,7 +15,7 @@ import pytest
 from cangauge.bus.captures.capture import read_capture
 from cangauge.bus.database import load_dbc
 from cangauge.bus.recording import capture_to_log
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
@@ -61,7 +61,7 @@ def test_captures(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", ["candump.log", "plain.blf"])
 def test_captures_as_logs(tmp_path: Path, name: str) -> None:
-    car = load_vehicle("leaf_aze0")
+    car = Vehicle.load("leaf_aze0")
     found = outcomes(
         tmp_path / name, corpus.capture_files()[name], lambda path: len(capture_to_log(path, car))
     )
@@ -74,7 +74,7 @@ TEXTS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "config.toml": (corpus.CONFIG, lambda path: load_config(path).load_vehicle()),
     "map.toml": (
         corpus.MAP.replace('dbc = "car.dbc"', 'dbc = "whole.dbc"'),
-        lambda path: load_vehicle(map_file=path),
+        lambda path: Vehicle.load(map=path),
     ),
     "speed.csv": (corpus.SPEED, read_speed),
     "model.json": (

@@ -1,4 +1,4 @@
-"""Recorded timing is kept."""
+"""Pacing of moments of log time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from live import never
 
 
 @pytest.mark.parametrize(("speed", "log_s"), [(1.0, 1.0), (10.0, 5.0)])
-def test_the_whole_takes_the_time_that_it_took(speed: float, log_s: float) -> None:
+def test_the_total_time_is_log_time_over_speed(speed: float, log_s: float) -> None:
     pacer = Pacer(speed, never)
     began = time.monotonic()
     for step in range(int(log_s * 1000) + 1):  # a moment every log millisecond
@@ -19,7 +19,7 @@ def test_the_whole_takes_the_time_that_it_took(speed: float, log_s: float) -> No
     assert time.monotonic() - began == pytest.approx(log_s / speed, abs=0.02)
 
 
-def test_what_is_late_does_not_make_the_rest_later() -> None:
+def test_a_late_moment_does_not_delay_the_rest() -> None:
     pacer = Pacer(1.0, never)
     began = time.monotonic()
     pacer.wait(0)
@@ -30,7 +30,7 @@ def test_what_is_late_does_not_make_the_rest_later() -> None:
     assert time.monotonic() - began == pytest.approx(0.5, abs=0.02)
 
 
-def test_a_long_pause_can_be_ended() -> None:
+def test_a_long_wait_can_be_stopped() -> None:
     ends = time.monotonic() + 0.3
     pacer = Pacer(1.0, lambda: time.monotonic() > ends)
     pacer.wait(0)

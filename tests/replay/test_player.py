@@ -1,4 +1,4 @@
-"""Replay and service on one bus: nothing lost, timing kept, clear words when nobody listens."""
+"""Replay to a service on one bus: no loss, recorded timing, errors without a receiver."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.publish import FrameIds, SocPublisher, standard_filter
 from cangauge.bus.time_source import is_clock
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import CangaugeError, InputError
 from cangauge.estimate.offline import run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
@@ -48,7 +48,7 @@ def play_log(
     channel: str, seconds: float, settings: ReplaySettings, preset: str = "generic"
 ) -> ReplayState:
     with virtual_port(channel, SOC_FRAMES) as port:
-        source = LogSource(short_log(seconds), load_vehicle(preset))
+        source = LogSource(short_log(seconds), Vehicle.load(preset))
         return play(port, source, settings, stop=never)
 
 
@@ -56,10 +56,8 @@ def play_log(
     ("preset", "method"),
     [("generic", "ekf"), ("generic", "newton"), ("generic", "coulomb"), ("leaf_aze0", "ekf")],
 )
-def test_the_replayed_soc_is_the_offline_one_within_the_quantisation_bound(
-    preset: str, method: str
-) -> None:
-    vehicle, log, model = load_vehicle(preset), short_log(200.0), leaf_model()
+def test_replayed_soc_is_offline_soc_within_the_bound(preset: str, method: str) -> None:
+    vehicle, log, model = Vehicle.load(preset), short_log(200.0), leaf_model()
     estimator = EstimatorSettings(method=method, initial_soc_pct=80.0)  # type: ignore[arg-type] # parametrised
     settings = GaugeSettings(estimator, "replay-clock")
     with virtual_service(f"{preset}{method}", settings, vehicle=vehicle) as service:
@@ -72,13 +70,13 @@ def test_the_replayed_soc_is_the_offline_one_within_the_quantisation_bound(
     limit = {"ekf": bound.ekf_pct, "newton": bound.newton_pct, "coulomb": bound.coulomb_pct}
     worst = float(np.max(np.abs(live - offline)))
     assert worst <= limit[method] + 1e-9
-    # The bound is no empty word: rounding does show, and the bound is not far above it.
+    # The bound is tight: quantization shows, not far below it.
     assert worst > limit[method] / 100.0
 
 
-def test_the_bound_is_what_its_equation_says() -> None:
+def test_the_bound_follows_its_equation() -> None:
     log, model = short_log(200.0), leaf_model()
-    bound = quantisation_bound(load_vehicle("leaf_aze0"), model, log)
+    bound = quantisation_bound(Vehicle.load("leaf_aze0"), model, log)
     # 0.25 A over the log's length; no stamp of this log needs rounding.
     assert bound.coulomb_pct == pytest.approx(0.25 * log.duration_s / 36.0 / 51.5, rel=1e-6)
     resistance = 0.1032 + 0.01501 + 0.009697 + 0.004652
@@ -88,7 +86,7 @@ def test_the_bound_is_what_its_equation_says() -> None:
     assert bound.ekf_pct == bound.coulomb_pct + bound.newton_pct
 
 
-def test_started_before_the_service_it_waits_and_loses_nothing() -> None:
+def test_a_replay_waits_for_the_service_without_loss() -> None:
     result: list[ReplayState] = []
     player = threading.Thread(target=lambda: result.append(play_log("early", 30.0, MAX)))
     player.start()
@@ -99,7 +97,7 @@ def test_started_before_the_service_it_waits_and_loses_nothing() -> None:
     assert result[0].acknowledged == 300
 
 
-def test_one_replay_after_the_other() -> None:
+def test_successive_replays_give_equal_estimates() -> None:
     with virtual_service("twice", REPLAYED) as service:
         first = play_log("twice", 20.0, MAX)
         second = play_log("twice", 20.0, MAX)
@@ -108,12 +106,12 @@ def test_one_replay_after_the_other() -> None:
     assert soc[:200] == soc[200:]
 
 
-def test_a_log_of_a_prime_number_of_rows_is_acknowledged_to_the_last() -> None:
+def test_the_last_samples_are_acknowledged() -> None:
     with virtual_service("prime", REPLAYED):
         assert play_log("prime", 10.1, MAX).acknowledged == 101
 
 
-def test_nobody_listening_is_told_in_one_line() -> None:
+def test_a_missing_receiver_is_an_error_of_one_line() -> None:
     settings = ReplaySettings(speed=math.inf, acknowledge_s=0.4)
     with pytest.raises(CangaugeError, match="--time-source replay-clock") as caught:
         play_log("alone", 10.0, settings)
@@ -121,21 +119,21 @@ def test_nobody_listening_is_told_in_one_line() -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_service_for_another_vehicle_is_told() -> None:
+def test_a_service_for_another_vehicle_is_an_error() -> None:
     settings = ReplaySettings(speed=math.inf, wait_s=3.0, acknowledge_s=0.5)
     with (
-        virtual_service("other", REPLAYED, vehicle=load_vehicle("leaf_aze0")),
+        virtual_service("other", REPLAYED, vehicle=Vehicle.load("leaf_aze0")),
         pytest.raises(CangaugeError, match=r"0 of \d+ samples sent have been processed"),
     ):
         play_log("other", 100.0, settings)
 
 
-def test_a_second_sender_on_the_bus_is_told() -> None:
+def test_a_second_sender_on_the_bus_is_an_error() -> None:
     with virtual_service("crowd", REPLAYED), virtual_port("crowd") as intruder:
         stop = threading.Event()
 
         def intrude() -> None:
-            encoder = FrameEncoder(load_vehicle("generic"))
+            encoder = FrameEncoder(Vehicle.load("generic"))
             for sample in itertools.cycle(samples_of(short_log(20.0))):
                 if stop.is_set():
                     return
@@ -145,7 +143,7 @@ def test_a_second_sender_on_the_bus_is_told() -> None:
         other = threading.Thread(target=intrude)
         other.start()
         try:
-            with pytest.raises(CangaugeError, match=r"somebody else|have been processed"):
+            with pytest.raises(CangaugeError, match=r"another program|have been processed"):
                 play_log("crowd", 100.0, MAX)
         finally:
             stop.set()
@@ -153,7 +151,7 @@ def test_a_second_sender_on_the_bus_is_told() -> None:
 
 
 class LossyBus:
-    """Passes to another bus all but some frames."""
+    """Drops some of the frames sent."""
 
     def __init__(self, bus: can.BusABC, lose: set[int]) -> None:
         self._bus = bus
@@ -169,11 +167,11 @@ class LossyBus:
         return getattr(self._bus, name)
 
 
-def test_a_frame_lost_on_the_way_does_not_pass_unnoticed() -> None:
+def test_lost_frames_are_an_error() -> None:
     settings = ReplaySettings(speed=math.inf, wait_s=3.0, acknowledge_s=0.5)
     bus = LossyBus(open_bus(BusAddress("virtual", "lossy"), SOC_FRAMES), {200, 400, 401, 402})
-    source = LogSource(short_log(30.0), load_vehicle("leaf_aze0"))
-    with virtual_service("lossy", REPLAYED, vehicle=load_vehicle("leaf_aze0")) as service:
+    source = LogSource(short_log(30.0), Vehicle.load("leaf_aze0"))
+    with virtual_service("lossy", REPLAYED, vehicle=Vehicle.load("leaf_aze0")) as service:
         port = BusConnection(bus, "lossy")  # type: ignore[arg-type] # has what is used of a bus
         with port, pytest.raises(CangaugeError, match="of 300 samples sent have been processed"):
             play(port, source, settings, stop=never)
@@ -181,7 +179,7 @@ def test_a_frame_lost_on_the_way_does_not_pass_unnoticed() -> None:
 
 
 def test_frames_under_way_are_bounded() -> None:
-    """No more waits in the receiver's socket than a default buffer holds."""
+    """The receiver's queue stays below what a default socket buffer holds."""
     bus = open_bus(BusAddress("virtual", "window"), SOC_FRAMES)
     receiver = open_bus(BusAddress("virtual", "window"))
     publisher = SocPublisher(acknowledge_every=1)
@@ -204,7 +202,7 @@ def test_frames_under_way_are_bounded() -> None:
     thread = threading.Thread(target=receive)
     with BusConnection(bus, "window") as port:
         thread.start()
-        source = LogSource(short_log(50.0), load_vehicle("generic"))
+        source = LogSource(short_log(50.0), Vehicle.load("generic"))
         state = play(port, source, MAX, stop=never)
     thread.join()
     receiver.shutdown()
@@ -227,7 +225,7 @@ def test_recorded_timing_is_kept(tmp_path: Path, speed: float, seconds: float) -
     with Recorder(path) as recorder:
         for frame in frames:
             recorder.write(frame)
-    # Other tests may have the cores for a moment: a player that keeps time does so in one of three.
+    # Other tests may occupy the cores: one of three attempts must keep time.
     for attempt in range(3):
         late = lateness(path, frames, speed, f"timing{speed}-{attempt}")
         if np.quantile(np.abs(late), 0.9) < 0.02:
@@ -240,7 +238,7 @@ def test_recorded_timing_is_kept(tmp_path: Path, speed: float, seconds: float) -
 def lateness(
     path: Path, frames: Sequence[can.Message], speed: float, channel: str
 ) -> NDArray[np.float64]:
-    """Play a capture and return by how much each frame came late after the first [s]."""
+    """Play a capture; return the delay of each frame relative to the first [s]."""
     with virtual_port(channel) as listener, virtual_port(channel, SOC_FRAMES) as port:
         state = play(port, CaptureSource(path), ReplaySettings(speed), stop=never)
         heard = collect(listener, 0.2)
@@ -256,19 +254,19 @@ def lateness(
     )
 
 
-def test_at_n_times_the_speed_the_estimate_is_the_same() -> None:
+def test_the_estimate_does_not_depend_on_the_speed() -> None:
     log, model = short_log(40.0), leaf_model()
     with virtual_service("fast", REPLAYED) as service:
         state = play_log("fast", 40.0, ReplaySettings(speed=40.0, wait_s=3.0))
         assert waits(lambda: service.gauge.samples == 400)
     assert state.seconds == pytest.approx(39.9 / 40.0, abs=0.1)
     assert state.acknowledged is None
-    sent = FrameEncoder(load_vehicle("generic")).quantise(log)
+    sent = FrameEncoder(Vehicle.load("generic")).quantise(log)
     offline = run_estimator(samples_of(sent), model, EstimatorSettings()).soc_pct
     assert [estimate.soc_pct for _, estimate in service.rows] == offline.tolist()
 
 
-def test_in_real_time_nobody_needs_to_listen_and_no_clock_is_sent() -> None:
+def test_real_time_needs_no_receiver_and_no_clock() -> None:
     with virtual_port("radio") as listener:
         state = play_log("radio", 1.0, ReplaySettings())
         heard = collect(listener, 0.1)
@@ -276,9 +274,9 @@ def test_in_real_time_nobody_needs_to_listen_and_no_clock_is_sent() -> None:
     assert not any(is_clock(each) for each in heard)
 
 
-def test_looping_goes_on_until_it_is_stopped() -> None:
+def test_a_loop_runs_until_stopped() -> None:
     with virtual_service("loop", REPLAYED) as service, virtual_port("loop", SOC_FRAMES) as port:
-        source = LogSource(short_log(5.0), load_vehicle("generic"))
+        source = LogSource(short_log(5.0), Vehicle.load("generic"))
         settings = ReplaySettings(speed=math.inf, loop=True)
         state = play(port, source, settings, stop=lambda: service.gauge.samples >= 220)
         assert state.samples >= 220
@@ -294,19 +292,19 @@ def test_full_speed_needs_the_vehicle_of_a_capture(tmp_path: Path) -> None:
         play(port, CaptureSource(path), MAX, stop=never)
 
 
-def test_fd_frames_need_a_bus_for_them(tmp_path: Path) -> None:
+def test_fd_frames_need_an_fd_bus(tmp_path: Path) -> None:
     path = tmp_path / "fd.log"
     path.write_text("(1.000000) can0 123##000112233445566778899AABB\n")
     with virtual_port("classic") as port, pytest.raises(InputError, match="fd=true"):
         play(port, CaptureSource(path), ReplaySettings(), stop=never)
 
 
-def test_ids_can_be_others() -> None:
+def test_ids_are_configurable() -> None:
     ids = FrameIds(0x111, 0x112, 0x113)
     filters = [standard_filter(0x111), standard_filter(0x112)]
     settings = GaugeSettings(time_source="replay-clock", ids=ids)
     with virtual_service("ids", settings), virtual_port("ids", filters) as port:
-        source = LogSource(short_log(10.0), load_vehicle("generic"))
+        source = LogSource(short_log(10.0), Vehicle.load("generic"))
         state = play(port, source, ReplaySettings(math.inf, ids=ids), stop=never)
     assert state.acknowledged == 100
     assert state.soc is not None
@@ -315,7 +313,7 @@ def test_ids_can_be_others() -> None:
 @pytest.mark.real
 def test_a_real_leafs_capture_at_full_speed(shared_data: Path) -> None:
     path = shared_data / "leaf_can" / "ZE0w24kWhstock.log.gz"
-    vehicle = load_vehicle("leaf_ze0")
+    vehicle = Vehicle.load("leaf_ze0")
     with virtual_service("leaf", REPLAYED, vehicle=vehicle) as service:
         assert isinstance(service, Service)
         with virtual_port("leaf", SOC_FRAMES) as port:

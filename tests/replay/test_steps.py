@@ -1,4 +1,4 @@
-"""What is sent, and when in log time."""
+"""Steps of logs and captures: frames and log time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from cangauge.bus.publish import SocPublisher
 from cangauge.bus.time_source import ClockFrames
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.replay.steps import CaptureSource, LogSource
 from cangauge.service.pipeline import NOTHING_YET
@@ -32,14 +32,14 @@ def write(path: Path, frames: list[can.Message]) -> Path:
 @pytest.mark.parametrize("preset", ["generic", "leaf_aze0"])
 def test_each_row_is_one_sample_at_its_time(preset: str) -> None:
     log = short_log(10.0)
-    steps = list(LogSource(log, load_vehicle(preset)).steps(loop=False))
+    steps = list(LogSource(log, Vehicle.load(preset)).steps(loop=False))
     assert [step.time_us for step in steps] == [round(1e6 * t) for t in log.time_s]
     assert [step.samples for step in steps] == list(range(1, len(log) + 1))
 
 
-def test_played_again_time_and_counters_go_on() -> None:
+def test_time_and_counters_continue_in_a_loop() -> None:
     log = short_log(2.0)
-    source = LogSource(log, load_vehicle("generic"))
+    source = LogSource(log, Vehicle.load("generic"))
     steps = list(islice(source.steps(loop=True), 3 * len(log)))
     times = [step.time_us for step in steps]
     assert times == [100_000 * number for number in range(60)]
@@ -48,15 +48,15 @@ def test_played_again_time_and_counters_go_on() -> None:
     assert [each.data[-2] >> 4 for each in currents] == [number % 16 for number in range(60)]
 
 
-def test_a_value_that_fits_into_no_frame_is_refused_before_anything_is_sent() -> None:
+def test_a_value_out_of_range_is_refused_before_sending() -> None:
     log = short_log(2.0)
     high = log.voltage_v + 300.0
     too_high = type(log)(log.time_s, log.current_a, high, log.temperature_c, log.soc_pct)
     with pytest.raises(InputError, match="voltage_v"):
-        LogSource(too_high, load_vehicle("leaf_aze0"))
+        LogSource(too_high, Vehicle.load("leaf_aze0"))
 
 
-def test_a_captures_frames_are_sent_as_they_were(tmp_path: Path) -> None:
+def test_a_captures_frames_are_sent_unchanged(tmp_path: Path) -> None:
     frames = [frame(1.7e9 + 0.013 * n, 0x100 + n % 3, bytes([n])) for n in range(30)]
     path = write(tmp_path / "a.log", frames)
     steps = list(CaptureSource(path).steps(loop=False))
@@ -66,15 +66,15 @@ def test_a_captures_frames_are_sent_as_they_were(tmp_path: Path) -> None:
     assert all(step.is_wanted for step in steps)
 
 
-def test_own_frames_in_a_capture_are_left_out_and_its_replay_clock_is_time(
+def test_own_frames_of_a_capture_only_give_its_time(
     tmp_path: Path,
 ) -> None:
     publisher, clock = SocPublisher(), ClockFrames()
     frames = []
     for number in range(5):
         mark = clock.at(1_000_000 * number)
-        told = publisher.estimate_frame(NOTHING_YET)
-        for each in (mark, frame(0.0, data=bytes([number])), told):
+        published = publisher.estimate_frame(NOTHING_YET)
+        for each in (mark, frame(0.0, data=bytes([number])), published):
             each.timestamp = 1.7e9 + 1e-3 * len(frames)
             frames.append(each)
     source = CaptureSource(write(tmp_path / "a.log", frames))
@@ -100,7 +100,7 @@ def test_samples_of_a_real_capture_are_counted_as_the_receiver_does(shared_data:
     from cangauge.bus.recording import capture_samples  # noqa: PLC0415 - needs the real data
 
     path = shared_data / "leaf_can" / "ZE0w24kWhstock.log.gz"
-    vehicle = load_vehicle("leaf_ze0")
+    vehicle = Vehicle.load("leaf_ze0")
     steps = list(CaptureSource(path, vehicle).steps(loop=False))
     assert steps[-1].samples == len(capture_samples(path, vehicle))
     wanted = {each.frames[0].arbitration_id for each in steps if each.is_wanted}

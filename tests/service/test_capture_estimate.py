@@ -10,7 +10,7 @@ import pytest
 
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.time_source import ClockFrames
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.validity import Estimate
@@ -33,7 +33,7 @@ def live_and_recorded(
     frames: list[can.Message], settings: GaugeSettings, path: Path, preset: str
 ) -> tuple[list[Estimate], Path]:
     """Handle frames as the loop does, recording them; return the estimates and the recording."""
-    gauge = Gauge(load_vehicle(preset), leaf_model(), settings)
+    gauge = Gauge(Vehicle.load(preset), leaf_model(), settings)
     found = []
     with Recorder(path) as recorder:
         for frame in frames:
@@ -50,7 +50,7 @@ def live_and_recorded(
 
 
 def assert_same(live: list[Estimate], path: Path, preset: str) -> None:
-    recorded = estimate_capture(path, load_vehicle(preset), leaf_model())
+    recorded = estimate_capture(path, Vehicle.load(preset), leaf_model())
     assert len(live) == recorded.table.soc_pct.size > 0
     for name in NUMBERS:
         expected = np.array([getattr(each, name) for each in live])
@@ -61,7 +61,7 @@ def assert_same(live: list[Estimate], path: Path, preset: str) -> None:
 @pytest.mark.parametrize("preset", ["generic", "leaf_aze0"])
 def test_recorded_stamps_are_the_live_ones(tmp_path: Path, suffix: str, preset: str) -> None:
     rng = np.random.default_rng(5)
-    encoder = FrameEncoder(load_vehicle(preset))
+    encoder = FrameEncoder(Vehicle.load(preset))
     frames = []
     for sample in samples_of(short_log(90.0)):
         for frame in encoder.encode(sample, 55.0):
@@ -76,7 +76,7 @@ def test_recorded_stamps_are_the_live_ones(tmp_path: Path, suffix: str, preset: 
 
 
 def test_of_a_recorded_replay_time_is_the_logs(tmp_path: Path) -> None:
-    clock, encoder = ClockFrames(), FrameEncoder(load_vehicle("generic"))
+    clock, encoder = ClockFrames(), FrameEncoder(Vehicle.load("generic"))
     frames = []
     for _ in range(2):  # two replays, one after the other: each log is estimated for itself
         for sample in samples_of(short_log(30.0)):
@@ -88,14 +88,14 @@ def test_of_a_recorded_replay_time_is_the_logs(tmp_path: Path) -> None:
     settings = GaugeSettings(time_source="replay-clock")
     live, _ = live_and_recorded(frames, settings, path, "generic")
     assert_same(live, path, "generic")
-    recorded = estimate_capture(path, load_vehicle("generic"), leaf_model())
+    recorded = estimate_capture(path, Vehicle.load("generic"), leaf_model())
     assert recorded.time_source == "replay-clock"
     assert recorded.counts.beginnings == 1
     assert recorded.table.time_s[:3].tolist() == [0.0, 0.1, 0.2]
 
 
 def test_samples_without_voltage_are_estimated_too(tmp_path: Path) -> None:
-    encoder = FrameEncoder(load_vehicle("generic"))
+    encoder = FrameEncoder(Vehicle.load("generic"))
     frames = []
     for row, sample in enumerate(samples_of(short_log(30.0))):
         for frame in encoder.encode(sample):
@@ -104,7 +104,7 @@ def test_samples_without_voltage_are_estimated_too(tmp_path: Path) -> None:
     path = tmp_path / "gappy.log"
     live, _ = live_and_recorded(frames, GaugeSettings(), path, "generic")
     assert_same(live, path, "generic")
-    recorded = estimate_capture(path, load_vehicle("generic"), leaf_model())
+    recorded = estimate_capture(path, Vehicle.load("generic"), leaf_model())
     assert np.count_nonzero(np.isnan(recorded.voltage_v)) == 100
 
 
@@ -113,7 +113,7 @@ def test_another_buses_capture_is_refused(tmp_path: Path) -> None:
     with Recorder(path) as recorder:
         recorder.write(can.Message(timestamp=1.0, arbitration_id=5, data=b"1"))
     with pytest.raises(InputError, match="no sample"):
-        estimate_capture(path, load_vehicle("generic"), leaf_model())
+        estimate_capture(path, Vehicle.load("generic"), leaf_model())
 
 
 def test_formats_that_round_stamps_are_refused(tmp_path: Path) -> None:
@@ -126,6 +126,6 @@ def test_formats_that_round_stamps_are_refused(tmp_path: Path) -> None:
 @pytest.mark.real
 def test_a_real_leafs_capture(shared_data: Path) -> None:
     path = shared_data / "leaf_can" / "ZE0w24kWhstock.log.gz"
-    recorded = estimate_capture(path, load_vehicle("leaf_ze0"), leaf_model())
+    recorded = estimate_capture(path, Vehicle.load("leaf_ze0"), leaf_model())
     assert recorded.table.soc_pct.size > 100
     assert np.nanmin(recorded.table.soc_pct) >= 0.0

@@ -15,7 +15,7 @@ import pyarrow.parquet
 import pytest
 
 from cangauge.bus.encoder import FrameEncoder
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.offline import samples_of
 from cangauge.logs.canonical import write_log
 from cangauge.service.capture_estimate import estimate_capture
@@ -60,7 +60,7 @@ def test_a_log_at_full_speed_from_one_process_to_the_other(
     assert result["lost"] == result["crc_errors"] == result["untimed"] == 0
     assert result["estimate"]["soc_pct"] == pytest.approx(replayed.json["soc_pct"], abs=0.002)
     # Bit for bit: the recording, offline.
-    offline = estimate_capture(record, load_vehicle("generic"), leaf_model()).table
+    offline = estimate_capture(record, Vehicle.load("generic"), leaf_model()).table
     read = pyarrow.csv.read_csv if suffix == ".csv" else pyarrow.parquet.read_table
     live = read(output)
     names = ["time_s", "soc_pct", "soc_std_pct", "soc_newton_pct", "soc_coulomb_pct",
@@ -75,7 +75,7 @@ def test_a_capture_in_real_time(bus: list[str], tmp_path: Path) -> None:
     # 6 s of a Leaf's battery, 100 frames a second and some others, not quite regular.
     capture, again = tmp_path / "drive.log", tmp_path / "again.log"
     rng = np.random.default_rng(8)
-    vehicle = load_vehicle("leaf_aze0")
+    vehicle = Vehicle.load("leaf_aze0")
     encoder = FrameEncoder(vehicle)
     with Recorder(capture) as recorder:
         for sample in samples_of(short_log(6.01, rate_hz=100.0)):

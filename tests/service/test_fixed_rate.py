@@ -9,10 +9,10 @@ from types import SimpleNamespace
 import can
 import pytest
 
-from cangauge.bus.connection import UNKNOWN_INTERFACE, BackendCapabilities, Stamps
+from cangauge.bus.backend import UNKNOWN_INTERFACE, BackendCapabilities, Stamps
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.publish import SocDetail, SocEstimate, SocReader
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Reason, Sample, Status
 from cangauge.service import loop
@@ -24,7 +24,7 @@ from live import leaf_model, never
 class Desk:
     """A port and the clock in one: receiving waits until the next frame, or the time is up."""
 
-    facts = UNKNOWN_INTERFACE
+    capabilities = UNKNOWN_INTERFACE
     queue_drops = None
 
     def __init__(self, frames: list[tuple[float, can.Message]], began_s: float = 5000.0) -> None:
@@ -34,7 +34,7 @@ class Desk:
         self.work_s = 0.0
         self._began_s = began_s
 
-    def receive_waiting(self, timeout_s: float) -> list[can.Message]:
+    def receive_pending(self, timeout_s: float) -> list[can.Message]:
         if self._frames and self._frames[0][0] <= self.now_s + timeout_s:
             at_s, frame = self._frames.pop(0)
             self.now_s = max(self.now_s, at_s) + self.work_s
@@ -52,7 +52,7 @@ class Desk:
 def frames_every(
     step_s: float, until_s: float, stamp_rate: float = 1.0, from_s: float = 0.0
 ) -> list[tuple[float, can.Message]]:
-    encoder = FrameEncoder(load_vehicle("generic"))
+    encoder = FrameEncoder(Vehicle.load("generic"))
     times = [from_s + number * step_s for number in range(int((until_s - from_s) / step_s))]
     return [
         (at_s, frame)
@@ -70,7 +70,7 @@ def served(
         process_time=time.process_time,
     )
     monkeypatch.setattr(loop, "time", clock)
-    gauge = Gauge(load_vehicle("generic"), leaf_model(), GaugeSettings())
+    gauge = Gauge(Vehicle.load("generic"), leaf_model(), GaugeSettings())
     serve(desk, gauge, LoopSettings(duration_s=seconds), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for
     return desk
 
@@ -114,20 +114,20 @@ def test_a_machine_that_slept_goes_on_the_grid_and_makes_up_for_nothing(
 ) -> None:
     frames = [*frames_every(0.1, 2.0), *frames_every(0.1, 12.0, from_s=9.0)]
     desk = Desk(frames)
-    receive = desk.receive_waiting
+    receive = desk.receive_pending
 
     def sleepy(timeout_s: float) -> list[can.Message]:
         if 2.0 < desk.now_s - 5000.0 < 2.5:
             desk.now_s += 5.678
         return receive(timeout_s)
 
-    desk.receive_waiting = sleepy  # type: ignore[method-assign] # the machine sleeps once
+    desk.receive_pending = sleepy  # type: ignore[method-assign] # the machine sleeps once
     clock = SimpleNamespace(
         monotonic=lambda: desk.now_s,
         process_time=time.process_time,
     )
     monkeypatch.setattr(loop, "time", clock)
-    gauge = Gauge(load_vehicle("generic"), leaf_model(), GaugeSettings())
+    gauge = Gauge(Vehicle.load("generic"), leaf_model(), GaugeSettings())
     serve(desk, gauge, LoopSettings(duration_s=12.0), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for
     told = [at_s for at_s, _ in beats(desk)]
     steps = [b - a for a, b in itertools.pairwise(told)]
@@ -157,8 +157,8 @@ def test_a_backlog_is_old_until_it_is_worked_off(
 ) -> None:
     """Stopped from 3.0 to 9.0 s, the service then reads in two seconds what waited meanwhile."""
     desk = Desk(frames_every(0.02, 14.0))
-    desk.facts = BackendCapabilities(stamps, echoes=False, has_error_classes=False)
-    receive = desk.receive_waiting
+    desk.capabilities = BackendCapabilities(stamps, echoes=False, has_error_classes=False)
+    receive = desk.receive_pending
 
     def stopped(timeout_s: float) -> list[can.Message]:
         since_s = desk.now_s - 5000.0
@@ -168,7 +168,7 @@ def test_a_backlog_is_old_until_it_is_worked_off(
         desk.work_s = 0.0025 if 9.0 <= since_s < 11.0 else 0.0
         return receive(timeout_s)
 
-    desk.receive_waiting = stopped  # type: ignore[method-assign] # is stopped once
+    desk.receive_pending = stopped  # type: ignore[method-assign] # is stopped once
     clock = SimpleNamespace(
         monotonic=lambda: desk.now_s,
         time=lambda: 1.7e9 + desk.now_s - 5000.0,
@@ -176,7 +176,7 @@ def test_a_backlog_is_old_until_it_is_worked_off(
     )
     monkeypatch.setattr(loop, "time", clock)
     known = GaugeSettings(EstimatorSettings(initial_soc_pct=60.0))
-    gauge = Gauge(load_vehicle("generic"), leaf_model(), known)
+    gauge = Gauge(Vehicle.load("generic"), leaf_model(), known)
     serve(desk, gauge, LoopSettings(duration_s=14.0), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for
     told = beats(desk)
     fresh = [content for at_s, content in told if 0.5 < at_s < 3.0 or at_s > 13.0]

@@ -10,7 +10,7 @@ import pytest
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.publish import FrameIds, SocDetail, SocEstimate, SocReader
 from cangauge.bus.time_source import ClockFrames
-from cangauge.bus.vehicle import Vehicle, load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.offline import run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
@@ -58,7 +58,7 @@ def estimates(gauge: Gauge, frames: list[can.Message]) -> list[Estimate]:
 @pytest.mark.parametrize("preset", ["generic", "leaf_aze0"])
 @pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
 def test_live_is_offline_on_what_the_frames_hold(log: Log, preset: str, method: str) -> None:
-    vehicle = load_vehicle(preset)
+    vehicle = Vehicle.load(preset)
     settings = EstimatorSettings(method=method, initial_soc_pct=80.0)  # type: ignore[arg-type] # parametrised
     gauge = Gauge(vehicle, leaf_model(), GaugeSettings(settings, "replay-clock"))
     live = estimates(gauge, with_clock(frames_of(log, vehicle)))
@@ -71,7 +71,7 @@ def test_live_is_offline_on_what_the_frames_hold(log: Log, preset: str, method: 
 
 
 def test_receive_stamps_are_bus_time(log: Log) -> None:
-    vehicle = load_vehicle("generic")
+    vehicle = Vehicle.load("generic")
     gauge = Gauge(vehicle, leaf_model(), GaugeSettings(START))
     live = estimates(gauge, frames_of(log, vehicle, shift_s=1.7e9))
     assert live[-1].time_s == pytest.approx(1.7e9 + log.time_s[-1])
@@ -80,7 +80,7 @@ def test_receive_stamps_are_bus_time(log: Log) -> None:
 
 
 def test_without_a_clock_frame_nothing_is_estimated(log: Log) -> None:
-    vehicle = load_vehicle("generic")
+    vehicle = Vehicle.load("generic")
     gauge = Gauge(vehicle, leaf_model(), GaugeSettings(START, "replay-clock"))
     frames = frames_of(log, vehicle)[:50]
     assert estimates(gauge, frames) == []
@@ -88,7 +88,7 @@ def test_without_a_clock_frame_nothing_is_estimated(log: Log) -> None:
 
 
 def test_before_the_first_sample_it_says_that_it_knows_nothing() -> None:
-    gauge = Gauge(load_vehicle("generic"), leaf_model())
+    gauge = Gauge(Vehicle.load("generic"), leaf_model())
     reader = SocReader()
     contents = [reader.read(frame) for frame in gauge.heartbeat(is_stale=False)]
     assert isinstance(contents[0], SocEstimate)
@@ -100,7 +100,7 @@ def test_before_the_first_sample_it_says_that_it_knows_nothing() -> None:
 
 
 def test_silence_is_published_as_invalid_with_the_last_soc(log: Log) -> None:
-    vehicle = load_vehicle("generic")
+    vehicle = Vehicle.load("generic")
     gauge = Gauge(vehicle, leaf_model(), GaugeSettings(START))
     estimates(gauge, frames_of(log, vehicle))
     reader = SocReader()
@@ -119,7 +119,7 @@ def test_silence_is_published_as_invalid_with_the_last_soc(log: Log) -> None:
 
 
 def test_the_last_samples_are_acknowledged_once_it_is_quiet(log: Log) -> None:
-    vehicle = load_vehicle("generic")
+    vehicle = Vehicle.load("generic")
     gauge = Gauge(vehicle, leaf_model(), GaugeSettings(START, "replay-clock"))
     reader = SocReader()
     told = 0
@@ -133,7 +133,7 @@ def test_the_last_samples_are_acknowledged_once_it_is_quiet(log: Log) -> None:
 
 
 def test_a_second_replay_starts_anew_and_counting_goes_on(log: Log) -> None:
-    vehicle = load_vehicle("generic")
+    vehicle = Vehicle.load("generic")
     gauge = Gauge(vehicle, leaf_model(), GaugeSettings(START, "replay-clock"))
     first = estimates(gauge, with_clock(frames_of(log, vehicle)))
     second = estimates(gauge, with_clock(frames_of(log, vehicle)))
@@ -144,7 +144,7 @@ def test_a_second_replay_starts_anew_and_counting_goes_on(log: Log) -> None:
 
 
 def test_damaged_and_lost_frames_are_counted(log: Log) -> None:
-    vehicle = load_vehicle("leaf_aze0")
+    vehicle = Vehicle.load("leaf_aze0")
     gauge = Gauge(vehicle, leaf_model(), GaugeSettings(START))
     frames = [each for each in frames_of(log, vehicle) if each.arbitration_id == 0x1DB]
     frames[10].data[0] ^= 0xFF
@@ -157,16 +157,16 @@ def test_damaged_and_lost_frames_are_counted(log: Log) -> None:
 def test_own_ids_must_not_be_the_vehicles() -> None:
     with pytest.raises(InputError, match="PACK_CURRENT"):
         Gauge(
-            load_vehicle("generic"), leaf_model(), GaugeSettings(ids=FrameIds(soc_estimate=0x400))
+            Vehicle.load("generic"), leaf_model(), GaugeSettings(ids=FrameIds(soc_estimate=0x400))
         )
 
 
 def test_only_wanted_ids_pass_the_filters() -> None:
-    gauge = Gauge(load_vehicle("leaf_aze0"), leaf_model())
+    gauge = Gauge(Vehicle.load("leaf_aze0"), leaf_model())
     assert {each["can_id"] for each in gauge.filters} == {0x1DB, 0x55B, 0x5C0}
     assert all(each["can_mask"] == 0x7FF and each["extended"] is False for each in gauge.filters)
     settings = GaugeSettings(time_source="replay-clock")
-    clocked = Gauge(load_vehicle("leaf_aze0"), leaf_model(), settings)
+    clocked = Gauge(Vehicle.load("leaf_aze0"), leaf_model(), settings)
     assert {each["can_id"] for each in clocked.filters} == {0x1DB, 0x55B, 0x5C0, 0x5AF}
 
 
@@ -177,8 +177,8 @@ def test_a_wide_standard_deviation_is_degraded_on_the_bus_and_says_so(log: Log) 
         (1.5, Status.VALID, Reason.NONE),
     ):
         given = EstimatorSettings(initial_soc_pct=80.0, valid_std_pct=limit)
-        gauge = Gauge(load_vehicle("generic"), leaf_model(), GaugeSettings(given))
-        for frame in frames_of(log, load_vehicle("generic")):
+        gauge = Gauge(Vehicle.load("generic"), leaf_model(), GaugeSettings(given))
+        for frame in frames_of(log, Vehicle.load("generic")):
             gauge.handle(frame)
         told = reader.read(gauge.heartbeat(is_stale=False)[0])
         assert isinstance(told, SocEstimate)

@@ -13,7 +13,7 @@ import pytest
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import GENERIC_RULE
 from cangauge.bus.publish import SocEstimate, SocReader
-from cangauge.bus.vehicle import Vehicle, VehicleSignal, load_vehicle
+from cangauge.bus.vehicle import Vehicle, VehicleSignal
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate, Reason, Sample, Status
@@ -23,7 +23,7 @@ from live import leaf_model, short_log
 START = EstimatorSettings(initial_soc_pct=80.0)
 BEGINS_S, ENDS_S = 100.0, 104.0
 """The fault."""
-VEHICLE = load_vehicle("generic")
+VEHICLE = Vehicle.load("generic")
 CURRENT, VOLTAGE, TEMPERATURE = 0x400, 0x401, 0x402
 SIGNALS: dict[int, VehicleSignal] = {signal.key: signal for signal in VEHICLE.signals}
 Spoil = Callable[[can.Message], None]

@@ -14,7 +14,7 @@ from cangauge.bus.connection import BusConnection, BusError
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.publish import SocDetail, SocEstimate, SocReader
 from cangauge.bus.time_source import ClockFrames
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.validity import Reason, Status
 from cangauge.service.capture_estimate import estimate_capture
@@ -36,7 +36,7 @@ from live import (
 
 
 def send_log(port: BusConnection, seconds: float, pause_s: float = 0.0) -> None:
-    encoder = FrameEncoder(load_vehicle("generic"))
+    encoder = FrameEncoder(Vehicle.load("generic"))
     for sample in samples_of(short_log(seconds)):
         for frame in encoder.encode(sample):
             port.send(frame)
@@ -57,7 +57,7 @@ def test_before_any_frame_it_publishes_that_it_knows_nothing() -> None:
 def test_an_estimate_is_published_every_100_ms_also_where_samples_are_slower() -> None:
     with virtual_port("slow") as port, virtual_service("slow"):
         for sample in samples_of(short_log(2.0, rate_hz=2.0)):
-            for frame in FrameEncoder(load_vehicle("generic")).encode(sample):
+            for frame in FrameEncoder(Vehicle.load("generic")).encode(sample):
                 port.send(frame)
             time.sleep(0.5)
         frames = [each for each in collect_queue(port) if each.arbitration_id == 0x5A0]
@@ -103,7 +103,7 @@ def test_recording_and_table_hold_what_was_live(tmp_path: Path) -> None:
     ):
         send_log(port, 20.0)
         assert waits(lambda: service.gauge.samples == 200)
-    recorded = estimate_capture(path, load_vehicle("generic"), leaf_model())
+    recorded = estimate_capture(path, Vehicle.load("generic"), leaf_model())
     assert recorded.table.soc_pct.tolist() == [each.soc_pct for _, each in service.rows]
     assert recorded.table.residual_v.tolist() == [each.residual_v for _, each in service.rows]
     assert recorded.time_source == "receive"
@@ -140,7 +140,7 @@ def test_a_replays_clock_on_the_bus_is_warned_of_once_and_not_recorded(tmp_path:
 
 
 def serve_on(bus: BrokenBus, seconds: float) -> Service:
-    gauge = Gauge(load_vehicle("generic"), leaf_model(), GaugeSettings())
+    gauge = Gauge(Vehicle.load("generic"), leaf_model(), GaugeSettings())
     port = BusConnection(bus, "fake bus")  # type: ignore[arg-type] # has what a bus is used for
     with Service(port, gauge, LoopSettings(duration_s=seconds)) as service:
         service.join(5.0)

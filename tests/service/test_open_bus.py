@@ -1,4 +1,4 @@
-"""Buses that cannot be opened: one clear line each, and nothing else on stderr."""
+"""Opening a bus: defaults, and one-line errors with nothing else on stderr."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ def test_the_receive_buffer_is_as_large_as_the_system_allows() -> None:
         socket.socket(fileno=os.dup(bus.fileno())) as own,
     ):
         size = own.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-    # Linux doubles what is asked for, for its own book-keeping.
+    # Linux doubles the requested size, for its own bookkeeping.
     assert 2 * min(RECEIVE_BUFFER_BYTES, allowed) <= size <= 2 * RECEIVE_BUFFER_BYTES
 
 
-def test_two_ports_of_one_machine_hear_each_other() -> None:
+def test_two_multicast_buses_receive_each_other() -> None:
     address = bus_address("udp_multicast", options={"port": 43987})
     first, second = open_bus(address), open_bus(address)
     try:
@@ -72,7 +72,7 @@ def test_without_socketcan_the_default_is_multicast(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize(
-    ("interface", "channel", "field", "say"),
+    ("interface", "channel", "field", "text"),
     [
         ("carrier_pigeon", None, "--interface", "use one of"),
         ("pcan", None, "--channel", "needs a channel"),
@@ -80,15 +80,15 @@ def test_without_socketcan_the_default_is_multicast(monkeypatch: pytest.MonkeyPa
         ("udp_multicast", "10.0.0.1", "--channel", "no multicast address"),
     ],
 )
-def test_addresses_that_mean_nothing(
-    interface: str, channel: str | None, field: str, say: str
+def test_invalid_addresses_are_refused(
+    interface: str, channel: str | None, field: str, text: str
 ) -> None:
-    with pytest.raises(InputError, match=say) as caught:
+    with pytest.raises(InputError, match=text) as caught:
         bus_address(interface, channel)
     assert caught.value.field == field
 
 
-def test_a_driver_that_is_missing(capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_driver_is_named(capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(InputError) as caught:
         open_bus(BusAddress("pcan", "PCAN_USBBUS1"))
     assert "library" in str(caught.value)
@@ -96,7 +96,7 @@ def test_a_driver_that_is_missing(capfd: pytest.CaptureFixture[str]) -> None:
     assert capfd.readouterr().err == ""
 
 
-def test_socketcan_channel_that_is_not_there(capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_socketcan_channel_is_named(capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(InputError) as caught:
         open_bus(BusAddress("socketcan", "nosuch0"))
     # Either the machine has no SocketCAN at all, or not this interface.
@@ -113,7 +113,7 @@ def test_multicast_without_msgpack_names_it(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.parametrize(
-    ("error", "say"),
+    ("error", "text"),
     [
         (PermissionError(1, "Operation not permitted"), "no permission"),
         (OSError(19, "No such device"), "no such bus"),
@@ -121,17 +121,19 @@ def test_multicast_without_msgpack_names_it(monkeypatch: pytest.MonkeyPatch) -> 
         (ImportError("No module named 'canlib'"), "library"),
     ],
 )
-def test_what_drivers_raise(monkeypatch: pytest.MonkeyPatch, error: Exception, say: str) -> None:
+def test_driver_errors_are_explained(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, text: str
+) -> None:
     def refuse(**_: object) -> object:
         raise error
 
     monkeypatch.setattr(can, "Bus", refuse)
-    with pytest.raises(InputError, match=say) as caught:
+    with pytest.raises(InputError, match=text) as caught:
         open_bus(BusAddress("pcan", "PCAN_USBBUS1"))
     assert caught.value.exit_code == 2
 
 
-def test_bus_options() -> None:
+def test_bus_options_get_their_types() -> None:
     assert parse_bus_options(["bitrate=500000", "fd=True", "x=0x10", "f=0.5", "name=a=b"]) == {
         "bitrate": 500000, "fd": True, "x": 16, "f": 0.5, "name": "a=b",
     }  # fmt: skip

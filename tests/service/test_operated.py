@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.logs.canonical import write_log
 from cangauge.service.capture_estimate import estimate_capture
 from live import Command, in_process, leaf_model, leaf_model_path, run_to_end, short_log
@@ -60,7 +60,7 @@ def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
     assert {"http.listening", "service.ready", "status.changed", "service.stopped"} <= {*events}
     assert ended.json["record"] == str(tmp_path / "seen-0001.blf")
     assert len(list(tmp_path.glob("seen-0001-*.blf"))) > 1
-    recorded = estimate_capture(ended.json["record"], load_vehicle("generic"), leaf_model())
+    recorded = estimate_capture(ended.json["record"], Vehicle.load("generic"), leaf_model())
     assert recorded.table.soc_pct[-1] == ended.json["estimate"]["soc_pct"]
     assert recorded.table.soc_pct.size == 1200
 

@@ -1,4 +1,4 @@
-"""What is published, bit by bit and when."""
+"""Published frames: bits and times."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def decoded(project: Path, message: can.Message) -> dict[str, object]:
     return database.decode_message(message.arbitration_id, message.data, decode_choices=False)
 
 
-def test_the_dbc_decodes_what_is_sent(project: Path) -> None:
+def test_the_dbc_decodes_the_published_frames(project: Path) -> None:
     publisher = SocPublisher()
     first, detail = publisher.beat(
         estimate(status=Status.DEGRADED, reasons=Reason.CURRENT_GAP | Reason.CURRENT_MISSING),
@@ -61,7 +61,7 @@ def test_unknown_values_have_their_codes(project: Path) -> None:
     first, detail = publisher.beat(unknown, 0, math.nan)
     values = decoded(project, first)
     assert (values["status"], values["reason"]) == (0, 1 << 10)
-    # The codes that the DBC names so: 31, 65535 and 4095.
+    # The "not available" codes of the DBC: 31, 65535 and 4095.
     assert (values["age_s"], values["soc_pct"]) == (31, pytest.approx(65535 * 0.002))
     assert values["soc_std_pct"] == pytest.approx(4095 * 0.025)
     reader = SocReader()
@@ -77,9 +77,7 @@ def test_unknown_values_have_their_codes(project: Path) -> None:
 
 
 @given(numbers, numbers, numbers)
-def test_any_number_can_be_sent_and_is_read_back_clipped(
-    soc: float, std: float, residual: float
-) -> None:
+def test_any_number_is_sent_and_read_back_clipped(soc: float, std: float, residual: float) -> None:
     publisher, reader = SocPublisher(), SocReader()
     given_estimate = estimate(soc_pct=soc, soc_std_pct=std, residual_v=residual)
     read = reader.read(publisher.estimate_frame(given_estimate))
@@ -97,7 +95,7 @@ def test_any_number_can_be_sent_and_is_read_back_clipped(
             assert value == pytest.approx(min(max(sent, low), high), abs=0.5001 * step)
 
 
-def test_counters_count_and_every_damaged_bit_is_refused() -> None:
+def test_counters_count_and_any_damaged_bit_is_refused() -> None:
     publisher, reader = SocPublisher(), SocReader()
     counters = [publisher.estimate_frame(estimate()).data[1] & 15 for _ in range(18)]
     assert counters == [*range(16), 0, 1]
@@ -110,7 +108,7 @@ def test_counters_count_and_every_damaged_bit_is_refused() -> None:
     assert reader.refused == 64
 
 
-def test_an_independent_check_of_the_profile_agrees(project: Path) -> None:
+def test_crcs_agree_with_an_independent_library(project: Path) -> None:
     database = cantools.database.load_file(project / "dbc" / "soc_estimate.dbc")
     publisher = SocPublisher()
     for _ in range(20):
@@ -122,21 +120,21 @@ def test_an_independent_check_of_the_profile_agrees(project: Path) -> None:
             assert crccheck.crc.Crc8Autosar.calc(covered) == message.data[0]
 
 
-def test_a_detail_taken_for_an_estimate_is_refused() -> None:
+def test_frames_under_a_swapped_id_are_refused() -> None:
     swapped = SocReader(FrameIds(soc_estimate=0x5A1, soc_detail=0x5A0))
     for message in SocPublisher().beat(estimate(), 7, 0.0):
         assert swapped.read(message) is None
     assert swapped.refused == 2
 
 
-def test_every_beat_has_an_estimate_and_every_tenth_the_details() -> None:
+def test_each_beat_has_an_estimate_each_tenth_a_detail() -> None:
     publisher = SocPublisher()
     beats = [publisher.beat(estimate(), beat, 0.0) for beat in range(40)]
     assert all(frames[0].arbitration_id == 0x5A0 for frames in beats)
     assert [beat for beat, frames in enumerate(beats) if len(frames) == 2] == [0, 10, 20, 30]
 
 
-def test_an_age_is_told_in_whole_seconds_and_not_beyond_30() -> None:
+def test_an_age_is_sent_in_whole_seconds_up_to_30() -> None:
     publisher, reader = SocPublisher(), SocReader()
     told = []
     for age_s in (0.0, 0.99, 1.0, 29.99, 30.0, 31.0, 1e9):
@@ -147,14 +145,14 @@ def test_an_age_is_told_in_whole_seconds_and_not_beyond_30() -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [10.0, 100.0, 12.5])
-def test_a_replay_is_followed_at_the_rate_of_its_own_time(rate_hz: float) -> None:
+def test_a_replay_publishes_at_the_rate_of_log_time(rate_hz: float) -> None:
     publisher = SocPublisher()
     times: dict[int, list[float]] = {0x5A0: [], 0x5A1: []}
     for sample in range(int(20.0 * rate_hz)):
         now_s = 1_700_000_000.0 + sample / rate_hz
         for message in publisher.publish(estimate(now_s), sample + 1):
             times[message.arbitration_id].append(now_s)
-    # Samples come when they come: the grid is kept on the average, within one sample.
+    # Samples do not fall on the grid: it is kept on average, within one sample.
     for frame_id, every_s in ((0x5A0, 0.1), (0x5A1, 1.0)):
         assert len(times[frame_id]) == pytest.approx(20.0 / every_s, abs=1)
         steps = [b - a for a, b in zip(times[frame_id], times[frame_id][1:], strict=False)]
@@ -173,7 +171,7 @@ def test_jitter_does_not_halve_the_rate() -> None:
     assert sent == 1000
 
 
-def test_samples_are_acknowledged_every_so_often() -> None:
+def test_samples_are_acknowledged_at_a_fixed_interval() -> None:
     publisher = SocPublisher(acknowledge_every=4)
     told = [
         sample
@@ -182,7 +180,7 @@ def test_samples_are_acknowledged_every_so_often() -> None:
         if message.arbitration_id == 0x5A1
     ]
     assert told == list(range(1, 40, 4))
-    # What is left over is acknowledged by the next beat, and without any by none.
+    # The next beat acknowledges the remaining samples; later beats have none.
     assert len(publisher.beat(estimate(), 39, 0.0)) == 2
     assert [len(publisher.beat(estimate(), 39, 0.0)) for _ in range(3)] == [1, 1, 1]
 

@@ -13,7 +13,7 @@ import pytest
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import LEAF_RULE
 from cangauge.bus.recording import open_vehicle_capture
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.offline import run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate, Reason, Status
@@ -45,7 +45,7 @@ START = EstimatorSettings(initial_soc_pct=60.0)
 
 def capture(shared_data: Path, name: str) -> tuple[EstimateStream, list[can.Message]]:
     preset = CAPTURES[name]
-    vehicle = load_vehicle(preset, temperature_c=20.0 if preset == "leaf_ze1" else None)
+    vehicle = Vehicle.load(preset, temperature_c=20.0 if preset == "leaf_ze1" else None)
     frames = list(open_vehicle_capture(shared_data / "leaf_can" / name, vehicle))
     return EstimateStream(vehicle, leaf_model(), START), frames
 
@@ -66,7 +66,7 @@ def test_trips_replayed_raise_no_alarm_and_keep_their_numbers(
     shared_data: Path, trip: str, preset: str
 ) -> None:
     """In steps of 0.0001 V and of 0.5 V, through traffic and at rest; whole degrees."""
-    vehicle = load_vehicle(preset)
+    vehicle = Vehicle.load(preset)
     log = read_log(shared_data / "bmw_i3" / f"{trip}.csv.gz")
     stream, encoder = EstimateStream(vehicle, leaf_model(), START), FrameEncoder(vehicle)
     estimates: list[Estimate] = []

@@ -20,7 +20,7 @@ import pytest
 from cangauge.bus.captures.capture import is_capture, open_capture
 from cangauge.bus.captures.files import all_parts, part_path, parts_of_run, run_path
 from cangauge.bus.encoder import FrameEncoder
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.offline import samples_of
 from cangauge.replay.steps import CaptureSource
@@ -35,7 +35,7 @@ FORMATS = [".log", ".csv", ".log.gz", ".blf", ".mf4"]
 
 
 def frames(seconds: float, begin_s: float = 1.7e9) -> list[can.Message]:
-    encoder = FrameEncoder(load_vehicle("generic"))
+    encoder = FrameEncoder(Vehicle.load("generic"))
     found = []
     for number, sample in enumerate(samples_of(short_log(seconds))):
         for frame in encoder.encode(sample):
@@ -70,7 +70,7 @@ def need(suffix: str) -> None:
 def test_parts_are_one_capture_and_give_the_live_numbers(tmp_path: Path, suffix: str) -> None:
     need(suffix)
     messages = frames(60.0)
-    gauge = Gauge(load_vehicle("generic"), leaf_model())
+    gauge = Gauge(Vehicle.load("generic"), leaf_model())
     live = []
     now = [0.0]
     limits = RecordLimits(part_bytes=20_000, part_s=12.0)
@@ -89,12 +89,12 @@ def test_parts_are_one_capture_and_give_the_live_numbers(tmp_path: Path, suffix:
     assert len(parts) >= 3
     assert is_capture(recorder.path)
     assert content(recorder.path) == expected(messages)
-    offline = estimate_capture(recorder.path, load_vehicle("generic"), leaf_model()).table
+    offline = estimate_capture(recorder.path, Vehicle.load("generic"), leaf_model()).table
     for name in ("time_s", "soc_pct", "soc_std_pct", "residual_v"):
         told = np.array([getattr(each, name) for each in live])
         assert np.array_equal(getattr(offline, name), told, equal_nan=True), name
     # And so does replay: as many samples, from the same name.
-    source = CaptureSource(recorder.path, load_vehicle("generic"))
+    source = CaptureSource(recorder.path, Vehicle.load("generic"))
     assert sum(len(step.frames) for step in source.steps(loop=False)) == len(messages)
 
 

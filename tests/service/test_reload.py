@@ -12,7 +12,7 @@ import pytest
 from cangauge._resources import shared_file
 from cangauge.bus.database import load_dbc
 from cangauge.bus.encoder import FrameEncoder
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.validity import Reason
 from cangauge.model.model_file import Model
@@ -53,7 +53,7 @@ class Car:
         self.reloader = Reloader(
             lambda: load_config(self.path), config, vehicle, self.gauge, self.said.append
         )
-        encoder = FrameEncoder(load_vehicle("generic"))
+        encoder = FrameEncoder(Vehicle.load("generic"))
         self.frames = [encoder.encode(each) for each in samples_of(short_log(200.0))]
 
     def write(self, text: str) -> None:

@@ -8,10 +8,11 @@ import time
 import can
 import pytest
 
-from cangauge.bus.connection import BusConnection, backend_capabilities
+from cangauge.bus.backend import backend_capabilities
+from cangauge.bus.connection import BusConnection
 from cangauge.bus.open import bus_address, open_bus
 from cangauge.bus.publish import FrameIds
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.service.loop import AGAIN_S, DuplicateSenderDetector
 from cangauge.service.pipeline import Gauge, GaugeSettings
 from live import Service, leaf_model, virtual_service, waits
@@ -45,7 +46,7 @@ def test_other_ids_are_no_rivals() -> None:
 
 
 def multicast_service(port: int) -> Service:
-    gauge = Gauge(load_vehicle("generic"), leaf_model())
+    gauge = Gauge(Vehicle.load("generic"), leaf_model())
     address = bus_address("udp_multicast", options={"port": port})
     bus = open_bus(address, gauge.filters)
     return Service(BusConnection(bus, str(address), backend_capabilities(address)), gauge)

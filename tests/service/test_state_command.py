@@ -13,7 +13,7 @@ from cangauge.bus.connection import BusConnection
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.publish import SocEstimate, SocReader, standard_filter
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.validity import Reason, Status
 from cangauge.service.loop import LoopSettings
@@ -35,7 +35,7 @@ BUS = ("--interface", "udp_multicast", "--channel", ADDRESS, "--bus-option", f"p
 
 
 def drive(port: BusConnection, first: int, after: int) -> None:
-    encoder = FrameEncoder(load_vehicle("generic"))
+    encoder = FrameEncoder(Vehicle.load("generic"))
     for sample in list(samples_of(short_log(100.0)))[first:after]:
         for frame in encoder.encode(sample):
             port.send(frame)

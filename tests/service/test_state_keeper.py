@@ -19,7 +19,7 @@ import pytest
 
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.time_source import ClockFrames
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate, Reason, Sample, Status
@@ -37,7 +37,7 @@ from cangauge.service.state import (
 from live import leaf_model, short_log
 
 MODEL = leaf_model()
-VEHICLE = load_vehicle("generic")
+VEHICLE = Vehicle.load("generic")
 EPOCH_S = 1_700_000_000.0
 STOP_WITHIN_S = state_keeper.STOP_WITHIN_S
 PATIENCE_S = 60.0

@@ -9,7 +9,7 @@ import pytest
 
 from cangauge.bus.connection import BusConnection, BusError
 from cangauge.bus.encoder import FrameEncoder
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import CangaugeError
 from cangauge.estimate.offline import samples_of
 from cangauge.service.loop import Housekeeping, LoopSettings, Outputs, serve
@@ -32,7 +32,7 @@ def run(channel: str, saves: Saves, every_s: float = 0.2) -> list[str]:
         if saves.error is not None:
             raise saves.error
 
-    encoder = FrameEncoder(load_vehicle("generic"))
+    encoder = FrameEncoder(Vehicle.load("generic"))
     with virtual_port(channel) as sender, service.port:
         for sample in samples_of(short_log(5.0)):
             for frame in encoder.encode(sample):

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from cangauge.bus.encoder import FrameEncoder
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.service.pipeline import Gauge, GaugeSettings
@@ -44,7 +44,7 @@ class Watched:
 
     def __post_init__(self) -> None:
         known = GaugeSettings(EstimatorSettings(initial_soc_pct=80.0))
-        self.gauge = Gauge(load_vehicle("generic"), leaf_model(), known)
+        self.gauge = Gauge(Vehicle.load("generic"), leaf_model(), known)
         self.monitor = Monitor(
             self.gauge,
             self.port,
@@ -56,7 +56,7 @@ class Watched:
 
     def drive(self, seconds: float) -> None:
         """Handle the frames of a drive, publishing as the loop does."""
-        encoder = FrameEncoder(load_vehicle("generic"))
+        encoder = FrameEncoder(Vehicle.load("generic"))
         for sample in samples_of(short_log(seconds)):
             for frame in encoder.encode(sample):
                 before = self.gauge.samples

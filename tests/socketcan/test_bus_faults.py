@@ -1,5 +1,5 @@
-"""What befalls a real SocketCAN interface, and the service on it: down, removed, overrun, told of
-errors, shared with a second service; and the signals meanwhile."""
+"""Faults of a real SocketCAN interface under the service: down, removed, overrun, error frames, a
+second service, signals."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from typing import Self
 import can
 import pytest
 
+from bus_log import BusLog
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, has_socketcan, open_bus
 from cangauge.bus.publish import SocDetail, SocEstimate, SocReader, standard_filter
 from cangauge.bus.reconnect import LONGEST_PAUSE_S, ReconnectingBus
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.settings import EstimatorSettings
@@ -63,25 +64,33 @@ def _vcan0() -> Iterator[None]:
         ip("del", "vcan7")
 
 
-class Lasting(Service):
-    """The service on a port that lasts; what the port says is kept."""
+class Reconnecting(Service):
+    """The service on a reconnecting bus; its log is kept."""
 
     def __init__(self, address: BusAddress = VCAN, *, wait: bool = False) -> None:
         known = GaugeSettings(EstimatorSettings(initial_soc_pct=80.0))
-        gauge = Gauge(load_vehicle("generic"), leaf_model(), known)
-        self.lines: list[str] = []
-        port = ReconnectingBus(address, gauge.filters, self.lines.append)
+        gauge = Gauge(Vehicle.load("generic"), leaf_model(), known)
+        self.log = BusLog()
+        port = ReconnectingBus(address, gauge.filters)
         port.open(wait=wait)
         super().__init__(port, gauge, LoopSettings(timeout_s=STALE_S))
 
+    def __enter__(self) -> Self:
+        self.log.__enter__()
+        return super().__enter__()
+
+    def __exit__(self, *error: object) -> None:
+        super().__exit__(*error)
+        self.log.__exit__()
+
     @property
-    def lasting(self) -> ReconnectingBus:
+    def bus(self) -> ReconnectingBus:
         assert isinstance(self.port, ReconnectingBus)
         return self.port
 
 
 class Pack:
-    """Sends a drive in real time, 50 samples a second, whenever there is a bus."""
+    """Sends a drive in real time, 50 samples a second, while there is a bus."""
 
     def __init__(self, address: BusAddress = VCAN) -> None:
         self._address = address
@@ -98,8 +107,8 @@ class Pack:
         self._thread.join(10.0)
 
     def _run(self) -> None:
-        encoder = FrameEncoder(load_vehicle("generic"))
-        port = ReconnectingBus(self._address, [], lambda _line: None)
+        encoder = FrameEncoder(Vehicle.load("generic"))
+        port = ReconnectingBus(self._address, [])
         port.open(wait=True)
         with port:
             for sample in samples_of(short_log(600.0)):
@@ -113,7 +122,7 @@ class Pack:
 
 
 class Listener:
-    """Reads what is published, on a bus opened when it is asked."""
+    """Reads the published estimates."""
 
     def __init__(self) -> None:
         self._bus = open_bus(VCAN, [standard_filter(0x5A0)])
@@ -133,13 +142,13 @@ class Listener:
         return content
 
 
-def is_stale(told: SocEstimate) -> bool:
-    return told.status is Status.INVALID and bool(told.reasons & Reason.INPUT_STALE)
+def is_stale(estimate: SocEstimate) -> bool:
+    return estimate.status is Status.INVALID and bool(estimate.reasons & Reason.INPUT_STALE)
 
 
 @pytest.mark.parametrize("kind", ["down", "removed"])
-def test_an_interface_that_goes_and_comes_back(kind: str) -> None:
-    with Lasting() as live:
+def test_an_interface_that_is_lost_and_returns(kind: str) -> None:
+    with Reconnecting() as live:
         with Pack():
             assert waits(lambda: live.gauge.samples >= 50)
         before = live.gauge.latest.soc_pct
@@ -147,74 +156,74 @@ def test_an_interface_that_goes_and_comes_back(kind: str) -> None:
             ip("set", "vcan0", "down")
         else:
             ip("del", "vcan0")
-        assert waits(lambda: live.lasting.is_away)
+        assert waits(lambda: live.bus.is_away)
         cpu_s = time.process_time()
         time.sleep(2.0)
-        # The whole program's, this test's included; a loop that spins takes two seconds.
+        # CPU time of the whole program, this test included; a busy loop takes two seconds.
         assert time.process_time() - cpu_s < 0.5
         assert live.error is None
-        assert live.lasting.is_away
+        assert live.bus.is_away
         if kind == "down":
             ip("set", "vcan0", "up")
         else:
             add("vcan0")
-        assert waits(lambda: not live.lasting.is_away, LONGEST_PAUSE_S + 0.5)
+        assert waits(lambda: not live.bus.is_away, LONGEST_PAUSE_S + 0.5)
         with Listener() as listener:
-            told = listener.next()
-            assert is_stale(told)  # it goes on publishing, and says how old that is
-            assert told.soc_pct == pytest.approx(before, abs=0.01)
+            estimate = listener.next()
+            assert is_stale(estimate)  # it keeps publishing, with the age
+            assert estimate.soc_pct == pytest.approx(before, abs=0.01)
             samples = live.gauge.samples
             with Pack():
                 assert waits(lambda: live.gauge.samples >= samples + 20)
-                told = [listener.next() for _ in range(30)][-1]
-            assert not is_stale(told)
-            assert told.soc_pct == pytest.approx(before, abs=0.5)
+                estimate = [listener.next() for _ in range(30)][-1]
+            assert not is_stale(estimate)
+            assert estimate.soc_pct == pytest.approx(before, abs=0.5)
     assert live.error is None
-    assert live.lasting.losses == 1
-    assert live.lasting.away_s >= 2.0
-    assert 1 <= len(live.lines) <= 3
-    assert live.lines[0].startswith("warning: socketcan vcan0: ")
+    assert live.bus.losses == 1
+    assert live.bus.away_s >= 2.0
+    assert [each for each in live.log.events if each != "bus.away"] == ["bus.lost", "bus.back"]
+    assert live.log.lines[0].startswith("socketcan vcan0: ")
 
 
-def test_an_interface_that_comes_and_goes() -> None:
-    with Lasting() as live, Pack():
+def test_an_interface_that_flaps() -> None:
+    with Reconnecting() as live, Pack():
         for _ in range(5):
             ip("set", "vcan0", "down")
             time.sleep(0.05)
             ip("set", "vcan0", "up")
             time.sleep(0.25)
-        assert waits(lambda: not live.lasting.is_away)
+        assert waits(lambda: not live.bus.is_away)
         samples = live.gauge.samples
         assert waits(lambda: live.gauge.samples >= samples + 20)
     assert live.error is None
     assert live.summary is not None
-    assert 1 <= live.lasting.losses <= 5
-    assert len(live.lines) <= live.summary.seconds + 1.0
+    assert 1 <= live.bus.losses <= 5
+    assert live.log.events.count("bus.lost") <= live.summary.seconds + 1.0
 
 
 def test_a_bus_that_does_not_exist_yet() -> None:
     address = BusAddress("socketcan", "vcan7")
     with pytest.raises(InputError, match="vcan7"):
-        Lasting(address)
-    with Lasting(address, wait=True) as live, Pack(address):
+        Reconnecting(address)
+    with Reconnecting(address, wait=True) as live, Pack(address):
         time.sleep(0.5)
-        assert live.lasting.is_away
+        assert live.bus.is_away
         add("vcan7")
         assert waits(lambda: live.gauge.samples >= 20)
     assert live.error is None
-    assert live.lasting.losses == 0
-    assert "waiting for it" in live.lines[0]
+    assert live.bus.losses == 0
+    assert live.log.events[-1] == "bus.back"
 
 
-def test_an_interface_that_is_down_is_told_when_it_is_opened() -> None:
+def test_opening_an_interface_that_is_down_is_an_error() -> None:
     ip("set", "vcan0", "down")
     with pytest.raises(InputError, match="is down") as caught:
         open_bus(VCAN)
     assert "ip link set vcan0 up" in str(caught.value)
 
 
-def test_trying_in_vain_leaks_no_descriptor(caplog: pytest.LogCaptureFixture) -> None:
-    # What the driver logs holds its errors, and they the sockets; only pytest keeps it.
+def test_failed_attempts_leak_no_descriptor(caplog: pytest.LogCaptureFixture) -> None:
+    # pytest keeps log records, which keep the errors and their sockets.
     caplog.set_level(logging.CRITICAL + 1, "can")
 
     def descriptors() -> int:
@@ -237,8 +246,8 @@ def send_error(classes: int, data: bytes = bytes(8)) -> None:
         raw.send(struct.pack("=IB3x8s", socket.CAN_ERR_FLAG | classes, 8, data))
 
 
-def test_error_frames_are_counted_by_kind_and_bus_off_is_told() -> None:
-    with Lasting() as live, Pack():
+def test_error_frames_are_counted_and_bus_off_is_logged() -> None:
+    with Reconnecting() as live, Pack():
         assert waits(lambda: live.gauge.samples >= 10)
         for _ in range(5):
             send_error(0x088)
@@ -247,21 +256,21 @@ def test_error_frames_are_counted_by_kind_and_bus_off_is_told() -> None:
         assert live.port.error_kinds == {
             "protocol": 5, "bus_error": 5, "controller_receive_overflow": 1,
         }  # fmt: skip
-        assert live.lines == []
+        assert live.log.lines == []
         send_error(0x040)
         assert waits(lambda: live.port.error_kinds["bus_off"] == 1)
-        assert waits(lambda: bool(live.lines))
-        assert "bus-off" in live.lines[0]
+        assert waits(lambda: bool(live.log.lines))
+        assert "bus-off" in live.log.lines[0]
         send_error(0x100)
         frames = live.gauge.counts.frames
         assert waits(lambda: live.gauge.counts.frames > frames + 20)
         assert not live.port.is_off
     assert live.error is None
-    assert live.lasting.losses == 0
+    assert live.bus.losses == 0
 
 
-def test_two_thousand_error_frames_keep_nothing_from_the_estimate() -> None:
-    with Lasting() as live, Pack() as pack:
+def test_two_thousand_error_frames_cost_no_sample() -> None:
+    with Reconnecting() as live, Pack() as pack:
         assert waits(lambda: live.gauge.samples >= 10)
         with socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw:
             raw.bind(("vcan0",))
@@ -277,7 +286,7 @@ def test_two_thousand_error_frames_keep_nothing_from_the_estimate() -> None:
     assert live.gauge.counts.lost == live.port.queue_drops == 0
 
 
-def test_the_kernel_stamps_when_a_frame_comes_in_and_not_when_it_is_read() -> None:
+def test_the_kernel_stamps_frames_on_arrival() -> None:
     with (
         BusConnection(open_bus(VCAN), "receiver") as port,
         BusConnection(open_bus(VCAN), "sender") as sender,
@@ -288,21 +297,21 @@ def test_the_kernel_stamps_when_a_frame_comes_in_and_not_when_it_is_read() -> No
         time.sleep(0.5)
         message = port.receive(1.0)
     assert message is not None
-    # Stamps have nanoseconds, this clock too; half a second would be the reading.
+    # Reading happens half a second later.
     assert before_s - 0.001 <= message.timestamp <= sent_s + 0.05
 
 
-def test_two_services_notice_each_other() -> None:
-    with Lasting() as one:
+def test_two_services_detect_each_other() -> None:
+    with Reconnecting() as one:
         time.sleep(0.5)
         assert one.warnings == []
-        with Lasting() as two:
+        with Reconnecting() as two:
             assert waits(lambda: bool(one.warnings) and bool(two.warnings))
     assert "somebody else sends 0x5A" in one.warnings[0]
 
 
-def test_one_service_through_overflow_signals_and_a_bus_that_is_down(tmp_path: Path) -> None:
-    """Processes start slowly in a guest, so one is led through all of it."""
+def test_overflow_signals_and_a_bus_that_is_down(tmp_path: Path) -> None:
+    """One process for all: processes start slowly in a guest."""
     config = tmp_path / "car.toml"
     config.write_text(f'model = "{leaf_model_path()}"\nchannel = "vcan0"\n')
     ip("set", "vcan0", "down")
@@ -310,7 +319,7 @@ def test_one_service_through_overflow_signals_and_a_bus_that_is_down(tmp_path: P
     live.wait_for("waiting for it")
     ip("set", "vcan0", "up")
     live.wait_for("there after")
-    # A pause of the process: what does not fit the queue is lost, and counted.
+    # A pause of the process: frames beyond the queue are lost and counted.
     live.process.send_signal(signal.SIGSTOP)
     burst = _overflow()
     live.process.send_signal(signal.SIGCONT)
@@ -345,7 +354,7 @@ def test_one_service_through_overflow_signals_and_a_bus_that_is_down(tmp_path: P
 
 
 def _wait_until_worked_off() -> None:
-    """Wait until the count of samples that the service tells stands still."""
+    """Wait until the service's sample count no longer changes."""
     reader, before = SocReader(), -1
     with open_bus(VCAN, [standard_filter(0x5A1)]) as listener:
         while (frame := listener.recv(3.0)) is not None:
@@ -358,8 +367,8 @@ def _wait_until_worked_off() -> None:
 
 
 def _overflow() -> int:
-    """Send until a receive queue as large as the service's has overflowed; return how many."""
-    encoder, sent = FrameEncoder(load_vehicle("generic")), 0
+    """Send until a receive queue as large as the service's overflows; return the count."""
+    encoder, sent = FrameEncoder(Vehicle.load("generic")), 0
     frames = [frame for each in samples_of(short_log(200.0)) for frame in encoder.encode(each)]
     with (
         BusConnection(open_bus(VCAN), "witness") as witness,

@@ -1,4 +1,4 @@
-"""Watching and recording on a real SocketCAN interface: kernel stamps, and no frame the worse."""
+"""Monitoring and recording on a real SocketCAN interface: kernel stamps, no loss."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, has_socketcan, open_bus
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.offline import samples_of
 from cangauge.service.capture_estimate import estimate_capture
 from cangauge.service.config import http_address
@@ -38,10 +38,10 @@ def _vcan0() -> None:
 
 
 def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
-    gauge = Gauge(load_vehicle("generic"), leaf_model())
+    gauge = Gauge(Vehicle.load("generic"), leaf_model())
     rows = []
     stop = threading.Event()
-    encoder = FrameEncoder(load_vehicle("generic"))
+    encoder = FrameEncoder(Vehicle.load("generic"))
     frames = [encoder.encode(sample) for sample in samples_of(short_log(50.0))]
     with (
         BusConnection(open_bus(VCAN, gauge.filters), "vcan0") as port,
@@ -72,7 +72,7 @@ def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
                     sender.send(frame)
                 time.sleep(0.002)
                 if number % 50 == 0:
-                    # No faster than this machine: what it can carry is not what is tested here.
+                    # Paced by the receiver: throughput is not tested here.
                     assert waits(lambda done=number: gauge.samples >= done, 20.0), gauge.counters
                     url = f"http://127.0.0.1:{endpoint.port}/metrics"
                     with urllib.request.urlopen(url, timeout=10.0) as answer:
@@ -84,10 +84,10 @@ def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
     assert scrapes == len(frames) // 50
     assert snapshot.samples == len(frames) == 500
     assert snapshot.lost == snapshot.rejected == 0
-    # By the kernel's stamps, so from the moment that the frame was there.
+    # Relative to the kernel's stamps, the arrival.
     assert snapshot.latency.count >= 10
     assert 0.0 < snapshot.latency.total_s / snapshot.latency.count < 1.0
-    recorded = estimate_capture(recorder.path, load_vehicle("generic"), leaf_model())
+    recorded = estimate_capture(recorder.path, Vehicle.load("generic"), leaf_model())
     assert len(list(tmp_path.iterdir())) > 1
     assert recorded.table.soc_pct.tolist() == [each.soc_pct for each in rows]
     residual = np.array([each.residual_v for each in rows])

@@ -1,4 +1,4 @@
-"""The live side on a real SocketCAN interface: kernel filters, counts, bits, a bus that goes."""
+"""Replay and service on a real SocketCAN interface: filters, counts, bits, loss."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ import can
 import numpy as np
 import pytest
 
-from cangauge.bus.connection import BusConnection, NothingWaitsError, pending_frames
+from cangauge.bus.backend import NoPendingFrameError, pending_frames
+from cangauge.bus.connection import BusConnection
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, has_socketcan, open_bus
 from cangauge.bus.publish import FrameIds, SocEstimate, SocReader, standard_filter
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.offline import run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
@@ -60,7 +61,7 @@ def replay_port() -> Iterator[BusConnection]:
 
 
 def service(preset: str, settings: GaugeSettings, record: Recorder | None = None) -> Service:
-    gauge = Gauge(load_vehicle(preset), leaf_model(), settings)
+    gauge = Gauge(Vehicle.load(preset), leaf_model(), settings)
     return Service(
         BusConnection(open_bus(VCAN, gauge.filters), str(VCAN)), gauge, LoopSettings(), record
     )
@@ -68,7 +69,7 @@ def service(preset: str, settings: GaugeSettings, record: Recorder | None = None
 
 @pytest.mark.parametrize("filters", [None, SOC_FRAMES], ids=["all", "filtered"])
 @pytest.mark.parametrize("options", [{"fd": True}, {"fd": False}], ids=["fd", "classic"])
-def test_frames_read_without_asking_are_those_of_python_can(
+def test_pending_frames_equal_those_of_python_can(
     options: dict[str, bool], filters: list[can.typechecking.CanFilter] | None
 ) -> None:
     address = BusAddress("socketcan", "vcan0", {**options, "receive_own_messages": True})
@@ -90,21 +91,21 @@ def test_frames_read_without_asking_are_those_of_python_can(
         open_bus(address, []) as sender,
         socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw,
     ):
-        waiting = pending_frames(ours)
-        assert waiting is not None
+        pending = pending_frames(ours)
+        assert pending is not None
         for frame in sent:
             sender.send(frame)
-        ours.send(sent[0])  # one's own, that comes back
+        ours.send(sent[0])  # an own frame, received as an echo
         raw.bind(("vcan0",))
         raw.send(struct.pack("=IB3x8s", 0x20000040, 8, bytes(8)))  # bus-off
         expected = []
         while (message := theirs.recv(0.5)) is not None:
             expected.append(message)
-        found = [waiting.next() for _ in expected]
-        with pytest.raises(NothingWaitsError):
-            waiting.next()
-        waiting.close()
-    # The kernel's filters let pass two of the sent ones less, and every error frame.
+        found = [pending.next() for _ in expected]
+        with pytest.raises(NoPendingFrameError):
+            pending.next()
+        pending.close()
+    # The kernel's filters drop two of the sent frames, and no error frame.
     assert len(expected) == len(sent) + 2 - (0 if filters is None else 2)
     assert [each.is_error_frame for each in expected].count(True) == 1
     assert same_frames([each for each in found if each is not None], expected)
@@ -118,7 +119,7 @@ def test_the_default_bus_is_vcan0() -> None:
 def test_a_log_at_full_speed_within_the_bound_and_bit_for_bit(
     replay_port: BusConnection, tmp_path: Path, preset: str
 ) -> None:
-    log, vehicle, path = short_log(60.0), load_vehicle(preset), tmp_path / "vcan0.log"
+    log, vehicle, path = short_log(60.0), Vehicle.load(preset), tmp_path / "vcan0.log"
     estimator = EstimatorSettings(initial_soc_pct=80.0)
     settings = GaugeSettings(estimator, "replay-clock")
     with Recorder(path) as recorder, service(preset, settings, recorder) as live:
@@ -135,26 +136,24 @@ def test_a_log_at_full_speed_within_the_bound_and_bit_for_bit(
     assert np.array_equal(recorded.table.residual_v, residual, equal_nan=True)
 
 
-def test_in_real_time_the_kernels_stamps_are_bus_time(
-    replay_port: BusConnection, tmp_path: Path
-) -> None:
+def test_real_time_uses_the_kernels_stamps(replay_port: BusConnection, tmp_path: Path) -> None:
     log, path = short_log(6.01), tmp_path / "vcan0.log"
     with Recorder(path) as recorder, service("generic", GaugeSettings(), recorder) as live:
         state = play(
-            replay_port, LogSource(log, load_vehicle("generic")), ReplaySettings(), stop=never
+            replay_port, LogSource(log, Vehicle.load("generic")), ReplaySettings(), stop=never
         )
         assert waits(lambda: live.gauge.samples == len(log))
     assert state.seconds == pytest.approx(6.0, abs=0.1)
     times = np.array([time_s for time_s, _ in live.rows])
     assert np.max(np.abs(times - times[0] - log.time_s)) < 0.1
-    recorded = estimate_capture(path, load_vehicle("generic"), leaf_model())
+    recorded = estimate_capture(path, Vehicle.load("generic"), leaf_model())
     assert recorded.time_source == "receive"
     assert recorded.table.time_s.tolist() == times.tolist()
     assert recorded.table.soc_pct.tolist() == [each.soc_pct for _, each in live.rows]
 
 
 def test_the_kernel_filters_the_wanted_ids() -> None:
-    gauge = Gauge(load_vehicle("leaf_aze0"), leaf_model())
+    gauge = Gauge(Vehicle.load("leaf_aze0"), leaf_model())
     bus = open_bus(VCAN, gauge.filters)
     raw = bus.socket.getsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, 64)  # type: ignore[attr-defined] # SocketcanBus
     assert len(raw) == 8 * 3
@@ -173,7 +172,7 @@ def test_the_kernel_filters_the_wanted_ids() -> None:
 
 def test_unwanted_traffic_costs_no_wanted_frame(replay_port: BusConnection, tmp_path: Path) -> None:
     """2,000 unwanted frames for 100 wanted ones, as fast as they can be sent."""
-    encoder, path = FrameEncoder(load_vehicle("leaf_aze0")), tmp_path / "busy.log"
+    encoder, path = FrameEncoder(Vehicle.load("leaf_aze0")), tmp_path / "busy.log"
     time_s = 1.7e9
     with Recorder(path) as recorder:
         for sample in samples_of(short_log(10.0)):
@@ -189,20 +188,20 @@ def test_unwanted_traffic_costs_no_wanted_frame(replay_port: BusConnection, tmp_
                     )
                 )
             time_s += 0.01
-    vehicle = load_vehicle("leaf_aze0")
+    vehicle = Vehicle.load("leaf_aze0")
     settings = GaugeSettings(time_source="replay-clock")
     with service("leaf_aze0", settings) as live:
         state = play(replay_port, CaptureSource(path, vehicle), MAX, stop=never)
     assert state.acknowledged == state.samples == 100
     assert live.gauge.counts.lost == 0
-    assert live.gauge.counts.frames < 150  # the rest never left the kernel
+    assert live.gauge.counts.frames < 150  # the rest is dropped in the kernel
 
 
-def test_what_is_published_can_be_read_by_others(replay_port: BusConnection) -> None:
+def test_others_can_read_the_published_frames(replay_port: BusConnection) -> None:
     listener = can.Bus("vcan0", interface="socketcan", ignore_config=True, can_filters=SOC_FRAMES)
     with service("generic", GaugeSettings(time_source="replay-clock")) as live:
         log = short_log(20.0)
-        play(replay_port, LogSource(log, load_vehicle("generic")), MAX, stop=never)
+        play(replay_port, LogSource(log, Vehicle.load("generic")), MAX, stop=never)
         assert waits(lambda: live.gauge.samples == len(log))
         time.sleep(0.3)
     reader = SocReader(FrameIds())
@@ -210,22 +209,22 @@ def test_what_is_published_can_be_read_by_others(replay_port: BusConnection) -> 
     while (message := listener.recv(0.1)) is not None:
         frames.append(message)
     listener.shutdown()
-    told = [each for each in map(reader.read, frames) if isinstance(each, SocEstimate)]
+    published = [each for each in map(reader.read, frames) if isinstance(each, SocEstimate)]
     assert reader.refused == 0
-    assert len(told) >= len(log)  # every 100 ms of bus time
-    assert told[-1].soc_pct == pytest.approx(live.rows[-1][1].soc_pct, abs=0.001)
+    assert len(published) >= len(log)  # every 100 ms of bus time
+    assert published[-1].soc_pct == pytest.approx(live.rows[-1][1].soc_pct, abs=0.001)
 
 
 def test_a_bus_that_does_not_exist(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="nosuch0") as caught:
         open_bus(BusAddress("socketcan", "nosuch0"))
-    assert "vcan0" in str(caught.value)  # what there is instead
+    assert "vcan0" in str(caught.value)  # the existing one
     with pytest.raises(InputError, match="nosuch0"):
         bus_address(None, "nosuch0")
 
 
-def test_both_commands_and_a_bus_that_goes_down(tmp_path: Path) -> None:
-    """Processes start slowly in a guest, so the commands are gone through once, in one test."""
+def test_both_commands_until_the_bus_goes_down(tmp_path: Path) -> None:
+    """One test for both commands: processes start slowly in a guest."""
     from cangauge.logs.canonical import write_log  # noqa: PLC0415 - pyarrow, for this test alone
 
     log_path, record = tmp_path / "drive.parquet", tmp_path / "drive.log"
@@ -251,15 +250,15 @@ def test_both_commands_and_a_bus_that_goes_down(tmp_path: Path) -> None:
         subprocess.run(["ip", "link", "set", "vcan0", "up"], check=True)
     assert ended.code == 0
     assert ended.json["bus_losses"] == 1
-    # What was recorded until then is there.
-    recorded = estimate_capture(record, load_vehicle("generic"), leaf_model())
+    # The recording until then is complete.
+    recorded = estimate_capture(record, Vehicle.load("generic"), leaf_model())
     assert recorded.table.soc_pct.size == 200
 
 
 @pytest.mark.real
 @pytest.mark.slow
 def test_a_real_trip_within_the_bound_and_bit_for_bit(shared_data: Path) -> None:
-    """One of the trips; `benchmarks/bus_trips.py` does them all."""
+    """One trip; `benchmarks/bus_trips.py` plays them all."""
     from bus_trips import compare  # noqa: PLC0415 - needs the real data
     from real_trips import identify, read_trips  # noqa: PLC0415
 
@@ -267,7 +266,7 @@ def test_a_real_trip_within_the_bound_and_bit_for_bit(shared_data: Path) -> None
     model = identify(read_trips(folder, ["A01", "A03", "A05"])).model
     trip = read_trips(folder, ["A02"])[0].rows(slice(0, 6000))
     for preset in ("generic", "leaf_aze0"):
-        result = compare(trip, load_vehicle(preset), model, VCAN)
+        result = compare(trip, Vehicle.load(preset), model, VCAN)
         assert result.samples == 6000
         assert result.lost == 0
         assert result.is_bit_for_bit

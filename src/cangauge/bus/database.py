@@ -1,19 +1,17 @@
-"""One signal ↔ the bits of a payload, decided once when the DBC is read.
+"""DBC files: bounded reading, search with helpful errors, and codecs of single signals.
 
-cantools reads the DBC and says where every signal is; decoding only the one signal that is
-wanted, on plain integers, costs a third of decoding its whole message. Values agree with those
-of cantools to the last bit.
-
-DBC files: read within bounds of time and memory, and searched with helpful errors.
+cantools reads the DBC. A `SignalCodec` decodes one signal without its whole message; its values
+equal those of cantools to the last bit.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import math
 import re
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -28,9 +26,9 @@ from cangauge._io import MAX_DBC_BYTES, read_bounded
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError, closest
 
-# --- One signal ↔ the bits of a payload, decided once when the DBC is read
+Decode = Callable[[bytes | bytearray], float]
 
-# How value tables name codes that are no values.
+# Names that value tables give to codes without a value.
 _NOT_A_VALUE = re.compile(
     r"^(sna|n/?a|no data|invalid|error|fault|fehler|undefined|unknown|init)$"
     r"|(not|un)[\s_-]?(available|avail|valid|def)|invalid",
@@ -48,7 +46,7 @@ class Field:
     shift, width : int
         Lowest bit and number of bits, in the payload read as one number.
     big_endian : bool
-        How the payload is read as one number: Motorola or Intel.
+        Byte order of that number: Motorola or Intel.
     """
 
     shift: int
@@ -69,7 +67,7 @@ class Field:
 
     @classmethod
     def of(cls, signal: Signal, length: int) -> Field:
-        """Return where a signal is in a payload of `length` bytes (DBC bit numbering)."""
+        """Return the bits of a signal in a payload of `length` bytes (DBC bit numbering)."""
         if signal.byte_order == "little_endian":
             return cls(signal.start, signal.length, big_endian=False)
         from_top = 8 * (signal.start // 8) + 7 - signal.start % 8
@@ -78,7 +76,7 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """A multiplexer that must show one of these values for a signal to be in the frame."""
+    """Multiplexer values with which a signal is present in a frame."""
 
     field: Field
     values: frozenset[int]
@@ -86,7 +84,7 @@ class Condition:
 
 @dataclass(frozen=True, slots=True)
 class SignalCodec:
-    """Converts one signal between payload and physical value in the DBC's unit.
+    """Conversion of one signal between payload and physical value in the DBC's unit.
 
     Parameters
     ----------
@@ -98,9 +96,14 @@ class SignalCodec:
     factor, offset : float
         value = raw × factor + offset.
     not_available : frozenset of int
-        Raw codes that mean "no value".
+        Raw codes without a value.
     conditions : tuple of Condition
-        All must hold for the signal to be in a frame.
+        All must hold for the signal to be present in a frame.
+
+    Attributes
+    ----------
+    decode : callable
+        Takes a payload of the message's own length; returns the value, NaN for "not available".
     """
 
     name: str
@@ -112,25 +115,52 @@ class SignalCodec:
     offset: float
     not_available: frozenset[int]
     conditions: tuple[Condition, ...] = ()
+    decode: Decode = dataclasses.field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "decode", self.decoder())
+
+    def decoder(self, gain: float = 1.0, shift: float = 0.0) -> Decode:
+        """Return a function that decodes a payload to gain × value + shift.
+
+        The kind of the signal is decided here, once, not for each frame.
+        """
+        order: Literal["big", "little"] = "big" if self.field.big_endian else "little"
+        low_bit, mask = self.field.shift, (1 << self.field.width) - 1
+        factor, offset = self.factor, self.offset
+
+        if self.float_format:
+            floating = struct.Struct(">" + self.float_format)
+
+            def decode_float(payload: bytes | bytearray) -> float:
+                raw = (int.from_bytes(payload, order) >> low_bit) & mask
+                number: float = floating.unpack(raw.to_bytes(floating.size, "big"))[0]
+                if not math.isfinite(number):
+                    return math.nan
+                return gain * (number * factor + offset) + shift
+
+            return decode_float
+
+        not_available = self.not_available
+        sign_bit = (mask + 1) >> 1 if self.is_signed else 0
+
+        def decode_integer(payload: bytes | bytearray) -> float:
+            raw = (int.from_bytes(payload, order) >> low_bit) & mask
+            if raw & sign_bit:
+                raw -= mask + 1
+            if raw in not_available:
+                return math.nan
+            return gain * (raw * factor + offset) + shift
+
+        def decode_plain(payload: bytes | bytearray) -> float:
+            raw = (int.from_bytes(payload, order) >> low_bit) & mask
+            return gain * (raw * factor + offset) + shift
+
+        return decode_integer if sign_bit or not_available else decode_plain
 
     def is_in(self, payload: bytes | bytearray) -> bool:
-        """Return whether the multiplexers, if any, say that the payload carries the signal."""
+        """Return whether the signal is present, according to the multiplexers if any."""
         return all(each.field.get(payload) in each.values for each in self.conditions)
-
-    def decode(self, payload: bytes | bytearray) -> float:
-        """Return the value in the DBC's unit; NaN for "not available"."""
-        field = self.field
-        raw = (int.from_bytes(payload, "big" if field.big_endian else "little") >> field.shift) & (
-            (1 << field.width) - 1
-        )
-        if self.float_format:
-            number = _as_float(raw, self.float_format)
-            return number * self.factor + self.offset if math.isfinite(number) else math.nan
-        if self.is_signed and raw >> (field.width - 1):
-            raw -= 1 << field.width
-        if raw in self.not_available:
-            return math.nan
-        return raw * self.factor + self.offset
 
     def encode_into(self, payload: bytearray, value: float) -> None:
         """Set the signal and its multiplexers; NaN becomes the first "not available" code.
@@ -142,16 +172,40 @@ class SignalCodec:
         """
         for condition in self.conditions:
             condition.field.put(payload, min(condition.values))
+        self.field.put(payload, self._raw(value))
+
+    def _raw(self, value: float) -> int:
+        number = (value - self.offset) / self.factor
         if self.float_format:
-            raw = self._float_bits(value)
-        elif math.isnan(value):
-            raw = self._missing()
-        else:
-            raw = self._number(value)
-        self.field.put(payload, raw)
+            try:
+                return int.from_bytes(struct.pack(">" + self.float_format, number), "big")
+            except OverflowError:
+                raise self._does_not_fit(value) from None
+        if math.isnan(value):
+            if not self.not_available:
+                raise InputError(
+                    "the DBC has no code for a missing value", field=self.name, value=math.nan
+                )
+            return min(self.not_available)
+        if not math.isfinite(number):
+            raise self._does_not_fit(value)
+        raw = round(number)
+        low, high = self.raw_range
+        if not low <= raw <= high or raw in self.not_available:
+            raise self._does_not_fit(value)
+        return raw
+
+    def _does_not_fit(self, value: float) -> InputError:
+        low, high = self.range
+        return InputError(
+            f"does not fit into the signal, which holds {low:g} to {high:g} {self.unit}".rstrip(),
+            field=self.name,
+            value=value,
+            cure="use a DBC with a wider signal",
+        )
 
     def quantise(self, values: FloatArray) -> FloatArray:
-        """Return what `decode` gives after `encode_into`, for every value, without range check."""
+        """Return what `decode` gives after `encode_into`, for each value, without range check."""
         if self.float_format:
             kind = {"e": np.float16, "f": np.float32, "d": np.float64}[self.float_format]
             numbers = ((values - self.offset) / self.factor).astype(kind).astype(np.float64)
@@ -160,7 +214,7 @@ class SignalCodec:
         return np.asarray(numbers * self.factor + self.offset)
 
     def fits(self, values: FloatArray) -> NDArray[np.bool_]:
-        """Return which values `encode_into` takes; NaN counts as one that it does."""
+        """Return which values `encode_into` accepts; NaN counts as accepted."""
         numbers = (values - self.offset) / self.factor
         if self.float_format:
             largest = {"e": 65504.0, "f": 3.4028234e38, "d": math.inf}[self.float_format]
@@ -192,41 +246,8 @@ class SignalCodec:
 
     @property
     def half_step(self) -> float:
-        """Largest error of rounding to the signal's step, in the DBC's unit; 0 for floats."""
+        """Largest quantization error, in the DBC's unit; 0 for floats."""
         return 0.0 if self.float_format else abs(self.factor) / 2.0
-
-    def _number(self, value: float) -> int:
-        number = (value - self.offset) / self.factor
-        if not math.isfinite(number):
-            raise self._refuse(value)
-        raw = round(number)
-        low, high = self.raw_range
-        if not low <= raw <= high or raw in self.not_available:
-            raise self._refuse(value)
-        return raw
-
-    def _float_bits(self, value: float) -> int:
-        try:
-            packed = struct.pack(">" + self.float_format, (value - self.offset) / self.factor)
-        except OverflowError:
-            raise self._refuse(value) from None
-        return int.from_bytes(packed, "big")
-
-    def _missing(self) -> int:
-        if not self.not_available:
-            raise InputError(
-                "the DBC has no code for a missing value", field=self.name, value=math.nan
-            )
-        return min(self.not_available)
-
-    def _refuse(self, value: float) -> InputError:
-        low, high = self.range
-        return InputError(
-            f"does not fit into the signal, which holds {low:g} to {high:g} {self.unit}".rstrip(),
-            field=self.name,
-            value=value,
-            cure="use a DBC with a wider signal",
-        )
 
 
 def signal_codec(
@@ -244,10 +265,10 @@ def signal_codec(
     ----------
     message, signal : cantools.database.can.Message, cantools.database.can.Signal
     source, field : object, str
-        For messages: the file, and the name of the mapping's entry.
+        For error messages: the file, and the name of the entry in the map file.
     not_available : tuple of int
-        Raw codes that mean "no value", besides those that the value table names so ("not
-        available", "SNA", "invalid", …).
+        Raw codes without a value, besides those that the value table names so ("not available",
+        "SNA", "invalid", …).
     when : dict of str to int, optional
         Further conditions: raw values of other signals of the message.
 
@@ -256,45 +277,72 @@ def signal_codec(
     InputError
         If the signal does not fit into its message or cannot be a number.
     """
-    _check_layout(message, signal, source, field)
-    is_float = signal.conversion.is_float
+    bits = _bits(message, signal, source, field)
+    conditions: list[Condition] = []
+    selector = signal
+    while (name := selector.multiplexer_signal) is not None:
+        values = frozenset(selector.multiplexer_ids or ())
+        found = _signal(message, name)
+        if found is None:
+            raise InputError(
+                f"{selector.name} is multiplexed by a signal that {message.name} does not have",
+                source=str(source),
+                field=field,
+                value=name,
+                cure="correct the DBC",
+            )
+        if len(conditions) > len(message.signals):
+            raise InputError("signals are multiplexed in a circle", source=str(source), field=field)
+        conditions.append(Condition(_bits(message, found, source, field), values))
+        selector = found
+    for name, value in (when or {}).items():
+        found = _signal(message, name)
+        if found is None:
+            raise InputError(
+                f"message {message.name} has no such signal",
+                source=str(source),
+                field=f"{field}.when",
+                value=name,
+            )
+        selector_bits = _bits(message, found, source, field)
+        raw = value & ((1 << selector_bits.width) - 1)
+        conditions.append(Condition(selector_bits, frozenset({raw})))
+    conversion = signal.conversion
     return SignalCodec(
         name=signal.name,
         unit=(signal.unit or "").strip(),
-        field=Field.of(signal, message.length),
-        is_signed=signal.is_signed and not is_float,
-        float_format=_FLOATS[signal.length] if is_float else "",
-        factor=float(signal.conversion.scale),
-        offset=float(signal.conversion.offset),
+        field=bits,
+        is_signed=signal.is_signed and not conversion.is_float,
+        float_format=_FLOATS[signal.length] if conversion.is_float else "",
+        factor=float(conversion.scale),
+        offset=float(conversion.offset),
         not_available=_codes_of_no_value(signal) | frozenset(not_available),
-        conditions=(
-            *_multiplexers(message, signal, source, field),
-            *_conditions(message, when or {}, source, field),
-        ),
+        conditions=tuple(conditions),
     )
+
+
+def _signal(message: Message, name: str) -> Signal | None:
+    return next((each for each in message.signals if each.name == name), None)
 
 
 def _codes_of_no_value(signal: Signal) -> frozenset[int]:
     names: Mapping[int, object] = signal.conversion.choices or {}
     if 2 * len(names) > 1 << min(signal.length, 64):
-        return frozenset()  # most codes have a name: an enumeration, where "invalid" is a value
+        return frozenset()  # an enumeration: most codes have a name, "invalid" is one of them
     return frozenset(int(raw) for raw, name in names.items() if _NOT_A_VALUE.search(str(name)))
 
 
-def _check_layout(message: Message, signal: Signal, source: object, field: str) -> None:
-    place = Field.of(signal, message.length)
+def _bits(message: Message, signal: Signal, source: object, field: str) -> Field:
+    """Return the bits of a signal; refuse a layout or conversion that is impossible."""
+    bits, conversion = Field.of(signal, message.length), signal.conversion
     problem = ""
-    if signal.length < 1 or place.shift < 0 or place.shift + place.width > 8 * message.length:
+    if signal.length < 1 or bits.shift < 0 or bits.shift + bits.width > 8 * message.length:
         problem = f"the signal does not fit into the {message.length} bytes of {message.name}"
-    elif signal.conversion.is_float and signal.length not in _FLOATS:
+    elif conversion.is_float and signal.length not in _FLOATS:
         problem = f"a float of {signal.length} bits is not possible"
-    elif not signal.conversion.is_float and signal.length > 64:
+    elif not conversion.is_float and signal.length > 64:
         problem = f"a number of {signal.length} bits is not possible"
-    elif not (
-        math.isfinite(signal.conversion.scale)
-        and math.isfinite(signal.conversion.offset)
-        and signal.conversion.scale != 0
-    ):
+    elif not (0.0 < abs(conversion.scale) < math.inf and math.isfinite(conversion.offset)):
         problem = "factor and offset must be finite and the factor not 0"
     if problem:
         raise InputError(
@@ -304,76 +352,27 @@ def _check_layout(message: Message, signal: Signal, source: object, field: str) 
             value=signal.name,
             cure="correct the DBC",
         )
+    return bits
 
-
-def _multiplexers(message: Message, signal: Signal, source: object, field: str) -> list[Condition]:
-    conditions: list[Condition] = []
-    while signal.multiplexer_signal is not None:
-        name = signal.multiplexer_signal
-        selector = next((each for each in message.signals if each.name == name), None)
-        if selector is None:
-            raise InputError(
-                f"{signal.name} is multiplexed by a signal that {message.name} does not have",
-                source=str(source),
-                field=field,
-                value=name,
-                cure="correct the DBC",
-            )
-        if len(conditions) > len(message.signals):
-            raise InputError("signals are multiplexed in a circle", source=str(source), field=field)
-        _check_layout(message, selector, source, field)
-        values = frozenset(signal.multiplexer_ids or ())
-        conditions.append(Condition(Field.of(selector, message.length), values))
-        signal = selector
-    return conditions
-
-
-def _conditions(
-    message: Message, when: dict[str, int], source: object, field: str
-) -> list[Condition]:
-    conditions = []
-    for name, value in when.items():
-        selector = next((each for each in message.signals if each.name == name), None)
-        if selector is None:
-            raise InputError(
-                f"message {message.name} has no such signal",
-                source=str(source),
-                field=f"{field}.when",
-                value=name,
-            )
-        _check_layout(message, selector, source, field)
-        place = Field.of(selector, message.length)
-        conditions.append(Condition(place, frozenset({value & ((1 << place.width) - 1)})))
-    return conditions
-
-
-def _as_float(raw: int, float_format: str) -> float:
-    size = struct.calcsize(float_format)
-    number: float = struct.unpack(">" + float_format, raw.to_bytes(size, "big"))[0]
-    return number
-
-
-# --- DBC files: read within bounds of time and memory, and searched with helpful errors
 
 MAX_MESSAGES: Final = 20_000
 MAX_MESSAGE_BYTES: Final = 1785
-"""The longest that J1939 can transport. cantools lays out every bit of a message in memory."""
+"""Longest message of J1939. cantools lays out every bit of a message in memory."""
 MAX_MULTIPLEXER_VALUE: Final = (1 << 32) - 1
 MAX_MULTIPLEXER_VALUES: Final = 65_536
-"""cantools makes a list of every value in a range of multiplexer values."""
+"""cantools expands each range of multiplexer values into a list."""
 
-_WHAT_CANTOOLS_RAISES: Final = (
+_CANTOOLS_ERRORS: Final = (
     cantools.Error,
     LookupError,
     ValueError,
     TypeError,
     ArithmeticError,
     AttributeError,
-    AssertionError,  # it asserts that a multiplexed signal says by what
+    AssertionError,  # a multiplexed signal without a multiplexer
 )
 
-# What cantools reads as these statements, and with possessive quantifiers, so that no text takes
-# more than linear time.
+# The statements as cantools reads them; possessive quantifiers keep the time linear for any text.
 _STRING_OR_COMMENT = re.compile(r'"(\\"|[^"])*?"|//[^\n]*+\n')
 _MESSAGE = re.compile(r"(?<![A-Za-z_])BO_\s++[-+]?\d++\s*+\w++\s*+:\s*+([-+]?\d++)")
 _SIGNAL = re.compile(
@@ -382,21 +381,19 @@ _SIGNAL = re.compile(
 _MULTIPLEXER_VALUES = re.compile(r"(?<![A-Za-z_])SG_MUL_VAL_\s[^;]*+")
 _RANGE = re.compile(r"(?<!\d)(\d++)\s*+-\s*+(\d++)")
 
-# cantools warns on stderr, twice for every message that a file defines again; the messages that
-# are wanted are checked for that here.
+# cantools warns on stderr of messages defined twice; `find_message` reports the wanted ones.
 logging.getLogger("cantools").addHandler(logging.NullHandler())
 
 
 def load_dbc(path: str | PathLike[str]) -> Database:
     """Read a DBC file.
 
-    Overlapping signals are accepted, since many files in use have some in messages that nobody
-    asks for.
+    Overlapping signals are accepted: many files have some in messages that are not wanted.
 
     Raises
     ------
     InputError
-        If the file is absent, too large, not a DBC, or defines what no CAN bus can carry.
+        If the file is absent, too large, not a DBC, or beyond what a CAN bus can carry.
     """
     path = Path(path)
     text = _read_text(path)
@@ -405,7 +402,7 @@ def load_dbc(path: str | PathLike[str]) -> Database:
         database = cantools.database.load_string(text, "dbc", strict=False)
     except RecursionError as error:
         raise InputError("signals are multiplexed in a circle", source=path) from error
-    except _WHAT_CANTOOLS_RAISES as error:
+    except _CANTOOLS_ERRORS as error:
         raise InputError(
             f"not a DBC file that can be read: {_first_line(error)}",
             source=path,
@@ -422,7 +419,7 @@ def find_message(database: Database, message: str | int, *, source: object, fiel
     Raises
     ------
     InputError
-        If there is none (with the closest names), or several.
+        If there is none (with the closest names) or more than one.
     """
     wanted = _as_id(message)
     found = [
@@ -440,13 +437,19 @@ def find_message(database: Database, message: str | int, *, source: object, fiel
             value=message,
             cure="keep one of them",
         )
-    if wanted is None:
-        names = closest(str(message), (candidate.name for candidate in database.messages))
-        cure = f"did you mean {names}?" if names else _few("messages", database)
-    else:
-        cure = _few("messages", database)
+    near = (
+        closest(str(message), (each.name for each in database.messages)) if wanted is None else ""
+    )
+    shown = ", ".join(f"{each.name} (0x{each.frame_id:X})" for each in database.messages[:6])
+    more = len(database.messages) - 6
     raise InputError(
-        "the DBC has no such message", source=str(source), field=field, value=message, cure=cure
+        "the DBC has no such message",
+        source=str(source),
+        field=field,
+        value=message,
+        cure=f"did you mean {near}?"
+        if near
+        else f"its messages are {shown}" + (f" and {more} more" if more > 0 else ""),
     )
 
 
@@ -458,13 +461,13 @@ def find_signal(
     Raises
     ------
     InputError
-        If there is none (with the closest names), or several.
+        If there is none (with the closest names) or more than one.
     """
     if message is not None:
         owner = find_message(database, message, source=source, field=f"{field}.message")
-        for candidate in owner.signals:
-            if candidate.name == signal:
-                return owner, candidate
+        found = _signal(owner, signal)
+        if found is not None:
+            return owner, found
         raise InputError(
             f"message {owner.name} has no such signal",
             source=str(source),
@@ -506,31 +509,31 @@ def _read_text(path: Path) -> str:
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
-        return data.decode("cp1252", errors="replace")  # what most tools write
+        return data.decode("cp1252", errors="replace")  # the encoding that most tools write
 
 
 def _refuse_hostile(text: str, path: Path) -> None:
-    """Refuse figures that would make cantools fill the memory."""
-    # A comment may stand between any two words, and a string may look like anything.
+    """Refuse sizes that would make cantools exhaust the memory."""
+    # Comments may stand between any two words, and strings may look like statements.
     text = _STRING_OR_COMMENT.sub(lambda match: '""' if match[0][0] == '"' else " ", text)
     messages = 0
     for match in _MESSAGE.finditer(text):
         messages += 1
-        _bounded(match[1], MAX_MESSAGE_BYTES, "a message of so many bytes", path)
+        _bounded(match[1], MAX_MESSAGE_BYTES, "a message that is too long (bytes)", path)
     if messages > MAX_MESSAGES:
         raise InputError(
             f"the DBC defines more than {MAX_MESSAGES} messages",
             source=path,
             value=messages,
-            cure="cut it down to those that you need",
+            cure="remove the messages that you do not need",
         )
     for match in _SIGNAL.finditer(text):
-        _bounded(match[1], 8 * MAX_MESSAGE_BYTES, "a signal that starts at such a bit", path)
-        _bounded(match[2], 8 * MAX_MESSAGE_BYTES, "a signal of so many bits", path)
+        _bounded(match[1], 8 * MAX_MESSAGE_BYTES, "a signal with a start bit out of range", path)
+        _bounded(match[2], 8 * MAX_MESSAGE_BYTES, "a signal that is too long (bits)", path)
     values = 0
     for statement in _MULTIPLEXER_VALUES.findall(text):
         for low, high in _RANGE.findall(statement):
-            _bounded(high, MAX_MULTIPLEXER_VALUE, "so large a multiplexer value", path)
+            _bounded(high, MAX_MULTIPLEXER_VALUE, "a multiplexer value that is too large", path)
             values += max(int(high) - int(low[-12:]) + 1, 0)
     if values > MAX_MULTIPLEXER_VALUES:
         raise InputError("the DBC lists too many multiplexer values", source=path, value=values)
@@ -551,11 +554,7 @@ def _as_id(message: str | int) -> int | None:
 
 
 def _signal_cure(database: Database, owner: Message, signal: str) -> str:
-    elsewhere = [
-        other.name
-        for other in database.messages
-        if any(candidate.name == signal for candidate in other.signals)
-    ]
+    elsewhere = [other.name for other in database.messages if _signal(other, signal)]
     if elsewhere:
         return f"it is in {', '.join(elsewhere[:3])}"
     names = [candidate.name for candidate in owner.signals]
@@ -564,12 +563,6 @@ def _signal_cure(database: Database, owner: Message, signal: str) -> str:
         return f"did you mean {near}?"
     shown = ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
     return f"it has {shown}" if shown else "it has no signals at all"
-
-
-def _few(what: str, database: Database) -> str:
-    names = [f"{message.name} (0x{message.frame_id:X})" for message in database.messages]
-    shown = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
-    return f"its {what} are {shown}"
 
 
 def _first_line(error: Exception) -> str:

@@ -1,4 +1,4 @@
-"""Samples → frames: what replay sends, and what the decoder will make of it."""
+"""Samples → frames: the inverse of `decoder`, with the quantization that frames cause."""
 
 from __future__ import annotations
 
@@ -13,28 +13,21 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.bus.database import Condition
 from cangauge.bus.protection import Protection
-from cangauge.bus.vehicle import Vehicle, VehicleSignal
+from cangauge.bus.time_source import MICROSECONDS
+from cangauge.bus.vehicle import LOG_COLUMNS, Vehicle, VehicleSignal
 from cangauge.errors import InputError
 from cangauge.estimate.validity import Sample
 from cangauge.logs.log import Log
 
 SLOW_EVERY_S: Final = 1.0
-"""Temperature and SoC are sent when they change, and at least this often in log time [s]."""
-MICROSECONDS: Final = 1e6
-"""REPLAY_CLOCK tells the log's time in whole microseconds: time_s = log_time_us / 1e6."""
+"""Longest interval at which temperature and SoC are sent without a change, in log time [s]."""
 
-_FIELDS: Final = {
-    "current": "current_a",
-    "voltage": "voltage_v",
-    "temperature": "temperature_c",
-    "soc_reference": "soc_pct",
-}
 _UNITS: Final = {"current": "A", "voltage": "V", "temperature": "°C", "soc_reference": "%"}
 
 
 @dataclass(slots=True)
 class _Outgoing:
-    """One frame to send: signals of one message that can stand in one payload."""
+    """A frame to send: the signals of one message that share a payload."""
 
     signals: tuple[VehicleSignal, ...]
     rule: Protection | None
@@ -42,21 +35,13 @@ class _Outgoing:
     last: bytes = b""
     last_s: float = -math.inf
 
-    def is_due(self, payload: bytes, time_s: float) -> bool:
-        """Return whether a slow frame must be sent again, and remember that it was."""
-        if payload == self.last and 0.0 <= time_s - self.last_s < SLOW_EVERY_S:
-            return False
-        self.last, self.last_s = payload, time_s
-        return True
-
 
 class FrameEncoder:
     """Makes frames of samples; the inverse of `SampleDecoder`.
 
-    Slow signals (temperature, SoC) go first, so that a sample finds its own temperature, then
-    current, then voltage. Slow ones are sent when their value as a frame carries it changes, and
-    every `SLOW_EVERY_S` of log time. Counters run on over all samples, per message. Frames carry
-    the sample's time as time stamp.
+    Slow signals (temperature, SoC) come first, so that they apply to their own sample; then
+    current; then voltage. Slow ones are sent when their quantized value changes, and every
+    `SLOW_EVERY_S` of log time. Alive counters run per message. Time stamps are the samples' times.
 
     Parameters
     ----------
@@ -69,20 +54,20 @@ class FrameEncoder:
         self._frames = _plan(vehicle)
 
     def encode(self, sample: Sample, soc_reference_pct: float | None = None) -> list[can.Message]:
-        """Return the frames of one sample, in the order in which they are to be sent.
+        """Return the frames of one sample, in sending order.
 
         Parameters
         ----------
         sample : Sample
-            Where all values of a frame are NaN it is not sent; one NaN among others becomes the
-            DBC's code for "not available".
+            A frame whose values are all NaN is not sent; a NaN among others becomes the DBC's
+            code for "not available".
         soc_reference_pct : float, optional
             Sent where the vehicle has such a signal; None or NaN: not sent.
 
         Raises
         ------
         InputError
-            If a value does not fit into its signal, or is NaN without a code for that (names it).
+            If a value does not fit into its signal, or is NaN without such a code.
         """
         values = {
             "current": sample.current_a,
@@ -108,8 +93,10 @@ class FrameEncoder:
         payload = bytearray(first.length)
         for signal, value in zip(frame.signals, values, strict=True):
             signal.encode_into(payload, value)
-        if frame.is_slow and not frame.is_due(bytes(payload), time_s):
-            return None
+        if frame.is_slow:
+            if payload == frame.last and 0.0 <= time_s - frame.last_s < SLOW_EVERY_S:
+                return None
+            frame.last, frame.last_s = bytes(payload), time_s
         if frame.rule is not None:
             counter = self._counters[first.key]
             self._counters[first.key] = counter + 1
@@ -123,12 +110,12 @@ class FrameEncoder:
         )
 
     def check_range(self, log: Log) -> None:
-        """Check once, before anything is sent, that every value of a log fits into its signal.
+        """Check that every value of a log fits into its signal, before anything is sent.
 
         Raises
         ------
         InputError
-            For the first signal that is too narrow: names it, its range, the value and its row.
+            Names the first signal that is too narrow, its range, the value and its row.
         """
         for signal, field, values in self._columns(log):
             bad = np.flatnonzero(~signal.fits(values))
@@ -146,7 +133,7 @@ class FrameEncoder:
                 )
 
     def quantisation(self) -> dict[str, float]:
-        """Return by how much a frame can differ from the log by rounding: half a step.
+        """Return the largest quantization errors of frames: half a step.
 
         Returns
         -------
@@ -154,22 +141,21 @@ class FrameEncoder:
             `current_a` [A], `voltage_v` [V], `temperature_c` [°C], `soc_pct` [%], where the
             vehicle sends them, and `time_s` [s] for REPLAY_CLOCK.
         """
-        steps = {_FIELDS[signal.role]: signal.half_step for signal in self.vehicle.signals}
+        steps = {LOG_COLUMNS[signal.role]: signal.half_step for signal in self.vehicle.signals}
         return {**steps, "time_s": 0.5 / MICROSECONDS}
 
     def quantise(self, log: Log) -> Log:
-        """Return the log as the decoder gets it, to the last bit, when time is REPLAY_CLOCK's.
+        """Return the log as decoded from its frames with REPLAY_CLOCK, bit for bit.
 
-        A vehicle without a temperature signal has its fixed temperature in every row, or the
-        log's where it has none.
+        A vehicle without a temperature signal gives its fixed temperature, or the log's if it has
+        none.
         """
         sent = {field: signal.quantise(values) for signal, field, values in self._columns(log)}
         if not math.isnan(self.vehicle.fixed_temperature_c):
             sent["temperature_c"] = np.full(len(log), self.vehicle.fixed_temperature_c)
-        microseconds = np.rint(log.time_s * MICROSECONDS)
         return replace(
             log,
-            time_s=microseconds / MICROSECONDS,
+            time_s=np.rint(log.time_s * MICROSECONDS) / MICROSECONDS,
             current_a=sent["current_a"],
             voltage_v=sent["voltage_v"],
             temperature_c=sent.get("temperature_c", log.temperature_c),
@@ -179,9 +165,9 @@ class FrameEncoder:
     def _columns(self, log: Log) -> list[tuple[VehicleSignal, str, FloatArray]]:
         found = []
         for signal in self.vehicle.signals:
-            values = getattr(log, _FIELDS[signal.role])
+            values = getattr(log, LOG_COLUMNS[signal.role])
             if values is not None:
-                found.append((signal, _FIELDS[signal.role], values))
+                found.append((signal, LOG_COLUMNS[signal.role], values))
         return found
 
 

@@ -1,9 +1,9 @@
-"""What a car's signals are called and how they are meant: the map file, checked by pydantic.
+"""The map file: which signals of a DBC are current, voltage, temperature, and how to read them.
 
 A map file in TOML, for any car with a DBC::
 
     name = "my car"
-    dbc = "my_car.dbc"              # optional: --dbc says it too
+    dbc = "my_car.dbc"              # optional: or give --dbc
     temperature_source = "pack"     # cell, pack, coolant, room, unknown
     pair_within_s = 0.020
 
@@ -11,13 +11,13 @@ A map file in TOML, for any car with a DBC::
     message = "BMS_Status"          # name or id ("0x1DB"); optional where the signal is unique
     signal = "PackCurrent"
     sign = -1                       # -1: on the bus, negative current discharges
-    lowest = -400                   # optional, as all below: [A], [V], [°C], in cangauge's sign
+    lowest = -400                   # optional, like all below: [A], [V], [°C], sign of cangauge
     highest = 400
-    max_jump = 300                  # between two values, whatever the time between them …
-    max_rate_per_s = 5000           # … and so much more a second
-    invalid_after = 5               # refused values in a row, then the signal is invalid …
-    valid_after = 3                 # … until so many good ones in a row
-    timeout_s = 0.5                 # without: from the message's period
+    max_jump = 300                  # largest change between two values …
+    max_rate_per_s = 5000           # … plus this for every second between them
+    invalid_after = 5               # consecutive failures until the signal is invalid
+    valid_after = 3                 # consecutive good values until it is valid again
+    timeout_s = 0.5                 # default: from the period of the message
 
     [voltage]
     signal = "PackVoltage"
@@ -26,25 +26,25 @@ A map file in TOML, for any car with a DBC::
     signal = "PackTemperature"      # or: fixed_c = 21.5
     when = { Selector = 2 }         # only in frames where this signal has this raw value
 
-    [soc_reference]                 # optional, to compare with
+    [soc_reference]                 # optional, for comparison
     signal = "DisplaySoc"
 
     [messages.BMS_Status]           # optional
     protection = "my_rule"          # leaf, generic, crc_only, counter, e2e_01, e2e_02, e2e_04,
                                     # e2e_05, e2e_06, e2e_07, e2e_11, or one of [rules]
-    period_s = 0.01                 # without: the DBC's, or learned from the frames
+    period_s = 0.01                 # default: from the DBC, or learned from the frames
 
     [messages.BMS_Temps]
     protection = "e2e_05"           # AUTOSAR end-to-end protection
     data_id = 0x1234                # e2e_02: data_id_list = [16 numbers of 0-255]
     # data_id_mode = "nibble"       # e2e_01, e2e_11: both (default), alternating, low, nibble
-    # header_byte = 0               # where the header begins
+    # header_byte = 0               # first byte of the header
     # protected_bytes = 8           # default: all bytes of the message
 
     [messages.BMS_Limits]
-    protection = "counter"          # no CRC that is known
+    protection = "counter"          # no known CRC
     counter = "AliveCounter"        # signal of the DBC
-    counter_modulus = 15            # default: all values of its bits
+    counter_modulus = 15            # number of values; default: all that its bits can hold
 
     [rules.my_rule]
     polynomial = 0x2F
@@ -57,15 +57,41 @@ A map file in TOML, for any car with a DBC::
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Annotated, Final, Literal, Self
 
+from cantools.database.can import Message
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from cangauge.bus.protection import LIST_LENGTH, DataIdMode, ProtectionRule
+from cangauge.bus import database
+from cangauge.bus.protection import (
+    LIST_LENGTH,
+    PROFILES,
+    RULES,
+    CounterRule,
+    DataIdMode,
+    E2eRule,
+    Protection,
+    ProtectionRule,
+)
+from cangauge.errors import InputError
 from cangauge.logs.log import TemperatureSource
 
-PAIR_WITHIN_S = 0.020
-"""Current and voltage at most this far apart in bus time belong together [s]."""
+PAIR_WITHIN_S: Final = 0.020
+"""Largest distance in bus time between paired current and voltage [s]."""
+
+COUNTER: Final = "counter"
+"""Protection by a counter alone."""
+_COUNTER_FIELDS: Final = ("counter", "counter_modulus")
+_PROFILE_FIELDS: Final = (
+    "data_id",
+    "data_id_list",
+    "data_id_mode",
+    "header_byte",
+    "protected_bytes",
+)
 
 _Byte = Annotated[int, Field(ge=0, le=255)]
 _Place = Annotated[int, Field(ge=-64, le=63)]
@@ -77,22 +103,22 @@ class _Strict(BaseModel):
 
 
 class CheckMap(_Strict):
-    """When values of a signal are believed; what is not stated is by default (`checks_of`).
+    """Plausibility limits of a signal; defaults in `plausibility.DEFAULTS`.
 
     Parameters
     ----------
     lowest, highest : float, optional
-        What a value can be [A, positive = discharge; V; °C; %].
+        Range [A, positive = discharge; V; °C; %].
     max_jump, max_rate_per_s : float, optional
-        A value may differ from the latest good one by `max_jump`, and by `max_rate_per_s` more
-        for every second since [A, V, K, %].
+        Largest distance from the latest good value: the first, plus the second for every second
+        since then [A, V, K, %].
     invalid_after, valid_after : int, optional
-        So many refused values in a row make the signal invalid; so many good ones valid again.
+        Consecutive failures until invalid; consecutive good values until valid again.
     stuck_after_s : float, optional
-        Standing still for so long is suspicious [s]: current and voltage while the other one
-        moves, temperature whatever the others do (only where this is stated).
+        Least duration of a constant value that can count as stuck [s]: current and voltage while
+        the other one moves; temperature in any case, only where this is stated.
     timeout_s : float, optional
-        The value holds for so long [s]; by default a multiple of the message's period.
+        Age at which a value becomes old [s]; by default a multiple of the message's period.
     """
 
     lowest: FiniteFloat | None = None
@@ -109,28 +135,26 @@ class CheckMap(_Strict):
         if self.lowest is not None and self.highest is not None and self.lowest >= self.highest:
             raise ValueError("lowest must lie below highest")
         if (self.max_rate_per_s is None) is not (self.max_jump is None):
-            raise ValueError("max_jump and max_rate_per_s belong together")
+            raise ValueError("max_jump and max_rate_per_s need each other")
         return self
 
 
 class SignalMap(CheckMap):
-    """One signal of the DBC and what it means: value = sign × scale × (DBC value) + offset.
+    """One signal of the DBC: value = sign × scale × (DBC value) + offset.
 
     Parameters
     ----------
     message : str or int, optional
-        Name or id; may be left out where the signal's name is unique in the DBC.
+        Name or id; optional where the signal's name is unique in the DBC.
     signal : str
     sign : {1, -1}
-        -1 where the bus counts the other way round (current: negative = discharge).
+        -1 where the bus has the opposite sign (current: negative = discharge).
     scale, offset : float
-        For a DBC with a wrong or foreign unit; stating either also overrides the DBC's unit.
+        For a DBC with a wrong or unknown unit; stating either also overrides the DBC's unit.
     when : dict of str to int
-        Raw values that other signals of the frame must have (multiplexers that the DBC lacks).
+        Raw values that other signals of the frame must have (multiplexers missing in the DBC).
     not_available : tuple of int
-        Raw codes that mean "no value", besides those that the DBC's value table names so.
-    lowest, … timeout_s
-        As in `CheckMap`.
+        Raw codes without a value, besides those that the DBC's value table names so.
     """
 
     message: str | int | None = None
@@ -143,7 +167,7 @@ class SignalMap(CheckMap):
 
     @property
     def states_unit(self) -> bool:
-        """Whether the mapping itself says how to come to the canonical unit."""
+        """Whether the map file states the conversion to the canonical unit."""
         return bool({"scale", "offset"} & self.model_fields_set)
 
 
@@ -161,19 +185,20 @@ class TemperatureMap(SignalMap):
 
 
 class MessageMap(_Strict):
-    """What is known of a message: its protection, and its period when no frame is lost [s].
+    """Protection and period of a message.
 
     Parameters
     ----------
     protection : str, optional
-        A rule that is known, one of [rules], "counter", or a profile of `e2e_rule.PROFILES`.
+        One of `protection.RULES`, of [rules] or of `protection.PROFILES`, or "counter".
     period_s : float, optional
+        Frame period [s].
     data_id, data_id_list, data_id_mode, header_byte, protected_bytes
-        Of a profile; see `E2eRule`.
+        For a profile; see `E2eRule`.
     counter : str, optional
-        Signal that counts, for "counter".
+        For "counter": the counter's signal.
     counter_modulus : int, optional
-        Its number of values, where they are not all that its bits can hold.
+        Number of counter values; by default all that its bits can hold.
     """
 
     protection: str | None = None
@@ -188,9 +213,113 @@ class MessageMap(_Strict):
     counter: str | None = None
     counter_modulus: Annotated[int, Field(ge=3, lt=1 << 32)] | None = None
 
+    def rule(
+        self, message: Message, rules: Mapping[str, RuleMap], *, source: str
+    ) -> Protection | None:
+        """Return the protection of a message; None where none is stated.
+
+        Parameters
+        ----------
+        message : cantools.database.can.Message
+        rules : mapping of str to RuleMap
+            The user's own rules.
+        source : str
+            The file, for error messages.
+
+        Raises
+        ------
+        InputError
+            If the rule is unknown, does not fit, lacks a field or has one that is not its own.
+        """
+        try:
+            rule = self._rule(message, rules)
+        except InputError as error:
+            name = (error.field or "").rpartition(".")[2]
+            raise InputError(
+                error.problem,
+                source=source,
+                field=f"messages.{message.name}.{name}",
+                value=error.value,
+                cure=error.cure,
+            ) from error
+        return rule
+
+    def _rule(self, message: Message, rules: Mapping[str, RuleMap]) -> Protection | None:
+        name = self.protection
+        if name != COUNTER:
+            self._refuse_fields(_COUNTER_FIELDS, f'"{COUNTER}"')
+        if name not in PROFILES:
+            self._refuse_fields(_PROFILE_FIELDS, "an e2e profile")
+        if name is None:
+            return None
+        rule: Protection
+        if name in rules:
+            rule = rules[name].rule(name)
+        elif name == COUNTER:
+            rule = self._counter_rule(message)
+        elif name in PROFILES:
+            rule = self._profile_rule(name)
+        elif name in RULES:
+            rule = RULES[name]
+        else:
+            raise InputError(
+                "unknown protection rule",
+                field="protection",
+                value=name,
+                cure=f"known are {', '.join([*RULES, COUNTER, *PROFILES, *rules])};"
+                f" or define it under [rules.{name}]",
+            )
+        if not rule.fits(message.length):
+            raise InputError(
+                f"the rule does not fit into the {message.length} bytes of the message",
+                field="protection",
+                value=name,
+            )
+        return rule
+
+    def _counter_rule(self, message: Message) -> CounterRule:
+        if self.counter is None:
+            raise InputError(
+                "is missing", field="counter", cure="name the signal of the alive counter"
+            )
+        signal = next((each for each in message.signals if each.name == self.counter), None)
+        if signal is None:
+            raise InputError(
+                f"message {message.name} has no such signal", field="counter", value=self.counter
+            )
+        bits = database.Field.of(signal, message.length)
+        return CounterRule(COUNTER, bits, message.length, self.counter_modulus or 1 << bits.width)
+
+    def _profile_rule(self, name: str) -> E2eRule:
+        wanted = "data_id" if PROFILES[name].id_bits else "data_id_list"
+        if getattr(self, wanted) is None:
+            raise InputError(
+                "is missing",
+                field=wanted,
+                cure=f"the CRC of {name} covers it: ask the sender's manufacturer",
+            )
+        return E2eRule(
+            name,
+            data_id=self.data_id or 0,
+            data_ids=bytes(self.data_id_list or ()),
+            data_id_mode=self.data_id_mode or "both",
+            header_byte=self.header_byte or 0,
+            protected_bytes=self.protected_bytes or 0,
+        )
+
+    def _refuse_fields(self, names: tuple[str, ...], protection: str) -> None:
+        """Refuse fields that only another protection has: most likely a mistake."""
+        for name in names:
+            if getattr(self, name) is not None:
+                raise InputError(
+                    f"belongs to {protection}",
+                    field=name,
+                    cure=f"set protection to {protection}, or remove this field",
+                )
+
 
 class RuleMap(_Strict):
-    """A protection rule of the user's own; see `ProtectionRule`."""
+    """A user's own protection rule; see `ProtectionRule`."""
 
     polynomial: _Byte
     initial: _Byte = 0
@@ -201,26 +330,26 @@ class RuleMap(_Strict):
     counter_shift: Annotated[int, Field(ge=0, le=7)] = 0
 
     def rule(self, name: str) -> ProtectionRule:
-        """Return it as a rule."""
+        """Return the rule under a name."""
         return ProtectionRule(name, **self.model_dump())
 
 
 class VehicleMap(_Strict):
-    """A whole map file.
+    """Content of a map file.
 
     Parameters
     ----------
     name : str
     dbc : tuple of str
-        DBC files, relative to the map file; `--dbc` goes before them.
+        DBC files, relative to the map file; searched after `--dbc`.
     current, voltage : SignalMap
     temperature : TemperatureMap, optional
-        Without it, a fixed temperature must be given elsewhere.
+        Without it, a fixed temperature must be given as an option.
     soc_reference : SignalMap, optional
-        The car's own state of charge, to compare with.
+        The car's own state of charge, for comparison.
     temperature_source : {"cell", "pack", "coolant", "room", "unknown"}
     pair_within_s : float
-        Current and voltage at most this far apart in bus time belong together [s].
+        Largest distance in bus time between paired current and voltage [s].
     messages : dict of str to MessageMap
         By name or id.
     rules : dict of str to RuleMap
@@ -243,3 +372,54 @@ class VehicleMap(_Strict):
         if isinstance(data, dict) and isinstance(data.get("dbc"), str):
             return {**data, "dbc": (data["dbc"],)}
         return data
+
+
+@dataclass(frozen=True, slots=True)
+class Overrides:
+    """Protection and checks of a service configuration, which override the car's map file.
+
+    For a known car, or a bus with a quirk of its own. What describes the car for good belongs in
+    the map file, which `estimate` reads too::
+
+        [messages.BATTERY_1DB]
+        protection = "leaf"
+
+        [checks.voltage]
+        lowest = 240
+        highest = 410
+
+    Parameters
+    ----------
+    source : str
+        The file, for error messages.
+    messages : mapping of str to MessageMap
+        By name or id; what one leaves out is taken from the map file.
+    rules : mapping of str to RuleMap
+    checks : mapping of str to CheckMap
+        By role: "current", "voltage", "temperature", "soc_reference".
+    """
+
+    source: str = ""
+    messages: Mapping[str, MessageMap] = field(default_factory=lambda: MappingProxyType({}))
+    rules: Mapping[str, RuleMap] = field(default_factory=lambda: MappingProxyType({}))
+    checks: Mapping[str, CheckMap] = field(default_factory=lambda: MappingProxyType({}))
+
+    def merged_messages(
+        self, mapping: VehicleMap, source: str, key_of: Callable[[str], int]
+    ) -> dict[int, tuple[MessageMap, str]]:
+        """Return [messages] of both files by message key, with the file that states each.
+
+        Another protection replaces all protection fields of the map file; the period stays.
+        """
+        merged = {key_of(name): (each, source) for name, each in mapping.messages.items()}
+        for name, each in self.messages.items():
+            key = key_of(name)
+            base = merged[key][0] if key in merged else MessageMap()
+            if each.protection is not None:
+                base = MessageMap(period_s=base.period_s)
+            given = {name: getattr(each, name) for name in each.model_fields_set}
+            merged[key] = (base.model_copy(update=given), self.source)
+        return merged
+
+
+NO_OVERRIDES: Final = Overrides()

@@ -1,7 +1,7 @@
-"""Opening a bus: any interface that python-can knows, with one clear line when it cannot be.
+"""Open a bus: any interface of python-can, with a one-line error and its cure on failure.
 
-Without an interface given it is SocketCAN's vcan0 where there is one, else `udp_multicast`, which
-needs no driver and connects the programs of this machine (its packets do not leave it).
+The default is SocketCAN's vcan0 where it exists, else `udp_multicast`, which needs no driver and
+connects the programs of this machine (its packets do not leave it).
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ BusOption = str | int | float | bool
 
 SOCKETCAN_CHANNEL: Final = "vcan0"
 MULTICAST_CHANNEL: Final = "239.74.163.2"
-"""python-can's IPv4 group: its default is an IPv6 one, which some machines cannot reach."""
+"""IPv4 group of python-can, whose default is an IPv6 group that some machines cannot reach."""
 
 MULTICAST_HOPS: Final = 0
-"""0: packets stay on this machine; 1 (`--bus-option hop_limit=1`): they reach the local network."""
+"""0: packets stay on this machine; 1 (`--bus-option hop_limit=1`): local network."""
 
 RECEIVE_BUFFER_BYTES: Final = 16 << 20
-"""Asked for at sockets, to ride out pauses: Linux's default holds about 270 frames only. The system
-gives less to those who have no right to more (CAP_NET_ADMIN, or net.core.rmem_max)."""
+"""Requested receive buffer of sockets, for pauses: Linux's default holds about 270 frames. Without
+CAP_NET_ADMIN the system limits it to net.core.rmem_max."""
 
 _SO_RCVBUFFORCE: Final = 33
-"""Linux's; Python has no name for it."""
+"""Linux; not in Python's socket module."""
 
 _DEFAULT_CHANNELS: Final = {
     "socketcan": SOCKETCAN_CHANNEL,
@@ -45,8 +45,8 @@ _DEFAULT_CHANNELS: Final = {
 }
 _ON_SOCKETS: Final = {"socketcan", "udp_multicast"}
 
-# Drivers raise what they like: python-can's own errors, the operating system's, and what a
-# missing library or a wrong option makes of the driver's code (NameError: kvaser without canlib).
+# Drivers raise python-can's errors, the operating system's, and anything that a missing library or
+# a wrong option causes in their code (NameError: kvaser without canlib).
 _DRIVER_ERRORS: Final = (
     can.CanError,
     OSError,
@@ -58,23 +58,22 @@ _DRIVER_ERRORS: Final = (
     ImportError,
 )
 
-# Drivers log their own lines about what is then raised and told in one; whoever sets up logging
-# still sees them.
+# Drivers also log the errors that they raise; a program that sets up logging still sees them.
 logging.getLogger("can").addHandler(logging.NullHandler())
 
 
 class DriverMissingError(InputError):
-    """What a bus needs is not installed: no waiting will bring it."""
+    """A driver or library is not installed: waiting does not help."""
 
 
 @dataclass(frozen=True)
 class BusAddress:
-    """Which bus.
+    """Address of a bus.
 
     Parameters
     ----------
     interface : str
-        One of python-can's (`can.VALID_INTERFACES`).
+        One of `can.VALID_INTERFACES`.
     channel : str
     options : mapping of str to (str, int, float or bool)
         Further arguments of the driver, such as `bitrate`.
@@ -93,9 +92,9 @@ def bus_address(
     channel: str | None = None,
     options: Mapping[str, BusOption] | None = None,
 ) -> BusAddress:
-    """Fill in what was not given.
+    """Complete a partial address.
 
-    Without an interface: SocketCAN if it has that channel (default vcan0), else `udp_multicast`.
+    Default interface: SocketCAN if it has that channel (default vcan0), else `udp_multicast`.
 
     Parameters
     ----------
@@ -105,14 +104,14 @@ def bus_address(
     Raises
     ------
     InputError
-        If the interface is not known or needs a channel, or the channel is on neither.
+        If the interface is unknown or needs a channel, or no default interface has the channel.
     """
     options = dict(options or {})
     if interface is None:
         interface = _guess_interface(channel)
     if interface not in can.VALID_INTERFACES:
         raise InputError(
-            "no such interface",
+            "unknown interface",
             field="--interface",
             value=interface,
             cure=f"use one of: {', '.join(sorted(can.VALID_INTERFACES))}",
@@ -140,8 +139,7 @@ def open_bus(address: BusAddress, filters: Sequence[CanFilter] | None = None) ->
     ----------
     address : BusAddress
     filters : sequence of CanFilter, optional
-        What to receive, as in `can.BusABC.set_filters`: in the kernel on SocketCAN, in Python on
-        interfaces that cannot.
+        As in `can.BusABC.set_filters`; applied in the kernel on SocketCAN, else in Python.
 
     Returns
     -------
@@ -150,9 +148,9 @@ def open_bus(address: BusAddress, filters: Sequence[CanFilter] | None = None) ->
     Raises
     ------
     InputError
-        If there is no such bus or it is down, an option is wrong, or rights are missing.
+        If there is no such bus or it is down, an option is wrong, or a permission is missing.
     DriverMissingError
-        If the driver or a library that it needs is.
+        If the driver or a library of it is missing.
     """
     arguments: dict[str, Any] = dict(address.options)
     if filters is not None:
@@ -174,7 +172,7 @@ def open_bus(address: BusAddress, filters: Sequence[CanFilter] | None = None) ->
 
 
 def has_socketcan(channel: str) -> bool:
-    """Return whether SocketCAN is up on this machine and has that interface."""
+    """Return whether this machine has SocketCAN and that interface."""
     if not hasattr(socket, "AF_CAN"):
         return False
     try:
@@ -186,17 +184,17 @@ def has_socketcan(channel: str) -> bool:
 
 
 def is_interface_name(channel: str | None) -> bool:
-    """Return whether a channel is a network interface's name, and no multicast address."""
+    """Return whether a channel is the name of a network interface, not a multicast address."""
     return channel is not None and not _is_multicast(channel)
 
 
 def parse_bus_options(given: Sequence[str]) -> dict[str, BusOption]:
-    """Return `K=V` texts as a mapping; whole numbers, decimals, true and false are meant as such.
+    """Parse `K=V` texts; whole numbers, decimals, true and false get their type.
 
     Raises
     ------
     InputError
-        If one is not of that form.
+        If a text is not of that form.
     """
     options: dict[str, BusOption] = {}
     for text in given:
@@ -240,7 +238,7 @@ def _is_multicast(channel: str) -> bool:
 
 
 def _as_driver_channel(address: BusAddress) -> str | int:
-    """Return the channel as python-can's own configuration would: whole numbers as such."""
+    # As python-can's own configuration: whole numbers as integers.
     if address.interface not in _ON_SOCKETS and address.channel.isdigit():
         return int(address.channel)
     return address.channel
@@ -249,8 +247,8 @@ def _as_driver_channel(address: BusAddress) -> str | int:
 def _widen_receive_buffer(bus: can.BusABC) -> None:
     if sys.platform == "win32":
         return
-    # The driver keeps its socket to itself; a duplicate of the descriptor is the same socket.
-    # What cannot be had is left: the system refuses it, or caps the size silently.
+    # The driver's socket is private; a duplicate of the descriptor is the same socket. Best effort:
+    # the system may refuse, or cap the size silently.
     options = [socket.SO_RCVBUF]
     if sys.platform == "linux":
         options.append(_SO_RCVBUFFORCE)
@@ -260,7 +258,7 @@ def _widen_receive_buffer(bus: can.BusABC) -> None:
 
 
 def _check_up(bus: can.BusABC, address: BusAddress) -> None:
-    # SocketCAN opens an interface that is down, and leaves the error to the first call after.
+    # SocketCAN opens an interface that is down; the error comes with the next call.
     with socket.socket(fileno=os.dup(bus.fileno())) as own:
         code = own.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
     if not code:
@@ -278,65 +276,45 @@ def _check_up(bus: can.BusABC, address: BusAddress) -> None:
 
 
 def _refusal(address: BusAddress, error: BaseException) -> InputError:
-    """Return what the driver's error means, in one line with a cure."""
+    """Return the meaning of a driver's error, in one line with a cure."""
     cause = error
     while not isinstance(cause, OSError) and cause.__cause__ is not None:
         cause = cause.__cause__
     code = cause.errno if isinstance(cause, OSError) else None
-    channel, interface = address.channel, address.interface
+    interface = address.interface
+    reason = " ".join(str(cause).split()) or type(cause).__name__
     if code in {errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT} and interface == "socketcan":
-        return InputError(
-            "this machine has no SocketCAN",
-            field="--interface",
-            value=interface,
-            cure="use another interface, e.g. --interface udp_multicast",
-        )
-    if code in {errno.ENODEV, errno.ENXIO, errno.ENOENT}:
-        cure = f"check the name{_socketcan_names()}" if interface == "socketcan" else "check it"
-        return InputError(
-            f"{interface} has no such bus", field="--channel", value=channel, cure=cure
-        )
-    if code in {errno.EPERM, errno.EACCES}:
-        return InputError(
-            f"no permission to open this bus ({interface})",
-            field="--channel",
-            value=channel,
-            cure="run as a user with the right to it",
-        )
+        problem = "this machine has no SocketCAN"
+        cure = "use another interface, e.g. --interface udp_multicast"
+        return InputError(problem, field="--interface", value=interface, cure=cure)
     if code in {errno.ENETUNREACH, errno.EADDRNOTAVAIL} and interface == "udp_multicast":
-        return InputError(
-            "no network carries multicast on this machine",
-            field="--interface",
-            value=interface,
-            cure="bring a network interface up, or use SocketCAN",
-        )
-    missing = isinstance(error, can.CanInterfaceNotImplementedError | ImportError | NameError)
-    said = " ".join(str(cause).split()) or type(cause).__name__
-    if missing or "library" in said or "module" in said or "install" in said:
-        return DriverMissingError(
-            f"a library for this interface is missing ({said})",
-            field="--interface",
-            value=interface,
-            cure=_library_cure(interface),
-        )
-    return InputError(
-        f"{interface} cannot open this bus ({said})",
-        field="--channel",
-        value=channel,
-        cure="check channel and --bus-option",
-    )
-
-
-def _library_cure(interface: str) -> str:
-    if interface == "udp_multicast":
-        return "install msgpack (pip install 'python-can[multicast]')"
-    return f"install what python-can's documentation names for {interface}"
+        problem = "no network interface of this machine carries multicast"
+        cure = "bring a network interface up, or use SocketCAN"
+        return InputError(problem, field="--interface", value=interface, cure=cure)
+    if code in {errno.ENODEV, errno.ENXIO, errno.ENOENT}:
+        problem = f"{interface} has no such bus"
+        cure = f"check the name{_socketcan_names()}" if interface == "socketcan" else "check it"
+    elif code in {errno.EPERM, errno.EACCES}:
+        problem = f"no permission to open this bus ({interface})"
+        cure = "run as a user with that permission"
+    elif isinstance(error, can.CanInterfaceNotImplementedError | ImportError | NameError) or any(
+        word in reason for word in ("library", "module", "install")
+    ):
+        problem = f"a library for this interface is missing ({reason})"
+        cure = f"install the library that python-can's documentation names for {interface}"
+        if interface == "udp_multicast":
+            cure = "install msgpack (pip install 'python-can[multicast]')"
+        return DriverMissingError(problem, field="--interface", value=interface, cure=cure)
+    else:
+        problem = f"{interface} cannot open this bus ({reason})"
+        cure = "check channel and --bus-option"
+    return InputError(problem, field="--channel", value=address.channel, cure=cure)
 
 
 def _socketcan_names() -> str:
-    """Return " (there is …)" with the CAN interfaces of this machine."""
+    """Return the CAN interfaces of this machine, as the end of a cure."""
     with suppress(OSError):
         names = [name for _, name in socket.if_nameindex() if "can" in name]
         if names:
-            return f"; there is {', '.join(names)}"
+            return f"; existing: {', '.join(names)}"
     return "; none is up: sudo ip link add dev vcan0 type vcan && sudo ip link set vcan0 up"

@@ -1,14 +1,13 @@
-"""What cangauge puts on the bus, and how to read it: SOC_ESTIMATE and SOC_DETAIL.
+"""Published frames: SOC_ESTIMATE and SOC_DETAIL, made and read.
 
-Both are published at a fixed rate by the clock of whoever owns the loop (`SocPublisher.beat`),
-whether samples come or not: every beat has a SOC_ESTIMATE, every tenth a SOC_DETAIL.
+Normally the clock of the loop sets the rate (`SocPublisher.beat`), with or without samples: each
+beat has a SOC_ESTIMATE, every tenth a SOC_DETAIL.
 
-While a log is replayed at another speed than its own, the rate is that of the log's time
-(`SocPublisher.publish`): SOC_ESTIMATE with the first sample at or after every 100 ms of it,
-SOC_DETAIL with the first at or after every second and, as acknowledgement, at the latest after so
-many samples (`acknowledge_every`). Beats then fill the silences.
+During a replay at another speed, log time sets the rate (`SocPublisher.publish`): SOC_ESTIMATE
+with the first sample of every 100 ms, SOC_DETAIL with the first of every second and, as an
+acknowledgement, at the latest after `acknowledge_every` samples. Beats then fill the silences.
 
-Counter and CRC are those of AUTOSAR E2E profile 2, with the data ids that the DBC tells.
+Counter and CRC are those of AUTOSAR E2E profile 2, with the data ids in the DBC.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from typing import Final, NamedTuple
 
 import can
 from can.typechecking import CanFilter
-from cantools.database.can import Database, Message
+from cantools.database.can import Database
 
 from cangauge._resources import shared_file
 from cangauge.bus.database import SignalCodec, load_dbc, signal_codec
@@ -30,32 +29,31 @@ from cangauge.errors import InputError
 from cangauge.estimate.validity import Estimate, Reason, Status
 
 ESTIMATE_EVERY_S: Final = 0.1
-"""Time between two beats [s]."""
-DETAIL_EVERY_BEATS: Final = 10
-"""Every so many beats carry a SOC_DETAIL: one a second."""
-
 DETAIL_EVERY_S: Final = 1.0
+DETAIL_EVERY_BEATS: Final = 10
+"""Periods of the frames: [s] of log time, and beats of `ESTIMATE_EVERY_S`."""
 EARLY_S: Final = 0.01
-"""A sample so much before its turn is taken for it, so that jitter does not halve the rate [s]."""
+"""A sample this much before its turn counts, so that jitter does not halve the rate [s]."""
 
 AGE_AT_MOST_S: Final = 30.0
-"""Ages beyond are told as this [s]."""
+"""Largest age in SOC_ESTIMATE [s]."""
 
 SAMPLES_MODULO: Final = 1 << 16
-"""SOC_DETAIL counts samples modulo this."""
+"""Modulus of the sample count in SOC_DETAIL."""
+ACKNOWLEDGE_EVERY: Final = 4
+"""Most samples between two SOC_DETAIL under the replay clock: `replay` waits for them."""
 
 _LENGTH: Final = 8
-_DBC: Final = "soc_estimate.dbc"
 
 
 @dataclass(frozen=True)
 class FrameIds:
-    """Standard ids of the frames; they must differ.
+    """Standard ids of the frames.
 
     Raises
     ------
     InputError
-        If one is no standard id, or two are the same.
+        If one is not a standard id, or two are equal.
     """
 
     soc_estimate: int = 0x5A0
@@ -87,7 +85,7 @@ class SocEstimate(NamedTuple):
     status: Status
     reasons: Reason
     age_s: float = math.nan
-    """Whole seconds since charge was last counted, 30 for more [s]; NaN: never yet."""
+    """Whole seconds since charge was last counted, at most 30 [s]; NaN: never yet."""
 
 
 class SocDetail(NamedTuple):
@@ -102,7 +100,7 @@ class SocDetail(NamedTuple):
 
 
 class _Layout:
-    """A message of soc_estimate.dbc: its signals by name, its counter and CRC."""
+    """A message of soc_estimate.dbc: codecs by signal, counter and CRC."""
 
     def __init__(self, database: Database, name: str, path: Path) -> None:
         message = database.get_message_by_name(name)
@@ -111,11 +109,18 @@ class _Layout:
             for signal in message.signals
             if not signal.name.startswith(("counter_", "crc_"))
         }
-        self._rule = E2eRule("e2e_02", data_ids=_data_ids(message, path))
         self._limits = {signal: codec.range for signal, codec in self._codecs.items()}
+        try:
+            attributes = getattr(message.dbc, "attributes", {})
+            data_ids = bytes.fromhex(str(attributes["E2EDataIdList"].value))
+        except (KeyError, ValueError) as error:
+            raise InputError(
+                "has no list of data ids", source=path, field=f"{name}.E2EDataIdList"
+            ) from error
+        self._rule = E2eRule("e2e_02", data_ids=data_ids)
 
     def encode(self, counter: int, **values: float) -> bytes:
-        """Return the payload; values are clipped to what the signal holds, NaN has its code."""
+        """Return the payload; values are clipped to the signal's range, NaN becomes its code."""
         payload = bytearray(_LENGTH)
         for name, codec in self._codecs.items():
             value = values[name]
@@ -126,25 +131,14 @@ class _Layout:
         return self._rule.protect(payload, counter)
 
     def decode(self, data: bytes | bytearray) -> dict[str, float] | None:
-        """Return the values by name; None if the frame is damaged."""
+        """Return the values by name; None for a damaged frame."""
         if len(data) != _LENGTH or not self._rule.is_whole(data):
             return None
         return {name: codec.decode(data) for name, codec in self._codecs.items()}
 
 
-def _data_ids(message: Message, path: Path) -> bytes:
-    """Return the data ids that the DBC states for a message."""
-    attributes = getattr(message.dbc, "attributes", {})
-    try:
-        return bytes.fromhex(str(attributes["E2EDataIdList"].value))
-    except (KeyError, ValueError) as error:
-        raise InputError(
-            "has no list of data ids", source=path, field=f"{message.name}.E2EDataIdList"
-        ) from error
-
-
 def _layouts() -> tuple[_Layout, _Layout]:
-    path = shared_file("dbc", _DBC)
+    path = shared_file("dbc", "soc_estimate.dbc")
     database = load_dbc(path)
     return _Layout(database, "SOC_ESTIMATE", path), _Layout(database, "SOC_DETAIL", path)
 
@@ -156,7 +150,7 @@ class SocPublisher:
     ----------
     ids : FrameIds, optional
     acknowledge_every : int, optional
-        Send SOC_DETAIL after so many samples, and at every beat after any.
+        Send SOC_DETAIL after this number of samples, and at a beat with unacknowledged ones.
     """
 
     def __init__(self, ids: FrameIds | None = None, acknowledge_every: int | None = None) -> None:
@@ -168,8 +162,7 @@ class SocPublisher:
         self._beats = 0
         self._estimate_due_s = -math.inf
         self._detail_due_s = -math.inf
-        self.samples_told = 0
-        """Samples that the latest SOC_DETAIL told."""
+        self._acknowledged = 0
 
     def beat(self, estimate: Estimate, samples: int, age_s: float) -> list[can.Message]:
         """Return the frames of one beat; due every `ESTIMATE_EVERY_S`.
@@ -178,37 +171,37 @@ class SocPublisher:
         ----------
         estimate : Estimate
         samples : int
-            Samples processed so far, those refused included.
+            Samples processed so far, including refused ones.
         age_s : float
             Time since the latest of them [s]; NaN: none yet.
         """
         frames = [self.estimate_frame(estimate, age_s)]
         is_due = self._beats % DETAIL_EVERY_BEATS == 0
         self._beats += 1
-        if is_due or (self._acknowledge_every is not None and samples != self.samples_told):
+        if is_due or (self._acknowledge_every is not None and samples != self._acknowledged):
             frames.append(self.detail_frame(estimate, samples))
         return frames
 
     def publish(self, estimate: Estimate, samples: int) -> list[can.Message]:
-        """Return the frames that are due with a sample of a replayed log; arguments as `beat`."""
+        """Return the frames due with a sample of a replayed log; arguments as in `beat`."""
         now_s = estimate.time_s
         frames = []
         if now_s >= self._estimate_due_s - EARLY_S:
-            self._estimate_due_s = _next(self._estimate_due_s, ESTIMATE_EVERY_S, now_s)
+            self._estimate_due_s = _next_due(self._estimate_due_s, ESTIMATE_EVERY_S, now_s)
             frames.append(self.estimate_frame(estimate))
         is_due = now_s >= self._detail_due_s - EARLY_S
-        if is_due or samples - self.samples_told >= (self._acknowledge_every or math.inf):
+        if is_due or samples - self._acknowledged >= (self._acknowledge_every or math.inf):
             if is_due:
-                self._detail_due_s = _next(self._detail_due_s, DETAIL_EVERY_S, now_s)
+                self._detail_due_s = _next_due(self._detail_due_s, DETAIL_EVERY_S, now_s)
             frames.append(self.detail_frame(estimate, samples))
         return frames
 
     def restart(self) -> None:
-        """Forget the log's times: those of a new log may lie before them."""
+        """Forget the due times: a new log may begin earlier."""
         self._estimate_due_s = self._detail_due_s = -math.inf
 
     def estimate_frame(self, estimate: Estimate, age_s: float = 0.0) -> can.Message:
-        """Return SOC_ESTIMATE with the next counter; arguments as `beat`."""
+        """Return SOC_ESTIMATE with the next counter; arguments as in `beat`."""
         data = self._estimate.encode(
             self._estimates_made,
             soc_pct=estimate.soc_pct,
@@ -230,12 +223,12 @@ class SocPublisher:
             residual_v=estimate.residual_v,
         )
         self._details_made += 1
-        self.samples_told = samples
+        self._acknowledged = samples
         return _message(self.ids.soc_detail, data)
 
 
 class SocReader:
-    """Reads what a `SocPublisher` sent.
+    """Reads the frames of a `SocPublisher`.
 
     Parameters
     ----------
@@ -286,7 +279,7 @@ def standard_filter(frame_id: int) -> CanFilter:
     return {"can_id": frame_id, "can_mask": 0x7FF, "extended": False}
 
 
-def _next(due_s: float, every_s: float, now_s: float) -> float:
+def _next_due(due_s: float, every_s: float, now_s: float) -> float:
     """Return the next due time on the grid, or on a new one after a pause."""
     following = due_s + every_s
     return following if following > now_s else now_s + every_s

@@ -1,12 +1,12 @@
-"""A bus that may go and come back: interface down, removed or not there yet, adapter unplugged.
+"""A bus that is reconnected when it is lost: interface down or removed, adapter unplugged.
 
-`ReconnectingBus` never raises once it is open. While the bus is away, receiving waits and returns
-nothing, frames to send are counted and dropped, and opening is tried again and again with growing
-pauses, in a thread of its own since some drivers take seconds for it.
+While the bus is away, receiving waits and returns nothing, frames to send are dropped and counted,
+and opening is retried with growing pauses, in a thread because some drivers take seconds for it.
 """
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
 import time
@@ -17,66 +17,61 @@ from typing import Final, TypeVar
 import can
 from can.typechecking import CanFilter
 
-from cangauge._logging import Voice
-from cangauge.bus.connection import SEND_WITHIN_S, BusConnection, BusError, backend_capabilities
+from cangauge._logging import emit
+from cangauge.bus.backend import backend_capabilities
+from cangauge.bus.connection import SEND_WITHIN_S, BusConnection, BusError
 from cangauge.bus.open import BusAddress, DriverMissingError, open_bus
 from cangauge.errors import InputError
 
 FIRST_PAUSE_S: Final = 0.05
 LONGEST_PAUSE_S: Final = 1.0
-"""Pauses between tries double from the first to this [s]. What arrives in the last one is lost."""
+"""Pauses between attempts double from the first to the longest [s]. Frames that arrive after the
+bus is back but before the next attempt are lost."""
 
 STEADY_S: Final = 5.0
-"""A bus that held for so long [s] is tried again at once when it goes; one that comes and goes is
-not."""
+"""A bus lost after this time in use [s] is retried at once; one that flaps keeps its pause."""
 
-REMIND_S: Final = 60.0
-"""While nothing changes, a bus that is away is mentioned so often [s]."""
+REPORT_AFTER_S: Final = 1.0
+"""Time without a bus after which failed attempts are logged [s]: a short outage needs one line."""
 
+_LOG = logging.getLogger(__name__)
 _Received = TypeVar("_Received")
 Opener = Callable[[BusAddress, Sequence[CanFilter] | None], can.BusABC]
 
 
 class ReconnectingBus(BusConnection):
-    """A bus in use that is opened again when it was lost.
+    """A bus in use that is opened again when it is lost. Never raises `BusError`.
+
+    Logs the events bus.missing, bus.lost, bus.away, bus.back, bus.off and bus.on.
 
     Parameters
     ----------
     address : BusAddress
     filters : sequence of CanFilter
-    say : callable
-        Takes a line of text when the bus goes, comes back, or is bus-off: one a second at most.
     opener : callable, optional
         Opens the bus.
 
     Attributes
     ----------
     losses : int
-        How often the bus was lost.
+        Number of times that the bus was lost.
     """
 
     def __init__(
-        self,
-        address: BusAddress,
-        filters: Sequence[CanFilter],
-        say: Callable[[str], None],
-        opener: Opener = open_bus,
+        self, address: BusAddress, filters: Sequence[CanFilter], opener: Opener = open_bus
     ) -> None:
         super().__init__(None, str(address), backend_capabilities(address))
         self.losses = 0
         self._address = address
         self._filters = list(filters)
         self._opener = opener
-        self._voice = Voice(say)
         self._attempt: _Attempt | None = None
         self._lost_bus: can.BusABC | None = None
         self._since_s = time.monotonic()
         self._away_s = 0.0
         self._is_closed = False
         self._pause_s = FIRST_PAUSE_S
-        self._try_at_s = 0.0
-        self._reason = ""
-        self._remind_at_s = 0.0
+        self._retry_at_s = 0.0
         self._was_off = False
 
     def open(self, *, wait: bool = False) -> None:
@@ -85,27 +80,27 @@ class ReconnectingBus(BusConnection):
         Parameters
         ----------
         wait : bool
-            If it is not there, come back without it and go on trying while receiving.
+            If the bus is missing, return without it; receiving then goes on trying.
 
         Raises
         ------
         InputError
-            As `open_bus`; with `wait` only where waiting cannot help.
+            As `open_bus`; with `wait` only for a missing driver.
         """
         try:
-            self._use(self._opener(self._address, self._filters))
+            self._attach(self._opener(self._address, self._filters))
         except DriverMissingError:
             raise
         except InputError as error:
             if not wait:
                 raise
-            self._go_away(str(error))
-            self._voice.say(f"warning: {self.name}: not there yet ({error}); waiting for it")
+            self._schedule_attempt(away_since_s=time.monotonic())
+            self._log("bus.missing", logging.WARNING, f"not there yet ({error}); waiting for it")
             return
         self._since_s = time.monotonic()
 
     def close(self) -> None:
-        """Close the bus, or give up the try to open it."""
+        """Close the bus, or give up the attempt to open it."""
         if self._attempt is not None:
             self._attempt.abandon()
             self._attempt = None
@@ -116,19 +111,19 @@ class ReconnectingBus(BusConnection):
     def receive(self, timeout_s: float) -> can.Message | None:
         """Return the next frame that passes the filters; None if none came in time.
 
-        While the bus is away it waits, and tries to open it.
+        While the bus is away, wait and try to open it.
         """
         return self._received(super().receive, timeout_s)
 
-    def receive_waiting(self, timeout_s: float) -> list[can.Message]:
-        """Return the frames that wait; empty if none came in time.
+    def receive_pending(self, timeout_s: float) -> list[can.Message]:
+        """Return the pending frames; empty if none came in time.
 
-        While the bus is away it waits, and tries to open it.
+        While the bus is away, wait and try to open it.
         """
-        return self._received(super().receive_waiting, timeout_s) or []
+        return self._received(super().receive_pending, timeout_s) or []
 
     def post(self, message: can.Message, within_s: float = SEND_WITHIN_S) -> None:
-        """Send a frame without ever waiting; while the bus is away it is dropped."""
+        """Send a frame without waiting; drop it while the bus is away."""
         if self._bus is None:
             self.unsent += 1
             return
@@ -138,7 +133,7 @@ class ReconnectingBus(BusConnection):
             self._lose(error)
 
     def set_filters(self, filters: Sequence[CanFilter]) -> None:
-        """Receive only what passes these filters from now on."""
+        """Receive only frames that pass these filters from now on."""
         self._filters = list(filters)
         if self._bus is None:
             return
@@ -154,12 +149,12 @@ class ReconnectingBus(BusConnection):
 
     @property
     def away_s(self) -> float:
-        """For how long there was no bus, in total [s]."""
+        """Total time without a bus [s]."""
         return self._away_s + (time.monotonic() - self._since_s if self.is_away else 0.0)
 
     @property
     def trouble(self) -> str:
-        """What is or went wrong with the bus, in words; empty if nothing did."""
+        """Present trouble with the bus, for people; empty without."""
         found = []
         if self.is_away:
             found.append(f"bus away for {time.monotonic() - self._since_s:.0f} s")
@@ -172,10 +167,9 @@ class ReconnectingBus(BusConnection):
     def _received(
         self, receive: Callable[[float], _Received], timeout_s: float
     ) -> _Received | None:
-        """Return what is received; None if the bus is away or goes."""
-        self._voice.look()
+        """Return what `receive` returns; None while the bus is away or when it is lost."""
         if self._bus is None:
-            self._try_again(timeout_s)
+            self._reconnect(timeout_s)
             return None
         try:
             received = receive(timeout_s)
@@ -183,7 +177,8 @@ class ReconnectingBus(BusConnection):
             self._lose(error)
             return None
         if self.is_off != self._was_off:
-            self._tell_off()
+            self._was_off = self.is_off
+            self._log_off()
         return received
 
     def _lose(self, error: BusError) -> None:
@@ -191,24 +186,22 @@ class ReconnectingBus(BusConnection):
         if now_s - self._since_s >= STEADY_S:
             self._pause_s = FIRST_PAUSE_S
         self.losses += 1
-        self._lost_bus = self._take_bus()
+        self._lost_bus = self._detach()
         self._was_off = False
-        self._go_away("")
-        self._voice.say(f"warning: {error} Trying again until it is back")
+        self._schedule_attempt(away_since_s=now_s)
+        emit(_LOG, logging.WARNING, "bus.lost", f"{error} Trying again until it is back")
 
-    def _go_away(self, reason: str) -> None:
-        now_s = self._since_s = time.monotonic()
-        self._reason = reason
-        self._remind_at_s = now_s + REMIND_S
-        self._try_later(now_s)
-
-    def _try_later(self, now_s: float) -> None:
-        self._try_at_s = now_s + self._pause_s
+    def _schedule_attempt(self, away_since_s: float | None = None) -> None:
+        now_s = time.monotonic()
+        if away_since_s is not None:
+            self._since_s = away_since_s
+        self._retry_at_s = now_s + self._pause_s
         self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
 
-    def _try_again(self, timeout_s: float) -> None:
+    def _reconnect(self, timeout_s: float) -> None:
+        """Start an attempt when it is due, or wait for the one under way."""
         if self._attempt is None:
-            left_s = self._try_at_s - time.monotonic()
+            left_s = self._retry_at_s - time.monotonic()
             if left_s > 0.0:
                 time.sleep(min(left_s, timeout_s))
                 return
@@ -219,37 +212,35 @@ class ReconnectingBus(BusConnection):
             return
         filters, self._attempt = self._attempt.filters, None
         now_s = time.monotonic()
-        if isinstance(outcome, str):
-            self._try_later(now_s)
-            is_news = self._reason not in {outcome, ""}
-            self._reason = outcome
-            if is_news or now_s >= self._remind_at_s:
-                self._remind_at_s = now_s + REMIND_S
-                away = f"away for {now_s - self._since_s:.0f} s"
-                self._voice.say(f"warning: {self.name}: {away} ({outcome}); trying again")
-            return
-        self._use(outcome)
         away_s = now_s - self._since_s
+        if isinstance(outcome, str):
+            self._schedule_attempt()
+            if away_s >= REPORT_AFTER_S:
+                text = f"away for {away_s:.0f} s ({outcome}); trying again"
+                self._log("bus.away", logging.WARNING, text)
+            return
+        self._attach(outcome)
         self._away_s += away_s
         self._since_s = now_s
-        self._voice.say(f"{self.name}: {'back' if self.losses else 'there'} after {away_s:.1f} s")
+        text = f"{'back' if self.losses else 'there'} after {away_s:.1f} s"
+        self._log("bus.back", logging.INFO, text)
         if filters != self._filters:
             self.set_filters(self._filters)
 
-    def _tell_off(self) -> None:
-        self._was_off = self.is_off
+    def _log_off(self) -> None:
         if self.is_off:
-            self._voice.say(
-                f"warning: {self.name}: the controller is bus-off; it comes back when the kernel"
-                f" restarts it (once for all: ip link set {self._address.channel} type can"
-                " restart-ms 100)"
-            )
+            cure = f"ip link set {self._address.channel} type can restart-ms 100"
+            text = f"the controller is bus-off until the kernel restarts it (automatically: {cure})"
+            self._log("bus.off", logging.WARNING, text)
         else:
-            self._voice.say(f"{self.name}: no longer bus-off")
+            self._log("bus.on", logging.INFO, "no longer bus-off")
+
+    def _log(self, event: str, level: int, text: str) -> None:
+        emit(_LOG, level, event, f"{self.name}: {text}")
 
 
 class _Attempt:
-    """One try to open a bus, in a thread; what is left of the lost one is closed before."""
+    """One attempt to open a bus, in a thread; closes the lost bus first."""
 
     def __init__(
         self,
@@ -276,7 +267,7 @@ class _Attempt:
             return None
 
     def abandon(self) -> None:
-        """Want the bus no more: it is closed as soon as it is open."""
+        """Close the bus as soon as it is open."""
         with self._lock:
             self._is_abandoned = True
         outcome = self.wait(0.0)
@@ -285,14 +276,14 @@ class _Attempt:
 
     def _run(self) -> None:
         if self._lost is not None:
-            # A driver may raise anything when what is gone is closed, and nothing depends on it.
+            # Drivers may raise anything when they close a lost bus; nothing depends on it.
             with suppress(Exception):
                 self._lost.shutdown()
             self._lost = None
         outcome: can.BusABC | str
         try:
             outcome = self._opener(self._address, self.filters)
-        except Exception as error:  # noqa: BLE001 - whatever a driver raises: there is no bus yet
+        except Exception as error:  # noqa: BLE001 - drivers raise anything
             outcome = str(error) or type(error).__name__
         with self._lock:
             if not self._is_abandoned:

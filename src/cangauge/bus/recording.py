@@ -57,7 +57,7 @@ def read_recording(
     ----------
     path : path-like
     vehicle : Vehicle, optional
-        Decodes a capture (`load_vehicle`). A log does not need it; it is then ignored with a
+        Decodes a capture (`Vehicle.load`). A log does not need it; it is then ignored with a
         remark.
     temperature_c : float, optional
         Constant temperature [°C], in place of the recording's own.
@@ -238,7 +238,7 @@ def capture_samples(
     if bus is None or not bus.values:
         raise _no_samples(path, vehicle, bus)
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(bus.values).reshape(-1, 5).T
-    remarks = [*capture.info.remarks, *_losses(bus.decoder.counters)]
+    remarks = [*capture.info.remarks, *_losses(bus.decoder.statistics)]
     if sum(bool(other.values) for other in buses.values()) > 1:
         remarks.append(f"several buses carry the frames: bus {channel} is used, which has most")
     if clock.beginnings:
@@ -249,7 +249,7 @@ def capture_samples(
         voltage_v=voltage_v,
         temperature_c=temperature_c,
         soc_pct=soc_pct,
-        counters=bus.decoder.counters,
+        statistics=bus.decoder.counters,
         info=capture.info,
         remarks=tuple(remarks),
     )
@@ -287,7 +287,7 @@ def _decode(capture: Capture, vehicle: Vehicle, clock: TimeSource) -> dict[Chann
 
 def _no_samples(path: str | PathLike[str], vehicle: Vehicle, bus: _Bus | None) -> InputError:
     name = f"0x{vehicle.current.arbitration_id:X} ({vehicle.current.message})"
-    counters = None if bus is None else bus.decoder.counters
+    statistics = None if bus is None else bus.decoder.counters
     if counters is None or not counters.messages[vehicle.current.key].wanted:
         problem = f"the capture holds no frames of {name}, which carries the current"
     else:

@@ -1,17 +1,14 @@
-"""Bus time: what a frame's time is, live and in a capture, to the microsecond.
+"""Bus time of frames: the receive stamp, or the log time of a replay (REPLAY_CLOCK).
 
-Two sources. `receive` is the frame's receive stamp. `replay-clock` is the log time that `replay`
-tells in REPLAY_CLOCK ahead of the frames that it belongs to, so that a replay at any speed gives
-the same charge and the same delays.
-
-Time is counted in whole microseconds: captures hold no more in most formats, so that a live run
-and its own recording see the same numbers, to the last bit.
+`replay` sends the log time in REPLAY_CLOCK ahead of the frames that it belongs to, so that a replay
+at any speed gives the same charge and the same delays. Times are whole microseconds, the resolution
+of most capture formats, so that a live run and its recording see equal numbers.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Final, Literal, Protocol, get_args
+from typing import Final, Literal, Protocol
 
 import can
 
@@ -20,39 +17,41 @@ from cangauge.bus.database import SignalCodec, load_dbc, signal_codec
 from cangauge.bus.protection import CRC_ONLY_RULE
 
 TimeSourceName = Literal["receive", "replay-clock"]
-TIME_SOURCES: Final[tuple[str, ...]] = get_args(TimeSourceName)
 
 REPLAY_CLOCK_ID: Final = 0x5AF
 
+MICROSECONDS: Final = 1e6
+"""Unit of REPLAY_CLOCK [1/s]."""
+
 STEP_BACK_S: Final = 1.0
-"""Time that runs backwards by more than this was set, or is that of a new log [s]."""
+"""A larger step back in time means that the clock was set, or a new log begins [s]."""
 
 
 def whole_us(time_s: float) -> int:
-    """Return a time [s] in microseconds, rounded to a whole number."""
-    return round(time_s * 1e6)
+    """Return a time [s] in whole microseconds."""
+    return round(time_s * MICROSECONDS)
 
 
 class TimeSource(Protocol):
-    """Says what the time of a frame is."""
+    """Gives each frame its bus time."""
 
     beginnings: int
-    """How often time began anew so far (a new log is replayed)."""
+    """Number of new logs so far, after the first."""
 
     def time_of(self, message: can.Message) -> float | None:
-        """Return the frame's bus time [s]; None for one that has none or is itself the clock."""
+        """Return the bus time of a frame [s]; None for a clock frame, or while not known."""
 
 
 class ReceiveTime:
-    """The receive stamp.
+    """Receive stamps.
 
-    A clock that is set back by more than `STEP_BACK_S` does not stop the estimate until it has
-    caught up: time then runs on from where it was. (A clock that is set forward looks like a gap.)
+    After a step back of more than `STEP_BACK_S` time runs on from where it was, so that a clock
+    that is set does not stop the estimate. A step forward looks like a gap.
 
     Attributes
     ----------
     steps_back : int
-        How often the clock was set back.
+        Number of such steps.
     """
 
     def __init__(self) -> None:
@@ -62,24 +61,24 @@ class ReceiveTime:
         self._shift_us = 0
 
     def time_of(self, message: can.Message) -> float | None:
-        """Return the frame's bus time [s]."""
-        now_us = round(message.timestamp * 1e6) + self._shift_us  # `whole_us`, of every frame
+        """Return the bus time of a frame [s]."""
+        now_us = round(message.timestamp * MICROSECONDS) + self._shift_us
         last_us = self._last_us
-        if last_us is not None and now_us < last_us - STEP_BACK_S * 1e6:
+        if last_us is not None and now_us < last_us - STEP_BACK_S * MICROSECONDS:
             self.steps_back += 1
             self._shift_us += last_us - now_us
             now_us = last_us
         self._last_us = now_us
-        return now_us / 1e6
+        return now_us / MICROSECONDS
 
 
 class ReplayClock:
-    """The log time that REPLAY_CLOCK tells; when it jumps back, a new log has begun.
+    """Log time of a replay; a step back of more than `STEP_BACK_S` begins a new log.
 
     Parameters
     ----------
     frame_id : int
-        REPLAY_CLOCK's id.
+        Id of REPLAY_CLOCK.
 
     Attributes
     ----------
@@ -95,23 +94,23 @@ class ReplayClock:
         self._now_us: int | None = None
 
     def time_of(self, message: can.Message) -> float | None:
-        """Return the log time [s] that the latest REPLAY_CLOCK told."""
+        """Return the log time of the latest REPLAY_CLOCK [s]; None before, and for the clock."""
         if is_clock(message, self._id):
             self._take(message)
             return None
-        return None if self._now_us is None else self._now_us / 1e6
+        return None if self._now_us is None else self._now_us / MICROSECONDS
 
     def resume(self, time_s: float) -> None:
-        """Go on after an interruption from a log time [s]: an earlier one is that of a new log."""
+        """Continue from a log time [s] after a restart: an earlier one begins a new log."""
         self._now_us = whole_us(time_s)
 
     def _take(self, message: can.Message) -> None:
         data = message.data
-        if len(data) != 8 or CRC_ONLY_RULE.crc(data) != data[CRC_ONLY_RULE.crc_byte]:
+        if len(data) != 8 or not CRC_ONLY_RULE.is_whole(data):
             self.refused += 1
             return
         now_us = int(self._codec.decode(data))
-        if self._now_us is not None and now_us < self._now_us - STEP_BACK_S * 1e6:
+        if self._now_us is not None and now_us < self._now_us - STEP_BACK_S * MICROSECONDS:
             self.beginnings += 1
         self._now_us = now_us
 
@@ -144,7 +143,7 @@ class ClockFrames:
         self._codec = _clock_codec()
 
     def at(self, time_us: int) -> can.Message:
-        """Return the frame that tells a log time [µs]."""
+        """Return the frame of a log time [µs]."""
         payload = bytearray(8)
         self._codec.encode_into(payload, float(time_us))
         return can.Message(

@@ -16,7 +16,7 @@ from rich.table import Table
 from cangauge._io import check_writable, write_text_atomic
 from cangauge._resources import shared_file
 from cangauge.bus.open import has_socketcan
-from cangauge.bus.vehicle import load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.options import JsonOption
 from cangauge.cli.output import console, emit_json, note
 from cangauge.errors import CangaugeError, InputError
@@ -80,7 +80,7 @@ def demo_command(
     settings = EstimatorSettings(temperature_source=log.temperature_source)
     offline, _ = estimate_log(log, model, settings)
     difference = float(np.nanmax(np.abs(table.soc_pct - offline.soc_pct)))
-    bound = quantisation_bound(load_vehicle("generic"), model, log).ekf_pct
+    bound = quantisation_bound(Vehicle.load("generic"), model, log).ekf_pct
     note("4/4  drawing …")
     write_text_atomic(soc_page, estimate_report(log, table, live, model, settings))
     result = _result(identification, live, difference, bound)

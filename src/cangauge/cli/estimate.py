@@ -389,12 +389,12 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     # python-can and cantools are slow to import.
     from cangauge.bus.captures.capture import Capture  # noqa: PLC0415
     from cangauge.bus.recording import capture_without_vehicle, open_recording  # noqa: PLC0415
-    from cangauge.bus.vehicle import load_vehicle  # noqa: PLC0415
+    from cangauge.bus.vehicle import Vehicle  # noqa: PLC0415
 
     if isinstance(open_recording(log_path), Capture):
         if not described:
             raise capture_without_vehicle(log_path)
-        car = load_vehicle(vehicle, dbc, map_file, temperature_c=temperature)
+        car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature)
         source = known_temperature_source(temperature_source) or "unknown"
         done = from_capture(log_path, car, model, replace(settings, temperature_source=source))
     else:

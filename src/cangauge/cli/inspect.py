@@ -64,7 +64,7 @@ def inspect_command(  # noqa: PLR0917 - typer fills the arguments by name
     """
     # Deferred: the readers and the decoder take half a second to import.
     from cangauge.bus.recording import open_recording  # noqa: PLC0415
-    from cangauge.bus.vehicle import load_vehicle  # noqa: PLC0415
+    from cangauge.bus.vehicle import Vehicle  # noqa: PLC0415
     from cangauge.inspect.capture import inspect_capture  # noqa: PLC0415
     from cangauge.inspect.log import LogInspection, inspect_log  # noqa: PLC0415
     from cangauge.logs.read import LogFile  # noqa: PLC0415
@@ -86,7 +86,7 @@ def inspect_command(  # noqa: PLR0917 - typer fills the arguments by name
             recording.read(temperature_c=temperature)
         )
     else:
-        car = load_vehicle(vehicle, dbc, map_file, temperature_c=temperature) if given else None
+        car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature) if given else None
         found = inspect_capture(path, car)
     if json_output:
         emit_json(found.to_dict())

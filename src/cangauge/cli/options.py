@@ -111,7 +111,7 @@ def load_log(
     """
     # pyarrow and cantools are slow to import; the service has these options and needs no logs.
     from cangauge.bus.recording import log_of, open_recording  # noqa: PLC0415
-    from cangauge.bus.vehicle import load_vehicle  # noqa: PLC0415
+    from cangauge.bus.vehicle import Vehicle  # noqa: PLC0415
     from cangauge.logs.read import LogFile  # noqa: PLC0415
 
     source = known_temperature_source(temperature_source)
@@ -120,7 +120,7 @@ def load_log(
     car = None
     if vehicle is not None or dbc is not None or map_file is not None:
         if is_capture:
-            car = load_vehicle(vehicle, dbc, map_file, temperature_c=temperature_c)
+            car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature_c)
         else:
             note_not_a_capture(path)
     log = log_of(recording, car, temperature_c=temperature_c, temperature_source=source)

@@ -16,7 +16,7 @@ from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import bus_address, open_bus, parse_bus_options
 from cangauge.bus.publish import FrameIds, standard_filter
 from cangauge.bus.recording import open_recording
-from cangauge.bus.vehicle import Vehicle, load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.options import (
     BusDbcOption,
     BusMapOption,
@@ -57,19 +57,19 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
         str,
         typer.Option(
             metavar="1|N|max",
-            help="1: in real time; N: N times faster; max: as fast as `cangauge run` acknowledges,"
-            " losing nothing.",
+            help="1: real time; N: N times faster; max: as fast as `cangauge run` acknowledges,"
+            " without loss.",
         ),
     ] = "1",
     loop: Annotated[
-        bool, typer.Option("--loop", help="Again and again, until Ctrl-C; time goes on.")
+        bool, typer.Option("--loop", help="Repeat until Ctrl-C, with increasing log time.")
     ] = False,
     wait_s: Annotated[
         float | None,
         typer.Option(
             "--wait",
             metavar="S",
-            help="Wait at most so long for `cangauge run` to be there before beginning [s].",
+            help="Longest wait for `cangauge run` before the first frame [s].",
         ),
     ] = None,
     acknowledge_s: Annotated[
@@ -77,7 +77,7 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
         typer.Option(
             "--acknowledge-within",
             metavar="S",
-            help="At full speed: how long an acknowledgement may take [s].",
+            help="Longest wait for an acknowledgement at full speed [s].",
         ),
     ] = 10.0,
     soc_estimate_id: EstimateIdOption = None,
@@ -87,10 +87,10 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
 ) -> None:
     """Play a recorded log or capture on a bus.
 
-    A log's current [A], voltage [V], temperature [°C] and SoC [%] go out as the vehicle's frames,
-    a capture's own frames as they were recorded. Recorded timing is kept. At every speed but 1
-    the log's time goes out too (REPLAY_CLOCK, 0x5AF), so that `cangauge run --time-source
-    replay-clock` counts the same charge at any speed.
+    A log is sent as the vehicle's frames of current [A], voltage [V], temperature [°C] and SoC [%],
+    a capture as recorded. Recorded timing is kept. At every speed but 1 the log time is sent too
+    (REPLAY_CLOCK, 0x5AF), so that `cangauge run --time-source replay-clock` counts the same charge
+    at any speed.
 
     For example:
 
@@ -108,27 +108,24 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
         acknowledge_s=_seconds(acknowledge_s, "--acknowledge-within") or 0.0,
         ids=ids,
     )
-    described = (vehicle, dbc, map_file) != (None, None, None)
     car: Vehicle | None = None
-    if described:
-        car = load_vehicle(vehicle, dbc, map_file, temperature_c=temperature)
+    if (vehicle, dbc, map_file) != (None, None, None):
+        car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature)
     source = _source(recorded, car, ids)
     address = bus_address(interface, channel, parse_bus_options(bus_option or []))
     with ExitStack() as stack:
         stop = stack.enter_context(stop_on_signals())
         filters = [standard_filter(ids.soc_estimate), standard_filter(ids.soc_detail)]
-        port = stack.enter_context(BusConnection(open_bus(address, filters), str(address)))
+        bus = stack.enter_context(BusConnection(open_bus(address, filters), str(address)))
         note(f"playing {recorded} on {address}, speed {speed}")
         bar = stack.enter_context(_Bar(source, loop=loop)) if console.is_terminal else None
-        state = play(
-            port, source, settings, stop=stop, show=None if bar is None else bar.show, warn=note
-        )
+        state = play(bus, source, settings, stop=stop, show=None if bar is None else bar.show)
         stopped = stop()
     note(_summary_line(state))
-    if port.unsent:
-        note(f"warning: {port.unsent} frames were not sent: the transmit queue stayed full")
+    if bus.unsent:
+        note(f"warning: {bus.unsent} frames were not sent: the transmit queue stayed full")
     if json_output:
-        emit_json(_as_json(state, port, source))
+        emit_json(_as_json(state, bus, source))
     if stopped and not loop:
         raise KeyboardInterrupt
 
@@ -140,7 +137,7 @@ def _source(recorded: Path, car: Vehicle | None, ids: FrameIds) -> Source:
     log = recording.read()
     for remark in log.remarks:
         note(f"{recorded}: {remark}")
-    return LogSource(log, car or load_vehicle(DEFAULT_VEHICLE))
+    return LogSource(log, car or Vehicle.load(DEFAULT_VEHICLE))
 
 
 def _speed(text: str) -> float:
@@ -152,10 +149,10 @@ def _speed(text: str) -> float:
         speed = math.nan
     if not 1e-3 <= speed <= 1e6:
         raise InputError(
-            "no speed",
+            "not a speed",
             field="--speed",
             value=text,
-            cure="give 1 (real time), another number (so many times faster), or max",
+            cure="give 1 (real time), another factor, or max",
         )
     return speed
 
@@ -167,19 +164,19 @@ def _seconds(value: float | None, option: str) -> float | None:
 
 
 class _Bar:
-    """Progress on the terminal: log time, speed, the SoC that comes back."""
+    """Progress on the terminal: log time, speed, SoC published by the receiver."""
 
     def __init__(self, source: Source, *, loop: bool) -> None:
         length_s = None if loop else source.duration_s
         columns = (
             TextColumn("{task.description}"),
             BarColumn(),
-            TextColumn("{task.fields[words]}"),
+            TextColumn("{task.fields[text]}"),
             TimeRemainingColumn(),
         )
-        # Without a thread of its own: it is drawn when there is something new.
+        # No refresh thread: redrawn with each state.
         self._bar = Progress(*columns, console=console, transient=True, auto_refresh=False)
-        self._task: TaskID = self._bar.add_task(source.name, total=length_s, words="")
+        self._task: TaskID = self._bar.add_task(source.name, total=length_s, text="")
 
     def __enter__(self) -> Self:
         self._bar.start()
@@ -189,10 +186,10 @@ class _Bar:
         self._bar.stop()
 
     def show(self, state: ReplayState) -> None:
-        words = f"{duration(state.log_seconds)}, {number(state.speed, 1)}×"
+        text = f"{duration(state.log_seconds)}, {number(state.speed, 1)}×"
         if state.soc is not None:
-            words += f", SoC {number(state.soc.soc_pct, 2, '%')}"
-        self._bar.update(self._task, completed=state.log_seconds, words=words, refresh=True)
+            text += f", SoC {number(state.soc.soc_pct, 2, '%')}"
+        self._bar.update(self._task, completed=state.log_seconds, text=text, refresh=True)
 
 
 def _summary_line(state: ReplayState) -> str:
@@ -203,13 +200,13 @@ def _summary_line(state: ReplayState) -> str:
     if state.acknowledged is not None:
         text += f"; {state.acknowledged} of {state.samples} samples acknowledged"
     if state.soc is not None:
-        text += f"; last SoC received {number(state.soc.soc_pct, 2, '%')}"
+        text += f"; latest SoC received {number(state.soc.soc_pct, 2, '%')}"
     return text
 
 
-def _as_json(state: ReplayState, port: BusConnection, source: Source) -> dict[str, Any]:
+def _as_json(state: ReplayState, bus: BusConnection, source: Source) -> dict[str, Any]:
     result: dict[str, Any] = {
-        "bus": port.name,
+        "bus": bus.name,
         "frames": state.frames,
         "clock_frames": state.clocks,
         "samples": state.samples if source.counts_samples else None,
@@ -217,7 +214,7 @@ def _as_json(state: ReplayState, port: BusConnection, source: Source) -> dict[st
         "seconds": state.seconds,
         "log_seconds": state.log_seconds,
         "speed": state.speed,
-        "unsent": port.unsent,
+        "unsent": bus.unsent,
         "soc_pct": None if state.soc is None else state.soc.soc_pct,
         "soc_std_pct": None if state.soc is None else state.soc.soc_std_pct,
     }

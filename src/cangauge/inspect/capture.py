@@ -17,7 +17,7 @@ from cangauge.bus.captures.files import CaptureInfo
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.protection import GENERIC_RULE, LEAF_RULE, FrameChecker, Verdict
 from cangauge.bus.recording import capture_to_log, open_vehicle_capture
-from cangauge.bus.vehicle import PRESETS, Vehicle, preset_vehicle
+from cangauge.bus.vehicle import PRESETS, Vehicle
 from cangauge.inspect.log import LogInspection, inspect_log
 
 GAP_S: Final = 1.0
@@ -416,7 +416,7 @@ class _Attempts:
     """Every preset tried on every bus of the capture."""
 
     def __init__(self) -> None:
-        self._vehicles = {name: preset_vehicle(preset) for name, preset in PRESETS.items()}
+        self._vehicles = {name: preset.vehicle() for name, preset in PRESETS.items()}
         self._wanted = {key for car in self._vehicles.values() for key in car.wanted_ids}
         self._buses: dict[Channel | None, dict[str, _Attempt]] = {}
 
@@ -471,7 +471,7 @@ class _Attempts:
 
 def _problem(name: str, attempt: _Attempt, vehicle: Vehicle, survey: _Survey) -> str:
     """Return why a preset does not match, or ""."""
-    counters = attempt.decoder.counters
+    counters = attempt.decoder.statistics
     if not attempt.samples:
         return "no current in its frames" if counters.wanted else "none of its frames"
     if counters.crc_errors > 0.1 * counters.wanted:

@@ -1,1 +1,1 @@
-"""Log or capture → frames on a bus, in time."""
+"""Replay of logs and captures as frames on a bus."""

@@ -1,16 +1,13 @@
-"""Keeping the recorded timing, at any speed.
+"""Play steps on a bus: at a given speed, or as fast as the receiver acknowledges.
 
-Full speed without loss: sending no further ahead than the receiver has acknowledged.
-
-The receiver (`cangauge run --time-source replay-clock`) tells in SOC_DETAIL how many samples it
-has processed, every few samples, and again when nothing comes any more. Frames that wait in its
-socket are bounded by a window, because the system's buffers drop what is too much without a word.
-
-Playing steps on a bus: in time, or as fast as the receiver acknowledges.
+At full speed nothing may be lost, although socket buffers drop excess frames silently. The receiver
+(`cangauge run --time-source replay-clock`) reports its sample count in SOC_DETAIL every few
+samples, and again in the silence after them; the player limits the samples and frames under way.
 """
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections import deque
@@ -20,245 +17,46 @@ from typing import Final
 
 import can
 
+from cangauge._logging import emit
 from cangauge.bus.connection import BusConnection
-from cangauge.bus.publish import SAMPLES_MODULO, FrameIds, SocDetail, SocEstimate, SocReader
-from cangauge.bus.time_source import ClockFrames
+from cangauge.bus.publish import (
+    ACKNOWLEDGE_EVERY,
+    SAMPLES_MODULO,
+    FrameIds,
+    SocDetail,
+    SocEstimate,
+    SocReader,
+)
+from cangauge.bus.time_source import MICROSECONDS, ClockFrames
 from cangauge.errors import CangaugeError, InputError
 from cangauge.replay.steps import Source, Step
-from cangauge.service.pipeline import ACKNOWLEDGE_EVERY
 
-# --- Keeping the recorded timing, at any speed
+_LOG = logging.getLogger(__name__)
 
 AHEAD_S: Final = 0.0002
-"""Frames so near to their time are sent at once: sleeping would cost more than it mends [s]."""
-
+"""Frames this close to their time are sent at once: sleeping is less precise [s]."""
 REST_AT_MOST_S: Final = 0.2
-"""Longer pauses are passed in parts, so that a signal is noticed."""
-
-
-class Pacer:
-    """Waits for the moments of log time.
-
-    Every moment is counted from the first, by the monotonic clock, so that errors do not add up:
-    what is late does not make the rest later.
-
-    Parameters
-    ----------
-    speed : float
-        Log seconds per second.
-    stop : callable
-        Asked while waiting; True ends it.
-    rest : callable
-        Passes at most so many seconds; may return earlier.
-    """
-
-    def __init__(
-        self,
-        speed: float,
-        stop: Callable[[], bool],
-        rest: Callable[[float], object] = time.sleep,
-    ) -> None:
-        self._us_per_s = 1e6 * speed
-        self._stop = stop
-        self._rest = rest
-        self._origin: tuple[int, float] | None = None
-
-    def wait(self, time_us: int) -> None:
-        """Return when it is time for a log time [µs], or at once when it has passed."""
-        if self._origin is None:
-            self._origin = (time_us, time.monotonic())
-        first_us, first_s = self._origin
-        due_s = first_s + (time_us - first_us) / self._us_per_s
-        while (ahead_s := due_s - time.monotonic()) > AHEAD_S and not self._stop():
-            self._rest(min(ahead_s, REST_AT_MOST_S))
-
-
-# --- Full speed without loss: sending no further ahead than the receiver has acknowledged
+"""Longest uninterrupted wait, so that a stop is noticed [s]."""
 
 WINDOW_SAMPLES: Final = 40
-"""Samples under way at most."""
-
+"""Most samples under way."""
 WINDOW_FRAMES: Final = 160
-"""Frames under way at most: a socket's default buffer holds about 270, on Linux …"""
-
+"""Most frames under way: a default socket buffer of Linux holds about 270."""
 SAMPLES_AT_LEAST: Final = 2 * ACKNOWLEDGE_EVERY
-"""… but so many samples always may be, or an acknowledgement would never become due."""
-
+"""Samples that may always be under way; with fewer, no acknowledgement would become due."""
 SLOW_S: Final = 0.5
-"""Waiting this long for an acknowledgement is worth a hint [s]."""
+"""Wait for an acknowledgement that is worth a warning [s]."""
+_POLL_S: Final = 0.05
 
-_LOOK_S: Final = 0.05
+SHOW_EVERY_S: Final = 0.2
+LISTEN_S: Final = 0.001
+"""Time to listen at each display, in case there was no pause for it [s]."""
+LISTEN_AT_END_S: Final = 0.15
+"""Time to listen for the estimate after the last frame [s]."""
 
 _HINT = (
     "is `cangauge run --time-source replay-clock` listening on this bus, for the same --vehicle?"
 )
-
-
-class Receiver:
-    """What is known of the receiver: its acknowledgements, and the SoC that it publishes.
-
-    Parameters
-    ----------
-    port : BusConnection
-        Receives SOC_ESTIMATE and SOC_DETAIL only.
-    reader : SocReader
-    stop : callable
-        Asked while waiting; True ends it.
-    warn : callable, optional
-        Takes a line of text.
-
-    Attributes
-    ----------
-    soc : SocEstimate or None
-        The latest that was published.
-    acknowledged : int
-        Samples processed since `wait_until_ready`.
-    """
-
-    def __init__(
-        self,
-        port: BusConnection,
-        reader: SocReader,
-        stop: Callable[[], bool],
-        warn: Callable[[str], None] | None = None,
-    ) -> None:
-        self._port = port
-        self._reader = reader
-        self._stop = stop
-        self._warn = warn
-        self.soc: SocEstimate | None = None
-        self.acknowledged = 0
-        self._told: int | None = None
-        self._sent = 0
-        self._frames_sent = 0
-        # Frames that had been sent when a sample was complete: (sample, frames).
-        self._marks: deque[tuple[int, int]] = deque()
-        self._frames_acknowledged = 0
-
-    def listen(self, within_s: float) -> None:
-        """Take in what arrives, for so long at most [s]; return when the bus is quiet.
-
-        Not without any time: where Python filters, one's own frames must be passed over first.
-        """
-        until_s = time.monotonic() + within_s
-        while (left_s := until_s - time.monotonic()) > 0.0 and self.take(left_s):
-            pass
-
-    def wait_until_ready(self, within_s: float) -> None:
-        """Wait for the receiver to show itself; its count so far is where counting begins.
-
-        Raises
-        ------
-        CangaugeError
-            If it does not within that time [s].
-        """
-        give_up_s = time.monotonic() + within_s
-        while self._told is None and not self._stop():
-            if time.monotonic() > give_up_s:
-                raise CangaugeError(
-                    f"{self._port.name}: nobody acknowledges: no SOC_DETAIL in {within_s:g} s;"
-                    f" {_HINT}"
-                )
-            self.take(_LOOK_S)
-
-    def sent(self, samples: int, frames: int) -> None:
-        """Note how many samples and frames have been sent so far."""
-        if samples != self._sent:
-            self._marks.append((samples, frames))
-        self._sent, self._frames_sent = samples, frames
-
-    def wait_for_room(self, within_s: float) -> None:
-        """Wait until the window has room.
-
-        Raises
-        ------
-        CangaugeError
-            If no acknowledgement comes within that time [s].
-        """
-        if not self._is_full():
-            return
-        # Once full it is emptied to a half, so that both sides work in strides.
-        self._wait(within_s, lambda: self._under_way <= WINDOW_SAMPLES // 2 and not self._is_full())
-
-    def wait_for_all(self, within_s: float) -> None:
-        """Wait until everything is acknowledged.
-
-        Raises
-        ------
-        CangaugeError
-            If no acknowledgement comes within that time [s].
-        """
-        self._wait(within_s, lambda: self._under_way == 0)
-
-    @property
-    def _under_way(self) -> int:
-        return self._sent - self.acknowledged
-
-    def _is_full(self) -> bool:
-        if self._under_way < SAMPLES_AT_LEAST:
-            return False
-        frames = self._frames_sent - self._frames_acknowledged
-        return self._under_way >= WINDOW_SAMPLES or frames >= WINDOW_FRAMES
-
-    def _wait(self, within_s: float, is_enough: Callable[[], bool]) -> None:
-        began_s = last_s = time.monotonic()
-        before = self.acknowledged
-        while not is_enough() and not self._stop():
-            self.take(_LOOK_S)
-            now_s = time.monotonic()
-            if self.acknowledged != before:
-                before, last_s = self.acknowledged, now_s
-            elif now_s - last_s > within_s:
-                raise CangaugeError(
-                    f"{self._port.name}: no acknowledgement in {within_s:g} s:"
-                    f" {self.acknowledged} of {self._sent} samples sent have been processed;"
-                    f" {_HINT}"
-                )
-            if now_s - began_s > SLOW_S and self._warn is not None:
-                self._warn(f"the receiver acknowledges slowly; {_HINT}")
-                self._warn = None
-
-    def take(self, timeout_s: float) -> bool:
-        """Take in one frame; return whether one came in time [s]."""
-        message = self._port.receive(timeout_s)
-        if message is None:
-            return False
-        content = self._reader.read(message)
-        if isinstance(content, SocEstimate):
-            if math.isfinite(content.soc_pct):
-                self.soc = content
-        elif isinstance(content, SocDetail):
-            self._count(content.samples)
-        return True
-
-    def _count(self, told: int) -> None:
-        if self._told is None or not self._sent:
-            self._told = told
-            return
-        more = (told - self._told) % SAMPLES_MODULO
-        if more == 0:
-            return
-        if more > self._under_way:
-            raise CangaugeError(
-                f"{self._port.name}: the receiver has processed {more} samples where"
-                f" {self._under_way} were under way: it was started again, or somebody else sends"
-                " or answers on this bus too"
-            )
-        self._told = told
-        self.acknowledged += more
-        while self._marks and self._marks[0][0] <= self.acknowledged:
-            self._frames_acknowledged = self._marks.popleft()[1]
-
-
-# --- Playing steps on a bus: in time, or as fast as the receiver acknowledges
-
-SHOW_EVERY_S: Final = 0.2
-
-LISTEN_S: Final = 0.001
-"""How long to listen then, where there was no pause to do it in [s]."""
-
-LAST_WORDS_S: Final = 0.15
-"""How long to listen for what the receiver publishes after the last frame [s]."""
 
 
 @dataclass(frozen=True)
@@ -270,12 +68,12 @@ class ReplaySettings:
     speed : float
         Log seconds per second; infinite: as fast as the receiver acknowledges.
     loop : bool
-        Again and again, until stopped.
+        Repeat until stopped.
     wait_s : float, optional
-        How long to wait for a receiver to show itself before beginning [s]; by default as long as
-        an acknowledgement at full speed, where there must be one, and else not at all.
+        Longest wait for a receiver before the first frame [s]; default: `acknowledge_s` at full
+        speed, else no wait.
     acknowledge_s : float
-        How long an acknowledgement may take at full speed [s].
+        Longest wait for an acknowledgement at full speed [s].
     ids : FrameIds
     """
 
@@ -293,21 +91,21 @@ class ReplaySettings:
 
 @dataclass
 class ReplayState:
-    """How far a replay is; handed to whoever shows it."""
+    """Progress of a replay."""
 
     frames: int = 0
-    """Frames sent, REPLAY_CLOCK left out."""
+    """Frames sent, without REPLAY_CLOCK."""
     clocks: int = 0
     """REPLAY_CLOCK frames sent."""
     samples: int = 0
-    """Samples that a receiver makes of them, where that is known."""
+    """Samples that a receiver makes of them, where known."""
     acknowledged: int | None = None
-    """Samples that the receiver says it has processed; None where that is not asked."""
+    """Samples acknowledged by the receiver; None below full speed."""
     log_seconds: float = 0.0
     seconds: float = 0.0
     """Since the first frame [s]."""
     soc: SocEstimate | None = None
-    """The latest that the receiver published."""
+    """Latest estimate published by the receiver."""
 
     @property
     def speed(self) -> float | None:
@@ -316,28 +114,25 @@ class ReplayState:
 
 
 def play(
-    port: BusConnection,
+    bus: BusConnection,
     source: Source,
     settings: ReplaySettings,
     *,
     stop: Callable[[], bool],
     show: Callable[[ReplayState], None] | None = None,
-    warn: Callable[[str], None] | None = None,
 ) -> ReplayState:
     """Play a source on a bus.
 
     Parameters
     ----------
-    port : BusConnection
+    bus : BusConnection
         Needs to receive SOC_ESTIMATE and SOC_DETAIL only.
     source : Source
     settings : ReplaySettings
     stop : callable
-        Asked between frames; True ends the replay.
+        Called between frames; True ends the replay.
     show : callable, optional
         Called a few times a second, and at the end.
-    warn : callable, optional
-        Takes a line of text.
 
     Returns
     -------
@@ -346,20 +141,20 @@ def play(
     Raises
     ------
     InputError
-        If full speed is asked of a capture without a vehicle.
+        If a capture without a vehicle is to be played at full speed, or the bus is not open for
+        the capture's CAN FD frames.
     CangaugeError
-        If the bus fails, no receiver shows itself, or one stops acknowledging.
+        If the bus fails, or no receiver acknowledges in time.
     """
     if settings.is_max and not source.counts_samples:
         raise InputError(
-            "at full speed the receiver's samples are counted, and this capture's vehicle is not"
-            " known",
+            "full speed needs the vehicle of a capture, to count the samples acknowledged",
             source=source.name,
             field="--speed",
             value="max",
             cure="give --vehicle, or --dbc and --map, or another speed",
         )
-    player = _Player(port, settings, stop, show, warn)
+    player = _Player(bus, settings, stop, show)
     player.begin()
     for step in source.steps(loop=settings.loop):
         if stop():
@@ -372,18 +167,17 @@ def play(
 class _Player:
     def __init__(
         self,
-        port: BusConnection,
+        bus: BusConnection,
         settings: ReplaySettings,
         stop: Callable[[], bool],
         show: Callable[[ReplayState], None] | None,
-        warn: Callable[[str], None] | None,
     ) -> None:
-        self._port = port
+        self._bus = bus
         self._settings = settings
         self._stop = stop
         self._show = show
-        self._receiver = Receiver(port, SocReader(settings.ids), stop, warn)
-        # Pauses are passed with listening.
+        self._receiver = _Receiver(bus, settings.ids, stop)
+        # Listen during pauses.
         self._pacer = None if settings.is_max else Pacer(settings.speed, stop, self._receiver.take)
         self._clock = None if settings.speed == 1.0 else ClockFrames(settings.ids.replay_clock)
         self._clock_us: int | None = None
@@ -411,50 +205,217 @@ class _Player:
             self._began_s = time.monotonic()
         if self._clock is not None and step.is_wanted and step.time_us != self._clock_us:
             self._clock_us = step.time_us
-            self._send_one(self._clock.at(step.time_us))
+            self._send_frame(self._clock.at(step.time_us))
             state.clocks += 1
         for frame in step.frames:
-            if frame.is_fd and not self._port.carries_fd:
+            if frame.is_fd and not self._bus.carries_fd:
                 raise InputError(
                     "holds CAN FD frames, and the bus is not open for them",
                     field="--bus-option",
                     cure="give --bus-option fd=true",
                 )
-            self._send_one(frame)
+            self._send_frame(frame)
         state.frames += len(step.frames)
         state.samples = step.samples
-        state.log_seconds = (step.time_us - self._first_us) / 1e6
+        state.log_seconds = (step.time_us - self._first_us) / MICROSECONDS
         if self._pacer is None:
-            self._receiver.sent(step.samples, state.frames + state.clocks)
-        self._show_if_due()
+            self._receiver.note_sent(step.samples, state.frames + state.clocks)
+        now_s = time.monotonic()
+        if now_s >= self._show_s:
+            self._show_s = now_s + SHOW_EVERY_S
+            self._update(LISTEN_S)
 
     def end(self) -> None:
         if self._pacer is None and not self._stop():
             self._receiver.wait_for_all(self._settings.acknowledge_s)
-        self._look(LAST_WORDS_S)
-        if self._show is not None:
-            self._show(self.state)
+        self._update(LISTEN_AT_END_S)
 
-    def _send_one(self, frame: can.Message) -> None:
-        if not self._port.send(frame) and self._pacer is None:
+    def _send_frame(self, frame: can.Message) -> None:
+        if not self._bus.send(frame) and self._pacer is None:
             raise CangaugeError(
-                f"{self._port.name}: the transmit queue stays full; is the bus up, with somebody"
-                " to acknowledge frames?"
+                f"{self._bus.name}: the transmit queue stays full; is the bus up, with another node"
+                " that acknowledges frames?"
             )
 
-    def _show_if_due(self) -> None:
-        now_s = time.monotonic()
-        if now_s >= self._show_s:
-            self._show_s = now_s + SHOW_EVERY_S
-            self._look(LISTEN_S)
-            if self._show is not None:
-                self._show(self.state)
-
-    def _look(self, within_s: float) -> None:
+    def _update(self, listen_s: float) -> None:
+        """Listen, bring the state up to date and show it."""
         state = self.state
         if self._first_us is not None:
             state.seconds = time.monotonic() - self._began_s
-        self._receiver.listen(within_s)
+        self._receiver.listen(listen_s)
         state.soc = self._receiver.soc
         if state.acknowledged is not None:
             state.acknowledged = self._receiver.acknowledged
+        if self._show is not None:
+            self._show(state)
+
+
+class Pacer:
+    """Waits for moments of log time.
+
+    All moments are counted from the first, on the monotonic clock: errors do not accumulate, and a
+    late frame does not delay the rest.
+
+    Parameters
+    ----------
+    speed : float
+        Log seconds per second.
+    stop : callable
+        Called while waiting; True ends the wait.
+    rest : callable
+        Waits for at most a time [s]; may return earlier.
+    """
+
+    def __init__(
+        self,
+        speed: float,
+        stop: Callable[[], bool],
+        rest: Callable[[float], object] = time.sleep,
+    ) -> None:
+        self._us_per_s = MICROSECONDS * speed
+        self._stop = stop
+        self._rest = rest
+        self._origin: tuple[int, float] | None = None
+
+    def wait(self, time_us: int) -> None:
+        """Return when a log time [µs] is due, or at once when it has passed."""
+        if self._origin is None:
+            self._origin = (time_us, time.monotonic())
+        first_us, first_s = self._origin
+        due_s = first_s + (time_us - first_us) / self._us_per_s
+        while (ahead_s := due_s - time.monotonic()) > AHEAD_S and not self._stop():
+            self._rest(min(ahead_s, REST_AT_MOST_S))
+
+
+class _Receiver:
+    """The receiver as seen by the player: acknowledged samples and published SoC.
+
+    Attributes
+    ----------
+    soc : SocEstimate or None
+        Latest estimate with a SoC.
+    acknowledged : int
+        Samples processed since `wait_until_ready`.
+    """
+
+    def __init__(self, bus: BusConnection, ids: FrameIds, stop: Callable[[], bool]) -> None:
+        self._bus = bus
+        self._reader = SocReader(ids)
+        self._stop = stop
+        self.soc: SocEstimate | None = None
+        self.acknowledged = 0
+        self._count: int | None = None  # latest sample count in SOC_DETAIL
+        self._sent = 0
+        self._frames_sent = 0
+        # Frames sent when a sample was complete: (sample, frames).
+        self._marks: deque[tuple[int, int]] = deque()
+        self._frames_acknowledged = 0
+        self._has_warned = False
+
+    def listen(self, within_s: float) -> None:
+        """Receive for at most `within_s` [s]; return when the bus is quiet.
+
+        A timeout of 0 would not do: where Python filters, own frames must be skipped first.
+        """
+        until_s = time.monotonic() + within_s
+        while (left_s := until_s - time.monotonic()) > 0.0 and self.take(left_s):
+            pass
+
+    def wait_until_ready(self, within_s: float) -> None:
+        """Wait for the first SOC_DETAIL; samples are counted from there.
+
+        Raises
+        ------
+        CangaugeError
+            If none comes within `within_s` [s].
+        """
+        give_up_s = time.monotonic() + within_s
+        while self._count is None and not self._stop():
+            if time.monotonic() > give_up_s:
+                raise CangaugeError(
+                    f"{self._bus.name}: no receiver: no SOC_DETAIL in {within_s:g} s; {_HINT}"
+                )
+            self.take(_POLL_S)
+
+    def note_sent(self, samples: int, frames: int) -> None:
+        """Record the samples and frames sent so far."""
+        if samples != self._sent:
+            self._marks.append((samples, frames))
+        self._sent, self._frames_sent = samples, frames
+
+    def wait_for_room(self, within_s: float) -> None:
+        """Wait until the window has room.
+
+        Raises
+        ------
+        CangaugeError
+            If no acknowledgement comes within `within_s` [s].
+        """
+        if self._is_full():
+            # Drain to half, so that both sides work in batches.
+            self._wait(
+                within_s, lambda: self._under_way <= WINDOW_SAMPLES // 2 and not self._is_full()
+            )
+
+    def wait_for_all(self, within_s: float) -> None:
+        """Wait until all samples are acknowledged; raises like `wait_for_room`."""
+        self._wait(within_s, lambda: self._under_way == 0)
+
+    @property
+    def _under_way(self) -> int:
+        return self._sent - self.acknowledged
+
+    def _is_full(self) -> bool:
+        if self._under_way < SAMPLES_AT_LEAST:
+            return False
+        frames = self._frames_sent - self._frames_acknowledged
+        return self._under_way >= WINDOW_SAMPLES or frames >= WINDOW_FRAMES
+
+    def _wait(self, within_s: float, is_enough: Callable[[], bool]) -> None:
+        began_s = last_s = time.monotonic()
+        before = self.acknowledged
+        while not is_enough() and not self._stop():
+            self.take(_POLL_S)
+            now_s = time.monotonic()
+            if self.acknowledged != before:
+                before, last_s = self.acknowledged, now_s
+            elif now_s - last_s > within_s:
+                raise CangaugeError(
+                    f"{self._bus.name}: no acknowledgement in {within_s:g} s: {self.acknowledged}"
+                    f" of {self._sent} samples sent have been processed; {_HINT}"
+                )
+            if now_s - began_s > SLOW_S and not self._has_warned:
+                self._has_warned = True
+                text = f"the receiver acknowledges slowly; {_HINT}"
+                emit(_LOG, logging.WARNING, "replay.slow", text)
+
+    def take(self, timeout_s: float) -> bool:
+        """Receive one frame; return whether one came in time [s]."""
+        message = self._bus.receive(timeout_s)
+        if message is None:
+            return False
+        content = self._reader.read(message)
+        if isinstance(content, SocEstimate):
+            if math.isfinite(content.soc_pct):
+                self.soc = content
+        elif isinstance(content, SocDetail):
+            self._acknowledge(content.samples)
+        return True
+
+    def _acknowledge(self, count: int) -> None:
+        if self._count is None or not self._sent:
+            self._count = count
+            return
+        more = (count - self._count) % SAMPLES_MODULO
+        if more == 0:
+            return
+        if more > self._under_way:
+            raise CangaugeError(
+                f"{self._bus.name}: the receiver has processed {more} samples where"
+                f" {self._under_way} were under way: it was restarted, or another program sends or"
+                " acknowledges on this bus too"
+            )
+        self._count = count
+        self.acknowledged += more
+        while self._marks and self._marks[0][0] <= self.acknowledged:
+            self._frames_acknowledged = self._marks.popleft()[1]

@@ -79,11 +79,11 @@ from pydantic import (
 
 from cangauge._config import read_toml, validated
 from cangauge._logging import LogFormat, LogLevel
-from cangauge.bus.mapping import CheckMap, MessageMap, RuleMap
+from cangauge.bus.mapping import CheckMap, MessageMap, Overrides, RuleMap
 from cangauge.bus.open import BusAddress, bus_address, is_interface_name
 from cangauge.bus.publish import FrameIds
 from cangauge.bus.time_source import TimeSourceName
-from cangauge.bus.vehicle import Overrides, Vehicle, load_vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.settings import (
     VALID_STD_PCT,
@@ -465,7 +465,7 @@ class RunConfig(OpsConfig):
         preset = self.vehicle
         if preset is None and self.dbc is None and self.map is None:
             preset = DEFAULT_VEHICLE
-        return load_vehicle(
+        return Vehicle.load(
             preset,
             self.dbc,
             self.map,

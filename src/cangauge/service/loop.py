@@ -356,13 +356,13 @@ class _Loop:
         self._settings = settings
         self._outputs = outputs
         self.rivals = DuplicateSenderDetector(
-            gauge.settings.ids, echoes=port.facts.echoes, warn=outputs.warn
+            gauge.settings.ids, echoes=port.capabilities.echoes, warn=outputs.warn
         )
         self._upkeep = Housekeeping(
             port, outputs.checkpoint, settings.checkpoint_every_s, outputs.warn
         )
         self._ignores_clock = self._awaits_clock = gauge.settings.time_source == "receive"
-        self._stamps_are_wall_time = port.facts.stamps == "kernel"
+        self._stamps_are_wall_time = port.capabilities.stamps == "kernel"
         self._no_input: frozenset[int] = frozenset()
         self._set_filters()
         self.began_s = time.monotonic()
@@ -387,7 +387,7 @@ class _Loop:
 
     def turn(self) -> None:
         left_s = self._beat_s + LATE_S - self._now_s
-        messages = self._port.receive_waiting(min(max(left_s, 0.0), LOOK_EVERY_S))
+        messages = self._port.receive_pending(min(max(left_s, 0.0), LOOK_EVERY_S))
         # The clock is asked once a turn and once more if there was a sample: where it takes a
         # system call that is not little.
         self._now_s = time.monotonic()

@@ -16,7 +16,7 @@ from can.typechecking import CanFilter
 
 from cangauge.bus.decoder import FrameStatistics, SampleDecoder
 from cangauge.bus.plausibility import MISSED_AT_LEAST, Pack
-from cangauge.bus.publish import FrameIds, SocPublisher, standard_filter
+from cangauge.bus.publish import ACKNOWLEDGE_EVERY, FrameIds, SocPublisher, standard_filter
 from cangauge.bus.time_source import (
     REPLAY_CLOCK_ID,
     ReceiveTime,
@@ -193,7 +193,7 @@ class EstimateStream:
     @property
     def counts(self) -> FrameCounts:
         """What happened to the frames so far."""
-        now = self._assembler.counters
+        now = self._assembler.statistics
         return self._past + FrameCounts(
             frames=now.frames,
             samples=now.samples,
@@ -211,7 +211,7 @@ class EstimateStream:
     @property
     def counters(self) -> FrameStatistics:
         """The same in detail, of the log that is running."""
-        return self._assembler.counters
+        return self._assembler.statistics
 
     @property
     def reference_soc_pct(self) -> float:
@@ -300,7 +300,7 @@ class EstimateStream:
         """
         sample = self.latest_sample
         estimate = self._latest if self._estimated is None else self._estimated
-        missing = self._assembler.health.reasons(now_s)
+        missing = self._assembler.reasons(now_s)
         reasons = estimate.reasons
         if sample is not None and math.isnan(sample.voltage_v):
             reasons &= ~Reason.VOLTAGE_MISSING
@@ -345,9 +345,6 @@ def _filled(settings: EstimatorSettings, vehicle: Vehicle) -> EstimatorSettings:
 
 
 # --- The gauge: frames in, frames out. Pure: no bus, no clock; whoever has both is `loop`
-
-ACKNOWLEDGE_EVERY: Final = 4
-"""Samples between two SOC_DETAIL at most, under the replay clock: `replay` waits for them."""
 
 
 @dataclass(frozen=True)

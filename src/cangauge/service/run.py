@@ -363,7 +363,7 @@ def summary_json(gauge: Gauge, port: ReconnectingBus, summary: RunSummary) -> di
         "bus_losses": port.losses,
         "bus_away_s": port.away_s,
         "rival_frames": summary.rival_frames,
-        "stamps": port.facts.stamps,
+        "stamps": port.capabilities.stamps,
         "step_p50_us": summary.step_p50_us,
         "estimate": {
             "time_s": latest.time_s,
@@ -406,7 +406,7 @@ def run_service(config: RunConfig, read: Callable[[], RunConfig]) -> dict[str, A
         # Signals first: whoever starts the service may end it at any moment after.
         stop = stack.enter_context(stop_on_signals())
         hangup = stack.enter_context(note_hangups())
-        port = stack.enter_context(ReconnectingBus(address, gauge.filters, _voice("bus.notice")))
+        port = stack.enter_context(ReconnectingBus(address, gauge.filters))
         port.open(wait=config.wait_for_bus)
         recorder = table = line = keeper = None
         if kept is not None:

@@ -23,7 +23,8 @@ from cangauge import __version__
 from cangauge._formatting import number
 from cangauge._logging import Pace, emit
 from cangauge.bus.connection import BusConnection
-from cangauge.bus.decoder import FrameStatistics, MessageStatistics
+from cangauge.bus.decoder import FrameStatistics
+from cangauge.bus.plausibility import MessageStatistics
 from cangauge.estimate.validity import Estimate, Reason, Sample, Status, reason_name, reason_names
 from cangauge.service.pipeline import Gauge
 from cangauge.service.systemd import Notifier

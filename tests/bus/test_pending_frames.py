@@ -1,4 +1,4 @@
-"""Frames read from the socket without asking first: those that python-can's `recv` gives."""
+"""Pending frames read from the socket: equal to those of python-can's `recv`."""
 
 from __future__ import annotations
 
@@ -11,13 +11,8 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.connection import (
-    AT_ONCE,
-    BusConnection,
-    BusError,
-    NothingWaitsError,
-    pending_frames,
-)
+from cangauge.bus.backend import NoPendingFrameError, pending_frames
+from cangauge.bus.connection import AT_ONCE, BusConnection, BusError
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.publish import standard_filter
 from live import BrokenBus, network_down, same_frames, unpack_error
@@ -53,10 +48,7 @@ def every_kind() -> list[can.Message]:
 
 
 def wait_for_stamps(sender: can.BusABC, *buses: can.BusABC) -> None:
-    """Wait until the kernel stamps what comes in: it begins a little after the first asked for it.
-
-    Until then a frame is stamped when it is read.
-    """
+    """Wait until the kernel stamps on arrival: it begins shortly after the first request."""
     probe = can.Message(arbitration_id=0x123, is_extended_id=False)
     for _ in range(100):
         sender.send(probe)
@@ -64,25 +56,25 @@ def wait_for_stamps(sender: can.BusABC, *buses: can.BusABC) -> None:
         frames = [bus.recv(1.0) for bus in buses]
         if all(frame and time.time() - frame.timestamp > 0.015 for frame in frames):
             return
-    raise AssertionError("the kernel stamps nothing")
+    raise AssertionError("the kernel does not stamp")
 
 
 @linux_only
 @pytest.mark.parametrize("carries_fd", [True, False])
 @pytest.mark.parametrize("filters", [None, FILTERS], ids=["all", "filtered"])
-def test_the_frames_are_those_of_python_can(
+def test_frames_equal_those_of_python_can(
     carries_fd: bool, filters: list[can.typechecking.CanFilter] | None
 ) -> None:
     address = multicast(fd=carries_fd)
-    # Twice each: what was refused once is not looked at again.
+    # Twice each: filter results are cached.
     sent = [each for each in every_kind() for _ in range(2)]
     with (
         open_bus(address, filters) as theirs,
         open_bus(address, filters) as ours,
         open_bus(multicast()) as sender,
     ):
-        waiting = pending_frames(ours)
-        assert waiting is not None
+        pending = pending_frames(ours)
+        assert pending is not None
         wait_for_stamps(sender, theirs, ours)
         for frame in sent:
             sender.send(frame)
@@ -91,12 +83,12 @@ def test_the_frames_are_those_of_python_can(
             expected.append(message)
         found = []
         for _ in sent:
-            message = waiting.next()
+            message = pending.next()
             if message is not None:
                 found.append(message)
-        with pytest.raises(NothingWaitsError):
-            waiting.next()
-        waiting.close()
+        with pytest.raises(NoPendingFrameError):
+            pending.next()
+        pending.close()
     assert (
         len(expected)
         == {(True, None): 22, (True, 1): 16, (False, None): 18, (False, 1): 12}[
@@ -107,7 +99,7 @@ def test_the_frames_are_those_of_python_can(
 
 
 @linux_only
-def test_other_filters_hold_from_the_next_frame_on() -> None:
+def test_new_filters_apply_from_the_next_frame() -> None:
     frame = can.Message(arbitration_id=0x55, is_extended_id=False)
     with (
         BusConnection(open_bus(multicast(), FILTERS), "rx") as port,
@@ -115,17 +107,17 @@ def test_other_filters_hold_from_the_next_frame_on() -> None:
     ):
         for _ in range(2):
             sender.send(frame)
-            assert port.receive_waiting(0.2) == []
+            assert port.receive_pending(0.2) == []
         port.set_filters([standard_filter(0x55)])
         sender.send(frame)
-        assert len(port.receive_waiting(0.2)) == 1
+        assert len(port.receive_pending(0.2)) == 1
         port.set_filters(FILTERS)
         sender.send(frame)
-        assert port.receive_waiting(0.2) == []
+        assert port.receive_pending(0.2) == []
 
 
 @linux_only
-def test_what_is_no_frame_is_counted_and_passed_over() -> None:
+def test_packets_that_are_no_frames_are_counted() -> None:
     address = multicast()
     junk = [b"", b"\xff", b"\x01", b"\x90", b"\x81\xa1x\x01", bytes(5000)]
     good = can.Message(arbitration_id=0x123, is_extended_id=False, data=b"1")
@@ -141,30 +133,30 @@ def test_what_is_no_frame_is_counted_and_passed_over() -> None:
         sender.send(good)
         for _ in junk:
             assert theirs.receive(0.2) is None
-        assert len(ours.receive_waiting(0.2)) == 1
+        assert len(ours.receive_pending(0.2)) == 1
         assert ours.garbled == theirs.garbled == len(junk)
 
 
 @linux_only
-def test_many_that_wait_come_in_parts_and_in_order_and_nothing_is_waited_for() -> None:
+def test_many_pending_frames_come_in_batches_in_order() -> None:
     address = multicast()
     with BusConnection(open_bus(address), "rx") as port, open_bus(address) as sender:
         for number in range(3 * AT_ONCE + 1):
             sender.send(can.Message(arbitration_id=number, is_extended_id=False))
         began_s = time.monotonic()
-        parts = [port.receive_waiting(5.0) for _ in range(4)]
+        parts = [port.receive_pending(5.0) for _ in range(4)]
         assert time.monotonic() - began_s < 1.0
         assert [len(each) for each in parts] == [AT_ONCE, AT_ONCE, AT_ONCE, 1]
         assert [each.arbitration_id for part in parts for each in part] == list(
             range(3 * AT_ONCE + 1)
         )
         began_s = time.monotonic()
-        assert port.receive_waiting(0.2) == []
+        assert port.receive_pending(0.2) == []
         assert 0.19 < time.monotonic() - began_s < 1.0
 
 
 @linux_only
-def test_a_closed_port_leaves_no_descriptor_behind() -> None:
+def test_a_closed_connection_leaks_no_descriptor() -> None:
     def descriptors() -> int:
         return len(list(Path("/proc/self/fd").iterdir()))
 
@@ -172,18 +164,18 @@ def test_a_closed_port_leaves_no_descriptor_behind() -> None:
     before = descriptors()
     for _ in range(3):
         with BusConnection(open_bus(address), "rx") as port:
-            port.receive_waiting(0.0)
+            port.receive_pending(0.0)
     assert descriptors() == before
 
 
-def test_a_bus_whose_socket_is_not_known_gives_one_frame_at_a_time() -> None:
+def test_other_interfaces_give_one_frame_at_a_time() -> None:
     frame = can.Message(arbitration_id=1)
     script: list[object] = [frame, frame, None, unpack_error(), frame, network_down()]
     port = BusConnection(BrokenBus(script), "x")  # type: ignore[arg-type] # what is used of one
-    assert [len(port.receive_waiting(0.0)) for _ in range(5)] == [1, 1, 0, 0, 1]
+    assert [len(port.receive_pending(0.0)) for _ in range(5)] == [1, 1, 0, 0, 1]
     assert port.garbled == 1
     with pytest.raises(BusError):
-        port.receive_waiting(0.0)
+        port.receive_pending(0.0)
 
 
 class Script:
@@ -193,7 +185,7 @@ class Script:
         self._steps = list(steps)
 
     def next(self) -> can.Message | None:
-        step = self._steps.pop(0) if self._steps else NothingWaitsError()
+        step = self._steps.pop(0) if self._steps else NoPendingFrameError()
         if isinstance(step, BaseException):
             raise step
         return step  # type: ignore[return-value] # a message or None
@@ -208,20 +200,20 @@ class Script:
         pass
 
 
-def test_an_error_takes_no_frame_with_it_that_was_read_before() -> None:
+def test_frames_read_before_an_error_are_kept() -> None:
     frame = can.Message(arbitration_id=1)
     port = BusConnection(BrokenBus([]), "x")  # type: ignore[arg-type] # what is used of one
-    port._waiting = Script(frame, unpack_error(), None, frame, network_down())
-    assert port.receive_waiting(0.0) == [frame, frame]
+    port._pending = Script(frame, unpack_error(), None, frame, network_down())
+    assert port.receive_pending(0.0) == [frame, frame]
     assert port.garbled == 1
     for _ in range(2):
         with pytest.raises(BusError, match="Network is down"):
-            port.receive_waiting(0.0)
+            port.receive_pending(0.0)
 
 
 def test_frames_after_an_error_frame_wait_for_the_next_call() -> None:
     frame, error = can.Message(arbitration_id=1), can.Message(is_error_frame=True)
     port = BusConnection(BrokenBus([]), "x")  # type: ignore[arg-type] # what is used of one
-    port._waiting = Script(frame, error, error, frame, frame)
-    assert [len(port.receive_waiting(0.0)) for _ in range(4)] == [1, 0, 2, 0]
+    port._pending = Script(frame, error, error, frame, frame)
+    assert [len(port.receive_pending(0.0)) for _ in range(4)] == [1, 0, 2, 0]
     assert port.error_frames == 2

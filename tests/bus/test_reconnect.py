@@ -1,4 +1,4 @@
-"""A bus that goes and comes back: what is done, how often, what it costs, what is said."""
+"""Reconnecting a lost bus: attempts, cost, log."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ import itertools
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import can
 import pytest
 from can.typechecking import CanFilter
 
-from cangauge.bus import reconnect as lasting
+from bus_log import BusLog
+from cangauge.bus import reconnect
 from cangauge.bus.open import BusAddress, DriverMissingError, open_bus
 from cangauge.bus.publish import standard_filter
 from cangauge.bus.reconnect import FIRST_PAUSE_S, LONGEST_PAUSE_S, ReconnectingBus
@@ -26,7 +27,7 @@ FRAME = can.Message(arbitration_id=0x123, is_extended_id=False, data=b"12345678"
 
 
 class Opener:
-    """Opens buses from a script: a bus, or an error to raise; the last one again and again."""
+    """Opens buses from a script: a bus, or an error to raise; the last step repeats."""
 
     def __init__(self, *script: object) -> None:
         self._script = list(script)
@@ -48,8 +49,14 @@ def missing() -> InputError:
     return InputError("no such bus", field="--channel", value="can9")
 
 
-def port_on(opener: Opener, lines: list[str], *, wait: bool = False) -> ReconnectingBus:
-    port = ReconnectingBus(ADDRESS, [standard_filter(0x123)], lines.append, opener)
+@pytest.fixture
+def log() -> Iterator[BusLog]:
+    with BusLog() as log:
+        yield log
+
+
+def port_on(opener: Opener, *, wait: bool = False) -> ReconnectingBus:
+    port = ReconnectingBus(ADDRESS, [standard_filter(0x123)], opener)
     port.open(wait=wait)
     return port
 
@@ -77,10 +84,10 @@ def pump(
     ],
     ids=repr,
 )
-def test_a_lost_bus_is_closed_and_opened_again_with_its_filters(error: BaseException) -> None:
+def test_a_lost_bus_is_reopened_with_its_filters(error: BaseException, log: BusLog) -> None:
     first, second = BrokenBus([FRAME, error]), BrokenBus([FRAME])
-    opener, lines = Opener(first, second), list[str]()
-    port = port_on(opener, lines)
+    opener = Opener(first, second)
+    port = port_on(opener)
     port.set_filters([standard_filter(0x55)])
     received = pump(port, 2.0, until=lambda: len(opener.at_s) == 2 and not port.is_away)
     received += pump(port, 0.1)
@@ -89,18 +96,15 @@ def test_a_lost_bus_is_closed_and_opened_again_with_its_filters(error: BaseExcep
     assert opener.filters[1] == [standard_filter(0x55)]
     assert (port.losses, port.is_away) == (1, False)
     assert FIRST_PAUSE_S <= port.away_s < 1.0
-    assert len(lines) == 1  # that it is back comes a second later
-    assert lines[0].startswith("warning: socketcan can9: receiving failed: ")
-    assert pump(port, 1.2) == []
-    assert len(lines) == 2
-    assert lines[1].startswith("socketcan can9: back after 0.")
+    assert log.events == ["bus.lost", "bus.back"]
+    assert log.lines[0].startswith("socketcan can9: receiving failed: ")
+    assert log.lines[1].startswith("socketcan can9: back after 0.")
     port.close()
     assert second.closed == 1
 
 
-def test_a_send_that_fails_is_a_loss_too_and_frames_meanwhile_are_counted() -> None:
-    opener, lines = Opener(BrokenBus([], sending=network_down()), missing()), list[str]()
-    port = port_on(opener, lines)
+def test_a_failed_send_is_a_loss_and_later_frames_are_counted(log: BusLog) -> None:
+    port = port_on(Opener(BrokenBus([], sending=network_down()), missing()))
     port.post(FRAME)
     assert (port.losses, port.unsent) == (1, 1)
     began_s = time.monotonic()
@@ -108,24 +112,24 @@ def test_a_send_that_fails_is_a_loss_too_and_frames_meanwhile_are_counted() -> N
         port.post(FRAME)
     assert time.monotonic() - began_s < 0.1
     assert port.unsent == 1001
-    assert "sending failed" in lines[0]
+    assert "sending failed" in log.lines[0]
     port.close()
 
 
-def test_one_bad_packet_is_no_loss() -> None:
-    port = port_on(Opener(BrokenBus([unpack_error(), FRAME])), [])
+def test_a_bad_packet_is_no_loss() -> None:
+    port = port_on(Opener(BrokenBus([unpack_error(), FRAME])))
     assert len(pump(port, 0.1)) == 1
     assert (port.garbled, port.losses) == (1, 0)
 
 
-def test_pauses_grow_to_a_ceiling_and_start_small_after_a_steady_time(
+def test_pauses_grow_to_a_limit_and_reset_when_steady(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(lasting, "LONGEST_PAUSE_S", 0.4)
-    monkeypatch.setattr(lasting, "STEADY_S", 0.3)
+    monkeypatch.setattr(reconnect, "LONGEST_PAUSE_S", 0.4)
+    monkeypatch.setattr(reconnect, "STEADY_S", 0.3)
     last = BrokenBus([])
     opener = Opener(BrokenBus([network_down()]), *(missing() for _ in range(6)), last)
-    port = port_on(opener, [])
+    port = port_on(opener)
     pump(port, 4.0, until=lambda: not port.is_away and len(opener.at_s) == 8)
     pauses = [b - a for a, b in itertools.pairwise(opener.at_s)]
     wanted = [0.05, 0.1, 0.2, 0.4, 0.4, 0.4, 0.4]
@@ -138,19 +142,19 @@ def test_pauses_grow_to_a_ceiling_and_start_small_after_a_steady_time(
     port.close()
 
 
-def test_a_bus_that_opens_and_fails_at_once_costs_little_and_says_little() -> None:
-    opener, lines = Opener(lambda: BrokenBus([network_down()])), list[str]()
-    port = port_on(opener, lines)
+def test_a_flapping_bus_costs_and_logs_little(log: BusLog) -> None:
+    port = port_on(Opener(lambda: BrokenBus([network_down()])))
     cpu_s = time.process_time()
     pump(port, 3.0)
     assert time.process_time() - cpu_s < 0.3
     # 0.05 + 0.1 + 0.2 + 0.4 + 0.8 s, then once a second.
     assert 4 <= port.losses <= 8
-    assert len(lines) <= 4
+    assert log.events.count("bus.lost") <= 4
+    assert log.events.count("bus.back") <= 4
     port.close()
 
 
-def test_a_driver_that_hangs_while_opening_stops_nothing() -> None:
+def test_a_driver_that_hangs_while_opening_blocks_nothing() -> None:
     free = threading.Event()
     late = BrokenBus([])
 
@@ -158,7 +162,7 @@ def test_a_driver_that_hangs_while_opening_stops_nothing() -> None:
         free.wait(10.0)
         return late
 
-    port = port_on(Opener(BrokenBus([network_down()]), hang), [])
+    port = port_on(Opener(BrokenBus([network_down()]), hang))
     pump(port, 0.2)
     began_s = time.monotonic()
     assert port.receive(0.05) is None
@@ -169,15 +173,13 @@ def test_a_driver_that_hangs_while_opening_stops_nothing() -> None:
     end_s = time.monotonic() + 2.0
     while not late.closed and time.monotonic() < end_s:
         time.sleep(0.01)
-    assert late.closed == 1  # nobody wants it any more
+    assert late.closed == 1  # abandoned
 
 
-def test_a_bus_that_is_not_there_at_the_start() -> None:
-    lines = list[str]()
+def test_a_bus_that_is_missing_at_the_start(log: BusLog) -> None:
     with pytest.raises(InputError, match="no such bus"):
-        port_on(Opener(missing()), lines)
-    opener = Opener(missing(), missing(), BrokenBus([FRAME]))
-    port = port_on(opener, lines, wait=True)
+        port_on(Opener(missing()))
+    port = port_on(Opener(missing(), missing(), BrokenBus([FRAME])), wait=True)
     assert port.is_away
     assert port.trouble.startswith("bus away for ")
     port.post(FRAME)
@@ -185,33 +187,33 @@ def test_a_bus_that_is_not_there_at_the_start() -> None:
     received += pump(port, 0.1)
     assert len(received) == 1
     assert (port.losses, port.unsent, port.trouble) == (0, 1, "")
-    assert "waiting for it" in lines[0]
-    pump(port, 1.2)
-    assert "there after" in lines[1]
+    assert log.events == ["bus.missing", "bus.back"]
+    assert "waiting for it" in log.lines[0]
+    assert "there after" in log.lines[1]
     port.close()
 
 
-def test_what_no_waiting_brings_ends_at_once() -> None:
+def test_a_missing_driver_is_not_waited_for() -> None:
     opener = Opener(DriverMissingError("a library for this interface is missing"))
     with pytest.raises(InputError, match="library"):
-        port_on(opener, [], wait=True)
+        port_on(opener, wait=True)
     with pytest.raises(DriverMissingError):
         open_bus(BusAddress("pcan", "PCAN_USBBUS1"))
 
 
-def test_while_it_is_away_it_is_mentioned_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lasting, "REMIND_S", 1.5)
-    monkeypatch.setattr(lasting, "LONGEST_PAUSE_S", 0.1)
-    lines = list[str]()
-    port = port_on(Opener(BrokenBus([network_down()]), missing()), lines)
+def test_an_absent_bus_is_logged_at_growing_intervals(
+    monkeypatch: pytest.MonkeyPatch, log: BusLog
+) -> None:
+    monkeypatch.setattr(reconnect, "LONGEST_PAUSE_S", 0.1)
+    port = port_on(Opener(BrokenBus([network_down()]), missing()))
     pump(port, 3.6)
-    assert 3 <= len(lines) <= 4  # lost; 1.5 s; 3 s
-    assert "away for 2 s (--channel: no such bus" in lines[1]
+    assert log.events == ["bus.lost", "bus.away", "bus.away"]  # after 1 and 2 s, then 4 s
+    assert "away for 2 s (--channel: no such bus" in log.lines[2]
     port.close()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="counts /proc/self/fd")
-def test_opening_in_vain_for_long_leaks_nothing() -> None:
+def test_failed_attempts_leak_nothing() -> None:
     nowhere = BusAddress("socketcan", "nosuch0")
     before = threading.active_count()
     for _ in range(300):
@@ -221,35 +223,34 @@ def test_opening_in_vain_for_long_leaks_nothing() -> None:
     assert threading.active_count() < before + 20
 
 
-def test_bus_off_is_told_and_so_is_its_end() -> None:
+def test_bus_off_and_its_end_are_logged(log: BusLog) -> None:
     def error_frame(classes: int) -> can.Message:
         return can.Message(
             arbitration_id=classes, is_extended_id=False, is_error_frame=True, data=bytes(8)
         )
 
-    bus, lines = BrokenBus([error_frame(0x080), error_frame(0x040)]), list[str]()
-    port = port_on(Opener(bus), lines)
+    bus = BrokenBus([error_frame(0x080), error_frame(0x040)])
+    port = port_on(Opener(bus))
     assert pump(port, 0.1) == []
     assert port.error_frames == 2
     assert port.error_kinds == {"bus_error": 1, "bus_off": 1}
     assert port.is_off
     assert port.trouble == "bus-off"
-    assert "restart-ms" in lines[0]
+    assert "restart-ms" in log.lines[0]
     bus._receiving.append(error_frame(0x100))
     pump(port, 0.1)
     assert not port.is_off
     bus._receiving += [error_frame(0x040), FRAME]
-    assert len(pump(port, 0.1)) == 1  # who receives is not off, whatever was told
+    assert len(pump(port, 0.1)) == 1  # a controller that receives is not off
     assert not port.is_off
-    pump(port, 1.1)
-    assert "no longer bus-off" in lines[-1]
+    assert log.events[:2] == ["bus.off", "bus.on"]
     assert port.losses == 0
 
 
 def test_a_full_transmit_queue_never_waits_and_keeps_order() -> None:
     full = can.CanOperationError("Failed to transmit: No buffer space", errno.ENOBUFS)
     bus = BrokenBus([FRAME] * 50, sending=full)
-    port = port_on(Opener(bus), [])
+    port = port_on(Opener(bus))
     began_s = time.monotonic()
     for number in range(10):
         port.post(can.Message(arbitration_id=number, is_extended_id=False), within_s=0.15)
@@ -267,5 +268,5 @@ def test_a_full_transmit_queue_never_waits_and_keeps_order() -> None:
     assert (port.unsent, len(bus.sent), port.losses) == (3, 10, 0)
 
 
-def test_the_ceiling_is_short_enough_for_a_pack_under_load() -> None:
-    assert LONGEST_PAUSE_S < 2.0  # else every loss would be a gap for the delay line
+def test_the_longest_pause_is_shorter_than_a_current_gap() -> None:
+    assert LONGEST_PAUSE_S < 2.0  # otherwise every loss would be a gap for the delay line

@@ -1,4 +1,4 @@
-"""Frames → samples."""
+"""Decoding of frames into samples."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import LEAF_RULE
-from cangauge.bus.vehicle import EXTENDED, Vehicle, load_vehicle
+from cangauge.bus.vehicle import EXTENDED, Vehicle
 from cangauge.estimate.validity import Sample
 
 CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID, SOC_ID = 0x400, 0x401, 0x402, 0x403
@@ -19,12 +19,12 @@ CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID, SOC_ID = 0x400, 0x401, 0x402, 0x403
 
 @pytest.fixture(scope="module")
 def generic() -> Vehicle:
-    return load_vehicle("generic")
+    return Vehicle.load("generic")
 
 
 @pytest.fixture(scope="module")
 def leaf() -> Vehicle:
-    return load_vehicle("leaf_ze0")
+    return Vehicle.load("leaf_ze0")
 
 
 def frames_of(
@@ -37,8 +37,8 @@ def frames_of(
     return frames
 
 
-def feed(assembler: SampleDecoder, frames: list[can.Message]) -> list[Sample]:
-    return [sample for frame in frames if (sample := assembler.handle(frame)) is not None]
+def feed(decoder: SampleDecoder, frames: list[can.Message]) -> list[Sample]:
+    return [sample for frame in frames if (sample := decoder.handle(frame)) is not None]
 
 
 def leaf_frame(hex_data: str, time_s: float, counter: int) -> can.Message:
@@ -47,13 +47,13 @@ def leaf_frame(hex_data: str, time_s: float, counter: int) -> can.Message:
 
 
 def test_every_sample_arrives_with_its_temperature_and_soc(generic: Vehicle) -> None:
-    assembler = SampleDecoder(generic)
-    samples = feed(assembler, frames_of(generic))
+    decoder = SampleDecoder(generic)
+    samples = feed(decoder, frames_of(generic))
     assert [each.current_a for each in samples] == [float(n) for n in range(10)]
     assert all(each.temperature_c == 20.0 for each in samples)
-    assert assembler.reference_soc_pct == 50.0
-    assert assembler.counters.samples == 10
-    assert assembler.last_update_s == {
+    assert decoder.reference_soc_pct == 50.0
+    assert decoder.statistics.samples == 10
+    assert {role: each.latest_s for role, each in decoder.health.items()} == {
         "current": 0.9,
         "voltage": 0.9,
         "temperature": 0.0,
@@ -61,48 +61,48 @@ def test_every_sample_arrives_with_its_temperature_and_soc(generic: Vehicle) -> 
     }
 
 
-def test_only_wanted_ids_are_looked_at(generic: Vehicle) -> None:
-    assembler = SampleDecoder(generic)
-    assert assembler.wanted_ids == (CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID, SOC_ID)
+def test_unwanted_ids_are_skipped(generic: Vehicle) -> None:
+    decoder = SampleDecoder(generic)
+    assert generic.wanted_ids == (CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID, SOC_ID)
     strange = can.Message(arbitration_id=0x123, is_extended_id=False, data=b"\xff" * 8)
-    assert assembler.handle(strange) is None
-    assert assembler.counters.frames == 1
-    assert assembler.counters.wanted == 0
+    assert decoder.handle(strange) is None
+    assert decoder.statistics.frames == 1
+    assert decoder.statistics.wanted == 0
 
 
 @pytest.mark.parametrize("kind", ["is_extended_id", "is_remote_frame", "is_error_frame"])
-def test_extended_remote_and_error_frames_are_not_taken(generic: Vehicle, kind: str) -> None:
-    assembler = SampleDecoder(generic)
+def test_extended_remote_and_error_frames_are_skipped(generic: Vehicle, kind: str) -> None:
+    decoder = SampleDecoder(generic)
     for frame in frames_of(generic):
         setattr(frame, kind, True)
-        assert assembler.handle(frame) is None
-    assert assembler.flush() is None
-    assert assembler.counters.wanted == 0
-    assert assembler.counters.ignored == (0 if kind == "is_extended_id" else 22)
+        assert decoder.handle(frame) is None
+    assert decoder.flush() is None
+    assert decoder.statistics.wanted == 0
+    assert decoder.statistics.ignored == (0 if kind == "is_extended_id" else 22)
 
 
 def test_damaged_and_short_frames_are_refused_and_counted(generic: Vehicle) -> None:
     frames = [frame for frame in frames_of(generic) if frame.arbitration_id == CURRENT_ID]
     frames[3].data[0] ^= 0x10
     frames[5].data = frames[5].data[:-1]
-    assembler = SampleDecoder(generic)
-    samples = feed(assembler, frames)
-    last = assembler.flush()
+    decoder = SampleDecoder(generic)
+    samples = feed(decoder, frames)
+    last = decoder.flush()
     assert last is not None
     currents = [each.current_a for each in (*samples, last)]
     assert currents == [0.0, 1.0, 2.0, 4.0, 6.0, 7.0, 8.0, 9.0]
-    fate = assembler.counters.messages[CURRENT_ID]
+    fate = decoder.statistics.messages[CURRENT_ID]
     assert (fate.crc_errors, fate.short) == (1, 1)
-    # The short one is missing from the counters' view; the damaged one is not counted again.
+    # The short one counts as lost for the alive counter; the damaged one does not.
     assert (fate.counter_jumps, fate.frames_lost) == (1, 1)
 
 
 def test_repeated_frames_are_refused(generic: Vehicle) -> None:
     frames = frames_of(generic, 5)
-    assembler = SampleDecoder(generic)
-    samples = feed(assembler, [frame for frame in frames for _ in range(2)])
+    decoder = SampleDecoder(generic)
+    samples = feed(decoder, [frame for frame in frames for _ in range(2)])
     assert [each.current_a for each in samples] == [0.0, 1.0, 2.0, 3.0, 4.0]
-    assert assembler.counters.counter_repeats == len(frames)
+    assert decoder.statistics.counter_repeats == len(frames)
 
 
 def test_neighbours_of_lost_frames_are_used(generic: Vehicle) -> None:
@@ -111,21 +111,21 @@ def test_neighbours_of_lost_frames_are_used(generic: Vehicle) -> None:
         for frame in frames_of(generic)
         if not (0.25 < frame.timestamp < 0.55 and frame.arbitration_id in {CURRENT_ID, VOLTAGE_ID})
     ]
-    assembler = SampleDecoder(generic)
-    samples = feed(assembler, frames)
+    decoder = SampleDecoder(generic)
+    samples = feed(decoder, frames)
     assert [each.current_a for each in samples] == [0.0, 1.0, 2.0, 6.0, 7.0, 8.0, 9.0]
-    assert assembler.counters.counter_jumps == 2
-    assert assembler.counters.frames_lost == 6
+    assert decoder.statistics.counter_jumps == 2
+    assert decoder.statistics.frames_lost == 6
 
 
-def test_longer_frames_are_read_by_their_first_bytes(generic: Vehicle) -> None:
+def test_longer_frames_are_cut_to_the_messages_length(generic: Vehicle) -> None:
     frames = frames_of(generic, 3)
     for frame in frames:
         frame.data += b"\x00\x00"
     assert len(feed(SampleDecoder(generic), frames)) == 3
 
 
-def test_missing_voltage_keeps_the_charge(generic: Vehicle) -> None:
+def test_currents_without_voltage_are_kept(generic: Vehicle) -> None:
     frames = [
         frame
         for frame in frames_of(generic)
@@ -136,113 +136,111 @@ def test_missing_voltage_keeps_the_charge(generic: Vehicle) -> None:
     assert [math.isnan(each.voltage_v) for each in samples] == [3 <= n <= 6 for n in range(10)]
 
 
-def test_temperature_holds_until_its_time_out(generic: Vehicle) -> None:
-    assembler = SampleDecoder(generic)
+def test_temperature_is_used_until_its_time_out(generic: Vehicle) -> None:
+    decoder = SampleDecoder(generic)
     frames = [
         frame
         for frame in frames_of(generic, 25, step_s=1.0)
         if frame.arbitration_id != TEMPERATURE_ID or frame.timestamp == 2.0
     ]
-    samples = feed(assembler, frames)
+    samples = feed(decoder, frames)
     known = [each.time_s for each in samples if each.temperature_c == 20.0]
     assert known == [float(n) for n in range(2, 13)]
 
 
 def test_reference_soc_is_nan_when_it_is_old(generic: Vehicle) -> None:
-    assembler = SampleDecoder(generic)
-    assert math.isnan(assembler.reference_soc_pct)
+    decoder = SampleDecoder(generic)
+    assert math.isnan(decoder.reference_soc_pct)
     frames = frames_of(generic, 15, step_s=1.0)
-    feed(assembler, [f for f in frames if f.arbitration_id != SOC_ID or f.timestamp == 0.0])
-    assert math.isnan(assembler.reference_soc_pct)
-    feed(assembler, frames_of(generic, 1))
-    assert assembler.reference_soc_pct == 50.0
+    feed(decoder, [f for f in frames if f.arbitration_id != SOC_ID or f.timestamp == 0.0])
+    assert math.isnan(decoder.reference_soc_pct)
+    feed(decoder, frames_of(generic, 1))
+    assert decoder.reference_soc_pct == 50.0
 
 
 def test_fixed_temperature_needs_no_frame() -> None:
-    vehicle = load_vehicle("generic", temperature_c=12.5)
-    assembler = SampleDecoder(vehicle)
-    assert TEMPERATURE_ID not in assembler.wanted_ids
-    samples = feed(assembler, frames_of(load_vehicle("generic"), 20, step_s=5.0))
+    vehicle = Vehicle.load("generic", temperature_c=12.5)
+    decoder = SampleDecoder(vehicle)
+    assert TEMPERATURE_ID not in vehicle.wanted_ids
+    samples = feed(decoder, frames_of(Vehicle.load("generic"), 20, step_s=5.0))
     assert {each.temperature_c for each in samples} == {12.5}
 
 
 def test_a_log_that_starts_again_is_decoded_again(generic: Vehicle) -> None:
     frames = frames_of(generic, 16)  # so that the counters go on
-    assembler = SampleDecoder(generic)
-    first = feed(assembler, frames)
-    second = feed(assembler, frames_of(generic, 16))
+    decoder = SampleDecoder(generic)
+    first = feed(decoder, frames)
+    second = feed(decoder, frames_of(generic, 16))
     assert first == second
-    assert assembler.counters.time_reversals > 0
+    assert decoder.statistics.time_reversals > 0
 
 
-def test_old_values_do_not_hold_for_ever_when_time_starts_again(generic: Vehicle) -> None:
-    assembler = SampleDecoder(generic)
+def test_old_values_time_out_after_a_step_back_in_time(generic: Vehicle) -> None:
+    decoder = SampleDecoder(generic)
     late = frames_of(generic, 1)
     for frame in late:
         frame.timestamp = 5000.0
-    feed(assembler, late)
+    feed(decoder, late)
     frames = frames_of(generic, 16, step_s=1.0)[8:]
     fast = [frame for frame in frames if frame.arbitration_id in {CURRENT_ID, VOLTAGE_ID}]
-    samples = feed(assembler, fast)
+    samples = feed(decoder, fast)
     assert samples[0].time_s == 2.0
     assert [each.time_s for each in samples if each.temperature_c == 20.0] == [
         float(n) for n in range(2, 13)
     ]
-    assert math.isnan(assembler.reference_soc_pct)
+    assert math.isnan(decoder.reference_soc_pct)
 
 
-def test_leaf_turns_the_sign_and_refuses_codes_of_wake_up(leaf: Vehicle) -> None:
-    assembler = SampleDecoder(leaf)
+def test_leaf_inverts_the_sign_and_refuses_wake_up_codes(leaf: Vehicle) -> None:
+    decoder = SampleDecoder(leaf)
     both = leaf_frame("7FE0FFC000000000", 0.00, 0)
     voltage = leaf_frame("FFE0FFC000000000", 0.01, 1)
     good = leaf_frame("FDA0BAAA00000000", 0.02, 2)
-    assert assembler.handle(both) is None
-    without = assembler.handle(voltage)
+    assert decoder.handle(both) is None
+    without = decoder.handle(voltage)
     assert without is not None
     assert without.current_a == 0.5
     assert math.isnan(without.voltage_v)
-    sample = assembler.handle(good)
+    sample = decoder.handle(good)
     assert sample is not None
     assert (sample.time_s, sample.current_a, sample.voltage_v) == (0.02, 9.5, 373.0)
     assert math.isnan(sample.temperature_c)
-    assert assembler.counters.not_available == 3
-    assert assembler.counters.current_unpaired == 1
-    assert assembler.last_update_s["voltage"] == 0.02
+    assert decoder.statistics.not_available == 3
+    assert decoder.statistics.current_unpaired == 1
+    assert decoder.health["voltage"].latest_s == 0.02
 
 
-def test_leaf_takes_the_average_of_the_multiplexed_temperatures(leaf: Vehicle) -> None:
-    assembler = SampleDecoder(leaf)
+def test_leaf_uses_the_average_multiplexed_temperature(leaf: Vehicle) -> None:
+    decoder = SampleDecoder(leaf)
     for n, payload in enumerate(("405068003A000000", "805656003CD40002", "C06060003AD40000")):
         data = bytes.fromhex(payload)
-        assembler.handle(
+        decoder.handle(
             can.Message(timestamp=0.1 * n, arbitration_id=0x5C0, is_extended_id=False, data=data)
         )
-    sample = assembler.handle(leaf_frame("FDA0BAAA00000000", 0.3, 2))
+    sample = decoder.handle(leaf_frame("FDA0BAAA00000000", 0.3, 2))
     assert sample is not None
     assert sample.temperature_c == 0x56 / 2 - 40
-    assert assembler.last_update_s["temperature"] == 0.1
+    assert decoder.health["temperature"].latest_s == 0.1
 
 
-def test_an_extended_id_is_wanted_where_the_dbc_means_it(generic: Vehicle) -> None:
+def test_an_extended_id_of_the_dbc_is_wanted(generic: Vehicle) -> None:
     signal = replace(generic.current, key=0x18FF0001 | EXTENDED)
     messages = {**generic.messages, signal.key: generic.messages[CURRENT_ID]}
     vehicle = replace(generic, current=signal, messages=messages)
-    assembler = SampleDecoder(vehicle)
-    assert assembler.wanted_ids[0] == 0x18FF0001
+    decoder = SampleDecoder(vehicle)
+    assert vehicle.wanted_ids[0] == 0x18FF0001
     assert vehicle.filters[0] == {
         "can_id": 0x18FF0001,
         "can_mask": 0x1FFFFFFF,
         "extended": True,
     }
-    assert len(feed(assembler, frames_of(vehicle))) == 10
+    assert len(feed(decoder, frames_of(vehicle))) == 10
 
 
-def test_counters_as_plain_values(generic: Vehicle) -> None:
-    assembler = SampleDecoder(generic)
-    feed(assembler, frames_of(generic))
-    told = assembler.counters.to_dict()
-    assert told["samples"] == 10
-    assert told["wanted"] == told["frames"] == 22
-    messages = told["messages"]
-    assert isinstance(messages, dict)
-    assert messages["0x400"]["wanted"] == 10
+def test_totals_are_sums_over_the_messages(generic: Vehicle) -> None:
+    decoder = SampleDecoder(generic)
+    feed(decoder, frames_of(generic))
+    statistics = decoder.statistics
+    assert statistics.samples == 10
+    assert statistics.wanted == statistics.frames == 22
+    assert statistics.messages[CURRENT_ID].wanted == 10
