@@ -25,7 +25,7 @@ from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.charge import capacity_from_reference
 from cangauge.model.voltage_model import VoltageModel
-from cangauge.validation.cases import (
+from cangauge.validation.recordings import (
     LG_25C,
     LG_CAPACITY_AH,
     LG_PARALLEL,
@@ -33,7 +33,7 @@ from cangauge.validation.cases import (
     summer_held_out,
     summer_training,
 )
-from cangauge.validation.twin.recorded import scaled_to_pack, with_start
+from cangauge.validation.twin.injection import scaled_to_pack, with_initial_soc
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 COLDER_AND_WARMER = ("0", "10", "40")
@@ -109,7 +109,8 @@ def error_v(logs: Sequence[Log], options: FitOptions, model: VoltageModel) -> fl
 
 
 def _pack(path: Path) -> Log:
-    return with_start(scaled_to_pack(read_log(path), series=LG_SERIES, parallel=LG_PARALLEL), 100.0)
+    pack = scaled_to_pack(read_log(path), series=LG_SERIES, parallel=LG_PARALLEL)
+    return with_initial_soc(pack, 100.0)
 
 
 if __name__ == "__main__":

@@ -10,8 +10,8 @@ alter      changes of values and frames, pure and seeded
 catalogue  the named faults (`catalogue_frames`, `_service`, `_state`, `_bus`)
 line       a bus of its own for each fault: UDP multicast, or a vcan interface
 process    the service's process
-stage      one service on one line, with what a fault may do to it
+bench      one service on one line, with what a fault may do to it
 run        plays one fault, watches what is published
-judge      what was seen → passed or not, and why
+judge      what was observed → passed or not, and why
 table      rows for people, JSON for programs
 """

@@ -1,9 +1,9 @@
-"""Inject faults on a live bus and print a table of what came of each.
+"""Inject faults on a live bus and print a table of the results.
 
     make faults
     PYTHONPATH=benchmarks python -m faults [--only NAME]… [--bus udp|vcan|both] [--json]
 
-Says how long it will take before it begins. Exit status 1 if a fault was not survived, or nothing
+Prints the estimated time first. Exit status 1 if a fault failed, or nothing
 could be judged.
 """
 
@@ -25,11 +25,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from cangauge.bus.open import has_socketcan
 from faults.catalogue import EVERYTHING, ON_ANY_BUS, ON_UDP, ON_VCAN
+from faults.criteria import Row, show
 from faults.fault import Fault
 from faults.line import udp, vcan
 from faults.process import prepare
-from faults.schedule import Jobs, run_all, seconds
-from faults.table import Row, show
+from faults.run import Jobs, run_all, seconds
 
 ERR = Console(stderr=True)
 
@@ -39,7 +39,7 @@ def main() -> int:
     options = _options()
     if options.list:
         for name, fault in EVERYTHING.items():
-            sys.stdout.write(f"{name}: {fault.done}\n")
+            sys.stdout.write(f"{name}: {fault.description}\n")
         return 0
     chosen = _chosen(options.only)
     prepare()
@@ -63,17 +63,17 @@ def main() -> int:
             "seed": options.seed,
             "faults": len({row.name for row in rows}),
             "failed": len(failed),
-            "left_out": sum(row.verdict is None for row in rows),
+            "skipped": sum(row.verdict is None for row in rows),
             "rows": [row.as_json() for row in rows],
         }
         sys.stdout.write(json.dumps(found) + "\n")
     else:
         console = Console(width=max(Console().width, 170))
         show(rows, console)
-        left_out = sum(row.verdict is None for row in rows)
+        skipped = sum(row.verdict is None for row in rows)
         console.print(
-            f"{len(rows)} runs: {len(rows) - len(failed) - left_out} passed, {len(failed)} failed,"
-            f" {left_out} left out; seed {options.seed}"
+            f"{len(rows)} runs: {len(rows) - len(failed) - skipped} passed, {len(failed)} failed,"
+            f" {skipped} skipped; seed {options.seed}"
         )
     return 1 if failed or not judged else 0
 
@@ -118,7 +118,9 @@ def _run(bus: str, faults: list[Fault], options: argparse.Namespace) -> list[Row
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
                TimeElapsedColumn())  # fmt: skip
     with Progress(*columns, console=ERR) as progress:
-        task = progress.add_task(bus, total=len(able) + len({fault.alike for fault in able}))
+        task = progress.add_task(
+            bus, total=len(able) + len({fault.reference_key for fault in able})
+        )
 
         def over(name: str) -> None:
             progress.update(task, advance=1, description=f"{bus}: {name}")
@@ -127,7 +129,7 @@ def _run(bus: str, faults: list[Fault], options: argparse.Namespace) -> list[Row
 
         lines = udp if bus == "udp" else vcan
         done = run_all(able, lines, jobs, options.seed, progress=over)
-    return [Row.of(each.fault, bus, each.verdict, each.why_not) for each in done] + rows
+    return [Row.of(each.fault, bus, each.verdict, each.reason) for each in done] + rows
 
 
 def _able(bus: str, faults: list[Fault]) -> tuple[list[Fault], list[Row]]:

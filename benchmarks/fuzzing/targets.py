@@ -38,7 +38,7 @@ from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model, load_model
 from cangauge.service.config import load_config
 from cangauge.service.pipeline import EstimateStream
-from cangauge.validation.twin.day import read_speed
+from cangauge.validation.twin.drive import read_speed
 from fuzzing import corpus
 from fuzzing.mutate import json_bytes, mutate, mutate_json
 from fuzzing.target import FindingError, Target, refusable
