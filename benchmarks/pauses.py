@@ -1,12 +1,12 @@
-"""Real trips with a night between: the SoC is kept where the car was parked, found where not.
+"""Real trips with a night in between: SoC kept if the car was parked, found anew if not.
 
     python benchmarks/pauses.py --data FOLDER [--hours 8] [--json]
 
 Model and capacity come from the odd summer trips of a BMW i3, as in `real_trips`. Each odd trip is
-driven (SoC given at its start, σ 1 %), then nobody sees the car for some hours, then the next even
-trip is judged against the car's own SoC: once by the estimator that went through the pause, once by
-one that begins with the first voltages and knows nothing else. How long the cars really stood is
-not known; what the car's SoC did in between is, and says which were charged.
+estimated (initial SoC given, σ 1 %); after an unobserved interval of some hours the next even trip
+is compared with the car's own SoC: once by the same estimator, once by a new one that starts from
+the first voltages. The true duration of the pauses is unknown; the change of the car's SoC shows
+which cars were charged.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from real_trips import DATA, TEST, TRAINING, identify, read_trips
 
 AT_S = (10.0, 120.0, 600.0)
 PARKED_PCT = 2.0
-"""A smaller change of the car's SoC is that of a parked car [%]."""
+"""Largest change of the SoC of a parked car [%]."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Pause:
 
     @property
     def was_parked(self) -> bool:
-        """Whether the car's SoC stayed what it was."""
+        """Whether the car's SoC is unchanged."""
         return abs(self.after_pct - self.before_pct) < PARKED_PCT
 
 
@@ -68,7 +68,7 @@ def errors(
 
 
 def judge(first: Log, second: Log, model: Model, hours: float) -> Pause:
-    """Drive one trip, wait, drive the next."""
+    """Estimate one trip, a pause and the next trip."""
     soc = [trip.soc_pct[np.isfinite(trip.soc_pct)] for trip in (first, second)
            if trip.soc_pct is not None]  # fmt: skip
     through = Estimator(model, EstimatorSettings(initial_soc_pct=float(soc[0][0])))
@@ -83,7 +83,7 @@ def judge(first: Log, second: Log, model: Model, hours: float) -> Pause:
 
 def table_of(pauses: list[Pause], hours: float) -> Table:
     """Return all pauses as a table."""
-    table = Table(title=f"after {hours:g} h unseen: error of the SoC [%]", title_justify="left")
+    table = Table(title=f"after {hours:g} h unobserved: error of the SoC [%]", title_justify="left")
     for name in ("trip", "car's SoC", "judged"):
         table.add_column(name)
     for when in ("10 s", "2 min", "10 min", "end"):
@@ -110,7 +110,7 @@ def table_of(pauses: list[Pause], hours: float) -> Table:
 
 
 def main() -> None:
-    """Run, and print a table or JSON."""
+    """Run the comparison."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n", maxsplit=1)[0])
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--hours", type=float, default=8.0)

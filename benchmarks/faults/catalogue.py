@@ -94,8 +94,8 @@ LOSS = [
 TIMES = [
     Fault("duplicate", "every frame twice", frames=duplicate()),
     Fault("duplicate at times", "20 % of the frames five times", frames=duplicate(0.2, 4)),
-    Fault("swap", "every two successive samples exchanged", frames=swap_neighbours()),
-    Fault("reorder", "frames of each half second in random order", frames=shuffle(0.5)),
+    Fault("swap", "successive samples swapped pairwise", frames=swap_neighbours()),
+    Fault("reorder", "frames of each 0.5 s in random order", frames=shuffle(0.5)),
     Fault("jitter", "every frame 0–80 ms late", frames=delay(0.0, 0.08)),
     Fault("jitter, real time", "every frame 0–80 ms late", REAL, frames=delay(0.0, 0.08)),
     Fault("voltage late", "voltage 150 ms after its current", frames=delay(0.15, 0.0, VOLTAGE)),
@@ -104,13 +104,13 @@ TIMES = [
     Fault("mixed rates", "current at 100 Hz, voltage at 1 Hz", frames=faster_current()),
     Fault(
         "burst of others",
-        "4,000 foreign frames/s besides (bus capacity)",
+        "4,000 foreign frames/s added (bus capacity)",
         REAL,
         frames=flood(foreign),
     ),
     Fault(
         "burst of wanted ids",
-        "1,000 frames/s of noise under the pack's ids besides",
+        "1,000 frames/s of random data with the pack's ids added",
         REAL,
         frames=flood(wanted_noise, 1000.0),
     ),
@@ -118,17 +118,17 @@ TIMES = [
 
 
 PROTECTION = [
-    Fault("CRC wrong, all", "a bit turned in every frame", frames=crc_wrong()),
-    Fault("CRC wrong, some", "a bit turned in 30 % of the frames", frames=crc_wrong(0.3)),
-    Fault("CRC wrong, current", "a bit turned in every current", REAL,
+    Fault("CRC wrong, all", "a bit flipped in every frame", frames=crc_wrong()),
+    Fault("CRC wrong, some", "a bit flipped in 30 % of the frames", frames=crc_wrong(0.3)),
+    Fault("CRC wrong, current", "a bit flipped in every current frame", REAL,
           frames=crc_wrong(1.0, CURRENT)),
     Fault("counter stuck", "every frame with counter 5 and a valid CRC", REAL,
           frames=counter_stuck()),
     Fault("counter jumps", "20 % of the counters random, CRC valid", frames=counter_jumps()),
     Fault("DLC short", "frames of 3 bytes", frames=cut(3)),
     Fault("DLC 0", "frames without data", frames=cut(0)),
-    Fault("DLC long", "frames of 8 bytes, the first ones right", frames=lengthened()),
-    Fault("wrong id", "all frames under an id that is one higher", REAL, frames=each(
+    Fault("DLC long", "frames padded to 8 bytes", frames=lengthened()),
+    Fault("wrong id", "all frames with another id", REAL, frames=each(
         lambda event, _v, _r: [event.bad(arbitration_id=event.frame.arbitration_id + 0x10)])),
     Fault("extended id", "all frames with extended ids", REAL,
           frames=as_frame(is_extended_id=True)),
@@ -139,10 +139,11 @@ PROTECTION = [
 
 VALUES = [
     *[
-        Fault(f"{role} not available", "its code, CRC valid", frames=not_available(role))
+        Fault(f"{role} not available", "code for not available, CRC valid",
+              frames=not_available(role))
         for role in ROLES
     ],
-    Fault("current not available, real time", "its code for that, CRC valid", REAL,
+    Fault("current not available, real time", "code for not available, CRC valid", REAL,
           frames=not_available("current")),
     Fault("current out of range", "±5,000 A, CRC valid", REAL, untrusted=CURRENT,
           values=value("current_a", lambda _a, rng: rng.choice((-5e3, 5e3)))),
@@ -160,12 +161,12 @@ VALUES = [
           values=value("voltage_v", lambda v, rng: v + _either(rng, 30, 60))),
     Fault("temperature implausibly quick", "40 K up and down", untrusted=TEMPERATURE,
           values=value("temperature_c", lambda t, rng: t + rng.choice((-40.0, 40.0)))),
-    Fault("current stuck", "held at its value, counter and CRC go on", values=stuck("current_a")),
-    Fault("voltage stuck", "held at its value, counter and CRC go on", values=stuck("voltage_v")),
-    Fault("temperature stuck", "held at its value, counter and CRC go on",
+    Fault("current stuck", "held at its value; counter and CRC valid", values=stuck("current_a")),
+    Fault("voltage stuck", "held at its value; counter and CRC valid", values=stuck("voltage_v")),
+    Fault("temperature stuck", "held at its value; counter and CRC valid",
           values=stuck("temperature_c")),
-    Fault("current dead", "0 A while it drives", values=value("current_a", lambda *_: 0.0)),
-    Fault("current turned", "the sign turned", values=value("current_a", lambda a, _r: -a)),
+    Fault("current dead", "0 A while driving", values=value("current_a", lambda *_: 0.0)),
+    Fault("current turned", "sign inverted", values=value("current_a", lambda a, _r: -a)),
     Fault("NaN", "IEEE floats: NaN in every field", vehicle="float",
           frames=both(raw(_floats(math.nan, math.nan), CURRENT),
                       raw(struct.pack("<f", math.nan), TEMPERATURE))),
@@ -196,12 +197,12 @@ CLOCK = [
     Fault("clock back 1 h", "replay clock set back by an hour", frames=clock_steps(-3600.0)),
     Fault("clock forward 1.5 s", "replay clock set forward by 1.5 s", frames=clock_steps(1.5)),
     Fault("clock forward 1 h", "replay clock set forward by an hour", frames=clock_steps(3600.0)),
-    Fault("clock damaged", "clocks an hour wrong, CRC wrong, besides", frames=clock_damaged()),
+    Fault("clock damaged", "clock frames an hour off with wrong CRC added", frames=clock_damaged()),
 ]
 
 
 ERRORS = [
-    Fault("error frames", "200 error frames/s besides: bus error, passive, bus-off", REAL,
+    Fault("error frames", "200 error frames/s added: bus error, passive, bus-off", REAL,
           frames=flood(error_frame, 200.0)),
 ]  # fmt: skip
 
@@ -217,17 +218,17 @@ INTERFACE = [
     Fault("interface down, long", "down for 15 s", REAL, plan=down_for(15.0), needs=NEEDS_VCAN),
     Fault("interface flaps", "down and up ten times in 10 s", REAL, plan=down_for(0.5, 10, 0.5),
           needs=NEEDS_VCAN),
-    Fault("adapter unplugged", "interface removed, made again after 5 s", REAL,
+    Fault("adapter unplugged", "interface removed, created again after 5 s", REAL,
           plan=unplugged_for(5.0), needs=NEEDS_VCAN),
-    Fault("queue full", "the interface takes no frame for 10 s", REAL, plan=queue_full_for(10.0),
+    Fault("queue full", "interface accepts no frame for 10 s", REAL, plan=queue_full_for(10.0),
           needs=NEEDS_VCAN),
 ]  # fmt: skip
 
 
 DISK = [
-    Fault("disk full", "state on a full file system, then killed and started again", REAL,
+    Fault("disk full", "state on a full file system; killed and started again", REAL,
           plan=small_disk("full"), needs=NEEDS_DISK),
-    Fault("state read-only", "state on a read-only file system, then killed and started again",
+    Fault("state read-only", "state on a read-only file system; killed and started again",
           REAL, plan=small_disk("read-only"), needs=NEEDS_DISK),
 ]  # fmt: skip
 
@@ -241,20 +242,20 @@ MACHINE_CLOCK = [
 
 
 RESTARTS = [
-    Fault("SIGTERM, restart", "ended and started again", REAL, plan=at(BEGIN, Bench.restart),
+    Fault("SIGTERM, restart", "stopped and started again", REAL, plan=at(BEGIN, Bench.restart),
           needs=frozenset({"state"})),
-    Fault("SIGKILL, restart", "killed at a random moment, a fresh interpreter started", REAL,
+    Fault("SIGKILL, restart", "killed at a random time, fresh interpreter started", REAL,
           plan=kills(1), needs=frozenset({"state"}), cold=True),
-    Fault("SIGKILL three times", "killed at random moments and started again", REAL, plan=kills(3),
+    Fault("SIGKILL three times", "killed at random times and started again", REAL, plan=kills(3),
           needs=frozenset({"state"})),
 ]  # fmt: skip
 
 
 CONFIG = [
     Fault("reload, good", "SIGHUP with another max_gap_s", REAL, plan=at(BEGIN, good_config)),
-    Fault("reload, unknown key", "SIGHUP with a key that is not known", REAL,
+    Fault("reload, unknown key", "SIGHUP with an unknown key", REAL,
           plan=at(BEGIN, unknown_key)),
-    Fault("reload, not TOML", "SIGHUP with a file that is no TOML", REAL,
+    Fault("reload, not TOML", "SIGHUP with a file that is not TOML", REAL,
           plan=broken_config("model = [[[\n\x00")),
     Fault("reload, empty", "SIGHUP with an empty file", REAL, plan=broken_config("")),
     Fault("reload, gone", "SIGHUP with the file removed", REAL, plan=broken_config(None)),
@@ -268,49 +269,49 @@ MACHINE = [
     Fault("paused in a burst", "SIGSTOP for 5 s, 2,000 foreign frames/s for 10 s", REAL,
           plan=during((BEGIN, Bench.pause), (0.3, Bench.resume)),
           frames=flood(foreign, 2000.0, 10.0)),
-    Fault("two services", "a second one with the same ids on the bus", REAL,
+    Fault("two services", "a second service with the same ids on the bus", REAL,
           plan=at(BEGIN, second_service)),
     Fault("slow consumer", "a listener that never reads", REAL, plan=at(BEGIN, deaf_listener)),
-    Fault("SIGUSR1, SIGPIPE", "signals that mean nothing", REAL, plan=during(
+    Fault("SIGUSR1, SIGPIPE", "signals without meaning to the service", REAL, plan=during(
         (BEGIN, lambda bench: bench.service.signal(signal.SIGPIPE)),
         (0.5, lambda bench: bench.service.signal(signal.SIGWINCH)))),
 ]  # fmt: skip
 
 
 UDP_PACKETS = [
-    Fault("garbage packets", "2,000 packets that are no frames", REAL, plan=at(BEGIN, garbage)),
+    Fault("garbage packets", "2,000 packets that are not frames", REAL, plan=at(BEGIN, garbage)),
 ]
 
 
 _STATE_DAMAGE: list[tuple[str, str, Callable[[Bench], None]]] = [
-    ("empty", "no byte in it", spoil(lambda _d, _r: b"")),
-    ("one byte", "its first byte only", spoil(lambda data, _r: data[:1])),
-    ("half", "cut in the middle", spoil(lambda data, _r: data[: len(data) // 2])),
-    ("last byte", "its last two bytes missing", spoil(lambda data, _r: data[:-2])),
-    ("zeros", "as long, all zeros", spoil(lambda data, _r: bytes(len(data)))),
-    ("noise", "as long, random bytes", spoil(lambda data, rng: rng.randbytes(len(data)))),
-    ("bit", "one bit turned", spoil(flip)),
-    ("twice", "its content twice", spoil(lambda data, _r: data + data)),
-    ("rubbish after", "random bytes after it", spoil(lambda d, rng: d + rng.randbytes(50))),
+    ("empty", "0 bytes", spoil(lambda _d, _r: b"")),
+    ("one byte", "first byte only", spoil(lambda data, _r: data[:1])),
+    ("half", "first half only", spoil(lambda data, _r: data[: len(data) // 2])),
+    ("last byte", "last two bytes missing", spoil(lambda data, _r: data[:-2])),
+    ("zeros", "zeros, same length", spoil(lambda data, _r: bytes(len(data)))),
+    ("noise", "random bytes, same length", spoil(lambda data, rng: rng.randbytes(len(data)))),
+    ("bit", "one bit flipped", spoil(flip)),
+    ("twice", "content twice", spoil(lambda data, _r: data + data)),
+    ("rubbish after", "random bytes appended", spoil(lambda d, rng: d + rng.randbytes(50))),
     ("numbers null", "every number null", spoil(numbers(lambda _n: None))),
     ("numbers NaN", "every number NaN", spoil(numbers(lambda _n: float("nan")))),
     ("numbers huge", "every number 1e308", spoil(numbers(lambda _n: 1e308))),
-    ("numbers shifted", "every number 30 more", spoil(numbers(lambda number: number + 30.0))),
+    ("numbers shifted", "every number plus 30", spoil(numbers(lambda number: number + 30.0))),
     ("numbers text", "every number a text", spoil(numbers(str))),
-    ("keys missing", "half of its keys missing", spoil(without_keys)),
+    ("keys missing", "half of the keys missing", spoil(without_keys)),
     ("not an object", "a JSON list", spoil(lambda _d, _r: b"[1, 2, 3]")),
     ("deep", "100,000 nested lists", spoil(lambda _d, _r: b"[" * 100_000)),
     ("large", "64 MB of spaces", spoil(lambda _d, _r: b" " * (64 << 20))),
     ("UTF-16", "another encoding",
      spoil(lambda data, _r: data.decode("utf-8", "replace").encode("utf-16"))),
-    ("folder", "a folder in its place", instead(Path.mkdir)),
-    ("pipe", "a pipe without a writer in its place", instead(os.mkfifo)),
+    ("folder", "a folder instead", instead(Path.mkdir)),
+    ("pipe", "a pipe without a writer instead", instead(os.mkfifo)),
     ("loop", "a link to itself", instead(lambda path: path.symlink_to(path))),
     ("gone", "removed", instead(lambda _path: None)),
 ]  # fmt: skip
 
 
-# In real time: by the replay clock a start would take half a minute of the log.
+# In real time: by the replay clock a start takes half a minute of the log.
 STATE_FILE = [
     Fault(f"state: {name}", f"state file: {done}; restarted", REAL, plan=at(0.0, do),
           needs=frozenset({"state"}))

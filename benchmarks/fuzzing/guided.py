@@ -1,4 +1,4 @@
-"""Coverage-guided fuzzing by atheris, where it is installed (`pip install atheris`)."""
+"""Coverage-guided fuzzing by atheris (optional: `pip install atheris`)."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ SEEDS = 200
 
 
 def guided(target: Target, seconds: float) -> int:
-    """Fuzz one target for so long, guided by the branches of cangauge that inputs reach.
+    """Fuzz one target for a time [s], guided by the coverage of cangauge.
 
-    atheris ends the process: with exit code 0 if nothing was found, else with a traceback and the
-    input saved as `crash-…` in the working folder.
+    atheris ends the process: with exit status 0 without a finding, else with a traceback and the
+    input saved as `crash-…` in the working directory.
     """
     try:
         import atheris  # noqa: PLC0415 - optional, and not for every Python
@@ -50,8 +50,8 @@ def guided(target: Target, seconds: float) -> int:
     return 0
 
 
-def _instrument(watch: Callable[[Any], object]) -> None:
-    """Watch the branches of every function of cangauge that is imported by now."""
+def _instrument(instrument: Callable[[Any], object]) -> None:
+    """Instrument every imported function of cangauge."""
     for name, module in list(sys.modules.items()):
         if name.split(".")[0] != "cangauge":
             continue
@@ -59,4 +59,4 @@ def _instrument(watch: Callable[[Any], object]) -> None:
         methods = [each for kind in own if isinstance(kind, type) for each in vars(kind).values()]
         for function in own + methods:
             if hasattr(function, "__code__"):
-                watch(function)
+                instrument(function)
