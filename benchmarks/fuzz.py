@@ -2,7 +2,6 @@
 
     python benchmarks/fuzz.py [--inputs 1000000] [--seed 1] [--target NAME]… [--json]
     python benchmarks/fuzz.py --again TARGET NUMBER      # one input, with its traceback
-    python benchmarks/fuzz.py --guided TARGET --minutes 10    # coverage-guided, needs atheris
 
 Inputs are mutants of small valid files of every format (bus frames, captures, logs, model and state
 files, configurations, maps, DBC files, speed traces). Each must be accepted, or refused by an
@@ -29,7 +28,6 @@ from rich.table import Table
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from fuzzing.guided import guided
 from fuzzing.supervise import CHUNK, Share, Tally, fuzz, input_of
 from fuzzing.target import Target, attempt
 from fuzzing.targets import targets
@@ -47,8 +45,6 @@ def main() -> int:
         print(repr(data[:4000]))
         print("accepted" if attempt(by_name[name], data) else "refused")
         return 0
-    if options.guided:
-        return guided(by_name[options.guided], 60.0 * options.minutes)
     chosen = [by_name[name] for name in options.target or by_name]
     shares = plan(chosen, options.inputs)
     console.print(
@@ -112,8 +108,6 @@ def _options() -> argparse.Namespace:
     )
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--again", nargs=2, metavar=("TARGET", "NUMBER"))
-    parser.add_argument("--guided", choices=names)
-    parser.add_argument("--minutes", type=float, default=10.0)
     return parser.parse_args()
 
 

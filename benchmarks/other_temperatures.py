@@ -48,7 +48,7 @@ def main() -> None:
     folder = parser.parse_args().data
     table = Table(title="Voltage error on other logs, median over the models [V]")
     for heading in (
-        "model of", "evaluated on", "models", "kt free", "kt held", "held is better in",
+        "model of", "tested on", "models", "kt free", "kt held", "held is better in",
         "kt free [V/K]", "kt held [V/K]",
     ):  # fmt: skip
         table.add_column(heading, justify="right")

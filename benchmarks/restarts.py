@@ -7,9 +7,9 @@ in-process  A 10 Hz drive is estimated by an uninterrupted service and by one th
             is written one second after the start and every 10 s of the drive, as by the service;
             one kill in ten interrupts the writing and leaves half a temporary file. Between the
             kill and the next frame 0.2 to 3 s of the drive are lost.
-process     `cangauge run` on a bus (udp_multicast) is killed by SIGKILL at random times and started
-            again, beside an uninterrupted one; the state is written every second. The time of the
-            start is that of the machine.
+process     `cangauge run` on a bus (udp_multicast) is killed by SIGKILL at random times, started
+            again, and compared with an uninterrupted one; the state is written every second. The
+            time of the start is that of the machine.
 
 For each restart: the permanent error of the counted charge (process: the step of the SoC, since the
 bus resolves the count to 0.025 % only), the charge that flowed in both directions between the last
@@ -252,7 +252,7 @@ KILLED_ID, WHOLE_ID = 0x5A0, 0x5B0
 
 
 def real_process(kills: int, seed: int, folder: Path, console: Console) -> Result:
-    """Kill `cangauge run` by SIGKILL, beside an uninterrupted one."""
+    """Kill `cangauge run` by SIGKILL, and compare with an uninterrupted one."""
     rng = np.random.default_rng(seed)
     model_path = shared_file("replay", "leaf2012_published_model.json")
     model = load_model(model_path)

@@ -28,30 +28,20 @@ from cangauge._typing import FloatArray
 from faults.fault import Fault
 
 MAX_SOC_ERROR_PCT: Final = 1.0
-
-
 MAX_SILENCE_S: Final = 3.0
-
-
 STALE_SLACK_S: Final = 0.6
 """Tolerance of the time-outs: a publishing period, and delays of a busy machine [s]."""
-
 
 TRANSPORT_S: Final = 0.5
 """Largest age of a published frame when it is received [s]."""
 
-
 RECOVERED_SHARE: Final = 0.9
 """The SoC is judged after this fraction of the run."""
-
 
 TIMEOUT_S: Final = {"current": 2.0, "voltage": 2.0, "temperature": 10.0}
 """Time-outs of the values: documented defaults of the service [s]."""
 
-
 INITIALISING, VALID, DEGRADED, INVALID = range(4)
-
-
 STATUS: Final = ("initialising", "valid", "degraded", "invalid")
 
 

@@ -11,8 +11,7 @@ from faults.bench import Bench
 from faults.frames import FAST, FrameChange, Profile, ValueChange
 
 Need = Literal["vcan", "root", "state", "alone"]
-"""An interface that can be taken down; rights of root; a service with --state; no other run
-beside it (it turns what all share)."""
+"""A vcan interface; root rights; a service with --state; no other run at the same time."""
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,6 @@ from cangauge.estimate.validity import Sample
 from cangauge.logs.read import read_log
 
 LOG: Final = "leaf2012_reconstruction_10min.parquet"
-
-
 ROLES: Final = ("current", "voltage", "temperature")
 
 
@@ -65,10 +63,7 @@ class Profile:
 # The log is at rest for 90 s and then drives hard (±130 A) until its end.
 FAST: Final = Profile("replay clock", 40.0, 430.0, (110.0, 170.0), 24.0)
 
-
 REAL: Final = Profile("real time", 75.0, 190.0, (80.0, 100.0), 1.0)
-
-
 SHORT: Final = Profile("replay clock, short", 55.0, 200.0, (90.0, 130.0), 25.0)
 """For tests: as `FAST`, with little time to recover."""
 
@@ -104,7 +99,6 @@ class Event:
 
 ValueChange = Callable[[Sample, Sample, Random], Sample]
 """(sample, first sample of the fault, random generator) → sample."""
-
 
 FrameChange = Callable[[list[Event], Profile, Vehicle, Random], list[Event]]
 
@@ -186,10 +180,8 @@ NOT_AVAILABLE: Final = {
 }
 """Raw codes of `dbc/generic_pack.dbc`."""
 
-
 BUS_CAPACITY_HZ: Final = 4000.0
 """Frame rate of a saturated 500 kbit/s bus."""
-
 
 EachChange = Callable[[Event, Vehicle, Random], Iterable[Event]]
 
@@ -382,10 +374,10 @@ def crc_wrong(share: float = 1.0, roles: tuple[str, ...] = ROLES) -> FrameChange
 def counter_stuck() -> FrameChange:
     """Send a constant counter with a valid CRC."""
 
-    def stand(event: Event, vehicle: Vehicle, _r: Random) -> list[Event]:
+    def stuck_counter(event: Event, vehicle: Vehicle, _r: Random) -> list[Event]:
         return [event.bad(data=_protected(event, vehicle, bytes(event.frame.data), 5))]
 
-    return each(stand)
+    return each(stuck_counter)
 
 
 def counter_jumps(share: float = 0.2) -> FrameChange:

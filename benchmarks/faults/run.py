@@ -35,7 +35,7 @@ LISTEN_AFTER_S: Final = 1.0
 
 
 def run_fault(fault: Fault, line: BusLine, seed: int, target: Target = cangauge) -> Observation:
-    """Run a fault on a bus of its own.
+    """Run a fault on a separate bus.
 
     Parameters
     ----------
@@ -237,8 +237,7 @@ class Listener(threading.Thread):
 
 
 OVERHEAD_S: Final = 4.0
-"""Time of a run besides its frames: start, end [s]."""
-
+"""Time of a run parallels its frames: start, end [s]."""
 
 IMPORT_S: Final = 10.0
 """Time to import the service once [s]."""
@@ -277,13 +276,13 @@ def seconds(faults: list[Fault], jobs: Jobs) -> float:
     """Return the estimated time of `run_all` [s]."""
     runs = _with_undisturbed(faults)
     alone = [fault for fault in runs if "alone" in fault.needs]
-    beside = [fault for fault in runs if "alone" not in fault.needs]
+    parallel = [fault for fault in runs if "alone" not in fault.needs]
     total = IMPORT_S + sum(fault.profile.seconds + OVERHEAD_S for fault in alone)
     pools = []
     for is_real, width in ((True, jobs.real), (False, jobs.fast)):
         lengths = [
             fault.profile.seconds + OVERHEAD_S
-            for fault in beside
+            for fault in parallel
             if fault.profile.is_real_time == is_real
         ]
         rounds = math.ceil(len(lengths) / width)

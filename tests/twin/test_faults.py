@@ -124,9 +124,9 @@ def test_time_skew_delays_the_current(
     plant: TwinPlant, demanding_drive: Drive, healthy: GroundTruth
 ) -> None:
     condition = apply_faults(plant.pack, (Fault("time_skew", 2.0),))
-    seen = simulate_truth(plant, demanding_drive, condition, healthy).measured_current_a
+    measured = simulate_truth(plant, demanding_drive, condition, healthy).measured_current_a
     rows = round(2.0 / demanding_drive.step_s)
-    np.testing.assert_allclose(seen[rows:], demanding_drive.current_a[:-rows], atol=1e-9)
+    np.testing.assert_allclose(measured[rows:], demanding_drive.current_a[:-rows], atol=1e-9)
 
 
 def test_charge_faults_shift_the_true_soc(plant: TwinPlant, demanding_drive: Drive) -> None:

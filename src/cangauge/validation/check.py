@@ -1,4 +1,4 @@
-"""The withheld check: draw cases, withhold their causes, diagnose them apart, reveal and score.
+"""The withheld check: draw cases, withhold their causes, diagnose, reveal and score.
 
 All causes are in one label file, whose hash is printed before the diagnosis starts.
 """
@@ -67,7 +67,7 @@ def read_labels(folder: Path, sha256: str) -> dict[str, dict[str, Any]]:
             "the labels changed: another hash was printed before the diagnosis",
             source=path,
             value=found,
-            cure="draw the cases anew",
+            cure="draw the cases again",
         )
     whole = json.loads(content)
     return {label["name"]: label for label in whole["labels"]}

@@ -455,12 +455,14 @@ def reliability(outcomes: Sequence[Outcome]) -> Figures:
 
     Without cases of two causes, which have no single correct verdict, and without crashes.
     """
-    said = [i for i in outcomes if len(i.truth) <= 1 and i.verdict != CRASHED and i.in_range]
+    stated = [i for i in outcomes if len(i.truth) <= 1 and i.verdict != CRASHED and i.in_range]
     bins = []
     for number in range(_PROBABILITY_BINS):
         low, high = number / _PROBABILITY_BINS, (number + 1) / _PROBABILITY_BINS
         there = [
-            i for i in said if low <= i.probability < high or (high == 1.0 and i.probability >= 1.0)
+            i
+            for i in stated
+            if low <= i.probability < high or (high == 1.0 and i.probability >= 1.0)
         ]
         bins.append(
             {
@@ -469,7 +471,7 @@ def reliability(outcomes: Sequence[Outcome]) -> Figures:
                 "right": share([i.strict for i in there]),
             }
         )
-    squares = [(i.probability - float(i.strict)) ** 2 for i in said]
+    squares = [(i.probability - float(i.strict)) ** 2 for i in stated]
     return {"brier": estimate(squares, np.mean), "bins": bins}
 
 
@@ -479,7 +481,7 @@ def confusion(items: Sequence[Outcome]) -> Figures:
     for item in items:
         if len(item.truth) <= 1:
             counts[item.truth[0] if item.truth else NONE][item.verdict] += 1
-    return {truth: dict(said.most_common()) for truth, said in sorted(counts.items())}
+    return {truth: dict(verdicts.most_common()) for truth, verdicts in sorted(counts.items())}
 
 
 def _cost(outcomes: Sequence[Outcome]) -> Figures:

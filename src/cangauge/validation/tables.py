@@ -88,7 +88,7 @@ TARGETS: Final = (
     Target("equation: top 1, pairs counted", _of("equation", "effects", "top1_pair"), low=0.95),
     Target("equation: top 1", _of("equation", "effects", "top1"), low=0.85),
     Target("equation: false alarms", _of("equation", "healthy", "false_alarms"), high=0.02),
-    # Here the temperature is the core's too: little but noise besides the cause.
+    # Here the reported temperature is that of the core: little error besides noise.
     Target("published: top 1, pairs counted", _of("published", "effects", "top1_pair"), low=0.95),
     Target("published: top 1", _of("published", "effects", "top1"), low=0.85),
     Target("published: false alarms", _of("published", "healthy", "false_alarms"), high=0.02),

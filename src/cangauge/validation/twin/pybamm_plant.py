@@ -240,7 +240,7 @@ def import_pybamm() -> Any:
 def draw_pybamm_plant(
     rng: np.random.Generator, pack: Pack, parameter_set: str | None = None
 ) -> PybammPlant:
-    """Draw a PyBaMM pack: a parameter set with exchange currents of its own.
+    """Draw a PyBaMM pack: a parameter set with individual exchange currents.
 
     Parameters
     ----------

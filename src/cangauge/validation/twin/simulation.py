@@ -41,7 +41,7 @@ class Simulation:
         Pack and cell model.
     faults : tuple of Fault
     limited : tuple of ScaledFault
-        Faults whose physical limits prevent the gap that was asked for.
+        Faults whose physical limits prevent the requested gap.
     """
 
     log: Log
