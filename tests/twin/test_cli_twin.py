@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import doctest
 import json
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from cangauge.errors import InputError
 from cangauge.logs.read import read_log
 from cangauge.model.charge import capacity_from_full_discharge
 from cangauge.validation import simulate
+from cangauge.validation.twin import simulation
 from cangauge.validation.twin.drive import read_speed
 from cangauge.validation.twin.faults import parse_effect
 from cangauge.validation.twin.pack import Pack
@@ -166,6 +168,10 @@ def test_simulate_returns_what_the_command_writes(tmp_path: Path) -> None:
     for name in ("time_s", "current_a", "voltage_v", "temperature_c", "soc_pct"):
         assert np.array_equal(getattr(simulated.log, name), getattr(written, name))
     assert simulated.to_dict().items() <= found.items()
+
+
+def test_example_of_simulate_runs() -> None:
+    assert doctest.testmod(simulation) == (0, 3)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ scores the answers::
     check       draw, withhold, diagnose (`workers`, `worker`), reveal
     score       labels and answers → figures; `tables` prints them
 
-Only `simulate` is public; it is loaded when first used.
+The public names, those of the twin, are loaded when first used.
 """
 
 from __future__ import annotations
@@ -19,9 +19,16 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from cangauge.validation.twin import Fault, FaultKind, Simulation, fault_kinds, simulate
+    from cangauge.validation.twin import (
+        Fault,
+        FaultKind,
+        Simulation,
+        fault_kinds,
+        read_speed,
+        simulate,
+    )
 
-__all__ = ["Fault", "FaultKind", "Simulation", "fault_kinds", "simulate"]
+__all__ = ["Fault", "FaultKind", "Simulation", "fault_kinds", "read_speed", "simulate"]
 
 
 def __getattr__(name: str) -> Any:

@@ -7,7 +7,8 @@ states it.
 
 from __future__ import annotations
 
+from cangauge.validation.twin.drive import read_speed
 from cangauge.validation.twin.faults import Fault, FaultKind, fault_kinds
 from cangauge.validation.twin.simulation import Simulation, simulate
 
-__all__ = ["Fault", "FaultKind", "Simulation", "fault_kinds", "simulate"]
+__all__ = ["Fault", "FaultKind", "Simulation", "fault_kinds", "read_speed", "simulate"]

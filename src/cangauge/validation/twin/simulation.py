@@ -118,7 +118,7 @@ def simulate(
     discharge : bool
         Drive from full to empty, by default in 2.5 h: a log to identify a model on.
     speed_ms : array of shape (m,), optional
-        Speed trace at 1 Hz [m/s], repeated as needed (see `read_speed`).
+        Speed trace at 1 Hz [m/s], repeated as needed (see `cangauge.validation.read_speed`).
     pack : {"leaf24", "leaf40", "car60", "car60lfp", "compact", "module12"}, optional
     chemistry : {"nmc", "lmo", "nca", "lfp"}, optional
     plant : {"twin", "equation", "published", "pybamm"}
