@@ -21,6 +21,8 @@ OUTSIDE_EFFECTS: Final = tuple(kind.id for kind in fault_kinds(outside=True))
 _CASES_PER_SCENARIO: Final = 4
 """Cases that share a pack, its training logs and its references."""
 
+_Cases = list[tuple[int, tuple[str, ...]]]
+
 
 @dataclass(frozen=True)
 class PlannedCase:
@@ -101,6 +103,29 @@ SMALL: Final[dict[str, Sizes]] = {
     "real-lg_hg2": Sizes(per_effect=1, healthy=1, effects=1),
 }
 
+_SECONDS_PER_CASE: Final = {
+    "simulated": 6.0,
+    "outside": 6.0,
+    "two-effects": 6.0,
+    "equation": 6.0,
+    "published": 6.0,
+    "pybamm": 53.0,
+    "real-bmw_i3": 12.0,
+    "real-lg_hg2": 25.0,
+    "cold-bmw_i3": 60.0,
+    "cold-lg_hg2": 30.0,
+    "hysteresis-a123_lfp": 12.0,
+}
+"""Rough time to draw and diagnose a case on one core [s]."""
+
+_OPEN_SET_SECONDS_PER_CASE: Final = 2.0
+_OPEN_SET_PER_EFFECT: Final = {"full": 10, "small": 1}
+"""Simulated cases of each effect that are diagnosed again without it in the library."""
+
+NEEDS_DATA: Final = tuple(
+    name for name in FULL if name.startswith("real-") or name in LABORATORY_CAUSES
+)
+
 
 def plan(protocols: dict[str, Sizes], *, seed: int, final: bool) -> tuple[Group, ...]:
     """Plan the cases of some protocols.
@@ -130,9 +155,6 @@ def plan(protocols: dict[str, Sizes], *, seed: int, final: bool) -> tuple[Group,
             for scenario_seed, cases in parts
         ]
     return tuple(groups[k] for k in rng.permutation(len(groups)))
-
-
-_Cases = list[tuple[int, tuple[str, ...]]]
 
 
 def _groups(protocol: str, sizes: Sizes, *, seed: int, final: bool) -> list[tuple[int, _Cases]]:
@@ -181,30 +203,6 @@ def _seeds(rng: np.random.Generator, number: int, *, final: bool) -> list[int]:
 def is_outside(effects: Sequence[str]) -> bool:
     """Whether one of the effects is outside the effects library."""
     return any(effect in OUTSIDE_EFFECTS for effect in effects)
-
-
-_SECONDS_PER_CASE: Final = {
-    "simulated": 6.0,
-    "outside": 6.0,
-    "two-effects": 6.0,
-    "equation": 6.0,
-    "published": 6.0,
-    "pybamm": 53.0,
-    "real-bmw_i3": 12.0,
-    "real-lg_hg2": 25.0,
-    "cold-bmw_i3": 60.0,
-    "cold-lg_hg2": 30.0,
-    "hysteresis-a123_lfp": 12.0,
-}
-"""Rough time to draw and diagnose a case on one core [s]."""
-
-_OPEN_SET_SECONDS_PER_CASE: Final = 2.0
-_OPEN_SET_PER_EFFECT: Final = {"full": 10, "small": 1}
-"""Simulated cases of each effect that are diagnosed again without it in the library."""
-
-NEEDS_DATA: Final = tuple(
-    name for name in FULL if name.startswith("real-") or name in LABORATORY_CAUSES
-)
 
 
 def open_set_size(part: str, per_effect: int | None) -> int:

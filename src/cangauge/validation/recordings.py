@@ -34,30 +34,7 @@ from cangauge.validation.twin.injection import (
     with_initial_soc,
 )
 from cangauge.validation.twin.pack import Pack
-
-
-def fit_model(logs: Sequence[Log], capacity_ah: float) -> Identification:
-    """Identify the model of healthy logs, as `cangauge fit` does."""
-    return fit(logs, FitOptions(capacity_ah=capacity_ah))
-
-
-def model_rmse_v(known: Identification, logs: Sequence[Log]) -> float:
-    """Return the RMS error of a model on healthy logs that it was not fitted to [V].
-
-    The SoC is counted from the initial SoC of each log.
-    """
-    model = known.voltage_model
-    options = FitOptions(
-        capacity_ah=known.model.capacity_ah,
-        rate_hz=known.model.rate_hz,
-        delay_s=tuple(known.model.delays_s),
-    )
-    errors = [
-        rows.voltage_v - model.voltage(rows.soc_pct, rows.temperature_c, rows.delayed_current_a)
-        for rows in prepare(logs, options)
-    ]
-    return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
-
+from cangauge.validation.twin.recording import rms
 
 _MIN_DURATION_S: Final = 600.0
 _I3_REFERENCES: Final = 8
@@ -72,6 +49,29 @@ LG_25C: Final = (
 LG_SERIES, LG_PARALLEL = 96, 17
 LG_CAPACITY_AH: Final = 2.78
 """Capacity of a cell in these files, by a full discharge at 25 °C [Ah]."""
+
+WINTER: Final = ("B03", "B05", "B06", "B16", "B17", "B18", "B19", "B20")
+_LG_TRAINED: Final = (
+    "25degC__551_LA92", "25degC__551_US06", "25degC__552_Mixed3", "25degC__552_Mixed5",
+)  # fmt: skip
+_LG_REFERENCES: Final = ("25degC__551_Mixed1", "25degC__551_Mixed2", "25degC__552_Mixed7")
+_LG_COLD: Final = (
+    ("0degC__589_LA92", "0degC__589_Mixed1", "0degC__589_US06", "0degC__590_Mixed5"),
+    ("10degC__567_Mixed1", "10degC__567_US06", "10degC__571_Mixed5", "10degC__571_Mixed7"),
+)
+_A123_DRIVES: Final = ("DYN_45_P05_s1", "DYN_50_P25_s1", "DYN_50_P45_s1")
+_A123_SLOW: Final = ("P05", "P25", "P45")
+_A123_CAPACITY_AH: Final = 2.07
+"""Capacity of the cell at C/30 and 25 °C [Ah]."""
+_A123_SOC_PCT: Final = (10.0, 92.0)
+"""Without the ends: the error of a 13-coefficient model at the knees of LFP exceeds hysteresis."""
+
+LABORATORY_CAUSES: Final[Mapping[str, tuple[str, int]]] = {
+    "cold-bmw_i3": ("resistance_temperature", len(WINTER) + 1),
+    "cold-lg_hg2": ("resistance_temperature", len(_LG_COLD)),
+    "hysteresis-a123_lfp": ("hysteresis", len(_A123_SLOW)),
+}
+"""Protocol → effect and number of cases."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,30 +183,6 @@ def _as_pack(path: Path) -> Log:
     return with_initial_soc(log, 100.0)
 
 
-WINTER: Final = ("B03", "B05", "B06", "B16", "B17", "B18", "B19", "B20")
-_LG_TRAINED: Final = (
-    "25degC__551_LA92", "25degC__551_US06", "25degC__552_Mixed3", "25degC__552_Mixed5",
-)  # fmt: skip
-_LG_REFERENCES: Final = ("25degC__551_Mixed1", "25degC__551_Mixed2", "25degC__552_Mixed7")
-_LG_COLD: Final = (
-    ("0degC__589_LA92", "0degC__589_Mixed1", "0degC__589_US06", "0degC__590_Mixed5"),
-    ("10degC__567_Mixed1", "10degC__567_US06", "10degC__571_Mixed5", "10degC__571_Mixed7"),
-)
-_A123_DRIVES: Final = ("DYN_45_P05_s1", "DYN_50_P25_s1", "DYN_50_P45_s1")
-_A123_SLOW: Final = ("P05", "P25", "P45")
-_A123_CAPACITY_AH: Final = 2.07
-"""Capacity of the cell at C/30 and 25 °C [Ah]."""
-_A123_SOC_PCT: Final = (10.0, 92.0)
-"""Without the ends: the error of a 13-coefficient model at the knees of LFP exceeds hysteresis."""
-
-LABORATORY_CAUSES: Final[Mapping[str, tuple[str, int]]] = {
-    "cold-bmw_i3": ("resistance_temperature", len(WINTER) + 1),
-    "cold-lg_hg2": ("resistance_temperature", len(_LG_COLD)),
-    "hysteresis-a123_lfp": ("hysteresis", len(_A123_SLOW)),
-}
-"""Protocol → effect and number of cases."""
-
-
 @dataclass(frozen=True, eq=False)
 class LaboratoryCase:
     """A laboratory case.
@@ -314,3 +290,26 @@ def _middle(log: Log, *, ends_full: bool) -> Log:
     inside = np.flatnonzero((soc >= low) & (soc <= high))
     rows = slice(int(inside[0]), int(inside[-1]) + 1)
     return with_initial_soc(log.rows(rows), float(soc[rows][0]))
+
+
+def fit_model(logs: Sequence[Log], capacity_ah: float) -> Identification:
+    """Identify the model of healthy logs, as `cangauge fit` does."""
+    return fit(logs, FitOptions(capacity_ah=capacity_ah))
+
+
+def model_rmse_v(known: Identification, logs: Sequence[Log]) -> float:
+    """Return the RMS error of a model on healthy logs that it was not fitted to [V].
+
+    The SoC is counted from the initial SoC of each log.
+    """
+    model = known.voltage_model
+    options = FitOptions(
+        capacity_ah=known.model.capacity_ah,
+        rate_hz=known.model.rate_hz,
+        delay_s=tuple(known.model.delays_s),
+    )
+    errors = [
+        rows.voltage_v - model.voltage(rows.soc_pct, rows.temperature_c, rows.delayed_current_a)
+        for rows in prepare(logs, options)
+    ]
+    return rms(np.concatenate(errors))
