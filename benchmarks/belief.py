@@ -94,7 +94,7 @@ def cases_of(folder: Path) -> list[Case]:
     """Return the cases of a folder; comparisons are cached in `compared`."""
     about = folder / "tasks.json"
     if about.exists() and json.loads(about.read_text(encoding="utf-8"))["final"]:
-        sys.exit(f"{folder}: final cases must not be fitted to")
+        sys.exit(f"{folder}: cases of the final seeds must not be fitted to")
     labels = json.loads((folder / "withheld" / "labels.json").read_text(encoding="utf-8"))["labels"]
     labels = [label for label in labels if "failed" not in label and len(label["effects"]) < 2]
     labels = [

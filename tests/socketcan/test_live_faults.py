@@ -41,8 +41,8 @@ def test_a_seeded_part_of_the_faults() -> None:
     faults = [replace(EVERYTHING[name], profile=BRIEF) for name in (*ALWAYS, *drawn)]
     prepare()
     done = run_all(faults, vcan, Jobs(fast=2, real=1), SEED)
-    told = {
+    failures = {
         each.fault.name: each.reason if each.verdict is None else "; ".join(each.verdict.failures)
         for each in done
     }
-    assert not any(told.values()), told
+    assert not any(failures.values()), failures
