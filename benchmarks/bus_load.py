@@ -1,16 +1,16 @@
-"""Load, speed, timing and memory of the live side, measured.
+"""Load, speed, timing and memory of the live service.
 
     python benchmarks/bus_load.py [--only load|max|offline|timing|memory]… [--seconds 20] [--json]
 
 load     4,000 frames/s (a saturated 500 kbit/s bus), 200 of them wanted: CPU time of `cangauge run`
-         and wanted frames lost; beside it the same bus read by a bare python-can loop.
+         and lost wanted frames, compared with a bare python-can loop on the same bus.
 max      a 2.5 h, 10 Hz log from `cangauge replay --speed max` to `cangauge run`.
-offline  the same log by `cangauge estimate`'s way.
+offline  the same log as by `cangauge estimate`.
 timing   a capture of 120 s in real time.
-memory   24 h of bus time at 10 Hz through the gauge.
+memory   24 h of bus time at 10 Hz.
 
-The bus is udp_multicast on this machine, where every frame reaches the process and the filter is
-Python's; on SocketCAN the kernel filters, and the 3,800 unwanted frames cost the process nothing.
+The bus is udp_multicast on this machine, where every frame reaches the process and Python filters.
+On SocketCAN the kernel filters, and the 3,800 unwanted frames cost the process nothing.
 """
 
 from __future__ import annotations
@@ -25,8 +25,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -48,19 +47,15 @@ from cangauge.model.model_file import Model
 from cangauge.replay.player import Pacer
 from cangauge.service.pipeline import Gauge, GaugeSettings
 from cangauge.service.recording import Recorder
+from live_service import MODEL, command, service
 
 RATE = 4000
-"""Frames a second of a saturated 500 kbit/s bus."""
+"""Frame rate of a saturated 500 kbit/s bus [1/s]."""
 WANTED_RATE = 200
 PORT = 43_555
 
 Result = dict[str, Any]
 Row = tuple[str, str, str]
-
-
-def model_path() -> Path:
-    """Return a model to run with."""
-    return shared_file("replay", "leaf2012_published_model.json")
 
 
 def long_log() -> Log:
@@ -69,34 +64,8 @@ def long_log() -> Log:
 
 
 def bus() -> BusAddress:
-    """Return a bus that nobody else uses."""
+    """Return a bus of this benchmark only."""
     return bus_address("udp_multicast", options={"port": PORT})
-
-
-def command(*arguments: object) -> list[str]:
-    """Return a `cangauge` command on the bus."""
-    main = "from cangauge.cli.app import main; main()"
-    name, *rest = map(str, arguments)
-    on = ["--interface", "udp_multicast", "--bus-option", f"port={PORT}", "--json"]
-    return [sys.executable, "-c", main, name, *rest, *on]
-
-
-@contextmanager
-def service(*arguments: object) -> Iterator[subprocess.Popen[str]]:
-    """Run `cangauge run` until the block ends; wait until it listens."""
-    process = subprocess.Popen(
-        command("run", "-m", model_path(), *arguments),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        if process.stderr is None or "listening" not in process.stderr.readline():
-            raise SystemExit("cangauge run does not start")
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
 
 
 # --- load -------------------------------------------------------------------------------------
@@ -104,7 +73,7 @@ def service(*arguments: object) -> Iterator[subprocess.Popen[str]]:
 
 def load(seconds: float) -> tuple[Result, list[Row]]:
     """Measure `cangauge run` and a bare loop on a saturated bus."""
-    with service("--until-idle", "1.5") as process:
+    with service(bus(), "--until-idle", "1.5") as process:
         sent = send_load(seconds)
         out, _ = process.communicate(timeout=60)
     run = json.loads(out)
@@ -114,7 +83,7 @@ def load(seconds: float) -> tuple[Result, list[Row]]:
         "sent": sent,
         "run": run,
         "bare": bare,
-        # Its own second and a half of waiting at the end counts as time, but costs nothing.
+        # Waiting 1.5 s for the end costs no CPU time.
         "run_cores": run["cpu_seconds"] / sent["seconds"],
         "bare_cores": bare["cpu_seconds"] / sent["seconds"],
         "wanted_lost": wanted - run["frames"],
@@ -122,12 +91,12 @@ def load(seconds: float) -> tuple[Result, list[Row]]:
     rows = [
         ("frames sent", f"{sent['frames'] / sent['seconds']:.0f}/s over {sent['seconds']:.1f} s",
          f"{RATE}/s"),
-        ("of them wanted", f"{wanted / sent['seconds']:.0f}/s", ""),
+        ("wanted frames", f"{wanted / sent['seconds']:.0f}/s", ""),
         ("wanted frames lost", f"{result['wanted_lost']} of {wanted}", "0"),
         ("CPU of `cangauge run`", f"{100 * result['run_cores']:.1f} % of a core", "< 50 %"),
         ("CPU of a bare python-can loop", f"{100 * result['bare_cores']:.1f} % of a core", ""),
-        ("  frames that it lost", f"{sent['frames'] - bare['frames']} of {sent['frames']}", ""),
-        ("run against bare loop", f"{result['run_cores'] / result['bare_cores']:.2f}×", ""),
+        ("  lost by it", f"{sent['frames'] - bare['frames']} of {sent['frames']}", ""),
+        ("run relative to the bare loop", f"{result['run_cores'] / result['bare_cores']:.2f}×", ""),
     ]  # fmt: skip
     return result, rows
 
@@ -164,7 +133,7 @@ def send_load(seconds: float) -> Result:
 
 
 def bare_loop(seconds: float) -> Result:
-    """Receive the same load with python-can alone, and count."""
+    """Count the same load with python-can alone."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_count_frames, args=(theirs,))
@@ -195,19 +164,22 @@ def _count_frames(pipe: Any) -> None:
 def full_speed() -> tuple[Result, list[Row]]:
     """Measure a 2.5 h log through the bus."""
     path = shared_file("replay", "leaf2012_reconstruction_white.parquet")
-    with service("--time-source", "replay-clock", "--until-idle", "1") as process:
+    with service(bus(), "--time-source", "replay-clock", "--until-idle", "1") as process:
         done = subprocess.run(
-            command("replay", path, "--speed", "max"), capture_output=True, text=True, check=True
+            command(bus(), "replay", path, "--speed", "max"),
+            capture_output=True,
+            text=True,
+            check=True,
         )
         out, _ = process.communicate(timeout=60)
     replay, run = json.loads(done.stdout), json.loads(out)
     lost = replay["samples"] - run["samples"]
     rows = [
         ("log", f"{replay['log_seconds'] / 3600:.2f} h, {replay['samples']} samples", ""),
-        ("through the bus in", f"{replay['seconds']:.1f} s", "< 60 s"),
+        ("time through the bus", f"{replay['seconds']:.1f} s", "< 60 s"),
         ("samples lost", str(lost), "0"),
         ("CPU of `cangauge run`", f"{run['cpu_seconds']:.1f} s", ""),
-        ("a step, median", f"{run['step_p50_us']:.0f} µs", ""),
+        ("step, median", f"{run['step_p50_us']:.0f} µs", ""),
     ]
     return {"replay": replay, "run": run, "lost": lost}, rows
 
@@ -218,12 +190,12 @@ def offline() -> tuple[Result, list[Row]]:
     log = long_log()
     read_s = time.monotonic() - began
     settings = EstimatorSettings(temperature_source=log.temperature_source)
-    _, scores = estimate_log(log, Model.load(model_path()), settings)
+    _, scores = estimate_log(log, Model.load(MODEL), settings)
     result = {"rows": len(log), "read_seconds": read_s, "seconds": scores.seconds}
     rows = [
         ("log", f"{log.duration_s / 3600:.2f} h, {len(log)} samples", ""),
-        ("estimated in", f"{scores.seconds:.2f} s", "< 5 s"),
-        ("read in", f"{read_s:.2f} s", ""),
+        ("estimation", f"{scores.seconds:.2f} s", "< 5 s"),
+        ("reading", f"{read_s:.2f} s", ""),
     ]
     return result, rows
 
@@ -239,11 +211,13 @@ def timing(seconds: float = 120.0) -> tuple[Result, list[Row]]:
                 recorder.write(
                     can.Message(timestamp=1.7e9 + stamp, arbitration_id=0x1F2, is_extended_id=False)
                 )
-        done = subprocess.run(command("replay", path), capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            command(bus(), "replay", path), capture_output=True, text=True, check=True
+        )
     replay: Result = json.loads(done.stdout)
     rows = [
         ("capture", f"{replay['log_seconds']:.3f} s, {replay['frames']} frames", ""),
-        ("played in", f"{replay['seconds']:.3f} s", f"{seconds:.1f} ± 0.1 s"),
+        ("duration of the replay", f"{replay['seconds']:.3f} s", f"{seconds:.1f} ± 0.1 s"),
     ]
     return replay, rows
 
@@ -252,10 +226,10 @@ def timing(seconds: float = 120.0) -> tuple[Result, list[Row]]:
 
 
 def memory(hours: float = 24.0) -> tuple[Result, list[Row]]:
-    """Measure the memory of a process that sees a day of bus time."""
+    """Measure the memory of a process over a day of bus time."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=_live_a_day, args=(theirs, hours))
+    process = context.Process(target=_handle_a_day, args=(theirs, hours))
     process.start()
     result: Result = ours.recv()
     process.join()
@@ -264,19 +238,19 @@ def memory(hours: float = 24.0) -> tuple[Result, list[Row]]:
         ("memory after half an hour", f"{result['mb_first']:.1f} MB", ""),
         ("memory at the end", f"{result['mb_last']:.1f} MB", ""),
         ("growth", f"{result['mb_last'] - result['mb_first']:+.2f} MB", "flat"),
-        ("computed in", f"{result['seconds']:.0f} s", ""),
+        ("computation", f"{result['seconds']:.0f} s", ""),
     ]
     return result, rows
 
 
-def _live_a_day(pipe: Any, hours: float) -> None:
+def _handle_a_day(pipe: Any, hours: float) -> None:
     vehicle = Vehicle.load("generic")
-    gauge = Gauge(vehicle, Model.load(model_path()), GaugeSettings())
+    gauge = Gauge(vehicle, Model.load(MODEL), GaugeSettings())
     encoder = FrameEncoder(vehicle)
     log = long_log()
     columns = (log.current_a.tolist(), log.voltage_v.tolist(), log.temperature_c.tolist())
     rows = itertools.cycle(list(zip(*columns, strict=True)))
-    for _ in range(len(log)):  # the cycle keeps what it has seen: once round, it grows no more
+    for _ in range(len(log)):  # itertools.cycle stores its items: fill it before measuring
         next(rows)
     began, first = time.monotonic(), math.nan
     total = int(hours * 36_000)
@@ -306,7 +280,7 @@ def _resident_mb() -> float:
 
 
 def main() -> int:
-    """Measure and print."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
@@ -319,7 +293,7 @@ def main() -> int:
         "timing": timing,
         "memory": memory,
     }
-    parser.add_argument("--only", action="append", choices=list(parts), help="may be repeated")
+    parser.add_argument("--only", action="append", choices=list(parts), help="repeat for several")
     options = parser.parse_args()
     results: Result = {"bus": str(bus()), "cores": os.cpu_count()}
     tables = []
@@ -332,7 +306,7 @@ def main() -> int:
         return 0
     console = Console()
     for name, rows in tables:
-        table = Table("", "measured", "wanted", title=f"{name} ({bus()}, {os.cpu_count()} cores)")
+        table = Table("", "measured", "target", title=f"{name} ({bus()}, {os.cpu_count()} cores)")
         for row in rows:
             table.add_row(*row)
         console.print(table)

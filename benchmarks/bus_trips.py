@@ -3,10 +3,10 @@
     python benchmarks/bus_trips.py --data FOLDER [--trip A02]… [--vehicle generic] [--json]
 
 The model is that of `real_trips.py` (fitted on A01, A03 … A21). Each of A02, A04 … A22 longer than
-15 minutes is played at full speed on vcan0 (where there is none: udp_multicast), and estimated
-there from the frames. Printed are, for each trip, the largest difference from the estimate of the
-log itself, the bound that the rounding in frames sets to it, and whether the estimate of the
-recorded frames is the live one to the last bit.
+15 minutes is replayed at full speed on vcan0 (or udp_multicast) and estimated from the frames.
+Prints for each trip the largest difference from the estimate of the log, its bound by the
+quantization of the frames, and whether the estimate of the recorded frames equals the live one bit
+for bit.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ FULL_SPEED = ReplaySettings(speed=math.inf, acknowledge_s=20.0)
 
 @dataclass(frozen=True)
 class Comparison:
-    """What came of one trip."""
+    """Comparison of one trip."""
 
     trip: str
     samples: int
@@ -64,23 +64,23 @@ class Comparison:
 def over_bus(
     log: Log, vehicle: Vehicle, model: Model, address: BusAddress, record: Path
 ) -> tuple[list[Estimate], Gauge, float]:
-    """Play a log on a bus and estimate it there; return the estimates, the gauge and seconds."""
+    """Replay a log on a bus and estimate it; return the estimates, the gauge and the time [s]."""
     gauge = Gauge(vehicle, model, GaugeSettings(time_source="replay-clock"))
     rows: list[Estimate] = []
     done = threading.Event()
     with (
-        BusConnection(open_bus(address, gauge.filters), str(address)) as ears,
-        BusConnection(open_bus(address, [standard_filter(0x5A1)]), str(address)) as mouth,
+        BusConnection(open_bus(address, gauge.filters), str(address)) as receiver,
+        BusConnection(open_bus(address, [standard_filter(0x5A1)]), str(address)) as sender,
         Recorder(record) as recorder,
     ):
         outputs = Outputs(record=recorder, table=lambda _, estimate: rows.append(estimate))
         service = threading.Thread(
-            target=serve, args=(ears, gauge, LoopSettings(), outputs, done.is_set)
+            target=serve, args=(receiver, gauge, LoopSettings(), outputs, done.is_set)
         )
         service.start()
         began = time.monotonic()
         try:
-            play(mouth, LogSource(log, vehicle), FULL_SPEED, stop=lambda: not service.is_alive())
+            play(sender, LogSource(log, vehicle), FULL_SPEED, stop=lambda: not service.is_alive())
         finally:
             done.set()
             service.join()
@@ -88,7 +88,7 @@ def over_bus(
 
 
 def compare(log: Log, vehicle: Vehicle, model: Model, address: BusAddress) -> Comparison:
-    """Return how the bus's estimate of a log differs from the log's own."""
+    """Compare the estimate over the bus with that of the log."""
     with tempfile.TemporaryDirectory() as folder:
         record = Path(folder) / "trip.log"
         rows, gauge, seconds = over_bus(log, vehicle, model, address, record)
@@ -134,13 +134,13 @@ def show(rows: list[Comparison], address: BusAddress, vehicle: Vehicle) -> None:
 
 
 def main() -> int:
-    """Run the comparison; exit 1 if a trip lost a sample, left the bound or differs recorded."""
+    """Run the comparison; exit 1 on lost samples, a difference above the bound, or changed bits."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the trips")
-    parser.add_argument("--trip", action="append", help="only this one; may be repeated")
-    parser.add_argument("--vehicle", default="generic", help="preset whose frames are sent")
+    parser.add_argument("--trip", action="append", help="only this trip; repeat for several")
+    parser.add_argument("--vehicle", default="generic", help="preset of the frames")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     if not options.data.is_dir():

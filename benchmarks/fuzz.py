@@ -1,14 +1,13 @@
-"""Fuzzing of every reader of cangauge, by one command.
+"""Fuzz every reader of cangauge.
 
     python benchmarks/fuzz.py [--inputs 1000000] [--seed 1] [--target NAME]… [--json]
-    python benchmarks/fuzz.py --again TARGET NUMBER      # one input of a run, with its traceback
-    python benchmarks/fuzz.py --guided TARGET --minutes 10    # coverage-guided, needs atheris
+    python benchmarks/fuzz.py --again TARGET NUMBER      # one input, with its traceback
 
-Inputs are mutants of small valid files of every format (frames of a bus, captures, logs, model and
-state files, configurations, maps, DBC files, speed traces). Each may be accepted or be refused by
-an `InputError` of one line; anything else is a finding: another exception, a numpy warning, more
-than 2 s of CPU time, more than 128 MB of memory, a SoC outside 0–100 %, a process that dies or
-hangs. Exit 1 if there is one. Seeded: the same seed, the same inputs.
+Inputs are mutants of small valid files of every format (bus frames, captures, logs, model and state
+files, configurations, maps, DBC files, speed traces). Each must be accepted, or refused by an
+`InputError` with a one-line message. Anything else is a finding: another exception, a numpy
+warning, more than 2 s of CPU time, more than 128 MB of memory, a SoC outside 0–100 %, a process
+that dies or hangs. Exit status 1 if there is one. The same seed gives the same inputs.
 
 Bombs, devices and pipes are tested by name in `tests/fuzz`.
 """
@@ -29,7 +28,6 @@ from rich.table import Table
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from fuzzing.guided import guided
 from fuzzing.supervise import CHUNK, Share, Tally, fuzz, input_of
 from fuzzing.target import Target, attempt
 from fuzzing.targets import targets
@@ -38,7 +36,7 @@ console = Console(stderr=True, highlight=False)
 
 
 def main() -> int:
-    """Run the command; return its exit code."""
+    """Run the command and return its exit status."""
     options = _options()
     by_name = {target.name: target for target in targets()}
     if options.again:
@@ -47,8 +45,6 @@ def main() -> int:
         print(repr(data[:4000]))
         print("accepted" if attempt(by_name[name], data) else "refused")
         return 0
-    if options.guided:
-        return guided(by_name[options.guided], 60.0 * options.minutes)
     chosen = [by_name[name] for name in options.target or by_name]
     shares = plan(chosen, options.inputs)
     console.print(
@@ -80,18 +76,20 @@ def main() -> int:
 
 
 def plan(chosen: Sequence[Target], inputs: int) -> list[Share]:
-    """Divide a number of inputs among targets, in shares that take turns."""
+    """Divide a number of inputs among the targets, in interleaved shares."""
     whole = sum(target.share for target in chosen)
-    turns: list[list[Share]] = []
+    of_targets: list[list[Share]] = []
     for target in chosen:
         calls = max(1, -(-round(inputs * target.share / whole) // target.weight))
         step = max(1, CHUNK // target.weight)
         starts = range(0, calls, step)
-        turns.append([Share(target.name, at, min(at + step, calls)) for at in starts])
-    longest = max(map(len, turns))
-    # Spread evenly, so that all end together and the time left can be told.
+        of_targets.append([Share(target.name, at, min(at + step, calls)) for at in starts])
+    longest = max(map(len, of_targets))
+    # Spread evenly, so that all targets end together and the remaining time is predictable.
     order = [
-        (place * longest / len(turn), share) for turn in turns for place, share in enumerate(turn)
+        (place * longest / len(shares), share)
+        for shares in of_targets
+        for place, share in enumerate(shares)
     ]
     return [share for _, share in sorted(order, key=lambda item: item[0])]
 
@@ -105,11 +103,11 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--target", action="append", choices=names)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--folder", type=Path, default=Path("out/fuzz"), help="for findings")
+    parser.add_argument(
+        "--folder", type=Path, default=Path("out/fuzz"), help="folder of the findings"
+    )
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--again", nargs=2, metavar=("TARGET", "NUMBER"))
-    parser.add_argument("--guided", choices=names)
-    parser.add_argument("--minutes", type=float, default=10.0)
     return parser.parse_args()
 
 

@@ -1,19 +1,19 @@
-"""Latency from a frame to the SoC made of it, and frames lost at high rates, beside a bare loop.
+"""Latency from a frame to its SoC, and frames lost at high rates, compared with a bare loop.
 
     python benchmarks/latency.py [--only latency|loss]… [--interface I --channel C]
                                  [--seconds 20] [--rounds 3] [--minutes 10] [--bare-minutes 10]
                                  [--highest HZ] [--wanted SHARE]… [--json]
 
 latency  1,000 wanted frames/s (current and voltage at 500 Hz each, and REPLAY_CLOCK). SOC_DETAIL
-         tells how many samples it was made of, so the time from the frame that completed the last
-         of them to it is known exactly; both are the kernel's stamps at one listener. Beside it, in
-         turn: a bare python-can loop that receives, decodes by cantools and sends as often.
-loss     the highest rate that a bare python-can receive loop carries without loss is searched for;
-         then the service sees that rate, for --minutes, and after it the bare loop once more.
-         Twice: 5 % of the frames wanted, as on a car's bus, and all of them.
+         has the number of samples, which identifies the frame that completed the last of them;
+         both times are kernel stamps at one listener. In alternation with a bare python-can loop
+         that receives, decodes by cantools and sends as often.
+loss     finds the highest rate that a bare python-can receive loop carries without loss; then the
+         service receives that rate for --minutes, and after it the bare loop again. Twice: with 5 %
+         of the frames wanted, as on a car's bus, and with all of them.
 
-Both on UDP multicast on this machine, or on SocketCAN (`--interface socketcan --channel vcan0`).
-Start-up is not counted: the service listens before the first frame.
+On UDP multicast on this machine, or on SocketCAN (`--interface socketcan --channel vcan0`). The
+service listens before the first frame, so start-up does not count.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ import argparse
 import json
 import math
 import multiprocessing
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -45,55 +44,32 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.validity import Sample
 from cangauge.replay.player import Pacer
 from faults.line import udp
+from live_service import service
 
 SOC_DETAIL_ID: Final = 0x5A1
 SAMPLES_MODULO: Final = 1 << 16
-"""SOC_DETAIL counts samples modulo this."""
+"""Modulus of the sample count in SOC_DETAIL."""
 SAMPLE_HZ: Final = 500
-"""Two wanted frames each."""
+"""Sample rate; two wanted frames each [Hz]."""
 BARE_EVERY: Final = 4
-"""The bare loop sends after so many samples, as the service acknowledges."""
+"""Samples between frames of the bare loop, as the service acknowledges."""
 WARM_S: Final = 1.0
-"""Not counted at the begin of each round [s]."""
+"""Excluded start of each round [s]."""
 WANTED_SHARE: Final = 0.05
-"""Of the frames on a car's bus: 200 of 4,000."""
+"""Share of wanted frames on a car's bus: 200 of 4,000."""
 TRY_S: Final = 4.0
-"""How long a rate is tried [s]: longer than what the socket's buffer bridges at rates found."""
+"""Duration of a trial of a rate; longer than the socket buffer can bridge [s]."""
 HIGHEST_HZ: Final = 64_000.0
 
 CONTEXT: Final = multiprocessing.get_context("spawn")
-COMMAND: Final = "from cangauge.cli.app import main; main()"
 Result = dict[str, Any]
-
-
-@contextmanager
-def service(address: BusAddress, *more: str) -> Iterator[subprocess.Popen[str]]:
-    """Run `cangauge run` until the block ends; wait until it listens."""
-    on = ["--interface", address.interface, "--channel", address.channel]
-    for key, value in address.options.items():
-        on += ["--bus-option", f"{key}={value}"]
-    model = str(shared_file("replay", "leaf2012_published_model.json"))
-    process = subprocess.Popen(
-        [sys.executable, "-c", COMMAND, "run", "-m", model, *on, *more, "--json"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    try:
-        for line in process.stderr or ():
-            if "listening" in line:
-                break
-        else:
-            raise SystemExit("cangauge run does not start")
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
 
 
 # --- latency ------------------------------------------------------------------------------------
 
 
 def latency(address: BusAddress, seconds: float, rounds: int) -> Result:
-    """Measure service and bare loop in turn."""
+    """Measure service and bare loop in alternation."""
     found: dict[str, list[float]] = {"service": [], "bare": []}
     for number in range(rounds):
         sys.stderr.write(f"latency: round {number + 1} of {rounds} …\n")
@@ -104,7 +80,7 @@ def latency(address: BusAddress, seconds: float, rounds: int) -> Result:
     result: Result = {}
     for name, values in found.items():
         if not values:
-            raise SystemExit(f"{name}: nothing was sent")
+            raise SystemExit(f"{name}: nothing was published")
         p50, p99 = np.percentile(values, [50, 99]).tolist()
         result[name] = {"count": len(values), "p50_us": 1e6 * p50, "p99_us": 1e6 * p99}
     for key in ("p50_us", "p99_us"):
@@ -113,7 +89,7 @@ def latency(address: BusAddress, seconds: float, rounds: int) -> Result:
 
 
 def _latencies(address: BusAddress, seconds: float) -> list[float]:
-    """Play, and return the times from the n-th sample's last frame to its SOC_DETAIL [s]."""
+    """Return the times from the last frame of a sample to its SOC_DETAIL [s]."""
     listener = open_bus(address)
     sender = CONTEXT.Process(target=_send_samples, args=(address, seconds))
     sender.start()
@@ -128,17 +104,17 @@ def _latencies(address: BusAddress, seconds: float) -> list[float]:
             continue
         if message.arbitration_id != SOC_DETAIL_ID or first is None:
             continue
-        told = int(layout.decode(message.data)["samples"])
-        # What was told is modulo 65536; it lies near what was sent.
-        number = len(done_s) - (len(done_s) - told) % SAMPLES_MODULO
+        samples = int(layout.decode(message.data)["samples"])
+        # Unwrap the count, which is close to the number of samples sent.
+        number = len(done_s) - (len(done_s) - samples) % SAMPLES_MODULO
         is_new = 0 < number <= len(done_s) and len(done_s) - number < SAMPLE_HZ
         if is_new and done_s[number - 1] > first + WARM_S:
             found.append((number, message.timestamp - done_s[number - 1]))
         if message.timestamp - done_s[-1] > 1.0:
-            break  # the service repeats itself; the bare loop falls silent
+            break  # only repetitions of the service are left
     sender.join()
     listener.shutdown()
-    # A count that is told again (by the heartbeat) tells of no new sample: the first one counts.
+    # The heartbeat repeats a count: its first frame is that of the sample.
     return list(dict(reversed(found)).values())
 
 
@@ -171,7 +147,7 @@ def _bare(address: BusAddress, loop: Any) -> Iterator[Connection]:
 
 
 def _echo(pipe: Connection, address: BusAddress) -> None:
-    """Receive, decode, send: what any service must do, and no more."""
+    """Receive, decode, send: the minimum of any service."""
     messages = _messages()
     wanted = [0x400, 0x401, 0x402, 0x403, 0x5AF]
     filters = [{"can_id": each, "can_mask": 0x7FF, "extended": False} for each in wanted]
@@ -194,7 +170,7 @@ def _echo(pipe: Connection, address: BusAddress) -> None:
 
 
 def _messages() -> dict[int, cantools.database.can.Message]:
-    """Return what the DBC files hold, by id."""
+    """Return the messages of the DBC files by id."""
     found = {}
     for name in ("generic_pack.dbc", "soc_estimate.dbc"):
         database = cantools.database.load_file(shared_file("dbc", name))
@@ -207,7 +183,7 @@ def _messages() -> dict[int, cantools.database.can.Message]:
 
 @dataclass(frozen=True)
 class Sent:
-    """What a sender got out."""
+    """Frames that a sender sent."""
 
     frames: int
     wanted: int
@@ -215,7 +191,7 @@ class Sent:
 
     @property
     def rate_hz(self) -> float:
-        """Frames a second."""
+        """Frame rate [1/s]."""
         return self.frames / self.seconds
 
 
@@ -226,7 +202,7 @@ def loss(
     shares: list[float],
     highest_hz: float,
 ) -> Result:
-    """Search the bare loop's highest rate, then let the service see it, and the bare loop again."""
+    """Measure the loss of the service, then of the bare loop, at the highest rate of the latter."""
     result: Result = {}
     for share in shares:
         name = "all wanted" if share == 1.0 else f"{100.0 * share:.0f} % wanted"
@@ -236,7 +212,7 @@ def loss(
             sent = _send(address, rate_hz, seconds, share)
             out, _ = process.communicate(timeout=seconds + 120.0)
         run = json.loads(out)
-        # The same bare loop once more: a rate that it carried for a moment is no measure.
+        # The bare loop again for longer: it carried the rate for a moment only.
         bare, bare_got = _bare_count(address, rate_hz, bare_seconds, share)
         result[name] = {
             "rate_hz": sent.rate_hz,
@@ -252,7 +228,7 @@ def loss(
 
 
 def highest_rate(address: BusAddress, share: float, highest_hz: float = HIGHEST_HZ) -> float:
-    """Return the highest rate [frames/s], to 10 %, that the bare loop carries without loss."""
+    """Find the highest rate that the bare loop carries without loss, to 10 % [frames/s]."""
     good, rate_hz, bad = 0.0, min(2000.0, highest_hz), 1.1 * highest_hz
     while good < highest_hz and bad > 1.1 * max(good, 1.0):
         sent, got = _bare_count(address, rate_hz, TRY_S, share)
@@ -280,7 +256,7 @@ def _bare_count(
 
 
 def _count(pipe: Connection, address: BusAddress) -> None:
-    """Receive wanted frames and count them, until none comes for two seconds."""
+    """Count wanted frames until none arrives for two seconds."""
     filters = [{"can_id": 0x400, "can_mask": 0x7FE, "extended": False}]
     bus, frames = open_bus(address, filters), 0
     pipe.send("ready")
@@ -301,10 +277,10 @@ def _send(address: BusAddress, rate_hz: float, seconds: float, share: float) -> 
 def _flood(
     pipe: Connection, address: BusAddress, rate_hz: float, seconds: float, share: float
 ) -> None:
-    """Send current and voltage in turn among foreign frames, evenly."""
+    """Send current and voltage alternately among foreign frames, evenly."""
     encoder, bus = FrameEncoder(Vehicle.load("generic")), open_bus(address, [])
     every = round(1.0 / share)
-    # Made before: counters go round after 16 samples, so the frames repeat.
+    # Encoded in advance: the frames repeat after 16 samples, as the counters do.
     ready = [
         frame
         for number in range(16)
@@ -343,23 +319,27 @@ def _put(bus: can.BusABC, frame: can.Message) -> None:
 
 
 def main() -> int:
-    """Measure and print."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--only", action="append", choices=("latency", "loss"))
     parser.add_argument("--interface", default="udp_multicast")
     parser.add_argument("--channel")
-    parser.add_argument("--seconds", type=float, default=20.0, help="of a round of latency")
+    parser.add_argument("--seconds", type=float, default=20.0, help="duration of a latency round")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--minutes", type=float, default=1.0, help="of the loss part (wanted: 10)")
-    parser.add_argument("--bare-minutes", type=float, help="of the bare loop after it; as long")
+    parser.add_argument(
+        "--minutes", type=float, default=1.0, help="duration of the loss part (target: 10)"
+    )
+    parser.add_argument(
+        "--bare-minutes", type=float, help="duration of the bare loop after it; default: the same"
+    )
     parser.add_argument(
         "--highest", type=float, default=HIGHEST_HZ, metavar="HZ",
-        help="rate that the search ends at; a bus of 1 Mbit/s carries less than 20,000 frames/s",
+        help="upper end of the search; a 1 Mbit/s bus carries less than 20,000 frames/s",
     )  # fmt: skip
     parser.add_argument(
-        "--wanted", action="append", type=float, help="shares of the frames: 0.05 and 1"
+        "--wanted", action="append", type=float, help="shares of wanted frames; default: 0.05 and 1"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
@@ -382,7 +362,7 @@ def main() -> int:
 
 
 def _show(result: Result, console: Console) -> None:
-    table = Table("", "service", "bare loop", "wanted", title=result["bus"])
+    table = Table("", "service", "bare loop", "target", title=result["bus"])
     if "latency" in result:
         found = result["latency"]
         for key in ("p50", "p99"):

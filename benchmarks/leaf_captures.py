@@ -1,10 +1,10 @@
-"""The published Leaf model on raw captures of 24 kWh Leafs, beside the car's own SoC.
+"""Published Leaf model on raw captures of 24 kWh Leafs, compared with the car's own SoC.
 
     python benchmarks/leaf_captures.py --data FOLDER [--json]
 
-FOLDER holds owners' captures of the EV-CAN. The model was identified on one car, new in 2012, at
-20–26 °C of *room* temperature; the captures are of other cars, older and in the cold, seconds to a
-minute long. The table shows what that does, and is no measure of the method.
+FOLDER holds owners' captures of the EV-CAN. The model was identified on one new car in 2012, at a
+*room* temperature of 20–26 °C; the captures are of other, older cars in the cold, seconds to a
+minute long. The table shows the consequences; it does not rate the method.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ CAPTURES = (
 )
 ROOM_C = 20.0
 
-WHY = """Why they differ:
-- temperature: the model's kt of −0.74 V/K was fitted to the room's 20–26 °C; the bus gives the
-  pack's. Followed to a pack at 2–12 °C it would be worth 6–13 V, 15–35 % SoC, so it is held 5 K
-  below the identified range ("bus T"); the last columns leave temperature out.
-- age: 10bars has lost capacity (10 of 12 bars); per cent of what, the car and the model disagree.
-- another car: 0x55B counts down to the car's own empty, the paper's 0 % is 51.5 Ah below full.
-- the flat of the curve: 0.34–0.39 V per % from 30 to 80 %, so 0.5 V of quantisation is 1.4 %.
-- the first 70 s fill the delay line; only one capture is longer."""
+WHY = """Reasons for the differences:
+- temperature: kt = −0.74 V/K was fitted to room temperatures of 20–26 °C; the bus has the pack's.
+  Extrapolated to 2–12 °C it would mean 6–13 V, or 15–35 % SoC, so it is limited to 5 K below the
+  identified range ("bus T"); the last columns use 20 °C.
+- age: 10bars has lost capacity (10 of 12 bars); car and model refer to different capacities.
+- definition: 0x55B refers to the car's own empty, 0 % of the paper is 51.5 Ah below full.
+- flat curve: 0.34–0.39 V per % from 30 to 80 %, so a quantization of 0.5 V is 1.4 %.
+- the delay line fills for 70 s; only one capture is longer."""
 
 
 def compare(folder: Path) -> list[dict[str, object]]:
@@ -75,7 +75,7 @@ def compare(folder: Path) -> list[dict[str, object]]:
 
 
 def main() -> int:
-    """Print the comparison."""
+    """Run the comparison."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,10 +1,10 @@
-"""How far a model of few logs is out at other temperatures, kt free and held.
+"""Error of models of few logs at other temperatures, with kt free and with its prior.
 
     python benchmarks/other_temperatures.py --data FOLDER
 
-FOLDER holds `lg_hg2` (drive cycles of a cell, as a pack of 96 × 17) and `bmw_i3` (trips of a car).
-Each model is of one to three logs, or of all; the table gives the median over them of the voltage's
-root mean square error on other logs, within the SoC that the model saw, and the range of kt.
+FOLDER holds `lg_hg2` (drive cycles of a cell, scaled to a pack of 96 × 17) and `bmw_i3` (trips of a
+car). Each model is fitted to one to three logs, or to all. The table gives the median over the
+models of the voltage RMSE on other logs, within the SoC range of the model, and the range of kt.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.charge import capacity_from_reference
 from cangauge.model.voltage_model import VoltageModel
-from cangauge.validation.cases import (
+from cangauge.validation.recordings import (
     LG_25C,
     LG_CAPACITY_AH,
     LG_PARALLEL,
@@ -32,7 +32,7 @@ from cangauge.validation.cases import (
     summer_held_out,
     summer_training,
 )
-from cangauge.validation.twin.recorded import scaled_to_pack, with_start
+from cangauge.validation.twin.injection import scaled_to_pack, with_initial_soc
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 COLDER_AND_WARMER = ("0", "10", "40")
@@ -41,13 +41,13 @@ ROWS_AT_LEAST = 100
 
 
 def main() -> None:
-    """Fit, judge, print."""
+    """Run the comparison."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the recorded logs")
     folder = parser.parse_args().data
     table = Table(title="Voltage error on other logs, median over the models [V]")
     for heading in (
-        "model of", "judged on", "models", "kt free", "kt held", "held is better in",
+        "model of", "tested on", "models", "kt free", "kt held", "held is better in",
         "kt free [V/K]", "kt held [V/K]",
     ):  # fmt: skip
         table.add_column(heading, justify="right")
@@ -59,30 +59,28 @@ def main() -> None:
     }
     ones = [[log] for log in at_25c]
     for each, logs in {"25": at_25c, **others}.items():
-        table.add_row("LG, 1 at 25 °C", f"{each} °C", *judged(ones, logs, of_cells))
+        table.add_row("LG, 1 at 25 °C", f"{each} °C", *evaluated(ones, logs, of_cells))
     for each, logs in others.items():
-        table.add_row("LG, 8 at 25 °C", f"{each} °C", *judged([at_25c], logs, of_cells))
+        table.add_row("LG, 8 at 25 °C", f"{each} °C", *evaluated([at_25c], logs, of_cells))
     summer, held_out = summer_training(folder / "bmw_i3"), summer_held_out(folder / "bmw_i3")
     of_car = FitOptions(capacity_ah=capacity_from_reference(summer))
     for number in (1, 2, 3, len(summer)):
         runs = [summer[k : k + number] for k in range(len(summer) - number + 1)]
         title = f"i3, {number} in summer"
-        table.add_row(title, "other summer trips", *judged(runs, held_out, of_car))
+        table.add_row(title, "other summer trips", *evaluated(runs, held_out, of_car))
     Console().print(table)
 
 
-def judged(
+def evaluated(
     models: Sequence[Sequence[Log]], logs: Sequence[Log], options: FitOptions
 ) -> tuple[str, ...]:
-    """Return the cells of a row of the table, from the number of models on."""
+    """Return the cells of a row, from the number of models on."""
     found, kt = [], []
     for training in models:
         rows = [fit_rows(log, options) for log in training]
         try:
-            two = [
-                fit_voltage_model(rows, options, with_kt_prior=held)[0] for held in (False, True)
-            ]
-        except InputError:  # too little SoC
+            two = [fit_voltage_model(rows, options, is_held=held)[0] for held in (False, True)]
+        except InputError:  # SoC range too small
             continue
         kt.append([model.kt_v_per_k for model in two])
         found.append([error_v([log for log in logs if log not in training], options, model)
@@ -98,7 +96,7 @@ def judged(
 
 
 def error_v(logs: Sequence[Log], options: FitOptions, model: VoltageModel) -> float:
-    """Return the root mean square error over logs [V], each counting the same."""
+    """Return the RMSE over logs, equally weighted [V]."""
     squares = []
     low, high = model.soc_range_pct
     for rows in (fit_rows(log, options) for log in logs):
@@ -110,7 +108,8 @@ def error_v(logs: Sequence[Log], options: FitOptions, model: VoltageModel) -> fl
 
 
 def _pack(path: Path) -> Log:
-    return with_start(scaled_to_pack(read_log(path), series=LG_SERIES, parallel=LG_PARALLEL), 100.0)
+    pack = scaled_to_pack(read_log(path), series=LG_SERIES, parallel=LG_PARALLEL)
+    return with_initial_soc(pack, 100.0)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Draw the README's picture: real trips chained, with a current sensor that is 3 A off.
+"""Draw the README's picture: chained real trips with a current sensor offset of 3 A.
 
 python benchmarks/picture.py --data FOLDER -o docs/chain.png
 """
@@ -21,7 +21,7 @@ from matplotlib import pyplot as plt
 
 
 def main() -> None:
-    """Identify on the odd trips, chain the even ones, draw."""
+    """Identify on the odd trips, estimate the chained even ones, draw."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the i3 trips")
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/chain.png"))

@@ -5,11 +5,11 @@
 FOLDER holds TripA01.csv.gz … TripA22.csv.gz of "Battery and Heating Data in Real Driving Cycles"
 (IEEE DataPort). The model and the capacity come from A01, A03 … A21 alone; A02, A04 … A22 longer
 than 15 minutes judge it. The car's own SoC is the reference. The data ends when the car stops, so
-trips are chained by 12 minutes in which only a current is seen: each method is told the SoC that
-the car gained or lost in between, in its own capacity and without offset. The cases "counted" give
-each method the charge instead, to be counted with the wrong capacity: a gauge that stays awake.
-All is done twice: with the 13 coefficients, and with the effects that `--effects auto` finds on the
-same training trips.
+chained trips are connected by 12 minutes with a current but no voltage, whose charge equals the
+SoC change of the car in each method's capacity, without offset. In the cases "counted" it is the
+true charge, to be counted with the wrong capacity, as by a gauge that is always on. All is done
+twice: with the 13 coefficients, and with the effects that `--effects auto` finds on the same
+training trips.
 """
 
 from __future__ import annotations
@@ -110,12 +110,12 @@ def identify(
     training: Sequence[Log],
     effects: tuple[str, ...] = (),
 ) -> Identification:
-    """Fit model and capacity, and perhaps effects, on the training trips alone."""
+    """Fit model, capacity and effects to the training trips."""
     return fit(training, capacity_ah=capacity_from_reference(training), effects=effects)
 
 
-def explain(identification: Identification, tests: Sequence[Log]) -> tuple[LogFit, ...]:
-    """Return how the model explains trips that it has not seen, on the rows of a fit."""
+def predict(identification: Identification, tests: Sequence[Log]) -> tuple[LogFit, ...]:
+    """Return the fit of other trips by the model, on the rows that a fit uses."""
     options = _options(identification.model)
     if identification.effects is None:
         model = identification.voltage_model
@@ -125,7 +125,7 @@ def explain(identification: Identification, tests: Sequence[Log]) -> tuple[LogFi
 
 
 def estimate(log: Log, model: Model, initial_pct: float | None) -> EstimateTable:
-    """Run the EKF over a trip, from an initial SoC (std 1 %) or from the first voltages."""
+    """Run the EKF over a trip, from an initial SoC (σ 1 %) or from the first voltages."""
     start = None if initial_pct is None else min(max(initial_pct, 0.0), 100.0)
     return run_estimator(samples_of(log), model, EstimatorSettings(initial_soc_pct=start))
 
@@ -133,14 +133,13 @@ def estimate(log: Log, model: Model, initial_pct: float | None) -> EstimateTable
 def chain(
     trips: Sequence[Log], capacity_ah: float, offset_a: float
 ) -> tuple[list[Sample], np.ndarray]:
-    """Return trips one after another, with their reference SoC [%] (NaN in the seams).
+    """Chain trips; return samples and reference SoC [%] (NaN between trips).
 
     Parameters
     ----------
     trips : sequence of Log
     capacity_ah : float
-        Capacity that the seams' charge is reckoned in [Ah]: the gauge's own tells it the SoC, the
-        true one leaves it to count.
+        Capacity that converts the SoC changes between trips to charge [Ah].
     offset_a : float
         Added to the current of the trips [A].
     """
@@ -190,17 +189,17 @@ CHAINS = {
     "chain_offset": (OFFSET_A, 0.0, True),
     "chain_capacity_high": (0.0, CAPACITY_ERROR, True),
     "chain_capacity_low": (0.0, -CAPACITY_ERROR, True),
-    # The charge between trips counted with the wrong capacity too, as a gauge awake would.
+    # True charge between trips, counted with the wrong capacity.
     "chain_capacity_high_counted": (0.0, CAPACITY_ERROR, False),
     "chain_capacity_low_counted": (0.0, -CAPACITY_ERROR, False),
 }
-"""What is wrong in each chain: the current's offset [A], the capacity (relative), and whether each
-method is told the SoC of the seams."""
+"""Chain → current offset [A], relative capacity error, whether charge between trips is in the wrong
+capacity."""
 
 UNCHECKED = {"chain", "chain_capacity_high_counted", "chain_capacity_low_counted"}
-"""Nothing wrong; and the other protocol. Shown beside, without a target."""
+"""Chains without a target."""
 
-CHECKED = {name: wrong for name, wrong in CHAINS.items() if name not in UNCHECKED}
+CHECKED = {name: errors for name, errors in CHAINS.items() if name not in UNCHECKED}
 
 
 def judge(
@@ -209,7 +208,7 @@ def judge(
     effects: tuple[str, ...] = (),
     chains: Mapping[str, tuple[float, float, bool]] = CHAINS,
 ) -> dict[str, object]:
-    """Do the whole comparison, or with some of the chains alone, and return its figures."""
+    """Run the comparison and return its figures."""
     console.print("reading 22 trips, fitting 11 of them …")
     began = time.perf_counter()
     identification = identify(read_trips(folder, TRAINING), effects)
@@ -217,7 +216,7 @@ def judge(
     model = identification.model
     all_tests = read_trips(folder, TEST)
     tests = [trip for trip in all_tests if trip.duration_s > JUDGED_S]
-    voltage = explain(identification, tests)
+    voltage = predict(identification, tests)
     rows = sum(len(item.rows) for item in voltage)
     result: dict[str, object] = {
         "fit_seconds": fit_seconds,
@@ -251,10 +250,12 @@ def judge(
         )
     result["trips"] = trips
     cases = {name: pooled([trip["cases"][name] for trip in trips]) for name in trips[0]["cases"]}
-    for name, (offset_a, error, told) in chains.items():
+    for name, (offset_a, error, is_gauge_capacity) in chains.items():
         console.print(f"estimating the {name.replace('_', ' ')} …")
         capacity_ah = model.capacity_ah * (1.0 + error)
-        samples, soc = chain(tests, capacity_ah if told else model.capacity_ah, offset_a)
+        samples, soc = chain(
+            tests, capacity_ah if is_gauge_capacity else model.capacity_ah, offset_a
+        )
         settings = EstimatorSettings(initial_soc_pct=float(soc[0]), capacity_ah=capacity_ah)
         table = run_estimator(samples, model, settings)
         cases[name] = figures(table, soc)
@@ -299,22 +300,22 @@ TARGETS = (
         for case in ("chain_offset", "chain_capacity_high", "chain_capacity_low")
     ),
 )
-"""What the trips must show: name, unit, limit (or how to get it), value."""
+"""Targets: name, unit, limit or function of the result, value."""
 
-REPAIRED = (
-    ("repaired model: SoC MAE by Newton", "%", 1.2, lambda r: r["soc_newton_mae_pct"]),
+WITH_EFFECTS = (
+    ("with effects: SoC MAE by Newton", "%", 1.2, lambda r: r["soc_newton_mae_pct"]),
     (
-        "repaired model: EKF, SoC withheld: MAE after 5 min", "%", 1.2,
+        "with effects: EKF, SoC withheld: MAE after 5 min", "%", 1.2,
         lambda r: r["cases"]["withheld"].mae_pct,
     ),
 )  # fmt: skip
-"""What they must show with effects, beside that."""
+"""Further targets of the model with effects."""
 
 
 def checks(result: dict[str, object]) -> list[dict[str, object]]:
-    """Return every target with its value and whether it is met."""
+    """Return all targets with value and result."""
     rows: list[dict[str, object]] = []
-    for name, unit, limit, value in (*TARGETS, *(REPAIRED if result["effects"] else ())):
+    for name, unit, limit, value in (*TARGETS, *(WITH_EFFECTS if result["effects"] else ())):
         bound = limit(result) if callable(limit) else limit
         rows.append(_check(name, unit, value(result), "≤", bound))
     for case, item in result["cases"].items():
@@ -416,7 +417,7 @@ def draw(result: dict[str, object], folder: Path, path: Path) -> None:
         plot.varea(minutes, low, high, fill_alpha=0.2, legend_label="EKF ±2σ")
         plot.line(minutes, table.soc_newton_pct[every], color="silver", legend_label="Newton")
         plot.line(minutes, table.soc_pct[every], line_width=2, legend_label="EKF")
-        plot.line(minutes, soc[every], color="black", line_dash="dashed", legend_label="car's own")
+        plot.line(minutes, soc[every], color="black", line_dash="dashed", legend_label="car")
         plot.legend.label_text_font_size = "8pt"
         plot.legend.background_fill_alpha = 0.5
         plots.append(plot)
@@ -432,7 +433,7 @@ def main() -> int:
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the trips")
     parser.add_argument("--report", type=Path, help="write a page with a plot of each test trip")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--only", choices=["plain", "auto"], help="one of both models")
+    parser.add_argument("--only", choices=["plain", "auto"], help="only this model")
     options = parser.parse_args()
     if not options.data.is_dir():
         sys.stderr.write(f"{options.data}: no such folder; give the trips' with --data\n")

@@ -1,21 +1,19 @@
-"""What a restart costs: the service killed at random moments, and what it then knows.
+"""Cost of a restart: the service is killed at random times and continues from its state file.
 
     python benchmarks/restarts.py [--kills 1000] [--real 20] [--seed 1] [--json]
 
-in-process  A drive of 10 Hz is estimated without a break, and beside it by a service that is killed
-            again and again. A kill throws the gauge and the state keeper away; the next service has
-            the state file as it was written by then, and nothing else. The file is written a second
-            after the start and then every 10 s of the drive, as by the service's loop; one in ten
-            kills falls into the writing and leaves half a temporary file. Between kill and first
-            frame 0.2 to 3 s of the drive are lost.
-process     `cangauge run` in a process of its own on a bus (udp_multicast), SIGKILLed at random
-            moments of the wall clock and started again, beside one that nobody kills; the state is
-            written every second there, so that kills are worth something in a minute. How long the
-            start takes is the machine's.
+in-process  A 10 Hz drive is estimated by an uninterrupted service and by one that is killed
+            repeatedly. A kill discards everything but the state file as written by then. The file
+            is written one second after the start and every 10 s of the drive, as by the service;
+            one kill in ten interrupts the writing and leaves half a temporary file. Between the
+            kill and the next frame 0.2 to 3 s of the drive are lost.
+process     `cangauge run` on a bus (udp_multicast) is killed by SIGKILL at random times, started
+            again, and compared with an uninterrupted one; the state is written every second. The
+            time of the start is that of the machine.
 
-For each restart: the charge that is counted wrongly for good (process: the step of the SoC, since
-the bus tells the count to 0.025 % only), beside the charge that flowed either way between the last
-writing and the first frame after; and the SoC less that of the undisturbed service.
+For each restart: the permanent error of the counted charge (process: the step of the SoC, since the
+bus resolves the count to 0.025 % only), the charge that flowed in both directions between the last
+writing and the first frame; and the SoC minus that of the uninterrupted service.
 """
 
 from __future__ import annotations
@@ -65,24 +63,24 @@ Result = dict[str, Any]
 
 @dataclass(frozen=True)
 class Restart:
-    """One kill, and what came of it."""
+    """One kill and its consequences."""
 
     unsaved_s: float
-    """From the last writing to the first frame after [s]."""
+    """Time from the last writing to the first frame after the restart [s]."""
     flowed_pct: float
-    """Charge that flowed in that time, either way [% of capacity]."""
+    """Charge in both directions in that time [% of capacity]."""
     net_pct: float
-    """The same, charging subtracted: what would be lost if nothing were counted across it."""
+    """Net charge in that time: the loss without counting across it [% of capacity]."""
     lost_pct: float
-    """Charge that is counted wrongly for good [% of capacity]."""
+    """Permanent error of the counted charge [% of capacity]."""
     soc_pct: float
-    """SoC at the first frame after, less the undisturbed [%]."""
+    """SoC minus that of the uninterrupted service at the first frame [%]."""
     later_pct: float
-    """The same at the end of that life, mostly a minute later [%]."""
+    """The same at the next kill, about a minute later [%]."""
 
 
 def main() -> None:
-    """Run, and print a table or JSON."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n", maxsplit=1)[0])
     parser.add_argument("--kills", type=int, default=1000)
     parser.add_argument("--real", type=int, default=20)
@@ -91,7 +89,7 @@ def main() -> None:
     options = parser.parse_args()
     console = Console(stderr=True)
     minutes = (options.kills * 0.25 + options.real * 7.0) / 60.0
-    console.print(f"about {minutes:.0f} minutes on a machine that is otherwise idle")
+    console.print(f"about {minutes:.0f} minutes on an idle machine")
     results: Result = {}
     with tempfile.TemporaryDirectory() as folder:
         if options.kills:
@@ -108,7 +106,7 @@ def main() -> None:
 
 
 def drive(seconds: float, model: Model, seed: int) -> list[Sample]:
-    """Return a drive with pulses and regeneration, down and up by turns; the model's voltage."""
+    """Return a drive with pulses, discharging and charging in turn, with the model's voltage."""
     rng = np.random.default_rng(seed)
     time_s = np.arange(0.0, seconds, 1.0 / RATE_HZ)
     edges = np.cumsum(rng.uniform(2.0, 15.0, int(seconds / 5.0) + 10))
@@ -129,8 +127,8 @@ def drive(seconds: float, model: Model, seed: int) -> list[Sample]:
     return [Sample(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
 
 
-class Life:
-    """A service from its start to its kill, driven by samples; the wall clock is theirs."""
+class ServiceRun:
+    """A service from its start to its kill, on the clock of the samples."""
 
     def __init__(self, model: Model, path: Path | None) -> None:
         self.now_s = EPOCH_S
@@ -150,14 +148,14 @@ class Life:
             self.keeper.__enter__()
 
     def take(self, sample: Sample, encoder: FrameEncoder) -> Estimate:
-        """Let the frames of a sample arrive."""
+        """Handle the frames of a sample."""
         self.now_s = sample.time_s
         for frame in encoder.encode(sample):
             self.gauge.handle(frame)
         return self.gauge.latest
 
     def keep(self) -> None:
-        """Have the state written, and wait: what is written later is lost with the service."""
+        """Write the state and wait for the end of the writing."""
         if self.keeper is None:
             return
         self.keeper.checkpoint()
@@ -166,7 +164,7 @@ class Life:
 
 
 def in_process(kills: int, seed: int, folder: Path, console: Console) -> Result:
-    """Kill so many services at random moments of one drive."""
+    """Kill services at random times of one drive."""
     rng = np.random.default_rng(seed)
     model = Model.load(shared_file("replay", "leaf2012_published_model.json"))
     path = folder / "state.json"
@@ -175,7 +173,7 @@ def in_process(kills: int, seed: int, folder: Path, console: Console) -> Result:
     samples = drive(float(lives.sum() + away.sum()) / RATE_HZ, model, seed)
     flowed, net = flowed_pct(samples, model.capacity_ah)
     encoder, other = (FrameEncoder(Vehicle.load("generic")) for _ in range(2))
-    whole, life = Life(model, None), Life(model, path)
+    whole, life = ServiceRun(model, None), ServiceRun(model, path)
     life.begin(EPOCH_S)
     restarts, begun = [], None
     first = saved = refused = 0
@@ -197,13 +195,13 @@ def in_process(kills: int, seed: int, folder: Path, console: Console) -> Result:
                 due, saved = at + int(EVERY_S * RATE_HZ), at
         if begun is not None:
             restarts.append(Restart(*begun, found.soc_pct - truth.soc_pct))
-        # Killed: nothing of it is used again but the file, as it is now.
+        # Killed: only the state file is used again.
         if rng.random() < 0.1:
             (folder / f".state.{number:08x}.json").write_bytes(b'{"format": "cangauge-st')
         first += alive + gone
         for at in range(first - gone, min(first, len(samples))):
             whole.take(samples[at], other)
-        life = Life(model, path)
+        life = ServiceRun(model, path)
         life.begin(EPOCH_S + first / RATE_HZ)
         refused += not (life.keeper is not None and life.keeper.restored)
         console.print(f"{number} kills", end="\r")
@@ -215,7 +213,7 @@ def in_process(kills: int, seed: int, folder: Path, console: Console) -> Result:
 
 
 def flowed_pct(samples: list[Sample], capacity_ah: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the charge since the first sample [%], either way and net, shape (n,) each."""
+    """Return the charge since the first sample in both directions and net [%], shape (n,) each."""
     current_a = np.array([sample.current_a for sample in samples])
     each = (current_a[1:] + current_a[:-1]) / 2.0 / RATE_HZ * 100.0 / (3600.0 * capacity_ah)
     either = np.concatenate(([0.0], np.cumsum(np.abs(each))))
@@ -223,13 +221,13 @@ def flowed_pct(samples: list[Sample], capacity_ah: float) -> tuple[np.ndarray, n
 
 
 def rms_30s_pct(samples: list[Sample], capacity_ah: float) -> float:
-    """Return the charge of 30 s at the drive's mean (root of squares) current [%]."""
+    """Return the charge of 30 s at the RMS current [%]."""
     rms_a = float(np.sqrt(np.mean([sample.current_a**2 for sample in samples])))
     return 100.0 * rms_a * 30.0 / (3600.0 * capacity_ah)
 
 
 def summary(restarts: list[Restart], rms_30s_pct: float) -> Result:
-    """Return what the restarts amount to."""
+    """Summarize the restarts."""
     columns = {
         name: np.abs([getattr(each, name) for each in restarts])
         for name in ("unsaved_s", "flowed_pct", "net_pct", "lost_pct", "soc_pct", "later_pct")
@@ -254,7 +252,7 @@ KILLED_ID, WHOLE_ID = 0x5A0, 0x5B0
 
 
 def real_process(kills: int, seed: int, folder: Path, console: Console) -> Result:
-    """Kill `cangauge run` so often with SIGKILL, beside one that nobody kills."""
+    """Kill `cangauge run` by SIGKILL, and compare with an uninterrupted one."""
     rng = np.random.default_rng(seed)
     model_path = shared_file("replay", "leaf2012_published_model.json")
     model = Model.load(model_path)
@@ -262,7 +260,7 @@ def real_process(kills: int, seed: int, folder: Path, console: Console) -> Resul
     samples = drive(kills * 30.0 + 300.0, model, seed)
     flowed, net = flowed_pct(samples, model.capacity_ah)
     restarts = []
-    with Player(samples, folder / "said.txt") as player:
+    with Player(samples, folder / "service.txt") as player:
         service = [player.service(model_path, KILLED_ID, folder / "real.json")]
         other = player.service(model_path, WHOLE_ID, None)
         try:
@@ -296,12 +294,12 @@ def real_process(kills: int, seed: int, folder: Path, console: Console) -> Resul
 
 
 class Player(threading.Thread):
-    """Plays a drive on a bus in real time, and hears what two services make of it."""
+    """Sends a drive to a bus in real time and reads the SoC of two services."""
 
-    def __init__(self, samples: list[Sample], said: Path) -> None:
+    def __init__(self, samples: list[Sample], log: Path) -> None:
         super().__init__(daemon=True)
         self._samples = samples
-        self._said = said
+        self._log = log
         self._bus = open_bus(BusAddress("udp_multicast", CHANNEL, {"port": PORT}))
         self._over = threading.Event()
         self._latest: dict[int, float] = {}
@@ -319,7 +317,7 @@ class Player(threading.Thread):
         self._bus.shutdown()
 
     def run(self) -> None:
-        """Send, and listen in between."""
+        """Send frames and receive in between."""
         encoder = FrameEncoder(Vehicle.load("generic"))
         began_s = time.monotonic()
         for number, sample in enumerate(self._samples):
@@ -329,23 +327,23 @@ class Player(threading.Thread):
             while (left_s := began_s + (number + 1) / RATE_HZ - time.monotonic()) > 0.0:
                 message = self._bus.recv(left_s)
                 if message is not None:
-                    self._hear(message)
+                    self._read(message)
             if self._over.is_set():
                 return
 
-    def _hear(self, message: can.Message) -> None:
+    def _read(self, message: can.Message) -> None:
         for frame_id, reader in zip((KILLED_ID, WHOLE_ID), self._readers, strict=True):
             content = reader.read(message)
             if isinstance(content, SocEstimate) and not content.reasons & Reason.INPUT_STALE:
                 self._latest[frame_id] = content.soc_pct
 
     def forget(self) -> None:
-        """Forget what the killed one said."""
+        """Drop the SoC of the killed service."""
         time.sleep(0.2)
         self._latest.pop(KILLED_ID, None)
 
     def wait_for_both(self) -> None:
-        """Wait until both tell a SoC of samples that they had."""
+        """Wait until both services publish a SoC."""
         until_s = time.monotonic() + 60.0
         while not {KILLED_ID, WHOLE_ID} <= self._latest.keys():
             if time.monotonic() > until_s:
@@ -353,7 +351,7 @@ class Player(threading.Thread):
             time.sleep(0.02)
 
     def apart_pct(self) -> float:
-        """Return the killed one's SoC less the other's [%]."""
+        """Return the SoC of the killed service minus that of the other [%]."""
         return self._latest[KILLED_ID] - self._latest[WHOLE_ID]
 
     def service(self, model: Path, frame_id: int, state: Path | None) -> subprocess.Popen[bytes]:
@@ -365,16 +363,16 @@ class Player(threading.Thread):
             "--soc-estimate-id", f"0x{frame_id:X}", "--soc-detail-id", f"0x{frame_id + 1:X}",
             "--replay-clock-id", f"0x{frame_id + 15:X}", *kept,
         ]  # fmt: skip
-        with self._said.open("ab") as said:
+        with self._log.open("ab") as log:
             return subprocess.Popen(
                 [sys.executable, "-c", COMMAND, *map(str, arguments)],
-                stderr=said,
+                stderr=log,
                 stdout=subprocess.DEVNULL,
             )
 
     def restored(self) -> int:
-        """Return how many starts went on from a state, as the services said."""
-        return self._said.read_text(encoding="utf-8").count("going on from")
+        """Return the number of starts that restored a state, by the log of the service."""
+        return self._log.read_text(encoding="utf-8").count("going on from")
 
 
 def table_of(results: Result) -> Table:

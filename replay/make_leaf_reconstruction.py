@@ -1,14 +1,14 @@
-"""Make the reconstruction of the published 2012 Leaf test: the logs that stand beside this script.
+"""Make the logs in this folder: a reconstruction of the published 2012 Leaf test.
 
-The original log (Argonne, chassis dynamometer) may not be redistributed. This is NOT that log. It
-is what a road-load model of the car draws from its battery on the public drive schedules, with the
-voltage of the published equation and coefficients, and an error of measurement added to it.
+The original log (Argonne, chassis dynamometer) may not be redistributed. This is NOT that log: a
+road-load model of the car on the public drive schedules gives the battery power, the published
+equation and coefficients give the voltage, and a measurement error is added.
 
     python replay/make_leaf_reconstruction.py --schedules DIR [-o DIR]
 
-DIR holds udds.csv, us06.csv and hwfet.csv (seconds and m/s, 1 Hz, one header line), as the PyPI
-package fastsim 2.1 carries them in its wheel under fastsim/resources/cycles. The same schedules
-give the same values: every seed is fixed.
+DIR holds udds.csv, us06.csv and hwfet.csv (seconds and m/s, 1 Hz, one header line) of the PyPI
+package fastsim 2.1, folder fastsim/resources/cycles. All seeds are fixed: the same schedules give
+the same values.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ RATE_HZ = 10
 STEP_S = 1.0 / RATE_HZ
 
 ORDER = ("udds", "hwfet", "udds", "us06", "hwfet", "udds", "us06", "hwfet", "udds")
-"""The schedules in the order driven; the pack is empty before the last one ends."""
+"""Order of the schedules; the pack is empty before the last one ends."""
 
 SEEDS = {"pedal": 1, "room": 2, "white": 3, "correlated": 4}
-"""Of numpy's default generator; the first ones tried."""
+"""Seeds of numpy's default generator."""
 
 NOTICE = (
     "A RECONSTRUCTION, not the measured log: published voltage equation of the 2012 Nissan Leaf,"
@@ -51,51 +51,51 @@ NOTICE = (
 
 @dataclass(frozen=True)
 class Car:
-    """A 2012 Leaf on the dynamometer. Road load and losses are within what is published of it."""
+    """A 2012 Leaf on the dynamometer; road load and losses within the published range."""
 
     mass_kg: float = 1640.0
-    """Test weight: kerb weight of 1,520 kg and a driver with instruments."""
+    """Test mass: kerb mass of 1,520 kg, driver and instruments [kg]."""
     rotating: float = 1.04
-    """Wheels and motor, as a factor on the mass."""
+    """Factor on the mass for wheels and motor [-]."""
     road_n: float = 160.0
-    """Rolling resistance of tyres on the rolls, bearings [N]."""
+    """Rolling resistance of tyres and bearings [N]."""
     drag_n_per_m2_s2: float = 0.49
-    """Air drag and rolls [N/(m/s)²]; 0.5·1.2 kg/m³·0.29·2.3 m² = 0.40 is the body alone."""
+    """Air drag and rolls [N/(m/s)²]; the body alone has 0.5·1.2 kg/m³·0.29·2.3 m² = 0.40."""
     drive_efficiency: float = 0.89
-    """Battery to wheels while driving."""
+    """Battery to wheels [-]."""
     regen_efficiency: float = 0.88
-    """Wheels to battery while braking."""
+    """Wheels to battery during regeneration [-]."""
     drive_limit_w: float = 70e3
-    """Most that the inverter draws [W]."""
+    """Largest power of the inverter [W]."""
     regen_limit_w: float = 19.5e3
-    """Most that it puts back [W]; the friction brakes do the rest."""
+    """Largest regeneration [W]; the friction brakes take the rest."""
     regen_fade_m_s: tuple[float, float] = (1.5, 4.5)
-    """Regeneration fades out between these speeds when the car stops."""
+    """Speeds between which regeneration fades out [m/s]."""
     accessory_w: float = 900.0
-    """Pumps, fans, lamps, control units while the car is on [W]."""
+    """Pumps, fans, lamps and control units of the car switched on [W]."""
 
 
 @dataclass(frozen=True)
 class Stop:
-    """Between two schedules: standing, switched off (contactor open), standing."""
+    """Stop between two schedules: on, off (contactor open), on."""
 
     on_s: float = 10.0
     off_s: float = 30.0
     precharge_s: float = 0.5
-    """At the end of the time off, the link behind the contactor is charged first."""
+    """Precharge of the link behind the contactor at the end of the off time [s]."""
     precharge_tau_s: float = 0.1
     collapse_tau_s: float = 0.4
-    """After the contactor has opened, the link is discharged with this time constant."""
+    """Time constant of the discharge of the link after the contactor opens [s]."""
 
 
 @dataclass(frozen=True)
 class Driver:
-    """Follows the schedule with some preview, and with an unsteady foot."""
+    """Follows the schedule with preview and pedal noise."""
 
     preview_s: float = 1.0
     lag_s: float = 0.3
     pedal_n: float = 50.0
-    """Standard deviation of the unsteady force at the wheels [N]."""
+    """Standard deviation of the pedal noise as a force at the wheels [N]."""
     pedal_tau_s: float = 1.5
 
 
@@ -106,7 +106,7 @@ def read_schedule(folder: Path, name: str) -> FloatArray:
         table = np.loadtxt(path, delimiter=",", skiprows=1, usecols=(0, 1), ndmin=2)
     except FileNotFoundError as error:
         raise InputError(
-            "the drive schedule is not there",
+            "the drive schedule does not exist",
             source=path,
             field="--schedules",
             cure="name the folder of udds.csv, us06.csv and hwfet.csv, e.g."
@@ -126,7 +126,7 @@ def read_schedule(folder: Path, name: str) -> FloatArray:
 
 
 def plan(schedules: Mapping[str, FloatArray], stop: Stop) -> tuple[FloatArray, BoolArray]:
-    """Return the wanted speed [m/s] and whether the contactor is closed, at 10 Hz."""
+    """Return the target speed [m/s] and whether the contactor is closed, at 10 Hz."""
     speed, closed = [], []
     for index, name in enumerate(ORDER):
         if index:
@@ -140,7 +140,7 @@ def plan(schedules: Mapping[str, FloatArray], stop: Stop) -> tuple[FloatArray, B
 
 
 def room_temperature(rows: int) -> FloatArray:
-    """Return the test room's temperature [°C] to 0.01: slow drift, control cycle, wander."""
+    """Return the temperature of the test room to 0.01 °C: drift, control cycle, random walk."""
     t = np.arange(rows) * STEP_S
     wander = coloured_noise(rows, [200.0], np.random.default_rng(SEEDS["room"]))
     drift = 1.7 * np.sin(2.0 * np.pi * (t / 5400.0 - 0.1))
@@ -149,7 +149,7 @@ def room_temperature(rows: int) -> FloatArray:
 
 
 def coloured_noise(rows: int, tau_s: Sequence[float], rng: np.random.Generator) -> FloatArray:
-    """Return a sum of Ornstein–Uhlenbeck processes of equal, stationary variance, together 1."""
+    """Return a sum of stationary Ornstein–Uhlenbeck processes of equal variance, in total 1."""
     total = np.zeros(rows)
     for tau in tau_s:
         keep = math.exp(-STEP_S / tau)
@@ -164,7 +164,7 @@ def coloured_noise(rows: int, tau_s: Sequence[float], rng: np.random.Generator) 
 
 
 def wheel_power(speed: FloatArray, car: Car, driver: Driver) -> FloatArray:
-    """Return the power that driving takes from the battery [W], negative while it charges."""
+    """Return the battery power of driving [W], negative during regeneration."""
     preview = round(driver.preview_s * RATE_HZ)
     ahead = np.concatenate([speed[preview:], np.zeros(preview)]).tolist()
     rng = np.random.default_rng(SEEDS["pedal"])
@@ -176,7 +176,7 @@ def wheel_power(speed: FloatArray, car: Car, driver: Driver) -> FloatArray:
     for target, unsteady in zip(ahead, pedal, strict=True):
         road = car.road_n + car.drag_n_per_m2_s2 * v * v
         if target == 0.0 and v < 0.3:
-            v = force = 0.0  # held on the brake
+            v = force = 0.0  # standstill
             power.append(0.0)
             continue
         wanted = inertia * (target - v) / driver.preview_s + road + (unsteady if v > 1.0 else 0.0)
@@ -198,9 +198,9 @@ def wheel_power(speed: FloatArray, car: Car, driver: Driver) -> FloatArray:
 def battery_current(
     power_w: FloatArray, closed: BoolArray, temperature_c: FloatArray
 ) -> FloatArray:
-    """Return the current that gives this power, to 0.01 A, until the pack is empty [A].
+    """Return the current for a power until the pack is empty, to 0.01 A [A].
 
-    U·I = P with U = E + R1·I, E being the published voltage without the present current.
+    Solves U·I = P with U = E + R1·I, where E is the published voltage without the present current.
     """
     model = leaf_2012_model()
     r1, *r_past = model.resistance_ohm
@@ -231,7 +231,7 @@ def true_voltage(
     closed: BoolArray,
     stop: Stop,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return SoC [%] and the voltage without error [V], as measured behind the contactor."""
+    """Return SoC [%] and the error-free voltage behind the contactor [V]."""
     model = leaf_2012_model()
     soc = 100.0 * (1.0 - discharged_ah(time_s, current_a) / CAPACITY_AH)
     delayed = delayed_currents(time_s, current_a, model.delay_s, time_s)
@@ -248,9 +248,9 @@ def true_voltage(
 
 
 def with_error(voltage_v: FloatArray, shape: FloatArray, closed: BoolArray) -> FloatArray:
-    """Return the voltage with a relative error of this shape and the published MAE [V], to 0.01.
+    """Add a relative error with the published MAE to the voltage, to 0.01 V [V].
 
-    The MAE is the mean of |error| / voltage over the rows cut to 1 Hz, contactor closed.
+    The MAE is the mean of |error| / voltage over the 1 Hz rows with a closed contactor.
     """
     kept = (np.arange(shape.size) % RATE_HZ == 0) & closed
     relative = shape * (VOLTAGE_MAE_PCT / 100.0 / np.mean(np.abs(shape[kept])))
@@ -258,7 +258,7 @@ def with_error(voltage_v: FloatArray, shape: FloatArray, closed: BoolArray) -> F
 
 
 def write_reconstruction(path: Path, columns: Mapping[str, FloatArray], about: str) -> None:
-    """Write one log as Parquet, with what it is in its metadata."""
+    """Write one log as Parquet, with its origin in the metadata."""
     table = pa.table(dict(columns)).replace_schema_metadata(
         {
             "cangauge.temperature_source": "room",
@@ -275,7 +275,7 @@ def write_reconstruction(path: Path, columns: Mapping[str, FloatArray], about: s
             part,
             compression="zstd",
             compression_level=19,
-            # The smallest of the encodings for each column, measured: together 0.5 MB, not 0.9.
+            # Smallest encoding of each column: 0.5 MB instead of 0.9 MB in total.
             use_dictionary=["current_a", "voltage_v"],
             use_byte_stream_split=["time_s"],
             write_page_checksum=True,
@@ -283,7 +283,7 @@ def write_reconstruction(path: Path, columns: Mapping[str, FloatArray], about: s
 
 
 def make(schedules: Path, out: Path) -> list[Path]:
-    """Write the three logs into `out` and return their paths."""
+    """Write the three logs to `out` and return their paths."""
     stop = Stop()
     speed, closed = plan({name: read_schedule(schedules, name) for name in set(ORDER)}, stop)
     power = wheel_power(speed, Car(), Driver()) + Car().accessory_w
@@ -326,7 +326,7 @@ def make(schedules: Path, out: Path) -> list[Path]:
 
 
 def main() -> int:
-    """Run the command line."""
+    """Run the command."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -339,7 +339,7 @@ def main() -> int:
         type=Path,
         default=Path(__file__).parent,
         metavar="DIR",
-        help="where to write the logs (default: beside this script)",
+        help="folder of the logs (default: that of this script)",
     )
     options = parser.parse_args()
     try:

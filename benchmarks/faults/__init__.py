@@ -1,17 +1,17 @@
-"""Faults on a live bus: named ways to break input, bus, service and state, a table of what comes.
+"""Fault injection on a live bus: named faults of input, bus, service and state, and their results.
 
     make faults        (or: PYTHONPATH=benchmarks python -m faults --help)
 
-The service runs in a process of its own and is known by its command line, its exit status and the
-frames that it publishes (`dbc/soc_estimate.dbc`) alone.
+The service runs in its own process and is observed by its command line, its exit status and its
+published frames (`dbc/soc_estimate.dbc`) only.
 
-drive      a log → frames with times; what a fault may change
-alter      changes of values and frames, pure and seeded
-catalogue  the named faults (`catalogue_frames`, `_service`, `_state`, `_bus`)
-line       a bus of its own for each fault: UDP multicast, or a vcan interface
-process    the service's process
-stage      one service on one line, with what a fault may do to it
-run        plays one fault, watches what is published
-judge      what was seen → passed or not, and why
-table      rows for people, JSON for programs
+fault      a fault: name, description, what it changes and does
+catalogue  the named faults; add one here
+frames     a log → frames with times, and changes of values and frames
+actions    actions on the service, its files, the bus interface and the machine
+bench      one service on one bus
+line       a separate bus for each fault: UDP multicast, or a vcan interface
+process    the process of the service
+run        one fault, or all of them in parallel
+criteria   observation → verdict → table
 """

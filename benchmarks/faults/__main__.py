@@ -1,9 +1,9 @@
-"""Inject faults on a live bus and print a table of what came of each.
+"""Inject faults on a live bus and print a table of the results.
 
     make faults
     PYTHONPATH=benchmarks python -m faults [--only NAME]… [--bus udp|vcan|both] [--json]
 
-Says how long it will take before it begins. Exit status 1 if a fault was not survived, or nothing
+Prints the estimated time first. Exit status 1 if a fault failed, or nothing
 could be judged.
 """
 
@@ -25,36 +25,37 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from cangauge.bus.open import has_socketcan
 from faults.catalogue import EVERYTHING, ON_ANY_BUS, ON_UDP, ON_VCAN
+from faults.criteria import Row, show
 from faults.fault import Fault
 from faults.line import udp, vcan
 from faults.process import prepare
-from faults.schedule import Jobs, run_all, seconds
-from faults.table import Row, show
+from faults.run import Jobs, run_all, seconds
 
 ERR = Console(stderr=True)
 
 
 def main() -> int:
-    """Run, judge, print."""
+    """Run the faults and print the table."""
     options = _options()
     if options.list:
         for name, fault in EVERYTHING.items():
-            sys.stdout.write(f"{name}: {fault.done}\n")
+            sys.stdout.write(f"{name}: {fault.description}\n")
         return 0
     chosen = _chosen(options.only)
     prepare()
     rows: list[Row] = []
     if options.bus in {"udp", "both"}:
         faults = [fault for fault in ON_UDP if fault.name in chosen]
-        there = _Elsewhere(options, chosen) if options.bus == "both" and options.socketcan else None
+        on_vcan = None
+        if options.bus == "both" and options.socketcan:
+            on_vcan = _VcanRun(options, chosen)
         rows += _run("udp", faults, options)
-        if there is not None:
-            rows += there.rows()
+        if on_vcan is not None:
+            rows += on_vcan.rows()
     if options.bus == "vcan" or (options.bus == "both" and not options.socketcan):
-        usual = ON_VCAN if not options.only else [*ON_ANY_BUS, *ON_VCAN]
-        if options.bus == "both":
-            usual = ON_VCAN
-        faults = list({fault.name: fault for fault in usual if fault.name in chosen}.values())
+        with_any = options.only and options.bus == "vcan"
+        on_bus = [*ON_ANY_BUS, *ON_VCAN] if with_any else ON_VCAN
+        faults = list({fault.name: fault for fault in on_bus if fault.name in chosen}.values())
         rows += _run("vcan", faults, options)
     failed = [row for row in rows if row.verdict is not None and not row.verdict.passed]
     judged = any(row.verdict is not None for row in rows)
@@ -63,17 +64,17 @@ def main() -> int:
             "seed": options.seed,
             "faults": len({row.name for row in rows}),
             "failed": len(failed),
-            "left_out": sum(row.verdict is None for row in rows),
+            "skipped": sum(row.verdict is None for row in rows),
             "rows": [row.as_json() for row in rows],
         }
         sys.stdout.write(json.dumps(found) + "\n")
     else:
         console = Console(width=max(Console().width, 170))
         show(rows, console)
-        left_out = sum(row.verdict is None for row in rows)
+        skipped = sum(row.verdict is None for row in rows)
         console.print(
-            f"{len(rows)} runs: {len(rows) - len(failed) - left_out} passed, {len(failed)} failed,"
-            f" {left_out} left out; seed {options.seed}"
+            f"{len(rows)} runs: {len(rows) - len(failed) - skipped} passed, {len(failed)} failed,"
+            f" {skipped} skipped; seed {options.seed}"
         )
     return 1 if failed or not judged else 0
 
@@ -83,16 +84,20 @@ def _options() -> argparse.Namespace:
         prog="faults", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument(
-        "--only", action="append", metavar="NAME", help="may hold *, may be repeated"
+        "--only", action="append", metavar="NAME", help="name or pattern with *; repeat for several"
     )
     parser.add_argument("--bus", choices=("udp", "vcan", "both"), default="both")
     parser.add_argument(
         "--socketcan", metavar="COMMAND", default="",
-        help="command under which SocketCAN is to be had, for what needs vcan interfaces",
+        help="command that provides SocketCAN, for faults that need vcan interfaces",
     )  # fmt: skip
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--jobs", type=int, default=Jobs.fast, help="by the replay clock at once")
-    parser.add_argument("--jobs-real", type=int, default=Jobs.real, help="in real time at once")
+    parser.add_argument(
+        "--jobs", type=int, default=Jobs.fast, help="parallel runs by the replay clock"
+    )
+    parser.add_argument(
+        "--jobs-real", type=int, default=Jobs.real, help="parallel runs in real time"
+    )
     parser.add_argument("--list", action="store_true", help="print the names of all faults")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     return parser.parse_args()
@@ -104,7 +109,7 @@ def _chosen(patterns: list[str] | None) -> set[str]:
         return names
     found = {name for name in names if any(fnmatchcase(name, each) for each in patterns)}
     if not found:
-        raise SystemExit(f"--only {patterns}: no such fault (--list prints them)")
+        raise SystemExit(f"--only {patterns}: unknown fault (--list prints them)")
     return found
 
 
@@ -118,20 +123,22 @@ def _run(bus: str, faults: list[Fault], options: argparse.Namespace) -> list[Row
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
                TimeElapsedColumn())  # fmt: skip
     with Progress(*columns, console=ERR) as progress:
-        task = progress.add_task(bus, total=len(able) + len({fault.alike for fault in able}))
+        task = progress.add_task(
+            bus, total=len(able) + len({fault.reference_key for fault in able})
+        )
 
         def over(name: str) -> None:
             progress.update(task, advance=1, description=f"{bus}: {name}")
             if not ERR.is_terminal:
-                ERR.print(f"{bus}: {name}: over")
+                ERR.print(f"{bus}: {name}: finished")
 
         lines = udp if bus == "udp" else vcan
         done = run_all(able, lines, jobs, options.seed, progress=over)
-    return [Row.of(each.fault, bus, each.verdict, each.why_not) for each in done] + rows
+    return [Row.of(each.fault, bus, each.verdict, each.reason) for each in done] + rows
 
 
 def _able(bus: str, faults: list[Fault]) -> tuple[list[Fault], list[Row]]:
-    """Return what can be run here, and the rows of the rest, which say why not."""
+    """Return the faults that can run here, and rows with the reason for the others."""
     lacking = _lacking(bus)
     able, rows = [], []
     for fault in faults:
@@ -146,7 +153,7 @@ def _able(bus: str, faults: list[Fault]) -> tuple[list[Fault], list[Row]]:
 def _lacking(bus: str) -> dict[str, str]:
     lacking = {}
     if bus == "vcan" and not _can_make_vcan():
-        lacking["vcan"] = "no vcan interface can be made here (--socketcan names a way)"
+        lacking["vcan"] = "no vcan interface can be created here (see --socketcan)"
     if bus == "udp":
         lacking["vcan"] = "needs a vcan interface"
     if os.geteuid() != 0:
@@ -164,13 +171,13 @@ def _can_make_vcan() -> bool:
     line = vcan(0)
     try:
         line.create()
-    except Exception as error:  # noqa: BLE001 - whatever it is, there is no such interface
+    except Exception as error:  # noqa: BLE001 - any error means that there is no interface
         ERR.print(f"vcan: {error}")
     return has_socketcan(line.channel)
 
 
-class _Elsewhere:
-    """The vcan part of this very program under another command, at the same time."""
+class _VcanRun:
+    """The faults on vcan, run in parallel by this program under the --socketcan command."""
 
     def __init__(self, options: argparse.Namespace, chosen: set[str]) -> None:
         command = [
@@ -190,12 +197,14 @@ class _Elsewhere:
         self._out, _ = self._process.communicate()
 
     def rows(self) -> list[Row]:
-        """Wait for its rows."""
+        """Wait for the rows."""
         self._thread.join()
         try:
             found: dict[str, Any] = json.loads(self._out)
         except ValueError:
-            raise SystemExit(f"the part on vcan ended with {self._process.returncode}") from None
+            raise SystemExit(
+                f"the run on vcan ended with status {self._process.returncode}"
+            ) from None
         return [Row.from_json(row) for row in found["rows"]]
 
 

@@ -1,4 +1,4 @@
-"""What a fault is: a name, what is done in words, and what is done."""
+"""Faults: a name, a description, and what is changed or done."""
 
 from __future__ import annotations
 
@@ -7,20 +7,19 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import Any, Final, Literal
 
-from faults.drive import FAST, FrameChange, Profile, ValueChange
-from faults.stage import Stage
+from faults.bench import Bench
+from faults.frames import FAST, FrameChange, Profile, ValueChange
 
 Need = Literal["vcan", "root", "state", "alone"]
-"""An interface that can be taken down; rights of root; a service with --state; no other run
-beside it (it turns what all share)."""
+"""A vcan interface; root rights; a service with --state; no other run at the same time."""
 
 
 @dataclass(frozen=True)
 class Action:
-    """Something done to the service, the bus or the machine at a time of the profile [s]."""
+    """An action on the service, the bus or the machine at a time of the profile [s]."""
 
     at_s: float
-    do: Callable[[Stage], None]
+    do: Callable[[Bench], None]
 
 
 Plan = Callable[[Profile, Random], list[Action]]
@@ -28,34 +27,34 @@ Plan = Callable[[Profile, Random], list[Action]]
 
 @dataclass(frozen=True)
 class Fault:
-    """One row of the table.
+    """One fault, a row of the table.
 
     Parameters
     ----------
     name : str
-    done : str
-        What is done, in words.
+    description : str
+        What is done, for the table.
     profile : Profile
     values, frames : callable, optional
-        Changes of what is sent.
-    untrue : tuple of str
-        Roles whose values cannot be trusted while `values` acts.
+        Changes of the samples and of the frames that are sent.
+    untrusted : tuple of str
+        Roles whose values are invalid while `values` acts.
     plan : callable, optional
-        What is done besides.
+        Actions during the run.
     needs : frozenset of str
     config : dict
         Keys of the service's configuration.
     vehicle : str
-        "generic" or "float": the same signals as IEEE floats, without CRC.
+        "generic", or "float": IEEE floats without CRC.
     cold : bool
         Start the service in a fresh interpreter.
     """
 
     name: str
-    done: str
+    description: str
     profile: Profile = FAST
     values: ValueChange | None = None
-    untrue: tuple[str, ...] = ()
+    untrusted: tuple[str, ...] = ()
     frames: FrameChange | None = None
     plan: Plan | None = None
     needs: frozenset[Need] = frozenset()
@@ -64,21 +63,21 @@ class Fault:
     cold: bool = False
 
     @property
-    def alike(self) -> tuple[str, str, str]:
-        """What a run must share with this one to be its undisturbed run."""
+    def reference_key(self) -> tuple[str, str, str]:
+        """Key of the undisturbed run that a run is compared with."""
         return self.profile.name, self.vehicle, repr(sorted(self.config.items()))
 
 
 UNDISTURBED: Final = "undisturbed"
 
 
-def at(share: float, do: Callable[[Stage], None]) -> Plan:
-    """Return the plan that does one thing at a share of the fault's time."""
+def at(share: float, do: Callable[[Bench], None]) -> Plan:
+    """Plan one action at a fraction of the fault's time."""
     return during((share, do))
 
 
-def during(*steps: tuple[float, Callable[[Stage], None]]) -> Plan:
-    """Return the plan that does things at shares of the fault's time."""
+def during(*steps: tuple[float, Callable[[Bench], None]]) -> Plan:
+    """Plan actions at fractions of the fault's time."""
 
     def plan(profile: Profile, _rng: Random) -> list[Action]:
         first, last = profile.fault_s

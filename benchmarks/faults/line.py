@@ -1,6 +1,6 @@
-"""A bus of its own for each fault: UDP multicast on this machine, or a vcan interface.
+"""A separate bus for each fault: UDP multicast on this machine, or a vcan interface.
 
-Sender and listener of the harness outlive an interface that goes and comes back.
+Sender and listener of the harness reopen an interface that was removed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from cangauge.errors import CangaugeError
 UDP_GROUP: Final = "239.74.163.2"
 UDP_PORT: Final = 20_000
 PORTS: Final = 100
-"""So many lines each process may have; ports alone keep multicast buses apart."""
+"""Buses per process; multicast buses differ by their port."""
 BLOCKS: Final = 120
 PUBLISHED: Final = [
     {"can_id": frame_id, "can_mask": 0x7FF, "extended": False} for frame_id in (0x5A0, 0x5A1)
@@ -30,7 +30,7 @@ PUBLISHED: Final = [
 
 
 @dataclass(frozen=True)
-class Line:
+class BusLine:
     """One bus.
 
     Parameters
@@ -47,44 +47,44 @@ class Line:
 
     @property
     def is_vcan(self) -> bool:
-        """Whether it is an interface that can be taken down."""
+        """Whether it is a vcan interface."""
         return self.interface == "socketcan"
 
     def open(self, *, published_only: bool) -> can.BusABC:
-        """Open it."""
+        """Open the bus."""
         address = BusAddress(self.interface, self.channel, self.options)
         return open_bus(address, PUBLISHED if published_only else [])
 
     def link(self, *arguments: str) -> None:
-        """Run `ip link` on it: "set up", "del" …; what fails is an error of the harness."""
+        """Run `ip link` on the interface; a failure is an error of the harness."""
         words = " ".join(arguments).replace("DEV", self.channel).split()
         run(["ip", "link", *words])
 
     def create(self) -> None:
-        """Make the interface, up, unless it is there."""
+        """Create the interface if needed and set it up."""
         if not Path("/sys/class/net", self.channel).exists():
             self.link("add DEV type vcan")
         self.link("set DEV up")
 
     def remove(self) -> None:
-        """Remove the interface, as an adapter that is unplugged."""
+        """Remove the interface, like an unplugged adapter."""
         self.link("del DEV")
 
 
-def udp(number: int) -> Line:
-    """Return a bus on this machine that no other number and no other process shares."""
+def udp(number: int) -> BusLine:
+    """Return a bus on this machine, exclusive to this number and process."""
     if not 0 <= number < PORTS:
         raise ValueError(f"no line {number}: there are {PORTS}")
     port = UDP_PORT + PORTS * _own_block()[0] + number
-    return Line("udp_multicast", UDP_GROUP, {"port": port, "hop_limit": 0})
+    return BusLine("udp_multicast", UDP_GROUP, {"port": port, "hop_limit": 0})
 
 
 @cache
 def _own_block() -> tuple[int, socket.socket]:
-    """Claim ports that no other process of this kind uses, until this one ends.
+    """Claim a block of ports for the lifetime of this process.
 
-    Multicast ports can be shared by design, so that nothing would tell of a clash: a name that
-    only one process can have is held instead.
+    Multicast ports can be shared, so that a clash goes unnoticed: an abstract socket name, which
+    only one process can bind, marks the block.
     """
     for block in range(BLOCKS):
         claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -97,41 +97,41 @@ def _own_block() -> tuple[int, socket.socket]:
     raise CangaugeError("no ports are left for buses of their own")
 
 
-def vcan(number: int) -> Line:
-    """Return a vcan interface of the harness's own."""
-    return Line("socketcan", f"fault{number}")
+def vcan(number: int) -> BusLine:
+    """Return a vcan interface of the harness."""
+    return BusLine("socketcan", f"fault{number}")
 
 
 def run(command: list[str]) -> None:
-    """Run a command of the system."""
+    """Run a system command; raise CangaugeError if it fails."""
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise CangaugeError(f"{' '.join(command)}: {done.stderr.strip()}")
 
 
-class Wire:
-    """Sends and receives on a line, and opens it again when it was gone.
+class HarnessBus:
+    """Sends and receives on a bus, and reopens it after it was lost.
 
     Parameters
     ----------
-    line : Line
+    line : BusLine
     published_only : bool
         Receive only what the service publishes.
     """
 
-    def __init__(self, line: Line, *, published_only: bool) -> None:
+    def __init__(self, line: BusLine, *, published_only: bool) -> None:
         self._line = line
         self._published_only = published_only
         self._bus: can.BusABC | None = line.open(published_only=published_only)
         self._closed = threading.Event()
 
     def close(self) -> None:
-        """Close it for good."""
+        """Close the bus."""
         self._closed.set()
         self._drop()
 
     def send(self, frame: can.Message) -> bool:
-        """Send a frame; return whether it went out."""
+        """Send a frame; return whether it was sent."""
         bus = self._ready()
         if bus is None:
             return False
@@ -143,7 +143,7 @@ class Wire:
         return True
 
     def receive(self, timeout_s: float) -> can.Message | None:
-        """Return the next frame, None if none came in time or the bus is gone."""
+        """Return the next frame, or None after a time-out or if the bus is lost."""
         bus = self._ready()
         if bus is None:
             self._closed.wait(timeout_s)

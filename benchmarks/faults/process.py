@@ -1,8 +1,8 @@
-"""The service in a process of its own: started, signalled, and watched for an end unasked for.
+"""Process of the service: start, signals, and detection of an unexpected end.
 
-Processes are forked from one that has imported the service already (multiprocessing's
-forkserver), so that many can be started at once; `cold` starts a fresh interpreter, as a
-supervisor would.
+Processes are forked from one that has imported the service (multiprocessing's
+forkserver), so that many start quickly; `cold` starts a fresh interpreter, as a
+service manager does.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Final
 
 Target = Callable[[list[str]], None]
-"""Takes the arguments of the command line; importable by name."""
+"""Entry point with command line arguments; importable by name."""
 
 CONTEXT: Final = multiprocessing.get_context("forkserver")
 PRELOAD: Final = [
@@ -44,7 +44,7 @@ def cangauge(arguments: list[str]) -> None:
 
 
 def prepare() -> None:
-    """Let the server of processes import what they need; the first start then is quick."""
+    """Start the fork server and let it import the service."""
     os.environ["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
     CONTEXT.set_forkserver_preload(PRELOAD)
     warm = CONTEXT.Process(target=_nothing)
@@ -59,10 +59,10 @@ class Process:
     ----------
     arguments : list of str
     log : Path
-        Takes stdout and stderr of all its starts.
+        Receives stdout and stderr.
     target : callable
     cold : bool
-        In a fresh interpreter; for `cangauge` only.
+        Start a fresh interpreter; for `cangauge` only.
     """
 
     def __init__(
@@ -73,16 +73,16 @@ class Process:
         self._target = target
         self._cold = cold
         self._child: BaseProcess | subprocess.Popen[bytes] | None = None
-        self._asked = False
+        self._stop_requested = False
         self.started_s = 0.0
         self.stop_seconds: list[float] = []
-        """How long it took to end when told so by SIGTERM [s]."""
-        self.troubles: list[str] = []
-        """Ends that nobody asked for, and other ends than by exit status 0."""
+        """Times from SIGTERM to the end [s]."""
+        self.incidents: list[str] = []
+        """Unexpected ends, and exit statuses other than 0."""
 
     def start(self) -> None:
-        """Start it."""
-        self._asked = False
+        """Start the process."""
+        self._stop_requested = False
         if self._cold:
             with self._log.open("ab") as out:
                 self._child = subprocess.Popen(
@@ -98,46 +98,46 @@ class Process:
         self.started_s = time.monotonic()
 
     def signal(self, number: signal.Signals) -> None:
-        """Send it a signal; one that is gone already is noted as trouble by `check`."""
+        """Send a signal, if the process runs."""
         if self.check() and self._child is not None and self._child.pid is not None:
             os.kill(self._child.pid, number)
 
     def kill(self) -> None:
-        """End it by SIGKILL and wait."""
+        """Kill the process and wait for its end."""
         if self.check() and self._child is not None:
-            self._asked = True
+            self._stop_requested = True
             self._child.kill()
             self._wait(10.0)
 
     def stop(self, seconds: float = 10.0) -> None:
-        """Ask it by SIGTERM to end; one that does not is killed and noted."""
+        """Stop the process by SIGTERM; after a time-out kill it and record the incident."""
         if not self.check() or self._child is None:
             return
-        self._asked = True
+        self._stop_requested = True
         began = time.monotonic()
         self._child.terminate()
         code = self._wait(seconds)
         if code is None:
-            self.troubles.append(f"did not end within {seconds:.0f} s of SIGTERM")
+            self.incidents.append(f"did not end within {seconds:.0f} s of SIGTERM")
             self._child.kill()
             self._wait(10.0)
             return
         self.stop_seconds.append(time.monotonic() - began)
         if code != 0:
-            self.troubles.append(f"exit status {code} after SIGTERM")
+            self.incidents.append(f"exit status {code} after SIGTERM")
 
     def check(self) -> bool:
-        """Return whether it runs; an end that nobody asked for is noted, once."""
+        """Return whether the process runs; record an unexpected end once."""
         code = self._code()
         if code is None:
             return self._child is not None
-        if not self._asked and self._child is not None:
-            self._asked = True
-            self.troubles.append(f"ended by itself, status {code}")
+        if not self._stop_requested and self._child is not None:
+            self._stop_requested = True
+            self.incidents.append(f"ended by itself, status {code}")
         return False
 
-    def said(self) -> str:
-        """Return what it wrote."""
+    def output(self) -> str:
+        """Return the output of the process."""
         return self._log.read_text(errors="replace") if self._log.exists() else ""
 
     def _code(self) -> int | None:

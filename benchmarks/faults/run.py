@@ -1,11 +1,15 @@
-"""One fault: starts the service, plays the frames, does what the fault does, watches."""
+"""Runs of faults: one on its bus, or all of them in parallel, each with its undisturbed run."""
 
 from __future__ import annotations
 
+import math
+import queue
 import tempfile
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 from typing import Final
@@ -18,142 +22,152 @@ from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import CangaugeError
 from cangauge.replay.player import Pacer
-from faults.drive import ROLES, Event, events
-from faults.fault import Action, Fault
-from faults.judge import RECOVERED_SHARE, Seen, Told
-from faults.line import Line, Wire
+from faults.bench import FIRST_START_S, Bench, ServiceSetup, remove, vehicle_config
+from faults.catalogue import undisturbed
+from faults.criteria import RECOVERED_SHARE, Estimate, Observation, Reference, Verdict, judge
+from faults.fault import UNDISTURBED, Action, Fault
+from faults.frames import ROLES, Event, events
+from faults.line import BusLine, HarnessBus
 from faults.process import Target, cangauge
-from faults.stage import FIRST_START_S, Setting, Stage, remove, vehicle_config
 
-LAST_WORDS_S: Final = 1.0
-"""How long to listen after the last frame; less than the time-out of the input [s]."""
+LISTEN_AFTER_S: Final = 1.0
+"""Time to listen after the last frame; below the time-outs of the input [s]."""
 
 
-def run_fault(fault: Fault, line: Line, seed: int, target: Target = cangauge) -> Seen:
-    """Run a fault on a line that nothing else uses.
+def run_fault(fault: Fault, line: BusLine, seed: int, target: Target = cangauge) -> Observation:
+    """Run a fault on a separate bus.
 
     Parameters
     ----------
     fault : Fault
-    line : Line
+    line : BusLine
     seed : int
-        With the fault's name it settles all that is chosen at random.
+        With the name of the fault the seed of all random choices.
     target : callable
         The service.
 
     Returns
     -------
-    Seen
+    Observation
     """
     folder = Path(tempfile.mkdtemp(prefix="fault-"))
     rng = Random(f"{seed} {fault.name}")  # noqa: S311 - must be repeatable
-    setting = Setting(
+    setting = ServiceSetup(
         fault.config, fault.vehicle, with_state="state" in fault.needs, cold=fault.cold,
         target=target,
     )  # fmt: skip
     if line.is_vcan:
         line.create()
-    stage = Stage(line, fault.profile, setting, folder, rng)
+    bench = Bench(line, fault.profile, setting, folder, rng)
     listener = Listener(line)
-    sender = Wire(line, published_only=True)
+    sender = HarnessBus(line, published_only=True)
     try:
-        return _played(fault, stage, sender, listener, rng)
+        return _played(fault, bench, sender, listener, rng)
     finally:
-        stage.end()
+        bench.end()
         sender.close()
         listener.end()
         remove(folder)
 
 
-def _played(fault: Fault, stage: Stage, sender: Wire, listener: Listener, rng: Random) -> Seen:
+def _played(
+    fault: Fault, bench: Bench, sender: HarnessBus, listener: Listener, rng: Random
+) -> Observation:
     profile = fault.profile
-    vehicle = the_vehicle(fault, stage.folder)
-    found = events(profile, vehicle, values=fault.values, untrue=fault.untrue, rng=rng)
+    vehicle = load_fault_vehicle(fault, bench.folder)
+    found = events(profile, vehicle, values=fault.values, untrusted=fault.untrusted, rng=rng)
     if fault.frames is not None:
         found = fault.frames(found, profile, vehicle, rng)
     actions = [] if fault.plan is None else fault.plan(profile, rng)
-    stage.service.start()
-    if not listener.wait(FIRST_START_S, stage.service.check):
-        stage.troubles.append("does not start: " + " ".join(stage.service.said().split())[-200:])
+    bench.service.start()
+    if not listener.wait(FIRST_START_S, bench.service.check):
+        bench.incidents.append("does not start: " + " ".join(bench.service.output().split())[-200:])
         # Nothing to play to; what is missing is judged all the same.
         found, actions = found[:1], []
-    seen = Seen(told=listener.told)
-    player = _Player(sender, seen, profile.speed)
+    observed = Observation(published=listener.published)
+    player = _FramePlayer(sender, observed, profile.speed)
     player.begin()
-    doer = _Doer(stage, actions, seen.began_s, profile.speed)
+    doer = _ActionThread(bench, actions, observed.began_s, profile.speed)
     doer.start()
     player.play(found)
-    time.sleep(LAST_WORDS_S)
+    time.sleep(LISTEN_AFTER_S)
     doer.join(30.0)
-    stage.service.check()
+    bench.service.check()
     listener.stop_listening()
-    stage.end()
+    bench.end()
     first, last = profile.fault_s
-    seen.fault_s = (seen.began_s + first / profile.speed, seen.began_s + last / profile.speed)
-    seen.judged_from_s = seen.began_s + RECOVERED_SHARE * profile.seconds
-    seen.excused = list(stage.excused)
-    processes = (stage.service, *stage.others)
-    seen.troubles = [*stage.troubles, *doer.troubles]
+    observed.fault_s = (
+        observed.began_s + first / profile.speed,
+        observed.began_s + last / profile.speed,
+    )
+    observed.recovered_from_s = observed.began_s + RECOVERED_SHARE * profile.seconds
+    observed.expected_silence_s = list(bench.expected_silence_s)
+    processes = (bench.service, *bench.others)
+    observed.incidents = [*bench.incidents, *doer.incidents]
     for process in processes:
-        seen.troubles += process.troubles
-        if "Traceback" in process.said():
-            seen.troubles.append("traceback: " + process.said().strip().splitlines()[-1][:200])
-    seen.stop_s = max((s for each in processes for s in each.stop_seconds), default=float("nan"))
-    return seen
+        observed.incidents += process.incidents
+        if "Traceback" in process.output():
+            observed.incidents.append(
+                "traceback: " + process.output().strip().splitlines()[-1][:200]
+            )
+    observed.stop_s = max(
+        (s for each in processes for s in each.stop_seconds), default=float("nan")
+    )
+    return observed
 
 
-def the_vehicle(fault: Fault, folder: Path) -> Vehicle:
-    """Return the vehicle whose frames are played."""
+def load_fault_vehicle(fault: Fault, folder: Path) -> Vehicle:
+    """Return the vehicle whose frames are sent."""
     names = vehicle_config(fault.vehicle, folder)
     return Vehicle.load(names.get("vehicle"), names.get("dbc"), names.get("map"))
 
 
-class _Player:
-    """Sends frames at their times, and keeps when what went out."""
+class _FramePlayer:
+    """Sends frames on time and records when."""
 
-    def __init__(self, sender: Wire, seen: Seen, speed: float) -> None:
+    def __init__(self, sender: HarnessBus, observed: Observation, speed: float) -> None:
         self._sender = sender
-        self._seen = seen
+        self._observation = observed
         self._speed = speed
         self._clock = None if speed == 1.0 else ClockFrames()
         self._pacer = Pacer(speed, lambda: False)
-        seen.good_s = {role: [] for role in ROLES}
+        observed.good_sent_s = {role: [] for role in ROLES}
 
     def begin(self) -> None:
         self._pacer.wait(0)
-        self._seen.began_s = self._seen.ended_s = time.monotonic()
-        self._seen.sent_s.append(self._seen.began_s)
-        self._seen.bus_s.append(0.0)
+        self._observation.began_s = self._observation.ended_s = time.monotonic()
+        self._observation.sent_s.append(self._observation.began_s)
+        self._observation.bus_s.append(0.0)
 
     def play(self, found: list[Event]) -> None:
-        seen, send, last_s = self._seen, self._sender.send, -1.0
+        observed, send, last_s = self._observation, self._sender.send, -1.0
         for event in found:
             if event.at_s != last_s:
                 self._pacer.wait(round(event.at_s * 1e6))
                 if self._clock is not None:
                     send(self._clock.at(round(event.at_s * 1e6)))
                 last_s = event.at_s
-                seen.sent_s.append(time.monotonic())
-                seen.bus_s.append(event.at_s)
-                took_s = seen.sent_s[-1] - seen.sent_s[-2]
-                meant_s = (seen.bus_s[-1] - seen.bus_s[-2]) / self._speed
-                seen.late_s = max(seen.late_s, took_s - meant_s)
+                observed.sent_s.append(time.monotonic())
+                observed.bus_s.append(event.at_s)
+                took_s = observed.sent_s[-1] - observed.sent_s[-2]
+                meant_s = (observed.bus_s[-1] - observed.bus_s[-2]) / self._speed
+                observed.late_s = max(observed.late_s, took_s - meant_s)
             if send(event.frame) and event.is_good:
                 for role in event.roles:
-                    seen.good_s[role].append(seen.sent_s[-1])
-        seen.ended_s = time.monotonic()
+                    observed.good_sent_s[role].append(observed.sent_s[-1])
+        observed.ended_s = time.monotonic()
 
 
-class _Doer(threading.Thread):
-    """Does actions at their times; one that takes long delays no frame."""
+class _ActionThread(threading.Thread):
+    """Takes actions on time, in a thread so that none delays a frame."""
 
-    def __init__(self, stage: Stage, actions: list[Action], began_s: float, speed: float) -> None:
+    def __init__(self, bench: Bench, actions: list[Action], began_s: float, speed: float) -> None:
         super().__init__(daemon=True)
-        self._stage = stage
+        self._stage = bench
         self._actions = sorted(actions, key=lambda action: action.at_s)
         self._began_s = began_s
         self._speed = speed
-        self.troubles: list[str] = []
+        self.incidents: list[str] = []
 
     def run(self) -> None:
         for action in self._actions:
@@ -162,24 +176,24 @@ class _Doer(threading.Thread):
             try:
                 action.do(self._stage)
             except (CangaugeError, OSError) as error:
-                self.troubles.append(f"the harness could not do it: {error}")
+                self.incidents.append(f"the harness could not do it: {error}")
 
 
 class Listener(threading.Thread):
-    """Keeps every SOC_ESTIMATE that is published on a line, read by the DBC file alone."""
+    """Records all published SOC_ESTIMATE frames, decoded by the DBC file."""
 
-    def __init__(self, line: Line) -> None:
+    def __init__(self, line: BusLine) -> None:
         super().__init__(daemon=True)
         database = cantools.database.load_file(shared_file("dbc", "soc_estimate.dbc"))
         self._message = database.get_message_by_name("SOC_ESTIMATE")
-        self._wire = Wire(line, published_only=True)
+        self._wire = HarnessBus(line, published_only=True)
         self._stopped = threading.Event()
         self._first = threading.Event()
-        self.told: list[Told] = []
+        self.published: list[Estimate] = []
         self.start()
 
     def run(self) -> None:
-        """Listen until told to stop."""
+        """Listen until stopped."""
         while not self._stopped.is_set():
             frame = self._wire.receive(0.1)
             if frame is not None and frame.arbitration_id == self._message.frame_id:
@@ -191,8 +205,8 @@ class Listener(threading.Thread):
         values = self._message.decode(frame.data, decode_choices=False, allow_truncated=True)
         # The raw codes for "not available" are the largest that the field holds.
         soc_pct = float(values["soc_pct"])
-        self.told.append(
-            Told(
+        self.published.append(
+            Estimate(
                 time.monotonic(),
                 soc_pct if soc_pct <= 100.0 else float("nan"),
                 int(values["status"]),
@@ -203,7 +217,7 @@ class Listener(threading.Thread):
         self._first.set()
 
     def wait(self, seconds: float, still: Callable[[], bool]) -> bool:
-        """Wait for the first estimate, as long as `still()` holds."""
+        """Wait for the first estimate while `still()` is true."""
         until = time.monotonic() + seconds
         while not self._first.is_set():
             if time.monotonic() > until or not still():
@@ -212,7 +226,7 @@ class Listener(threading.Thread):
         return True
 
     def stop_listening(self) -> None:
-        """Keep nothing more."""
+        """Stop recording."""
         self._stopped.set()
         self.join(5.0)
 
@@ -220,3 +234,172 @@ class Listener(threading.Thread):
         """Close the bus."""
         self.stop_listening()
         self._wire.close()
+
+
+OVERHEAD_S: Final = 4.0
+"""Time of a run parallels its frames: start, end [s]."""
+
+IMPORT_S: Final = 10.0
+"""Time to import the service once [s]."""
+
+
+@dataclass(frozen=True)
+class Jobs:
+    """Number of faults that run in parallel.
+
+    Parameters
+    ----------
+    fast, real : int
+        By the replay clock (a quarter of a core each), and in real time
+        (little load).
+    """
+
+    fast: int = 3
+    real: int = 24
+
+
+MAX_SEND_DELAY_S: Final = 1.5
+"""Delay of the harness itself between frames that invalidates a run: it is close to
+the time-outs of the service [s]."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """A fault that was run; without a verdict if its undisturbed run is not valid."""
+
+    fault: Fault
+    verdict: Verdict | None
+    reason: str = ""
+
+
+def seconds(faults: list[Fault], jobs: Jobs) -> float:
+    """Return the estimated time of `run_all` [s]."""
+    runs = _with_undisturbed(faults)
+    alone = [fault for fault in runs if "alone" in fault.needs]
+    parallel = [fault for fault in runs if "alone" not in fault.needs]
+    total = IMPORT_S + sum(fault.profile.seconds + OVERHEAD_S for fault in alone)
+    pools = []
+    for is_real, width in ((True, jobs.real), (False, jobs.fast)):
+        lengths = [
+            fault.profile.seconds + OVERHEAD_S
+            for fault in parallel
+            if fault.profile.is_real_time == is_real
+        ]
+        rounds = math.ceil(len(lengths) / width)
+        pools.append(rounds * max(lengths, default=0.0))
+    return total + max(pools)
+
+
+def run_all(
+    faults: list[Fault],
+    lines: Callable[[int], BusLine],
+    jobs: Jobs,
+    seed: int,
+    *,
+    target: Target = cangauge,
+    progress: Callable[[str], None] = lambda _name: None,
+    retry_if_disturbed: bool = True,
+) -> list[Result]:
+    """Run faults and their undisturbed runs, and judge them.
+
+    Parameters
+    ----------
+    faults : list of Fault
+    lines : callable
+        Returns a bus by number.
+    jobs : Jobs
+    seed : int
+    target : callable
+        The service.
+    progress : callable
+        Estimate the name of each run that is over.
+    retry_if_disturbed : bool
+        Whether to repeat once a run that the machine delayed, and an undisturbed run that is
+        not valid.
+
+    Returns
+    -------
+    list of Result
+        In the order of `faults`, the undisturbed runs first.
+
+    """
+    runs = _with_undisturbed(faults)
+    free: queue.SimpleQueue[BusLine] = queue.SimpleQueue()
+    for number in range(jobs.fast + jobs.real):
+        free.put(lines(number))
+
+    def one(fault: Fault) -> Observation:
+        line = free.get()
+        try:
+            return run_fault(fault, line, seed, target)
+        finally:
+            free.put(line)
+            progress(fault.name)
+
+    observed = _run_each(runs, one, jobs)
+    references = _references(runs, observed)
+    # A busy machine disturbs runs too: repeat these once.
+    again = [
+        number
+        for number, fault in enumerate(runs)
+        if observed[number].late_s > MAX_SEND_DELAY_S
+        or (fault.name == UNDISTURBED and isinstance(references[fault.reference_key], str))
+    ]
+    if again and retry_if_disturbed:
+        repeated = _run_each([runs[number] for number in again], one, jobs)
+        observed = [*observed]
+        for number, found in zip(again, repeated, strict=True):
+            observed[number] = found
+        references = _references(runs, observed)
+    return [
+        _done(fault, observed[number], references[fault.reference_key])
+        for number, fault in enumerate(runs)
+    ]
+
+
+def _run_each(
+    runs: list[Fault], one: Callable[[Fault], Observation], jobs: Jobs
+) -> list[Observation]:
+    """Run faults in parallel, then one by one those that need the machine alone."""
+    futures: dict[int, Future[Observation]] = {}
+    with ThreadPoolExecutor(jobs.fast) as fast, ThreadPoolExecutor(jobs.real) as real:
+        for number, fault in enumerate(runs):
+            if "alone" not in fault.needs:
+                pool = real if fault.profile.is_real_time else fast
+                futures[number] = pool.submit(one, fault)
+                # Staggered: simultaneous starts delay each other.
+                time.sleep(0.05)
+    return [
+        futures[number].result() if number in futures else one(fault)
+        for number, fault in enumerate(runs)
+    ]
+
+
+def _references(
+    runs: list[Fault], observed: list[Observation]
+) -> dict[tuple[str, str, str], Reference | str]:
+    return {
+        fault.reference_key: _reference(found)
+        for fault, found in zip(runs, observed, strict=True)
+        if fault.name == UNDISTURBED
+    }
+
+
+def _reference(observed: Observation) -> Reference | str:
+    try:
+        return Reference(observed)
+    except ValueError as error:
+        return str(error)
+
+
+def _done(fault: Fault, observed: Observation, reference: Reference | str) -> Result:
+    if isinstance(reference, str):
+        return Result(fault, None, reference)
+    if observed.late_s > MAX_SEND_DELAY_S:
+        return Result(fault, None, f"the machine delayed frames by {observed.late_s:.1f} s, twice")
+    return Result(fault, judge(observed, reference))
+
+
+def _with_undisturbed(faults: list[Fault]) -> list[Fault]:
+    needed = {fault.reference_key: undisturbed(fault) for fault in faults}
+    return [*needed.values(), *faults]

@@ -1,4 +1,4 @@
-"""Fuzzing of everything that reads what others wrote: corpus, mutations, targets, supervision.
+"""Fuzzing of all readers of external data: corpus, mutations, targets, supervision.
 
 `benchmarks/fuzz.py` is the command; `tests/fuzz` runs a small part of it under hypothesis.
 """

@@ -1,4 +1,4 @@
-"""Small valid files of every format that cangauge reads, as their makers write them."""
+"""Small valid files of every format that cangauge reads."""
 
 from __future__ import annotations
 
@@ -110,12 +110,12 @@ SPEED = "time_s,speed_kmh\n" + "".join(f"{k},{k % 7}.5\n" for k in range(ROWS))
 
 
 def current_a(row: int) -> float:
-    """Return a current that steps, positive = discharge [A]."""
+    """Return a stepping current, positive = discharge [A]."""
     return 40.0 if row % 2 else -10.0
 
 
 def log_rows() -> list[tuple[float, ...]]:
-    """Return time [s], current [A], voltage [V], temperature [°C], SoC [%] of some rows."""
+    """Return rows of time [s], current [A], voltage [V], temperature [°C], SoC [%]."""
     return [
         (k / 10, current_a(k), 380.0 - 0.1 * current_a(k), 21.0, 80.0 - k / 100)
         for k in range(ROWS)
@@ -131,7 +131,7 @@ def csv_log() -> bytes:
 
 
 def parquet_log(*, checked: bool = False, compression: str = "none") -> bytes:
-    """Return a canonical log as Parquet; without checksums, damage reaches the decoder."""
+    """Return a canonical log as Parquet; without checksums mutants reach the decoder."""
     names = ("time_s", "current_a", "voltage_v", "temperature_c", "soc_pct")
     columns = dict(zip(names, map(list, zip(*log_rows(), strict=True)), strict=True))
     table = pa.table({**columns, "temperature_source": ["pack"] * ROWS})
@@ -150,7 +150,7 @@ def _table(head: str, row: str, mark: str = "\n") -> bytes:
 
 @cache
 def log_files() -> dict[str, bytes]:
-    """Return a small file of every format of logs, by file name."""
+    """Return a small file of every log format, by file name."""
     d3 = {
         "2012": (
             "Timestamp [sec]\tDyno Speed [mph]\tCell Temp [C]\tPhase #"
@@ -207,7 +207,7 @@ def log_files() -> dict[str, bytes]:
 
 
 def zipped(name: str, data: bytes) -> bytes:
-    """Return a zip of one test and a document beside it."""
+    """Return a zip of one test and a document."""
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(zipfile.ZipInfo(name), data)
@@ -217,7 +217,7 @@ def zipped(name: str, data: bytes) -> bytes:
 
 @cache
 def leaf_frames() -> tuple[can.Message, ...]:
-    """Return the frames that a Leaf with these rows would send."""
+    """Return the rows as frames of a Leaf."""
     encoder = FrameEncoder(Vehicle.load("leaf_aze0"))
     frames: list[can.Message] = []
     for t, i, u, temp, soc in log_rows():
@@ -265,13 +265,13 @@ _WRITERS: dict[str, Callable[..., can.io.generic.MessageWriter]] = {
 
 @cache
 def capture_files() -> dict[str, bytes]:
-    """Return a small file of every format of captures, by file name (MF4 where it is there)."""
+    """Return a small file of every capture format, by file name (MF4 if asammdf is installed)."""
     files = {}
     for name, (head, line) in _TEXTS.items():
         files[name] = (head + "".join(map(line, leaf_frames()))).encode()
     for name in _WRITERS:
         files[name] = _written(name)
-    # Not packed, so that what is changed inside a container arrives inside it.
+    # Uncompressed, so that mutants reach the content of a container.
     files["plain.blf"] = _written("x.blf", compression_level=0)
     files["candump.log.gz"] = gzip.compress(files["candump.log"], mtime=0)
     mf4 = _mf4()
@@ -312,7 +312,7 @@ def _mf4() -> bytes | None:
 
 @cache
 def model_tree() -> dict[str, Any]:
-    """Return a model file's content, with every effect and with information."""
+    """Return the content of a model file with all effects and an information matrix."""
     path = shared_file("replay", "leaf2012_published_model.json")
     tree: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     file = Model.load(path)

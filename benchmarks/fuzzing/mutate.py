@@ -1,7 +1,7 @@
 """Mutations of bytes, of text and of JSON, all drawn from one `random.Random`.
 
-The same generator state gives the same input, so a finding is named by its seed and number alone,
-and hypothesis can draw (and shrink) the choices instead.
+The same generator state gives the same input, so that seed and number identify a finding, and
+hypothesis can draw (and shrink) the choices instead.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from random import Random
 from typing import Any
 
 MAX_BYTES = 20_000
-"""Mutants are kept below this size: what is large is tested apart, by name."""
+"""Largest mutant; large files have tests of their own."""
 
 NUMBERS = (
     "0", "-1", "1", "2", "7", "8", "9", "63", "64", "65", "127", "128", "255", "256", "1023",
@@ -36,16 +36,16 @@ _NUMBER = re.compile(rb"(?<![A-Za-z_])-?\d+(?:\.\d+)?(?:[eE][+-]?\d+)?")
 
 
 def mutate(rng: Random, data: bytes, others: Sequence[bytes] = (), *, text: bool = False) -> bytes:
-    """Return a mutant: one to a few mutations, mostly one.
+    """Apply one or a few mutations.
 
     Parameters
     ----------
     rng : Random
     data : bytes
     others : sequence of bytes
-        Other inputs of the kind, to splice with.
+        Other inputs of the kind, to splice.
     text : bool
-        Whether tokens and lines mean something.
+        Whether to mutate tokens and lines too.
     """
     steps = _TEXT + _BINARY if text else _BINARY
     for _ in range(rng.choice((1, 1, 1, 2, 2, 3, 5, 8))):
@@ -122,7 +122,7 @@ def _word(rng: Random, data: bytes, _: Sequence[bytes]) -> bytes:
 
 
 def _swap(rng: Random, data: bytes, _: Sequence[bytes]) -> bytes:
-    """Put a token of the text in another's place."""
+    """Replace a token by another of the text."""
     hits = list(_TOKEN.finditer(data))
     return data if not hits else _replace(
         rng, data, _TOKEN, rng.choice(hits)[0].decode("utf-8", "replace")
@@ -130,7 +130,7 @@ def _swap(rng: Random, data: bytes, _: Sequence[bytes]) -> bytes:
 
 
 def _lines(rng: Random, data: bytes, _: Sequence[bytes]) -> bytes:
-    """Remove, repeat or exchange lines."""
+    """Remove, repeat or swap lines."""
     lines = data.split(b"\n")
     a, b = rng.randrange(len(lines)), rng.randrange(len(lines))
     what = rng.randrange(3)
@@ -155,7 +155,7 @@ _VALUES: tuple[Any, ...] = (
 
 
 def mutate_json(rng: Random, tree: Any) -> Any:
-    """Return a mutant of plain JSON data: a few nodes replaced, removed, renamed or repeated."""
+    """Replace, remove, rename or repeat a few nodes of JSON data."""
     tree = copy.deepcopy(tree)
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         owners = [node for node in _nodes(tree) if node]
@@ -173,7 +173,7 @@ def mutate_json(rng: Random, tree: Any) -> Any:
             factor = rng.choice((-1, 0, 2, 10, 1e-3, 1e6, 1e30, 0.999, 1.001))
             try:
                 owner[key] = value * factor
-            except OverflowError:  # an integer that no float can hold, of a mutation before
+            except OverflowError:  # an integer beyond float, from an earlier mutation
                 owner[key] = value * 10
         elif what == 3 and isinstance(value, list):
             owner[key] = value * rng.choice((2, 50))
@@ -186,7 +186,7 @@ def mutate_json(rng: Random, tree: Any) -> Any:
 
 
 def json_bytes(tree: Any) -> bytes:
-    """Return JSON data as text, with what Python's own dialect makes of NaN."""
+    """Return JSON data as text, with NaN as Python writes it."""
     return json.dumps(tree).encode("utf-8", "replace")
 
 

@@ -1,7 +1,7 @@
-"""Workers that fuzz, and a parent that notices when one hangs or dies.
+"""Fuzzing workers, and a supervisor that replaces those that hang or die.
 
-An input is named by seed, target and number alone, so a worker that is lost costs nothing: what is
-left of its share is given to another one.
+Seed, target and number identify an input, so that another worker can continue the share of one that
+is lost.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from typing import Any
 from fuzzing.target import Target, attempt
 
 SLOW_S = 2.0
-"""More CPU time than this for one input (or 200 frames) is a finding [s]."""
+"""CPU time of one input (or 200 frames) above which it is a finding [s]."""
 HANG_S = 120.0
-"""A worker that is so long at one input is killed [s]: CPU time is judged when it ends."""
+"""Real time of one input after which its worker is killed [s]."""
 GROWTH_MB = 128.0
-"""One small input that takes so much more memory is a finding [MB]."""
+"""Growth of memory by one input above which it is a finding [MB]."""
 DATA_LIMIT = 4 << 30
-"""No worker gets more memory than this [bytes]."""
+"""Memory limit of a worker [bytes]."""
 CHUNK = 250
 _STATUS = Path("/proc/self/status")
 
 
 @dataclass
 class Example:
-    """The first input that showed a finding, and how many did."""
+    """First input of a finding, and the number of inputs with it."""
 
     number: int
     text: str
@@ -47,7 +47,7 @@ class Example:
 
 @dataclass
 class Tally:
-    """What came of the inputs of one target."""
+    """Results of the inputs of one target."""
 
     inputs: int = 0
     accepted: int = 0
@@ -58,7 +58,7 @@ class Tally:
     peak_mb: float = 0.0
 
     def add(self, other: Tally) -> None:
-        """Take over what another tally counted."""
+        """Add another tally."""
         self.inputs += other.inputs
         self.accepted += other.accepted
         self.refused += other.refused
@@ -89,12 +89,12 @@ class Share:
 
 
 def input_of(target: Target, seed: int, number: int) -> bytes:
-    """Return the input of that name."""
+    """Return an input by its number."""
     return target.make(Random(f"{seed}/{target.name}/{number}"))  # noqa: S311 - no secret
 
 
 def try_one(target: Target, data: bytes, number: int, tally: Tally) -> None:
-    """Run one input and count what comes of it."""
+    """Run one input and count the result."""
     tally.inputs += target.weight
     before_mb, began_s = _memory_mb(), time.process_time()
     try:
@@ -102,7 +102,7 @@ def try_one(target: Target, data: bytes, number: int, tally: Tally) -> None:
             tally.accepted += target.weight
         else:
             tally.refused += target.weight
-    except Exception as error:  # noqa: BLE001 - whatever comes out is what is looked for
+    except Exception as error:  # noqa: BLE001 - any exception is a finding
         tally.note(_where(error), Example(number, str(error)[:300]))
     taken_s, memory_mb = time.process_time() - began_s, _memory_mb()
     tally.peak_mb = max(tally.peak_mb, memory_mb)
@@ -131,23 +131,23 @@ def fuzz(
     shares : sequence of Share
     seed : int
     workers : int
-        Processes at a time.
+        Number of processes.
     progress : callable
-        Called with a target and the inputs done, for every share that is done.
+        Called with the target and the number of inputs of each finished share.
     module : str
-        Whose `targets()` are run.
+        Module whose `targets()` are run.
     hang_s : float
-        A worker that is so long at one input is killed [s].
+        Real time of one input after which its worker is killed [s].
     """
     weights = {target.name: target.weight for target in import_module(module).targets()}
     tallies = {share.target: Tally() for share in shares}
-    open_ = deque(shares)
+    pending = deque(shares)
     team = [_Worker(seed, module) for _ in range(workers)]
     try:
-        while open_ or any(worker.share for worker in team):
+        while pending or any(worker.share for worker in team):
             for worker in team:
-                if worker.share is None and open_:
-                    worker.give(open_.popleft())
+                if worker.share is None and pending:
+                    worker.give(pending.popleft())
             ready = wait([worker.connection for worker in team if worker.share], timeout=1.0)
             for place, worker in enumerate(team):
                 share = worker.share
@@ -169,7 +169,7 @@ def fuzz(
                 number = worker.number
                 tallies[share.target].inputs += weights[share.target]
                 tallies[share.target].note((what, share.target), Example(number, ""))
-                open_.extendleft(
+                pending.extendleft(
                     part
                     for part in (
                         Share(share.target, share.start, number),
@@ -191,7 +191,7 @@ class _Worker:
     def __init__(self, seed: int, module: str) -> None:
         context = mp.get_context("spawn")
         self.connection, theirs = context.Pipe()
-        # Number of the input at work, and when it began.
+        # Number and start time of the current input.
         self._at = context.RawArray("d", 2)
         self.share: Share | None = None
         self._process = context.Process(
@@ -202,7 +202,7 @@ class _Worker:
 
     def give(self, share: Share) -> None:
         self.share = share
-        # Its time begins when it does: a process takes a while to start.
+        # The time starts with the first input, not with the process.
         self._at[0], self._at[1] = share.start, math.inf
         self.connection.send(share)
 
@@ -227,7 +227,7 @@ class _Worker:
         return self._process.exitcode
 
     def end(self) -> None:
-        """End it: by itself if it waits for work, so that it tidies up, else by force."""
+        """End the process: cleanly if it is idle, else by SIGKILL."""
         self.connection.close()
         if self.share is None:
             self._process.join(5.0)
@@ -236,7 +236,7 @@ class _Worker:
 
 
 def _work(connection: Connection, at: Any, seed: int, module: str) -> None:
-    warnings.simplefilter("error", RuntimeWarning)  # numpy's, which a user would see on stderr
+    warnings.simplefilter("error", RuntimeWarning)  # numpy's, visible to users on stderr
     with contextlib.suppress(ValueError, OSError):
         resource.setrlimit(resource.RLIMIT_DATA, (DATA_LIMIT, DATA_LIMIT))
     by_name: dict[str, Target] = {each.name: each for each in import_module(module).targets()}
@@ -247,7 +247,7 @@ def _work(connection: Connection, at: Any, seed: int, module: str) -> None:
         except (EOFError, OSError):
             return
         target, tally = by_name[share.target], Tally()
-        if share.target not in warm:  # what is built once belongs to no input
+        if share.target not in warm:  # caches count for no input
             warm.add(share.target)
             at[1] = time.monotonic()
             with contextlib.suppress(Exception):
@@ -259,17 +259,17 @@ def _work(connection: Connection, at: Any, seed: int, module: str) -> None:
 
 
 def _where(error: BaseException) -> tuple[str, str]:
-    """Return what was raised, and the innermost place of ours that it went through."""
+    """Return the exception type and the innermost line of cangauge."""
     frames = traceback.extract_tb(error.__traceback__)
     ours = [frame for frame in frames if "cangauge" in frame.filename.split("/")] or frames
     return type(error).__name__, f"{ours[-1].filename.rpartition('/')[2]}:{ours[-1].lineno}"
 
 
 def _memory_mb() -> float:
-    """Return the most memory that this process ever had [MB]."""
+    """Return the peak memory of this process [MB]."""
     try:
         with _STATUS.open() as status:
             return next(float(line.split()[1]) for line in status if line[:6] == "VmHWM:") / 1024.0
     except (OSError, StopIteration):
-        # Elsewhere than on Linux, where this begins with the parent's.
+        # Not on Linux, where it would include the parent.
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0

@@ -1,7 +1,7 @@
-"""One kind of input, and how an input may be refused.
+"""Fuzzing target: one kind of input.
 
-A target's `run` returns whether the input was accepted. `InputError` (any `CangaugeError`) is how
-it may be refused; whatever else comes out is a finding.
+`run` returns whether an input is accepted. It may refuse an input by a `CangaugeError`; any other
+exception is a finding.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from random import Random
 
 from cangauge.errors import CangaugeError
 
-LONGEST_MESSAGE = 2000
+MAX_MESSAGE = 2000
 
 
 class FindingError(Exception):
-    """An input was accepted, and what came of it is wrong."""
+    """An accepted input has a wrong result."""
 
 
 @dataclass(frozen=True)
@@ -28,15 +28,15 @@ class Target:
     ----------
     name : str
     make : callable
-        Draws an input from a generator of random numbers; `bytes`, or what `run` takes.
+        Random generator → input.
     run : callable
-        Takes it; returns whether it was accepted.
+        Input → whether it is accepted.
     weight : int
-        How many inputs one call counts for.
+        Number of inputs that one call counts as.
     share : float
-        Share of all inputs in a whole run.
+        Share of the inputs of a run.
     seeds : callable, optional
-        Valid files; None for what is no file.
+        Valid files; None for other inputs.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Target:
 
 
 def attempt(target: Target, data: bytes) -> bool:
-    """Run a target; return whether the input was accepted; anything else is raised."""
+    """Run a target and return whether the input is accepted; raise findings."""
     with refusable():
         return target.run(data)
     return False
@@ -56,10 +56,10 @@ def attempt(target: Target, data: bytes) -> bool:
 
 @contextmanager
 def refusable() -> Iterator[None]:
-    """Let the inside end by a `CangaugeError` whose message is one readable line."""
+    """Allow a `CangaugeError` whose message is one printable line."""
     try:
         yield
     except CangaugeError as error:
         line = str(error)
-        if not line or not line.isprintable() or len(line) > LONGEST_MESSAGE:
+        if not line or not line.isprintable() or len(line) > MAX_MESSAGE:
             raise FindingError(f"a message of {len(line)} characters: {line[:100]!r}") from error

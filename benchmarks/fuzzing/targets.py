@@ -1,4 +1,4 @@
-"""What is fuzzed: how an input is made, and all that cangauge does with it."""
+"""Fuzzing targets: inputs, and what cangauge does with them."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ import math
 import os
 import tempfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from random import Random
-from typing import Any
 
 import can
 
@@ -36,17 +35,18 @@ from cangauge.inspect.log import inspect_log
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
+from cangauge.service import state as state_file
 from cangauge.service.config import load_config
 from cangauge.service.pipeline import EstimateStream
-from cangauge.validation.twin.day import read_speed
+from cangauge.validation.twin.drive import read_speed
 from fuzzing import corpus
 from fuzzing.mutate import json_bytes, mutate, mutate_json
 from fuzzing.target import FindingError, Target, refusable
 
 FRAMES_AT_ONCE = 200
-"""Frames of one stream: each is an input."""
+"""Frames of one stream; each counts as an input."""
 ESTIMATED_ROWS = 200
-"""Longer logs are read and inspected, but not estimated."""
+"""Longer logs are read and inspected, not estimated."""
 
 
 # --- a place for files ---------------------------------------------------------------------------
@@ -54,8 +54,8 @@ ESTIMATED_ROWS = 200
 
 @cache
 def _folder() -> Path:
-    """Return this process's own folder, in memory where the machine has such a file system."""
-    memory = Path("/dev/shm")  # noqa: S108 - only where to put a folder of our own
+    """Return a temporary folder of this process, in memory if possible."""
+    memory = Path("/dev/shm")  # noqa: S108 - parent of a temporary folder
     where = memory if memory.is_dir() and os.access(memory, os.W_OK) else None
     holder = tempfile.TemporaryDirectory(prefix="cangauge-fuzz-", dir=where)
     _HOLDERS.append(holder)
@@ -100,7 +100,7 @@ def _make_log(rng: Random) -> bytes:
     return _packed(rng, mutant)
 
 
-# Some formats take the temperature from the file's name.
+# Some formats have the temperature in the file name.
 _LOG_NAMES = ("input", "A_P25_x.csv", "Cell-HPPC-10C.csv", "_N05_.csv")
 
 
@@ -183,7 +183,7 @@ def _use_capture(path: Path, what: int) -> None:
 
 
 def _make_frames(rng: Random) -> bytes:
-    """Return a stream's seed: the frames are drawn while it runs."""
+    """Return the seed of a stream, which draws its frames."""
     return rng.randrange(1 << 62).to_bytes(8, "big")
 
 
@@ -218,7 +218,7 @@ def _run_frames(data: bytes) -> bool:
 
 def _read_back(rng: Random, reader: SocReader, message: can.Message) -> None:
     if reader.read(message) is None:
-        raise FindingError("a frame that was published cannot be read")
+        raise FindingError("a published frame cannot be read")
     damaged = bytearray(message.data)
     damaged[rng.randrange(6)] ^= 1 << rng.randrange(8)
     message.data = bytearray(GENERIC_RULE.protect(damaged, rng.randrange(16)))
@@ -257,7 +257,7 @@ def _mutant_frame(rng: Random, frame: can.Message, vehicle: Vehicle) -> can.Mess
             )
     rule = next((m.rule for key, m in vehicle.messages.items() if key == number), None)
     if rule is not None and rng.randrange(3) and rule.fits(len(data)):
-        # With a right CRC and a counter that goes on, the damage gets through.
+        # With a valid CRC the damage reaches the decoder.
         data = bytearray(rule.protect(data, rng.randrange(16)))
     return can.Message(arbitration_id=number, is_extended_id=extended, data=data, **kinds)
 
@@ -277,7 +277,7 @@ def _dbc_seeds() -> dict[str, bytes]:
         name: shared_file("dbc", name).read_bytes()
         for name in ("soc_estimate.dbc", "generic_pack.dbc")
     }
-    # The small one more often: reading takes time with the size.
+    # The small one more often, as it reads faster.
     return {"car.dbc": corpus.DBC.encode(), "again.dbc": corpus.DBC.encode()} | shipped
 
 
@@ -357,22 +357,13 @@ def _run_model(data: bytes) -> bool:
     return True
 
 
-def _state_target() -> Target | None:
-    """Return the target of state files, where this release keeps any."""
-    try:
-        from cangauge.service import state as state_file  # noqa: PLC0415
-    except ImportError:
-        return None
-    return Target("state", lambda rng: _make_state(rng, state_file), _runs_state(state_file), 0.05)
-
-
-def _make_state(rng: Random, state_file: Any) -> bytes:
-    tree = json.loads(_state_text(state_file))
+def _make_state(rng: Random) -> bytes:
+    tree = json.loads(_state_text())
     if rng.randrange(4) == 0:
         return mutate(rng, json_bytes(tree), text=True)
     tree["content"] = mutate_json(rng, tree["content"])
     if rng.randrange(8):
-        # Signed anew, or the hash refuses it at once.
+        # With a valid hash, which is checked first.
         with suppress(TypeError, ValueError):
             text = json.dumps(tree["content"], sort_keys=True, separators=(",", ":"))
             tree["sha256"] = hashlib.sha256(text.encode()).hexdigest()
@@ -380,7 +371,7 @@ def _make_state(rng: Random, state_file: Any) -> bytes:
 
 
 @cache
-def _state_text(state_file: Any) -> str:
+def _state_text() -> str:
     estimator = Estimator(_model(), EstimatorSettings())
     for t, i, u, temp, _ in corpus.log_rows():
         estimator.step(Sample(t, i, u, temp))
@@ -392,25 +383,22 @@ def _state_text(state_file: Any) -> str:
     )  # fmt: skip
 
 
-def _runs_state(state_file: Any) -> Callable[[bytes], bool]:
-    def run(data: bytes) -> bool:
-        with _file(data, "state.json") as path:
-            content = state_file.read_state(path)
-        estimator = Estimator(_model(), EstimatorSettings())
-        _check_estimate(estimator.restore(content.estimator))
-        for t, i, u, temp, _ in corpus.log_rows():
-            _check_estimate(estimator.step(Sample(2e9 + t, i, u, temp)))
-        return True
-
-    return run
+def _run_state(data: bytes) -> bool:
+    with _file(data, "state.json") as path:
+        content = state_file.read_state(path)
+    estimator = Estimator(_model(), EstimatorSettings())
+    _check_estimate(estimator.restore(content.estimator))
+    for t, i, u, temp, _ in corpus.log_rows():
+        _check_estimate(estimator.step(Sample(2e9 + t, i, u, temp)))
+    return True
 
 
 # --- all -----------------------------------------------------------------------------------------
 
 
 def targets() -> tuple[Target, ...]:
-    """Return all targets; shares are of a whole run's inputs."""
-    found = [
+    """Return all targets."""
+    return (
         Target("frames", _make_frames, _run_frames, 0.44, weight=FRAMES_AT_ONCE),
         Target("captures", _make_capture, _run_capture, 0.16, seeds=corpus.capture_files),
         Target("logs", _make_log, _run_log, 0.10, seeds=corpus.log_files),
@@ -421,6 +409,5 @@ def targets() -> tuple[Target, ...]:
         Target(
             "speed", lambda rng: mutate(rng, corpus.SPEED.encode(), text=True), _run_speed, 0.04
         ),
-    ]
-    state = _state_target()
-    return tuple(found if state is None else [*found, state])
+        Target("state", _make_state, _run_state, 0.05),
+    )

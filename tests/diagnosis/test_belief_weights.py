@@ -37,7 +37,7 @@ def case(rng: np.random.Generator, number: int) -> learning.Case:
 
 
 def test_the_weights_that_causes_were_drawn_by_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(learning, "HELD", 1e-6)  # of many cases they are found without
+    monkeypatch.setattr(learning, "RIDGE", 1e-6)  # of many cases they are found without
     rng = np.random.default_rng(3)
     cases = [case(rng, number) for number in range(3000)]
     found = learning.fit_which(cases)

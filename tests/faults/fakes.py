@@ -1,4 +1,4 @@
-"""Services that are broken on purpose: the harness must see it.
+"""Services broken on purpose, which the harness must detect.
 
 They take the command line of `cangauge run` and publish frames of `dbc/soc_estimate.dbc`.
 """
@@ -20,13 +20,13 @@ from cangauge._resources import shared_file
 from cangauge.estimate.validity import Status
 
 AGE_S = 2.0
-"""Older input is missed [s]; the last words of a run are shorter."""
+"""Age at which input counts as missing [s]; above the time that the harness listens on."""
 
 
 def _serve(
     arguments: list[str], answer: Callable[[float, int], tuple[float, Status] | None]
 ) -> None:
-    """Publish every 100 ms what `answer` makes of (seconds since the last current, currents)."""
+    """Publish `answer(seconds since the last current, currents)` every 100 ms."""
     config: dict[str, Any] = tomllib.loads(Path(arguments[2]).read_text())
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     bus = can.Bus(
@@ -44,26 +44,26 @@ def _serve(
         if now_s < due_s:
             continue
         due_s = now_s + 0.1
-        told = answer(now_s - last_s, currents)
-        if told is not None:
-            soc_pct, status = told
+        reply = answer(now_s - last_s, currents)
+        if reply is not None:
+            soc_pct, status = reply
             values = dict.fromkeys((signal.name for signal in layout.signals), 0)
             data = layout.encode({**values, "soc_pct": soc_pct, "status": int(status)})
             bus.send(can.Message(arbitration_id=layout.frame_id, is_extended_id=False, data=data))
 
 
 def honest(arguments: list[str]) -> None:
-    """A constant SoC, invalid as soon as no current comes: nothing to object to."""
+    """Constant SoC, invalid without current: correct."""
     _serve(arguments, lambda age_s, _n: (70.0, Status.INVALID if age_s > AGE_S else Status.VALID))
 
 
 def always_valid(arguments: list[str]) -> None:
-    """Never notices that its input is missing."""
+    """Does not detect missing input."""
     _serve(arguments, lambda _age, _n: (70.0, Status.VALID))
 
 
 def silent_after_a_fault(arguments: list[str]) -> None:
-    """Publishes nothing any more once its input was missing."""
+    """Stops publishing after missing input."""
     lost: list[bool] = []
 
     def answer(age_s: float, _n: int) -> tuple[float, Status] | None:
@@ -75,7 +75,7 @@ def silent_after_a_fault(arguments: list[str]) -> None:
 
 
 def drifts_after_a_fault(arguments: list[str]) -> None:
-    """Is 2 % off for good once its input was missing, and calls it valid."""
+    """Publishes a valid SoC that is 2 % off after missing input."""
     lost: list[bool] = []
 
     def answer(age_s: float, _n: int) -> tuple[float, Status] | None:
@@ -88,7 +88,7 @@ def drifts_after_a_fault(arguments: list[str]) -> None:
 
 
 def dies_of_a_fault(arguments: list[str]) -> None:
-    """Ends with an exception when its input is missing."""
+    """Ends with an exception on missing input."""
 
     def answer(age_s: float, _n: int) -> tuple[float, Status] | None:
         if age_s > AGE_S:
@@ -99,7 +99,7 @@ def dies_of_a_fault(arguments: list[str]) -> None:
 
 
 def hard_to_stop(arguments: list[str]) -> None:
-    """Ends with status 3 when told to end."""
+    """Ends with status 3 on SIGTERM."""
     try:
         honest(arguments)
     except SystemExit:
@@ -107,10 +107,10 @@ def hard_to_stop(arguments: list[str]) -> None:
 
 
 def never_valid(arguments: list[str]) -> None:
-    """Publishes nothing that could be wrong, for nothing is ever valid."""
+    """Never publishes a valid SoC."""
     _serve(arguments, lambda _age, _n: (70.0, Status.DEGRADED))
 
 
 def does_not_start(arguments: list[str]) -> None:
-    """Ends at once."""
+    """Ends immediately."""
     sys.exit(f"error: {arguments[2]}: nothing is right")

@@ -17,7 +17,7 @@ from cangauge.errors import InputError
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.service.config import load_config
-from cangauge.validation.twin.day import read_speed
+from cangauge.validation.twin.drive import read_speed
 
 READERS: dict[str, Callable[[Path], object]] = {
     "log": read_log,

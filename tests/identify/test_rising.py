@@ -9,14 +9,14 @@ from cangauge.errors import InputError
 from cangauge.identify import voltage_fit
 from cangauge.identify.fit import fit
 from cangauge.model.voltage_model import SLOPE_POINTS
-from cangauge.validation.twin.world import draw_world
+from cangauge.validation.cases import draw_scenario
 
 
 def test_a_fall_between_two_points_is_constrained_too(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A simulated day from 98 to 2 % SoC whose first fit the voltage model refuses."""
-    world = draw_world(27872859)
+    """Found by gap-check: a simulated day from 98 to 2 % SoC whose fit was refused by the model."""
+    world = draw_scenario(27872859)
     logs = [recording.log for recording in world.training]
     found = fit(logs, capacity_ah=world.pack.capacity_ah).voltage_model
     points = np.linspace(*found.soc_range_pct, SLOPE_POINTS)

@@ -17,8 +17,8 @@ from cangauge.logs.read import read_log
 from cangauge.model.effects.first_order import low_passed
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 from cangauge.model.voltage_model import VoltageModel
-from cangauge.validation.cases import LG_CAPACITY_AH, LG_PARALLEL, LG_SERIES
-from cangauge.validation.twin.recorded import scaled_to_pack, with_start
+from cangauge.validation.recordings import LG_CAPACITY_AH, LG_PARALLEL, LG_SERIES
+from cangauge.validation.twin.injection import scaled_to_pack, with_initial_soc
 from synthetic import synthetic_log
 
 OPTIONS = FitOptions(capacity_ah=CAPACITY_AH)
@@ -98,7 +98,7 @@ def test_a_quantized_temperature_is_interpolated(step_k: float) -> None:
 def test_kt_of_one_drive_of_real_cells_holds_in_the_cold(shared_data: Path) -> None:
     """Plain least squares on one drive at 25 °C is wrong by tens of volts at 10 °C."""
     there, cold = (
-        with_start(
+        with_initial_soc(
             scaled_to_pack(
                 read_log(shared_data / "lg_hg2" / f"{name}.parquet"),
                 series=LG_SERIES,

@@ -10,10 +10,10 @@ import pytest
 from cangauge.bus.open import has_socketcan
 from cangauge.errors import CangaugeError
 from faults.catalogue import EVERYTHING
-from faults.drive import Profile
+from faults.frames import Profile
 from faults.line import vcan
 from faults.process import prepare
-from faults.schedule import Jobs, run_all
+from faults.run import Jobs, run_all
 
 pytestmark = [pytest.mark.socketcan, pytest.mark.slow]
 
@@ -41,8 +41,8 @@ def test_a_seeded_part_of_the_faults() -> None:
     faults = [replace(EVERYTHING[name], profile=BRIEF) for name in (*ALWAYS, *drawn)]
     prepare()
     done = run_all(faults, vcan, Jobs(fast=2, real=1), SEED)
-    problems = {
-        each.fault.name: each.why_not if each.verdict is None else "; ".join(each.verdict.failures)
+    failures = {
+        each.fault.name: each.reason if each.verdict is None else "; ".join(each.verdict.failures)
         for each in done
     }
-    assert not any(problems.values()), problems
+    assert not any(failures.values()), failures

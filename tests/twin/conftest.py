@@ -1,23 +1,23 @@
-"""Packs and days that several tests of the twin share."""
+"""A pack and a drive shared by tests of the twin."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from cangauge.validation.twin.day import Day, draw_day
+from cangauge.validation.twin.drive import Drive, draw_drive
 from cangauge.validation.twin.pack import Pack, draw_pack
 from cangauge.validation.twin.plant import TwinPlant
 
 
 @pytest.fixture(scope="session")
 def pack() -> Pack:
-    """A 96-cell pack whose sensors send once a second."""
+    """A 96-cell pack with a sampling rate of 1 Hz."""
     for seed in range(100):
         found = draw_pack(np.random.default_rng(seed), "leaf24")
         if found.sensors.rate_hz == 1.0:
             return found
-    pytest.fail("no pack sends once a second")
+    pytest.fail("no pack with a rate of 1 Hz")
 
 
 @pytest.fixture(scope="session")
@@ -26,9 +26,9 @@ def plant(pack: Pack) -> TwinPlant:
 
 
 @pytest.fixture(scope="session")
-def day(pack: Pack) -> Day:
-    """A drive from 90 % in cool weather, long enough to come down to a tenth."""
-    return draw_day(
+def drive(pack: Pack) -> Drive:
+    """A cool drive from 90 % to 10 % SoC."""
+    return draw_drive(
         np.random.default_rng(3),
         pack,
         hours=1.6,
@@ -37,11 +37,3 @@ def day(pack: Pack) -> Day:
         end_soc=0.10,
         discharge=True,
     )
-
-
-def constant_day(
-    current_a: np.ndarray, *, start_soc: float = 0.6, celsius: float = 25.0, step_s: float = 0.5
-) -> Day:
-    """A day of one given current, at one temperature."""
-    time_s = np.arange(current_a.size) * step_s
-    return Day(time_s, current_a, np.full_like(time_s, celsius), celsius, start_soc, seed=1)

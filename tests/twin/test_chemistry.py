@@ -1,4 +1,4 @@
-"""Tables of voltage and entropy: rising, in the range of real cells, one bend a specimen."""
+"""Chemistry tables: monotone voltage, entropy and spread in the range of real cells."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ PLATEAU_V = {"nmc": 3.745, "lmo": 3.835, "nca": 3.742, "lfp": 3.297}
 
 
 @given(st.sampled_from(CHEMISTRIES), st.integers(0, 10**6))
-def test_voltage_rises_with_charge_in_every_specimen(name: str, seed: int) -> None:
+def test_voltage_rises_with_soc_in_every_specimen(name: str, seed: int) -> None:
     cell = chemistry(name, np.random.default_rng(seed))
     assert np.all(np.diff(cell.ocv_table_v) > 0.0)
-    # A specimen is bent by millivolts, not another chemistry.
+    # A specimen deviates by millivolts.
     assert cell.ocv(np.array([0.5]))[0] == pytest.approx(PLATEAU_V[name], abs=0.04)
 
 
@@ -28,13 +28,13 @@ def test_entropy_is_tenths_of_a_millivolt_per_kelvin(name: str) -> None:
     assert 1e-4 < np.max(np.abs(entropy)) < 6e-4
 
 
-def test_a_weak_cell_falls_steeply_below_its_empty() -> None:
+def test_voltage_falls_steeply_below_empty() -> None:
     cell = chemistry("nmc", np.random.default_rng(1))
     full, empty, below = cell.ocv(np.array([1.0, 0.0, -0.03]))
     assert full == pytest.approx(4.2, abs=0.03)
     assert empty - below > 0.4
 
 
-def test_an_unknown_chemistry_is_named_with_the_known_ones() -> None:
+def test_unknown_chemistry_is_refused() -> None:
     with pytest.raises(InputError, match=r"lmo.*lfp"):
         chemistry("lead", np.random.default_rng(1))

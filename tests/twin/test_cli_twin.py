@@ -1,7 +1,8 @@
-"""`cangauge twin`: one log, one JSON object; faults as text; clear refusals."""
+"""`cangauge twin` and `simulate`: logs, effects as text, refused input."""
 
 from __future__ import annotations
 
+import doctest
 import json
 from pathlib import Path
 
@@ -14,7 +15,9 @@ from cangauge.cli.twin import twin_command
 from cangauge.errors import InputError
 from cangauge.logs.read import read_log
 from cangauge.model.charge import capacity_from_full_discharge
-from cangauge.validation.twin.day import read_speed
+from cangauge.validation import simulate
+from cangauge.validation.twin import simulation
+from cangauge.validation.twin.drive import read_speed
 from cangauge.validation.twin.faults import parse_effect
 from cangauge.validation.twin.pack import Pack
 
@@ -29,7 +32,7 @@ def run(*arguments: str) -> dict[str, object]:
     return found
 
 
-def test_the_log_is_canonical_and_the_same_again(tmp_path: Path) -> None:
+def test_log_is_canonical_and_repeatable(tmp_path: Path) -> None:
     paths = [tmp_path / name for name in ("a.parquet", "b.csv")]
     found = [run("--seed", "4", "--hours", "0.3", "-o", str(path)) for path in paths]
     logs = [read_log(path) for path in paths]
@@ -41,7 +44,7 @@ def test_the_log_is_canonical_and_the_same_again(tmp_path: Path) -> None:
     assert other["capacity_ah"] != found[0]["capacity_ah"]
 
 
-def test_another_day_is_of_the_same_pack(tmp_path: Path) -> None:
+def test_another_day_has_the_same_pack(tmp_path: Path) -> None:
     first, second = (
         run("--seed", "4", "--day", str(day), "--hours", "0.3", "-o", str(tmp_path / f"{day}.csv"))
         for day in (1, 2)
@@ -50,7 +53,7 @@ def test_another_day_is_of_the_same_pack(tmp_path: Path) -> None:
     assert first["true_soc_pct"] != second["true_soc_pct"]
 
 
-def test_a_fault_has_the_size_or_the_gap_asked_for(tmp_path: Path) -> None:
+def test_effect_has_the_given_size_or_gap(tmp_path: Path) -> None:
     common = ("--seed", "4", "--hours", "0.5", "--pack", "leaf24")
     clean, offset = tmp_path / "clean.csv", tmp_path / "offset.csv"
     run(*common, "-o", str(clean))
@@ -67,7 +70,7 @@ def test_a_fault_has_the_size_or_the_gap_asked_for(tmp_path: Path) -> None:
     assert np.mean(shift) == pytest.approx(2.0, abs=0.02)
 
 
-def test_the_reference_is_the_truth_after_the_assumed_start(tmp_path: Path) -> None:
+def test_soc_is_true_after_the_assumed_initial_soc(tmp_path: Path) -> None:
     common = ("--seed", "4", "--hours", "0.3", "--start-soc", "70", "--effect",
               "initial_soc:shift_pct=-6")  # fmt: skip
     run(*common, "-o", str(tmp_path / "full.csv"))
@@ -81,7 +84,7 @@ def test_the_reference_is_the_truth_after_the_assumed_start(tmp_path: Path) -> N
     assert np.isfinite(start).sum() == 1
 
 
-def test_a_schedule_is_driven(tmp_path: Path) -> None:
+def test_driving_schedule_is_followed(tmp_path: Path) -> None:
     schedule = tmp_path / "speed.csv"
     speed = np.concatenate((np.zeros(100), np.linspace(0, 20, 20), np.full(80, 20.0)))
     rows = "\n".join(f"{t},{3.6 * v}" for t, v in enumerate(speed))
@@ -95,13 +98,13 @@ def test_a_schedule_is_driven(tmp_path: Path) -> None:
 
 
 @pytest.mark.real
-def test_the_public_schedules_are_read(shared_data: Path) -> None:
+def test_public_schedule_is_read(shared_data: Path) -> None:
     speed = read_speed(shared_data / "drive_schedules" / "udds.csv")
     assert speed.size == pytest.approx(1370, abs=3)
     assert speed.max() == pytest.approx(25.3, abs=0.2)
 
 
-def test_the_list_names_every_parameter() -> None:
+def test_list_has_every_parameter() -> None:
     found = run("--list")
     effects = {item["effect"]: item for item in found["effects"]}  # type: ignore[attr-defined]
     assert effects["resistance_step"]["shape"] == ["at_s"]
@@ -126,7 +129,7 @@ def test_the_list_names_every_parameter() -> None:
         (("-o", "nowhere/x.csv"), "folder"),
     ],
 )
-def test_bad_usage_is_refused_in_one_line(
+def test_bad_usage_is_refused(
     arguments: tuple[str, ...], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -150,9 +153,25 @@ def test_bad_usage_is_refused_in_one_line(
         ("hysteresis:gap_v=1,reach=7", "within"),
     ],
 )
-def test_a_fault_that_makes_no_sense_is_refused(text: str, message: str, pack: Pack) -> None:
+def test_invalid_effect_is_refused(text: str, message: str, pack: Pack) -> None:
     with pytest.raises(InputError, match=message):
         parse_effect(text, pack, seed=1, default_gap_v=1.0)
+
+
+def test_simulate_returns_what_the_command_writes(tmp_path: Path) -> None:
+    path = tmp_path / "log.parquet"
+    found = run(
+        "--seed", "4", "--hours", "0.2", "--effect", "current_offset:offset_a=4", "-o", str(path)
+    )  # fmt: skip
+    simulated = simulate("current_offset:offset_a=4", seed=4, hours=0.2)
+    written = read_log(path)
+    for name in ("time_s", "current_a", "voltage_v", "temperature_c", "soc_pct"):
+        assert np.array_equal(getattr(simulated.log, name), getattr(written, name))
+    assert simulated.to_dict().items() <= found.items()
+
+
+def test_example_of_simulate_runs() -> None:
+    assert doctest.testmod(simulation) == (0, 3)
 
 
 @pytest.mark.parametrize(
@@ -160,16 +179,16 @@ def test_a_fault_that_makes_no_sense_is_refused(text: str, message: str, pack: P
     ["", "time,speed\n", "time,speed\n0,1\n0,2\n", "time,speed\n0,1\n1,-2\n",
      "time,speed\n0,1\n1,300\n", "time,speed\n0,a\n1,b\n", "only\n1\n2\n"],
 )  # fmt: skip
-def test_what_is_no_speed_trace_is_refused(content: str, tmp_path: Path) -> None:
+def test_invalid_speed_trace_is_refused(content: str, tmp_path: Path) -> None:
     path = tmp_path / "speed.csv"
     path.write_text(content)
     with pytest.raises(InputError, match=r"speed\.csv"):
         read_speed(path)
 
 
-def test_a_whole_discharge_gives_a_fit_its_capacity(tmp_path: Path) -> None:
-    """It ended at 2.03 % SoC, which a fit does not take for empty."""
+def test_full_discharge_gives_its_capacity(tmp_path: Path) -> None:
+    """An end at 2.03 % SoC would not count as empty."""
     path = tmp_path / "full.parquet"
-    told = run("--seed", "1", "--discharge", "--hours", "1", "-o", str(path))
+    simulated = run("--seed", "1", "--discharge", "--hours", "1", "-o", str(path))
     found = capacity_from_full_discharge([read_log(path)], None)
-    assert found == pytest.approx(told["capacity_ah"], rel=0.01)
+    assert found == pytest.approx(simulated["capacity_ah"], rel=0.01)

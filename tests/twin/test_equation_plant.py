@@ -1,55 +1,57 @@
-"""The plant of the published form: healthy it obeys the equation, and every fault shows."""
+"""Equation plant: it obeys the published equation while healthy, and shows every fault."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from cangauge.validation.cases import identify
+from cangauge.validation.cases import Scenario, draw_scenario
+from cangauge.validation.recordings import fit_model
 from cangauge.validation.twin.faults import Fault, fault_kind, fault_kinds
-from cangauge.validation.twin.simulate import Truth, simulate
-from cangauge.validation.twin.world import World, draw_world, record_day, rms
+from cangauge.validation.twin.recording import GroundTruth, record_drive, rms, simulate_truth
 
 
 @pytest.fixture(scope="module")
-def world() -> World:
-    return draw_world(8, kind="leaf40", plant_name="equation")
+def scenario() -> Scenario:
+    return draw_scenario(8, kind="leaf40", plant_name="equation")
 
 
 @pytest.fixture(scope="module")
-def healthy(world: World) -> Truth:
-    return simulate(world.plant, world.reference_days[0])
+def healthy(scenario: Scenario) -> GroundTruth:
+    return simulate_truth(scenario.plant, scenario.reference_drives[0])
 
 
-def test_a_healthy_log_is_explained_to_the_sensors_floor(world: World) -> None:
-    training = world.training[0]
-    fitted = identify([training.log], world.pack.capacity_ah)
-    assert fitted.voltage_rmse_v < 1.3 * rms(training.floor_v)
+def test_healthy_log_is_fitted_to_the_sensor_floor(scenario: Scenario) -> None:
+    training = scenario.training[0]
+    fitted = fit_model([training.log], scenario.pack.capacity_ah)
+    assert fitted.voltage_rmse_v < 1.3 * rms(training.sensor_error_v)
 
 
-def test_a_gauge_that_knows_the_core_sees_every_clean_day_explained() -> None:
-    world = draw_world(8, kind="leaf40", plant_name="published")
-    clean = (*world.training, *world.references)
-    fitted = identify([recording.log for recording in clean], world.pack.capacity_ah)
-    floor_v = rms(np.concatenate([recording.floor_v for recording in clean]))
-    assert fitted.voltage_rmse_v < 1.05 * floor_v
+def test_reported_core_fits_all_logs_to_the_floor() -> None:
+    scenario = draw_scenario(8, kind="leaf40", plant_name="published")
+    clean = (*scenario.training, *scenario.references)
+    fitted = fit_model([recording.log for recording in clean], scenario.pack.capacity_ah)
+    sensor_floor_v = rms(np.concatenate([recording.sensor_error_v for recording in clean]))
+    assert fitted.voltage_rmse_v < 1.05 * sensor_floor_v
 
 
-def test_a_core_that_sheds_its_heat_worse_shows_there_too() -> None:
-    world = draw_world(8, kind="leaf40", plant_name="published")
-    day = world.reference_days[0]
+def test_core_fault_shows_with_reported_core() -> None:
+    scenario = draw_scenario(8, kind="leaf40", plant_name="published")
+    drive = scenario.reference_drives[0]
     fault = Fault("core_temperature", 5.0, seed=2)
-    recording = record_day(world.plant, day, (fault,))
+    recording = record_drive(scenario.plant, drive, (fault,))
     assert rms(recording.gap_v) > 0.1
 
 
-def test_the_open_circuit_voltage_rises_from_below_empty_to_above_full(world: World) -> None:
-    assert np.all(np.diff(world.pack.chemistry.ocv_table_v) > 0.0)
+def test_open_circuit_voltage_is_monotone(scenario: Scenario) -> None:
+    assert np.all(np.diff(scenario.pack.chemistry.ocv_table_v) > 0.0)
 
 
 @pytest.mark.parametrize("fault_id", [kind.id for kind in fault_kinds()])
-def test_every_named_fault_shows(fault_id: str, world: World, healthy: Truth) -> None:
-    _, largest = fault_kind(fault_id).limits(world.pack)
+def test_every_fault_opens_a_gap(fault_id: str, scenario: Scenario, healthy: GroundTruth) -> None:
+    _, largest = fault_kind(fault_id).limits(scenario.pack)
     fault = Fault(fault_id, largest, seed=2)
-    recording = record_day(world.plant, world.reference_days[0], (fault,), healthy=healthy)
+    recording = record_drive(
+        scenario.plant, scenario.reference_drives[0], (fault,), healthy=healthy
+    )
     assert rms(recording.gap_v) > 0.002

@@ -1,4 +1,4 @@
-"""Every fault opens the gap that was asked for, and does what its words say."""
+"""Faults: scaled to a gap, and their effect on the signals."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.validation.twin.condition import HEALTHY, Switching, is_on
-from cangauge.validation.twin.day import Day, draw_day
+from cangauge.validation.twin.condition import HEALTHY, Intermittent
+from cangauge.validation.twin.drive import Drive, draw_drive
 from cangauge.validation.twin.faults import (
     Fault,
     apply_faults,
@@ -18,9 +18,8 @@ from cangauge.validation.twin.faults import (
 )
 from cangauge.validation.twin.pack import Pack
 from cangauge.validation.twin.plant import TwinPlant
+from cangauge.validation.twin.recording import GroundTruth, gap_v, record_drive, rms, simulate_truth
 from cangauge.validation.twin.scaling import scale_to_gap
-from cangauge.validation.twin.simulate import Truth, gap_v, simulate
-from cangauge.validation.twin.world import record_day, rms
 
 DESIGN_IDS = {
     "current_offset", "current_gain", "voltage_offset", "voltage_gain", "temperature_lag",
@@ -34,9 +33,9 @@ WANTED_V = 0.4
 
 
 @pytest.fixture(scope="module")
-def telling_day(pack: Pack) -> Day:
-    """A cold start with a strong heater and a stop at a charger: it can show every fault."""
-    drawn = draw_day(
+def demanding_drive(pack: Pack) -> Drive:
+    """A cold drive with pack heating and a stop at a charger: it shows every fault."""
+    drawn = draw_drive(
         np.random.default_rng(8),
         pack,
         hours=2.0,
@@ -49,158 +48,162 @@ def telling_day(pack: Pack) -> Day:
     charging = np.full(round(2400.0 / drawn.step_s), -0.6 * pack.one_c_a)
     current = np.concatenate((drawn.current_a[:middle], charging, drawn.current_a[middle:]))
     time_s = np.arange(current.size) * drawn.step_s
-    return Day(
+    return Drive(
         time_s, current, np.full_like(time_s, -6.0), drawn.start_c, drawn.start_soc,
         conditioning_w=4000.0, target_c=22.0, seed=3,
     )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def healthy(plant: TwinPlant, telling_day: Day) -> Truth:
-    return simulate(plant, telling_day)
+def healthy(plant: TwinPlant, demanding_drive: Drive) -> GroundTruth:
+    return simulate_truth(plant, demanding_drive)
 
 
-def test_the_twenty_have_the_names_of_the_design() -> None:
+def test_faults_of_the_library_are_complete() -> None:
     assert {kind.id for kind in fault_kinds()} == DESIGN_IDS
     assert len(fault_kinds(outside=True)) >= 6
 
 
 @pytest.mark.parametrize("fault_id", ALL)
-def test_the_gap_is_the_one_asked_for(
-    fault_id: str, plant: TwinPlant, telling_day: Day, healthy: Truth
+def test_fault_is_scaled_to_the_gap(
+    fault_id: str, plant: TwinPlant, demanding_drive: Drive, healthy: GroundTruth
 ) -> None:
-    scaled = scale_to_gap(plant, [telling_day], Fault(fault_id, 1.0, seed=2), WANTED_V, [healthy])
+    scaled = scale_to_gap(
+        plant, [demanding_drive], Fault(fault_id, 1.0, seed=2), WANTED_V, [healthy]
+    )
     assert not scaled.limited
     assert scaled.reached_v == pytest.approx(WANTED_V, rel=0.05)
     low, high = scaled.fault.kind.limits(plant.pack)
     assert 0.999 * low <= scaled.fault.size <= 1.001 * high
-    # And so it is in the log: noise and gap add up, whatever the sensors do to it.
-    recording = record_day(plant, telling_day, (scaled.fault,), healthy=healthy)
+    # In the log, sensor errors and gap add up.
+    recording = record_drive(plant, demanding_drive, (scaled.fault,), healthy=healthy)
     error = recording.log.voltage_v - recording.expected_voltage_v
     assert rms(recording.gap_v) == pytest.approx(WANTED_V, rel=0.08)
     assert rms(error) == pytest.approx(np.hypot(WANTED_V, rms(error - recording.gap_v)), rel=0.08)
 
 
 @pytest.mark.parametrize("fault_id", ALL)
-def test_a_fault_of_no_size_changes_nothing(fault_id: str, pack: Pack) -> None:
+def test_fault_of_size_zero_changes_nothing(fault_id: str, pack: Pack) -> None:
     assert apply_faults(pack, (Fault(fault_id, 0.0),)) is HEALTHY
 
 
-# Late is not the mirror image of early for what lasts less than the skew.
+# A late current is not the mirror image of an early one within the skew.
 @pytest.mark.parametrize(
     "fault_id", [kind.id for kind in fault_kinds() if kind.signed and kind.id != "time_skew"]
 )
-def test_a_signed_fault_opens_the_opposite_gap_when_it_is_turned(
-    fault_id: str, plant: TwinPlant, telling_day: Day, healthy: Truth
+def test_negative_fault_opens_the_opposite_gap(
+    fault_id: str, plant: TwinPlant, demanding_drive: Drive, healthy: GroundTruth
 ) -> None:
-    scaled = scale_to_gap(plant, [telling_day], Fault(fault_id, 1.0), 0.2, [healthy])
+    scaled = scale_to_gap(plant, [demanding_drive], Fault(fault_id, 1.0), 0.2, [healthy])
     gaps = []
     for sign in (1.0, -1.0):
         condition = apply_faults(plant.pack, (scaled.fault.sized(sign * scaled.fault.size),))
-        truth = simulate(plant, telling_day, condition, healthy)
-        gaps.append(gap_v(plant, telling_day, truth, healthy))
+        truth = simulate_truth(plant, demanding_drive, condition, healthy)
+        gaps.append(gap_v(plant, demanding_drive, truth, healthy))
     rows = min(gap.size for gap in gaps)
-    assert rows * telling_day.step_s > 3000.0
+    assert rows * demanding_drive.step_s > 3000.0
     assert rms(gaps[0][:rows] + gaps[1][:rows]) < 0.5 * rms(gaps[0][:rows] - gaps[1][:rows])
 
 
-def test_sensor_faults_leave_the_truth_alone(
-    plant: TwinPlant, telling_day: Day, healthy: Truth
+def test_sensor_faults_leave_the_truth_unchanged(
+    plant: TwinPlant, demanding_drive: Drive, healthy: GroundTruth
 ) -> None:
     for fault in (
         Fault("current_offset", 2.0), Fault("current_gain", 0.05), Fault("voltage_offset", 1.0),
         Fault("voltage_gain", 0.01), Fault("time_skew", 1.5), Fault("temperature_lag", 900.0),
     ):  # fmt: skip
-        truth = simulate(plant, telling_day, apply_faults(plant.pack, (fault,)), healthy)
+        truth = simulate_truth(plant, demanding_drive, apply_faults(plant.pack, (fault,)), healthy)
         assert np.array_equal(truth.voltage_v, healthy.voltage_v)
-    truth = simulate(
-        plant, telling_day, apply_faults(plant.pack, (Fault("current_offset", 2.0),)), healthy
+    truth = simulate_truth(
+        plant, demanding_drive, apply_faults(plant.pack, (Fault("current_offset", 2.0),)), healthy
     )
-    np.testing.assert_allclose(truth.seen_current_a - telling_day.current_a, 2.0)
+    np.testing.assert_allclose(truth.measured_current_a - demanding_drive.current_a, 2.0)
 
 
-def test_a_late_current_is_read_later(plant: TwinPlant, telling_day: Day, healthy: Truth) -> None:
+def test_time_skew_delays_the_current(
+    plant: TwinPlant, demanding_drive: Drive, healthy: GroundTruth
+) -> None:
     condition = apply_faults(plant.pack, (Fault("time_skew", 2.0),))
-    seen = simulate(plant, telling_day, condition, healthy).seen_current_a
-    rows = round(2.0 / telling_day.step_s)
-    np.testing.assert_allclose(seen[rows:], telling_day.current_a[:-rows], atol=1e-9)
+    measured = simulate_truth(plant, demanding_drive, condition, healthy).measured_current_a
+    rows = round(2.0 / demanding_drive.step_s)
+    np.testing.assert_allclose(measured[rows:], demanding_drive.current_a[:-rows], atol=1e-9)
 
 
-def test_charge_faults_end_where_they_should(plant: TwinPlant, telling_day: Day) -> None:
-    clean = record_day(plant, telling_day, ()).true_soc_pct
-    short = record_day(plant, telling_day, (Fault("initial_soc", -4.0),)).true_soc_pct
+def test_charge_faults_shift_the_true_soc(plant: TwinPlant, demanding_drive: Drive) -> None:
+    clean = record_drive(plant, demanding_drive, ()).true_soc_pct
+    short = record_drive(plant, demanding_drive, (Fault("initial_soc", -4.0),)).true_soc_pct
     rows = min(clean.size, short.size)
     np.testing.assert_allclose(short[:rows] - clean[:rows], -4.0, atol=1e-9)
-    lossy = record_day(plant, telling_day, (Fault("coulombic_efficiency", 0.3),)).true_soc_pct
-    charged = np.minimum(telling_day.current_a, 0.0)
-    missing = 30.0 * np.trapezoid(charged, telling_day.time_s) / 3600.0 / plant.pack.capacity_ah
+    lossy = record_drive(plant, demanding_drive, (Fault("coulombic_efficiency", 0.3),)).true_soc_pct
+    charged = np.minimum(demanding_drive.current_a, 0.0)
+    missing = 30.0 * np.trapezoid(charged, demanding_drive.time_s) / 3600.0 / plant.pack.capacity_ah
     assert lossy[-1] - clean[lossy.size - 1] == pytest.approx(missing, rel=0.03)
 
 
-def test_a_step_leaves_what_was_before_it_alone(
-    plant: TwinPlant, telling_day: Day, healthy: Truth
+def test_resistance_step_acts_from_its_time_on(
+    plant: TwinPlant, demanding_drive: Drive, healthy: GroundTruth
 ) -> None:
     fault = Fault("resistance_step", 0.02, {"at_s": 2000.0})
-    truth = simulate(plant, telling_day, apply_faults(plant.pack, (fault,)), healthy)
+    truth = simulate_truth(plant, demanding_drive, apply_faults(plant.pack, (fault,)), healthy)
     gap = truth.voltage_v - healthy.voltage_v
-    before = telling_day.time_s < 2000.0
-    np.testing.assert_allclose(gap[before], 0.0, atol=2e-3)  # the last hundredths of a kelvin
-    # Soon after it; later the pack is a little warmer for it.
-    soon = ~before & (telling_day.time_s < 2100.0)
-    np.testing.assert_allclose(gap[soon], -0.02 * telling_day.current_a[soon], atol=2e-2)
+    before = demanding_drive.time_s < 2000.0
+    np.testing.assert_allclose(gap[before], 0.0, atol=2e-3)  # tolerance of the thermal iteration
+    # Shortly after the step, before it warms the pack.
+    soon = ~before & (demanding_drive.time_s < 2100.0)
+    np.testing.assert_allclose(gap[soon], -0.02 * demanding_drive.current_a[soon], atol=2e-2)
 
 
-def test_asymmetry_acts_on_charging_alone(
-    plant: TwinPlant, telling_day: Day, healthy: Truth
+def test_asymmetry_acts_during_charge_only(
+    plant: TwinPlant, demanding_drive: Drive, healthy: GroundTruth
 ) -> None:
     condition = apply_faults(plant.pack, (Fault("resistance_asymmetry", 0.05),))
-    truth = simulate(plant, telling_day, condition, healthy)
-    gap, current = truth.voltage_v - healthy.voltage_v, telling_day.current_a
-    # Before the charger: what it heats the pack by shows in every resistance.
-    current = current[: round(3000.0 / telling_day.step_s)]
+    truth = simulate_truth(plant, demanding_drive, condition, healthy)
+    gap, current = truth.voltage_v - healthy.voltage_v, demanding_drive.current_a
+    # Before the charger, which warms the pack.
+    current = current[: round(3000.0 / demanding_drive.step_s)]
     gap = gap[: current.size]
     hard = current < -20.0
     np.testing.assert_allclose(gap[hard], -0.05 * current[hard], rtol=0.15)
     assert np.max(np.abs(gap[current > 20.0])) < 0.03
 
 
-def test_hysteresis_is_a_loop_of_its_width(plant: TwinPlant) -> None:
+def test_hysteresis_loop_has_its_width(plant: TwinPlant) -> None:
     pulse = plant.pack.one_c_a * np.concatenate((np.ones(2400), -np.ones(2400), np.zeros(1200)))
     time_s = np.arange(pulse.size) * 0.5
-    day = Day(time_s, pulse, np.full_like(time_s, 25.0), 25.0, 0.7, history=1.0)
-    clean = simulate(plant, day)
+    drive = Drive(time_s, pulse, np.full_like(time_s, 25.0), 25.0, 0.7, history=1.0)
+    clean = simulate_truth(plant, drive)
     condition = apply_faults(plant.pack, (Fault("hysteresis", 1.0, {"reach": 0.03}),))
-    gap = simulate(plant, day, condition, clean).voltage_v - clean.voltage_v
+    gap = simulate_truth(plant, drive, condition, clean).voltage_v - clean.voltage_v
     assert gap[0] == pytest.approx(-1.0)
     assert gap[2399] == pytest.approx(-1.0)
     assert gap[4799] == pytest.approx(1.0)
-    assert gap[-1] == pytest.approx(1.0)  # and it stays at rest
+    assert gap[-1] == pytest.approx(1.0)  # constant at rest
 
 
-def test_added_relaxations_add_up_to_their_resistance() -> None:
+def test_relaxations_sum_to_their_resistance() -> None:
     for modes in (cole_cole(0.03, 4.0, 0.85), finite_warburg(0.03, 900.0)):
         assert sum(mode.ohm for mode in modes) == pytest.approx(0.03)
         assert all(mode.ohm > 0.0 and mode.tau_s > 0.0 for mode in modes)
 
 
-def test_what_switches_is_on_for_its_share_of_the_time() -> None:
+def test_intermittent_is_active_for_its_share() -> None:
     time_s = np.arange(0.0, 4e5, 1.0)
-    on = is_on(Switching(1.0, 100.0, 300.0, seed=3), time_s)
+    on = Intermittent(1.0, 100.0, 300.0, seed=3).is_active(time_s)
     assert not on[0]
     assert np.mean(on) == pytest.approx(0.25, abs=0.03)
-    # No chopping off of long logs: it still switches at the end.
+    # Long logs too: it still switches at the end.
     assert 0 < np.mean(on[-40000:]) < 0.6
 
 
-def test_an_impossible_gap_is_said_to_be_out_of_reach(plant: TwinPlant, pack: Pack) -> None:
-    gentle = draw_day(np.random.default_rng(1), pack, hours=0.5, ambient_c=25.0, start_soc=0.9)
+def test_unreachable_gap_is_reported_as_limited(plant: TwinPlant, pack: Pack) -> None:
+    gentle = draw_drive(np.random.default_rng(1), pack, hours=0.5, ambient_c=25.0, start_soc=0.9)
     scaled = scale_to_gap(plant, [gentle], Fault("temperature_lag", 1.0), 5.0)
     assert scaled.limited
     assert scaled.reached_v < 1.0
 
 
-def test_names_and_repetitions_are_checked(pack: Pack) -> None:
-    with pytest.raises(InputError, match="no such effect"):
+def test_unknown_and_repeated_faults_are_refused(pack: Pack) -> None:
+    with pytest.raises(InputError, match="unknown effect"):
         fault_kind("gremlins")
     with pytest.raises(InputError, match="twice"):
         apply_faults(pack, (Fault("capacity", 0.1), Fault("capacity", 0.2)))

@@ -1,4 +1,4 @@
-"""The PyBaMM plant: charge, voltage and faults behind the same door as the twin's cells."""
+"""PyBaMM plant: parameter sets and faults."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import pytest
 
 from cangauge.errors import InputError
 from cangauge.validation.twin.condition import HEALTHY, Condition, WeakCells
-from cangauge.validation.twin.day import Day, draw_day
+from cangauge.validation.twin.drive import Drive, draw_drive
 from cangauge.validation.twin.pack import draw_pack
 from cangauge.validation.twin.pybamm_plant import PARAMETER_SETS, PybammPlant, draw_pybamm_plant
-from cangauge.validation.twin.simulate import simulate
+from cangauge.validation.twin.recording import simulate_truth
 
 needs_pybamm = pytest.mark.skipif(
     importlib.util.find_spec("pybamm") is None, reason="the extra pybamm is not installed"
@@ -26,33 +26,35 @@ def plant() -> PybammPlant:
 
 
 @pytest.fixture(scope="module")
-def day(plant: PybammPlant) -> Day:
-    return draw_day(np.random.default_rng(6), plant.pack, hours=0.3, ambient_c=15.0, start_soc=0.6)
+def drive(plant: PybammPlant) -> Drive:
+    return draw_drive(
+        np.random.default_rng(6), plant.pack, hours=0.3, ambient_c=15.0, start_soc=0.6
+    )
 
 
 @needs_pybamm
 @pytest.mark.slow
 @pytest.mark.parametrize("parameter_set", PARAMETER_SETS)
-def test_every_parameter_set_drives(parameter_set: str) -> None:
+def test_every_parameter_set_simulates_a_drive(parameter_set: str) -> None:
     rng = np.random.default_rng(5)
     plant = draw_pybamm_plant(rng, draw_pack(rng, "leaf24"), parameter_set)
-    day = draw_day(rng, plant.pack, hours=0.2, ambient_c=20.0, start_soc=0.7)
-    truth = simulate(plant, day)
-    assert truth.rows == day.time_s.size
-    # At rest it shows the open-circuit voltage of its own table.
-    assert truth.voltage_v[0] + plant.pack.resistance_ohm * day.current_a[0] == pytest.approx(
+    drive = draw_drive(rng, plant.pack, hours=0.2, ambient_c=20.0, start_soc=0.7)
+    truth = simulate_truth(plant, drive)
+    assert truth.rows == drive.time_s.size
+    # Near rest the voltage is the open-circuit voltage of the table.
+    assert truth.voltage_v[0] + plant.pack.resistance_ohm * drive.current_a[0] == pytest.approx(
         truth.equilibrium_v[0], abs=3.0
     )
-    # Quick changes of the current are answered by its resistance.
-    moved, answer = np.diff(day.current_a), -np.diff(truth.voltage_v)
+    # Fast changes of the current see the resistance.
+    moved, answer = np.diff(drive.current_a), -np.diff(truth.voltage_v)
     slope = np.sum(moved * answer) / np.sum(moved**2)
     assert 0.4 < slope / plant.pack.resistance_ohm < 1.3
 
 
 @needs_pybamm
 @pytest.mark.slow
-def test_faults_act_on_it(plant: PybammPlant, day: Day) -> None:
-    clean = simulate(plant, day)
+def test_faults_change_the_voltage(plant: PybammPlant, drive: Drive) -> None:
+    clean = simulate_truth(plant, drive)
     rms = {}
     for name, condition in (
         ("none", HEALTHY),
@@ -61,14 +63,14 @@ def test_faults_act_on_it(plant: PybammPlant, day: Day) -> None:
         ("contact", Condition(step_ohm=0.02, step_at_s=300.0)),
         ("weak", Condition(weak=WeakCells(2, 0.3, 0.05))),
     ):
-        gap = simulate(plant, day, condition, clean).voltage_v - clean.voltage_v
+        gap = simulate_truth(plant, drive, condition, clean).voltage_v - clean.voltage_v
         rms[name] = float(np.sqrt(np.mean(gap**2)))
     assert rms["none"] < 1e-6
     assert all(size > 0.02 for name, size in rms.items() if name != "none")
 
 
 @pytest.mark.skipif(importlib.util.find_spec("pybamm") is not None, reason="pybamm is installed")
-def test_without_the_extra_it_says_what_to_install() -> None:
+def test_missing_extra_is_reported() -> None:
     rng = np.random.default_rng(1)
     with pytest.raises(InputError, match=r"cangauge\[pybamm\]"):
         draw_pybamm_plant(rng, draw_pack(rng))

@@ -1,12 +1,13 @@
-"""The scorer against verdicts made by hand."""
+"""Scores of verdicts made by hand."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 
-from cangauge.validation.score import Outcome, Share, estimate, outcome_of, score
+from cangauge.validation.score import Outcome, estimate, outcome_of, proportion, score
 from cangauge.validation.tables import judge_targets
 from cangauge.validation.workers import Task
 
@@ -57,11 +58,11 @@ def answer(
 
 def outcome(
     truth: dict[str, Any],
-    said: dict[str, Any],
+    given: dict[str, Any],
     protocol: str = "simulated",
     leave_out: tuple[str, ...] = (),
 ) -> Outcome:
-    return outcome_of(Task("t", "c", protocol, leave_out), truth, said)
+    return outcome_of(Task("t", "c", protocol, leave_out), truth, given)
 
 
 def figures(*items: Outcome, protocol: str = "simulated") -> dict[str, Any]:
@@ -69,7 +70,7 @@ def figures(*items: Outcome, protocol: str = "simulated") -> dict[str, Any]:
     return found
 
 
-def test_strict_pair_two_and_family_are_told_apart() -> None:
+def test_top1_pairs_top2_and_family_differ() -> None:
     truth = label("voltage_offset")
     items = [
         outcome(truth, answer("voltage_offset")),
@@ -88,7 +89,7 @@ def test_strict_pair_two_and_family_are_told_apart() -> None:
     assert effects["ranked_first"]["hits"] == 3
 
 
-def test_a_crash_is_wrong_and_listed() -> None:
+def test_crash_is_wrong_and_listed() -> None:
     result = score(
         [outcome(label("capacity"), {"error": "boom"}), outcome(label(), {"error": "b"})]
     )
@@ -98,14 +99,14 @@ def test_a_crash_is_wrong_and_listed() -> None:
     assert [item["error"] for item in result["crashed"]] == ["boom", "b"]
 
 
-def test_false_alarms_are_any_verdict_but_none() -> None:
-    said = [answer("none"), answer("none"), answer("unknown"), answer("capacity")]
-    healthy = figures(*(outcome(label(), item) for item in said))["healthy"]
+def test_any_verdict_but_none_is_a_false_alarm() -> None:
+    answers = [answer("none"), answer("none"), answer("unknown"), answer("capacity")]
+    healthy = figures(*(outcome(label(), item) for item in answers))["healthy"]
     assert healthy["false_alarms"]["hits"] == 2
     assert healthy["named_an_effect"]["hits"] == 1
 
 
-def test_with_the_cause_left_out_only_unknown_is_right() -> None:
+def test_without_the_cause_only_unknown_is_correct() -> None:
     truth, out = label("capacity"), ("capacity",)
     items = [
         outcome(truth, answer("unknown"), "open-set", out),
@@ -122,8 +123,10 @@ def test_with_the_cause_left_out_only_unknown_is_right() -> None:
     assert "effects" not in found
 
 
-def test_faults_outside_the_library_are_unknown_too() -> None:
-    items = [outcome(label("string_dropout"), answer(said)) for said in ("unknown", "capacity")]
+def test_faults_outside_the_library_are_unknown() -> None:
+    items = [
+        outcome(label("string_dropout"), answer(verdict)) for verdict in ("unknown", "capacity")
+    ]
     assert figures(*items)["open_set"]["unknown"]["value"] == 0.5
 
 
@@ -136,14 +139,14 @@ def test_two_causes_need_both() -> None:
     assert pairs["both"]["hits"] == 1
 
 
-def test_a_gap_below_the_range_is_not_counted() -> None:
+def test_gap_below_the_range_is_excluded() -> None:
     small, large = label("capacity", gap_v=0.3), label("capacity", gap_v=0.6)
     found = figures(outcome(small, answer("none")), outcome(large, answer("capacity")))
     assert found["effects"]["cases"] == found["below_range"] == 1
     assert [entry["top1"]["of"] for entry in found["by_gap"]] == [1, 1, 0, 0]
 
 
-def test_closed_is_by_the_truths_floors_and_zero_without_a_cause() -> None:
+def test_closed_fraction_uses_the_true_floors() -> None:
     named = outcome(label("capacity"), answer("capacity", rmse=(3.0, 1.0)))
     assert named.closed == {
         "reported": 0.7,
@@ -180,20 +183,20 @@ def test_coverage_is_of_the_true_parameter(interval: list[float], holds: int) ->
     assert coverage["by_parameter"]["capacity.change_pct"]["of"] == 1
 
 
-def test_wilsons_interval() -> None:
+def test_wilson_interval() -> None:
     # Newcombe, Statistics in Medicine 17 (1998) 857, table I, method 3.
-    assert Share(81, 263).interval == pytest.approx((0.2553, 0.3662), abs=5e-5)
-    assert Share(0, 20).interval == pytest.approx((0.0, 0.1611), abs=5e-5)
-    assert Share(0, 0).value is None
+    assert proportion(81, 263)["ci"] == pytest.approx((0.2553, 0.3662), abs=5e-5)
+    assert proportion(0, 20)["ci"] == pytest.approx((0.0, 0.1611), abs=5e-5)
+    assert proportion(0, 0)["value"] is None
 
 
 def test_bootstrap_covers_a_mean() -> None:
-    found = estimate([0.0, 1.0] * 50, lambda values: float(values.mean()))
+    found = estimate([0.0, 1.0] * 50, np.mean)
     assert found["value"] == 0.5
     assert found["ci"] == pytest.approx([0.4, 0.6], abs=0.02)
 
 
-def test_targets_are_judged_where_they_were_run() -> None:
+def test_targets_without_a_figure_are_skipped() -> None:
     result: dict[str, Any] = score([outcome(label(), answer("none")) for _ in range(3)])
     rows = {row["name"]: row for row in judge_targets(result | {"later": {}})}
     assert rows["simulated: false alarms"]["met"]

@@ -1,4 +1,4 @@
-"""Diagnosing processes: what they are told, and that a dead one is replaced."""
+"""Diagnosing processes: their inputs, crashes and timeouts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from cangauge.validation import workers
-from cangauge.validation.cases import EFFECTS
+from cangauge.validation.plan import EFFECTS
 from cangauge.validation.workers import Task, diagnose_all
 
 SPY = """
@@ -26,11 +26,11 @@ for line in sys.stdin:
     if text == "hang":
         import time
         time.sleep(60)
-    told = {
+    received = {
         "argv": sys.argv, "environment": dict(os.environ), "cwd": os.getcwd(), "line": line,
         "files": {str(path): path.read_text() for path in home.iterdir()}, "pid": os.getpid(),
     }
-    print(json.dumps({"told": told}), flush=True)
+    print(json.dumps({"received": received}), flush=True)
 """
 
 
@@ -45,9 +45,9 @@ def cases(tmp_path: Path) -> Path:
         (place / "log_1.parquet").write_text(text)
         listing = {"logs": ["log_1.parquet"], "references": ["reference_1.parquet"]}
         (place / "case.json").write_text(json.dumps(listing))
-    sealed = tmp_path / "kept" / "sealed"
-    sealed.mkdir()
-    (sealed / "labels.json").write_text("hysteresis")
+    withheld = tmp_path / "kept" / "withheld"
+    withheld.mkdir()
+    (withheld / "labels.json").write_text("hysteresis")
     return folder
 
 
@@ -66,58 +66,58 @@ def ask(
     return run
 
 
-def test_the_process_is_told_of_logs_and_model_alone(
+def test_process_gets_logs_and_model_only(
     ask: Callable[..., dict[str, dict[str, Any]]], cases: Path
 ) -> None:
     task = Task("task_1", "case_0", "simulated")
-    told = ask(task)["task_1"]["told"]
-    everything = json.dumps(told)
+    received = ask(task)["task_1"]["received"]
+    everything = json.dumps(received)
     for effect in EFFECTS:
         assert effect not in everything
-    # Neither where the case came from, nor its name or protocol, nor the sealed folder.
-    for secret in (str(cases.parent), "sealed", "case_0", "task_1", "simulated"):
+    # Neither origin, name and protocol of the case, nor the folder of the labels.
+    for secret in (str(cases.parent), "withheld", "case_0", "task_1", "simulated"):
         assert secret not in everything
-    assert json.loads(told["line"]).keys() == {
+    assert json.loads(received["line"]).keys() == {
         "model", "logs", "references", "leave_out", "extended",
     }  # fmt: skip
-    assert {Path(path).name for path in told["files"]} == {
+    assert {Path(path).name for path in received["files"]} == {
         "model.json", "log_1.parquet", "reference_1.parquet",
     }  # fmt: skip
-    assert told["environment"]["OMP_NUM_THREADS"] == "1"
+    assert received["environment"]["OMP_NUM_THREADS"] == "1"
 
 
-def test_its_folder_is_gone_afterwards(ask: Callable[..., dict[str, dict[str, Any]]]) -> None:
-    told = ask(Task("a", "case_0", "simulated"))["a"]["told"]
-    assert not Path(told["cwd"]).exists()
-    assert not any(Path(path).exists() for path in told["files"])
+def test_folder_is_removed_afterwards(ask: Callable[..., dict[str, dict[str, Any]]]) -> None:
+    received = ask(Task("a", "case_0", "simulated"))["a"]["received"]
+    assert not Path(received["cwd"]).exists()
+    assert not any(Path(path).exists() for path in received["files"])
 
 
-def test_one_that_dies_is_a_crash_and_the_next_case_goes_on(
+def test_crashed_process_is_replaced(
     ask: Callable[..., dict[str, dict[str, Any]]],
 ) -> None:
     first, bad, last = (Task(f"t{k}", f"case_{n}", "simulated") for k, n in enumerate((0, 1, 3)))
     found = ask(first, bad, last)
     assert "code 3" in found["t1"]["error"]
-    assert found["t0"]["told"]["pid"] != found["t2"]["told"]["pid"]
+    assert found["t0"]["received"]["pid"] != found["t2"]["received"]["pid"]
 
 
-def test_one_that_hangs_is_stopped(
+def test_hanging_process_is_stopped(
     ask: Callable[..., dict[str, dict[str, Any]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(workers, "LONGEST_S", 1.0)
+    monkeypatch.setattr(workers, "TIMEOUT_S", 1.0)
     found = ask(Task("a", "case_2", "simulated"), Task("b", "case_0", "simulated"))
     assert "ended" in found["a"]["error"]
-    assert "told" in found["b"]
+    assert "received" in found["b"]
 
 
-def test_several_processes_share_the_work(ask: Callable[..., dict[str, dict[str, Any]]]) -> None:
+def test_several_processes_share_the_tasks(ask: Callable[..., dict[str, dict[str, Any]]]) -> None:
     tasks = [Task(f"t{k}", f"case_{k % 2 * 3}", "simulated") for k in range(12)]
     found = ask(*tasks, jobs=2)
     assert len(found) == 12
-    assert len({answer["told"]["pid"] for answer in found.values()}) <= 2
+    assert len({answer["received"]["pid"] for answer in found.values()}) <= 2
 
 
-def test_a_case_without_files_is_a_crash(ask: Callable[..., dict[str, dict[str, Any]]]) -> None:
+def test_case_without_files_is_a_crash(ask: Callable[..., dict[str, dict[str, Any]]]) -> None:
     found = ask(Task("a", "case_9", "simulated"), Task("b", "case_0", "simulated"))
     assert "error" in found["a"]
-    assert "told" in found["b"]
+    assert "received" in found["b"]

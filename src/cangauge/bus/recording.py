@@ -249,7 +249,7 @@ def capture_samples(
         voltage_v=voltage_v,
         temperature_c=temperature_c,
         soc_pct=soc_pct,
-        statistics=bus.decoder.counters,
+        counters=bus.decoder.statistics,
         info=capture.info,
         remarks=tuple(remarks),
     )
@@ -287,7 +287,7 @@ def _decode(capture: Capture, vehicle: Vehicle, clock: TimeSource) -> dict[Chann
 
 def _no_samples(path: str | PathLike[str], vehicle: Vehicle, bus: _Bus | None) -> InputError:
     name = f"0x{vehicle.current.arbitration_id:X} ({vehicle.current.message})"
-    statistics = None if bus is None else bus.decoder.counters
+    counters = None if bus is None else bus.decoder.statistics
     if counters is None or not counters.messages[vehicle.current.key].wanted:
         problem = f"the capture holds no frames of {name}, which carries the current"
     else:

@@ -1,14 +1,12 @@
-"""`cangauge twin`: a simulated pack and drive → a log whose truth is known."""
+"""`cangauge twin`: a simulated log whose truth is known."""
 
 from __future__ import annotations
 
 import json
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, cast
 
-import numpy as np
 import typer
 
 from cangauge._io import write_text_atomic
@@ -16,72 +14,61 @@ from cangauge.cli.options import JsonOption, check_outputs, within
 from cangauge.cli.output import console, emit_json, note, print_table
 from cangauge.errors import InputError
 from cangauge.logs.canonical import write_log
-from cangauge.logs.log import Log
-from cangauge.validation.twin.day import Day, draw_day, read_speed
-from cangauge.validation.twin.faults import Fault, fault_kinds, parse_effect
-from cangauge.validation.twin.plant import Plant
-from cangauge.validation.twin.scaling import scale_to_gap
-from cangauge.validation.twin.simulate import Recording, Truth, simulate
-from cangauge.validation.twin.world import PlantName, draw_plant, record_day, rms
-
-DEFAULT_GAP = 0.003
-"""Gap of an effect whose size is not given, as a part of the nominal voltage."""
-
-EMPTY = 0.015
-"""State of charge at which a whole discharge ends: a fit takes 2 % and less for empty."""
+from cangauge.validation.twin.drive import read_speed
+from cangauge.validation.twin.faults import fault_kinds
+from cangauge.validation.twin.simulation import PlantName, simulate
 
 
 def twin_command(  # noqa: PLR0917 - typer passes options by name
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="LOG", help="The log: .parquet or .csv."),
+        typer.Option("-o", "--output", metavar="LOG", help="Log to write: .parquet or .csv."),
     ] = None,
     seed: Annotated[
-        int, typer.Option(metavar="N", min=0, help="Which pack; the same seed, the same log.")
+        int, typer.Option(metavar="N", min=0, help="Selects the pack. Same seed, same log.")
     ] = 0,
     effect: Annotated[
         list[str] | None,
         typer.Option(
             metavar="ID[:parameter=value,…]",
-            help="A fault of the pack or its sensors; repeat for several. `gap_v=V` in place of"
-            " a size: as large as it takes to open this RMS gap. Without either: 0.3 % of the"
-            " pack's voltage.",
+            help="Fault of the pack or its sensors; repeat for several. `gap_v=V` in place of a"
+            " size: the size that opens this RMS gap. Default: a gap of 0.3 % of the pack voltage.",
         ),
     ] = None,
     day: Annotated[
-        int, typer.Option(metavar="N", min=1, help="Which day (drive and weather) of the pack.")
+        int, typer.Option(metavar="N", min=1, help="Number of the drive, with its weather.")
     ] = 1,
     hours: Annotated[
-        float | None, typer.Option(metavar="H", help="Length [h]. Default: 0.5 to 2.5 at random.")
+        float | None, typer.Option(metavar="H", help="Duration [h]. Default: 0.5 to 2.5, drawn.")
     ] = None,
     ambient_c: Annotated[
         float | None,
-        typer.Option(metavar="C", help="Ambient temperature [°C]. Default: −10 to 35 at random."),
+        typer.Option(metavar="C", help="Ambient temperature [°C]. Default: −10 to 35, drawn."),
     ] = None,
     start_soc: Annotated[
-        float | None, typer.Option(metavar="P", help="SoC at the start [%]. Default: at random.")
+        float | None, typer.Option(metavar="P", help="Initial SoC [%]. Default: drawn.")
     ] = None,
     end_soc: Annotated[
-        float | None, typer.Option(metavar="P", help="SoC at which the drive ends at last [%].")
+        float | None, typer.Option(metavar="P", help="SoC at which the drive ends [%].")
     ] = None,
     discharge: Annotated[
         bool,
         typer.Option(
             "--discharge",
-            help="From full to empty within the hours (default 2.5 h), to identify a model on.",
+            help="Drive from full to empty within the hours (default 2.5 h): a log for `fit`.",
         ),
     ] = False,
     speed: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="A driving schedule: CSV of time [s] and speed [m/s], repeated."
+            metavar="FILE", help="Driving schedule: CSV of time [s] and speed [m/s], repeated."
         ),
     ] = None,
     pack: Annotated[
         str | None,
         typer.Option(
             metavar="KIND",
-            help="leaf24, leaf40, car60, car60lfp, compact or module12. Default: at random.",
+            help="leaf24, leaf40, car60, car60lfp, compact or module12. Default: drawn.",
         ),
     ] = None,
     chemistry: Annotated[
@@ -91,29 +78,29 @@ def twin_command(  # noqa: PLR0917 - typer passes options by name
         str,
         typer.Option(
             metavar="twin|equation|published|pybamm",
-            help="What simulates the cells; pybamm needs the extra cangauge[pybamm].",
+            help="Model of the cells; pybamm needs the extra cangauge[pybamm].",
         ),
     ] = "twin",
     soc: Annotated[
         str,
         typer.Option(
             metavar="full|start",
-            help="soc_pct of the log: the true SoC after the assumed start, or the start alone.",
+            help="soc_pct of the log: assumed initial SoC, then the true SoC; or the former alone.",
         ),
     ] = "full",
     truth: Annotated[
-        Path | None, typer.Option(metavar="FILE.json", help="Write what is true here too.")
+        Path | None, typer.Option(metavar="FILE.json", help="Write the truth to this file too.")
     ] = None,
     list_effects: Annotated[
-        bool, typer.Option("--list", help="List the effects and their parameters, and leave.")
+        bool, typer.Option("--list", help="List the effects and their parameters.")
     ] = False,
     json_output: JsonOption = False,
 ) -> None:
     """Simulate a pack, a drive, the weather and the sensors: a log whose truth is known.
 
-    The cells are no copy of the voltage model that cangauge identifies (tabulated open-circuit
-    voltage, Butler–Volmer kinetics, diffusion, two thermal nodes, cell spread, quantised and
-    jittered sensors), so what it finds here it has earned. Positive current discharges.
+    The cell model is independent of the voltage model that cangauge identifies: tabulated
+    open-circuit voltage, Butler–Volmer kinetics, diffusion, two thermal nodes, cell spread,
+    quantized and jittered sensors. Positive current discharges.
 
     For example:
 
@@ -131,30 +118,36 @@ def twin_command(  # noqa: PLR0917 - typer passes options by name
     if output is None:
         raise InputError("no log to write", field="-o", cure="name a .parquet or a .csv file")
     if soc not in {"full", "start"}:
-        raise InputError("no such choice", field="--soc", value=soc, cure="use full or start")
+        raise InputError("unknown choice", field="--soc", value=soc, cure="use full or start")
     check_outputs([output, truth], [speed] if speed is not None else [])
     began = time.perf_counter()
-    with console.status("drawing the pack") as status:
-        stand_in = draw_plant(
-            np.random.default_rng([seed, 1]), pack, chemistry, cast("PlantName", plant)
-        )
-        what = draw_day(
-            np.random.default_rng([seed, 4, day]),
-            stand_in.pack,
-            hours=2.5 if hours is None and discharge else _hours(hours),
-            ambient_c=_ambient(ambient_c),
-            start_soc=_start(start_soc, discharge=discharge),
-            end_soc=EMPTY if end_soc is None and discharge else _share(end_soc, "--end-soc"),
-            speed_ms=None if speed is None else read_speed(speed),
+    with console.status("simulating"):
+        simulated = simulate(
+            effect or (),
+            seed=seed,
+            drive=day,
+            hours=_within(hours, 0.05, 12.0, "--hours", "h"),
+            ambient_c=_within(ambient_c, -30.0, 50.0, "--ambient-c", "°C"),
+            start_soc_pct=_within(start_soc, 0.0, 100.0, "--start-soc", "%"),
+            end_soc_pct=_within(end_soc, 0.0, 100.0, "--end-soc", "%"),
             discharge=discharge,
+            speed_ms=None if speed is None else read_speed(speed),
+            pack=pack,
+            chemistry=chemistry,
+            plant=cast("PlantName", plant),
+            name=output.stem,
         )
-        status.update("simulating")
-        healthy = simulate(stand_in, what)
-        faults = _faults(effect or [], stand_in, what, healthy, seed)
-        recording = record_day(stand_in, what, faults, name=output.stem, healthy=healthy)
-    log = _with_soc(recording, soc)
-    write_log(log, output)
-    result = _result(recording, stand_in, faults, output, time.perf_counter() - began)
+    for scaled in simulated.limited:
+        note(
+            f"{scaled.fault.id}: on this drive its physical limits allow a gap of"
+            f" {scaled.reached_v:.3g} V, not {scaled.target_v:.3g} V"
+        )
+    write_log(simulated.log if soc == "full" else simulated.recording.log, output)
+    result = {
+        "log": str(output),
+        **simulated.to_dict(),
+        "seconds": time.perf_counter() - began,
+    }
     if truth is not None:
         write_text_atomic(truth, json.dumps(result, indent=1) + "\n")
     if json_output:
@@ -164,88 +157,8 @@ def twin_command(  # noqa: PLR0917 - typer passes options by name
     note(f"log: {output}")
 
 
-def _hours(given: float | None) -> float | None:
-    return given if given is None else within(given, 0.05, 12.0, option="--hours", unit="h")
-
-
-def _ambient(given: float | None) -> float | None:
-    return given if given is None else within(given, -30.0, 50.0, option="--ambient-c", unit="°C")
-
-
-def _start(given: float | None, *, discharge: bool) -> float | None:
-    if given is None:
-        return 1.0 if discharge else None
-    return _share(given, "--start-soc")
-
-
-def _share(given: float | None, option: str) -> float | None:
-    return given if given is None else within(given, 0.0, 100.0, option=option, unit="%") / 100.0
-
-
-def _faults(
-    texts: list[str], plant: Plant, day: Day, healthy: Truth, seed: int
-) -> tuple[Fault, ...]:
-    faults = []
-    for number, text in enumerate(texts):
-        asked = parse_effect(
-            text,
-            plant.pack,
-            seed=seed + 7919 * number,
-            default_gap_v=DEFAULT_GAP * plant.pack.nominal_v,
-        )
-        fault = asked.fault
-        if asked.gap_v is not None:
-            scaled = scale_to_gap(plant, [day], fault, asked.gap_v, [healthy])
-            fault = scaled.fault
-            if scaled.limited:
-                note(
-                    f"{fault.id}: this drive shows {scaled.reached_v:.3g} V of the gap of"
-                    f" {asked.gap_v:.3g} V at most, within what is physical"
-                )
-        faults.append(fault)
-    return tuple(faults)
-
-
-def _with_soc(recording: Recording, soc: str) -> Log:
-    log = recording.log
-    if soc == "start" or log.soc_pct is None:
-        return log
-    reference = recording.true_soc_pct.copy()
-    reference[0] = log.soc_pct[0]  # what the gauge assumes
-    return replace(log, soc_pct=reference)
-
-
-def _result(
-    recording: Recording, plant: Plant, faults: tuple[Fault, ...], output: Path, seconds: float
-) -> dict[str, Any]:
-    log, pack = recording.log, plant.pack
-    assumed = log.first_soc()
-    return {
-        "log": str(output),
-        "rows": len(log),
-        "hours": log.duration_s / 3600.0,
-        "seconds": seconds,
-        "plant": plant.name,
-        "pack": pack.name,
-        "chemistry": pack.chemistry.name,
-        "cells": pack.cells,
-        "capacity_ah": pack.capacity_ah,
-        "assumed_start_soc_pct": None if assumed is None else assumed[1],
-        "true_soc_pct": [float(recording.true_soc_pct[0]), float(recording.true_soc_pct[-1])],
-        "temperature_c": [float(log.temperature_c.min()), float(log.temperature_c.max())],
-        "floor_sensor_v": rms(recording.floor_v),
-        "gap_v": rms(recording.gap_v),
-        "effects": [
-            {
-                "effect": fault.id,
-                "parameter": fault.kind.parameter,
-                "value": fault.size,
-                "unit": fault.kind.unit,
-                "shape": fault.full_shape(),
-            }
-            for fault in faults
-        ],
-    }
+def _within(value: float | None, low: float, high: float, option: str, unit: str) -> float | None:
+    return value if value is None else within(value, low, high, option=option, unit=unit)
 
 
 def _show(result: dict[str, Any]) -> None:
@@ -253,11 +166,11 @@ def _show(result: dict[str, Any]) -> None:
     rows = [
         ["pack", f"{result['pack']}, {result['cells']} cells {result['chemistry']}", ""],
         ["capacity", f"{result['capacity_ah']:.2f}", "Ah"],
-        ["length", f"{result['hours']:.2f}", "h"],
-        ["assumed start", f"{result['assumed_start_soc_pct']:.1f}", "%"],
+        ["duration", f"{result['hours']:.2f}", "h"],
+        ["assumed initial SoC", f"{result['assumed_start_soc_pct']:.1f}", "%"],
         ["true SoC", f"{from_pct:.1f} → {to_pct:.1f}", "%"],
         ["temperature", f"{cold:.1f} … {warm:.1f}", "°C"],
-        ["floor of the sensors", f"{result['floor_sensor_v']:.3f}", "V"],
+        ["sensor floor", f"{result['floor_sensor_v']:.3f}", "V"],
         ["gap", f"{result['gap_v']:.3f}", "V"],
     ]
     rows += [
@@ -280,7 +193,7 @@ def _list(json_output: bool) -> None:
                         "unit": kind.unit,
                         "signed": kind.signed,
                         "shape": list(kind.shape),
-                        "says": kind.says,
+                        "says": kind.summary,
                     }
                     for kind in kinds
                 ]
@@ -289,12 +202,12 @@ def _list(json_output: bool) -> None:
         return
     print_table(
         "Effects",
-        ["id", "<parameters", "<what happens"],
+        ["id", "<parameters", "<effect on the log"],
         [
             [
                 kind.id,
                 f"{kind.parameter} [{kind.unit}]" + "".join(f", {name}" for name in kind.shape),
-                kind.says,
+                kind.summary,
             ]
             for kind in kinds
         ],

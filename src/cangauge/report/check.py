@@ -24,7 +24,7 @@ from cangauge.report.page import (
     Tile,
     render,
 )
-from cangauge.validation.cases import EFFECTS
+from cangauge.validation.plan import EFFECTS
 from cangauge.validation.score import CRASHED, LEAST_GAP, NONE, UNKNOWN
 from cangauge.validation.tables import entries_of, limits, measured, percent
 

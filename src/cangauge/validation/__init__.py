@@ -1,3 +1,37 @@
-"""The withheld check: causes are drawn and sealed, diagnosed from the logs alone, then scored."""
+"""Validation: simulated truth (`twin`) and the withheld check of the diagnosis.
+
+The check draws causes, withholds them, diagnoses in processes that get logs and model alone, then
+scores the answers::
+
+    plan        protocols → planned cases, each with its seed
+    cases       a planned case → logs with a fault, in memory
+    recordings  recorded logs: healthy ones to put faults into, laboratory ones with a known cause
+    generation  cases → files for the diagnosis, labels for the scorer
+    check       draw, withhold, diagnose (`workers`, `worker`), reveal
+    score       labels and answers → figures; `tables` prints them
+
+The public names, those of the twin, are loaded when first used.
+"""
 
 from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from cangauge.validation.twin import (
+        Fault,
+        FaultKind,
+        Simulation,
+        fault_kinds,
+        read_speed,
+        simulate,
+    )
+
+__all__ = ["Fault", "FaultKind", "Simulation", "fault_kinds", "read_speed", "simulate"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in __all__:
+        return getattr(import_module("cangauge.validation.twin"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,6 +1,6 @@
-"""The sealed file: every cause in one file whose hash is shown before the diagnosis starts.
+"""The withheld check: draw cases, withhold their causes, diagnose, reveal and score.
 
-The whole check: draw and seal, diagnose apart, unseal and score.
+All causes are in one label file, whose hash is printed before the diagnosis starts.
 """
 
 from __future__ import annotations
@@ -23,91 +23,69 @@ import numpy as np
 from cangauge._io import write_text_atomic
 from cangauge._resources import THREADS
 from cangauge.errors import InputError
-from cangauge.validation.cases import EFFECTS, Group
-from cangauge.validation.draw import MODEL, Label, draw_group
-from cangauge.validation.held_out_evaluation import judge_later, later_figures, write_model
+from cangauge.validation.generation import MODEL, Label, draw_group
+from cangauge.validation.held_out_evaluation import model_errors, pool_errors
+from cangauge.validation.plan import EFFECTS, Group
 from cangauge.validation.score import Outcome, outcome_of
 from cangauge.validation.workers import Task, diagnose_all
 
-# --- The sealed file: every cause in one file whose hash is shown before the diagnosis starts
-
+OPEN, WITHHELD, TASKS, ANSWERS = "open", "withheld", "tasks.json", "answers.jsonl"
 LABELS: Final = "labels.json"
 SCHEMA: Final = 1
+OPEN_SET: Final = "open-set"
+_CONTROL_EVERY: Final = 5
+"""One open-set task in this many leaves out an effect that is not the cause, so that the request
+does not reveal the cause."""
+
+Progress = Callable[[int], None]
 
 
-def seal(labels: Sequence[dict[str, Any]], folder: Path) -> str:
-    """Write all causes and return the file's SHA-256.
-
-    Parameters
-    ----------
-    labels : sequence of dict
-        Each with the `name` of its case.
-    folder : Path
-        One that the diagnosis is not told of.
-    """
+def write_labels(labels: Sequence[dict[str, Any]], folder: Path) -> str:
+    """Write all labels to one file, sorted by case, and return its SHA-256."""
     ordered = sorted(labels, key=lambda label: label["name"])
     path = folder / LABELS
     write_text_atomic(path, json.dumps({"schema": SCHEMA, "labels": ordered}, indent=1) + "\n")
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def unseal(folder: Path, sha256: str) -> dict[str, dict[str, Any]]:
-    """Return the causes by the name of their case; for the scorer alone.
-
-    Parameters
-    ----------
-    folder : Path
-    sha256 : str
-        What was shown before the diagnosis started.
+def read_labels(folder: Path, sha256: str) -> dict[str, dict[str, Any]]:
+    """Return the labels by case, for the scorer alone.
 
     Raises
     ------
     InputError
-        If the file is not the one that was sealed.
+        If the file cannot be read, or its hash is not the one printed before the diagnosis.
     """
     path = folder / LABELS
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise InputError(
-            f"the sealed file cannot be read: {error.strerror}", source=path
-        ) from error
+        raise InputError(f"the labels cannot be read: {error.strerror}", source=path) from error
     found = hashlib.sha256(content).hexdigest()
     if found != sha256:
         raise InputError(
-            "the sealed file is not the one whose hash was shown before the diagnosis",
+            "the labels changed: another hash was printed before the diagnosis",
             source=path,
             value=found,
-            cure="draw the cases anew",
+            cure="draw the cases again",
         )
     whole = json.loads(content)
     return {label["name"]: label for label in whole["labels"]}
 
 
-# --- The whole check: draw and seal, diagnose apart, unseal and score
-
-OPEN, SEALED, TASKS, ANSWERS = "open", "sealed", "tasks.json", "answers.jsonl"
-OPEN_SET: Final = "open-set"
-DECOY_EVERY: Final = 5
-"""One in so many open-set requests leaves out an effect that is not the cause, so that the request
-does not tell it."""
-
-Progress = Callable[[int], None]
-
-
 @dataclass(frozen=True)
-class Drawn:
-    """Cases on the disk, sealed.
+class CheckFiles:
+    """Files of a check.
 
     Parameters
     ----------
     folder : Path
-        Holds `open/` for the diagnosis and `sealed/` for the scorer.
+        With `open/` for the diagnosis and `withheld/` for the scorer.
     sha256 : str
-        Of the sealed file.
+        Hash of the labels.
     tasks : tuple of Task
     about : dict
-        Seed, whether it is final, and so on.
+        Seed of the plan, and whether it is final.
     """
 
     folder: Path
@@ -125,8 +103,8 @@ def draw_all(
     open_set: int,
     about: dict[str, Any],
     progress: Progress,
-) -> Drawn:
-    """Draw all cases, seal their causes and say what is to be diagnosed.
+) -> CheckFiles:
+    """Draw all cases, write files and labels, and list the diagnoses to run.
 
     Parameters
     ----------
@@ -135,79 +113,69 @@ def draw_all(
     data : Path, optional
         Folder of the recorded logs.
     jobs : int
-        Processes.
+        Number of processes.
     open_set : int
-        So many cases of each effect on the simulated plant are diagnosed once more, with that
-        effect out of the library.
+        Simulated cases of each effect that are diagnosed again without it in the library.
     about : dict
-        To be kept with the cases; `seed` is used.
+        Stored with the cases; `seed` shuffles the tasks.
     progress : callable
         Called with the number of cases drawn.
     """
-    place, sealed = folder / OPEN, folder / SEALED
-    for path in (place, sealed):
+    place, withheld = folder / OPEN, folder / WITHHELD
+    for path in (place, withheld):
         path.mkdir(parents=True, exist_ok=True)
     labels: list[Label] = []
     with (
-        _one_thread(),
+        _single_threaded(),
         ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool,
     ):
-        running = [pool.submit(draw_group, group, place, sealed, data) for group in groups]
+        running = [pool.submit(draw_group, group, place, withheld, data) for group in groups]
         for future in as_completed(running):
             labels += future.result()
             progress(len(future.result()))
-    sha256 = seal(labels, sealed)
+    sha256 = write_labels(labels, withheld)
     tasks = _tasks(labels, open_set, np.random.default_rng([int(about["seed"]), 11]))
-    drawn = Drawn(folder, sha256, tasks, about)
-    _write(drawn)
-    return drawn
+    content = {
+        "schema": SCHEMA,
+        **about,
+        "labels_sha256": sha256,
+        "tasks": [asdict(task) for task in tasks],
+    }
+    write_text_atomic(folder / TASKS, json.dumps(content, indent=1) + "\n")
+    return CheckFiles(folder, sha256, tasks, about)
 
 
 def _tasks(labels: Sequence[Label], open_set: int, rng: np.random.Generator) -> tuple[Task, ...]:
-    there = sorted(
+    drawn = sorted(
         (label for label in labels if "failed" not in label), key=lambda label: label["name"]
     )
-    asked = [
+    tasks = [
         Task("", label["name"], label["protocol"], wants_model="judged_on" in label)
-        for label in there
+        for label in drawn
     ]
-    again: list[Task] = []
+    open_set_tasks: list[Task] = []
     for effect in EFFECTS:
-        with_it = [
+        of_effect = [
             label
-            for label in there
+            for label in drawn
             if label["protocol"] == "simulated" and label["effects"] == [effect]
         ]
-        again += [Task("", label["name"], OPEN_SET, (effect,)) for label in with_it[:open_set]]
-    decoys = [
+        open_set_tasks += [
+            Task("", label["name"], OPEN_SET, (effect,)) for label in of_effect[:open_set]
+        ]
+    controls = [
         replace(task, leave_out=(str(rng.choice([e for e in EFFECTS if e not in task.leave_out])),))
-        for task in again[:: DECOY_EVERY - 1]
+        for task in open_set_tasks[:: _CONTROL_EVERY - 1]
     ]
-    asked += again + decoys
+    tasks += open_set_tasks + controls
     return tuple(
-        replace(asked[k], id=f"task_{number:05d}")
-        for number, k in enumerate(rng.permutation(len(asked)).tolist(), start=1)
+        replace(tasks[k], id=f"task_{number:05d}")
+        for number, k in enumerate(rng.permutation(len(tasks)).tolist(), start=1)
     )
 
 
-def _write(drawn: Drawn) -> None:
-    whole = {
-        "schema": SCHEMA,
-        **drawn.about,
-        "labels_sha256": drawn.sha256,
-        "tasks": [asdict(task) for task in drawn.tasks],
-    }
-    write_text_atomic(drawn.folder / TASKS, json.dumps(whole, indent=1) + "\n")
-
-
-def drawn_before(folder: Path) -> Drawn:
-    """Return the cases that an earlier run kept.
-
-    Raises
-    ------
-    InputError
-        If there are none in the folder.
-    """
+def load_files(folder: Path) -> CheckFiles:
+    """Return the cases that an earlier check kept; raise InputError if there are none."""
     path = folder / TASKS
     try:
         whole = json.loads(path.read_text(encoding="utf-8"))
@@ -217,38 +185,37 @@ def drawn_before(folder: Path) -> Drawn:
         sha256 = str(whole.pop("labels_sha256"))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
-            "no cases of an earlier run are in this folder",
+            "no cases of an earlier check in this folder",
             source=folder,
             cure="draw some with --keep FOLDER",
         ) from error
     whole.pop("schema")
-    return Drawn(folder, sha256, tasks, whole)
+    return CheckFiles(folder, sha256, tasks, whole)
 
 
 def diagnose_tasks(
-    drawn: Drawn, tasks: Sequence[Task], jobs: int, progress: Progress
+    files: CheckFiles, tasks: Sequence[Task], jobs: int, progress: Progress
 ) -> dict[str, dict[str, Any]]:
-    """Return the answer to each task by its id; nothing here opens the sealed file.
+    """Diagnose tasks without access to the labels; return the answers by task id.
 
-    Answers that an earlier run kept are put aside as `answers-1.jsonl`, `answers-2.jsonl`, …
+    Answers of an earlier check are renamed to `answers-1.jsonl`, `answers-2.jsonl`, …
 
     Parameters
     ----------
-    drawn : Drawn
+    files : CheckFiles
     tasks : sequence of Task
-        All of its tasks or some.
     jobs : int
-        Processes.
+        Number of processes.
     progress : callable
-        Called with the number of answers that came.
+        Called with the number of answers received.
     """
     answers = {}
-    path = drawn.folder / ANSWERS
+    path = files.folder / ANSWERS
     if path.exists():
         path.rename(_free_name(path))
-    # Line by line, so that a long check that is stopped can be scored as far as it came.
+    # Line by line, so that an interrupted check can be scored.
     with path.open("w", encoding="utf-8") as file:
-        for task, answer in diagnose_all(tasks, drawn.folder / OPEN, jobs):
+        for task, answer in diagnose_all(tasks, files.folder / OPEN, jobs):
             answers[task.id] = answer
             file.write(json.dumps({"task": task.id, **answer}) + "\n")
             file.flush()
@@ -256,23 +223,17 @@ def diagnose_tasks(
     return answers
 
 
-def answers_before(drawn: Drawn) -> dict[str, dict[str, Any]]:
-    """Return the answers that an earlier run kept.
-
-    Raises
-    ------
-    InputError
-        If there are none.
-    """
+def load_answers(files: CheckFiles) -> dict[str, dict[str, Any]]:
+    """Return the answers that an earlier check kept; raise InputError if there are none."""
     try:
-        text = (drawn.folder / ANSWERS).read_text(encoding="utf-8")
+        text = (files.folder / ANSWERS).read_text(encoding="utf-8")
     except OSError as error:
         raise InputError(
-            "no answers of an earlier run are in this folder",
-            source=drawn.folder,
+            "no answers of an earlier check in this folder",
+            source=files.folder,
             cure="leave out --score-only",
         ) from error
-    # The last line may have been cut off when the check was stopped.
+    # The last line is incomplete if the check was interrupted.
     whole = text[: text.rfind("\n") + 1]
     found = [json.loads(line) for line in whole.splitlines()]
     return {item.pop("task"): item for item in found}
@@ -283,31 +244,29 @@ def _free_name(path: Path) -> Path:
     return next(name for name in numbered if not name.exists())
 
 
-def outcomes_of(
-    drawn: Drawn,
+def score_answers(
+    files: CheckFiles,
     tasks: Sequence[Task],
     answers: dict[str, dict[str, Any]],
     undrawn_of: Collection[str] | None = None,
 ) -> list[Outcome]:
-    """Unseal the causes and return what each answer is worth.
-
-    Cases that could not be drawn or diagnosed are crashes.
+    """Compare answers with the labels; cases that could not be drawn or diagnosed are crashes.
 
     Parameters
     ----------
-    drawn : Drawn
+    files : CheckFiles
     tasks : sequence of Task
     answers : dict
-        By the task's id.
+        By task id.
     undrawn_of : collection of str, optional
-        Protocols whose cases that could not be drawn count; all by default.
+        Protocols whose undrawn cases count; by default all.
 
     Raises
     ------
     InputError
-        If the sealed file is not the one whose hash was shown.
+        If the labels changed.
     """
-    labels = unseal(drawn.folder / SEALED, drawn.sha256)
+    labels = read_labels(files.folder / WITHHELD, files.sha256)
     outcomes = [
         outcome_of(task, labels[task.case], answers[task.id])
         for task in tasks
@@ -320,40 +279,41 @@ def outcomes_of(
     return outcomes
 
 
-def some_of(tasks: Sequence[Task], at_most: int | None) -> list[Task]:
-    """Return so many tasks at random, always the same ones; all without a number."""
+def sample_tasks(tasks: Sequence[Task], at_most: int | None) -> list[Task]:
+    """Return at most this many tasks, drawn with a fixed seed."""
     if at_most is None or at_most >= len(tasks):
         return list(tasks)
     chosen = np.random.default_rng(0).permutation(len(tasks))[:at_most]
     return [tasks[k] for k in sorted(chosen.tolist())]
 
 
-def later_of(
-    drawn: Drawn, tasks: Sequence[Task], answers: dict[str, dict[str, Any]], progress: Progress
+def evaluate_held_out(
+    files: CheckFiles, tasks: Sequence[Task], answers: dict[str, dict[str, Any]], progress: Progress
 ) -> dict[str, Any]:
-    """Return the figures of extended models on logs that were kept back (see `later`).
+    """Evaluate extended models on held-out logs (see `held_out_evaluation`).
 
-    A case without an extended model keeps the plain one.
+    Without an extended model, the plain one takes its place.
     """
-    labels = unseal(drawn.folder / SEALED, drawn.sha256)
-    judged = []
+    labels = read_labels(files.folder / WITHHELD, files.sha256)
+    errors = []
     with TemporaryDirectory(prefix="models-") as folder:
         for task in tasks:
             if not task.wants_model or task.id not in answers:
                 continue
-            plain = drawn.folder / OPEN / task.case / MODEL
+            plain = files.folder / OPEN / task.case / MODEL
             model = answers[task.id].get("extended_model")
-            better = (
-                plain if model is None else write_model(model, Path(folder) / f"{task.id}.json")
-            )
-            judged.append(judge_later(labels[task.case], plain, better, drawn.folder / SEALED))
+            better = plain
+            if model is not None:
+                better = Path(folder) / f"{task.id}.json"
+                better.write_text(json.dumps(model), encoding="utf-8")
+            errors.append(model_errors(labels[task.case], plain, better, files.folder / WITHHELD))
             progress(1)
-    return later_figures(judged)
+    return pool_errors(errors)
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let the processes that start within use one thread each: the cores are theirs already."""
+def _single_threaded() -> Iterator[None]:
+    """Start processes with one BLAS thread each: there is one process per core already."""
     before = {name: os.environ.get(name) for name in THREADS}
     os.environ.update(dict.fromkeys(THREADS, "1"))
     try:

@@ -1,8 +1,7 @@
-"""Extended models on logs that the diagnosis never saw, through the estimator that runs live."""
+"""Held-out evaluation: errors of plain and extended models on logs the diagnosis did not get."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -15,36 +14,36 @@ from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 
-SETTLED_S: Final = 300.0
-"""The SoC of the EKF is judged from here on, its initial SoC withheld [s]."""
+_SETTLING_S: Final = 300.0
+"""Time after which the SoC of the EKF is evaluated; it does not get the initial SoC [s]."""
 
 
-def judge_later(
-    label: Mapping[str, Any], plain: Path, extended: Path, sealed: Path
+def model_errors(
+    label: Mapping[str, Any], plain: Path, extended: Path, withheld: Path
 ) -> dict[str, Any]:
-    """Return errors of the plain and the extended model on the logs kept back for it.
+    """Return the errors of plain and extended model on the held-out logs of a case.
 
     Parameters
     ----------
     label : mapping
-        Its `judged_on` names the sealed logs by group.
+        Its `judged_on` names the held-out logs by group.
     plain, extended : Path
         Model files.
-    sealed : Path
-        Folder of the sealed logs.
+    withheld : Path
+        Folder of the held-out logs.
 
     Returns
     -------
     dict
-        Group → list of `{"log", "plain": {…}, "extended": {…}}`, the errors as sums and counts,
-        so that those of several logs can be pooled.
+        Group → list of `{"log", "plain": {…}, "extended": {…}}`, with errors as sums and counts to
+        be pooled.
     """
     models = {"plain": Model.load(plain), "extended": Model.load(extended)}
     return {
         group: [
             {"log": item["log"]}
             | {
-                name: errors_of(read_log(sealed / item["file"]), model)
+                name: _log_errors(read_log(withheld / item["file"]), model)
                 for name, model in models.items()
             }
             for item in items
@@ -53,14 +52,14 @@ def judge_later(
     }
 
 
-def errors_of(log: Log, model: Model) -> dict[str, float]:
-    """Return sums of squares and of absolute errors of one log.
+def _log_errors(log: Log, model: Model) -> dict[str, float]:
+    """Return sums of squared voltage errors and of absolute SoC errors of one log.
 
-    Voltage: at the SoC counted from the log's own start, on rows where the delay line is full.
-    SoC: by the EKF with the start withheld, after `SETTLED_S`.
+    The voltage is predicted at the counted SoC, where the delay line is full. The SoC is that of
+    the EKF without an initial SoC, after `_SETTLING_S`.
     """
     start = log.first_soc()
-    # Rows before the first SoC tell nothing of where to count from.
+    # Counting starts at the first SoC.
     rows = log.rows(slice(0 if start is None else start[0], None))
     known = EstimatorSettings(method="coulomb", initial_soc_pct=None if start is None else start[1])
     voltage = run_estimator(samples_of(rows), model, known).residual_v
@@ -69,7 +68,7 @@ def errors_of(log: Log, model: Model) -> dict[str, float]:
     found = run_estimator(samples_of(log), model, EstimatorSettings())
     reference = np.full(len(log), np.nan) if log.soc_pct is None else log.soc_pct
     error = found.soc_pct - reference
-    error = error[np.isfinite(error) & (log.time_s - log.time_s[0] >= SETTLED_S)]
+    error = error[np.isfinite(error) & (log.time_s - log.time_s[0] >= _SETTLING_S)]
     return {
         "voltage_squares": float(np.sum(voltage**2)),
         "voltage_rows": float(voltage.size),
@@ -78,8 +77,8 @@ def errors_of(log: Log, model: Model) -> dict[str, float]:
     }
 
 
-def pooled(items: Sequence[Mapping[str, Any]], name: str) -> dict[str, float | None]:
-    """Return RMSE of the voltage [V] and MAE of the SoC [%] over all logs, for one model."""
+def _pooled(items: Sequence[Mapping[str, Any]], name: str) -> dict[str, float | None]:
+    """Return voltage RMSE [V] and SoC MAE [%] of one model over all logs."""
 
     def total(key: str) -> float:
         return float(sum(item[name][key] for item in items))
@@ -91,30 +90,24 @@ def pooled(items: Sequence[Mapping[str, Any]], name: str) -> dict[str, float | N
     }
 
 
-def later_figures(judged: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return pooled and single figures of every group of kept-back logs."""
+def pool_errors(errors: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the errors of each group of held-out logs, pooled and by log."""
     groups: dict[str, list[Mapping[str, Any]]] = {}
-    for item in judged:
+    for item in errors:
         for group, logs in item.items():
             groups.setdefault(group, []).extend(logs)
     return {
         group: {
-            "plain": pooled(logs, "plain"),
-            "extended": pooled(logs, "extended"),
+            "plain": _pooled(logs, "plain"),
+            "extended": _pooled(logs, "extended"),
             "logs": [
                 {
                     "log": log["log"],
-                    "plain": pooled([log], "plain"),
-                    "extended": pooled([log], "extended"),
+                    "plain": _pooled([log], "plain"),
+                    "extended": _pooled([log], "extended"),
                 }
                 for log in logs
             ],
         }
         for group, logs in groups.items()
     }
-
-
-def write_model(model: Mapping[str, Any], path: Path) -> Path:
-    """Write a model that came in an answer, and return its path."""
-    path.write_text(json.dumps(model), encoding="utf-8")
-    return path

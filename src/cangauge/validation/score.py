@@ -1,94 +1,78 @@
-"""95 % intervals: Wilson's for shares, bootstrap percentiles for what is no share.
+"""Score of the withheld check: labels and answers → figures with 95 % intervals.
 
-A true fault in the terms of the diagnosis: which parameter, which value.
-
-Only faults whose size is a quantity that a diagnosis can state. The twin and the library of
-effects name and sign them each in their own way.
-
-One label beside one answer.
-
-All outcomes → the figures of the check, each with its 95 % interval.
+Intervals are Wilson's for shares and bootstrap percentiles for medians and means.
 """
 
 from __future__ import annotations
 
-import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from scipy.stats import binomtest, bootstrap
 
-from cangauge._typing import FloatArray
-from cangauge.validation.cases import EFFECTS, is_outside
+from cangauge.validation.plan import EFFECTS, is_outside
 from cangauge.validation.twin.faults import fault_kinds
 from cangauge.validation.workers import Task
 
-# --- 95 % intervals: Wilson's for shares, bootstrap percentiles for what is no share
+NONE, UNKNOWN, CRASHED = "none", "unknown", "crashed"
+FAMILY: Final = {kind.id: kind.family for kind in fault_kinds()}
 
-_Z: Final = 1.959963984540054
-_DRAWS: Final = 2000
+LEAST_GAP: Final = 0.45
+"""Gaps below this multiple of the floor are out of range: physics allowed no larger one."""
+_CONFIDENT: Final = 0.5
+_GAP_EDGES: Final = (0.0, 0.5, 1.0, 2.0, 5.5)
+_PROBABILITY_BINS: Final = 10
+_RESAMPLES: Final = 2000
+_ROUNDING: Final = 1e-9
+"""Relative rounding between the units of the twin and of the effects library."""
+_RECORDED: Final = "real-"
+"""Prefix of protocols on recorded logs, which are scored each and together."""
 
-
-@dataclass(frozen=True)
-class Share:
-    """How many of how many."""
-
-    hits: int
-    of: int
-
-    @property
-    def value(self) -> float | None:
-        """Share, or None of nothing."""
-        return self.hits / self.of if self.of else None
-
-    @property
-    def interval(self) -> tuple[float, float] | None:
-        """Wilson's 95 % interval (Wilson 1927)."""
-        if not self.of:
-            return None
-        share, n = self.hits / self.of, self.of
-        middle = (share + _Z**2 / (2.0 * n)) / (1.0 + _Z**2 / n)
-        half = math.sqrt(share * (1.0 - share) / n + _Z**2 / (4.0 * n**2)) * _Z / (1.0 + _Z**2 / n)
-        return max(0.0, middle - half), min(1.0, middle + half)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return value, interval and counts."""
-        interval = self.interval
-        return {
-            "value": self.value,
-            "ci": None if interval is None else list(interval),
-            "hits": self.hits,
-            "of": self.of,
-        }
+Figures = dict[str, Any]
 
 
-def share(flags: Sequence[bool]) -> Share:
-    """Return how many flags are set."""
-    return Share(sum(flags), len(flags))
+def proportion(hits: int, of: int) -> Figures:
+    """Return a share with its 95 % interval (Wilson 1927)."""
+    interval = None
+    if of:
+        interval = list(binomtest(hits, of).proportion_ci(0.95, method="wilson"))
+    return {"value": hits / of if of else None, "ci": interval, "hits": hits, "of": of}
 
 
-def estimate(values: Sequence[float], statistic: Callable[[FloatArray], float]) -> dict[str, Any]:
-    """Return a statistic with its bootstrap interval; the draws are always the same.
+def share(flags: Sequence[bool]) -> Figures:
+    """Return the share of set flags with its interval."""
+    return proportion(sum(flags), len(flags))
+
+
+def estimate(values: Sequence[float], statistic: Callable[..., Any]) -> Figures:
+    """Return a statistic with its bootstrap percentile interval (fixed seed).
 
     Parameters
     ----------
     values : sequence of float
     statistic : callable
-        Array → number, such as the median.
+        `np.median` or `np.mean`: takes an array and an axis.
     """
     data = np.asarray(values, dtype=np.float64)
     if data.size == 0:
         return {"value": None, "ci": None, "of": 0}
-    rng = np.random.default_rng(0)
-    draws = [statistic(data[rng.integers(data.size, size=data.size)]) for _ in range(_DRAWS)]
-    low, high = np.quantile(draws, (0.025, 0.975)).tolist()
-    return {"value": float(statistic(data)), "ci": [low, high], "of": int(data.size)}
+    value = float(statistic(data))
+    interval = [value, value]
+    if data.size > 1:
+        resampled = bootstrap(
+            (data,),
+            statistic,
+            n_resamples=_RESAMPLES,
+            method="percentile",
+            random_state=np.random.default_rng(0),
+        )
+        interval = [float(limit) for limit in resampled.confidence_interval]
+    return {"value": value, "ci": interval, "of": int(data.size)}
 
-
-# --- A true fault in the terms of the diagnosis: which parameter, which value
 
 _Values = Callable[[float, Mapping[str, float]], dict[str, float]]
 
@@ -106,40 +90,20 @@ _EXPECTED: Final[Mapping[str, _Values]] = {
 }
 
 COMPARABLE: Final = tuple(_EXPECTED)
+"""Faults whose size a diagnosis can state; twin and effects library differ in name and sign."""
 
 
 def expected_parameters(fault: Mapping[str, Any]) -> dict[str, float]:
-    """Return the parameters that a perfect diagnosis of a fault would state.
+    """Return the parameters of the effect that reproduces a fault; empty if not comparable.
 
-    Parameters
-    ----------
-    fault : mapping
-        As in a label: `id`, `size`, `shape`.
-
-    Returns
-    -------
-    dict of str to float
-        Parameter of the effect → value in its unit; empty where the size cannot be compared.
+    `fault` has `id`, `size` and `shape`, as in a label.
     """
     rule = _EXPECTED.get(fault["id"])
     return {} if rule is None else rule(float(fault["size"]), fault["shape"])
 
 
-# --- One label beside one answer
-
-NONE, UNKNOWN, CRASHED = "none", "unknown", "crashed"
-FAMILY: Final = {kind.id: kind.family for kind in fault_kinds()}
-
-LEAST_GAP: Final = 0.45
-"""A gap below this many floors is out of the check's range: physics allowed no larger one."""
-
-ROUNDING: Final = 1e-9
-"""Part of a true value by which the twin's and the library's units may round it apart."""
-
-
-@dataclass(frozen=True)
-class Covered:
-    """Whether an interval holds the true value of a parameter."""
+class Interval(NamedTuple):
+    """Stated interval of a parameter, and its true value."""
 
     effect: str
     parameter: str
@@ -150,35 +114,35 @@ class Covered:
 
     @property
     def holds(self) -> bool:
-        """Whether it does, but for rounding: the truth may be at a bound, where intervals end."""
-        rounding = ROUNDING * abs(self.true)
+        """Whether the interval contains the true value; both may lie at a bound."""
+        rounding = _ROUNDING * abs(self.true)
         return self.low - rounding <= self.true <= self.high + rounding
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a diagnosis said of a case whose cause is known.
+    """Verdict on a case whose cause is known.
 
     Parameters
     ----------
     task, case, protocol : str
     truth : tuple of str
-        Effects that are there; empty for a healthy pack.
+        True effects; empty for a healthy pack.
     leave_out : tuple of str
-        Effects that the library was without.
+        Effects that were removed from the library.
     gap_in_floors : float, optional
-        RMS gap that the faults open, over what the model misses on clean days.
+        RMS gap of the faults in multiples of the floor, the model's error on healthy logs.
     verdict : str
-        An effect, `none`, `unknown`, or `crashed`.
+        An effect, `none`, `unknown` or `crashed`.
     probability : float
-        Of the verdict being right; 0 of a crash.
+        Stated probability of the verdict; 0 for a crash.
     ambiguous_with, accepted, ranked : tuple of str
     closed : dict of str to float
-        Closed part of the squared gap, by the floor it is counted to.
-    covered : tuple of Covered
+        Closed fraction of the squared gap, by the floor it is counted from.
+    intervals : tuple of Interval
     seconds, peak_mib : float, optional
     error : str
-        Why there is no verdict.
+        Reason of a crash.
     """
 
     task: str
@@ -193,14 +157,14 @@ class Outcome:
     accepted: tuple[str, ...] = ()
     ranked: tuple[str, ...] = ()
     closed: Mapping[str, float] | None = None
-    covered: tuple[Covered, ...] = ()
+    intervals: tuple[Interval, ...] = ()
     seconds: float | None = None
     peak_mib: float | None = None
     error: str = ""
 
     @property
     def right(self) -> str:
-        """The verdict that is right of a case with one cause or none."""
+        """Correct verdict of a case with at most one cause."""
         if not self.truth:
             return NONE
         if is_outside(self.truth) or set(self.truth) & set(self.leave_out):
@@ -208,20 +172,20 @@ class Outcome:
         return self.truth[0]
 
     @property
-    def is_decoy(self) -> bool:
-        """Whether an effect was left out of the library that is not the cause."""
+    def is_control(self) -> bool:
+        """Whether the library lacks an effect that is not the cause."""
         return bool(self.leave_out) and not set(self.truth) & set(self.leave_out)
 
     @property
     def strict(self) -> bool:
-        """Whether the verdict is right (of several causes: one of them)."""
+        """Whether the verdict is correct (of several causes: one of them)."""
         if len(self.truth) > 1 and not self.leave_out:
             return self.verdict in self.truth
         return self.verdict == self.right
 
     @property
     def within_pair(self) -> bool:
-        """Whether the truth is the verdict or the one effect that it could not be told from."""
+        """Whether the truth is the verdict or the single effect that it is ambiguous with."""
         return self.strict or (
             self.names_effect
             and len(self.ambiguous_with) == 1
@@ -235,21 +199,21 @@ class Outcome:
 
     @property
     def within_two(self) -> bool:
-        """Whether an effect is named and the truth is among the first two."""
+        """Whether an effect is named and the truth is among the two most probable."""
         return self.names_effect and self.right in self.ranked[:2]
 
     @property
     def family(self) -> bool:
-        """Whether the family is right."""
+        """Whether the family is correct."""
         return self.names_effect and FAMILY[self.verdict] == FAMILY.get(self.right)
 
     @property
     def in_range(self) -> bool:
-        """Whether the gap is one of the check's sizes."""
+        """Whether the gap is large enough to be scored."""
         return self.gap_in_floors is None or self.gap_in_floors >= LEAST_GAP
 
     def to_dict(self) -> dict[str, Any]:
-        """Return everything, for `--json`."""
+        """Return the outcome as JSON."""
         return {
             "task": self.task,
             "case": self.case,
@@ -264,7 +228,7 @@ class Outcome:
             "accepted": list(self.accepted),
             "ranked": list(self.ranked[:5]),
             "closed": None if self.closed is None else dict(self.closed),
-            "parameters": [{**vars(item), "holds": item.holds} for item in self.covered],
+            "parameters": [{**item._asdict(), "holds": item.holds} for item in self.intervals],
             "seconds": self.seconds,
             "peak_mib": self.peak_mib,
             "error": self.error,
@@ -272,16 +236,7 @@ class Outcome:
 
 
 def outcome_of(task: Task, label: Mapping[str, Any], answer: Mapping[str, Any]) -> Outcome:
-    """Return what an answer is worth.
-
-    Parameters
-    ----------
-    task : Task
-    label : mapping
-        From the sealed file.
-    answer : mapping
-        From the diagnosing process.
-    """
+    """Compare the answer of a diagnosing process with the label of its case."""
     about: dict[str, Any] = {
         "task": task.id,
         "case": task.case,
@@ -307,7 +262,7 @@ def outcome_of(task: Task, label: Mapping[str, Any], answer: Mapping[str, Any]) 
         accepted=tuple(item["effect"] for item in cause["accepted"]),
         ranked=tuple(ranked),
         closed=_closed(gap, label, verdict),
-        covered=_covered(cause, label),
+        intervals=_intervals(cause, label),
     )
 
 
@@ -318,11 +273,10 @@ def _gap_in_floors(label: Mapping[str, Any]) -> float | None:
 
 
 def _closed(gap: Mapping[str, Any], label: Mapping[str, Any], verdict: str) -> dict[str, float]:
-    """Return the closed part of the gap: as the diagnosis reckons it, and by the truth's floors.
+    """Return the closed fraction of the gap, as reported and relative to true floors.
 
-    `clean`: what a model of training and references misses on the same days without the fault;
-    `sensor`: what noise, steps and start of a perfect model leave. Without a cause nothing is
-    closed.
+    `clean`: error of a model of training and references on the same drives without the fault;
+    `sensor`: error of a perfect model. Without a cause nothing is closed.
     """
     result: dict[str, float] = {}
     has_cause = verdict not in {NONE, UNKNOWN}
@@ -332,16 +286,16 @@ def _closed(gap: Mapping[str, Any], label: Mapping[str, Any], verdict: str) -> d
         floor = label.get(f"floor_{name}_v")
         if floor is None:
             continue
-        there = float(gap["baseline_rmse_v"]) ** 2 - float(floor) ** 2
-        if there <= 0.0:
-            continue  # the model as given has no gap above this floor
-        shrunk = float(gap["baseline_rmse_v"]) ** 2 - float(gap["extended_rmse_v"]) ** 2
-        result[name] = min(shrunk / there, 1.0) if has_cause else 0.0
+        total = float(gap["baseline_rmse_v"]) ** 2 - float(floor) ** 2
+        if total <= 0.0:
+            continue  # no gap above this floor
+        closed = float(gap["baseline_rmse_v"]) ** 2 - float(gap["extended_rmse_v"]) ** 2
+        result[name] = min(closed / total, 1.0) if has_cause else 0.0
     return result
 
 
-def _covered(cause: Mapping[str, Any], label: Mapping[str, Any]) -> tuple[Covered, ...]:
-    """Return the intervals of the true cause's parameters, where the verdict named it."""
+def _intervals(cause: Mapping[str, Any], label: Mapping[str, Any]) -> tuple[Interval, ...]:
+    """Return the parameter intervals of the true cause, if the verdict names it."""
     found = []
     for fault in label["faults"]:
         if fault["id"] != cause["verdict"]:
@@ -356,34 +310,17 @@ def _covered(cause: Mapping[str, Any], label: Mapping[str, Any]) -> tuple[Covere
                 continue
             low, high = item["ci"]
             found.append(
-                Covered(fault["id"], name, true, float(item["value"]), float(low), float(high))
+                Interval(fault["id"], name, true, float(item["value"]), float(low), float(high))
             )
     return tuple(found)
 
 
-# --- All outcomes → the figures of the check, each with its 95 % interval
-
-CONFIDENT: Final = 0.5
-GAP_EDGES: Final = (0.0, 0.5, 1.0, 2.0, 5.5)
-_BINS: Final = 10
-
-REAL: Final = "real-"
-"""Protocols of faults put into recorded logs; they are scored each and all together."""
-
-Figures = dict[str, Any]
-
-
 def score(outcomes: Sequence[Outcome]) -> Figures:
-    """Return every figure of the check.
-
-    Parameters
-    ----------
-    outcomes : sequence of Outcome
-    """
+    """Return all figures of the check."""
     by_protocol: dict[str, list[Outcome]] = defaultdict(list)
     for item in outcomes:
         by_protocol[item.protocol].append(item)
-    recorded = [item for item in outcomes if item.protocol.startswith(REAL)]
+    recorded = [item for item in outcomes if item.protocol.startswith(_RECORDED)]
     if recorded:
         by_protocol["real"] = recorded
     return {
@@ -395,8 +332,8 @@ def score(outcomes: Sequence[Outcome]) -> Figures:
 
 
 def _protocol(everything: Sequence[Outcome]) -> Figures:
-    decoys = [i for i in everything if i.is_decoy]
-    items = [i for i in everything if not i.is_decoy]
+    controls = [i for i in everything if i.is_control]
+    items = [i for i in everything if not i.is_control]
     single = [i for i in items if len(i.truth) == 1 and not is_outside(i.truth)]
     closed_set = [i for i in single if i.right in EFFECTS and i.in_range]
     healthy = [i for i in items if not i.truth]
@@ -410,22 +347,22 @@ def _protocol(everything: Sequence[Outcome]) -> Figures:
         result["coverage"] = _coverage(closed_set)
     if healthy:
         result["healthy"] = {
-            "false_alarms": share([i.verdict != NONE for i in healthy]).to_dict(),
-            "named_an_effect": share([i.names_effect for i in healthy]).to_dict(),
+            "false_alarms": share([i.verdict != NONE for i in healthy]),
+            "named_an_effect": share([i.names_effect for i in healthy]),
         }
     if unnamed:
         result["open_set"] = _open_set(unnamed)
     if pairs:
         result["pairs"] = {
-            "first_is_one_of_both": share([i.verdict in i.truth for i in pairs]).to_dict(),
-            "both": share([set(i.accepted) == set(i.truth) for i in pairs]).to_dict(),
+            "first_is_one_of_both": share([i.verdict in i.truth for i in pairs]),
+            "both": share([set(i.accepted) == set(i.truth) for i in pairs]),
             "both_among_three": share(
                 [i.names_effect and set(i.truth) <= set(i.ranked[:3]) for i in pairs]
-            ).to_dict(),
+            ),
         }
-    if decoys:
-        # The cause is still in the library, so these say whether leaving another out does harm.
-        result["decoys"] = share([i.strict for i in decoys]).to_dict()
+    if controls:
+        # The cause is still in the library: does removing another effect change the verdict?
+        result["decoys"] = share([i.strict for i in controls])
     result["confusion"] = confusion(items)
     result["cost"] = _cost(items)
     return result
@@ -433,7 +370,7 @@ def _protocol(everything: Sequence[Outcome]) -> Figures:
 
 def _accuracy(items: Sequence[Outcome]) -> Figures:
     def rate(is_hit: Callable[[Outcome], bool]) -> Figures:
-        return share([is_hit(item) for item in items]).to_dict()
+        return share([is_hit(item) for item in items])
 
     correct = [item for item in items if item.strict]
     return {
@@ -446,12 +383,12 @@ def _accuracy(items: Sequence[Outcome]) -> Figures:
         "unknown": rate(lambda i: i.verdict == UNKNOWN),
         "ranked_first": rate(lambda i: i.ranked[:1] == (i.right,)),
         "ranked_in_two": rate(lambda i: i.right in i.ranked[:2]),
-        "correct_and_confident": share([i.probability >= CONFIDENT for i in correct]).to_dict(),
+        "correct_and_confident": share([i.probability >= _CONFIDENT for i in correct]),
         "closed": {
             floor: {
-                "all": estimate(_closed_share(items, floor), _median),
+                "all": estimate(_closed_share(items, floor), np.median),
                 "detected": estimate(
-                    _closed_share((i for i in items if i.names_effect), floor), _median
+                    _closed_share((i for i in items if i.names_effect), floor), np.median
                 ),
             }
             for floor in ("clean", "sensor", "reported")
@@ -463,24 +400,16 @@ def _closed_share(items: Iterable[Outcome], floor: str) -> list[float]:
     return [i.closed[floor] for i in items if i.closed is not None and floor in i.closed]
 
 
-def _median(values: np.ndarray) -> float:
-    return float(np.median(values))
-
-
-def _mean(values: np.ndarray) -> float:
-    return float(np.mean(values))
-
-
 def _by_gap(items: Sequence[Outcome]) -> list[Figures]:
     result = []
-    for low, high in pairwise(GAP_EDGES):
+    for low, high in pairwise(_GAP_EDGES):
         there = [i for i in items if i.gap_in_floors is not None and low <= i.gap_in_floors < high]
         result.append(
             {
                 "gap_in_floors": [low, high],
-                "detected": share([i.verdict not in {NONE, CRASHED} for i in there]).to_dict(),
-                "top1": share([i.strict for i in there]).to_dict(),
-                "top1_pair": share([i.within_pair for i in there]).to_dict(),
+                "detected": share([i.verdict not in {NONE, CRASHED} for i in there]),
+                "top1": share([i.strict for i in there]),
+                "top1_pair": share([i.within_pair for i in there]),
             }
         )
     return result
@@ -492,8 +421,8 @@ def _by_effect(items: Sequence[Outcome]) -> Figures:
         groups[item.truth[0]].append(item)
     return {
         effect: {
-            "top1": share([i.strict for i in there]).to_dict(),
-            "top1_pair": share([i.within_pair for i in there]).to_dict(),
+            "top1": share([i.strict for i in there]),
+            "top1_pair": share([i.within_pair for i in there]),
             "verdicts": dict(Counter(i.verdict for i in there).most_common()),
         }
         for effect, there in sorted(groups.items())
@@ -501,63 +430,58 @@ def _by_effect(items: Sequence[Outcome]) -> Figures:
 
 
 def _coverage(items: Sequence[Outcome]) -> Figures:
-    covered = [item for outcome in items for item in outcome.covered]
+    covered = [item for outcome in items for item in outcome.intervals]
     groups: dict[str, list[bool]] = defaultdict(list)
     for item in covered:
         groups[f"{item.effect}.{item.parameter}"].append(item.holds)
     return {
-        "all": share([item.holds for item in covered]).to_dict(),
-        "by_parameter": {name: share(flags).to_dict() for name, flags in sorted(groups.items())},
+        "all": share([item.holds for item in covered]),
+        "by_parameter": {name: share(flags) for name, flags in sorted(groups.items())},
     }
 
 
 def _open_set(items: Sequence[Outcome]) -> Figures:
     return {
         "cases": len(items),
-        "unknown": share([i.verdict == UNKNOWN for i in items]).to_dict(),
-        "none": share([i.verdict == NONE for i in items]).to_dict(),
-        "named_an_effect": share([i.names_effect for i in items]).to_dict(),
-        "confidently_wrong": share(
-            [i.names_effect and i.probability >= CONFIDENT for i in items]
-        ).to_dict(),
+        "unknown": share([i.verdict == UNKNOWN for i in items]),
+        "none": share([i.verdict == NONE for i in items]),
+        "named_an_effect": share([i.names_effect for i in items]),
+        "confidently_wrong": share([i.names_effect and i.probability >= _CONFIDENT for i in items]),
     }
 
 
 def reliability(outcomes: Sequence[Outcome]) -> Figures:
-    """Return how often verdicts of each stated probability are right, and the Brier score.
+    """Return the reliability diagram and the Brier score of the stated probabilities.
 
-    Cases with two causes are left out: what is right of them is not one verdict. A crash states
-    nothing.
-
-    Parameters
-    ----------
-    outcomes : sequence of Outcome
+    Without cases of two causes, which have no single correct verdict, and without crashes.
     """
-    said = [i for i in outcomes if len(i.truth) <= 1 and i.verdict != CRASHED and i.in_range]
+    stated = [i for i in outcomes if len(i.truth) <= 1 and i.verdict != CRASHED and i.in_range]
     bins = []
-    for number in range(_BINS):
-        low, high = number / _BINS, (number + 1) / _BINS
+    for number in range(_PROBABILITY_BINS):
+        low, high = number / _PROBABILITY_BINS, (number + 1) / _PROBABILITY_BINS
         there = [
-            i for i in said if low <= i.probability < high or (high == 1.0 and i.probability >= 1.0)
+            i
+            for i in stated
+            if low <= i.probability < high or (high == 1.0 and i.probability >= 1.0)
         ]
         bins.append(
             {
                 "probability": [low, high],
-                "stated": _mean(np.array([i.probability for i in there])) if there else None,
-                "right": share([i.strict for i in there]).to_dict(),
+                "stated": float(np.mean([i.probability for i in there])) if there else None,
+                "right": share([i.strict for i in there]),
             }
         )
-    squares = [(i.probability - float(i.strict)) ** 2 for i in said]
-    return {"brier": estimate(squares, _mean), "bins": bins}
+    squares = [(i.probability - float(i.strict)) ** 2 for i in stated]
+    return {"brier": estimate(squares, np.mean), "bins": bins}
 
 
 def confusion(items: Sequence[Outcome]) -> Figures:
-    """Return how often each verdict was given of each truth (single causes and none)."""
+    """Return the verdict counts of each truth, for at most one cause."""
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     for item in items:
         if len(item.truth) <= 1:
             counts[item.truth[0] if item.truth else NONE][item.verdict] += 1
-    return {truth: dict(said.most_common()) for truth, said in sorted(counts.items())}
+    return {truth: dict(verdicts.most_common()) for truth, verdicts in sorted(counts.items())}
 
 
 def _cost(outcomes: Sequence[Outcome]) -> Figures:

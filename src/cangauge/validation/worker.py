@@ -1,4 +1,4 @@
-"""The process that diagnoses: gets logs, model and a request, knows nothing else.
+"""Diagnosing process: it gets logs, a model and requests, and nothing else.
 
 `python -m cangauge.validation.worker` reads one request a line (JSON) from stdin and writes one
 answer a line to stdout:
@@ -8,7 +8,7 @@ answer a line to stdout:
 
     {"seconds": s, "peak_mib": MiB or null, "result": {"gap": …, "cause": …}}  or  {"error": text}
 
-It calls what `cangauge gap` calls, and keeps of its JSON what is scored.
+It diagnoses as `cangauge gap` does and returns the part of its JSON that is scored.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ import time
 import traceback
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from cangauge.diagnosis.diagnose import diagnose
 from cangauge.diagnosis.extended_model import model_file_of
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 
-SCORED = ("gap", "cause")
+_SCORED = ("gap", "cause")
 
 
 def answer(request: dict[str, Any]) -> dict[str, Any]:
-    """Return the diagnosis of one request, or why there is none."""
-    _forget_peak()
+    """Return the diagnosis of one request, or its error."""
+    _reset_peak_memory()
     began = time.perf_counter()
     try:
         model = Model.load(Path(request["model"]))
@@ -46,7 +46,7 @@ def answer(request: dict[str, Any]) -> dict[str, Any]:
             better = model_file_of(found.extension, model, found.extended_rmse_v)
             better.save(Path(request["extended"]))
         whole = found.to_dict(request.get("extended"))
-    except Exception as error:  # noqa: BLE001 - a case that crashes counts as wrong; the next goes on
+    except Exception as error:  # noqa: BLE001 - a crash counts as a wrong answer
         return {
             "error": f"{type(error).__name__}: {error}",
             "where": traceback.format_exc(limit=-4),
@@ -55,19 +55,12 @@ def answer(request: dict[str, Any]) -> dict[str, Any]:
     return {
         "seconds": time.perf_counter() - began,
         "peak_mib": _peak_mib(),
-        "result": {key: whole[key] for key in SCORED},
+        "result": {key: whole[key] for key in _SCORED},
     }
 
 
-def serve(requests: TextIO, answers: TextIO) -> None:
-    """Answer every line until the input ends."""
-    for line in requests:
-        answers.write(json.dumps(answer(json.loads(line))) + "\n")
-        answers.flush()
-
-
-def _forget_peak() -> None:
-    """Let the peak of the memory start anew, where the system can (Linux)."""
+def _reset_peak_memory() -> None:
+    """Reset the peak memory of the process (Linux)."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
@@ -81,10 +74,12 @@ def _peak_mib() -> float | None:
 
 
 def main() -> None:
-    """Serve stdin; whatever else is printed goes to stderr."""
+    """Answer requests from stdin until it ends; other output goes to stderr."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    serve(sys.stdin, answers)
+    for line in sys.stdin:
+        answers.write(json.dumps(answer(json.loads(line))) + "\n")
+        answers.flush()
 
 
 if __name__ == "__main__":

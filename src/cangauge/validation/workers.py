@@ -1,4 +1,4 @@
-"""Diagnosing processes: each gets copies of a case's open files under a name that says nothing."""
+"""Diagnosing processes: each gets copies of the open files of a case in an anonymous folder."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from typing import Any, Final
 from cangauge._resources import THREADS
 
 COMMAND: Final = (sys.executable, "-m", "cangauge.validation.worker")
-LONGEST_S: Final = 600.0
-"""A case that takes longer is stopped and counts as crashed."""
+TIMEOUT_S: Final = 600.0
+"""A longer diagnosis is stopped and counts as crashed [s]."""
 
 _PASSED_ON: Final = (
     "PATH", "PYTHONPATH", "HOME", "LANG", "LC_ALL", "TMPDIR", "TEMP", "SYSTEMROOT",
@@ -31,17 +31,18 @@ _PASSED_ON: Final = (
 
 @dataclass(frozen=True)
 class Task:
-    """One diagnosis that is asked for.
+    """One diagnosis to run.
 
     Parameters
     ----------
     id : str
     case : str
-        Name of the folder that holds its logs and model.
+        Name of the folder with logs and model.
+    protocol : str
     leave_out : tuple of str
-        Effects that the library is to be without.
+        Effects to remove from the library.
     wants_model : bool
-        Whether the extended model is wanted too.
+        Whether to return the extended model.
     """
 
     id: str
@@ -53,7 +54,7 @@ class Task:
 
 @dataclass(eq=False)
 class _Worker:
-    """One process, started when it is first needed and again after it died."""
+    """One process, started on demand and again after a crash."""
 
     home: Path
     process: subprocess.Popen[str] | None = field(default=None)
@@ -62,9 +63,9 @@ class _Worker:
         process = self._running()
         if process.stdin is None or process.stdout is None:  # both are pipes
             return {"error": "the diagnosing process has no pipes"}
-        late = threading.Timer(LONGEST_S, process.kill)
+        timer = threading.Timer(TIMEOUT_S, process.kill)
         began = time.perf_counter()
-        late.start()
+        timer.start()
         try:
             process.stdin.write(json.dumps(request) + "\n")
             process.stdin.flush()
@@ -72,7 +73,7 @@ class _Worker:
         except BrokenPipeError:
             line = ""
         finally:
-            late.cancel()
+            timer.cancel()
         if not line:
             code = process.wait()
             self.process = None
@@ -91,7 +92,7 @@ class _Worker:
                 text=True,
                 encoding="utf-8",
                 cwd=self.home,
-                env=environment(),
+                env=_environment(),
             )
         return self.process
 
@@ -109,23 +110,14 @@ class _Worker:
             self.process.stdout.close()
 
 
-def environment() -> dict[str, str]:
-    """Return what a diagnosing process knows of its surroundings: where Python is, one thread."""
+def _environment() -> dict[str, str]:
+    """Return the environment of a diagnosing process: where Python is, one BLAS thread."""
     kept = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
     return kept | dict.fromkeys(THREADS, "1")
 
 
-def request_of(task: Task, source: Path, home: Path) -> dict[str, Any]:
-    """Copy a case's open files into an empty folder and return the request for them.
-
-    Parameters
-    ----------
-    task : Task
-    source : Path
-        The case's folder.
-    home : Path
-        The empty folder.
-    """
+def _request(task: Task, source: Path, home: Path) -> dict[str, Any]:
+    """Copy the open files of a case to an empty folder and return the request for them."""
     listing = json.loads((source / "case.json").read_text(encoding="utf-8"))
 
     def copied(name: str) -> str:
@@ -144,15 +136,15 @@ def request_of(task: Task, source: Path, home: Path) -> dict[str, Any]:
 def diagnose_all(
     tasks: Sequence[Task], cases: Path, jobs: int
 ) -> Iterator[tuple[Task, dict[str, Any]]]:
-    """Yield every task with its answer, as they come.
+    """Diagnose tasks; yield each with its answer in order of completion.
 
     Parameters
     ----------
     tasks : sequence of Task
     cases : Path
-        Folder that holds the cases' folders.
+        Folder of the case folders.
     jobs : int
-        Processes.
+        Number of processes.
     """
     with tempfile.TemporaryDirectory(prefix="gap-") as top:
         workers = [_Worker(Path(top)) for _ in range(jobs)]
@@ -164,11 +156,11 @@ def diagnose_all(
             worker = free.get()
             home = Path(tempfile.mkdtemp(dir=top))
             try:
-                found = worker.ask(request_of(task, cases / task.case, home))
+                found = worker.ask(_request(task, cases / task.case, home))
                 if task.wants_model and "error" not in found:
                     text = (home / "extended.json").read_text(encoding="utf-8")
                     found["extended_model"] = json.loads(text)
-            # A kept case whose files are gone, a full disk, an answer that was cut off.
+            # Missing files of a kept case, a full disk, a truncated answer.
             except (OSError, ValueError) as error:
                 return {"error": f"{type(error).__name__}: {error}"}
             else:
@@ -179,12 +171,12 @@ def diagnose_all(
 
         try:
             with ThreadPoolExecutor(jobs) as pool:
-                asked = {pool.submit(run, task): task for task in tasks}
+                submitted = {pool.submit(run, task): task for task in tasks}
                 try:
-                    for future in as_completed(asked):
-                        yield asked[future], future.result()
+                    for future in as_completed(submitted):
+                        yield submitted[future], future.result()
                 finally:
-                    for future in asked:
+                    for future in submitted:
                         future.cancel()
         finally:
             for worker in workers:

@@ -1,7 +1,14 @@
 """Simulated truth: packs, drives and faults whose cause is known.
 
-Kept apart from `cangauge.model` and `cangauge.gap` on purpose: nothing of them is imported here,
-and no equation is taken from them, so that a diagnosis is judged on physics that it does not own.
+Independent of what it validates: it imports neither the voltage model nor the effects library,
+identification, estimation or diagnosis, and shares no equation with them except where a plant
+states it.
 """
 
 from __future__ import annotations
+
+from cangauge.validation.twin.drive import read_speed
+from cangauge.validation.twin.faults import Fault, FaultKind, fault_kinds
+from cangauge.validation.twin.simulation import Simulation, simulate
+
+__all__ = ["Fault", "FaultKind", "Simulation", "fault_kinds", "read_speed", "simulate"]

@@ -1,4 +1,4 @@
-"""What is wrong with a pack and its sensors on a day; the defaults are a healthy pack."""
+"""State of a pack and its sensors: every quantity that a fault can change."""
 
 from __future__ import annotations
 
@@ -12,116 +12,148 @@ from cangauge._typing import FloatArray
 
 
 @dataclass(frozen=True)
-class Mode:
-    """One relaxation of the whole pack beyond the clean ones."""
+class Relaxation:
+    """One first-order relaxation of the whole pack, added to the healthy ones."""
 
     ohm: float
     tau_s: float
 
 
 @dataclass(frozen=True)
-class Hump:
-    """Ohmic resistance that rises towards one end of the charge, by a logistic curve."""
+class SocResistance:
+    """Rise of the ohmic resistance towards one end of the charge, a logistic curve.
+
+    Parameters
+    ----------
+    height : float
+        Rise relative to the healthy ohmic resistance [-].
+    centre : float
+        State of charge at half the rise [-].
+    width : float
+        Width of the rise [-]; negative for a rise towards full.
+    """
 
     height: float
-    """Rise over the clean ohmic resistance [-]."""
     centre: float
-    """State of charge in the middle of the rise [-]."""
     width: float
-    """Width of the rise [-]; negative: towards full."""
 
 
 @dataclass(frozen=True)
 class WeakCells:
-    """Some cells that hold less than the others."""
+    """Cells with less capacity than the others.
+
+    Parameters
+    ----------
+    count : int
+    loss : float
+        Missing fraction of the capacity [-].
+    deficit : float
+        Initial SoC below that of the other cells [-].
+    """
 
     count: int
     loss: float
-    """Part of the capacity that they lack [-]."""
     deficit: float
-    """Start SoC below that of the others [-]."""
 
 
 @dataclass(frozen=True)
-class Switching:
-    """Something that comes and goes: on for a while, off for a while, at random."""
+class Intermittent:
+    """A disturbance of some size that is active and inactive for random times.
+
+    Parameters
+    ----------
+    size : float
+    on_s, off_s : float
+        Mean duration of the active and the inactive phases [s].
+    seed : int
+    """
 
     size: float
     on_s: float
     off_s: float
     seed: int
 
+    def is_active(self, time_s: FloatArray) -> NDArray[np.bool_]:
+        """Return where the disturbance is active, shape (n,); it starts inactive."""
+        rng = np.random.default_rng(self.seed)
+        span = float(time_s[-1] - time_s[0])
+        pairs = max(4, int(2.0 * span / (self.on_s + self.off_s)) + 4)
+        # Drawn in pairs, so that another duration stretches the same sequence.
+        lengths = rng.exponential(1.0, (pairs, 2)) * (self.off_s, self.on_s)
+        edges = time_s[0] + np.cumsum(lengths.ravel())
+        passed = np.searchsorted(edges, time_s, side="right")
+        return np.asarray(passed % 2 == 1, dtype=np.bool_)
+
 
 @dataclass(frozen=True, eq=False)
 class Condition:
-    """Everything that a fault can change.
+    """Condition of a pack and its sensors; the defaults are healthy.
 
     Parameters
     ----------
     capacity_factor : float
-        True capacity over the one that the gauge assumes [-].
+        True over assumed capacity [-].
     charge_loss : float
-        Part of the charge put in that cannot be taken out again [-].
+        Fraction of the charge put in that cannot be taken out again [-].
     start_soc_shift : float
-        True start SoC minus the one that the gauge assumes [-].
-    cold_stiffness_k : float
-        Extra steepness of the resistance against temperature [K].
-    hump : Hump, optional
-        Resistance that depends on the state of charge.
+        True minus assumed initial SoC [-].
+    cold_resistance_k : float
+        Additional temperature coefficient of the resistance, exp(x/(T − 230 K)) [K].
+    soc_resistance : SocResistance, optional
     charging_ohm : float
-        Extra resistance of the pack while it is charged [Ω].
+        Additional pack resistance during charge [Ω].
     step_ohm, step_at_s : float
-        Extra resistance of the pack from a moment on [Ω, s].
+        Additional pack resistance from a moment on [Ω, s].
     transfer_slowdown : float
         Factor by which the exchange current falls, minus 1 [-].
-    modes : tuple of Mode
-        Extra relaxations.
+    relaxations : tuple of Relaxation
     hysteresis_v, hysteresis_reach : float
-        Half width of the pack's hysteresis [V], and the widest charge swing that it forgets by [-].
+        Half width of the pack's hysteresis [V], and the charge swing that reverses it fully [-].
     entropy_shift_v_k : array, optional
-        Added to dU/dT of one cell [V/K], on the grid of the chemistry.
+        Change of dU/dT of one cell [V/K], on the SoC grid of the chemistry.
     weak : WeakCells, optional
     insulation : float
-        Extra thermal resistance between core and surface, over the clean one [-].
+        Additional thermal resistance between core and surface, relative to the healthy one [-].
     current_offset_a, current_gain, current_skew_s : float
-        Recorded = (1 + gain)·true(t − skew) + offset [A, -, s].
+        Measured = (1 + gain)·true(t − skew) + offset [A, -, s].
     voltage_offset_v, voltage_gain : float
-        Recorded = (1 + gain)·true + offset [V, -].
+        Measured = (1 + gain)·true + offset [V, -].
     temperature_lag_s : float
-        Extra lag of the temperature sensor [s].
-
-    The rest is outside what a diagnosis is expected to know by name.
-
-    string_loss : Switching, optional
-        A parallel string comes and goes; size: rise of all overpotentials [-].
-    hidden_load : Switching, optional
-        A load before the current sensor [A].
-    flicker : Switching, optional
-        A contact that opens and closes [Ω].
-    bursts : Switching, optional
+        Additional lag of the temperature sensor [s].
+    string_loss : Intermittent, optional
+        A parallel string drops out; size: rise of all overpotentials [-].
+    hidden_load : Intermittent, optional
+        A load that the current sensor does not measure [A].
+    flicker : Intermittent, optional
+        Contact resistance [Ω].
+    bursts : Intermittent, optional
         Noise on the voltage [V].
-    stale : Switching, optional
-        The voltage repeats its last value while "on".
+    stale : Intermittent, optional
+        The voltage repeats its last value while active.
     ripple_v, ripple_period_v, ripple_phase : float
         Integral nonlinearity of the voltage sensor [V, V, rad].
     clip_share : float
-        Part of the largest current beyond which the sensor saturates, from 1 down [-].
+        Saturation of the current sensor, relative to the largest current [-].
     remanence_a : float
-        Magnetic memory of the current sensor [A].
+        Magnetic remanence of the current sensor [A].
     temperature_hold : float
         0: the temperature sensor follows, 1: it is stuck [-].
+
+    Notes
+    -----
+    From `string_loss` on, the effects library has no counterpart.
     """
 
     capacity_factor: float = 1.0
     charge_loss: float = 0.0
     start_soc_shift: float = 0.0
-    cold_stiffness_k: float = 0.0
-    hump: Hump | None = None
+    cold_resistance_k: float = 0.0
+    soc_resistance: SocResistance | None = None
     charging_ohm: float = 0.0
     step_ohm: float = 0.0
     step_at_s: float = 0.0
     transfer_slowdown: float = 0.0
-    modes: tuple[Mode, ...] = ()
+    relaxations: tuple[Relaxation, ...] = ()
     hysteresis_v: float = 0.0
     hysteresis_reach: float = 0.03
     entropy_shift_v_k: FloatArray | None = None
@@ -135,11 +167,11 @@ class Condition:
     voltage_gain: float = 0.0
     temperature_lag_s: float = 0.0
 
-    string_loss: Switching | None = None
-    hidden_load: Switching | None = None
-    flicker: Switching | None = None
-    bursts: Switching | None = None
-    stale: Switching | None = None
+    string_loss: Intermittent | None = None
+    hidden_load: Intermittent | None = None
+    flicker: Intermittent | None = None
+    bursts: Intermittent | None = None
+    stale: Intermittent | None = None
     ripple_v: float = 0.0
     ripple_period_v: float = 1.0
     ripple_phase: float = 0.0
@@ -149,15 +181,3 @@ class Condition:
 
 
 HEALTHY: Final = Condition()
-
-
-def is_on(switching: Switching, time_s: FloatArray) -> NDArray[np.bool_]:
-    """Return when something that switches at random is on, shape (n,); it starts off."""
-    rng = np.random.default_rng(switching.seed)
-    span = float(time_s[-1] - time_s[0])
-    pairs = max(4, int(2.0 * span / (switching.on_s + switching.off_s)) + 4)
-    # Drawn in pairs, so that longer stretches are the same ones, stretched.
-    lengths = rng.exponential(1.0, (pairs, 2)) * (switching.off_s, switching.on_s)
-    edges = time_s[0] + np.cumsum(lengths.ravel())
-    passed = np.searchsorted(edges, time_s, side="right")
-    return np.asarray(passed % 2 == 1, dtype=np.bool_)

@@ -1,10 +1,8 @@
-"""Open-circuit voltage and entropy of some cell chemistries, as tables.
+"""Simulated packs: cell chemistry, size, impedance, thermal masses and sensors; drawn at random.
 
-The tables are drawn after the published shape of such curves (half-cell plateaus, knees near
-empty), not after one product; every pack bends its own a little. Between the points a monotone
-cubic (PCHIP, Fritsch and Butland 1984) keeps the voltage rising with charge.
-
-What a simulated pack is made of, and how one is drawn at random.
+The open-circuit voltage tables follow the published shape of such curves (half-cell plateaus, knees
+near empty), not one product, and every specimen deviates by some millivolts. A monotone cubic
+(PCHIP, Fritsch and Butland 1984) interpolates them.
 """
 
 from __future__ import annotations
@@ -18,10 +16,9 @@ from scipy.interpolate import PchipInterpolator
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 
-# --- Open-circuit voltage and entropy of some cell chemistries, as tables
-
+KELVIN: Final = 273.15
 LOWEST, HIGHEST = -0.06, 1.04
-"""Stoichiometry covered by the dense tables [-]: a weak cell goes below its own 0 %."""
+"""SoC range of the tables [-]: a weak cell is discharged below its 0 %."""
 _POINTS: Final = 2201
 _BEND_V: Final = 0.006
 
@@ -67,7 +64,7 @@ CHEMISTRIES: Final = tuple(_OCV)
 
 @dataclass(frozen=True, eq=False)
 class Chemistry:
-    """Voltage and entropy of one cell against its state of charge.
+    """Open-circuit voltage and entropy of one cell over its state of charge.
 
     Parameters
     ----------
@@ -95,7 +92,7 @@ class Chemistry:
 
 
 def chemistry(name: str, rng: np.random.Generator, entropy_scale: float = 1.0) -> Chemistry:
-    """Return one specimen of a chemistry: its table, bent by some millivolts.
+    """Draw one specimen of a chemistry, some millivolts off its table.
 
     Parameters
     ----------
@@ -108,19 +105,17 @@ def chemistry(name: str, rng: np.random.Generator, entropy_scale: float = 1.0) -
     Raises
     ------
     InputError
-        If there is no such chemistry.
+        For an unknown chemistry.
     """
     if name not in _OCV:
-        raise InputError(
-            "no such chemistry", value=name, cure=f"use one of: {', '.join(CHEMISTRIES)}"
-        )
+        raise InputError("unknown chemistry", value=name, cure=f"use {', '.join(CHEMISTRIES)}")
     soc, volts = np.array(_OCV[name]).T
-    # A full cell's table ends at 100 %; a weak or overfull one goes on beyond both ends.
+    # Extended beyond both ends, for weak and overcharged cells.
     soc = np.concatenate(([-6.0, -3.0], soc, [104.0])) / 100.0
     volts = np.concatenate(([volts[0] - 1.35, volts[0] - 0.62], volts, [volts[-1] + 0.12]))
     grid = np.linspace(LOWEST, HIGHEST, _POINTS)
     table = PchipInterpolator(soc, volts)(grid)
-    # Bent by a slow wave; the flat table of LFP is bent less, so that it keeps rising.
+    # A slow wave; smaller for the flat table of LFP, which must keep rising.
     waves = sum(
         rng.normal() / order * np.sin(order * np.pi * grid + rng.uniform(0.0, 2.0 * np.pi))
         for order in (1, 2, 3)
@@ -133,14 +128,27 @@ def chemistry(name: str, rng: np.random.Generator, entropy_scale: float = 1.0) -
     return Chemistry(name, grid, table, entropy_table)
 
 
-# --- What a simulated pack is made of, and how one is drawn at random
-
-KELVIN: Final = 273.15
-
-
 @dataclass(frozen=True)
 class Sensors:
-    """The chain from the terminals to the frame, as the clean pack has it."""
+    """Sensors of a healthy pack.
+
+    Parameters
+    ----------
+    current_step_a, voltage_step_v, temperature_step_k : float
+        Resolution [A, V, K].
+    current_noise_a, voltage_noise_v : float
+        Standard deviation of the noise [A, V].
+    temperature_lag_s : float
+        Time constant [s].
+    rate_hz : float
+        Sampling rate [Hz].
+    jitter : float
+        Standard deviation of the sampling instant, in sampling periods [-].
+    drop_share : float
+        Fraction of lost samples [-].
+    start_soc_std_pct : float
+        Standard deviation of the assumed initial SoC [%].
+    """
 
     current_step_a: float
     current_noise_a: float
@@ -150,19 +158,53 @@ class Sensors:
     temperature_lag_s: float
     rate_hz: float
     jitter: float
-    """Standard deviation of the sampling instant, in sampling periods [-]."""
     drop_share: float
-    """Share of the frames that get lost [-]."""
     start_soc_std_pct: float
-    """Error of the SoC that the gauge assumes at the start [%]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pack:
     """A pack of lithium-ion cells in series.
 
-    Resistances are of one cell at 25 °C [Ω], positive. Groups hold representative cells, shape
-    (g,): how many cells each stands for and how it differs from the mean cell.
+    Resistances are those of one cell at 25 °C [Ω]. Cell spread is represented by g groups of equal
+    cells.
+
+    Parameters
+    ----------
+    name : str
+    chemistry : Chemistry
+    cells : int
+    capacity_ah : float
+    weights : array of shape (g,)
+        Cells in each group.
+    capacity_factor, resistance_factor, soc_shift : array of shape (g,)
+        Deviation of each group from the mean cell [-].
+    ohmic_ohm : float
+    ohmic_vogel_k : float
+        B of exp(B/(T − 170 K)), electrolyte conductivity (Vogel–Fulcher–Tammann) [K].
+    busbar_ohm : float
+        Copper of the whole pack, independent of temperature [Ω].
+    exchange_a : float
+        Exchange current at 25 °C and 50 % SoC [A].
+    exchange_activation_k : float
+        Its activation energy over the gas constant [K].
+    anodic : float
+        Anodic charge transfer coefficient [-].
+    double_layer_s : float
+        Time constant of the double layer [s].
+    electrolyte_ohm, electrolyte_tau_s : tuple of float
+        Modes of the electrolyte's concentration overpotential [Ω, s].
+    solid_swing, solid_tau_s : tuple of float
+        Modes of the surface minus mean SoC per ampere [1/A, s].
+    diffusion_activation_k : float
+        Activation energy of diffusion over the gas constant [K].
+    core_j_k, surface_j_k : float
+        Heat capacities [J/K].
+    core_surface_w_k, surface_ambient_w_k : float
+        Thermal conductances [W/K].
+    sensors : Sensors
+    reports_core : bool
+        Whether the reported temperature is that of the healthy core instead of the surface.
     """
 
     name: str
@@ -173,44 +215,33 @@ class Pack:
     capacity_factor: FloatArray
     resistance_factor: FloatArray
     soc_shift: FloatArray
-    """Start SoC against the pack's [-]."""
-
     ohmic_ohm: float
     ohmic_vogel_k: float
-    """B of exp(B/(T − 170 K)): conductivity of the electrolyte (Vogel–Fulcher–Tammann)."""
     busbar_ohm: float
-    """Copper of the whole pack [Ω]; hardly depends on temperature."""
     exchange_a: float
-    """Exchange current at 25 °C and half charge [A]."""
     exchange_activation_k: float
-    """Activation energy over the gas constant [K]."""
     anodic: float
-    """Share of the overpotential that helps discharge [-] (0.5: symmetric)."""
     double_layer_s: float
     electrolyte_ohm: tuple[float, ...]
     electrolyte_tau_s: tuple[float, ...]
     solid_swing: tuple[float, ...]
-    """Surface against mean state of charge per ampere, one a mode [1/A]."""
     solid_tau_s: tuple[float, ...]
     diffusion_activation_k: float
-
     core_j_k: float
     surface_j_k: float
     core_surface_w_k: float
     surface_ambient_w_k: float
     sensors: Sensors
-    knows_core: bool = False
-    """Whether the gauge adds to the surface's temperature what the core stands above it while the
-    pack is healthy."""
+    reports_core: bool = False
 
     @property
     def one_c_a(self) -> float:
-        """Current that empties the pack in one hour [A]."""
+        """1C current [A]."""
         return self.capacity_ah
 
     @property
     def nominal_v(self) -> float:
-        """Open-circuit voltage at half charge [V]."""
+        """Open-circuit voltage at 50 % SoC [V]."""
         return float(self.cells * self.chemistry.ocv(np.array([0.5]))[0])
 
     @property
@@ -220,12 +251,12 @@ class Pack:
 
     @property
     def resistance_ohm(self) -> float:
-        """Resistance of the pack at 25 °C against currents of some seconds [Ω]."""
+        """Pack resistance at 25 °C within seconds of a current step [Ω]."""
         transfer = 0.02569 / self.exchange_a
         return self.cells * (self.ohmic_ohm + transfer) + self.busbar_ohm
 
 
-# Name → cells in series, capacity [Ah] from … to, chemistries and how often each.
+# Kind → cells in series, capacity range [Ah], probability of each chemistry.
 KINDS: Final[dict[str, tuple[int, float, float, dict[str, float]]]] = {
     "leaf24": (96, 48.0, 66.0, {"lmo": 1.0}),
     "leaf40": (96, 100.0, 116.0, {"nmc": 1.0}),
@@ -241,36 +272,32 @@ _KIND_ODDS: Final = {"leaf24": 3, "leaf40": 2, "car60": 2, "car60lfp": 1, "compa
 def draw_pack(
     rng: np.random.Generator, kind: str | None = None, chemistry_name: str | None = None
 ) -> Pack:
-    """Return a pack at random.
+    """Draw a pack.
 
     Parameters
     ----------
     rng : Generator
     kind : str, optional
-        One of `KINDS`; at random without.
+        One of `KINDS`; drawn by default.
     chemistry_name : {"nmc", "lmo", "nca", "lfp"}, optional
-        Another chemistry than the kind's own.
+        By default one that the kind is built with.
 
     Raises
     ------
     InputError
-        If there is no such kind or chemistry.
+        For an unknown kind or chemistry.
     """
     if kind is not None and kind not in KINDS:
-        raise InputError("no such pack", value=kind, cure=f"use one of: {', '.join(KINDS)}")
+        raise InputError("unknown pack", value=kind, cure=f"use {', '.join(KINDS)}")
     if kind is None:
         odds = np.array(list(_KIND_ODDS.values()), dtype=float)
         kind = str(rng.choice(list(_KIND_ODDS), p=odds / odds.sum()))
     cells, low_ah, high_ah, names = KINDS[kind]
     capacity = float(rng.uniform(low_ah, high_ah))
-    drawn = str(rng.choice(list(names), p=list(names.values())))
-    name = drawn if chemistry_name is None else chemistry_name
-    if name not in CHEMISTRIES:
-        raise InputError(
-            "no such chemistry", value=name, cure=f"use one of: {', '.join(CHEMISTRIES)}"
-        )
-    specimen = chemistry(name, rng, entropy_scale=float(np.exp(rng.uniform(-0.2, 1.1))))
-    # Volts that 1C costs in all, then shared among the processes.
+    name = str(rng.choice(list(names), p=list(names.values())))
+    entropy_scale = float(np.exp(rng.uniform(-0.2, 1.1)))
+    specimen = chemistry(chemistry_name or name, rng, entropy_scale)
+    # Overpotential of one cell at 1C, divided among the processes.
     volts = rng.uniform(0.050, 0.095)
     share = rng.dirichlet(np.array([9.0, 5.0, 3.0]))
     ohmic, transfer, electrolyte = volts * share / capacity
@@ -280,13 +307,13 @@ def draw_pack(
     swing = rng.uniform(0.012, 0.030) / capacity
     energy = cells * 3.7 * capacity / 1000.0
     heat_j_k = energy * rng.uniform(5500.0, 8500.0)
-    weights, quantiles = _spread(cells)
+    quantiles = np.array([-1.75, -0.85, 0.0, 0.85, 1.75])  # of the cell spread, for the groups
     return Pack(
         name=kind,
         chemistry=specimen,
         cells=cells,
         capacity_ah=capacity,
-        weights=weights,
+        weights=np.array([0.1, 0.2, 0.4, 0.2, 0.1]) * cells,
         capacity_factor=1.0 + rng.uniform(0.003, 0.012) * rng.permutation(quantiles),
         resistance_factor=1.0 + rng.uniform(0.01, 0.05) * rng.permutation(quantiles),
         soc_shift=rng.uniform(0.001, 0.006) * rng.permutation(quantiles),
@@ -308,13 +335,6 @@ def draw_pack(
         surface_ambient_w_k=float(heat_j_k / rng.uniform(9000.0, 30000.0)),
         sensors=_draw_sensors(rng, pack_v=cells * 3.7, capacity_ah=capacity),
     )
-
-
-def _spread(cells: int) -> tuple[FloatArray, FloatArray]:
-    shares = np.array([0.1, 0.2, 0.4, 0.2, 0.1])
-    weights = shares * cells
-    quantiles = np.array([-1.75, -0.85, 0.0, 0.85, 1.75])
-    return weights, quantiles
 
 
 def _draw_sensors(rng: np.random.Generator, pack_v: float, capacity_ah: float) -> Sensors:

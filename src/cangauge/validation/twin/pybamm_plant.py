@@ -1,9 +1,9 @@
-"""A pack whose cells are simulated by PyBaMM's single-particle model with electrolyte (SPMe).
+"""Plant whose cells are simulated by PyBaMM's single-particle model with electrolyte (SPMe).
 
-Another team's physics in place of the twin's own: porous electrodes, particles, electrolyte.
-Capacity, exchange current and start charge change in its parameters; faults of the pack around
-the cells (contacts, hysteresis, extra relaxations …) come on top as in the twin. Needs the extra
-`pybamm` (https://www.pybamm.org, BSD; Sulzer et al. 2021).
+Independent physics: porous electrodes, particles, electrolyte. Capacity, exchange current and
+initial SoC change its parameters; faults around the cells (contacts, hysteresis, relaxations) are
+added as in the other plants. Needs the extra `pybamm` (https://www.pybamm.org, BSD; Sulzer et al.
+2021).
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ import numpy as np
 
 from cangauge._typing import FloatArray
 from cangauge.errors import CangaugeError, InputError
-from cangauge.validation.twin.condition import Condition, is_on
-from cangauge.validation.twin.day import Day
+from cangauge.validation.twin.condition import Condition
+from cangauge.validation.twin.drive import Drive
 from cangauge.validation.twin.pack import HIGHEST, KELVIN, LOWEST, Chemistry, Pack
 from cangauge.validation.twin.plant import (
     REFERENCE_K,
-    Electrical,
+    Response,
+    cold_resistance_factor,
     discharged,
-    extra_drop,
-    hump_rise,
+    fault_drop,
     hysteresis_drop,
     ohmic_factor,
-    stiffness,
+    soc_resistance_rise,
 )
 
 PARAMETER_SETS: Final = ("Mohtat2020", "Ecker2015", "NCA_Kim2011", "Chen2020", "Ai2020")
 _POINTS: Final = 501
 _MESH: Final = {"x_n": 6, "x_s": 5, "x_p": 6, "r_n": 14, "r_p": 14}
 _OUTPUT_S: Final = 1.0
-_KEPT: Final = 12
-"""Answers: of three days with and without a fault, and a few more."""
+_CACHE_SIZE: Final = 12
+"""Solutions: three drives with and without a fault, and some more."""
 _CONTACT_SHARE: Final = (0.1, 0.35)
 
 
 @dataclass(frozen=True)
 class Stoichiometry:
-    """Lithium in both electrodes at 0 and 100 % [-]."""
+    """Stoichiometry of both electrodes at 0 and 100 % SoC [-]."""
 
     negative_empty: float
     negative_full: float
@@ -51,7 +51,7 @@ class Stoichiometry:
 
 @dataclass(frozen=True)
 class _Cell:
-    """One cell's charge at the start, and how its condition changes PyBaMM's parameters."""
+    """Initial SoC of a cell, and its changes to PyBaMM's parameters."""
 
     start: float
     capacity_factor: float
@@ -65,15 +65,15 @@ class PybammPlant:
     Parameters
     ----------
     pack : Pack
-        Size, thermal masses and sensors; its open-circuit voltage is that of the parameters.
+        Size, thermal masses and sensors; with the open-circuit voltage of the parameters.
     parameters : pybamm.ParameterValues
     stoichiometry : Stoichiometry
     contact_ohm : float
-        Ohmic resistance per cell around the cell itself at 25 °C [Ω].
+        Ohmic resistance outside the cell, per cell, at 25 °C [Ω].
     """
 
     name = "pybamm"
-    settled_k = 0.3
+    temperature_tolerance_k = 0.3
 
     def __init__(
         self, pack: Pack, parameters: Any, stoichiometry: Stoichiometry, contact_ohm: float
@@ -82,30 +82,30 @@ class PybammPlant:
         self._parameters = parameters
         self._stoichiometry = stoichiometry
         self._contact_ohm = contact_ohm
-        # The nominal capacity of a set is often not what lies between its two ends.
+        # The nominal capacity of a set often differs from that between its stoichiometries.
         negative_ah = _number(parameters, import_pybamm().LithiumIonParameters().n.Q_init)
         window = stoichiometry.negative_full - stoichiometry.negative_empty
         self._cell_ah = negative_ah * window
-        self._known: dict[tuple[bytes, bytes, bytes, _Cell], FloatArray] = {}
+        self._solutions: dict[tuple[bytes, bytes, bytes, _Cell], FloatArray] = {}
 
-    def electrical(
-        self, day: Day, condition: Condition, current_a: FloatArray, core_c: FloatArray
-    ) -> Electrical:
-        """Return voltage, charge and heat, shape (n,) each.
+    def respond(
+        self, drive: Drive, condition: Condition, current_a: FloatArray, core_c: FloatArray
+    ) -> Response:
+        """Return the response to a current (see `Plant.respond`).
 
         Raises
         ------
         CangaugeError
-            If PyBaMM cannot solve the day.
+            If PyBaMM cannot solve the drive.
         """
         pack, kelvin = self.pack, core_c + KELVIN
-        charge = discharged(day, current_a, condition.charge_loss) / pack.capacity_ah
-        start = day.start_soc + condition.start_soc_shift
+        charge = discharged(drive, current_a, condition.charge_loss) / pack.capacity_ah
+        start = drive.start_soc + condition.start_soc_shift
         soc = start - charge / condition.capacity_factor
         usual = _Cell(
             start, condition.capacity_factor, condition.charge_loss, condition.transfer_slowdown
         )
-        cell_v = self._cell_v(day, current_a, kelvin, usual)
+        cell_v = self._cell_v(drive, current_a, kelvin, usual)
         total_v, lowest = pack.cells * cell_v, cell_v
         weak = condition.weak
         if weak is not None:
@@ -114,7 +114,7 @@ class PybammPlant:
                 start=start - weak.deficit,
                 capacity_factor=condition.capacity_factor * (1.0 - weak.loss),
             )
-            weak_v = self._cell_v(day, current_a, kelvin, lesser)
+            weak_v = self._cell_v(drive, current_a, kelvin, lesser)
             total_v = total_v + weak.count * (weak_v - cell_v)
             lowest = np.minimum(cell_v, weak_v)
         entropy = pack.chemistry.entropy(soc)
@@ -124,18 +124,20 @@ class PybammPlant:
             entropy = entropy + shift
         contact = self._contact_ohm * ohmic_factor(pack, kelvin) * current_a
         inner = pack.ohmic_ohm * ohmic_factor(pack, kelvin) * current_a
-        stiff = stiffness(condition, kelvin)
-        drop = pack.cells * (contact + inner * (stiff * (1.0 + hump_rise(condition, soc)) - 1.0))
-        drop = drop + extra_drop(day, condition, current_a, kelvin)
+        stiff = cold_resistance_factor(condition, kelvin)
+        drop = pack.cells * (
+            contact + inner * (stiff * (1.0 + soc_resistance_rise(condition, soc)) - 1.0)
+        )
+        drop = drop + fault_drop(drive, condition, current_a, kelvin)
         open_v = pack.cells * (pack.chemistry.ocv(soc) + entropy * (kelvin - REFERENCE_K))
         if condition.string_loss is not None:
             losses = open_v - total_v + drop
-            on = is_on(condition.string_loss, day.time_s)
+            on = condition.string_loss.is_active(drive.time_s)
             drop = drop + condition.string_loss.size * losses * on
         before_hysteresis = total_v - drop
         if condition.hysteresis_v:
-            drop = drop + hysteresis_drop(day, condition, charge)
-        return Electrical(
+            drop = drop + hysteresis_drop(drive, condition, charge)
+        return Response(
             voltage_v=total_v - drop,
             soc=soc,
             equilibrium_v=open_v,
@@ -145,31 +147,31 @@ class PybammPlant:
         )
 
     def _cell_v(
-        self, day: Day, current_a: FloatArray, kelvin: FloatArray, cell: _Cell
+        self, drive: Drive, current_a: FloatArray, kelvin: FloatArray, cell: _Cell
     ) -> FloatArray:
-        """Return the voltage of one cell [V]; after PyBaMM's cell is empty, that of an empty.
+        """Return the voltage of one cell [V]; 0 after PyBaMM ends the discharge.
 
-        What sensors do to a log, or parts around the cell, is sized by trying, and leaves the cell
-        what it was: the latest answers are kept, since each takes a second.
+        Sizing a fault of the sensors or around the cells repeats the same solution, which takes a
+        second: the latest ones are cached.
         """
-        key = (day.time_s.tobytes(), current_a.tobytes(), kelvin.tobytes(), cell)
-        if key not in self._known:
-            if len(self._known) >= _KEPT:
-                self._known.pop(next(iter(self._known)))
-            self._known[key] = self._solved_v(day, current_a, kelvin, cell)
-        return self._known[key]
+        key = (drive.time_s.tobytes(), current_a.tobytes(), kelvin.tobytes(), cell)
+        if key not in self._solutions:
+            if len(self._solutions) >= _CACHE_SIZE:
+                self._solutions.pop(next(iter(self._solutions)))
+            self._solutions[key] = self._solved_v(drive, current_a, kelvin, cell)
+        return self._solutions[key]
 
     def _solved_v(
-        self, day: Day, current_a: FloatArray, kelvin: FloatArray, cell: _Cell
+        self, drive: Drive, current_a: FloatArray, kelvin: FloatArray, cell: _Cell
     ) -> FloatArray:
         pybamm = import_pybamm()
         parameters = self._parameters.copy()
-        time_s = day.time_s
-        every = max(1, round(_OUTPUT_S / day.step_s))
+        time_s = drive.time_s
+        every = max(1, round(_OUTPUT_S / drive.step_s))
         counted = np.where(current_a < 0.0, (1.0 - cell.charge_loss) * current_a, current_a)
         amperes = counted * self._cell_ah / self.pack.capacity_ah
         coarse_s = time_s[::every]
-        # A little beyond the end, where the solver may look.
+        # Extended beyond the end, where the solver may evaluate them.
         beyond_s = np.append(time_s, time_s[-1] + 60.0)
         beyond_a = np.append(amperes, amperes[-1])
         beyond_k = np.append(kelvin, kelvin[-1])
@@ -190,12 +192,12 @@ class PybammPlant:
         try:
             solution = simulation.solve([0.0, float(time_s[-1])], t_interp=coarse_s)
         except pybamm.SolverError as error:
-            problem = f"PyBaMM could not solve this day: {str(error).splitlines()[0]}"
+            problem = f"PyBaMM cannot solve this drive: {str(error).splitlines()[0]}"
             raise CangaugeError(problem) from error
         volts = np.asarray(solution["Voltage [V]"](t=coarse_s), dtype=np.float64)
         ended = np.asarray(coarse_s > float(solution.t[-1]))
         volts[ended] = 0.0
-        # Within a second the electrodes hardly move; the ohmic part of the cell does.
+        # Within a second only the ohmic part of the cell responds.
         return np.interp(time_s, coarse_s, volts) - self._within_second(current_a, every)
 
     def _within_second(self, current_a: FloatArray, every: int) -> FloatArray | float:
@@ -223,13 +225,7 @@ class PybammPlant:
 
 
 def import_pybamm() -> Any:
-    """Return the module pybamm.
-
-    Raises
-    ------
-    InputError
-        If it is not installed.
-    """
+    """Return the module pybamm; raise InputError if it is not installed."""
     try:
         return importlib.import_module("pybamm")
     except ImportError as error:
@@ -237,14 +233,14 @@ def import_pybamm() -> Any:
             "PyBaMM is not installed",
             field="plant",
             value="pybamm",
-            cure="install cangauge[pybamm], or take the plant twin",
+            cure="install cangauge[pybamm], or use the plant twin",
         ) from error
 
 
 def draw_pybamm_plant(
     rng: np.random.Generator, pack: Pack, parameter_set: str | None = None
 ) -> PybammPlant:
-    """Return a PyBaMM pack at random: one of its parameter sets, each specimen a little off.
+    """Draw a PyBaMM pack: a parameter set with individual exchange currents.
 
     Parameters
     ----------
@@ -252,28 +248,28 @@ def draw_pybamm_plant(
     pack : Pack
         Size, thermal masses and sensors.
     parameter_set : str, optional
-        One of `PARAMETER_SETS`.
+        One of `PARAMETER_SETS`; drawn by default.
 
     Raises
     ------
     InputError
-        If PyBaMM is not installed or has no such set.
+        If PyBaMM is not installed or the set is unknown.
     """
     pybamm = import_pybamm()
     if parameter_set is None:
         parameter_set = str(rng.choice(PARAMETER_SETS))
     if parameter_set not in PARAMETER_SETS:
         raise InputError(
-            "no such parameter set",
+            "unknown parameter set",
             value=parameter_set,
-            cure=f"use one of: {', '.join(PARAMETER_SETS)}",
+            cure=f"use {', '.join(PARAMETER_SETS)}",
         )
     parameters = pybamm.ParameterValues(parameter_set)
     low, high, high_soc, low_soc = (
         float(value) for value in pybamm.lithium_ion.get_min_max_stoichiometries(parameters)
     )
     stoichiometry = Stoichiometry(low, high, high_soc, low_soc)
-    # The pack's own protection decides when a drive ends, not the set's limits.
+    # The pack's protection ends a drive, not the limits of the set.
     parameters["Lower voltage cut-off [V]"] = 1.5
     parameters["Upper voltage cut-off [V]"] = 5.0
     for side in ("Negative", "Positive"):
@@ -308,7 +304,7 @@ def _divided(value: Any, divisor: float) -> Any:
 def _ocv_table(
     parameters: Any, s: Stoichiometry, drawn: Chemistry, parameter_set: str
 ) -> Chemistry:
-    """Return the open-circuit voltage of the parameters, on the twin's grid."""
+    """Return the open-circuit voltage of the parameters on the grid of `drawn`."""
     soc = np.linspace(max(LOWEST, -0.02), min(HIGHEST, 1.0), _POINTS)
     negative = np.clip(
         s.negative_empty + soc * (s.negative_full - s.negative_empty), 1e-4, 1.0 - 1e-4
@@ -335,9 +331,9 @@ def _number(parameters: Any, expression: Any) -> float:
 
 
 def _pulse_ohm(plant: PybammPlant) -> float:
-    """Return the resistance of one cell against 10 s of 1C at half charge and 25 °C [Ω]."""
+    """Return the resistance of one cell after 10 s of 1C at 50 % SoC and 25 °C [Ω]."""
     time_s = np.arange(0.0, 60.0)
     current = np.where((time_s >= 20.0) & (time_s < 40.0), plant.pack.one_c_a, 0.0)
-    day = Day(time_s, current, np.full_like(time_s, 25.0), 25.0, 0.5)
-    volts = plant.electrical(day, Condition(), current, np.full_like(time_s, 25.0)).voltage_v
+    drive = Drive(time_s, current, np.full_like(time_s, 25.0), 25.0, 0.5)
+    volts = plant.respond(drive, Condition(), current, np.full_like(time_s, 25.0)).voltage_v
     return float((volts[19] - volts[30]) / plant.pack.one_c_a / plant.pack.cells)

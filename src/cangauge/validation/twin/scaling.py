@@ -1,4 +1,4 @@
-"""How large a fault must be to open a wanted gap."""
+"""Size of a fault that opens a given RMS gap, within the physical limits of the fault."""
 
 from __future__ import annotations
 
@@ -8,123 +8,116 @@ from typing import Final
 
 import numpy as np
 
-from cangauge.validation.twin.day import Day
+from cangauge.validation.twin.drive import Drive
 from cangauge.validation.twin.faults import Fault, apply_faults
 from cangauge.validation.twin.plant import Plant
-from cangauge.validation.twin.simulate import Truth, gap_v, simulate
+from cangauge.validation.twin.recording import GroundTruth, gap_v, simulate_truth
 
-TOLERANCE: Final = 0.03
-_MAX_TRIES: Final = 14
-_SHORTEST_S: Final = 900.0
+_TOLERANCE: Final = 0.03
+"""Relative error of the gap at which the search stops [-]."""
+_MAX_EVALUATIONS: Final = 14
+_MIN_DURATION_S: Final = 900.0
+"""A size that ends a drive before this, or before its half, is impossible."""
 
 
 @dataclass(frozen=True, eq=False)
-class Scaled:
-    """A fault with its size, and the gap that it opens.
+class ScaledFault:
+    """A fault scaled to a gap.
 
     Parameters
     ----------
     fault : Fault
-    wanted_v, reached_v : float
-        RMS gap over all days [V].
+    target_v, reached_v : float
+        RMS gap over all drives, wanted and reached [V].
     limited : bool
-        Whether the physical limits of the size kept it from what was wanted.
+        Whether the physical limits of the size prevent the wanted gap.
     """
 
     fault: Fault
-    wanted_v: float
+    target_v: float
     reached_v: float
     limited: bool
 
 
-def rms_gap_v(
-    plant: Plant, days: Sequence[Day], healthy: Sequence[Truth], faults: tuple[Fault, ...]
+def _rms_gap_v(
+    plant: Plant, drives: Sequence[Drive], healthy: Sequence[GroundTruth], faults: tuple[Fault, ...]
 ) -> float:
-    """Return the RMS gap that faults open over some days [V]; inf if a car would hardly start.
-
-    Parameters
-    ----------
-    plant : Plant
-    days, healthy : sequences of equal length
-        The days and what happens on them without a fault.
-    faults : tuple of Fault
-    """
+    """Return the RMS gap of faults over some drives [V]; inf if the pack is empty too early."""
     condition = apply_faults(plant.pack, faults)
     total, rows = 0.0, 0
-    for day, clean in zip(days, healthy, strict=True):
-        truth = simulate(plant, day, condition, clean)
-        if truth.rows * day.step_s < min(_SHORTEST_S, 0.5 * float(day.time_s[-1])):
+    for drive, clean in zip(drives, healthy, strict=True):
+        truth = simulate_truth(plant, drive, condition, clean)
+        if truth.rows * drive.step_s < min(_MIN_DURATION_S, 0.5 * float(drive.time_s[-1])):
             return float("inf")
-        gap = gap_v(plant, day, truth, clean)
-        total += float(np.sum(gap**2)) * day.step_s
-        rows += round(truth.rows * day.step_s)
+        gap = gap_v(plant, drive, truth, clean)
+        total += float(np.sum(gap**2)) * drive.step_s
+        rows += round(truth.rows * drive.step_s)
     return float(np.sqrt(total / max(rows, 1)))
 
 
 def scale_to_gap(
     plant: Plant,
-    days: Sequence[Day],
+    drives: Sequence[Drive],
     fault: Fault,
-    wanted_v: float,
-    healthy: Sequence[Truth] | None = None,
-) -> Scaled:
-    """Return the fault with the size that opens the wanted gap, within its physical limits.
-
-    The search goes by secants in log size against log gap, and halves its bracket where these
-    leave it. The fault's own size gives the sign.
+    target_v: float,
+    healthy: Sequence[GroundTruth] | None = None,
+) -> ScaledFault:
+    """Scale a fault to an RMS gap over simulated drives.
 
     Parameters
     ----------
     plant : Plant
-    days : sequence of Day
-        The gap is that over all of them.
+    drives : sequence of Drive
     fault : Fault
-    wanted_v : float
-        RMS gap [V].
-    healthy : sequence of Truth, optional
-        What happens on the days without a fault, if it is known already.
+        Its size gives the sign.
+    target_v : float
+        RMS gap over all drives [V].
+    healthy : sequence of GroundTruth, optional
+        The drives without a fault, if known already.
     """
-    clean = [simulate(plant, day) for day in days] if healthy is None else healthy
+    clean = [simulate_truth(plant, drive) for drive in drives] if healthy is None else healthy
     return find_size(
-        lambda sized: rms_gap_v(plant, days, clean, (sized,)),
+        lambda sized: _rms_gap_v(plant, drives, clean, (sized,)),
         fault,
-        wanted_v,
+        target_v,
         fault.kind.limits(plant.pack),
     )
 
 
 def find_size(
-    gap_of: Callable[[Fault], float], fault: Fault, wanted_v: float, limits: tuple[float, float]
-) -> Scaled:
-    """Return the fault with the size at which `gap_of` gives the wanted gap.
+    gap_of: Callable[[Fault], float], fault: Fault, target_v: float, limits: tuple[float, float]
+) -> ScaledFault:
+    """Find the size of a fault at which `gap_of` returns the wanted gap.
+
+    Secant search in log size over log gap, with bisection where a secant leaves the bracket.
 
     Parameters
     ----------
     gap_of : callable
-        Fault → RMS gap [V]; inf where the size is impossible.
+        Fault → RMS gap [V]; inf if the size is impossible.
     fault : Fault
         Its size gives the sign.
-    wanted_v : float
+    target_v : float
         RMS gap [V].
     limits : tuple of float
         Smallest and largest size, positive.
     """
     sign = -1.0 if fault.size < 0.0 else 1.0
     low, high = (float(np.log(limit)) for limit in limits)
-    target = float(np.log(wanted_v))
+    target = float(np.log(target_v))
     below: tuple[float, float] | None = None
     above: tuple[float, float] | None = None
     best: tuple[float, float, float] | None = None
     at = 0.5 * (low + high)
     slope = 1.0
     previous: tuple[float, float] | None = None
-    for _ in range(_MAX_TRIES):
+    for _ in range(_MAX_EVALUATIONS):
         gap = gap_of(fault.sized(sign * float(np.exp(at))))
         level = float(np.log(max(gap, 1e-9)))
         away = abs(level - target)
         if np.isfinite(level) and (best is None or away < best[0]):
             best = (away, at, gap)
-        if away < TOLERANCE:
+        if away < _TOLERANCE:
             break
         if level < target:
             below = (at, level) if below is None or at > below[0] else below
@@ -138,13 +131,13 @@ def find_size(
             previous = (at, level)
         step_to = at + (target - level) / slope if np.isfinite(level) else low
         at = _inside(step_to, below, above, low, high)
-    if best is None:  # even the smallest size stops the car
-        return Scaled(fault.sized(0.0), wanted_v, 0.0, limited=True)
-    return Scaled(
+    if best is None:  # even the smallest size is impossible
+        return ScaledFault(fault.sized(0.0), target_v, 0.0, limited=True)
+    return ScaledFault(
         fault.sized(sign * float(np.exp(best[1]))),
-        wanted_v,
+        target_v,
         best[2],
-        limited=best[0] > 2.0 * TOLERANCE,
+        limited=best[0] > 2.0 * _TOLERANCE,
     )
 
 
@@ -155,7 +148,7 @@ def _inside(
     low: float,
     high: float,
 ) -> float:
-    """Return `at` if it lies within what is known, else the middle of that."""
+    """Return `at` if it lies within the bracket, else the middle of the bracket."""
     first = low if below is None else below[0]
     last = high if above is None else above[0]
     if below is not None and above is not None:

@@ -1,4 +1,4 @@
-"""The sensor chain: steps, jitter, losses, rates, and what a gauge may know of the charge."""
+"""Sensors: quantization, jitter, lost samples, rates, assumed initial SoC."""
 
 from __future__ import annotations
 
@@ -7,39 +7,39 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cangauge.validation.twin.day import Day, draw_day
+from cangauge.validation.twin.drive import Drive, draw_drive
 from cangauge.validation.twin.faults import Fault
 from cangauge.validation.twin.pack import Pack, draw_pack
 from cangauge.validation.twin.plant import TwinPlant
-from cangauge.validation.twin.world import record_day, rms
+from cangauge.validation.twin.recording import record_drive, rms
 
 
 def with_sensors(pack: Pack, **changes: float) -> Pack:
     return replace(pack, sensors=replace(pack.sensors, **changes))
 
 
-def test_values_are_multiples_of_the_steps(pack: Pack, day: Day) -> None:
+def test_values_are_quantized(pack: Pack, drive: Drive) -> None:
     plant = TwinPlant(
         with_sensors(pack, current_step_a=0.5, voltage_step_v=0.25, temperature_step_k=1.0)
     )
-    log = record_day(plant, day, ()).log
+    log = record_drive(plant, drive, ()).log
     for values, step in ((log.current_a, 0.5), (log.voltage_v, 0.25), (log.temperature_c, 1.0)):
         np.testing.assert_allclose(values / step, np.rint(values / step), atol=1e-6)
 
 
-def test_only_the_start_of_the_charge_is_told(plant: TwinPlant, day: Day) -> None:
-    log = record_day(plant, day, ()).log
+def test_log_has_the_assumed_initial_soc_only(plant: TwinPlant, drive: Drive) -> None:
+    log = record_drive(plant, drive, ()).log
     assert log.soc_pct is not None
     assert log.soc_pct[0] == pytest.approx(90.0, abs=0.6)
     assert np.all(np.isnan(log.soc_pct[1:]))
 
 
 @pytest.mark.parametrize("rate_hz", [1.0, 2.0, 5.0, 10.0])
-def test_frames_come_at_the_rate_with_jitter_and_losses(rate_hz: float) -> None:
+def test_samples_have_jitter_and_losses(rate_hz: float) -> None:
     rng = np.random.default_rng(4)
     pack = with_sensors(draw_pack(rng, "leaf40"), rate_hz=rate_hz, jitter=0.05, drop_share=0.01)
-    day = draw_day(rng, pack, hours=0.4)
-    log = record_day(TwinPlant(pack), day, ()).log
+    drive = draw_drive(rng, pack, hours=0.4)
+    log = record_drive(TwinPlant(pack), drive, ()).log
     intervals = np.diff(log.time_s)
     assert np.median(intervals) == pytest.approx(1.0 / rate_hz, rel=0.02)
     assert 0.02 < np.std(intervals[intervals < 1.5 / rate_hz]) * rate_hz < 0.1
@@ -47,18 +47,18 @@ def test_frames_come_at_the_rate_with_jitter_and_losses(rate_hz: float) -> None:
     assert 0.97 * expected < len(log) < 0.9985 * expected
 
 
-def test_the_floor_is_what_a_perfect_model_cannot_avoid(plant: TwinPlant, day: Day) -> None:
-    recording = record_day(plant, day, ())
+def test_sensor_error_is_that_of_a_perfect_model(plant: TwinPlant, drive: Drive) -> None:
+    recording = record_drive(plant, drive, ())
     assert np.all(recording.gap_v == 0.0)
     sensors = plant.pack.sensors
     least = np.hypot(sensors.voltage_noise_v, sensors.voltage_step_v / np.sqrt(12.0))
-    assert 0.95 * least < rms(recording.floor_v) < 4.0 * least + 0.3
+    assert 0.95 * least < rms(recording.sensor_error_v) < 4.0 * least + 0.3
     error = recording.log.voltage_v - recording.expected_voltage_v
-    assert rms(error) < 1.3 * rms(recording.floor_v) + 0.05
+    assert rms(error) < 1.3 * rms(recording.sensor_error_v) + 0.05
 
 
-def test_a_car_stops_before_its_weakest_cell_is_ruined(plant: TwinPlant, day: Day) -> None:
-    whole = record_day(plant, day, ()).log
-    short = record_day(plant, day, (Fault("capacity", 0.4),)).log
+def test_log_ends_when_the_lowest_cell_is_empty(plant: TwinPlant, drive: Drive) -> None:
+    whole = record_drive(plant, drive, ()).log
+    short = record_drive(plant, drive, (Fault("capacity", 0.4),)).log
     assert short.duration_s < 0.9 * whole.duration_s
     assert short.voltage_v.min() / plant.pack.cells > 2.0

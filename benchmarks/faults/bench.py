@@ -1,4 +1,4 @@
-"""One service on one line, in a folder of its own, and what a fault may do to it."""
+"""Test bench: one service on one bus, with the actions that a fault may take."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from random import Random
 from typing import Any, Final
 
 from cangauge._resources import shared_file
-from faults.drive import Profile, initial_soc_pct
-from faults.line import Line
+from faults.frames import Profile, initial_soc_pct
+from faults.line import BusLine
 from faults.process import Process, Target, cangauge
 
 MODEL: Final = "leaf2012_published_model.json"
 START_S: Final = 15.0
-"""How long a service may take until it publishes; a guest's or a busy machine's interpreter takes
-long to start [s]."""
+"""Time until a restarted service publishes; long for an interpreter on a busy or virtual
+machine [s]."""
 FIRST_START_S: Final = 60.0
-"""How long the first start may take, on a machine that does other things too [s]."""
+"""Time until the first start publishes, on a busy machine [s]."""
 RECONNECT_S: Final = 5.0
-"""How long it may take until it uses a bus that is back [s]."""
+"""Time until the service uses a bus that is back [s]."""
 
 FLOAT_DBC: Final = """VERSION ""
 BU_: Pack
@@ -52,21 +52,21 @@ timeout_s = 10.0
 
 
 @dataclass(frozen=True)
-class Setting:
-    """How the service is started.
+class ServiceSetup:
+    """Setup of the service.
 
     Parameters
     ----------
     config : dict
-        Keys of its configuration besides bus and model.
+        Configuration keys besides bus and model.
     vehicle : str
         "generic" or "float".
     with_state : bool
-        Give it a state file.
+        Use a state file.
     cold : bool
         Start it in a fresh interpreter.
     target : callable
-        The service, or what stands for it in tests of the harness.
+        The service, or a replacement in tests of the harness.
     """
 
     config: dict[str, Any]
@@ -76,22 +76,22 @@ class Setting:
     target: Target = cangauge
 
 
-class Stage:
-    """One service on one line.
+class Bench:
+    """One service on one bus.
 
     Parameters
     ----------
-    line : Line
+    line : BusLine
     profile : Profile
-    setting : Setting
+    setting : ServiceSetup
     folder : Path
-        For its files; removed by whoever made it.
+        Folder of its files.
     rng : Random
-        For what a fault chooses at random.
+        Random generator of the fault.
     """
 
     def __init__(
-        self, line: Line, profile: Profile, setting: Setting, folder: Path, rng: Random
+        self, line: BusLine, profile: Profile, setting: ServiceSetup, folder: Path, rng: Random
     ) -> None:
         self.line = line
         self.profile = profile
@@ -100,8 +100,8 @@ class Stage:
         self.config_path = folder / "run.toml"
         self.state_path = folder / "state" / "soc.state"
         self.state_path.parent.mkdir()
-        self.excused: list[tuple[float, float]] = []
-        self.troubles: list[str] = []
+        self.expected_silence_s: list[tuple[float, float]] = []
+        self.incidents: list[str] = []
         self._setting = setting
         self._at_end: list[Callable[[], None]] = []
         self.config: dict[str, Any] = {
@@ -121,7 +121,7 @@ class Stage:
     # --- service --------------------------------------------------------------------------
 
     def another_service(self, name: str, *, with_state: bool = False) -> Process:
-        """Return a service that is not started yet."""
+        """Return another service, not started yet."""
         arguments = ["run", "--config", str(self.config_path)]
         if with_state:
             arguments += ["--state", str(self.state_path)]
@@ -129,72 +129,72 @@ class Stage:
         return Process(arguments, log, setting.target, cold=setting.cold)
 
     def write_config(self, **changes: object) -> None:
-        """Write the configuration, with changes that last."""
+        """Write the configuration with permanent changes."""
         self.config |= changes
         self.config_path.write_text(_toml({k: v for k, v in self.config.items() if v is not None}))
 
     def start(self) -> None:
-        """Start the service; it may need time."""
+        """Start the service."""
         self.service.start()
-        self.excuse(START_S)
+        self.expect_silence(START_S)
 
     def restart(self) -> None:
-        """End the service by SIGTERM and start it again at once."""
+        """Stop the service by SIGTERM and start it again."""
         self.service.stop()
         self.start()
 
     def kill_and_restart(self) -> None:
-        """End the service by SIGKILL and start it again at once."""
+        """Kill the service and start it again."""
         self.service.kill()
         self.start()
 
     def reload(self) -> None:
-        """Tell the service to read its configuration again."""
+        """Reload the configuration."""
         self.service.signal(signal.SIGHUP)
 
     def pause(self) -> None:
-        """Stop the service's process for the time being."""
+        """Suspend the process of the service."""
         self.service.signal(signal.SIGSTOP)
-        self.excuse(self.profile.seconds)  # shortened by `go_on`
+        self.expect_silence(self.profile.seconds)  # shortened by `resume`
 
-    def go_on(self) -> None:
-        """Let it go on."""
+    def resume(self) -> None:
+        """Resume the process of the service."""
         self.service.signal(signal.SIGCONT)
-        first, _ = self.excused.pop()
-        self.excused.append((first, time.monotonic() + 1.0))
+        first, _ = self.expected_silence_s.pop()
+        self.expected_silence_s.append((first, time.monotonic() + 1.0))
 
     def end(self) -> None:
-        """End everything."""
+        """Stop all services and undo all actions."""
         for process in (self.service, *self.others):
             process.stop()
         while self._at_end:
             self._at_end.pop()()
 
     def at_end(self, undo: Callable[[], None]) -> None:
-        """Have something undone at the end."""
+        """Register what undoes an action at the end."""
         self._at_end.append(undo)
 
-    def excuse(self, seconds: float) -> None:
-        """Expect no frames for so long from now."""
+    def expect_silence(self, seconds: float) -> None:
+        """Expect no published frames for a time from now [s]."""
         now_s = time.monotonic()
-        self.excused.append((now_s, now_s + seconds))
+        self.expected_silence_s.append((now_s, now_s + seconds))
 
     # --- bus ------------------------------------------------------------------------------
 
     @contextmanager
     def without_bus(self) -> Iterator[None]:
-        """Expect no frames within the block, and until the service is back after it."""
+        """Expect no published frames within the block and until the service has reconnected."""
         first = time.monotonic()
         yield
-        self.excused.append((first, time.monotonic() + RECONNECT_S))
+        self.expected_silence_s.append((first, time.monotonic() + RECONNECT_S))
 
     def wait(self, seconds: float) -> None:
-        """Wait, in time of the profile."""
+        """Wait for a time of the profile [s]."""
         threading.Event().wait(seconds / self.profile.speed)
 
 
 def vehicle_config(vehicle: str, folder: Path) -> dict[str, Any]:
-    """Return the configuration's keys for a vehicle, writing the files that it needs."""
+    """Return the configuration keys of a vehicle; write the files that it needs."""
     if vehicle == "generic":
         return {"vehicle": "generic"}
     dbc, mapping = folder / "float.dbc", folder / "float.toml"
@@ -209,7 +209,7 @@ def remove(folder: Path) -> None:
 
 
 def _toml(values: dict[str, Any]) -> str:
-    """Return TOML; JSON's numbers, texts and flat tables are TOML's, but for the table's form."""
+    """Return TOML: numbers and texts as in JSON, tables with a header."""
     lines, tables = [], []
     for key, value in values.items():
         if isinstance(value, dict):

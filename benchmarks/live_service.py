@@ -1,0 +1,40 @@
+"""`cangauge` commands on a bus of the benchmarks, in processes of their own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from cangauge._resources import shared_file
+from cangauge.bus.open import BusAddress
+
+MODEL = shared_file("replay", "leaf2012_published_model.json")
+_ENTRY = "import sys; from cangauge.cli.app import main; main()"
+
+
+def command(address: BusAddress, name: str, *arguments: object) -> list[str]:
+    """Return the command line of a `cangauge` command on a bus, with `--json`."""
+    on = ["--interface", address.interface, "--channel", address.channel]
+    for key, value in address.options.items():
+        on += ["--bus-option", f"{key}={value}"]
+    return [sys.executable, "-c", _ENTRY, name, *map(str, arguments), *on, "--json"]
+
+
+@contextmanager
+def service(address: BusAddress, *arguments: object) -> Iterator[subprocess.Popen[str]]:
+    """Run `cangauge run` during the block, which starts when the service listens."""
+    process = subprocess.Popen(
+        command(address, "run", "-m", MODEL, *arguments),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        if not any("listening" in line for line in process.stderr or ()):
+            raise SystemExit("cangauge run does not start")
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
