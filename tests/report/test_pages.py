@@ -1,0 +1,320 @@
+"""Report pages: whole, self-contained, honest about what is missing."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from markupsafe import escape
+
+from cangauge import __version__
+from cangauge.estimate.offline import estimate_log
+from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimate.validity import REASON_WORDS, Reason
+from cangauge.identify.fit import Identification, fit
+from cangauge.logs.canonical import write_log
+from cangauge.logs.log import Log
+from cangauge.logs.read import read_log
+from cangauge.model.model_file import Model, model_json
+from cangauge.report.charts import Timeline
+from cangauge.report.estimate import estimate_page, estimate_report
+from cangauge.report.fit import fit_page, fit_report
+from cangauge.report.page import Bullets, Figure, Page, Section, Table, Tile, joined, render
+from cangauge.service.offline import RecordedEstimate, Recording
+from report_html import MAX_PAGE_BYTES, Html
+from synthetic import synthetic_log
+
+FIT_FIGURES = [
+    "Current",
+    "Voltage",
+    "Temperature",
+    "Power",
+    "Charge taken out",
+    "Measured voltage, model and pseudo-OCV",
+    "Pseudo-OCV against SoC",
+    "Slope of the pseudo-OCV",
+    "Measured minus modelled voltage",
+    "Distribution of the error",
+    "SoC from voltage alone",
+    "Error of the SoC from voltage",
+    "Voltage drop against current",
+    "Energy at the terminals",
+]
+ESTIMATE_FIGURES = [
+    "Estimated state of charge",
+    "Error against the reference",
+    "Measured and modelled voltage",
+    "Measured minus modelled voltage",
+    "Current",
+    "Temperature",
+    "Status over time",
+]
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    return synthetic_log(hours=1.2, noise_v=0.5, name="drive")
+
+
+@pytest.fixture(scope="module")
+def found(log: Log) -> Identification:
+    return fit([log])
+
+
+def estimated(
+    log: Log, model: Model, settings: EstimatorSettings | None = None
+) -> RecordedEstimate:
+    settings = settings or EstimatorSettings()
+    return RecordedEstimate(log, *estimate_log(log, model, settings), model, settings)
+
+
+def figure(page: Page, title: str) -> Figure:
+    return next(item for item in page.figures if item.title == title)
+
+
+def test_fit_report_is_one_file_with_every_published_figure(found: Identification) -> None:
+    page = fit_report(found)
+    html = Html(page)
+    assert html.fetched == []
+    assert "default-src 'none'" in page
+    assert len(page.encode()) < MAX_PAGE_BYTES
+    assert set(FIT_FIGURES) <= set(html.headings)
+    assert html.tables >= 6
+    for name in ("k7", "kt", "R4", "std. error", "delay line not yet full"):
+        assert name in page
+    assert f"{found.voltage_mae_pct:.3f} %" in page
+    assert "reconstruction" not in page
+
+
+def test_figures_have_units_on_their_axes_and_a_caption(found: Identification, log: Log) -> None:
+    pages = [fit_page(found), estimate_page(estimated(log, found.model))]
+    for item in (item for page in pages for item in page.figures):
+        assert item.caption.endswith(".")
+        for axis in (item.plot.xaxis[0], item.plot.yaxis[0]):
+            label = axis.axis_label or ""
+            named_rows = label == "" and hasattr(item.plot.y_range, "factors")
+            assert named_rows or re.search(r"\[.+\]$", label), (item.title, label)
+
+
+def test_time_figures_move_together_and_hide_by_legend(found: Identification) -> None:
+    plots = [item.plot for item in fit_page(found).figures]
+    over_time = [plot for plot in plots if plot.xaxis[0].axis_label.startswith("time")]
+    assert len(over_time) == 9
+    assert len({plot.x_range.id for plot in over_time}) == 1
+    assert all(legend.click_policy == "hide" for plot in plots for legend in plot.legend)
+    assert all(any(type(tool).__name__ == "HoverTool" for tool in plot.tools) for plot in plots)
+
+
+def test_long_series_are_reduced_and_the_page_says_so() -> None:
+    long = synthetic_log(hours=1.2, rate_hz=10.0, noise_v=0.5, name="fast")
+    page = fit_page(fit([long]))
+    sources = [
+        renderer.data_source
+        for item in page.figures
+        for renderer in item.plot.renderers
+        if "x" in renderer.data_source.data
+    ]
+    assert max(len(source.data["x"]) for source in sources) <= 4000
+    assert "Lines longer than 4000 points" in render(page)
+    drawn = figure(page, "Current").plot.renderers[0]
+    assert np.nanmax(drawn.data_source.data["y"]) == pytest.approx(long.current_a.max(), rel=1e-6)
+
+
+def test_several_logs_follow_one_another(log: Log) -> None:
+    logs = [
+        log,
+        synthetic_log(hours=0.4, start_pct=70.0, end_pct=50.0, seed=5, name="second & <third>"),
+    ]
+    page = fit_page(fit(logs))
+    current = figure(page, "Current").plot
+    names = [item.text for item in current.center if type(item).__name__ == "Label"]
+    assert names[0] == "drive"
+    assert "second & <third>".startswith(names[1])
+    assert any(type(item).__name__ == "Span" for item in current.center)
+    html = render(page)
+    assert "second &amp; &lt;third&gt;" in html
+    assert "second & <third>" not in html.split("<script", maxsplit=1)[0]
+
+
+def test_a_reconstruction_is_called_one(log: Log) -> None:
+    named = replace(log, name="leaf2012_reconstruction_white")
+    found = fit([named])
+    assert "This is a reconstruction" in fit_report(found)
+    assert "This is a reconstruction" in estimate_report(estimated(named, found.model))
+
+
+def test_pages_name_version_date_and_hashed_inputs(log: Log, tmp_path: Path) -> None:
+    write_log(log, tmp_path / "drive.csv")
+    log = read_log(tmp_path / "drive.csv")
+    found = fit([log])
+    model_path = tmp_path / "model.json"
+    model_path.write_text(model_json(found.model), encoding="utf-8")
+    paths = (tmp_path / "drive.csv", model_path)
+    hashes = [hashlib.sha256(path.read_bytes()).hexdigest()[:12] for path in paths]
+    pages = [fit_report(found), estimate_report(estimated(log, found.model), model_path)]
+    for page in pages:
+        text = Html(page).text
+        for words in (f"cangauge {__version__}", "drive", *(f">{digits}<" for digits in hashes)):
+            assert words in text
+        assert re.search(r"\b20\d\d-\d\d-\d\d \d\d:\d\d UTC", text)
+        assert re.search(r"<title>.*drive.*</title>", page)
+
+
+def test_estimate_report(found: Identification, log: Log) -> None:
+    estimate = estimated(log, found.model, EstimatorSettings(initial_soc_pct=100.0))
+    page = estimate_report(estimate)
+    html = Html(page)
+    assert html.fetched == []
+    assert set(ESTIMATE_FIGURES) <= set(html.headings)
+    assert len(page.encode()) < MAX_PAGE_BYTES
+    assert str(escape(REASON_WORDS[Reason.DELAY_LINE_FILLING])) in page
+    assert f"{estimate.scores.soc_mae_pct:.2f} %" in page
+
+
+def test_without_reference_nothing_is_compared(found: Identification, log: Log) -> None:
+    headings = Html(estimate_report(estimated(replace(log, soc_pct=None), found.model))).headings
+    assert "Error against the reference" not in headings
+    assert "SoC error" not in headings
+    assert "Uncertainty" in headings
+
+
+def test_an_initial_value_is_no_reference(found: Identification, log: Log) -> None:
+    soc = np.full(len(log), np.nan)
+    soc[0] = 100.0
+    settings = EstimatorSettings(initial_soc_pct=100.0)
+    estimate = estimated(replace(log, soc_pct=soc), found.model, settings)
+    assert "Error against the reference" not in Html(estimate_report(estimate)).headings
+
+
+@pytest.mark.parametrize("rows", [1, 2, 30])
+def test_short_logs_still_give_a_page(found: Identification, log: Log, rows: int) -> None:
+    estimate = estimated(log.rows(slice(0, rows)), found.model)
+    assert "Estimated state of charge" in Html(estimate_report(estimate)).headings
+
+
+def test_samples_without_voltage_or_any_estimate(found: Identification, log: Log) -> None:
+    few = log.rows(slice(0, 60))
+    estimate = estimated(few, found.model)
+    nothing = np.full(60, np.nan)
+    numbers = set(vars(estimate.table)) - {"time_s", "status", "reasons"}
+    page = estimate_report(
+        replace(
+            estimate,
+            recorded=Recording(
+                few.time_s, few.current_a, nothing, nothing, nothing, "parked", "", "pack"
+            ),
+            table=replace(estimate.table, **dict.fromkeys(numbers, nothing)),
+            scores=replace(estimate.scores, soc_mae_pct=None),
+        )
+    )
+    assert "State of charge of parked" in page
+    assert "NaN" not in Html(page).text
+
+
+def test_start_up_rows_stay_out_of_the_figure(found: Identification, log: Log) -> None:
+    volts = log.voltage_v.copy()
+    volts[2000:2030] = 0.5
+    voltage = figure(fit_page(fit([replace(log, voltage_v=volts)])), "Voltage")
+    assert voltage.plot.y_range.start > 200.0
+    assert "below the figure" in voltage.caption
+
+
+def test_lines_break_over_gaps_and_between_logs() -> None:
+    def make(time_s: list[float]) -> Log:
+        n = len(time_s)
+        return Log(np.array(time_s), np.zeros(n), np.ones(n), np.ones(n))
+
+    logs = [make([100.0, 101.0, 102.0, 110.0, 111.0]), make([5.0, 6.0, 7.0])]
+    timeline = Timeline(logs)
+    x, y = timeline.line([(item.time_s, item.time_s) for item in logs])
+    nan = np.nan
+    expected = [100.0, 101.0, 102.0, nan, 110.0, 111.0, nan, 5.0, 6.0, 7.0, nan]
+    assert np.array_equal(y, expected, equal_nan=True)
+    assert np.all(np.diff(x) >= 0.0)
+    assert x[0] == 0.0
+    assert timeline.end == pytest.approx(x[-1])
+
+
+def test_page_escapes_what_it_shows() -> None:
+    page = Page(
+        title="<b>title</b>",
+        lead="<lead>",
+        subtitle="a & b",
+        tiles=[Tile("<i>", "1 < 2")],
+        sections=[Section("<s>", [Table(["<h>"], [["<c>"]], "<n>"), Bullets(["<li>"])])],
+        banners=["<banner>"],
+    )
+    html = render(page)
+    for text in ("<b>title", "<lead>", "<i>", "<s>", "<h>", "<c>", "<n>", "<li><li>", "<banner>"):
+        assert text not in html
+    assert "&lt;b&gt;title&lt;/b&gt;" in html
+
+
+def test_columns_of_numbers_are_flush_right() -> None:
+    table = Table(["name", "value"], [["a", "−1.5"], ["b", "–"]])
+    html = render(Page("t", "", [], [Section("s", [table])]))
+    assert '<td>a</td><td class="number">−1.5</td>' in html
+
+
+def test_titles_name_a_few_logs_and_count_the_rest() -> None:
+    assert joined(["a", "b", "c"]) == "a, b, c"
+    assert joined(["a", "b", "c", "d", "e"]) == "a, b and 3 more"
+
+
+@pytest.fixture
+def browser() -> str:
+    """Chromium's path."""
+    path = shutil.which("chromium") or shutil.which("google-chrome")
+    if path is None:
+        pytest.skip("no chromium on this machine")
+    return path
+
+
+def title_after_script(browser: str, page: Path, window: str) -> str:
+    """Return the title of a page in a headless browser after its scripts have run."""
+    dumped = subprocess.run(
+        [browser, "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=8000",
+         f"--window-size={window}", "--dump-dom", page.as_uri()],
+        capture_output=True, text=True, timeout=60, check=True,
+    ).stdout  # fmt: skip
+    return re.search(r"<title>(.*?)</title>", dumped).group(1)
+
+
+@pytest.mark.slow
+def test_a_browser_draws_every_figure(browser: str, found: Identification, tmp_path: Path) -> None:
+    path = tmp_path / "fit.html"
+    # The drawings live in shadow roots, which a dump leaves out: the page itself counts them.
+    counting = """<script>setTimeout(() => {
+      let found = 0;
+      const walk = root => { for (const e of root.querySelectorAll('*')) {
+        if (e.tagName === 'CANVAS' && e.width > 100) found++;
+        if (e.shadowRoot) walk(e.shadowRoot); } };
+      walk(document); document.title = 'drawn ' + found; }, 3000)</script>"""
+    path.write_text(fit_report(found).replace("</body>", counting + "</body>"), encoding="utf-8")
+    drawn = re.match(r"drawn (\d+)", title_after_script(browser, path, "1300,9000"))
+    assert drawn
+    assert int(drawn.group(1)) >= len(FIT_FIGURES)
+
+
+@pytest.mark.slow
+def test_no_page_scrolls_sideways_at_400_px(
+    browser: str, found: Identification, log: Log, tmp_path: Path
+) -> None:
+    # A browser's window has a least width, a frame in it has none.
+    measuring = """<script>setTimeout(() => { const page = document.documentElement;
+      parent.postMessage(page.scrollWidth - page.clientWidth, '*') }, 3000)</script></body>"""
+    outer = tmp_path / "outer.html"
+    outer.write_text(
+        "<title>-</title><iframe src='inner.html' style='width:400px;height:9000px'></iframe>"
+        "<script>addEventListener('message', e => document.title = 'excess ' + e.data)</script>"
+    )
+    for page in (fit_report(found), estimate_report(estimated(log, found.model))):
+        inner = page.replace("</body>", measuring)
+        (tmp_path / "inner.html").write_text(inner, encoding="utf-8")
+        assert title_after_script(browser, outer, "1000,9000") == "excess 0"
