@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from cangauge.model.published import CAPACITY_AH
 from cangauge.report.diagnosis import gap_page, share_figures
 from cangauge.report.page import Beside, Bullets, Figure, InputFile, Page, Section, Table, render
 from cangauge.report.summary import headline
-from report_html import MAX_PAGE_BYTES, Html
+from report_html import MAX_PAGE_BYTES, Html, excess_width_px
 from synthetic import synthetic_log
 
 SECTIONS = [
@@ -185,6 +186,11 @@ def test_page_is_small_and_loads_nothing(page: Page) -> None:
     assert "default-src 'none'" in text
     assert "NaN" not in Html(text).text
     assert render(page).count("<figure>") == text.count("<figure>") == len(page.figures)
+
+
+@pytest.mark.slow
+def test_page_does_not_scroll_sideways_at_400_px(page: Page, tmp_path: Path) -> None:
+    assert excess_width_px(render(page), tmp_path) == 0
 
 
 def test_caveats_of_a_poor_log_come_first(model: Model) -> None:

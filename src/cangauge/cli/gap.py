@@ -29,7 +29,7 @@ from cangauge.diagnosis.posterior import NONE, UNKNOWN
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
 from cangauge.model.model_file import load_model, model_json
-from cangauge.report.summary import headline, open_question, parameters_text
+from cangauge.report.summary import headline, next_step, open_question, parameters_text
 
 SHOWN_CANDIDATES = 5
 SHORTEST_S = 300.0
@@ -152,7 +152,12 @@ def _long_enough(log: Log) -> Log:
 
 
 def _show(found: Diagnosis) -> None:
-    for sentence in (headline(found), in_words(found), open_question(found)):
+    for sentence in (
+        headline(found),
+        in_words(found),
+        open_question(found),
+        next_step(found),
+    ):
         if sentence:
             typer.echo(sentence)
     rows = []

@@ -58,7 +58,13 @@ from cangauge.report.page import (
     reconstruction_banners,
     render,
 )
-from cangauge.report.summary import headline, open_question, parameters_text, percent_span
+from cangauge.report.summary import (
+    headline,
+    next_step,
+    open_question,
+    parameters_text,
+    percent_span,
+)
 
 _SHOWN_CANDIDATES: Final = 8
 _MOMENT_POINTS: Final = 600
@@ -116,7 +122,7 @@ def gap_page(diagnosis: Diagnosis, model: InputFile | None = None) -> Page:
     return Page(
         title=title,
         lead=size or verdict,
-        subtitle=verdict if size else "",
+        subtitle=f"{verdict} {next_step(diagnosis)}" if size else "",
         tiles=_tiles(diagnosis),
         sections=sections,
         inputs=[
@@ -455,13 +461,10 @@ def _cause_text(diagnosis: Diagnosis) -> str:
             " the gap."
         )
     effect = LIBRARY[verdict.cause]
-    text = f"{verdict.cause}: {effect.signature}. {effect.equation}."
-    if verdict.ambiguous_with:
-        text += (
-            f" These logs cannot separate it from {', '.join(verdict.ambiguous_with)}. To separate"
-            f" them: {effect.separated_by}."
-        )
-    return f"{text} An effect is a signature at the terminals, not proof of a mechanism."
+    return (
+        f"{verdict.cause}: {effect.signature}. {effect.equation}. {next_step(diagnosis)}"
+        " An effect is a signature at the terminals, not proof of a mechanism."
+    )
 
 
 # How far the gap closes: the error over time before and after, and by log.

@@ -100,8 +100,17 @@ def _size(diagnosis: Diagnosis) -> str:
     return sentence.format(size=size, sign=positive if value > 0.0 else negative)
 
 
+def next_step(diagnosis: Diagnosis) -> str:
+    """Return the measurement that would confirm the named cause; "" without one."""
+    verdict = diagnosis.verdict
+    if verdict.cause in {NONE, UNKNOWN}:
+        return ""
+    purpose = "separate these causes" if verdict.ambiguous_with else "confirm the cause"
+    return f"To {purpose}: {LIBRARY[verdict.cause].separated_by}."
+
+
 def open_question(diagnosis: Diagnosis) -> str:
-    """Return what the verdict leaves open and what would settle it; "" for a clear cause."""
+    """Return what the verdict leaves open; "" for a clear cause."""
     verdict, references = diagnosis.verdict, diagnosis.settled.references
     baseline = number(diagnosis.baseline_rmse_v, 2, "V")
     if verdict.cause == NONE:
@@ -114,7 +123,7 @@ def open_question(diagnosis: Diagnosis) -> str:
             f" does not prove that there is none.{_invisible(diagnosis)}"
         )
     if verdict.cause == UNKNOWN:
-        floor = f"{'references' if references else 'the model file states'}"
+        floor = "references" if references else "the model file states"
         return (
             f"No cause can be named: the gap is real ({baseline}, {floor}"
             f" {number(diagnosis.floor_v, 2, 'V')}), but no effect of the library is a likely"
@@ -131,7 +140,6 @@ def open_question(diagnosis: Diagnosis) -> str:
     if verdict.ambiguous_with:
         sentences.append(
             f"These logs cannot separate {verdict.cause} from {', '.join(verdict.ambiguous_with)}."
-            f" To separate them: {LIBRARY[verdict.cause].separated_by}."
         )
     return " ".join(sentences)
 
