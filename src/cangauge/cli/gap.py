@@ -75,12 +75,13 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     """Diagnose why a model does not explain logs: how large the gap is, where, and its cause.
 
     The verdict is an effect, `none` (no significant gap) or `unknown` (a gap without a likely cause
-    in the library), with its probability. Give at least three references, better more; without any,
-    the error that the model file states is taken as normal. A log needs 10 minutes, better an hour,
-    with changing load and SoC. Positive current discharges.
+    in the library), with its probability; the documentation states how often it is right. Give at
+    least three references, better more; without any, the error that the model file states is taken
+    as normal. A log needs 10 minutes, better an hour, with changing load and SoC. Positive current
+    discharges.
 
-    Example:
-
+    Examples
+    --------
     `cangauge gap cold1.csv cold2.csv -m pack.json --reference mild1.csv --reference mild2.csv
     --reference mild3.csv --report gap.html --extended cold.json`
     """
