@@ -1,4 +1,4 @@
-"""`cangauge estimate`: its file, its JSON contract, its start, its refusals; captures as live."""
+"""`cangauge estimate`: table, JSON contract, initial SoC, refusals; captures as live."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ import pytest
 
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
-from cangauge.cli.estimate import write_estimates
 from cangauge.estimate.offline import estimate_log, samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.logs.canonical import write_log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.service.capture_estimate import estimate_capture
+from cangauge.service.offline import read_estimates, write_estimates
 
 Run = Callable[..., object]
 
@@ -59,7 +59,7 @@ def refused(ran: object, *words: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_a_row_per_sample_bit_for_bit(run: Run, made: Path, tmp_path: Path, suffix: str) -> None:
+def test_one_row_per_sample_bit_for_bit(run: Run, made: Path, tmp_path: Path, suffix: str) -> None:
     out = tmp_path / f"soc{suffix}"
     ran = run("estimate", made / "part.csv", "-m", made / "model.json", "-o", out)
     assert ran.code == 0, ran.err
@@ -146,7 +146,7 @@ def test_each_method_gives_its_own_soc(run: Run, made: Path, tmp_path: Path) -> 
         assert table["soc_pct"].to_pylist() == table[f"soc_{method}_pct"].to_pylist()
 
 
-def test_what_is_not_known_is_empty(run: Run, made: Path, tmp_path: Path) -> None:
+def test_unknown_values_are_empty(run: Run, made: Path, tmp_path: Path) -> None:
     log = read_log(made / "part.csv")
     volts = log.voltage_v.copy()
     volts[:5] = 0.0
@@ -173,6 +173,10 @@ def test_a_refused_sample_keeps_its_own_time(made: Path, tmp_path: Path) -> None
     written = pa.parquet.read_table(tmp_path / "soc.parquet")
     assert written["time_s"].to_numpy().tolist() == log.time_s.tolist()
     assert "implausible input" in written["reasons"][20].as_py()
+    again = read_estimates(tmp_path / "soc.parquet")
+    assert np.array_equal(again.soc_pct, table.soc_pct, equal_nan=True)
+    assert again.status.tolist() == table.status.tolist()
+    assert again.reasons.tolist() == table.reasons.tolist()
 
 
 def test_a_slow_log_has_no_gaps_by_default(run: Run, made: Path, tmp_path: Path) -> None:
@@ -218,7 +222,7 @@ def test_bad_options_get_one_line_and_write_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_model_of_another_pack(run: Run, made: Path, tmp_path: Path) -> None:
+def test_the_model_of_another_pack_is_refused(run: Run, made: Path, tmp_path: Path) -> None:
     log = read_log(made / "part.csv")
     write_log(replace(log, voltage_v=log.voltage_v / 2.0), tmp_path / "half.parquet")
     out = tmp_path / "soc.csv"
@@ -245,7 +249,7 @@ def test_outputs_must_not_overwrite_input(run: Run, made: Path) -> None:
 
 @pytest.fixture(scope="module")
 def capture(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The part of a discharge, as frames of the generic pack."""
+    """Part of a discharge, as frames of the generic pack."""
     log = read_log(made / "part.csv")
     path = tmp_path_factory.mktemp("capture") / "drive.log"
     encoder = FrameEncoder(Vehicle.load("generic"))
@@ -277,7 +281,7 @@ def test_a_capture_is_estimated_as_the_service_does(
         assert np.array_equal(table[name].to_numpy(), getattr(live, name), equal_nan=True)
 
 
-def test_a_capture_of_another_pack_or_with_turned_current(
+def test_turned_current_in_a_capture_is_refused(
     run: Run, made: Path, tmp_path: Path, capture: Path
 ) -> None:
     model = ("-m", made / "model.json", "-o", tmp_path / "soc.csv")

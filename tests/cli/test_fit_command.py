@@ -1,4 +1,4 @@
-"""`cangauge fit`: its JSON contract, its files, its refusals."""
+"""`cangauge fit`: JSON contract, files, refusals."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_json_is_one_object_that_keeps_the_contract(run: Run, made: Path, tmp_pa
     assert model.capacity_ah == found["capacity_ah"]
 
 
-def test_people_see_tables_with_units_and_errors(run: Run, made: Path, tmp_path: Path) -> None:
+def test_tables_have_units_and_standard_errors(run: Run, made: Path, tmp_path: Path) -> None:
     ran = run("fit", made / "full.parquet", "-o", tmp_path / "m.json")
     assert ran.code == 0
     for text in ("std. error", "R4", "Ω", "V/K", "kWh", "condition number", "held out"):
@@ -216,7 +216,7 @@ def test_nan_in_a_column(run: Run, made: Path, tmp_path: Path) -> None:
     assert files(tmp_path) == ["holes.csv"]
 
 
-def test_no_option_left_out_silently(run: Run, made: Path) -> None:
+def test_the_output_must_be_named(run: Run, made: Path) -> None:
     assert run("fit", made / "full.parquet").code == 2
 
 
@@ -258,9 +258,7 @@ def test_a_capture_needs_its_vehicle(run: Run, shared_data: Path, tmp_path: Path
     assert files(tmp_path) == []
 
 
-def test_a_log_that_the_vehicle_options_do_not_apply_to(
-    run: Run, made: Path, tmp_path: Path
-) -> None:
+def test_vehicle_options_do_not_apply_to_a_log(run: Run, made: Path, tmp_path: Path) -> None:
     ran = run(
         "fit", made / "full.parquet", "-o", tmp_path / "m.json", "--vehicle", "leaf_ze0", "--json"
     )

@@ -1,4 +1,4 @@
-"""`cangauge gap`: its JSON, its files, what it tells people, its refusals."""
+"""`cangauge gap`: JSON, files, texts, refusals."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def day(seed: int) -> Log:
 
 @pytest.fixture(scope="module")
 def days(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with three clean days and one on which the voltage reads 6 V too much."""
+    """Folder with three days without a fault and one on which the voltage reads 6 V too high."""
     folder = tmp_path_factory.mktemp("days")
     for seed in (11, 12, 13):
         write_log(day(seed), folder / f"good{seed}.parquet")
@@ -60,13 +60,11 @@ def test_json_report_and_a_model_that_runs(
     assert ran.code == 0
 
 
-def test_people_are_told_the_verdict_and_what_the_logs_cannot_show(
-    run: Run, made: Path, days: Path
-) -> None:
+def test_text_gives_verdict_candidates_and_caveats(run: Run, made: Path, days: Path) -> None:
     ran = run("gap", days / "good11.parquet", "-m", made / "model.json")
     assert ran.code == 0
     for text in (
-        "No gap beyond what the model file states", "probability", "left [V]",
+        "No gap beyond what the model file states", "probability", "left [V]", "closed",
         "What these logs cannot show:", "- No reference logs: whether",
     ):  # fmt: skip
         assert text in ran.out
@@ -81,7 +79,7 @@ def test_a_log_that_is_its_own_reference_is_refused(run: Run, made: Path, days: 
     )  # fmt: skip
     assert ran.code == 2
     assert "trip.csv" in ran.err
-    assert "is a LOG and a reference" in ran.err
+    assert "is both a LOG and a reference" in ran.err
     assert not (days / "never.json").exists()
 
 

@@ -32,18 +32,18 @@ from cangauge.identify.effect_search import parse_effect_ids
 from cangauge.identify.fit import Identification, fit
 from cangauge.inference.rows import DELAYS_S, FitOptions
 from cangauge.model.charge import capacity_from_full_discharge, capacity_from_reference
-from cangauge.report.tables import effect_rows, step_rows
+from cangauge.report.summary import effect_rows, rounded, search_rows
 
 FROM_SOC = "from-soc"
 AUTO = "auto"
 SHOWN_CHOICES = 8
-"""So many of the best choices of delays are shown and reported."""
+"""Number of the best choices of delays to report."""
 
 
 def fit_command(  # noqa: PLR0917 - typer passes options by name
     logs: Annotated[
         list[Path],
-        typer.Argument(metavar="LOG", help="Recorded logs or captures of one pack, one or more."),
+        typer.Argument(metavar="LOG", help="Recorded logs or captures of one pack."),
     ],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="MODEL", help="The model file (JSON).")
@@ -52,8 +52,8 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         str | None,
         typer.Option(
             metavar="A|from-soc",
-            help="Charge from 100 to 0 % [Ah], or `from-soc`: the charge per 100 % of the logs'"
-            " own soc_pct. Default: from a log that runs from full to empty.",
+            help="Charge from 100 to 0 % [Ah], e.g. 51.5; `from-soc` takes the charge per 100 % of"
+            " the logs' soc_pct. Default: from a log that runs from full to empty.",
         ),
     ] = None,
     initial_soc: Annotated[
@@ -63,13 +63,14 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         ),
     ] = None,
     rate_hz: Annotated[
-        float, typer.Option(metavar="HZ", help="Rate of the fit [Hz]; logs are decimated to it.")
+        float, typer.Option(metavar="HZ", help="Rate of the fit [Hz]; faster logs are decimated.")
     ] = 1.0,
     delays: Annotated[
         str,
         typer.Option(
             metavar="S,S,…|auto",
-            help="Delays of the current [s], or `auto`: a search by error on data held out.",
+            help="Delays of the current [s]; `auto` searches those with the smallest error on"
+            " held-out data.",
         ),
     ] = "0,10,30,70",
     epsilon: Annotated[
@@ -82,12 +83,12 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         list[str] | None,
         typer.Option(
             metavar="ID…|auto",
-            help="Effects beyond the coefficients: ids (repeated or separated by commas), or"
-            " `auto`: those that lower the error on data held out by more than chance.",
+            help="Effects to add to the model, separated by commas, e.g. hysteresis; `auto` adds"
+            " those that lower the error on held-out data significantly.",
         ),
     ] = None,
     name: Annotated[
-        str | None, typer.Option(help="Name of the model. Default: the logs' names.")
+        str | None, typer.Option(help="Name of the model. Default: from the logs' names.")
     ] = None,
     vehicle: VehicleOption = None,
     dbc: DbcOption = None,
@@ -99,11 +100,11 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
 ) -> None:
     """Identify the voltage model of a pack from one or more recorded logs.
 
-    Positive current discharges. A log has time_s [s], current_a [A], voltage_v [V],
-    temperature_c [°C] and perhaps soc_pct [%]; `cangauge inspect` tells what a file holds.
+    A log has time_s [s], current_a [A] (positive discharges), voltage_v [V], temperature_c [°C]
+    and optionally soc_pct [%]; `cangauge inspect` shows what a file holds.
 
-    For example:
-
+    Examples
+    --------
     `cangauge fit full_discharge.parquet -o pack.json --report pack.html`
 
     `cangauge fit trip1.csv trip2.csv trip3.csv -o pack.json --capacity-ah from-soc`
@@ -112,7 +113,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge fit trip1.csv trip2.csv trip3.csv -o pack.json --capacity-ah from-soc --effects auto`
 
-    The model file and the report are written only when all has succeeded.
+    Model file and report are written together, or neither.
     """
     capacity = _capacity(capacity_ah)
     if initial_soc is not None:
@@ -266,16 +267,16 @@ def _show(result: Identification, search: DelaySearch | None) -> None:
         f"Model {model.name}",
         ["", "value", "<unit"],
         [
-            ["voltage MAE", number(result.voltage_mae_pct, 3), "%"],
-            ["voltage RMSE", significant(result.voltage_rmse_v, 3), "V"],
-            ["voltage MAE held out", number(model.noise.voltage_mae_pct, 3), "%"],
-            ["SoC by inverse, MAE", number(result.soc_newton_mae_pct, 2), "%"],
+            ["voltage error, MAE", number(result.voltage_mae_pct, 3), "%"],
+            ["voltage error, RMSE", significant(result.voltage_rmse_v, 3), "V"],
+            ["voltage error held out, MAE", number(model.noise.voltage_mae_pct, 3), "%"],
+            ["SoC from voltage, MAE", number(result.soc_newton_mae_pct, 2), "%"],
             ["capacity", number(model.capacity_ah, 2), "Ah"],
-            ["slope resistance", significant(result.slope_ohm, 4), "Ω"],
-            ["  expected (R1 + Σ Rj·ρj)", significant(result.slope_expected_ohm, 4), "Ω"],
+            ["slope resistance", significant(result.slope_ohm, 3), "Ω"],
+            ["  expected (R1 + Σ Rj·ρj)", significant(result.slope_expected_ohm, 3), "Ω"],
             ["condition number", significant(result.solution.condition_number, 2), ""],
-            ["identified over SoC", span(*model.range.soc_pct, 1), "%"],
-            ["identified over temperature", span(*model.range.temperature_c, 1), "°C"],
+            ["identified at SoC", span(*model.range.soc_pct, 1), "%"],
+            ["identified at temperature", span(*model.range.temperature_c, 1), "°C"],
             ["rows used", str(sum(len(item.rows) for item in result.fits)), ""],
         ],
     )
@@ -283,22 +284,21 @@ def _show(result: Identification, search: DelaySearch | None) -> None:
         "Coefficients",
         ["", "value", "std. error", "<unit"],
         [
-            [name, significant(item.value, 5), significant(item.std_error, 2),
-             item.unit.replace("ohm", "Ω")]
+            [name, *rounded(item.value, item.std_error), item.unit.replace("ohm", "Ω")]
             for name, item in model.coefficients.items()
         ],
     )  # fmt: skip
     if result.effects is not None:
         print_table("Effects", *effect_rows(result.effects))
-        print_table("Search for effects", *step_rows(result.effects))
+        print_table("Search for effects", *search_rows(result.effects))
     print_table(
         "Energy at the terminals",
         ["", "value", "<unit"],
         [
-            ["driven", significant(energy.driven_kwh, 4), "kWh"],
-            ["regenerated", significant(energy.regenerated_kwh, 4), "kWh"],
-            ["net", significant(energy.net_kwh, 4), "kWh"],
-            ["Joule heat", significant(energy.heat_kwh, 4), "kWh"],
+            ["driven", significant(energy.driven_kwh, 3), "kWh"],
+            ["regenerated", significant(energy.regenerated_kwh, 3), "kWh"],
+            ["net", significant(energy.net_kwh, 3), "kWh"],
+            ["Joule heat", significant(energy.heat_kwh, 3), "kWh"],
             ["efficiency", number(energy.efficiency_pct, 1), "%"],
         ],
     )

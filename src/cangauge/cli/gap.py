@@ -1,15 +1,14 @@
-"""`cangauge gap`: what a model misses on logs, where, which effect, how far it shrinks."""
+"""`cangauge gap`: diagnose why a model does not explain logs."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from cangauge._formatting import NONE_KNOWN, number, significant
+from cangauge._formatting import NONE_KNOWN, number
 from cangauge._io import atomic_path
 from cangauge.cli.options import (
     DbcOption,
@@ -30,39 +29,40 @@ from cangauge.diagnosis.posterior import NONE, UNKNOWN
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
-from cangauge.report.tables import verdict_limit
+from cangauge.report.summary import headline, next_step, open_question, parameters_text
 
-SHOWN = 5
+SHOWN_CANDIDATES = 5
 SHORTEST_S = 300.0
-"""A log shorter than this shows nothing but its start [s]."""
+"""Shortest log to diagnose [s]: a shorter one shows only its start."""
 
 
 def gap_command(  # noqa: PLR0917 - typer passes options by name
     logs: Annotated[
         list[Path],
-        typer.Argument(metavar="LOG", help="Logs that the model does not explain; one cause."),
+        typer.Argument(metavar="LOG", help="Logs to diagnose; they share one cause."),
     ],
     model: Annotated[Path, typer.Option("-m", "--model", metavar="MODEL", help="Model file.")],
     reference: Annotated[
         list[Path] | None,
         typer.Option(
             metavar="LOG",
-            help="A log on which the model is good; repeat it. It tells its SoC (soc_pct), at least"
-            " at its start, or starts full.",
+            help="A log without a fault; repeat the option. It has soc_pct, at least at its start,"
+            " or starts full.",
         ),
     ] = None,
     initial_soc: Annotated[
         float | None,
-        typer.Option(metavar="P", help="SoC at each diagnosed log's first row [%]."),
+        typer.Option(metavar="P", help="SoC at the first row of each diagnosed log [%], e.g. 80."),
     ] = None,
     capacity_ah: Annotated[
         float | None,
         typer.Option(
-            metavar="A", help="Capacity instead of the model's, for all logs and --extended [Ah]."
+            metavar="A", help="Charge from 100 to 0 % [Ah], in place of the model's, for all logs."
         ),
     ] = None,
     extended: Annotated[
-        Path | None, typer.Option(metavar="MODEL", help="Write the extended model here.")
+        Path | None,
+        typer.Option(metavar="MODEL", help="Write the model extended by the cause here."),
     ] = None,
     vehicle: VehicleOption = None,
     dbc: DbcOption = None,
@@ -72,27 +72,28 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Diagnose the gap between a model and logs: where, which effect, how far it shrinks.
+    """Diagnose why a model does not explain logs: how large the gap is, where, and its cause.
 
-    The verdict is an effect, `none` (no gap beyond what the references show) or `unknown` (a gap
-    of which no effect in the library is likely to be the cause). It is early work: the README says
-    how often it is right. Give at least three references, more are better; without any, the error
-    that the model file states is what is expected of logs without a cause. Logs of 10 minutes and
-    more can be judged, better of an hour, with changing load and SoC. Positive current discharges.
+    The verdict is an effect, `none` (no significant gap) or `unknown` (a gap without a likely cause
+    in the library), with its probability; the documentation states how often it is right. Give at
+    least three references, better more; without any, the error that the model file states is taken
+    as normal. A log needs 10 minutes, better an hour, with changing load and SoC. Positive current
+    discharges.
 
-    For example:
-
+    Examples
+    --------
     `cangauge gap cold1.csv cold2.csv -m pack.json --reference mild1.csv --reference mild2.csv
     --reference mild3.csv --report gap.html --extended cold.json`
     """
     given = list(reference or [])
-    _check_apart(logs, given)
+    _refuse_common(logs, given)
     check_outputs([report, extended], [*logs, *given, model])
     model_file = Model.load(model)
     if initial_soc is not None:
         within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
     if capacity_ah is not None:
-        model_file = _with_capacity(model_file, capacity_ah)
+        within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
+        model_file = model_file.model_copy(update={"capacity_ah": capacity_ah})
 
     def read(path: Path) -> Log:
         return load_log(
@@ -113,10 +114,12 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
             better = model_file_of(found.extension, model_file, found.extended_rmse_v)
             stack.enter_context(atomic_path(extended)).write_text(better.to_json())
         if report is not None:
-            # Drawing is slow to import; the diagnosis does without.
+            # bokeh takes half a second to import.
             from cangauge.report.diagnosis import gap_report  # noqa: PLC0415
+            from cangauge.report.page import InputFile  # noqa: PLC0415
 
-            stack.enter_context(atomic_path(report)).write_text(gap_report(found))
+            page = gap_report(found, InputFile.of_model(model_file, model))
+            stack.enter_context(atomic_path(report)).write_text(page, encoding="utf-8")
     if json_output:
         emit_json(found.to_dict(None if extended is None else str(extended)))
         return
@@ -126,40 +129,22 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
             note(f"wrote {written}")
 
 
-def _with_units(parameters: Mapping[str, dict[str, Any]]) -> str:
-    """Return parameters with their 95 % intervals, where they have any."""
-    said = []
-    for name, told in parameters.items():
-        unit = "" if told["unit"] == "1" else f" {told['unit']}"
-        within = ""
-        if told["ci"] is not None:
-            low, high = (significant(value, 3) for value in told["ci"])
-            within = f" ({low} … {high})"
-        said.append(f"{name} {significant(told['value'], 3)}{unit}{within}")
-    return ", ".join(said)
-
-
-def _check_apart(logs: list[Path], references: list[Path]) -> None:
+def _refuse_common(logs: list[Path], references: list[Path]) -> None:
     known = {path.resolve() for path in references}
     for path in logs:
         if path.resolve() in known:
             raise InputError(
-                "is a LOG and a reference: what it shows would be clean and a gap at once",
+                "is both a LOG and a reference: a reference must be without the fault",
                 source=path,
                 field="--reference",
                 cure="give it as one of them",
             )
 
 
-def _with_capacity(model: Model, capacity_ah: float) -> Model:
-    within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
-    return model.model_copy(update={"capacity_ah": capacity_ah})
-
-
 def _long_enough(log: Log) -> Log:
     if log.duration_s < SHORTEST_S:
         raise InputError(
-            f"{log.duration_s:.0f} s of data show nothing but the start: nothing can be concluded",
+            f"{log.duration_s:.0f} s are too short: nothing can be concluded",
             source=log.source or log.name,
             cure=f"give a log of at least {SHORTEST_S / 60.0:.0f} min, better half an hour with"
             " changing load and SoC",
@@ -168,29 +153,36 @@ def _long_enough(log: Log) -> Log:
 
 
 def _show(found: Diagnosis) -> None:
-    typer.echo(in_words(found))
-    if open_question := verdict_limit(found):
-        typer.echo(open_question)
+    for sentence in (
+        headline(found),
+        in_words(found),
+        open_question(found),
+        next_step(found),
+    ):
+        if sentence:
+            typer.echo(sentence)
     rows = []
-    for item in found.candidates[:SHOWN]:
+    for item in found.candidates[:SHOWN_CANDIDATES]:
         closed = item["closed_fraction"]
         rows.append(
             [
                 str(item["effect"]),
-                f"{item['probability']:.2f}",
+                number(item["probability"], 2),
                 number(item["log_bayes_factor"], 1),
                 number(item["rmse_v"], 2),
-                NONE_KNOWN if closed is None else f"{100.0 * closed:.0f} %",
+                NONE_KNOWN if closed is None else number(100.0 * closed, 0, "%"),
             ]
         )
     for answer in (UNKNOWN, NONE):
-        chance = f"{found.verdict.chances[answer]:.2f}"
-        rows.append([answer, chance, NONE_KNOWN, NONE_KNOWN, NONE_KNOWN])
-    headings = ["effect", "probability", "evidence [ln]", "left [V]", "closed"]
-    print_table("Candidates; error left, and gap closed, on rows held out", headings, rows)
+        probability = number(found.verdict.chances[answer], 2)
+        rows.append([answer, probability, NONE_KNOWN, NONE_KNOWN, NONE_KNOWN])
+    headings = ["cause", "probability", "evidence", "left [V]", "closed"]
+    print_table(
+        "Candidates: log evidence; error left and gap closed on held-out rows", headings, rows
+    )
     for item in found.candidates:
         if item["effect"] in found.extension.cause:
-            typer.echo(f"{item['effect']}: {_with_units(item['parameters'])}")
+            typer.echo(f"{item['effect']}: {parameters_text(item['parameters'])}")
     if found.limits:
         typer.echo("What these logs cannot show:")
     for sentence in found.limits:

@@ -1,7 +1,4 @@
-"""Pictures of a check: confusion matrix, reliability, detection against the gap's size.
-
-The page of `cangauge gap-check`: what it must show, confusion, reliability, detection.
-"""
+"""The page of `cangauge gap-check`: targets, confusion matrix, reliability, detection."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ import numpy as np
 from bokeh.models import ColumnDataSource, FactorRange, LinearColorMapper, Range1d, Whisker
 
 from cangauge._formatting import number
-from cangauge.report.charts import BLUE, GREEN, GREY, ORANGE, Pen, Plot, add_line, plane
+from cangauge.report.charts import BLUE, GREEN, GREY, ORANGE, Pen, Plot, add_line, new_figure
 from cangauge.report.page import (
     Block,
     Bullets,
@@ -28,149 +25,8 @@ from cangauge.validation.plan import EFFECTS
 from cangauge.validation.score import CRASHED, LEAST_GAP, NONE, UNKNOWN
 from cangauge.validation.tables import entries_of, limits, measured, percent
 
-# --- Pictures of a check: confusion matrix, reliability, detection against the gap's size
-
 _SHADES: Final = ("#ffffff", "#deebf7", "#c6dbef", "#9ecae1", "#6baed6", "#4292c6", "#2171b5")
 _ROW_PX: Final = 22
-
-
-def confusion_figure(confusion: Mapping[str, Mapping[str, int]]) -> Figure:
-    """Return the confusion matrix: a row for each truth, a column for each verdict.
-
-    Parameters
-    ----------
-    confusion : mapping
-        Truth → verdict → how often.
-    """
-    order = [*EFFECTS, NONE, UNKNOWN, CRASHED]
-    said = {verdict for row in confusion.values() for verdict in row}
-    truths = sorted(confusion, key=lambda name: (name not in order, _place(order, name), name))
-    verdicts = [name for name in order if name in said or name in confusion]
-    cells = [
-        (truth, verdict, count, count / sum(row.values()))
-        for truth, row in confusion.items()
-        for verdict, count in row.items()
-    ]
-    plot = plane(
-        ("verdict", "truth"),
-        "@truth: @verdict, @count of @of",
-        units=("", ""),
-        height=170 + _ROW_PX * len(truths),
-        x_range=FactorRange(factors=verdicts),
-        y_categories=truths[::-1],
-    )
-    source = ColumnDataSource(
-        {
-            "truth": [cell[0] for cell in cells],
-            "verdict": [cell[1] for cell in cells],
-            "count": [cell[2] for cell in cells],
-            "of": [sum(confusion[cell[0]].values()) for cell in cells],
-            "share": [cell[3] for cell in cells],
-            "ink": ["#ffffff" if cell[3] > 0.6 else "#1c2430" for cell in cells],
-            "edge": [GREEN if cell[0] == cell[1] else GREY for cell in cells],
-        }
-    )
-    shades = LinearColorMapper(palette=list(_SHADES), low=0.0, high=1.0)
-    plot.rect(
-        x="verdict", y="truth", width=0.94, height=0.9, source=source, line_color="edge",
-        fill_color={"field": "share", "transform": shades},
-    )  # fmt: skip
-    plot.text(
-        x="verdict", y="truth", text="count", source=source, text_align="center",
-        text_baseline="middle", text_font_size="11px", text_color="ink",
-    )  # fmt: skip
-    plot.xaxis.major_label_orientation = 0.9
-    plot.xgrid.grid_line_color = plot.ygrid.grid_line_color = None
-    return Figure(
-        "What was said of what",
-        plot,
-        "Numbers count cases; the shade is the share of the row. Right verdicts have a green edge.",
-    )
-
-
-def reliability_figure(bins: Sequence[Mapping[str, Any]]) -> Figure:
-    """Return how often verdicts are right against the probability that they state.
-
-    Parameters
-    ----------
-    bins : sequence of mapping
-        Those of `score.reliability` that hold cases.
-    """
-    plot = plane(
-        ("stated probability", "share that is right"),
-        "stated @x{0.00}: right @y{0.00} of @of",
-        units=("", ""),
-        height=340,
-        x_range=Range1d(0.0, 1.0),
-    )
-    add_line(plot, "perfect", np.array([0.0, 1.0]), np.array([0.0, 1.0]), Pen(GREY, dash="dashed"))
-    _points(
-        plot,
-        "verdicts",
-        [entry["stated"] for entry in bins],
-        [entry["right"] for entry in bins],
-        BLUE,
-    )
-    plot.y_range = Range1d(-0.03, 1.03)
-    return Figure(
-        "Reliability",
-        plot,
-        "Above the dashed line verdicts are right more often than they claim, below less often."
-        " Bars are 95 % intervals.",
-    )
-
-
-def gap_figure(by_gap: Sequence[Mapping[str, Any]]) -> Figure:
-    """Return how often a gap is found, and its cause named, against its size.
-
-    Parameters
-    ----------
-    by_gap : sequence of mapping
-        Of `score.score`, one for each range of the gap.
-    """
-    there = [entry for entry in by_gap if entry["top1"]["of"]]
-    plot = plane(
-        ("gap in floors (middle of its range)", "share of cases"),
-        "$name: @y{0.00} of @of",
-        units=("", ""),
-    )
-    for nudge, key, name, color in (
-        (0.98, "detected", "a gap is found", GREY),
-        (1.0, "top1_pair", "cause, pairs counted", BLUE),
-        (1.02, "top1", "cause, strictly", ORANGE),
-    ):
-        middle = [nudge * 0.5 * sum(entry["gap_in_floors"]) for entry in there]
-        _points(plot, name, middle, [entry[key] for entry in there], color)
-    plot.y_range = Range1d(-0.03, 1.03)
-    return Figure("By size of the gap", plot, "Bars are 95 % intervals.")
-
-
-def _points(
-    plot: Plot, name: str, x: Sequence[float], shares: Sequence[Mapping[str, Any]], color: str
-) -> None:
-    """Draw shares with their intervals."""
-    y = [item["value"] for item in shares]
-    add_line(plot, name, np.array(x), np.array(y), Pen(color))
-    source = ColumnDataSource(
-        {
-            "x": list(x),
-            "y": y,
-            "low": [item["ci"][0] for item in shares],
-            "high": [item["ci"][1] for item in shares],
-            "of": [item["of"] for item in shares],
-        }
-    )
-    plot.scatter(x="x", y="y", source=source, size=7, color=color, name=name)
-    whisker = Whisker(base="x", upper="high", lower="low", source=source, line_color=color)
-    whisker.upper_head.line_color = whisker.lower_head.line_color = color
-    plot.add_layout(whisker)
-
-
-def _place(order: Sequence[str], name: str) -> int:
-    return order.index(name) if name in order else len(order)
-
-
-# --- The page of `cangauge gap-check`: what it must show, confusion, reliability, detection
 
 Result = Mapping[str, Any]
 
@@ -181,24 +37,28 @@ def check_report(result: Result) -> str:
     Parameters
     ----------
     result : mapping
-        What `cangauge gap-check --json` prints.
+        As `cangauge gap-check --json` prints it.
     """
     return render(check_page(result))
 
 
 def check_page(result: Result) -> Page:
-    """Return the page of a check."""
+    """Return the report's content (see `check_report`); `figures` holds the bokeh figures."""
     seeds = "a release's final seeds" if result["final"] else f"development seed {result['seed']}"
-    sections = [Section("What it must show", [_targets(result["targets"])])]
+    sections = [Section("Targets", [_targets(result["targets"])])]
     sections += [
         Section(name, _protocol(items)) for name, items in sorted(result["protocols"].items())
     ]
     if result["later"]:
         sections.append(Section("Extended models on further logs", _later(result["later"])))
-    sections.append(Section("How far probabilities can be trusted", _reliability(result)))
-    sections.append(Section("How it was done", _done(result)))
+    sections.append(Section("Reliability of the probabilities", _reliability(result)))
+    sections.append(Section("Method", _method(result)))
+    targets = result["targets"]
     return Page(
         title="Withheld check of the diagnosis",
+        lead=f"{sum(row['met'] for row in targets)} of {len(targets)} targets met."
+        if targets
+        else "",
         subtitle=f"Causes drawn from {seeds}, sealed, diagnosed from the logs alone, then scored."
         " Shares with 95 % intervals.",
         tiles=_tiles(result),
@@ -213,7 +73,7 @@ def _tiles(result: Result) -> list[Tile]:
     tiles = [
         Tile("Diagnoses", str(len(result["cases"])), f"{len(result['crashed'])} crashed"),
         Tile("Targets met", f"{sum(row['met'] for row in targets)} of {len(targets)}"),
-        Tile("Brier score", number(brier["value"], 3), "0 is perfect, 0.25 a coin"),
+        Tile("Brier score", number(brier["value"], 3), "0 is perfect, 0.25 is chance"),
     ]
     if seconds is not None:
         tiles.append(
@@ -226,9 +86,9 @@ def _tiles(result: Result) -> list[Tile]:
 
 def _targets(rows: Sequence[Result]) -> Block:
     if not rows:
-        return Paragraph("This run was of none of what has a target.")
+        return Paragraph("This run covers no target.")
     return Table(
-        ["figure", "measured (95 %)", "wanted", "met"],
+        ["figure", "measured (95 %)", "target", "met"],
         [[row["name"], measured(row), limits(row), "yes" if row["met"] else "NO"] for row in rows],
     )
 
@@ -240,18 +100,18 @@ def _protocol(items: Result) -> list[Block]:
         blocks.append(
             Paragraph(
                 f"{items['below_range']} of {items['cases']} cases have a gap below {LEAST_GAP}"
-                " floors, since physics allows no larger one on their days. They are in no share of"
-                " effects."
+                " floors, the largest that is physical on their days. The shares by effect exclude"
+                " them."
             )
         )
     if items["confusion"]:
-        blocks.append(confusion_figure(items["confusion"]))
+        blocks.append(_confusion_figure(items["confusion"]))
     if "by_gap" in items:
-        blocks.append(gap_figure(items["by_gap"]))
+        blocks.append(_gap_size_figure(items["by_gap"]))
     if items.get("coverage", {}).get("by_parameter"):
         blocks.append(
             Table(
-                ["parameter", "interval holds the truth", "cases"],
+                ["parameter", "interval covers the truth", "cases"],
                 [
                     [name, percent(item), str(item["of"])]
                     for name, item in items["coverage"]["by_parameter"].items()
@@ -283,34 +143,145 @@ def _later(later: Result) -> list[Block]:
                     "EKF SoC MAE, plain [%]", "EKF SoC MAE, extended [%]",
                 ],
                 rows,
-                note="Voltage at the counted SoC; the EKF's initial SoC is withheld, and it is"
-                " judged after 5 minutes.",
+                note="Voltage at the counted SoC; EKF after 5 minutes, initial SoC withheld.",
             )
         )  # fmt: skip
     return blocks
 
 
 def _reliability(result: Result) -> list[Block]:
-    said = [entry for entry in result["reliability"]["bins"] if entry["right"]["of"]]
-    if not said:
-        return [Paragraph("No verdict was given.")]
-    return [reliability_figure(said)]
+    bins = [entry for entry in result["reliability"]["bins"] if entry["right"]["of"]]
+    return [_reliability_figure(bins) if bins else Paragraph("No case gave a verdict.")]
 
 
-def _done(result: Result) -> list[Block]:
+def _method(result: Result) -> list[Block]:
     cost = result["cost"]
     lines = [
-        f"SHA-256 of the sealed causes, shown before the diagnosis: {result['labels_sha256']}.",
-        f"{result['jobs']} diagnosing processes, each with the logs, the model and a request.",
-        "A gap is counted in what a model of training and references misses on clean days that"
-        " it has not seen.",
-        "Shares have Wilson's intervals, medians and the Brier score bootstrap ones.",
+        f"SHA-256 of the sealed causes, published before the diagnosis: {result['labels_sha256']}.",
+        f"{result['jobs']} diagnosing processes, each with logs, model and request alone.",
+        "A floor, the unit of a gap, is the error of a model of training and reference logs on"
+        " unseen days without a fault.",
+        "Intervals: Wilson's for shares, bootstrap for medians and the Brier score.",
         "A case that crashes counts as wrong.",
     ]
     if cost["peak_mib"] is not None:
         lines.append(
-            f"Memory of a diagnosis: median {cost['peak_mib']['median']:.0f} MiB,"
+            f"Peak memory of a diagnosis: median {cost['peak_mib']['median']:.0f} MiB,"
             f" at most {cost['peak_mib']['max']:.0f} MiB."
         )
     lines += [f"Crashed: {item['case']}: {item['error']}" for item in result["crashed"]]
     return [Bullets(lines)]
+
+
+def _confusion_figure(confusion: Mapping[str, Mapping[str, int]]) -> Figure:
+    """Draw a row for each truth and a column for each verdict, from their counts."""
+    order = {name: at for at, name in enumerate([*EFFECTS, NONE, UNKNOWN, CRASHED])}
+    given = {verdict for row in confusion.values() for verdict in row}
+    truths = sorted(confusion, key=lambda name: (order.get(name, len(order)), name))
+    verdicts = [name for name in order if name in given or name in confusion]
+    cells = [
+        (truth, verdict, count, count / sum(row.values()))
+        for truth, row in confusion.items()
+        for verdict, count in row.items()
+    ]
+    plot = new_figure(
+        ("verdict", "truth"),
+        "@truth: @verdict, @count of @of",
+        units=("", ""),
+        height=170 + _ROW_PX * len(truths),
+        x_range=FactorRange(factors=verdicts),
+        y_categories=truths[::-1],
+    )
+    source = ColumnDataSource(
+        {
+            "truth": [cell[0] for cell in cells],
+            "verdict": [cell[1] for cell in cells],
+            "count": [cell[2] for cell in cells],
+            "of": [sum(confusion[cell[0]].values()) for cell in cells],
+            "share": [cell[3] for cell in cells],
+            "ink": ["#ffffff" if cell[3] > 0.6 else "#1c2430" for cell in cells],
+            "edge": [GREEN if cell[0] == cell[1] else GREY for cell in cells],
+        }
+    )
+    shades = LinearColorMapper(palette=list(_SHADES), low=0.0, high=1.0)
+    plot.rect(
+        x="verdict", y="truth", width=0.94, height=0.9, source=source, line_color="edge",
+        fill_color={"field": "share", "transform": shades},
+    )  # fmt: skip
+    plot.text(
+        x="verdict", y="truth", text="count", source=source, text_align="center",
+        text_baseline="middle", text_font_size="11px", text_color="ink",
+    )  # fmt: skip
+    plot.xaxis.major_label_orientation = 0.9
+    plot.xgrid.grid_line_color = plot.ygrid.grid_line_color = None
+    return Figure(
+        "Verdict against truth",
+        plot,
+        "Numbers of cases, shaded by their share of the row. Correct verdicts have a green edge.",
+    )
+
+
+def _reliability_figure(bins: Sequence[Result]) -> Figure:
+    """Draw the share of correct verdicts against the stated probability, over bins with cases."""
+    plot = new_figure(
+        ("stated probability", "share that is correct"),
+        "stated @x{0.00}: correct @y{0.00} of @of",
+        units=("", ""),
+        height=340,
+        x_range=Range1d(0.0, 1.0),
+    )
+    add_line(plot, "perfect", np.array([0.0, 1.0]), np.array([0.0, 1.0]), Pen(GREY, dash="dashed"))
+    _points(
+        plot,
+        "verdicts",
+        [entry["stated"] for entry in bins],
+        [entry["right"] for entry in bins],
+        BLUE,
+    )
+    plot.y_range = Range1d(-0.03, 1.03)
+    return Figure(
+        "Reliability",
+        plot,
+        "Above the dashed line verdicts are correct more often than stated, below it less often."
+        " Bars are 95 % intervals.",
+    )
+
+
+def _gap_size_figure(by_gap: Sequence[Result]) -> Figure:
+    """Draw how often a gap is detected and its cause named, over ranges of its size."""
+    by_gap = [entry for entry in by_gap if entry["top1"]["of"]]
+    plot = new_figure(
+        ("gap in floors (middle of its range)", "share of cases"),
+        "$name: @y{0.00} of @of",
+        units=("", ""),
+    )
+    for shift, key, name, color in (
+        (0.98, "detected", "gap detected", GREY),
+        (1.0, "top1_pair", "cause named, pairs count", BLUE),
+        (1.02, "top1", "cause named, alone", ORANGE),
+    ):
+        middle = [shift * 0.5 * sum(entry["gap_in_floors"]) for entry in by_gap]
+        _points(plot, name, middle, [entry[key] for entry in by_gap], color)
+    plot.y_range = Range1d(-0.03, 1.03)
+    return Figure("Detection by size of the gap", plot, "Bars are 95 % intervals.")
+
+
+def _points(
+    plot: Plot, name: str, x: Sequence[float], shares: Sequence[Mapping[str, Any]], color: str
+) -> None:
+    """Draw shares with their 95 % intervals."""
+    y = [item["value"] for item in shares]
+    add_line(plot, name, np.array(x), np.array(y), Pen(color))
+    source = ColumnDataSource(
+        {
+            "x": list(x),
+            "y": y,
+            "low": [item["ci"][0] for item in shares],
+            "high": [item["ci"][1] for item in shares],
+            "of": [item["of"] for item in shares],
+        }
+    )
+    plot.scatter(x="x", y="y", source=source, size=7, color=color, name=name)
+    whisker = Whisker(base="x", upper="high", lower="low", source=source, line_color=color)
+    whisker.upper_head.line_color = whisker.lower_head.line_color = color
+    plot.add_layout(whisker)

@@ -1,11 +1,10 @@
-"""When an estimate was valid and when not, drawn as bars over time with the reasons in words.
-
-The report of an estimate: SoC against the reference, and how far each value can be trusted.
-"""
+"""The page of `cangauge estimate`: SoC against the reference, and when the estimate was valid."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
 
 import numpy as np
 from bokeh.models import ColumnDataSource
@@ -13,11 +12,9 @@ from numpy.typing import NDArray
 
 from cangauge._formatting import duration, number, span
 from cangauge._typing import FloatArray
-from cangauge.estimate.offline import EstimateTable, Scores
-from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimate.offline import EstimateTable
 from cangauge.estimate.validity import REASON_WORDS, Reason, Status, reason_name
 from cangauge.inference.rows import running_rows
-from cangauge.model.model_file import Model
 from cangauge.report.charts import (
     AMBER,
     BLACK,
@@ -28,17 +25,16 @@ from cangauge.report.charts import (
     PURPLE,
     Pen,
     Plot,
-    Recorded,
     TimeFigures,
-    Timeline,
     add_zero,
-    frame,
-    plane,
+    new_figure,
+    set_y_limits,
 )
 from cangauge.report.page import (
     Block,
     Bullets,
     Figure,
+    InputFile,
     Page,
     Paragraph,
     Section,
@@ -47,196 +43,117 @@ from cangauge.report.page import (
     reconstruction_banners,
     render,
 )
+from cangauge.service.offline import Recorded, RecordedEstimate
 
-# --- When an estimate was valid and when not, drawn as bars over time with the reasons in words
-
-STATUS_COLORS = {
+_METHODS: Final = {
+    "ekf": "an extended Kalman filter (EKF) over voltage and charge",
+    "newton": "the inverse of the voltage model (Newton)",
+    "coulomb": "coulomb counting",
+}
+_STATUS_COLORS: Final = {
     Status.INITIALISING: GREY,
     Status.VALID: GREEN,
     Status.DEGRADED: AMBER,
     Status.INVALID: BLACK,
 }
-
-SPANS_AT_MOST = 500
-"""Gaps shorter than this part of the time axis are not drawn: no screen shows them."""
-
-
-def status_figure(log: Recorded, table: EstimateTable, time: TimeFigures) -> Figure:
-    """Return a row of bars for the status and one for each reason that ever was set."""
-    reasons = _seen(table)
-    names = ["status", *(reason_name(reason) for reason in reasons)]
-    plot = plane(
-        (time.timeline.label, ""),
-        f"@what<br>@left{{0.[00]}} … @right{{0.[00]}} {time.timeline.unit}",
-        units=("", ""),
-        height=76 + 30 * len(names),
-        x_range=time.x_range,
-        y_categories=names[::-1],
-    )
-    at = time.timeline.at(0, log.time_s)
-    for status in Status:
-        spans = _stretches(at, table.status == status)
-        _add_bars(plot, spans, ("status", status.name.lower()), STATUS_COLORS[status])
-    for reason, name in zip(reasons, names[1:], strict=True):
-        _add_bars(plot, _stretches(at, (table.reasons & reason) != 0), (name, name), AMBER)
-    plot.ygrid.grid_line_color = None
-    return Figure(
-        "Status over time",
-        plot,
-        "Green is valid, amber degraded, grey initialising, black invalid; below, when each reason"
-        " held.",
-    )
+_MAX_BARS: Final = 500
+"""Gaps shorter than the time axis over this are closed: no screen shows them."""
 
 
-def reason_table(table: EstimateTable) -> Table:
-    """Return the share of samples of each status and each reason, with its meaning."""
-    rows = [
-        [status.name.lower(), _share(table.status == status), ""]
-        for status in Status
-        if np.any(table.status == status)
-    ]
-    rows += [
-        [reason_name(reason), _share((table.reasons & reason) != 0), REASON_WORDS[reason]]
-        for reason in _seen(table)
-    ]
-    return Table(["status or reason", "share of samples", "meaning"], rows)
-
-
-def _seen(table: EstimateTable) -> list[Reason]:
-    return [reason for reason in Reason if np.any(table.reasons & reason)]
-
-
-def _share(mask: NDArray[np.bool_]) -> str:
-    return number(100.0 * float(mask.mean()), 2, "%")
-
-
-def _add_bars(
-    plot: Plot, spans: tuple[FloatArray, FloatArray], words: tuple[str, str], color: str
-) -> None:
-    """Draw one bar for each stretch of time, in the row and with the hover text of `words`."""
-    left, right = spans
-    if not left.size:
-        return
-    row, what = words
-    columns = {"left": left, "right": right, "row": [row] * left.size, "what": [what] * left.size}
-    plot.hbar(
-        y="row",
-        left="left",
-        right="right",
-        height=0.62,
-        fill_color=color,
-        line_color=color,  # a single sample must still be seen
-        source=ColumnDataSource(columns),
-    )
-
-
-def _stretches(at: FloatArray, mask: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
-    """Return where `mask` begins and ceases to hold; each row lasts until the next one."""
-    change = np.diff(np.concatenate(([0], mask.astype(np.int8), [0])))
-    begin, end = np.flatnonzero(change == 1), np.flatnonzero(change == -1)
-    left, right = at[begin], at[np.minimum(end, at.size - 1)]
-    if left.size > 1:
-        least = (at[-1] - at[0]) / SPANS_AT_MOST
-        apart = left[1:] - right[:-1] >= least
-        left, right = left[np.r_[True, apart]], right[np.r_[apart, True]]
-    return left, right
-
-
-# --- The report of an estimate: SoC against the reference, and how far each value can be tru…
-
-METHOD_WORDS = {
-    "ekf": "fusion (EKF) of voltage and charge",
-    "newton": "inverse of the voltage model (Newton)",
-    "coulomb": "Coulomb counting",
-}
-
-
-def estimate_report(
-    log: Recorded,
-    table: EstimateTable,
-    scores: Scores,
-    model: Model,
-    settings: EstimatorSettings | None = None,
-) -> str:
+def estimate_report(estimate: RecordedEstimate, model_path: Path | None = None) -> str:
     """Return the report of an estimate as one self-contained HTML page.
 
     Parameters
     ----------
-    log : Recorded
-        What was estimated, n rows: a log, or the samples of a capture.
-    table : EstimateTable
-        Its estimates, n rows.
-    scores : Scores
-    model : Model
-    settings : EstimatorSettings, optional
+    estimate : RecordedEstimate
+    model_path : Path, optional
+        The model's file, to name it by its SHA-256.
     """
-    return render(estimate_page(log, table, scores, model, settings))
+    return render(estimate_page(estimate, model_path))
 
 
-def estimate_page(
-    log: Recorded,
-    table: EstimateTable,
-    scores: Scores,
-    model: Model,
-    settings: EstimatorSettings | None = None,
-    *,
-    title: str | None = None,
-    first: Sequence[Section] = (),
-) -> Page:
-    """Return the report's content (see `estimate_report`), for those who want to add to it.
-
-    Parameters
-    ----------
-    title : str, optional
-        In place of "State of charge of <log>".
-    first : sequence of Section
-        What to show before the rest.
-    """
-    settings = settings or EstimatorSettings()
-    time = TimeFigures(Timeline.of([log]))
+def estimate_page(estimate: RecordedEstimate, model_path: Path | None = None) -> Page:
+    """Return the report's content (see `estimate_report`); `figures` holds the bokeh figures."""
+    log, model, settings = estimate.recorded, estimate.model, estimate.settings
+    time = TimeFigures([log])
     sections = [
-        *first,
-        Section("State of charge", _soc(log, table, time)),
-        *_scores(log, table, scores),
-        Section("Voltage", _voltage(log, table, time)),
+        Section("State of charge", _soc(estimate, time)),
+        *_errors(estimate),
+        Section("Voltage", _voltage(log, estimate.table, time)),
         Section("Input", _input(log, time)),
-        Section("Status", [status_figure(log, table, time), reason_table(table)]),
-        Section("Model and settings", _settings(log, model, settings)),
+        Section("Status", [_status_figure(log, estimate.table, time), _reasons(estimate.table)]),
+        Section("Model and settings", _settings(estimate)),
     ]
     return Page(
-        title=title or f"State of charge of {log.name}",
-        subtitle=f"{duration(log.duration_s)}, {len(log):,} samples, by"
-        f" {METHOD_WORDS[settings.method]} with the model {model.name}."
-        " Positive current discharges.",
-        tiles=_tiles(log, table, scores),
+        title=f"State of charge of {log.name}",
+        lead=_lead(estimate),
+        subtitle=f"{duration(log.duration_s)}, {len(log):,} samples, estimated by"
+        f" {_METHODS[settings.method]} with the model {model.name}.",
+        tiles=_tiles(estimate),
         sections=sections,
-        banners=reconstruction_banners(log.name, log.source, *log.remarks),
+        inputs=[
+            InputFile.of_model(model, model_path),
+            InputFile.of_path("log", log.name, log.source),
+        ],
+        banners=[
+            *reconstruction_banners(log.name, log.source, *log.remarks),
+            *estimate.warnings,
+        ],
     )
 
 
-def _tiles(log: Recorded, table: EstimateTable, scores: Scores) -> list[Tile]:
+def _lead(estimate: RecordedEstimate) -> str:
+    table, scores = estimate.table, estimate.scores
     known = np.flatnonzero(np.isfinite(table.soc_pct))
-    ends = f"{number(table.soc_pct[known[0]], 1)} → {number(table.soc_pct[known[-1]], 1, '%')}" \
-        if known.size else "–"  # fmt: skip
-    std = number(table.soc_std_pct[known[-1]], 2, "%") if known.size else "–"
+    if not known.size:
+        return "No sample gives a state of charge."
+    last = known[-1]
+    text = (
+        f"From {number(table.soc_pct[known[0]], 1)} to {number(table.soc_pct[last], 1)} % SoC"
+        f" (±{number(2.0 * table.soc_std_pct[last], 1, '%')} at the end, 2σ)."
+    )
+    if _reference(estimate.recorded) is not None and scores.soc_mae_pct is not None:
+        text += (
+            f" Mean error against the reference {number(scores.soc_mae_pct, 2, '%')},"
+            f" largest {number(scores.soc_max_pct, 2, '%')}."
+        )
+    return text
+
+
+def _tiles(estimate: RecordedEstimate) -> list[Tile]:
+    table, scores = estimate.table, estimate.scores
+    known = np.flatnonzero(np.isfinite(table.soc_pct))
+    ends, std = "–", "–"
+    if known.size:
+        first, last = known[0], known[-1]
+        ends = f"{number(table.soc_pct[first], 1)} → {number(table.soc_pct[last], 1, '%')}"
+        std = number(table.soc_std_pct[last], 2, "%")
     tiles = [Tile("SoC, start → end", ends, f"σ at the end {std}")]
-    if _reference(log) is not None:
+    if _reference(estimate.recorded) is not None:
         cover = None if scores.cover_2sigma is None else 100.0 * scores.cover_2sigma
         tiles += [
             Tile("SoC error (MAE)", number(scores.soc_mae_pct, 2, "%"),
                  f"largest {number(scores.soc_max_pct, 2, '%')}"),
             Tile("Newton alone (MAE)", number(scores.soc_newton_mae_pct, 2, "%"), "no counting"),
             Tile("Coulomb alone (MAE)", number(scores.soc_coulomb_mae_pct, 2, "%"), "no voltage"),
-            Tile("Within ±2σ", number(cover, 1, "%"), "of compared samples"),
+            Tile("Reference within ±2σ", number(cover, 1, "%"), "of compared samples"),
         ]  # fmt: skip
     tiles += [
-        Tile("Voltage error (MAE)", number(scores.voltage_mae_pct, 3, "%"), "measured − model"),
+        Tile("Voltage error (MAE)", number(scores.voltage_mae_pct, 2, "%"), "measured − model"),
         Tile("Valid", number(100.0 * scores.valid_fraction, 1, "%"), "of all samples"),
     ]
     return tiles
 
 
-def _soc(log: Recorded, table: EstimateTable, time: TimeFigures) -> list[Block]:
+def _reference(log: Recorded) -> FloatArray | None:
+    """Return the reference SoC; None if it is no more than an initial value."""
+    if log.soc_pct is None or np.isfinite(log.soc_pct).sum() < 2:
+        return None
+    return log.soc_pct
+
+
+def _soc(estimate: RecordedEstimate, time: TimeFigures) -> list[Block]:
+    log, table = estimate.recorded, estimate.table
     reference = _reference(log)
     at = log.time_s
     plot = time.plot("state of charge", "%", height=380)
@@ -246,73 +163,83 @@ def _soc(log: Recorded, table: EstimateTable, time: TimeFigures) -> list[Block]:
     if reference is not None:
         time.line(plot, "reference", [(at, reference)], Pen(BLACK, width=2.0))
     time.line(plot, "estimate", [(at, table.soc_pct)], Pen(BLUE, width=2.0))
-    shown = Figure(
+    expected = (
+        "The estimate should follow the reference, which should lie inside the band."
+        if reference is not None
+        else "The log has no reference SoC."
+    )
+    figure = Figure(
         "Estimated state of charge",
         plot,
-        "The estimate should follow the reference, with the reference inside the band nearly"
-        " always. Newton scatters where the voltage is flat; counting drifts."
-        if reference is not None
-        else "The log has no reference SoC to compare with. Newton scatters where the voltage is"
-        " flat; counting drifts.",
+        f"{expected} Newton scatters where the pseudo-OCV is flat; Coulomb counting drifts.",
     )
     if reference is None:
-        return [shown, _uncertainty(log, table, time)]
+        std = time.plot("σ of SoC", "%", height=235)
+        time.line(std, "σ", [(at, table.soc_std_pct)], Pen(BLUE, in_legend=False))
+        return [figure, Figure("Uncertainty", std, "Standard deviation of the estimated SoC.")]
     error = time.plot("SoC error", "%", height=280)
     time.band(error, "±2σ", [(at, *_band(np.zeros_like(at), table.soc_std_pct, -100.0))], BLUE)
-    for name, values, pen in (
+    for name, soc_pct, pen in (
         ("Newton", table.soc_newton_pct, Pen(AMBER, width=0.8, alpha=0.6)),
         ("Coulomb", table.soc_coulomb_pct, Pen(GREEN, dash="dashed")),
         ("estimate", table.soc_pct, Pen(BLUE, width=1.8)),
     ):
-        time.line(error, name, [(at, values - reference)], pen)
-    everyone = (table.soc_newton_pct, table.soc_coulomb_pct, table.soc_pct)
-    _frame_error(error, [values - reference for values in everyone], table.soc_std_pct)
+        time.line(error, name, [(at, soc_pct - reference)], pen)
+    _limit_error(error, table, reference)
     add_zero(error)
     return [
-        shown,
+        figure,
         Figure(
             "Error against the reference",
             error,
-            "Each SoC minus the reference. The band is the estimate's own claim: a line that"
-            " leaves it for long shows an error that the estimate did not expect."
-            " A wide band at the start may reach beyond the frame.",
+            "Each SoC minus the reference. An estimate that leaves the ±2σ band for long has an"
+            " error that its model does not expect. A wide band at the start may extend beyond the"
+            " figure.",
         ),
     ]
 
 
-def _uncertainty(log: Recorded, table: EstimateTable, time: TimeFigures) -> Figure:
-    plot = time.plot("σ of SoC", "%", height=235)
-    time.line(plot, "σ", [(log.time_s, table.soc_std_pct)], Pen(BLUE, in_legend=False))
-    return Figure("Uncertainty", plot, "The estimate's own standard deviation.")
+def _band(center: FloatArray, std: FloatArray, lower_bound: float) -> tuple[FloatArray, FloatArray]:
+    """Return ±2σ around `center`, within `lower_bound` … 100."""
+    return np.maximum(center - 2.0 * std, lower_bound), np.minimum(center + 2.0 * std, 100.0)
 
 
-def _scores(log: Recorded, table: EstimateTable, scores: Scores) -> list[Section]:
-    """Return the section with the error of each way to SoC; none without a reference."""
-    reference = _reference(log)
+def _limit_error(plot: Plot, table: EstimateTable, reference: FloatArray) -> None:
+    """Set the vertical range so that a wide start or a few outliers do not flatten the rest."""
+    methods = (table.soc_newton_pct, table.soc_coulomb_pct, table.soc_pct)
+    sizes = [(np.abs(soc_pct - reference), 0.99) for soc_pct in methods]
+    sizes.append((2.0 * table.soc_std_pct, 0.9))
+    known = [(size[np.isfinite(size)], quantile) for size, quantile in sizes]
+    limit = max((float(np.quantile(size, q)) for size, q in known if size.size), default=1.0)
+    set_y_limits(plot, -max(limit, 0.1), max(limit, 0.1))
+
+
+def _errors(estimate: RecordedEstimate) -> list[Section]:
+    """Return the section with the error of each method; empty without a reference."""
+    table, scores = estimate.table, estimate.scores
+    reference = _reference(estimate.recorded)
     if reference is None:
         return []
     rows = []
-    for name, values, mae in (
+    for name, soc_pct, mae_pct in (
         ("estimate", table.soc_pct, scores.soc_mae_pct),
         ("Newton alone", table.soc_newton_pct, scores.soc_newton_mae_pct),
         ("Coulomb alone", table.soc_coulomb_pct, scores.soc_coulomb_mae_pct),
     ):
-        error = values - reference
+        error = soc_pct - reference
         error = error[np.isfinite(error)]
-        known = error.size > 0
-        rows.append(
-            [
-                name,
-                number(mae, 2),
-                number(float(np.sqrt(np.mean(error**2))) if known else None, 2),
-                number(float(error.mean()) if known else None, 2),
-                number(float(np.abs(error).max()) if known else None, 2),
-                number(float(error[-1]) if known else None, 2),
+        rest: list[float | None] = [None] * 4
+        if error.size:
+            rest = [
+                float(np.sqrt(np.mean(error**2))),
+                float(error.mean()),
+                float(np.abs(error).max()),
+                float(error[-1]),
             ]
-        )
+        rows.append([name, *(number(value, 2) for value in (mae_pct, *rest))])
     head = ["SoC by", "MAE [%]", "RMSE [%]", "mean [%]", "largest [%]", "at the end [%]"]
     note = f"Over {np.isfinite(reference).sum():,} samples with a reference; errors in % SoC."
-    return [Section("How good it is", [Table(head, rows, note)])]
+    return [Section("SoC error", [Table(head, rows, note)])]
 
 
 def _voltage(log: Recorded, table: EstimateTable, time: TimeFigures) -> list[Block]:
@@ -324,24 +251,25 @@ def _voltage(log: Recorded, table: EstimateTable, time: TimeFigures) -> list[Blo
     pen = Pen(PURPLE, width=0.9, in_legend=False)
     time.line(residual, "residual", [(at, table.residual_v)], pen)
     add_zero(residual)
-    beyond = _frame_running(log, table, both, residual)
+    is_limited = _limit_to_running(log, table, both, residual)
     return [
         Figure(
             "Measured and modelled voltage",
             both,
-            f"The model's voltage at the estimated SoC should lie on the measurement.{beyond}",
+            "The model's voltage at the estimated SoC should lie on the measurement."
+            + (" Start-up and shut-down rows lie below the figure." if is_limited else ""),
         ),
         Figure(
             "Measured minus modelled voltage",
             residual,
-            "Scatter about zero is harmless; a lasting bias pulls the SoC, and the filter allows"
-            " for as much of it as the model file states.",
+            "Scatter about zero averages out. A lasting bias shifts the SoC; the filter allows for"
+            " the lasting error that the model file states.",
         ),
     ]
 
 
-def _frame_running(log: Recorded, table: EstimateTable, both: Plot, residual: Plot) -> str:
-    """Keep start-up and shut-down rows out of the frames; say so if there are any."""
+def _limit_to_running(log: Recorded, table: EstimateTable, both: Plot, residual: Plot) -> bool:
+    """Limit the figures to the rows between start-up and shut-down; False if those are all."""
     running = np.isfinite(log.voltage_v)
     measured = int(running.sum())
     if measured:
@@ -349,56 +277,131 @@ def _frame_running(log: Recorded, table: EstimateTable, both: Plot, residual: Pl
     error = np.abs(table.residual_v[running])
     error = error[np.isfinite(error)]
     if int(running.sum()) == measured or not error.size:
-        return ""
+        return False
     shown = np.concatenate([log.voltage_v[running], table.voltage_model_v[running]])
-    frame(both, float(np.nanmin(shown)), float(np.nanmax(shown)))
+    set_y_limits(both, float(np.nanmin(shown)), float(np.nanmax(shown)))
     limit = float(np.quantile(error, 0.9995))
-    frame(residual, -limit, limit)
-    return " Start-up and shut-down rows lie below the frame."
+    set_y_limits(residual, -limit, limit)
+    return True
 
 
 def _input(log: Recorded, time: TimeFigures) -> list[Block]:
     current = time.plot("current", "A", height=235)
-    time.line(
-        current, "current", [(log.time_s, log.current_a)], Pen(BLUE, width=0.9, in_legend=False)
-    )
+    pen = Pen(BLUE, width=0.9, in_legend=False)
+    time.line(current, "current", [(log.time_s, log.current_a)], pen)
     temperature = time.plot("temperature", "°C", height=235)
-    time.line(
-        temperature, "temperature", [(log.time_s, log.temperature_c)],
-        Pen(ORANGE, width=1.2, in_legend=False),
-    )  # fmt: skip
+    pen = Pen(ORANGE, width=1.2, in_legend=False)
+    time.line(temperature, "temperature", [(log.time_s, log.temperature_c)], pen)
     return [
-        Figure("Current", current, "Above zero the pack is discharged, below it is charged."),
+        Figure("Current", current, "Positive current discharges the pack, negative charges it."),
         Figure(
             "Temperature",
             temperature,
-            f"Measured on: {log.temperature_source}. Only within the model's own temperatures is"
-            " the estimate called valid.",
+            f"Measured on: {log.temperature_source}. An estimate is valid only at temperatures that"
+            " the model was identified at.",
         ),
     ]
 
 
-def _settings(log: Recorded, model: Model, settings: EstimatorSettings) -> list[Block]:
-    start = settings.initial_soc_pct
-    given = (
-        "from the first voltages"
-        if start is None
-        else f"{number(start, 2)} ± {number(settings.initial_soc_std_pct, 2, '%')}"
+def _status_figure(log: Recorded, table: EstimateTable, time: TimeFigures) -> Figure:
+    """Return a row of bars for the status and one for each reason that occurs."""
+    reasons = _occurring(table)
+    names = ["status", *map(reason_name, reasons)]
+    timeline = time.timeline
+    plot = new_figure(
+        (timeline.label, ""),
+        f"@what<br>@left{{0.[00]}} … @right{{0.[00]}} {timeline.unit}",
+        units=("", ""),
+        height=76 + 30 * len(names),
+        x_range=time.x_range,
+        y_categories=names[::-1],
     )
+    at = timeline.at(0, log.time_s)
+    for status in Status:
+        intervals = _intervals(at, table.status == status)
+        _add_bars(plot, "status", status.name.lower(), intervals, _STATUS_COLORS[status])
+    for reason, name in zip(reasons, names[1:], strict=True):
+        _add_bars(plot, name, name, _intervals(at, (table.reasons & reason) != 0), AMBER)
+    plot.ygrid.grid_line_color = None
+    return Figure(
+        "Status over time",
+        plot,
+        "Green: valid; amber: degraded; grey: initialising; black: invalid. Below: when each reason"
+        " applied.",
+    )
+
+
+def _add_bars(
+    plot: Plot, row: str, hover: str, intervals: tuple[FloatArray, FloatArray], color: str
+) -> None:
+    left, right = intervals
+    if not left.size:
+        return
+    columns = {"left": left, "right": right, "row": [row] * left.size, "what": [hover] * left.size}
+    plot.hbar(
+        y="row",
+        left="left",
+        right="right",
+        height=0.62,
+        fill_color=color,
+        line_color=color,  # keeps a single sample visible
+        source=ColumnDataSource(columns),
+    )
+
+
+def _intervals(at: FloatArray, mask: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+    """Return where `mask` begins and ceases to hold; each row lasts until the next one."""
+    change = np.diff(np.concatenate(([0], mask.astype(np.int8), [0])))
+    begin, end = np.flatnonzero(change == 1), np.flatnonzero(change == -1)
+    left, right = at[begin], at[np.minimum(end, at.size - 1)]
+    if left.size > 1:
+        apart = left[1:] - right[:-1] >= (at[-1] - at[0]) / _MAX_BARS
+        left, right = left[np.r_[True, apart]], right[np.r_[apart, True]]
+    return left, right
+
+
+def _reasons(table: EstimateTable) -> Table:
+    """Return the share of samples with each status and each reason, with its meaning."""
+    rows = [
+        [status.name.lower(), _share(table.status == status), ""]
+        for status in Status
+        if np.any(table.status == status)
+    ]
+    rows += [
+        [reason_name(reason), _share((table.reasons & reason) != 0), REASON_WORDS[reason]]
+        for reason in _occurring(table)
+    ]
+    return Table(["status or reason", "share of samples", "meaning"], rows)
+
+
+def _occurring(table: EstimateTable) -> Sequence[Reason]:
+    return [reason for reason in Reason if np.any(table.reasons & reason)]
+
+
+def _share(mask: NDArray[np.bool_]) -> str:
+    return number(100.0 * float(mask.mean()), 1, "%")
+
+
+def _settings(estimate: RecordedEstimate) -> list[Block]:
+    log, model, settings = estimate.recorded, estimate.model, estimate.settings
+    initial = "from the first voltages"
+    if settings.initial_soc_pct is not None:
+        std = number(settings.initial_soc_std_pct, 1, "%")
+        initial = f"{number(settings.initial_soc_pct, 1)} ± {std}"
     blocks: list[Block] = [
         Table(
             ["setting", ""],
             [
-                ["method", METHOD_WORDS[settings.method]],
-                ["initial SoC (±1σ)", given],
+                ["method", settings.method],
+                ["initial SoC (±1σ)", initial],
                 ["capacity", number(settings.capacity_ah or model.capacity_ah, 2, "Ah")],
-                ["longest step that is no gap", number(settings.gap_s, 1, "s")],
+                ["a gap is longer than", number(settings.gap_s, 1, "s")],
                 ["model", model.name],
-                ["model's voltage error", number(model.noise.voltage_mae_pct, 3, "%")
-                 + f" on {model.noise.judged_on}"],
-                ["identified over SoC", span(*model.range.soc_pct, 1, "%")],
-                ["identified over temperature", span(*model.range.temperature_c, 1, "°C")],
-                ["identified over current", span(*model.range.current_a, 1, "A")],
+                ["voltage error (MAE) of the model",
+                 f"{number(model.noise.voltage_mae_pct, 2, '%')} on {model.noise.judged_on}"],
+                ["identified at SoC", span(*model.range.soc_pct, 1, "%")],
+                ["identified at temperature", span(*model.range.temperature_c, 1, "°C")],
+                ["identified at current", span(*model.range.current_a, 0, "A")],
                 ["temperature of model / log",
                  f"{model.temperature_source} / {log.temperature_source}"],
             ],
@@ -407,23 +410,3 @@ def _settings(log: Recorded, model: Model, settings: EstimatorSettings) -> list[
     if log.remarks:
         blocks += [Paragraph("Remarks on the log:"), Bullets(log.remarks)]
     return blocks
-
-
-def _reference(log: Recorded) -> FloatArray | None:
-    """Return the reference SoC; None if there is no more of it than a start."""
-    if log.soc_pct is None or np.isfinite(log.soc_pct).sum() < 2:
-        return None
-    return log.soc_pct
-
-
-def _band(middle: FloatArray, std: FloatArray, least: float) -> tuple[FloatArray, FloatArray]:
-    """Return the ends of ±2σ, within `least` … 100."""
-    return np.maximum(middle - 2.0 * std, least), np.minimum(middle + 2.0 * std, 100.0)
-
-
-def _frame_error(plot: Plot, errors: Sequence[FloatArray], std: FloatArray) -> None:
-    """Set the vertical range so that a wide start or a few far values do not flatten the rest."""
-    sizes = [(np.abs(error), 0.99) for error in errors] + [(2.0 * std, 0.9)]
-    known = [(size[np.isfinite(size)], part) for size, part in sizes]
-    limit = max((float(np.quantile(size, part)) for size, part in known if size.size), default=1.0)
-    frame(plot, -max(limit, 0.1), max(limit, 0.1))

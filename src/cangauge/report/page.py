@@ -1,32 +1,33 @@
-"""How a report looks: style sheet, frame of the HTML, theme of the drawings.
+"""A report page: tiles, tables and figures as one HTML file that needs no network.
 
-The frame of every report: one HTML file with tiles, tables and figures, and no network.
-
-Scripts and styles stand in the page, and its content security policy forbids it to load anything,
-so that a report looks the same in a workshop without network and in ten years.
+Scripts and styles are inline and the content security policy forbids any request, so a page reads
+the same in a workshop without network and in ten years.
 """
 
 from __future__ import annotations
 
+import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from html import escape
-from typing import Any
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, ClassVar, Final
 
 from bokeh.document import Document
 from bokeh.embed import components
 from bokeh.resources import Resources
 from bokeh.themes import Theme
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from cangauge import __version__
-from cangauge.report.charts import POINTS_AT_MOST
+from cangauge.model.model_file import Model
+from cangauge.report.charts import MAX_POINTS
 
-# --- How a report looks: style sheet, frame of the HTML, theme of the drawings
+_FONT: Final = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
+"""As in page.css: a canvas does not inherit the page's font."""
 
-FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
-
-THEME = Theme(
+_THEME: Final = Theme(
     json={
         "attrs": {
             "Plot": {
@@ -35,11 +36,11 @@ THEME = Theme(
                 "outline_line_color": "#d5dae1",
             },
             "Axis": {
-                "axis_label_text_font": FONT,
+                "axis_label_text_font": _FONT,
                 "axis_label_text_font_size": "13px",
                 "axis_label_text_font_style": "normal",
                 "axis_label_text_color": "#3b4654",
-                "major_label_text_font": FONT,
+                "major_label_text_font": _FONT,
                 "major_label_text_font_size": "12px",
                 "major_label_text_color": "#3b4654",
                 "axis_line_color": "#aab3bf",
@@ -48,7 +49,7 @@ THEME = Theme(
             },
             "Grid": {"grid_line_color": "#edf0f4"},
             "Legend": {
-                "label_text_font": FONT,
+                "label_text_font": _FONT,
                 "label_text_font_size": "12px",
                 "label_text_color": "#1c2430",
                 "border_line_color": None,
@@ -62,78 +63,41 @@ THEME = Theme(
     }
 )
 
-STYLE = f"""
-:root {{ color-scheme: light; }}
-* {{ box-sizing: border-box; }}
-body {{ margin: 0 auto; max-width: 1180px; padding: 28px 24px 48px; background: #fff;
-  color: #1c2430; font: 15px/1.5 {FONT}; }}
-h1 {{ font-size: 26px; line-height: 1.25; margin: 0 0 4px; }}
-h2 {{ font-size: 19px; margin: 36px 0 10px; padding-top: 14px; border-top: 1px solid #dfe4ea; }}
-h3 {{ font-size: 15px; margin: 0 0 4px; }}
-.subtitle {{ color: #55606e; margin: 0 0 14px; }}
-.banner {{ background: #fff4d6; border-left: 5px solid #e0a100; padding: 10px 14px; margin: 12px 0;
-  font-weight: 600; }}
-.tiles {{ display: grid; grid-template-columns: repeat(auto-fit, minmax(148px, 1fr)); gap: 10px; }}
-.tiles div {{ background: #f5f7fa; border-radius: 8px; padding: 10px 13px; }}
-.tiles span, .tiles small {{ display: block; color: #55606e; font-size: 12.5px;
-  line-height: 1.35; }}
-.tiles b {{ display: block; font-size: 17px; white-space: nowrap;
-  font-variant-numeric: tabular-nums; margin: 2px 0; }}
-nav {{ margin: 16px 0 0; font-size: 13.5px; }}
-nav a {{ color: #0b62a4; text-decoration: none; margin-right: 16px; white-space: nowrap; }}
-figure {{ margin: 14px 0 22px; break-inside: avoid; }}
-figcaption, .note {{ color: #55606e; font-size: 13.5px; margin: 4px 0 0; }}
-.beside {{ display: grid; grid-template-columns: repeat(auto-fit, minmax(400px, 1fr)); gap: 22px; }}
-.beside figure {{ min-width: 0; }}
-.scroll {{ overflow-x: auto; margin: 12px 0 4px; }}
-table {{ border-collapse: collapse; font-size: 13.5px; font-variant-numeric: tabular-nums; }}
-th, td {{ text-align: left; padding: 4px 14px 4px 0; border-bottom: 1px solid #e6eaef;
-  vertical-align: top; }}
-th {{ color: #55606e; font-weight: 600; vertical-align: bottom; }}
-th.n, td.n {{ text-align: right; }}
-ul {{ padding-left: 20px; }}
-footer {{ margin-top: 40px; color: #77818e; font-size: 12.5px; }}
-@media print {{
-  body {{ max-width: none; padding: 0; font-size: 11pt; }}
-  nav {{ display: none; }}
-  figure, tr {{ break-inside: avoid; }}
-  h2, h3 {{ break-after: avoid; }}
-  .tiles div {{ border: 1px solid #dfe4ea; }}
-}}
-"""
-
-FRAME = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; \
-script-src 'unsafe-inline' 'unsafe-eval'; style-src 'unsafe-inline'; img-src data: blob:; \
-font-src data:">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>{style}</style>
-{bokeh}
-</head>
-<body>
-<header>
-<h1>{title}</h1>
-<p class="subtitle">{subtitle}</p>
-{banners}
-<div class="tiles">{tiles}</div>
-<nav>{links}</nav>
-</header>
-{body}
-<footer>Made by cangauge {version}. Positive current discharges. Lines longer than {points} points
-are thinned for drawing to the smallest and largest value of each short stretch, clouds evenly; all
-figures in tiles and tables come from all rows. The time axes move together; click a legend entry
-to hide its line.</footer>
-{script}
-</body>
-</html>
-"""
+_NUMBER: Final = re.compile(r"[−+-]?[\d.,]+([eE][+−-]?\d+)?( ?[%Ω])?|–|")
+"""A table cell that counts as a number: a column of these is set flush right."""
 
 
-# --- The frame of every report: one HTML file with tiles, tables and figures, and no network
+@dataclass(frozen=True)
+class InputFile:
+    """A file that a page was made from.
+
+    Parameters
+    ----------
+    role : str
+        "model", "log", "reference", …
+    name : str
+    sha256 : str, optional
+        In hexadecimal; None where the data did not come from a single file.
+    """
+
+    role: str
+    name: str
+    sha256: str | None = None
+
+    @classmethod
+    def of_path(cls, role: str, name: str, path: str | Path) -> InputFile:
+        """Hash the file at `path`, if it is one."""
+        if not path or not Path(path).is_file():
+            return cls(role, name)
+        with Path(path).open("rb") as file:
+            return cls(role, name, hashlib.file_digest(file, "sha256").hexdigest())
+
+    @classmethod
+    def of_model(cls, model: Model, path: Path | None = None) -> InputFile:
+        """Hash a model's file, or without one the file that it would be written as."""
+        if path is not None:
+            return cls.of_path("model", model.name, path)
+        return cls("model", model.name, hashlib.sha256(model.to_json().encode()).hexdigest())
 
 
 @dataclass(frozen=True)
@@ -147,27 +111,44 @@ class Tile:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of texts; a column that holds nothing but numbers is set flush right."""
+    """A table of texts; columns of numbers are set flush right."""
 
+    kind: ClassVar[str] = "table"
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
     note: str = ""
 
+    @property
+    def is_numeric(self) -> list[bool]:
+        """Whether each column holds nothing but numbers."""
+        columns = list(zip(*self.rows, strict=True)) or [()] * len(self.head)
+        return [bool(column) and all(map(_NUMBER.fullmatch, column)) for column in columns]
+
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """A drawing with its title above and a sentence below that says what to see."""
+    """A bokeh figure with a title above and a caption below.
 
+    Parameters
+    ----------
+    title : str
+    plot : bokeh figure
+        `bokeh.plotting.show(figure.plot)` draws it in a notebook.
+    caption : str
+        What to look for.
+    """
+
+    kind: ClassVar[str] = "figure"
     title: str
     plot: Any
-    """A bokeh model (bokeh ships no types that mypy could follow)."""
-    see: str
+    caption: str
 
 
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """Figures side by side."""
+    """Figures side by side where the page is wide enough."""
 
+    kind: ClassVar[str] = "beside"
     figures: Sequence[Figure]
 
 
@@ -175,6 +156,7 @@ class Beside:
 class Paragraph:
     """Plain text."""
 
+    kind: ClassVar[str] = "paragraph"
     text: str
 
 
@@ -182,6 +164,7 @@ class Paragraph:
 class Bullets:
     """A list of remarks."""
 
+    kind: ClassVar[str] = "bullets"
     items: Sequence[str]
 
 
@@ -198,50 +181,76 @@ class Section:
 
 @dataclass(frozen=True, eq=False)
 class Page:
-    """A whole report."""
+    """A whole report.
+
+    Parameters
+    ----------
+    title : str
+        Names the model or the logs; also the title of the browser's tab.
+    subtitle : str
+    tiles : sequence of Tile
+    sections : sequence of Section
+    lead : str
+        The result in a sentence, above the subtitle.
+    inputs : sequence of InputFile
+        What the page was made from.
+    banners : sequence of str
+        What to know before anything else, such as that a log is a reconstruction.
+    """
 
     title: str
     subtitle: str
     tiles: Sequence[Tile]
     sections: Sequence[Section]
+    lead: str = ""
+    inputs: Sequence[InputFile] = field(default=())
     banners: Sequence[str] = field(default=())
-    """What the reader must know before anything else, such as that a log is a reconstruction."""
+
+    @property
+    def figures(self) -> list[Figure]:
+        """All figures in the order of the page."""
+        return list(self._figures())
+
+    def _figures(self) -> Iterator[Figure]:
+        for section in self.sections:
+            for block in section.blocks:
+                if isinstance(block, Figure):
+                    yield block
+                elif isinstance(block, Beside):
+                    yield from block.figures
 
 
 def render(page: Page) -> str:
-    """Return the page as one self-contained HTML text."""
-    figures = [item for section in page.sections for item in _figures(section)]
-    plots = {f"f{number}": item.plot for number, item in enumerate(figures)}
-    _gather(list(plots.values()))
-    script, divs = components(plots, theme=THEME) if plots else ("", {})
-    # Only bokeh's core is needed: its widgets, tables and formulae would add 2.7 MB.
-    bokeh = Resources(mode="inline", components=["bokeh"]).render() if plots else ""
-    drawn = {id(item): divs[f"f{number}"] for number, item in enumerate(figures)}
-    body = "\n".join(
-        _section(section, number, drawn) for number, section in enumerate(page.sections)
+    """Return the page as one self-contained HTML text, dated now."""
+    figures = page.figures
+    script, drawn, bokeh_js = "", (), ""
+    if figures:
+        _add_to_document([item.plot for item in figures])
+        script, drawn = components([item.plot for item in figures], theme=_THEME)
+        # Only bokeh's core: its widgets, tables and formulae would add 2.7 MB.
+        bokeh_js = Resources(mode="inline", components=["bokeh"]).render()
+    environment = Environment(
+        loader=PackageLoader("cangauge.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    links = " ".join(  # a space to break the line at
-        f'<a href="#s{number}">{escape(section.title)}</a>'
-        for number, section in enumerate(page.sections)
-    )
-    banners = "".join(f'<p class="banner">{escape(text)}</p>' for text in page.banners)
-    return FRAME.format(
-        title=escape(page.title),
-        subtitle=escape(page.subtitle),
-        style=STYLE,
-        bokeh=bokeh,
-        banners=banners,
-        tiles="".join(_tile(tile) for tile in page.tiles),
-        links=links,
-        body=body,
-        script=script,
-        version=escape(__version__),
-        points=POINTS_AT_MOST,
+    style, _, _ = environment.loader.get_source(environment, "page.css")  # type: ignore[union-attr]
+    return environment.get_template("page.html.j2").render(
+        page=page,
+        plots=dict(zip(figures, drawn, strict=True)),
+        style=style,
+        bokeh_js=bokeh_js,
+        bokeh_script=script,
+        version=__version__,
+        made=datetime.now(UTC),
+        max_points=MAX_POINTS,
     )
 
 
-def _gather(plots: Sequence[Any]) -> None:
-    """Put drawings into one document, which bokeh would search anew after each of them."""
+def _add_to_document(plots: Sequence[Any]) -> None:
+    """Add plots to one document at once: bokeh would search it again after each of them."""
     if any(plot.document is not None for plot in plots):
         return  # rendered before
     document = Document()
@@ -250,74 +259,18 @@ def _gather(plots: Sequence[Any]) -> None:
             document.add_root(plot)
 
 
+def joined(names: Sequence[str], at_most: int = 3) -> str:
+    """Return names for a title: the first few, and how many more there are."""
+    if len(names) <= at_most:
+        return ", ".join(names)
+    return f"{', '.join(names[: at_most - 1])} and {len(names) - at_most + 1} more"
+
+
 def reconstruction_banners(*texts: str) -> list[str]:
-    """Return the banner to show if a name, source or remark speaks of a reconstruction."""
+    """Return the banner to show if a name, source or remark mentions a reconstruction."""
     if not any("reconstruction" in text.lower() for text in texts):
         return []
     return [
         "This is a reconstruction: the log was computed from a published equation and published"
         " coefficients. It is not a recording of a car."
     ]
-
-
-def _figures(section: Section) -> list[Figure]:
-    found: list[Figure] = []
-    for block in section.blocks:
-        if isinstance(block, Figure):
-            found.append(block)
-        elif isinstance(block, Beside):
-            found.extend(block.figures)
-    return found
-
-
-def _section(section: Section, number: int, drawn: dict[int, str]) -> str:
-    blocks = "\n".join(_block(block, drawn) for block in section.blocks)
-    return f'<section id="s{number}"><h2>{escape(section.title)}</h2>\n{blocks}\n</section>'
-
-
-def _block(block: Block, drawn: dict[int, str]) -> str:
-    match block:
-        case Figure():
-            return _figure(block, drawn)
-        case Beside():
-            return f'<div class="beside">{"".join(_figure(f, drawn) for f in block.figures)}</div>'
-        case Table():
-            return _table(block)
-        case Paragraph():
-            return f"<p>{escape(block.text)}</p>"
-        case Bullets():
-            return "<ul>" + "".join(f"<li>{escape(item)}</li>" for item in block.items) + "</ul>"
-
-
-def _figure(figure: Figure, drawn: dict[int, str]) -> str:
-    return (
-        f"<figure><h3>{escape(figure.title)}</h3>{drawn[id(figure)]}"
-        f"<figcaption>{escape(figure.see)}</figcaption></figure>"
-    )
-
-
-def _tile(tile: Tile) -> str:
-    hint = f"<small>{escape(tile.hint)}</small>" if tile.hint else ""
-    return f"<div><span>{escape(tile.label)}</span><b>{escape(tile.value)}</b>{hint}</div>"
-
-
-_NUMBER = re.compile(r"[−+-]?[\d.,]+([eE][+−-]?\d+)?( ?[%Ω])?|–|")
-
-
-def _table(table: Table) -> str:
-    columns = list(zip(*table.rows, strict=True)) or [()] * len(table.head)
-    flush = [
-        ' class="n"' if column and all(map(_NUMBER.fullmatch, column)) else "" for column in columns
-    ]
-    head = "".join(f"<th{c}>{escape(text)}</th>" for c, text in zip(flush, table.head, strict=True))
-    rows = "".join(
-        "<tr>"
-        + "".join(f"<td{c}>{escape(text)}</td>" for c, text in zip(flush, row, strict=True))
-        + "</tr>"
-        for row in table.rows
-    )
-    note = f'<p class="note">{escape(table.note)}</p>' if table.note else ""
-    return (
-        f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>'
-        f"</div>{note}"
-    )

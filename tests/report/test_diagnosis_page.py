@@ -1,10 +1,11 @@
-"""The page of a diagnosis: every question has its figure, and limits come first."""
+"""The page of a diagnosis: a figure for every question, caveats first."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,19 +19,18 @@ from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH
 from cangauge.report.diagnosis import gap_page, share_figures
-from cangauge.report.page import Beside, Bullets, Figure, Page, Section, Table, render
+from cangauge.report.page import Beside, Bullets, Figure, InputFile, Page, Section, Table, render
+from cangauge.report.summary import headline
+from report_html import MAX_PAGE_BYTES, Html, excess_width_px
 from synthetic import synthetic_log
 
-LARGEST_PAGE_BYTES = 3_000_000
-
-
 SECTIONS = [
-    "How large it is",
-    "Where it lies",
-    "Which effect",
-    "How far it shrinks",
-    "The worst moments",
-    "How much of each effect these logs can show",
+    "How large the gap is",
+    "Where the gap is",
+    "Cause",
+    "How far the gap closes",
+    "Worst moments",
+    "What these logs can show",
 ]
 
 
@@ -59,13 +59,7 @@ def offset(model: Model, references: list[Log]) -> Diagnosis:
 
 @pytest.fixture(scope="module")
 def page(offset: Diagnosis) -> Page:
-    return gap_page(offset)
-
-
-def figures(page: Page) -> list[Figure]:
-    blocks = [block for section in page.sections for block in section.blocks]
-    inside = [figure for block in blocks if isinstance(block, Beside) for figure in block.figures]
-    return [block for block in blocks if isinstance(block, Figure)] + inside
+    return gap_page(offset, InputFile("model", "pack", "0123456789abcdef"))
 
 
 def section(page: Page, title: str) -> Section:
@@ -77,7 +71,7 @@ def tables(part: Section) -> list[Table]:
 
 
 def stacked(figure: Figure) -> list[Any]:
-    """Return the drawings of a figure that stands one above the other."""
+    """Return the plots of a figure that are stacked vertically."""
     grid = next(item for item in figure.plot.references() if type(item).__name__ == "GridPlot")
     return [drawn for drawn, _row, _column in grid.children]
 
@@ -87,8 +81,15 @@ def test_every_question_has_its_section(page: Page) -> None:
     assert [title for title in titles if title in SECTIONS] == SECTIONS
 
 
+def test_title_names_the_logs_and_the_lead_size_and_cause(page: Page, offset: Diagnosis) -> None:
+    assert page.title == "Diagnosis of day 21, day 22 with model pack"
+    assert page.lead == headline(offset)
+    assert re.match(r"The current reads \d\.\d \(.* … .*\) A too high: current_offset", page.lead)
+    assert ">0123456789ab<" in render(page)
+
+
 def test_size_is_in_volts_and_soc_against_two_floors(page: Page, offset: Diagnosis) -> None:
-    rows = {row[0]: row for row in tables(section(page, "How large it is"))[0].rows}
+    rows = {row[0]: row for row in tables(section(page, "How large the gap is"))[0].rows}
     assert list(rows) == [
         "model as given", "with current_offset", "floor: references", "floor: explainable",
     ]  # fmt: skip
@@ -101,7 +102,7 @@ def test_size_is_in_volts_and_soc_against_two_floors(page: Page, offset: Diagnos
 
 
 def test_maps_show_before_and_after_in_the_same_shades(page: Page) -> None:
-    maps = [item for item in figures(page) if item.title.startswith("RMS error over SoC ×")]
+    maps = [item for item in page.figures if item.title.startswith("RMS error over SoC ×")]
     assert [item.title for item in maps] == [
         "RMS error over SoC × current, model as given",
         "RMS error over SoC × temperature, model as given",
@@ -118,7 +119,7 @@ def test_maps_show_before_and_after_in_the_same_shades(page: Page) -> None:
 
 
 def test_ten_worst_moments_are_drawn_on_one_scale(page: Page, offset: Diagnosis) -> None:
-    part = section(page, "The worst moments")
+    part = section(page, "Worst moments")
     drawn = [item for block in part.blocks if isinstance(block, Beside) for item in block.figures]
     assert len(drawn) == MOMENTS
     assert drawn[0].title == f"1. {offset.worst[0].log} at {offset.worst[0].time_s:.0f} s"
@@ -135,8 +136,8 @@ def test_ten_worst_moments_are_drawn_on_one_scale(page: Page, offset: Diagnosis)
     assert len(tables(part)[0].rows) == MOMENTS
 
 
-def test_how_far_it_shrinks_is_shown_over_time_and_by_log(page: Page) -> None:
-    part = section(page, "How far it shrinks")
+def test_closing_is_shown_over_time_and_by_log(page: Page) -> None:
+    part = section(page, "How far the gap closes")
     over_time = next(block for block in part.blocks if isinstance(block, Figure))
     names = {line.name for line in over_time.plot.renderers}
     assert {"model as given", "with current_offset"} <= names
@@ -146,7 +147,7 @@ def test_how_far_it_shrinks_is_shown_over_time_and_by_log(page: Page) -> None:
 
 
 def test_shares_have_intervals(page: Page) -> None:
-    shares = [item for item in figures(page) if item.title.startswith("Share of the squared error")]
+    shares = [item for item in page.figures if item.title.startswith("Share of the squared error")]
     assert len(shares) == 6
     for each in shares:
         assert any(type(item).__name__ == "Whisker" for item in each.plot.center)
@@ -154,7 +155,7 @@ def test_shares_have_intervals(page: Page) -> None:
         assert all(low <= high for low, high in zip(data["low"], data["high"], strict=True))
 
 
-def test_shares_of_a_cells_currents_have_names_of_their_own() -> None:
+def test_shares_of_small_currents_have_distinct_names() -> None:
     edges = [-1.2, -0.06, 0.06, 1.5, 2.9]
     places = [
         Place("current", low, high, "A", 0.25, 0.1, (0.2, 0.3)) for low, high in pairwise(edges)
@@ -167,9 +168,9 @@ def test_shares_of_a_cells_currents_have_names_of_their_own() -> None:
     assert "−0.06 … 0.06" in names
 
 
-def test_every_figure_has_units_and_a_sentence(page: Page) -> None:
-    for each in figures(page):
-        assert each.see.endswith("."), each.title
+def test_every_figure_has_units_and_a_caption(page: Page) -> None:
+    for each in page.figures:
+        assert each.caption.endswith("."), each.title
         drawn = stacked(each) if each.title[0].isdigit() else [each.plot]
         for plot in drawn:
             for axis in (plot.xaxis[0], plot.yaxis[0]):
@@ -180,13 +181,18 @@ def test_every_figure_has_units_and_a_sentence(page: Page) -> None:
 
 def test_page_is_small_and_loads_nothing(page: Page) -> None:
     text = render(page)
-    assert len(text.encode()) < LARGEST_PAGE_BYTES
+    assert len(text.encode()) < MAX_PAGE_BYTES
     assert "default-src 'none'" in text
-    assert "NaN" not in re.sub(r"<script.*?</script>", "", text, flags=re.DOTALL)
-    assert render(page).count("<figure>") == text.count("<figure>") == len(figures(page))
+    assert "NaN" not in Html(text).text
+    assert render(page).count("<figure>") == text.count("<figure>") == len(page.figures)
 
 
-def test_a_poor_log_is_told_first_what_it_cannot_show(model: Model) -> None:
+@pytest.mark.slow
+def test_page_does_not_scroll_sideways_at_400_px(page: Page, tmp_path: Path) -> None:
+    assert excess_width_px(render(page), tmp_path) == 0
+
+
+def test_caveats_of_a_poor_log_come_first(model: Model) -> None:
     short = synthetic_log(hours=0.15, start_pct=70.0, end_pct=68.0, noise_v=0.5, name="stub")
     short = replace(short, temperature_c=np.full(len(short), 23.0))
     found = diagnose([short], model, [])
@@ -202,12 +208,12 @@ def test_a_poor_log_is_told_first_what_it_cannot_show(model: Model) -> None:
     assert any(tile.label == "Floor: model file" for tile in page.tiles)
 
 
-def test_a_coarse_temperature_is_told_of(model: Model) -> None:
+def test_a_coarse_temperature_is_a_caveat(model: Model) -> None:
     log = synthetic_log(hours=0.5, start_pct=70.0, end_pct=60.0, noise_v=0.5, name="coarse")
     coarse = replace(log, temperature_c=np.round(log.temperature_c))
-    told = [" ".join(diagnose([each], model, []).limits) for each in (log, coarse)]
-    assert "reported in steps" not in told[0]
-    assert "reported in steps of 1 K" in told[1]
+    fine_caveats, caveats = (" ".join(diagnose([each], model, []).limits) for each in (log, coarse))
+    assert "reported in steps" not in fine_caveats
+    assert "reported in steps of 1 K" in caveats
 
 
 def test_a_log_too_short_to_judge_on_is_refused(model: Model) -> None:

@@ -1,4 +1,4 @@
-"""Thinning for drawing loses no peak, whatever the series."""
+"""Reduction for drawing loses no peak, whatever the series."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ SERIES = arrays(np.float64, st.integers(0, 400), elements=VALUES)
 SOME = arrays(np.float64, st.integers(1, 400), elements=VALUES)
 
 
-@given(values=SERIES, at_most=st.integers(6, 60))
-def test_extremes_are_kept_in_order_and_few(values: np.ndarray, at_most: int) -> None:
-    rows = extremes(values, at_most)
-    assert rows.size <= at_most
+@given(values=SERIES, max_points=st.integers(6, 60))
+def test_extremes_are_kept_in_order_and_few(values: np.ndarray, max_points: int) -> None:
+    rows = extremes(values, max_points)
+    assert rows.size <= max_points
     assert np.all(np.diff(rows) > 0)
     known = values[np.isfinite(values)]
     drawn = values[rows]
@@ -27,10 +27,10 @@ def test_extremes_are_kept_in_order_and_few(values: np.ndarray, at_most: int) ->
     assert np.isnan(values).any() == np.isnan(drawn).any()
 
 
-@given(values=SOME, at_most=st.integers(6, 60))
-def test_a_band_covers_all_that_it_stands_for(values: np.ndarray, at_most: int) -> None:
-    rows, low, high = envelope(values - 1.0, values + 1.0, at_most)
-    assert rows.size == low.size == high.size <= at_most
+@given(values=SOME, max_points=st.integers(6, 60))
+def test_a_reduced_band_covers_all_rows(values: np.ndarray, max_points: int) -> None:
+    rows, low, high = envelope(values - 1.0, values + 1.0, max_points)
+    assert rows.size == low.size == high.size <= max_points
     ends = np.append(rows[1:], values.size)
     for first, end, bottom, top in zip(rows, ends, low, high, strict=True):
         inside = values[first:end][np.isfinite(values[first:end])]
@@ -41,12 +41,12 @@ def test_a_band_covers_all_that_it_stands_for(values: np.ndarray, at_most: int) 
             assert np.isnan(bottom)
 
 
-@given(n=st.integers(0, 100_000), at_most=st.integers(1, 5000))
-def test_a_cloud_is_thinned_evenly(n: int, at_most: int) -> None:
-    assert len(range(n)[every(n, at_most)]) <= at_most
+@given(n=st.integers(0, 100_000), max_points=st.integers(1, 5000))
+def test_a_cloud_is_sampled_evenly(n: int, max_points: int) -> None:
+    assert len(range(n)[every(n, max_points)]) <= max_points
 
 
-def test_a_lone_spike_in_a_long_series_is_drawn() -> None:
+def test_a_single_spike_in_a_long_series_is_drawn() -> None:
     values = np.zeros(90_000)
     values[54_321] = -7.0
     assert 54_321 in extremes(values)

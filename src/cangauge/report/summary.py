@@ -1,0 +1,170 @@
+"""Results in words and as table rows, shared by the terminal and the pages; imports no bokeh."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+from cangauge._formatting import number, significant, span
+from cangauge.diagnosis.diagnose import EVEN, Diagnosis
+from cangauge.diagnosis.posterior import NONE, UNKNOWN
+from cangauge.identify.effect_search import FittedEffects
+from cangauge.model.effects.library import LIBRARY
+
+Rows = list[list[str]]
+
+_SIZES: Final = {
+    "current_offset": ("offset_a", "The current reads {size} A {sign}", "too high", "too low"),
+    "current_gain": ("gain_pct", "The current reads {size} % {sign}", "too high", "too low"),
+    "voltage_offset": ("offset_v", "The voltage reads {size} V {sign}", "too high", "too low"),
+    "voltage_gain": ("gain_pct", "The voltage reads {size} % {sign}", "too high", "too low"),
+    "time_skew": ("skew_s", "The current is {size} s {sign}", "late", "early"),
+    "capacity": ("change_pct", "The capacity is {size} % {sign} than the model's", "larger",
+                 "smaller"),
+    "initial_soc": ("offset_pct", "The assumed initial SoC is {size} % {sign}", "too low",
+                    "too high"),
+    "resistance_step": ("step_ohm", "The resistance steps {sign} by {size} Ω", "up", "down"),
+    "resistance_asymmetry": ("charging_ohm", "The resistance to charging is {size} Ω {sign}",
+                             "too high", "too low"),
+}  # fmt: skip
+"""Effect → its main parameter, a sentence, and the words for a positive and a negative value."""
+
+
+def rounded(value: float, std_error: float | None) -> tuple[str, str]:
+    """Return a value rounded to its standard error, and the error with two digits."""
+    if not std_error or not math.isfinite(std_error):
+        return significant(value, 3), significant(std_error, 2)
+    decimals = max(0, 1 - math.floor(math.log10(std_error)))
+    return number(value, decimals), significant(std_error, 2)
+
+
+def effect_rows(found: FittedEffects) -> tuple[list[str], Rows]:
+    """Return headings and rows: every parameter of every effect with its standard error."""
+    rows = [
+        [
+            effect_id if k == 0 else "",
+            item.name,
+            *rounded(item.value, item.std_error),
+            "" if item.unit == "1" else item.unit.replace("ohm", "Ω"),
+        ]
+        for effect_id, parameters in found.estimates
+        for k, item in enumerate(parameters)
+    ]
+    return ["<effect", "<parameter", "value", "std. error", "<unit"], rows
+
+
+def search_rows(found: FittedEffects) -> tuple[list[str], Rows]:
+    """Return headings and rows: the steps of the effect search with their held-out errors."""
+    rows = [
+        [
+            step.effect_id,
+            step.what,
+            significant(step.comparison.before_rmse_v, 3),
+            significant(step.comparison.after_rmse_v, 3),
+            number(step.comparison.t_value, 1),
+            number(step.comparison.t_critical, 1),
+        ]
+        for step in found.steps
+    ]
+    return ["<effect", "<step", "held out without [V]", "with [V]", "t", "t needed"], rows
+
+
+def headline(diagnosis: Diagnosis) -> str:
+    """Return size and cause of the gap in one sentence; "" if no cause is named."""
+    verdict = diagnosis.verdict
+    if verdict.cause in {NONE, UNKNOWN}:
+        return ""
+    names = [verdict.cause, *verdict.ambiguous_with]
+    together = sum(verdict.chances[name] for name in names)
+    causes = f"{' or '.join(names)} (probability {together:.2f}{' together' if names[1:] else ''})"
+    size = _size(diagnosis)
+    return f"{size}: {causes}." if size else f"The likely cause is {causes}."
+
+
+def _size(diagnosis: Diagnosis) -> str:
+    """Return the size of the cause with its 95 % interval; "" if it has no single number."""
+    cause = diagnosis.verdict.cause
+    if cause not in _SIZES:
+        return ""
+    name, sentence, positive, negative = _SIZES[cause]
+    parameters: dict[str, Any] = next(
+        item["parameters"] for item in diagnosis.candidates if item["effect"] == cause
+    )
+    if name not in parameters:
+        return ""
+    value, interval = parameters[name]["value"], parameters[name]["ci"]
+    size = significant(abs(value), 2)
+    if interval is not None:
+        low, high = sorted(bound if value > 0.0 else -bound for bound in interval)
+        size += f" ({significant(low, 2)} … {significant(high, 2)})"
+    return sentence.format(size=size, sign=positive if value > 0.0 else negative)
+
+
+def next_step(diagnosis: Diagnosis) -> str:
+    """Return the measurement that would confirm the named cause; "" without one."""
+    verdict = diagnosis.verdict
+    if verdict.cause in {NONE, UNKNOWN}:
+        return ""
+    purpose = "separate these causes" if verdict.ambiguous_with else "confirm the cause"
+    return f"To {purpose}: {LIBRARY[verdict.cause].separated_by}."
+
+
+def open_question(diagnosis: Diagnosis) -> str:
+    """Return what the verdict leaves open; "" for a clear cause."""
+    verdict, references = diagnosis.verdict, diagnosis.settled.references
+    baseline = number(diagnosis.baseline_rmse_v, 2, "V")
+    if verdict.cause == NONE:
+        learned = ""
+        if references:
+            with_references = number(diagnosis.extended_rmse_v, 2, "V")
+            learned = f" ({baseline} as given, {with_references} with what the references show)"
+        return (
+            f"No cause can be named: logs without a fault may have the same error{learned}. This"
+            f" does not prove that there is none.{_invisible(diagnosis)}"
+        )
+    if verdict.cause == UNKNOWN:
+        floor = "references" if references else "the model file states"
+        return (
+            f"No cause can be named: the gap is real ({baseline}, {floor}"
+            f" {number(diagnosis.floor_v, 2, 'V')}), but no effect of the library is a likely"
+            f" cause. The best, {verdict.candidates[0].effect_id}, explains"
+            f" {100.0 * verdict.explained:.0f} % of it. The cause is not in the library, or several"
+            " act at once, or the model is not of this pack."
+        )
+    sentences = []
+    if verdict.probability < EVEN:
+        sentences.append(
+            f"{verdict.cause} is the most likely cause, but its probability is only"
+            f" {verdict.probability:.2f}: do not act on it alone."
+        )
+    if verdict.ambiguous_with:
+        sentences.append(
+            f"These logs cannot separate {verdict.cause} from {', '.join(verdict.ambiguous_with)}."
+        )
+    return " ".join(sentences)
+
+
+def _invisible(diagnosis: Diagnosis) -> str:
+    names = [str(item["effect"]) for item in diagnosis.observability if item["visible"] == 0.0]
+    if not names:
+        return " Causes smaller than these logs can show remain possible."
+    return f" At no physical size would these logs clearly show {', '.join(names)}."
+
+
+def parameters_text(parameters: dict[str, dict[str, Any]], separator: str = ", ") -> str:
+    """Return parameters of an effect with units and 95 % intervals, where they have one."""
+    texts = []
+    for name, item in parameters.items():
+        unit = "" if item["unit"] == "1" else f" {item['unit'].replace('ohm', 'Ω')}"
+        interval = ""
+        if item["ci"] is not None:
+            low, high = (significant(bound, 3) for bound in item["ci"])
+            interval = f" ({low} … {high})"
+        value = 0.0 if abs(item["value"]) < 1e-6 else item["value"]
+        texts.append(f"{name} {significant(value, 3)}{unit}{interval}")
+    return separator.join(texts)
+
+
+def percent_span(low: float, high: float) -> str:
+    """Return a range of fractions in %."""
+    return span(100.0 * low, 100.0 * high, 0, "%")
