@@ -16,6 +16,13 @@ from cangauge.errors import InputError, closest
 _KEY_PART: Final = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+"""
 _LONG_KEY: Final = re.compile(rf"(?<![\w-])(?:{_KEY_PART}){{{MAX_TOML_KEY}}}")
 _UNION_TAGS: Final = {"bool", "int", "float", "str", "constrained-int", "constrained-float"}
+# pydantic's words where ours are shorter.
+_WORDS: Final = (
+    ("Value error, ", ""),
+    ("Input should be", "must be"),
+    ("greater than or equal to", "at least"),
+    ("less than or equal to", "at most"),
+)
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -82,7 +89,8 @@ def schema_error(
     elif first["type"] in {"model_type", "model_attributes_type", "dict_type"}:
         problem = "must be a table"
     else:
-        problem = problem.removeprefix("Value error, ").replace("Input should be", "must be", 1)
+        for theirs, ours in _WORDS:
+            problem = problem.replace(theirs, ours, 1)
         problem = problem[0].lower() + problem[1:]
     return InputError(
         problem,

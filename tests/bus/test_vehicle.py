@@ -224,7 +224,7 @@ def test_the_map_file_defines_protection_rules(own: Path) -> None:
             'name = "my car"',
             "pair_within_s = 5",
             "pair_within_s",
-            "must be less than or equal to 1",
+            "must be at most 1",
         ),
         ('signal = "PackTemperature"', "", "temperature", "either signal or fixed_c"),
         ('signal = "PackTemperature"', "fixed_c = 900", "temperature.fixed_c", "120"),
