@@ -18,8 +18,8 @@ class CangaugeError(Exception):
     """Anything that cangauge reports in one clear line instead of a traceback (exit code 1)."""
 
     exit_code = 1
-    told = False
-    """Whether stderr has it already, as an event: then nobody else tells it there."""
+    logged = False
+    """Set once the error is logged, to avoid reporting it twice."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the message and its parts for `--json`; None is a part that is not known."""

@@ -248,7 +248,7 @@ def _failures_logged(log_format: LogFormat) -> Iterator[None]:
     except CangaugeError as error:
         if log_format == "json":
             emit(_LOG, logging.ERROR, "service.failed", str(error), exit_code=error.exit_code)
-            error.told = True
+            error.logged = True
         raise
 
 
