@@ -7,7 +7,7 @@ import itertools
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import can
@@ -19,7 +19,7 @@ from cangauge.bus.open import BusAddress, DriverMissingError, open_bus
 from cangauge.bus.publish import standard_filter
 from cangauge.bus.reconnect import FIRST_PAUSE_S, LONGEST_PAUSE_S, ReconnectingBus
 from cangauge.errors import InputError
-from live import BrokenBus, network_down, unpack_error
+from live import BrokenBus, LoggedLines, network_down, unpack_error
 
 ADDRESS = BusAddress("socketcan", "can9")
 FRAME = can.Message(arbitration_id=0x123, is_extended_id=False, data=b"12345678")
@@ -48,8 +48,14 @@ def missing() -> InputError:
     return InputError("no such bus", field="--channel", value="can9")
 
 
-def port_on(opener: Opener, lines: list[str], *, wait: bool = False) -> ReconnectingBus:
-    port = ReconnectingBus(ADDRESS, [standard_filter(0x123)], lines.append, opener)
+@pytest.fixture
+def lines() -> Iterator[list[str]]:
+    with LoggedLines("cangauge.bus.reconnect") as logged:
+        yield logged.lines
+
+
+def port_on(opener: Opener, *, wait: bool = False) -> ReconnectingBus:
+    port = ReconnectingBus(ADDRESS, [standard_filter(0x123)], opener)
     port.open(wait=wait)
     return port
 
@@ -77,10 +83,12 @@ def pump(
     ],
     ids=repr,
 )
-def test_a_lost_bus_is_closed_and_opened_again_with_its_filters(error: BaseException) -> None:
+def test_a_lost_bus_is_closed_and_opened_again_with_its_filters(
+    error: BaseException, lines: list[str]
+) -> None:
     first, second = BrokenBus([FRAME, error]), BrokenBus([FRAME])
-    opener, lines = Opener(first, second), list[str]()
-    port = port_on(opener, lines)
+    opener = Opener(first, second)
+    port = port_on(opener)
     port.set_filters([standard_filter(0x55)])
     received = pump(port, 2.0, until=lambda: len(opener.at_s) == 2 and not port.is_away)
     received += pump(port, 0.1)
@@ -98,9 +106,9 @@ def test_a_lost_bus_is_closed_and_opened_again_with_its_filters(error: BaseExcep
     assert second.closed == 1
 
 
-def test_a_send_that_fails_is_a_loss_too_and_frames_meanwhile_are_counted() -> None:
-    opener, lines = Opener(BrokenBus([], sending=network_down()), missing()), list[str]()
-    port = port_on(opener, lines)
+def test_a_send_that_fails_is_a_loss_too_and_frames_meanwhile_are_counted(lines: list[str]) -> None:
+    opener = Opener(BrokenBus([], sending=network_down()), missing())
+    port = port_on(opener)
     port.post(FRAME)
     assert (port.losses, port.unsent) == (1, 1)
     began_s = time.monotonic()
@@ -113,7 +121,7 @@ def test_a_send_that_fails_is_a_loss_too_and_frames_meanwhile_are_counted() -> N
 
 
 def test_one_bad_packet_is_no_loss() -> None:
-    port = port_on(Opener(BrokenBus([unpack_error(), FRAME])), [])
+    port = port_on(Opener(BrokenBus([unpack_error(), FRAME])))
     assert len(pump(port, 0.1)) == 1
     assert (port.garbled, port.losses) == (1, 0)
 
@@ -125,7 +133,7 @@ def test_pauses_grow_to_a_ceiling_and_start_small_after_a_steady_time(
     monkeypatch.setattr(lasting, "STEADY_S", 0.3)
     last = BrokenBus([])
     opener = Opener(BrokenBus([network_down()]), *(missing() for _ in range(6)), last)
-    port = port_on(opener, [])
+    port = port_on(opener)
     pump(port, 4.0, until=lambda: not port.is_away and len(opener.at_s) == 8)
     pauses = [b - a for a, b in itertools.pairwise(opener.at_s)]
     wanted = [0.05, 0.1, 0.2, 0.4, 0.4, 0.4, 0.4]
@@ -138,9 +146,9 @@ def test_pauses_grow_to_a_ceiling_and_start_small_after_a_steady_time(
     port.close()
 
 
-def test_a_bus_that_opens_and_fails_at_once_costs_little_and_says_little() -> None:
-    opener, lines = Opener(lambda: BrokenBus([network_down()])), list[str]()
-    port = port_on(opener, lines)
+def test_a_bus_that_opens_and_fails_at_once_costs_little_and_says_little(lines: list[str]) -> None:
+    opener = Opener(lambda: BrokenBus([network_down()]))
+    port = port_on(opener)
     cpu_s = time.process_time()
     pump(port, 3.0)
     assert time.process_time() - cpu_s < 0.3
@@ -158,7 +166,7 @@ def test_a_driver_that_hangs_while_opening_stops_nothing() -> None:
         free.wait(10.0)
         return late
 
-    port = port_on(Opener(BrokenBus([network_down()]), hang), [])
+    port = port_on(Opener(BrokenBus([network_down()]), hang))
     pump(port, 0.2)
     began_s = time.monotonic()
     assert port.receive(0.05) is None
@@ -172,12 +180,11 @@ def test_a_driver_that_hangs_while_opening_stops_nothing() -> None:
     assert late.closed == 1  # nobody wants it any more
 
 
-def test_a_bus_that_is_not_there_at_the_start() -> None:
-    lines = list[str]()
+def test_a_bus_that_is_not_there_at_the_start(lines: list[str]) -> None:
     with pytest.raises(InputError, match="no such bus"):
-        port_on(Opener(missing()), lines)
+        port_on(Opener(missing()))
     opener = Opener(missing(), missing(), BrokenBus([FRAME]))
-    port = port_on(opener, lines, wait=True)
+    port = port_on(opener, wait=True)
     assert port.is_away
     assert port.trouble.startswith("bus away for ")
     port.post(FRAME)
@@ -194,16 +201,17 @@ def test_a_bus_that_is_not_there_at_the_start() -> None:
 def test_what_no_waiting_brings_ends_at_once() -> None:
     opener = Opener(DriverMissingError("a library for this interface is missing"))
     with pytest.raises(InputError, match="library"):
-        port_on(opener, [], wait=True)
+        port_on(opener, wait=True)
     with pytest.raises(DriverMissingError):
         open_bus(BusAddress("pcan", "PCAN_USBBUS1"))
 
 
-def test_while_it_is_away_it_is_mentioned_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_while_it_is_away_it_is_mentioned_now_and_then(
+    monkeypatch: pytest.MonkeyPatch, lines: list[str]
+) -> None:
     monkeypatch.setattr(lasting, "REMIND_S", 1.5)
     monkeypatch.setattr(lasting, "LONGEST_PAUSE_S", 0.1)
-    lines = list[str]()
-    port = port_on(Opener(BrokenBus([network_down()]), missing()), lines)
+    port = port_on(Opener(BrokenBus([network_down()]), missing()))
     pump(port, 3.6)
     assert 3 <= len(lines) <= 4  # lost; 1.5 s; 3 s
     assert "away for 2 s (--channel: no such bus" in lines[1]
@@ -221,14 +229,14 @@ def test_opening_in_vain_for_long_leaks_nothing() -> None:
     assert threading.active_count() < before + 20
 
 
-def test_bus_off_is_told_and_so_is_its_end() -> None:
+def test_bus_off_is_told_and_so_is_its_end(lines: list[str]) -> None:
     def error_frame(classes: int) -> can.Message:
         return can.Message(
             arbitration_id=classes, is_extended_id=False, is_error_frame=True, data=bytes(8)
         )
 
-    bus, lines = BrokenBus([error_frame(0x080), error_frame(0x040)]), list[str]()
-    port = port_on(Opener(bus), lines)
+    bus = BrokenBus([error_frame(0x080), error_frame(0x040)])
+    port = port_on(Opener(bus))
     assert pump(port, 0.1) == []
     assert port.error_frames == 2
     assert port.error_kinds == {"bus_error": 1, "bus_off": 1}
@@ -249,7 +257,7 @@ def test_bus_off_is_told_and_so_is_its_end() -> None:
 def test_a_full_transmit_queue_never_waits_and_keeps_order() -> None:
     full = can.CanOperationError("Failed to transmit: No buffer space", errno.ENOBUFS)
     bus = BrokenBus([FRAME] * 50, sending=full)
-    port = port_on(Opener(bus), [])
+    port = port_on(Opener(bus))
     began_s = time.monotonic()
     for number in range(10):
         port.post(can.Message(arbitration_id=number, is_extended_id=False), within_s=0.15)

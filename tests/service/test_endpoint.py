@@ -21,8 +21,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from watched import Watched
 
 from cangauge.errors import CangaugeError, InputError
-from cangauge.service.config import http_address
-from cangauge.service.http import MAX_CLIENTS, Endpoint, default_path, open_unix, served_sockets
+from cangauge.service.addresses import default_path, http_address, open_unix, served_sockets
+from cangauge.service.http import MAX_CLIENTS, Endpoint
 from cangauge.service.status_client import NotRunningError, fetch_status, find_socket
 from live import in_process
 

@@ -11,8 +11,8 @@ import pytest
 from watched import StandInPort, Watched
 
 from cangauge.estimate.validity import Reason, Status
+from cangauge.service.lifecycle import Notifier
 from cangauge.service.status import BOUNDS_S, Histogram, as_json
-from cangauge.service.systemd import Notifier
 
 
 class CountingNotifier(Notifier):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.service.systemd import Notifier
+from cangauge.service.lifecycle import Notifier
 from live import COMMAND, Command, leaf_model_path
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import can
@@ -15,12 +16,9 @@ from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import load_vehicle
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.validity import Reason
-from cangauge.model.model_file import load_model
-from cangauge.service.config import load_config
 from cangauge.service.loop import LoopSettings
-from cangauge.service.pipeline import Gauge
-from cangauge.service.run import Reloader
-from live import leaf_model_path, short_log
+from cangauge.service.run import Service
+from live import LoggedLines, leaf_model_path, short_log, waits
 
 MAP = """
 dbc = ["pack.dbc"]
@@ -46,15 +44,15 @@ class Car:
         self.model = folder / "model.json"
         shutil.copy(leaf_model_path(), self.model)
         self.write(text)
-        config = load_config(self.path)
-        vehicle = config.load_vehicle()
-        self.gauge = Gauge(vehicle, load_model(config.model), config.gauge_settings())
-        self.said: list[str] = []
-        self.reloader = Reloader(
-            lambda: load_config(self.path), config, vehicle, self.gauge, self.said.append
-        )
+        self.service = Service(self.path)
+        self.gauge = self.service.gauge
+        self.logged = LoggedLines("cangauge.service.run")
         encoder = FrameEncoder(load_vehicle("generic"))
         self.frames = [encoder.encode(each) for each in samples_of(short_log(200.0))]
+
+    @property
+    def said(self) -> list[str]:
+        return self.logged.lines
 
     def write(self, text: str) -> None:
         self.path.write_text(f'model = "model.json"\ninitial_soc = 80\n{text}')
@@ -69,14 +67,15 @@ class Car:
 
     def reload(self, text: str) -> LoopSettings | None:
         self.write(text)
-        return self.reloader.reload()
+        return self.service.reconfigure()
 
 
 @pytest.fixture
-def car(tmp_path: Path) -> Car:
+def car(tmp_path: Path) -> Iterator[Car]:
     car = Car(tmp_path)
     car.drive(0, 1000)
-    return car
+    with car.logged:
+        yield car
 
 
 def test_thresholds_and_time_outs_change_and_the_estimate_goes_on_bit_for_bit(
@@ -84,7 +83,7 @@ def test_thresholds_and_time_outs_change_and_the_estimate_goes_on_bit_for_bit(
 ) -> None:
     settings = car.reload("timeout_s = 0.5\nuntil_idle_s = 9\n")
     assert settings == LoopSettings(timeout_s=0.5, until_idle_s=9.0)
-    assert car.said == ["configuration read again; changed: timeout_s, until_idle_s"]
+    assert car.said == ["configuration reloaded; changed: timeout_s, until_idle_s"]
     car.drive(1000, 1200)
     (tmp_path / "undisturbed").mkdir()
     undisturbed = Car(tmp_path / "undisturbed")
@@ -112,7 +111,7 @@ def test_initial_soc_is_of_the_past(car: Car) -> None:
     before = car.gauge.latest
     assert car.reload("initial_soc_std = 20\n") is not None
     car.path.write_text('model = "model.json"\ninitial_soc = 20\n')
-    assert car.reloader.reload() is not None
+    assert car.service.reconfigure() is not None
     car.drive(1000, 1001)
     assert car.gauge.latest.soc_pct == pytest.approx(before.soc_pct, abs=0.05)
 
@@ -152,7 +151,7 @@ def test_a_dbc_or_map_that_changed_is_noticed(tmp_path: Path) -> None:
     car.drive(0, 100)
     temperature_c = car.gauge.latest_sample.temperature_c  # type: ignore[union-attr] # there is one
     (tmp_path / "map.toml").write_text(MAP + "offset = 5\n")
-    assert car.reloader.reload() is not None
+    assert car.service.reconfigure() is not None
     car.drive(100, 200)
     assert car.gauge.latest_sample.temperature_c == pytest.approx(  # type: ignore[union-attr] # as above
         temperature_c + 5.0, abs=1.0
@@ -177,7 +176,7 @@ def test_what_is_broken_is_refused_whole_and_the_old_one_goes_on(
     settings, filters, latest = car.gauge.settings, car.gauge.filters, car.gauge.latest
     assert car.reload(text) is None
     assert len(car.said) == 1
-    assert car.said[0].startswith("warning: new configuration refused, the old one goes on: ")
+    assert car.said[0].startswith("warning: new configuration refused, the old one stays: ")
     assert say in car.said[0]
     assert "\n" not in car.said[0]
     assert (car.gauge.settings, car.gauge.filters, car.gauge.latest) == (settings, filters, latest)
@@ -198,8 +197,8 @@ def test_a_broken_model_is_refused(car: Car, content: bytes) -> None:
     assert car.reload("timeout_s = 0.5\n") is None
     assert "model.json" in car.said[0]
     car.model.unlink()
-    assert car.reloader.reload() is None
-    assert len(car.said) == 2
+    assert car.service.reconfigure() is None
+    assert waits(lambda: len(car.said) == 2)
 
 
 def test_what_needs_a_restart_is_said_and_left(car: Car) -> None:
@@ -208,6 +207,6 @@ def test_what_needs_a_restart_is_said_and_left(car: Car) -> None:
     assert car.gauge.settings.time_source == "receive"
     assert car.gauge.settings.ids.replay_clock == 0x5AF
     assert car.said[1] == (
-        "warning: channel, time_source, ids.replay_clock: takes effect when the service starts"
-        " again"
+        "warning: channel, time_source, ids.replay_clock: takes effect when the service is"
+        " restarted"
     )

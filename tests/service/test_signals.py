@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.service.signals import note_hangups, stop_on_signals
+from cangauge.service.lifecycle import note_hangups, stop_on_signals
 
 pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no SIGHUP on this system")
 
@@ -29,7 +29,7 @@ def test_a_hangup_is_told_once() -> None:
 
 LOOP = """
 import sys, time
-from cangauge.service.signals import note_hangups, stop_on_signals
+from cangauge.service.lifecycle import note_hangups, stop_on_signals
 with stop_on_signals() as stop, note_hangups() as take:
     print("ready", flush=True)
     until = time.monotonic() + 20.0

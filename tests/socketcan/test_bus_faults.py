@@ -30,7 +30,7 @@ from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Reason, Status
 from cangauge.service.loop import LoopSettings
 from cangauge.service.pipeline import Gauge, GaugeSettings
-from live import Command, Service, leaf_model, leaf_model_path, short_log, waits
+from live import Command, LoggedLines, Service, leaf_model, leaf_model_path, short_log, waits
 
 pytestmark = pytest.mark.socketcan
 
@@ -69,10 +69,19 @@ class Lasting(Service):
     def __init__(self, address: BusAddress = VCAN, *, wait: bool = False) -> None:
         known = GaugeSettings(EstimatorSettings(initial_soc_pct=80.0))
         gauge = Gauge(load_vehicle("generic"), leaf_model(), known)
-        self.lines: list[str] = []
-        port = ReconnectingBus(address, gauge.filters, self.lines.append)
+        self._bus_lines = LoggedLines("cangauge.bus.reconnect")
+        self._bus_lines.__enter__()
+        port = ReconnectingBus(address, gauge.filters)
         port.open(wait=wait)
         super().__init__(port, gauge, LoopSettings(timeout_s=STALE_S))
+
+    @property
+    def lines(self) -> list[str]:
+        return self._bus_lines.lines
+
+    def end(self) -> None:
+        super().end()
+        self._bus_lines.__exit__()
 
     @property
     def lasting(self) -> ReconnectingBus:
@@ -99,7 +108,7 @@ class Pack:
 
     def _run(self) -> None:
         encoder = FrameEncoder(load_vehicle("generic"))
-        port = ReconnectingBus(self._address, [], lambda _line: None)
+        port = ReconnectingBus(self._address, [])
         port.open(wait=True)
         with port:
             for sample in samples_of(short_log(600.0)):

@@ -7,6 +7,7 @@ pauses, in a thread of its own since some drivers take seconds for it.
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
 import time
@@ -17,7 +18,7 @@ from typing import Final, TypeVar
 import can
 from can.typechecking import CanFilter
 
-from cangauge._logging import Voice
+from cangauge._logging import emit
 from cangauge.bus.connection import SEND_WITHIN_S, BusConnection, BusError, backend_capabilities
 from cangauge.bus.open import BusAddress, DriverMissingError, open_bus
 from cangauge.errors import InputError
@@ -33,6 +34,7 @@ not."""
 REMIND_S: Final = 60.0
 """While nothing changes, a bus that is away is mentioned so often [s]."""
 
+_LOG = logging.getLogger(__name__)
 _Received = TypeVar("_Received")
 Opener = Callable[[BusAddress, Sequence[CanFilter] | None], can.BusABC]
 
@@ -44,8 +46,6 @@ class ReconnectingBus(BusConnection):
     ----------
     address : BusAddress
     filters : sequence of CanFilter
-    say : callable
-        Takes a line of text when the bus goes, comes back, or is bus-off: one a second at most.
     opener : callable, optional
         Opens the bus.
 
@@ -59,7 +59,6 @@ class ReconnectingBus(BusConnection):
         self,
         address: BusAddress,
         filters: Sequence[CanFilter],
-        say: Callable[[str], None],
         opener: Opener = open_bus,
     ) -> None:
         super().__init__(None, str(address), backend_capabilities(address))
@@ -67,7 +66,6 @@ class ReconnectingBus(BusConnection):
         self._address = address
         self._filters = list(filters)
         self._opener = opener
-        self._voice = Voice(say)
         self._attempt: _Attempt | None = None
         self._lost_bus: can.BusABC | None = None
         self._since_s = time.monotonic()
@@ -100,7 +98,11 @@ class ReconnectingBus(BusConnection):
             if not wait:
                 raise
             self._go_away(str(error))
-            self._voice.say(f"warning: {self.name}: not there yet ({error}); waiting for it")
+            _report(
+                logging.WARNING,
+                "bus.missing",
+                f"{self.name}: not there yet ({error}); waiting for it",
+            )
             return
         self._since_s = time.monotonic()
 
@@ -173,7 +175,6 @@ class ReconnectingBus(BusConnection):
         self, receive: Callable[[float], _Received], timeout_s: float
     ) -> _Received | None:
         """Return what is received; None if the bus is away or goes."""
-        self._voice.look()
         if self._bus is None:
             self._try_again(timeout_s)
             return None
@@ -194,7 +195,7 @@ class ReconnectingBus(BusConnection):
         self._lost_bus = self._take_bus()
         self._was_off = False
         self._go_away("")
-        self._voice.say(f"warning: {error} Trying again until it is back")
+        _report(logging.WARNING, "bus.lost", f"{error} Trying again until it is back")
 
     def _go_away(self, reason: str) -> None:
         now_s = self._since_s = time.monotonic()
@@ -226,26 +227,34 @@ class ReconnectingBus(BusConnection):
             if is_news or now_s >= self._remind_at_s:
                 self._remind_at_s = now_s + REMIND_S
                 away = f"away for {now_s - self._since_s:.0f} s"
-                self._voice.say(f"warning: {self.name}: {away} ({outcome}); trying again")
+                text = f"{self.name}: {away} ({outcome}); trying again"
+                _report(logging.WARNING, "bus.away", text)
             return
         self._use(outcome)
         away_s = now_s - self._since_s
         self._away_s += away_s
         self._since_s = now_s
-        self._voice.say(f"{self.name}: {'back' if self.losses else 'there'} after {away_s:.1f} s")
+        text = f"{self.name}: {'back' if self.losses else 'there'} after {away_s:.1f} s"
+        _report(logging.INFO, "bus.back", text)
         if filters != self._filters:
             self.set_filters(self._filters)
 
     def _tell_off(self) -> None:
         self._was_off = self.is_off
         if self.is_off:
-            self._voice.say(
-                f"warning: {self.name}: the controller is bus-off; it comes back when the kernel"
+            _report(
+                logging.WARNING,
+                "bus.off",
+                f"{self.name}: the controller is bus-off; it comes back when the kernel"
                 f" restarts it (once for all: ip link set {self._address.channel} type can"
-                " restart-ms 100)"
+                " restart-ms 100)",
             )
         else:
-            self._voice.say(f"{self.name}: no longer bus-off")
+            _report(logging.INFO, "bus.on", f"{self.name}: no longer bus-off")
+
+
+def _report(level: int, event: str, text: str) -> None:
+    emit(_LOG, level, event, text, limit="bus.state")
 
 
 class _Attempt:

@@ -17,16 +17,17 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from cangauge import __version__
 from cangauge._formatting import number
-from cangauge._logging import Pace, emit
+from cangauge._logging import emit
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.decoder import FrameStatistics, MessageStatistics
 from cangauge.estimate.validity import Estimate, Reason, Sample, Status, reason_name, reason_names
+from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Gauge
-from cangauge.service.systemd import Notifier
+from cangauge.service.recording import Recorder, RecordState
 
 # --- Counts in fixed buckets: what the loop fills in a fraction of a microsecond, and others…
 
@@ -115,27 +116,6 @@ class Identity:
     method: str
     time_source: str
     began_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class RecordState:
-    """How the recording fares.
-
-    Parameters
-    ----------
-    path : str
-        The file that is written.
-    frames, lost_frames, written_bytes : int
-        Frames taken so far; those that the disk did not take; bytes on the disk.
-    problem : str or None
-        Why nothing can be written at present.
-    """
-
-    path: str
-    frames: int
-    lost_frames: int
-    written_bytes: int
-    problem: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -330,14 +310,6 @@ _REJECTS: Final = tuple(
 _LOG = logging.getLogger(__name__)
 
 
-class Recording(Protocol):
-    """A recording that can say how it fares."""
-
-    @property
-    def state(self) -> RecordState:
-        """How it fares."""
-
-
 class Monitor:
     """Watches the loop from within; its methods are for the loop's thread.
 
@@ -347,7 +319,7 @@ class Monitor:
     port : BusConnection
     identity : Identity
     notifier : Notifier
-    record : Recording, optional
+    record : Recorder, optional
     clock : callable
         Monotonic time [s].
 
@@ -366,7 +338,7 @@ class Monitor:
         *,
         identity: Identity,
         notifier: Notifier,
-        record: Recording | None = None,
+        record: Recorder | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._gauge = gauge
@@ -384,7 +356,6 @@ class Monitor:
         self._rate = 0.0
         self._rate_from = (now_s, 0)
         self._status: Status | None = None
-        self._pace = Pace()
         self.latest = self._snapshot(now_s)
 
     def stepped(self, stamp_s: float, step_s: float, came_s: float) -> None:
@@ -422,10 +393,10 @@ class Monitor:
         finally:
             self._notifier.ready(status_line(self.latest))
 
-    def turn(self, now_s: float) -> None:
-        """Take notice that the loop has turned (monotonic clock [s])."""
+    def turn(self, now_s: float) -> bool:
+        """Note a turn of the loop (monotonic time [s]); return whether `latest` is new."""
         if now_s < self._due_s:
-            return
+            return False
         self._due_s = now_s + SHOW_EVERY_S
         self.latest = snapshot = self._snapshot(now_s)
         self._log_status(snapshot)
@@ -436,6 +407,7 @@ class Monitor:
         if self._notifier.active and now_s >= self._tell_s:
             self._tell_s = now_s + TELL_EVERY_S
             self._notifier.status(status_line(snapshot))
+        return True
 
     def _snapshot(self, now_s: float) -> Snapshot:
         gauge = self._gauge
@@ -470,8 +442,7 @@ class Monitor:
 
     def _log_status(self, snapshot: Snapshot) -> None:
         estimate = snapshot.estimate
-        # A change that may not be told yet is told later, if it has not gone by then.
-        if estimate.status is self._status or not self._pace.allows(snapshot.made_s):
+        if estimate.status is self._status:
             return
         before, self._status = self._status, estimate.status
         is_worse = estimate.status is Status.INVALID
@@ -480,7 +451,6 @@ class Monitor:
             logging.WARNING if is_worse else logging.INFO,
             "status.changed",
             status_line(snapshot),
-            always=True,
             status=estimate.status.name.lower(),
             before=None if before is None else before.name.lower(),
             reasons=reason_ids(estimate.reasons),
