@@ -10,6 +10,7 @@ import time
 import pytest
 from watched import StandInPort, Watched
 
+from cangauge._logging import RateLimitFilter
 from cangauge.estimate.validity import Reason, Status
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.status import BOUNDS_S, Histogram, as_json
@@ -134,15 +135,25 @@ def test_changes_of_the_status_are_logged_and_the_last_always(
 ) -> None:
     caplog.set_level(logging.INFO, "cangauge")
     watched = Watched()
-    watched.turn()
+    written: list[logging.LogRecord] = []
+    limiter = RateLimitFilter(written.append, lambda: watched.now_s)
+
+    def turn(later_s: float) -> None:
+        caplog.clear()
+        watched.turn(later_s)
+        written.extend(filter(limiter.filter, caplog.records))
+        limiter.release_due()
+
+    turn(1.0)
     watched.drive(90.0)
     for number in range(200):
         watched.gauge.heartbeat(is_stale=number % 2 == 0)
-        watched.turn(0.3)
+        turn(0.3)
     watched.gauge.heartbeat(is_stale=True)
     for _ in range(400):
-        watched.turn(0.3)
-    told = [record for record in caplog.records if getattr(record, "event", "") == "status.changed"]
+        turn(0.3)
+    limiter.close()
+    told = [each for each in written if getattr(each, "event", "") == "status.changed"]
     assert 4 <= len(told) < 15  # 200 changes in a minute
     assert told[-1].fields["status"] == "invalid"  # type: ignore[attr-defined] # extra of `emit`
     assert told[-1].levelno == logging.WARNING
