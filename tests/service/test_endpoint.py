@@ -236,7 +236,7 @@ def test_services_are_found_where_they_put_their_sockets(
         ):
             find_socket()
     (tmp_path / "cangauge").chmod(0o777)
-    with pytest.raises(InputError, match="not this user's alone"):
+    with pytest.raises(InputError, match="not private to this user"):
         default_path("can0")
 
 

@@ -1,4 +1,4 @@
-"""Events: one a line, with stable names; repeats at growing intervals."""
+"""Events: one a line, with stable names; repetitions are rate-limited."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_levels_and_what_was_before_is_restored() -> None:
     assert (root.handlers, root.level) == before
 
 
-def test_a_stream_that_is_gone_ends_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_closed_stream_is_ignored(capsys: pytest.CaptureFixture[str]) -> None:
     stream = io.StringIO()
     with logging_to("text", stream=stream):
         stream.close()
@@ -95,7 +95,7 @@ def test_events_are_limited_separately() -> None:
     assert events == ["a.b:", "a.c:"]
 
 
-def test_many_different_events_take_no_memory() -> None:
+def test_many_different_events_use_bounded_memory() -> None:
     repeats = RateLimitFilter(clock=lambda: 0.0)
     for number in range(5_000):
         repeats.filter(record(f"made.up_{number}"))
@@ -108,7 +108,7 @@ def test_the_first_of_an_event_is_always_written() -> None:
     assert not limiter.filter(record("bus.lost"))
 
 
-def test_the_latest_suppressed_record_is_written_when_its_interval_ends() -> None:
+def test_the_latest_suppressed_record_follows_its_interval() -> None:
     now, written = [100.0], list[str]()
     limiter = RateLimitFilter(lambda each: written.append(each.getMessage()), lambda: now[0])
     assert limiter.filter(record("bus.lost", "down"))
@@ -125,7 +125,7 @@ def test_the_latest_suppressed_record_is_written_when_its_interval_ends() -> Non
     limiter.close()
 
 
-def test_a_suppressed_record_is_released_by_a_timer_and_at_the_end() -> None:
+def test_suppressed_records_are_written_by_a_timer_and_at_the_end() -> None:
     stream = io.StringIO()
     with logging_to("text", stream=stream):
         for number in range(3):

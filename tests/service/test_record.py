@@ -1,4 +1,4 @@
-"""Recording: in parts, within bounds, past a full disk and a kill, and read back to the bit."""
+"""Recording: parts, limits, full disks, kills, and exact reading back."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_a_clock_that_is_set_back_is_kept(tmp_path: Path, suffix: str) -> None:
     assert content(recorder.path) == expected(messages)
 
 
-def test_without_limits_one_file_that_the_next_run_does_not_replace(tmp_path: Path) -> None:
+def test_without_limits_a_run_keeps_the_previous_file(tmp_path: Path) -> None:
     path = tmp_path / "drive.log"
     for number, name in enumerate(("drive.log", "drive-0001.log", "drive-0002.log")):
         begin_s = 1.7e9 + 100.0 * number
@@ -291,7 +291,7 @@ def test_a_folder_that_goes_and_comes_back(tmp_path: Path, monkeypatch: pytest.M
     assert content(recorder.path) == expected(messages)
 
 
-def test_a_disk_that_hangs_does_not_hold_the_loop_or_the_end(
+def test_a_hanging_disk_delays_neither_loop_nor_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hang = threading.Event()

@@ -1,4 +1,4 @@
-"""Another configuration while running: what takes effect, what does not, and what is refused."""
+"""Reloading the configuration: what changes, what needs a restart, what is refused."""
 
 from __future__ import annotations
 
@@ -78,9 +78,7 @@ def car(tmp_path: Path) -> Iterator[Car]:
         yield car
 
 
-def test_thresholds_and_time_outs_change_and_the_estimate_goes_on_bit_for_bit(
-    car: Car, tmp_path: Path
-) -> None:
+def test_a_reload_of_timeouts_leaves_the_estimate_bit_for_bit(car: Car, tmp_path: Path) -> None:
     settings = car.reload("timeout_s = 0.5\nuntil_idle_s = 9\n")
     assert settings == LoopSettings(timeout_s=0.5, until_idle_s=9.0)
     assert car.said == ["configuration reloaded; changed: timeout_s, until_idle_s"]
@@ -107,7 +105,7 @@ def test_another_model_in_the_same_file_takes_soc_over(car: Car) -> None:
     assert car.gauge.samples == 1001
 
 
-def test_initial_soc_is_of_the_past(car: Car) -> None:
+def test_a_reload_ignores_the_initial_soc(car: Car) -> None:
     before = car.gauge.latest
     assert car.reload("initial_soc_std = 20\n") is not None
     car.path.write_text('model = "model.json"\ninitial_soc = 20\n')
@@ -132,7 +130,7 @@ def estimate_counter(frame: can.Message) -> int:
     return int(next(values[name] for name in values if name.startswith("counter")))  # type: ignore[union-attr,call-overload] # a dict of numbers
 
 
-def test_another_car_is_taken_and_frames_stay_counted(car: Car) -> None:
+def test_a_reload_changes_the_vehicle_and_keeps_counts(car: Car) -> None:
     frames = car.gauge.counts.frames
     assert car.reload('vehicle = "leaf_aze0"\n') is not None
     car.drive(1000, 1100)  # the frames of the other car: not wanted now
@@ -170,9 +168,7 @@ def test_a_dbc_or_map_that_changed_is_noticed(tmp_path: Path) -> None:
         ("[ids]\nsoc_estimate = 0x100\nsoc_detail = 0x900", "soc_detail"),
     ],
 )
-def test_what_is_broken_is_refused_whole_and_the_old_one_goes_on(
-    car: Car, text: str, say: str
-) -> None:
+def test_an_invalid_configuration_is_refused_as_a_whole(car: Car, text: str, say: str) -> None:
     settings, filters, latest = car.gauge.settings, car.gauge.filters, car.gauge.latest
     assert car.reload(text) is None
     assert len(car.said) == 1
@@ -184,7 +180,7 @@ def test_what_is_broken_is_refused_whole_and_the_old_one_goes_on(
     assert car.gauge.samples == 1001
 
 
-def test_an_id_that_the_new_car_uses_is_refused_before_anything_changes(car: Car) -> None:
+def test_an_id_of_the_new_vehicle_is_refused_without_changes(car: Car) -> None:
     filters = car.gauge.filters
     assert car.reload('vehicle = "leaf_aze0"\n[ids]\nsoc_estimate = 0x1DB\n') is None
     assert "0x1DB" in car.said[0]
@@ -201,7 +197,7 @@ def test_a_broken_model_is_refused(car: Car, content: bytes) -> None:
     assert waits(lambda: len(car.said) == 2)
 
 
-def test_what_needs_a_restart_is_said_and_left(car: Car) -> None:
+def test_keys_that_need_a_restart_are_logged_and_unchanged(car: Car) -> None:
     text = 'channel = "can5"\ntime_source = "replay-clock"\n[ids]\nreplay_clock = 0x111\n'
     assert car.reload(text) is not None
     assert car.gauge.settings.time_source == "receive"

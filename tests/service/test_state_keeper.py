@@ -1,4 +1,4 @@
-"""The state file: what is kept over a restart, what is refused; and nothing stops the gauge."""
+"""The state file: restarts, refused files, and failing disks."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ def test_a_service_restarted_at_once_goes_on_bit_for_bit(machine: Machine) -> No
     assert again[-1] == whole[-1]
 
 
-def test_until_a_sample_comes_the_restored_soc_is_told_as_stale(machine: Machine) -> None:
+def test_a_restored_soc_is_stale_until_the_first_sample(machine: Machine) -> None:
     last = kept(machine)[-1]
     latest = machine.start().gauge.latest
     assert latest.soc_pct == last.soc_pct
@@ -185,7 +185,7 @@ def test_until_a_sample_comes_the_restored_soc_is_told_as_stale(machine: Machine
     assert latest.reasons & Reason.INPUT_STALE
 
 
-def test_it_is_written_when_asked_and_not_without_new_samples(machine: Machine) -> None:
+def test_the_state_is_written_only_after_new_samples(machine: Machine) -> None:
     service = machine.start()
     service.keep()
     assert not machine.path.exists()
@@ -200,7 +200,7 @@ def test_it_is_written_when_asked_and_not_without_new_samples(machine: Machine) 
     assert read_state(machine.path).estimator.samples == 60
 
 
-def test_a_long_pause_in_a_restart_draws_toward_the_voltage_and_does_not_jump(
+def test_after_a_long_pause_the_soc_approaches_the_voltage(
     machine: Machine,
 ) -> None:
     machine.settings = GaugeSettings(EstimatorSettings(initial_soc_pct=80.0))
@@ -552,9 +552,7 @@ def test_a_folder_and_a_file_without_rights(machine: Machine) -> None:
         machine.path.parent.chmod(0o700)
 
 
-def test_a_disk_that_hangs_holds_nothing_up(
-    machine: Machine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_hanging_disk_delays_nothing(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     # SIGTERM is to stop the service within a second, the disk's part included.
     assert STOP_WITHIN_S < 1.0
     monkeypatch.setattr(state_keeper, "STOP_WITHIN_S", STOP_WITHIN_S)
@@ -600,9 +598,7 @@ def test_a_state_holds_no_nan_and_is_plain_json(machine: Machine) -> None:
 
 
 @pytest.mark.parametrize("method", ["ekf", "coulomb"])
-def test_after_a_refused_state_the_given_soc_is_of_an_earlier_start(
-    machine: Machine, method: Any
-) -> None:
+def test_a_refused_state_starts_by_voltage(machine: Machine, method: Any) -> None:
     given = EstimatorSettings(method=method, initial_soc_pct=40.0, initial_soc_std_pct=1.0)
     machine.settings = GaugeSettings(estimator=given)
     first = machine.start()

@@ -99,7 +99,7 @@ def test_a_snapshot_is_made_a_few_times_a_second_at_most() -> None:
     assert sum(watched.monitor.turn(200.0 + 1e-3 * ms) for ms in range(1000)) <= 5
 
 
-def test_a_table_whose_disk_is_full_is_given_up_and_the_service_goes_on(
+def test_a_full_disk_abandons_the_table_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "soc.parquet"

@@ -1,4 +1,4 @@
-"""Saving now and then and at the end, and telling of frames that the kernel dropped."""
+"""Housekeeping: saving the state, and reporting dropped frames."""
 
 from __future__ import annotations
 
