@@ -104,8 +104,12 @@ def logging_to(
 
 class _Handler(logging.StreamHandler[TextIO]):
     def write(self, record: logging.LogRecord) -> None:
-        with self.lock or threading.RLock():
+        """Write a record without filtering it."""
+        self.acquire()
+        try:
             self.emit(record)
+        finally:
+            self.release()
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
         """Ignore it: a closed stderr must not end the service, and cannot be reported."""

@@ -47,7 +47,7 @@ def run_command(
     `dbc/soc_estimate.dbc`: SoC and its standard deviation [%], status, reasons. Ctrl-C or SIGTERM
     stops it with a summary. Positive current discharges.
 
-    SIGHUP reloads configuration, model and vehicle: the SoC goes on, and an invalid configuration
+    SIGHUP reloads configuration, model and vehicle: the SoC continues, an invalid configuration
     is refused. Changes of the bus, the time source and output files need a restart.
 
     For example:

@@ -78,7 +78,7 @@ class OptionInfo:
         Option names; empty: the key's name with dashes.
     unit : str
     default : str
-        Default in words, where the field's own default does not say it.
+        Default in words, where the field's own default is not enough.
     needs_restart : bool
         A reload does not apply a change of this key.
     is_path : bool
@@ -111,7 +111,7 @@ def _key(
 
 
 def option_info(field: FieldInfo) -> OptionInfo:
-    """Return what a key's field tells the command line."""
+    """Return the option data of a key's field."""
     return next((each for each in field.metadata if isinstance(each, OptionInfo)), OptionInfo())
 
 

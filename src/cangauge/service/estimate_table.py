@@ -46,7 +46,7 @@ class EstimateWriter:
     """Write one row per sample, as `cangauge estimate` does; use it in a `with` block.
 
     All or nothing: the file appears when the block ends without an exception. If the disk is full
-    or fails, the table is abandoned with an event, and the service goes on.
+    or fails, the table is abandoned with an event, and the service continues.
 
     Parameters
     ----------

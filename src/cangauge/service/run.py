@@ -170,7 +170,7 @@ class Service:
         return summary_json(gauge, port, summary) | {"state": config.state} | written
 
     def reconfigure(self) -> LoopSettings | None:
-        """Read the configuration again and apply it as a whole; the SoC goes on.
+        """Read the configuration again and apply it as a whole; the SoC continues.
 
         Model, vehicle, method, capacity, gaps, time-outs and published ids change at once. The
         initial SoC is ignored: the SoC is known by now. Other keys need a restart, which is logged.

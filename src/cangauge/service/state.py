@@ -4,7 +4,7 @@
 
 The hash is that of the content, written without spaces and with sorted keys. Everything is checked
 before use: size, JSON, format, version, hash, then the type and range of every field. A file that
-cannot be read or written never stops the estimator: it is logged, and the service goes on without.
+cannot be read or written never stops the estimator: it is logged, and the service runs without.
 """
 
 from __future__ import annotations
