@@ -137,7 +137,7 @@ class ServiceRun:
         self.keeper: StateKeeper | None = None
         if path is not None:
             self.keeper = StateKeeper(
-                StateSettings(path, every_s=EVERY_S), self.gauge, lambda _: None,
+                StateSettings(path, every_s=EVERY_S), self.gauge,
                 wall_s=lambda: self.now_s,
             )  # fmt: skip
 

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import io
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from typing import Any, Self
 import can
 import pytest
 
+from cangauge._logging import RateLimitFilter
 from cangauge._resources import shared_file
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.open import BusAddress, open_bus
@@ -54,6 +56,41 @@ def short_log(seconds: float = 100.0, rate_hz: float = 10.0, *, noise_v: float =
     )
 
 
+class LoggedLines(logging.Handler):
+    """Lines that a service would write, rate-limited as there; warnings begin with "warning: ".
+
+    Parameters
+    ----------
+    logger : str
+    thread : threading.Thread, optional
+        Keep the lines of this thread only.
+    """
+
+    def __init__(self, logger: str = "cangauge", thread: threading.Thread | None = None) -> None:
+        super().__init__(logging.INFO)
+        self._logger = logging.getLogger(logger)
+        self._thread = thread
+        self._limiter = RateLimitFilter(self.emit)
+        self.addFilter(self._limiter)
+        self.lines: list[str] = []
+
+    def __enter__(self) -> Self:
+        self._level = self._logger.level
+        self._logger.setLevel(logging.INFO)
+        self._logger.addHandler(self)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._logger.removeHandler(self)
+        self._logger.setLevel(self._level)
+        self._limiter.close()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if self._thread is None or record.thread == self._thread.ident:
+            begin = "warning: " if record.levelno >= logging.WARNING else ""
+            self.lines.append(begin + record.getMessage())
+
+
 @dataclass
 class Service:
     """`serve` on a bus of its own, in a thread; estimates and warnings are kept."""
@@ -64,22 +101,29 @@ class Service:
     record: Any = None
     checkpoint: Callable[[], None] | None = None
     rows: list[tuple[float, Estimate]] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
     summary: RunSummary | None = None
     error: BaseException | None = None
 
     def __enter__(self) -> Self:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
+        self._logged = LoggedLines("cangauge.service.loop", self._thread)
+        self._logged.__enter__()
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self.end()
 
+    @property
+    def warnings(self) -> list[str]:
+        """Lines of the loop."""
+        return self._logged.lines
+
     def end(self) -> None:
         self._stop.set()
         self._thread.join(10.0)
+        self._logged.__exit__()
         self.port.close()
         assert not self._thread.is_alive()
 
@@ -91,7 +135,6 @@ class Service:
         outputs = Outputs(
             record=self.record,
             table=lambda time_s, estimate: self.rows.append((time_s, estimate)),
-            warn=self.warnings.append,
             checkpoint=self.checkpoint,
         )
         try:

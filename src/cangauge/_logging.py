@@ -1,14 +1,12 @@
-"""Events of a running service, one a line on stderr: for people, or as JSON for machines.
+"""Events of a running service: one line each on stderr, for people or as JSON, rate-limited.
 
-Anything that has something to say takes a logger of the standard library and names its event::
+Modules log through the standard library and name their event::
 
     _LOG = logging.getLogger(__name__)
     emit(_LOG, logging.WARNING, "bus.lost", "socketcan can0 is down", retry_s=1.0)
 
-Event names are stable (`area.what_happened`), so that they can be searched and counted; the text
-may change. An event that repeats is told at growing intervals, with how often it was left out.
-
-Saying what happens to a bus without flooding anybody: a line a second at most.
+Event names (`area.what_happened`) are stable, so that logs can be searched and counted; texts may
+change. `RateLimitFilter` is the only rate limiter: whoever logs need not keep count.
 """
 
 from __future__ import annotations
@@ -17,26 +15,26 @@ import json
 import logging
 import math
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Final, Literal, TextIO
-
-# --- Events of a running service, one a line on stderr: for people, or as JSON for machines
 
 LogFormat = Literal["text", "json"]
 LogLevel = Literal["debug", "info", "warning", "error"]
 
-FIRST_REPEAT_S: Final = 1.0
-"""An event is told again so long after it was told first [s] …"""
-LONGEST_REPEAT_S: Final = 60.0
-"""… then after twice as long each time, up to this [s]. Quiet for longer, it is new again."""
+FIRST_INTERVAL_S: Final = 1.0
+"""Minimum time between the first two records of an event [s]; doubles with each repetition …"""
+LONGEST_INTERVAL_S: Final = 60.0
+"""… up to this [s]. An event that was quiet for longer starts again at the first interval."""
 EVENTS_KEPT: Final = 256
-"""Of so many different events it is known when they were told."""
+"""Number of different events whose repetitions are tracked: bounds the memory."""
 
 _UNNAMED: Final = "log"
-"""The event of a record that has none: what a library logs."""
+"""Event of a record without one: those of other libraries."""
 
 
 def emit(
@@ -45,7 +43,7 @@ def emit(
     event: str,
     text: str,
     *,
-    always: bool = False,
+    limit: str | None = None,
     **fields: object,
 ) -> None:
     """Log one event.
@@ -56,85 +54,76 @@ def emit(
     level : int
         `logging.INFO`, `logging.WARNING`, …
     event : str
-        Its stable name, such as "bus.lost".
+        Stable name, such as "bus.lost".
     text : str
         One line for people.
-    always : bool
-        Tell it however often it repeats.
+    limit : str, optional
+        Share one rate limit among events that supersede each other, such as the states of a bus.
     **fields
-        Further values, with units in their names. JSON has them as keys.
+        Further values, with units in their names; keys of the JSON object.
     """
-    logger.log(level, "%s", text, extra={"event": event, "always": always, "fields": fields})
-
-
-def speaker(logger: logging.Logger, event: str, *, always: bool = False) -> Callable[[str], None]:
-    """Return a function that logs lines of text as one event; "warning: …" is a warning.
-
-    Parameters
-    ----------
-    logger : logging.Logger
-    event : str
-    always : bool
-        Where who speaks keeps a measure of their own.
-    """
-
-    def say(text: str) -> None:
-        words = text.removeprefix("warning: ")
-        level = logging.INFO if words == text else logging.WARNING
-        emit(logger, level, event, words, always=always)
-
-    return say
+    extra = {"event": event, "limit": limit or event, "fields": fields}
+    logger.log(level, "%s", text, extra=extra)
 
 
 @contextmanager
 def logging_to(
     log_format: LogFormat, level: LogLevel = "info", stream: TextIO | None = None
 ) -> Iterator[None]:
-    """Write what is logged to a stream while the block runs, then restore what was before.
+    """Write log records to a stream while the block runs, then restore the previous set-up.
 
     Parameters
     ----------
     log_format : {"text", "json"}
     level : {"debug", "info", "warning", "error"}
-        What is less is left out; of other libraries all but errors, unless it is "debug".
+        Lowest level written. Other libraries are limited to errors, unless it is "debug".
     stream : file, optional
         stderr by default.
     """
     handler = _Handler(stream or sys.stderr)
     handler.setFormatter(JsonFormatter() if log_format == "json" else TextFormatter())
-    handler.addFilter(RepeatFilter())
+    limiter = RateLimitFilter(handler.write)
+    handler.addFilter(limiter)
     root, own = logging.getLogger(), logging.getLogger("cangauge")
     bus = logging.getLogger("can")
     before = root.handlers[:], root.level, own.level, bus.level
     root.handlers[:] = [handler]
     root.setLevel(logging.DEBUG if level == "debug" else logging.ERROR)
-    own.setLevel(_number(level))
-    # What python-can logs as an error it raises as well, at each try to open a bus that is away.
+    own.setLevel(level.upper())
+    # python-can logs and raises the same error, at each attempt to open a missing bus.
     bus.setLevel(logging.NOTSET if level == "debug" else logging.CRITICAL)
     try:
         yield
     finally:
+        limiter.close()
         root.handlers[:] = before[0]
         root.setLevel(before[1])
         own.setLevel(before[2])
         bus.setLevel(before[3])
 
 
-def _number(level: LogLevel) -> int:
-    return logging.getLevelNamesMapping()[level.upper()]
-
-
 class _Handler(logging.StreamHandler[TextIO]):
+    def write(self, record: logging.LogRecord) -> None:
+        """Write a record without filtering it."""
+        self.acquire()
+        try:
+            self.emit(record)
+        finally:
+            self.release()
+
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
-        """Do nothing: a stderr that is gone must not end the service, and cannot be told of."""
+        """Ignore it: a closed stderr must not end the service, and cannot be reported."""
 
 
 class TextFormatter(logging.Formatter):
-    """`2026-10-17T08:30:00.123Z WARNING bus.lost: socketcan can0 is down (retry_s=1.0)`."""
+    """`2026-10-17T08:30:00.123Z WARNING bus.lost: socketcan can0 is down (retry_s=1)`."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
-        pairs = " ".join(f"{name}={_short(value)}" for name, value in _fields(record).items())
+        pairs = " ".join(
+            f"{name}={value:.6g}" if isinstance(value, float) else f"{name}={value}"
+            for name, value in _fields(record).items()
+        )
         line = f"{_time(record)} {record.levelname} {_event(record)}: {_message(record)}"
         return " ".join((f"{line} ({pairs})" if pairs else line).splitlines())
 
@@ -154,62 +143,109 @@ class JsonFormatter(logging.Formatter):
         return json.dumps(content, ensure_ascii=False)
 
 
-class Pace:
-    """How often something may be told: at once, then at growing intervals while it goes on.
+@dataclass(slots=True)
+class _Repetitions:
+    """State of one event."""
 
-    Attributes
-    ----------
-    left_out : int
-        How often it was not told since it was told last.
-    """
-
-    def __init__(self) -> None:
-        self.left_out = 0
-        self._asked_s = self._next_s = -math.inf
-        self._wait_s = FIRST_REPEAT_S
-
-    def allows(self, now_s: float) -> bool:
-        """Return whether it may be told now (monotonic clock [s]); if so, it counts as told."""
-        is_new = now_s - self._asked_s > LONGEST_REPEAT_S
-        self._asked_s = now_s
-        if is_new:
-            self._wait_s = FIRST_REPEAT_S
-        elif now_s < self._next_s:
-            self.left_out += 1
-            return False
-        else:
-            self._wait_s = min(2.0 * self._wait_s, LONGEST_REPEAT_S)
-        self._next_s = now_s + self._wait_s
-        return True
+    latest_s: float = -math.inf
+    next_s: float = -math.inf
+    interval_s: float = FIRST_INTERVAL_S
+    suppressed: int = 0
+    held: logging.LogRecord | None = None
 
 
-class RepeatFilter(logging.Filter):
-    """Lets an event pass that is new, and one that repeats at growing intervals.
+class RateLimitFilter(logging.Filter):
+    """Limit each event to one record per interval; the latest suppressed one follows at its end.
 
     Parameters
     ----------
+    release : callable, optional
+        Writes a suppressed record when its interval ends, from a timer thread. Without it,
+        suppressed records are only counted.
     clock : callable
         Monotonic time [s].
     """
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        release: Callable[[logging.LogRecord], None] | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         super().__init__()
+        self._release = release
         self._clock = clock
-        self._paces: dict[tuple[str, str], Pace] = {}
+        self._lock = threading.Lock()
+        self._events: dict[tuple[str, str], _Repetitions] = {}
+        self._timer: threading.Timer | None = None
+        self._timer_s = math.inf
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether the record is told; one that is carries what was left out before it."""
-        event = _event(record)
-        key = (record.name, event if event != _UNNAMED else str(record.msg))
-        pace = self._paces.pop(key, None) or Pace()
-        self._paces[key] = pace
-        if len(self._paces) > EVENTS_KEPT:
-            del self._paces[next(iter(self._paces))]  # the one not seen for longest
-        if not (getattr(record, "always", False) or pace.allows(self._clock())):
-            return False
-        if pace.left_out:
-            record.left_out, pace.left_out = pace.left_out, 0
+        """Return whether to write the record now; its `suppressed` counts those before it."""
+        key = (record.name, str(getattr(record, "limit", record.msg)))
+        with self._lock:
+            now_s = self._clock()
+            seen = self._events.pop(key, None) or _Repetitions()
+            self._events[key] = seen
+            if len(self._events) > EVENTS_KEPT:
+                del self._events[next(iter(self._events))]  # the one quiet for longest
+            if now_s - seen.latest_s > LONGEST_INTERVAL_S:
+                seen.interval_s = FIRST_INTERVAL_S
+            elif now_s < seen.next_s:
+                seen.latest_s = now_s
+                seen.suppressed += 1
+                seen.held = record
+                self._set_timer(seen.next_s, now_s)
+                return False
+            else:
+                seen.interval_s = min(2.0 * seen.interval_s, LONGEST_INTERVAL_S)
+            seen.latest_s = now_s
+            _pass(seen, record, now_s)
         return True
+
+    def release_due(self, *, everything: bool = False) -> None:
+        """Write the suppressed records whose interval has ended, or all of them."""
+        if self._release is None:
+            return
+        with self._lock:
+            now_s = self._clock()
+            due: list[logging.LogRecord] = []
+            self._timer_s = math.inf
+            for seen in self._events.values():
+                if seen.held is None:
+                    continue
+                if now_s < seen.next_s and not everything:
+                    self._set_timer(seen.next_s, now_s)
+                    continue
+                due.append(seen.held)
+                seen.suppressed -= 1
+                seen.interval_s = min(2.0 * seen.interval_s, LONGEST_INTERVAL_S)
+                _pass(seen, seen.held, now_s)
+        for record in sorted(due, key=lambda each: each.created):
+            self._release(record)
+
+    def close(self) -> None:
+        """Write all suppressed records and stop the timer."""
+        self.release_due(everything=True)
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def _set_timer(self, due_s: float, now_s: float) -> None:
+        if self._release is None or due_s >= self._timer_s:
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer_s = due_s
+        self._timer = threading.Timer(due_s - now_s, self.release_due)
+        self._timer.daemon = True
+        self._timer.start()
+
+
+def _pass(seen: _Repetitions, record: logging.LogRecord, now_s: float) -> None:
+    if seen.suppressed:
+        record.suppressed = seen.suppressed
+    seen.suppressed = 0
+    seen.held = None
+    seen.next_s = now_s + seen.interval_s
 
 
 def _time(record: logging.LogRecord) -> str:
@@ -228,13 +264,9 @@ def _message(record: logging.LogRecord) -> str:
 
 def _fields(record: logging.LogRecord) -> dict[str, Any]:
     fields = dict(getattr(record, "fields", {}))
-    if hasattr(record, "left_out"):
-        fields["repeats_left_out"] = record.left_out
+    if hasattr(record, "suppressed"):
+        fields["repeats_suppressed"] = record.suppressed
     return fields
-
-
-def _short(value: Any) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def _plain(value: Any) -> Any:
@@ -243,49 +275,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
     return value if isinstance(value, str | int | bool) or value is None else str(value)
-
-
-# --- Saying what happens to a bus without flooding anybody: a line a second at most
-
-EVERY_S: Final = 1.0
-
-
-class Voice:
-    """Says lines, at most one in `EVERY_S`; of those that come sooner the last is said later.
-
-    Parameters
-    ----------
-    say : callable
-        Takes a line of text.
-    clock : callable, optional
-        Returns monotonic time [s].
-    """
-
-    def __init__(
-        self, say: Callable[[str], None], clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        self._say = say
-        self._clock = clock
-        self._last_s = -math.inf
-        self._held: str | None = None
-        self._left_out = 0
-
-    def say(self, text: str) -> None:
-        """Say a line now, or when it is time (see `look`)."""
-        if self._held is not None:
-            self._left_out += 1
-        self._held = text
-        self.look()
-
-    def look(self) -> None:
-        """Say what was held back, if it is time."""
-        if self._held is None:
-            return
-        now_s = self._clock()
-        if now_s - self._last_s < EVERY_S:
-            return
-        text = self._held
-        if self._left_out:
-            text += f" (lines left out: {self._left_out})"
-        self._held, self._left_out, self._last_s = None, 0, now_s
-        self._say(text)

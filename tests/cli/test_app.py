@@ -1,4 +1,4 @@
-"""The application: its commands, and what starting one of them imports."""
+"""The application: its commands, help, completion, and what a start imports."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ import typer
 
 from cangauge._resources import THREADS
 from cangauge.cli.app import COMMANDS, app
+from live import in_process
 
 SLOW_TO_IMPORT = ("bokeh", "pyarrow", "clarabel", "cangauge.diagnosis", "cangauge.report.page")
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_is_there_and_has_help(name: str) -> None:
+def test_each_command_loads_and_has_help(name: str) -> None:
     command = typer.main.get_command(app).get_command(None, name)  # type: ignore[attr-defined, arg-type] # a group, which needs no context
     assert command.name == name
     assert command.help
 
 
-def test_the_service_starts_without_what_only_others_need() -> None:
+def test_run_imports_no_module_of_other_commands() -> None:
     code = (
         "import sys; from cangauge.cli.app import LazyGroup, app; import typer;"
         "typer.main.get_command(app).get_command(None, 'run');"
@@ -34,11 +35,56 @@ def test_the_service_starts_without_what_only_others_need() -> None:
     assert done.stdout.strip() == "[]"
 
 
+def test_the_root_page_and_completion_import_no_command() -> None:
+    for setting, word in (({}, "--help"), (COMPLETE_R, "")):
+        code = (
+            f"import sys; sys.argv = ['cangauge', {word!r}]; from cangauge.cli.app import main\n"
+            "try: main()\n"
+            "except SystemExit: print([m for m in sys.modules if m.startswith('cangauge.cli.')])"
+        )
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            capture_output=True, text=True, check=True, timeout=60, env=os.environ | setting,
+        )  # fmt: skip
+        assert "replay" in done.stdout
+        assert done.stdout.splitlines()[-1] == "['cangauge.cli.output', 'cangauge.cli.app']"
+
+
+COMPLETE_R = {
+    "_CANGAUGE_COMPLETE": "complete_bash",
+    "COMP_WORDS": "cangauge re",
+    "COMP_CWORD": "1",
+}
+
+
+@pytest.mark.parametrize(
+    ("line", "suggested"),
+    [
+        ("rnu", "run"),
+        ("gapcheck", "gap-check"),
+        ("run --modle x", "--model"),
+        ("run --htp x", "--http"),
+    ],
+)
+def test_mistyped_words_are_answered_with_the_nearest(line: str, suggested: str) -> None:
+    ended = in_process(*line.split())
+    assert ended.code == 2
+    assert f"did you mean {suggested}" in ended.err.lower()
+    assert ended.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("words", [["-h"], ["status", "-h"]])
+def test_h_shows_help(words: list[str]) -> None:
+    ended = in_process(*words)
+    assert ended.code == 0
+    assert "Usage: cangauge" in ended.out
+
+
 @pytest.mark.parametrize(("asked", "expected"), [(None, "1"), ("2", "2")])
-def test_linear_algebra_has_one_thread_unless_the_user_says_more(
+def test_blas_has_one_thread_unless_the_user_asks_for_more(
     asked: str | None, expected: str
 ) -> None:
-    """It is asked for before numpy is imported, which would not hear of it later."""
+    """Set before numpy is imported, which reads the variable once."""
     code = (
         "import os, sys; from cangauge.cli import app; loaded = 'numpy' in sys.modules\n"
         "sys.argv = ['cangauge', '--version']\n"

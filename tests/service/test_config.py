@@ -1,14 +1,15 @@
-"""The configuration: file, command line, and errors that say where and what."""
+"""The configuration: file, options, reference, and errors with source, field and value."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
 from cangauge.bus.protection import GENERIC_RULE, E2eRule
 from cangauge.errors import InputError
-from cangauge.service.config import load_config
+from cangauge.service.config import config_keys, load_config, reference
 
 
 def write(tmp_path: Path, text: str) -> Path:
@@ -54,7 +55,7 @@ def test_a_whole_file(tmp_path: Path) -> None:
     assert config.load_vehicle().name == "Nissan Leaf AZE0"
 
 
-def test_the_command_line_goes_before_the_file(tmp_path: Path) -> None:
+def test_options_take_precedence_over_the_file(tmp_path: Path) -> None:
     path = write(
         tmp_path,
         'model = "a.json"\nvehicle = "leaf_aze0"\ninitial_soc = 50\n'
@@ -132,7 +133,7 @@ def test_no_such_file() -> None:
         load_config("/nowhere/car.toml")
 
 
-def test_protection_and_checks_go_before_the_cars(tmp_path: Path) -> None:
+def test_protection_and_checks_precede_the_vehicles(tmp_path: Path) -> None:
     path = write(
         tmp_path,
         """
@@ -182,7 +183,9 @@ def test_protection_and_checks_go_before_the_cars(tmp_path: Path) -> None:
         ("[messages.PACK_CURRENT]\ndata_id = -1", "messages.PACK_CURRENT.data_id"),
     ],
 )
-def test_mistakes_in_them_name_file_and_field(tmp_path: Path, text: str, field: str) -> None:
+def test_errors_in_protection_and_checks_name_file_and_field(
+    tmp_path: Path, text: str, field: str
+) -> None:
     path = write(tmp_path, f'model = "leaf.json"\n{text}\n')
     with pytest.raises(InputError) as caught:
         load_config(path).load_vehicle()
@@ -190,10 +193,28 @@ def test_mistakes_in_them_name_file_and_field(tmp_path: Path, text: str, field: 
     assert field == "messages.PACK_CURENT" or caught.value.source == str(path)
 
 
-def test_a_bus_that_is_waited_for_need_not_be_seen_to_be_known() -> None:
+def test_the_interface_of_a_missing_bus_follows_from_its_name() -> None:
     waiting = load_config(None, {"model": "a.json", "channel": "can7", "wait_for_bus": True})
     assert str(waiting.address()) == "socketcan can7"
     group = load_config(None, {"model": "a.json", "channel": "239.1.1.1", "wait_for_bus": True})
     assert group.address().interface == "udp_multicast"
     with pytest.raises(InputError, match="can7"):
         load_config(None, {"model": "a.json", "channel": "can7"}).address()
+
+
+def test_each_key_is_described_and_each_option_declared_once() -> None:
+    keys = {key.name: key for key in config_keys()}
+    assert set(keys) > {"model", "ids.soc_estimate", "full_charge.voltage_v", "checks.voltage"}
+    assert all(key.text for key in keys.values())
+    flags = [flag for key in keys.values() for flag in re.split("[,/] ?", key.option) if flag]
+    assert len(flags) == len(set(flags))
+    timeout = keys["timeout_s"]
+    assert (timeout.option, timeout.default, timeout.unit) == ("--timeout-s", "2", "s")
+    assert timeout.bounds == "> 0, ≤ 1e+09"
+    assert "| `ids.soc_detail` | `--soc-detail-id` | whole number | 0x5A1 |" in reference()
+
+
+def test_an_error_of_an_option_names_it_as_it_is_written() -> None:
+    with pytest.raises(InputError) as caught:
+        load_config(None, {"model": "m", "until_idle_s": -1.0})
+    assert caught.value.field == "--until-idle"

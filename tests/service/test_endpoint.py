@@ -1,4 +1,4 @@
-"""Status by unix socket and HTTP: what is told, to whom, and that nobody can hold it up."""
+"""Status by unix socket and HTTP: content, access, and limits of clients."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from watched import Watched
 
 from cangauge.errors import CangaugeError, InputError
-from cangauge.service.config import http_address
-from cangauge.service.http import MAX_CLIENTS, Endpoint, default_path, open_unix, served_sockets
+from cangauge.service.addresses import default_path, http_address, open_unix, served_sockets
+from cangauge.service.http import MAX_CLIENTS, Endpoint
 from cangauge.service.status_client import NotRunningError, fetch_status, find_socket
 from live import in_process
 
@@ -123,8 +123,8 @@ def test_without_a_token_only_loopback_names_are_answered(http: Endpoint) -> Non
 @pytest.mark.parametrize(
     ("text", "say"),
     [
-        ("0.0.0.0:9464", "open to the network"),
-        ("[::]:9464", "open to the network"),
+        ("0.0.0.0:9464", "reachable from the network"),
+        ("[::]:9464", "reachable from the network"),
         ("192.168.1.7:9464", "--http-token-file"),
         ("example.org:9464", "HOST:PORT"),
         ("127.0.0.1", "HOST:PORT"),
@@ -148,7 +148,7 @@ def test_addresses_that_are_taken(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", ["", "short", "two words of a token", "x" * 2000, "ü" * 30])
-def test_bad_tokens_are_refused_without_being_told(tmp_path: Path, content: str) -> None:
+def test_bad_tokens_are_refused_without_being_quoted(tmp_path: Path, content: str) -> None:
     path = tmp_path / "token"
     path.write_text(content)
     with pytest.raises(InputError, match="token") as caught:
@@ -206,12 +206,12 @@ def test_a_socket_left_behind_is_replaced_and_a_file_is_not(tmp_path: Path) -> N
     open_unix(path).close()
     path.unlink()
     path.write_text("precious")
-    with pytest.raises(InputError, match="cannot be made"):
+    with pytest.raises(InputError, match="cannot be created"):
         open_unix(path)
     assert path.read_text() == "precious"
-    with pytest.raises(InputError, match="cannot be made"):
+    with pytest.raises(InputError, match="cannot be created"):
         open_unix(tmp_path / "no" / "folder.sock")
-    with pytest.raises(InputError, match="cannot be made"):
+    with pytest.raises(InputError, match="cannot be created"):
         open_unix(tmp_path / ("long" * 50))
 
 
@@ -232,11 +232,11 @@ def test_services_are_found_where_they_put_their_sockets(
         second = tmp_path / "cangauge" / "b.sock"
         with (
             Endpoint(lambda: watched.monitor.latest, unix_path=second),
-            pytest.raises(InputError, match="several services run"),
+            pytest.raises(InputError, match="several services are running"),
         ):
             find_socket()
     (tmp_path / "cangauge").chmod(0o777)
-    with pytest.raises(InputError, match="not this user's alone"):
+    with pytest.raises(InputError, match="not private to this user"):
         default_path("can0")
 
 
@@ -271,7 +271,7 @@ def test_answers_that_are_none(tmp_path: Path, answer: bytes) -> None:
     server.close()
 
 
-def test_slow_and_greedy_clients_hold_nobody_up(http: Endpoint) -> None:
+def test_slow_and_greedy_clients_block_nobody(http: Endpoint) -> None:
     assert get(http.port, "/status")[0] == 200  # so that all is open that will be
     files = len(list(Path("/proc/self/fd").iterdir()))
     slow = [socket.create_connection(("127.0.0.1", http.port or 0)) for _ in range(200)]

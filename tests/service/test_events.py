@@ -1,4 +1,4 @@
-"""Events: one a line, with stable names; repeats at growing intervals."""
+"""Events: one a line, with stable names; repetitions are rate-limited."""
 
 from __future__ import annotations
 
@@ -10,9 +10,16 @@ import sys
 
 import pytest
 
-from cangauge._logging import LogFormat, Pace, RepeatFilter, emit, logging_to, speaker
+from cangauge._logging import LogFormat, RateLimitFilter, emit, logging_to
+from live import waits
 
 LOG = logging.getLogger("cangauge.test")
+
+
+def record(event: str, text: str = "x") -> logging.LogRecord:
+    made = logging.LogRecord("cangauge.bus", logging.WARNING, "", 0, "%s", (text,), None)
+    made.event = made.limit = event
+    return made
 
 
 def logged(log_format: LogFormat, level: str = "info") -> io.StringIO:
@@ -45,17 +52,6 @@ def test_text_is_one_line_an_event() -> None:
     assert lines[1].endswith("WARNING bus.said: 100 % busy")
 
 
-def test_a_speaker_takes_lines_as_they_were() -> None:
-    stream = io.StringIO()
-    with logging_to("text", stream=stream):
-        say = speaker(LOG, "bus.told", always=True)
-        say("warning: can0 is down")
-        say("can0: back")
-    lines = stream.getvalue().splitlines()
-    assert lines[0].endswith("WARNING bus.told: can0 is down")
-    assert lines[1].endswith("INFO bus.told: can0: back")
-
-
 def test_levels_and_what_was_before_is_restored() -> None:
     root = logging.getLogger()
     before = root.handlers[:], root.level
@@ -64,7 +60,7 @@ def test_levels_and_what_was_before_is_restored() -> None:
     assert (root.handlers, root.level) == before
 
 
-def test_a_stream_that_is_gone_ends_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_closed_stream_is_ignored(capsys: pytest.CaptureFixture[str]) -> None:
     stream = io.StringIO()
     with logging_to("text", stream=stream):
         stream.close()
@@ -72,48 +68,83 @@ def test_a_stream_that_is_gone_ends_nothing(capsys: pytest.CaptureFixture[str]) 
     assert capsys.readouterr().err == ""
 
 
-def test_repeats_are_told_at_growing_intervals_with_what_was_left_out() -> None:
+def test_repetitions_are_written_at_growing_intervals() -> None:
     now = [0.0]
-    repeats = RepeatFilter(lambda: now[0])
-    told = []
+    repeats = RateLimitFilter(clock=lambda: now[0])
+    written = []
     for tenth in range(10_000):
         now[0] = 0.1 * tenth
-        record = logging.LogRecord("cangauge.bus", 30, "", 0, "%s", ("x",), None)
-        record.event = "bus.lost"
-        if repeats.filter(record):
-            told.append((now[0], getattr(record, "left_out", 0)))
-    assert [round(time_s) for time_s, _ in told][:7] == [0, 1, 3, 7, 15, 31, 63]
-    assert told[1][1] == 9
-    assert sum(left + 1 for _, left in told) <= 10_000
-    assert all(later[0] - before[0] <= 60.2 for before, later in itertools.pairwise(told))
+        each = record("bus.lost")
+        if repeats.filter(each):
+            written.append((now[0], getattr(each, "suppressed", 0)))
+    assert [round(time_s) for time_s, _ in written][:7] == [0, 1, 3, 7, 15, 31, 63]
+    assert written[1][1] == 9
+    assert sum(left + 1 for _, left in written) <= 10_000
+    assert all(later[0] - before[0] <= 60.2 for before, later in itertools.pairwise(written))
     now[0] += 61.0  # quiet for a minute: new again
-    record = logging.LogRecord("cangauge.bus", 30, "", 0, "%s", ("x",), None)
-    record.event = "bus.lost"
-    assert repeats.filter(record)
+    assert repeats.filter(record("bus.lost"))
 
 
-def test_other_events_and_those_told_always_pass() -> None:
+def test_events_are_limited_separately() -> None:
     stream = io.StringIO()
     with logging_to("text", stream=stream):
         for _ in range(3):
             emit(LOG, logging.INFO, "a.b", "x")
             emit(LOG, logging.INFO, "a.c", "x")
-            emit(LOG, logging.INFO, "a.d", "x", always=True)
-    events = [line.split()[2] for line in stream.getvalue().splitlines()]
-    assert events == ["a.b:", "a.c:", "a.d:", "a.d:", "a.d:"]
+        events = [line.split()[2] for line in stream.getvalue().splitlines()]
+    assert events == ["a.b:", "a.c:"]
 
 
-def test_many_different_events_take_no_memory() -> None:
-    repeats = RepeatFilter(lambda: 0.0)
+def test_many_different_events_use_bounded_memory() -> None:
+    repeats = RateLimitFilter(clock=lambda: 0.0)
     for number in range(5_000):
-        record = logging.LogRecord("cangauge.bus", 30, "", 0, "%s", ("x",), None)
-        record.event = f"made.up_{number}"
-        repeats.filter(record)
-    assert sys.getsizeof(repeats._paces) < 100_000
+        repeats.filter(record(f"made.up_{number}"))
+    assert sys.getsizeof(repeats._events) < 100_000
 
 
-def test_a_pace_begins_at_once() -> None:
-    pace = Pace()
-    assert pace.allows(-1e9)
-    assert not pace.allows(-1e9 + 0.5)
-    assert pace.left_out == 1
+def test_the_first_of_an_event_is_always_written() -> None:
+    limiter = RateLimitFilter(clock=lambda: -1e9)
+    assert limiter.filter(record("bus.lost"))
+    assert not limiter.filter(record("bus.lost"))
+
+
+def test_the_latest_suppressed_record_follows_its_interval() -> None:
+    now, written = [100.0], list[str]()
+    limiter = RateLimitFilter(lambda each: written.append(each.getMessage()), lambda: now[0])
+    assert limiter.filter(record("bus.lost", "down"))
+    for number in range(5):
+        now[0] += 0.1
+        assert not limiter.filter(record("bus.lost", f"try {number}"))
+    now[0] = 100.99
+    limiter.release_due()
+    assert written == []
+    now[0] = 101.0
+    limiter.release_due()
+    limiter.release_due()
+    assert written == ["try 4"]
+    limiter.close()
+
+
+def test_suppressed_records_are_written_by_a_timer_and_at_the_end() -> None:
+    stream = io.StringIO()
+    with logging_to("text", stream=stream):
+        for number in range(3):
+            emit(LOG, logging.INFO, "bus.lost", f"try {number}")
+        assert waits(lambda: len(stream.getvalue().splitlines()) == 2)
+        emit(LOG, logging.INFO, "bus.lost", "last")
+    lines = stream.getvalue().splitlines()
+    assert [line.split("lost: ")[1] for line in lines] == [
+        "try 0", "try 2 (repeats_suppressed=1)", "last"
+    ]  # fmt: skip
+
+
+def test_events_of_one_limit_supersede_each_other() -> None:
+    stream = io.StringIO()
+    with logging_to("text", stream=stream):
+        for number in range(3):
+            emit(LOG, logging.WARNING, "bus.lost", f"lost {number}", limit="bus.state")
+            emit(LOG, logging.INFO, "bus.back", f"back {number}", limit="bus.state")
+    lines = stream.getvalue().splitlines()
+    assert lines[0].endswith("WARNING bus.lost: lost 0")
+    assert lines[1].endswith("INFO bus.back: back 2 (repeats_suppressed=4)")
+    assert len(lines) == 2

@@ -1,4 +1,4 @@
-"""What systemd hears, from the class and from the real service."""
+"""Notifications to systemd, of the class and of the real service."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.service.systemd import Notifier
+from cangauge.service.lifecycle import Notifier
 from live import COMMAND, Command, leaf_model_path
 
 
@@ -106,7 +106,7 @@ def test_a_full_queue_does_not_block(systemd: FakeSystemd) -> None:
 
 
 @pytest.mark.slow
-def test_the_service_is_ready_lives_while_its_loop_turns_and_says_when_it_stops(
+def test_systemd_gets_ready_watchdog_and_stopping(
     systemd: FakeSystemd, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert "main" in COMMAND

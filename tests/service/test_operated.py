@@ -1,4 +1,4 @@
-"""The service with all that operators want, in a process of its own, over udp_multicast."""
+"""The whole service in a process over udp_multicast: status, metrics, recording."""
 
 from __future__ import annotations
 

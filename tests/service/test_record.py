@@ -1,4 +1,4 @@
-"""Recording: in parts, within bounds, past a full disk and a kill, and read back to the bit."""
+"""Recording: parts, limits, full disks, kills, and exact reading back."""
 
 from __future__ import annotations
 
@@ -24,11 +24,10 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.offline import samples_of
 from cangauge.replay.steps import CaptureSource
-from cangauge.service import async_writer as record_file
-from cangauge.service.async_writer import DiskWriter, RecordFile
+from cangauge.service import recording
 from cangauge.service.capture_estimate import estimate_capture
 from cangauge.service.pipeline import Gauge
-from cangauge.service.recording import Recorder, RecordLimits
+from cangauge.service.recording import RecordBuffer, Recorder, RecordLimits
 from live import in_process, leaf_model, leaf_model_path, short_log, waits
 
 FORMATS = [".log", ".csv", ".log.gz", ".blf", ".mf4"]
@@ -121,7 +120,7 @@ def test_a_clock_that_is_set_back_is_kept(tmp_path: Path, suffix: str) -> None:
     assert content(recorder.path) == expected(messages)
 
 
-def test_without_limits_one_file_that_the_next_run_does_not_replace(tmp_path: Path) -> None:
+def test_without_limits_a_run_keeps_the_previous_file(tmp_path: Path) -> None:
     path = tmp_path / "drive.log"
     for number, name in enumerate(("drive.log", "drive-0001.log", "drive-0002.log")):
         begin_s = 1.7e9 + 100.0 * number
@@ -211,8 +210,8 @@ class FailingFile(io.FileIO):
 
 @pytest.fixture
 def failing(monkeypatch: pytest.MonkeyPatch) -> type[FailingFile]:
-    monkeypatch.setattr(record_file.io, "FileIO", FailingFile)
-    monkeypatch.setattr(record_file, "RETRY_S", 0.02)
+    monkeypatch.setattr(recording.io, "FileIO", FailingFile)
+    monkeypatch.setattr(recording, "RETRY_S", 0.02)
     monkeypatch.setattr(FailingFile, "is_full", False)
     return FailingFile
 
@@ -225,7 +224,7 @@ def test_a_full_disk_costs_frames_of_the_recording_only(
     caplog: pytest.LogCaptureFixture,
     suffix: str,
 ) -> None:
-    monkeypatch.setattr(record_file, "WAITING_BYTES", 4_000)
+    monkeypatch.setattr(recording, "WAITING_BYTES", 4_000)
     messages = frames(60.0)
     with Recorder(tmp_path / f"drive{suffix}") as recorder:
         for number, message in enumerate(messages):
@@ -240,7 +239,7 @@ def test_a_full_disk_costs_frames_of_the_recording_only(
                 assert waits(lambda: recorder.state.problem is not None)
                 assert recorder.state.problem == "No space left on device"
                 failing.is_full = False
-                monkeypatch.setattr(record_file, "WAITING_BYTES", 1 << 20)
+                recorder._disk.writer.max_waiting_bytes = 1 << 20
                 assert waits(lambda: recorder.state.problem is None)
     state = recorder.state
     assert state.problem is None
@@ -272,7 +271,7 @@ def test_a_disk_that_is_full_for_good(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_goes_and_comes_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(record_file, "RETRY_S", 0.02)
+    monkeypatch.setattr(recording, "RETRY_S", 0.02)
     folder = tmp_path / "stick"
     folder.mkdir()
     messages = frames(20.0)
@@ -292,7 +291,7 @@ def test_a_folder_that_goes_and_comes_back(tmp_path: Path, monkeypatch: pytest.M
     assert content(recorder.path) == expected(messages)
 
 
-def test_a_disk_that_hangs_does_not_hold_the_loop_or_the_end(
+def test_a_hanging_disk_delays_neither_loop_nor_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hang = threading.Event()
@@ -302,7 +301,7 @@ def test_a_disk_that_hangs_does_not_hold_the_loop_or_the_end(
             hang.wait(20.0)
             return super().write(data)
 
-    monkeypatch.setattr(record_file.io, "FileIO", Hanging)
+    monkeypatch.setattr(recording.io, "FileIO", Hanging)
     began = time.monotonic()
     with Recorder(tmp_path / "drive.log") as recorder:
         for message in frames(30.0):
@@ -356,14 +355,7 @@ def test_a_kill_loses_no_more_than_the_last_half_second(tmp_path: Path, suffix: 
 def test_a_file_in_memory_is_one_file() -> None:
     written: list[tuple[bytes, int, int | None]] = []
 
-    class Disk(DiskWriter):
-        def __init__(self) -> None:
-            pass
-
-        def write(self, data: bytes, frames: int, place: int | None = None) -> None:
-            written.append((data, frames, place))
-
-    file = RecordFile(Disk())
+    file = RecordBuffer(lambda *piece: written.append(piece))
     file.write(b"headxx")
     file.seek(4)
     file.write(b"er")

@@ -1,9 +1,10 @@
-"""Another configuration while running: what takes effect, what does not, and what is refused."""
+"""Reloading the configuration: what changes, what needs a restart, what is refused."""
 
 from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import can
@@ -15,12 +16,9 @@ from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.validity import Reason
-from cangauge.model.model_file import Model
-from cangauge.service.config import load_config
 from cangauge.service.loop import LoopSettings
-from cangauge.service.pipeline import Gauge
-from cangauge.service.run import Reloader
-from live import leaf_model_path, short_log
+from cangauge.service.run import Service
+from live import LoggedLines, leaf_model_path, short_log, waits
 
 MAP = """
 dbc = ["pack.dbc"]
@@ -46,15 +44,15 @@ class Car:
         self.model = folder / "model.json"
         shutil.copy(leaf_model_path(), self.model)
         self.write(text)
-        config = load_config(self.path)
-        vehicle = config.load_vehicle()
-        self.gauge = Gauge(vehicle, Model.load(config.model), config.gauge_settings())
-        self.said: list[str] = []
-        self.reloader = Reloader(
-            lambda: load_config(self.path), config, vehicle, self.gauge, self.said.append
-        )
+        self.service = Service(self.path)
+        self.gauge = self.service.gauge
+        self.logged = LoggedLines("cangauge.service.run")
         encoder = FrameEncoder(Vehicle.load("generic"))
         self.frames = [encoder.encode(each) for each in samples_of(short_log(200.0))]
+
+    @property
+    def said(self) -> list[str]:
+        return self.logged.lines
 
     def write(self, text: str) -> None:
         self.path.write_text(f'model = "model.json"\ninitial_soc = 80\n{text}')
@@ -69,22 +67,21 @@ class Car:
 
     def reload(self, text: str) -> LoopSettings | None:
         self.write(text)
-        return self.reloader.reload()
+        return self.service.reconfigure()
 
 
 @pytest.fixture
-def car(tmp_path: Path) -> Car:
+def car(tmp_path: Path) -> Iterator[Car]:
     car = Car(tmp_path)
     car.drive(0, 1000)
-    return car
+    with car.logged:
+        yield car
 
 
-def test_thresholds_and_time_outs_change_and_the_estimate_goes_on_bit_for_bit(
-    car: Car, tmp_path: Path
-) -> None:
+def test_a_reload_of_timeouts_leaves_the_estimate_bit_for_bit(car: Car, tmp_path: Path) -> None:
     settings = car.reload("timeout_s = 0.5\nuntil_idle_s = 9\n")
     assert settings == LoopSettings(timeout_s=0.5, until_idle_s=9.0)
-    assert car.said == ["configuration read again; changed: timeout_s, until_idle_s"]
+    assert car.said == ["configuration reloaded; changed: timeout_s, until_idle_s"]
     car.drive(1000, 1200)
     (tmp_path / "undisturbed").mkdir()
     undisturbed = Car(tmp_path / "undisturbed")
@@ -108,11 +105,11 @@ def test_another_model_in_the_same_file_takes_soc_over(car: Car) -> None:
     assert car.gauge.samples == 1001
 
 
-def test_initial_soc_is_of_the_past(car: Car) -> None:
+def test_a_reload_ignores_the_initial_soc(car: Car) -> None:
     before = car.gauge.latest
     assert car.reload("initial_soc_std = 20\n") is not None
     car.path.write_text('model = "model.json"\ninitial_soc = 20\n')
-    assert car.reloader.reload() is not None
+    assert car.service.reconfigure() is not None
     car.drive(1000, 1001)
     assert car.gauge.latest.soc_pct == pytest.approx(before.soc_pct, abs=0.05)
 
@@ -133,7 +130,7 @@ def estimate_counter(frame: can.Message) -> int:
     return int(next(values[name] for name in values if name.startswith("counter")))  # type: ignore[union-attr,call-overload] # a dict of numbers
 
 
-def test_another_car_is_taken_and_frames_stay_counted(car: Car) -> None:
+def test_a_reload_changes_the_vehicle_and_keeps_counts(car: Car) -> None:
     frames = car.gauge.counts.frames
     assert car.reload('vehicle = "leaf_aze0"\n') is not None
     car.drive(1000, 1100)  # the frames of the other car: not wanted now
@@ -152,7 +149,7 @@ def test_a_dbc_or_map_that_changed_is_noticed(tmp_path: Path) -> None:
     car.drive(0, 100)
     temperature_c = car.gauge.latest_sample.temperature_c  # type: ignore[union-attr] # there is one
     (tmp_path / "map.toml").write_text(MAP + "offset = 5\n")
-    assert car.reloader.reload() is not None
+    assert car.service.reconfigure() is not None
     car.drive(100, 200)
     assert car.gauge.latest_sample.temperature_c == pytest.approx(  # type: ignore[union-attr] # as above
         temperature_c + 5.0, abs=1.0
@@ -171,13 +168,11 @@ def test_a_dbc_or_map_that_changed_is_noticed(tmp_path: Path) -> None:
         ("[ids]\nsoc_estimate = 0x100\nsoc_detail = 0x900", "soc_detail"),
     ],
 )
-def test_what_is_broken_is_refused_whole_and_the_old_one_goes_on(
-    car: Car, text: str, say: str
-) -> None:
+def test_an_invalid_configuration_is_refused_as_a_whole(car: Car, text: str, say: str) -> None:
     settings, filters, latest = car.gauge.settings, car.gauge.filters, car.gauge.latest
     assert car.reload(text) is None
     assert len(car.said) == 1
-    assert car.said[0].startswith("warning: new configuration refused, the old one goes on: ")
+    assert car.said[0].startswith("warning: new configuration refused, the old one stays: ")
     assert say in car.said[0]
     assert "\n" not in car.said[0]
     assert (car.gauge.settings, car.gauge.filters, car.gauge.latest) == (settings, filters, latest)
@@ -185,7 +180,7 @@ def test_what_is_broken_is_refused_whole_and_the_old_one_goes_on(
     assert car.gauge.samples == 1001
 
 
-def test_an_id_that_the_new_car_uses_is_refused_before_anything_changes(car: Car) -> None:
+def test_an_id_of_the_new_vehicle_is_refused_without_changes(car: Car) -> None:
     filters = car.gauge.filters
     assert car.reload('vehicle = "leaf_aze0"\n[ids]\nsoc_estimate = 0x1DB\n') is None
     assert "0x1DB" in car.said[0]
@@ -198,16 +193,16 @@ def test_a_broken_model_is_refused(car: Car, content: bytes) -> None:
     assert car.reload("timeout_s = 0.5\n") is None
     assert "model.json" in car.said[0]
     car.model.unlink()
-    assert car.reloader.reload() is None
-    assert len(car.said) == 2
+    assert car.service.reconfigure() is None
+    assert waits(lambda: len(car.said) == 2)
 
 
-def test_what_needs_a_restart_is_said_and_left(car: Car) -> None:
+def test_keys_that_need_a_restart_are_logged_and_unchanged(car: Car) -> None:
     text = 'channel = "can5"\ntime_source = "replay-clock"\n[ids]\nreplay_clock = 0x111\n'
     assert car.reload(text) is not None
     assert car.gauge.settings.time_source == "receive"
     assert car.gauge.settings.ids.replay_clock == 0x5AF
     assert car.said[1] == (
-        "warning: channel, time_source, ids.replay_clock: takes effect when the service starts"
-        " again"
+        "warning: channel, time_source, ids.replay_clock: takes effect when the service is"
+        " restarted"
     )

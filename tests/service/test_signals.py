@@ -1,4 +1,4 @@
-"""SIGHUP: a request to read again, and the end where it means that the terminal is gone."""
+"""SIGHUP: a reload, or the end if the terminal was closed."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.service.signals import note_hangups, stop_on_signals
+from cangauge.service.lifecycle import note_hangups, stop_on_signals
 
 pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no SIGHUP on this system")
 
 
-def test_a_hangup_is_told_once() -> None:
+def test_a_hangup_is_reported_once() -> None:
     before = signal.getsignal(signal.SIGHUP)
     with stop_on_signals() as stop, note_hangups() as take:
         assert not take()
@@ -29,7 +29,7 @@ def test_a_hangup_is_told_once() -> None:
 
 LOOP = """
 import sys, time
-from cangauge.service.signals import note_hangups, stop_on_signals
+from cangauge.service.lifecycle import note_hangups, stop_on_signals
 with stop_on_signals() as stop, note_hangups() as take:
     print("ready", flush=True)
     until = time.monotonic() + 20.0
@@ -42,7 +42,7 @@ open(sys.argv[1], "w").write("stopped" if stop() else "went on")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no terminals of that kind")
-def test_a_terminal_that_is_closed_ends_it(tmp_path: Path) -> None:
+def test_a_closed_terminal_stops_the_process(tmp_path: Path) -> None:
     import pty  # noqa: PLC0415 - not on every system
 
     said = tmp_path / "said"

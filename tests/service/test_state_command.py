@@ -97,7 +97,7 @@ def test_stopped_killed_and_started_again(tmp_path: Path) -> None:
     assert [each.name for each in tmp_path.iterdir()] == ["state.json"]
 
 
-def test_the_loop_asks_for_the_state_soon_then_every_so_often_and_at_the_end() -> None:
+def test_the_state_is_saved_soon_periodically_and_at_the_end() -> None:
     asked: list[float] = []
     service = virtual_service("state", loop=LoopSettings(duration_s=2.6, checkpoint_every_s=1.2))
     began = time.monotonic()

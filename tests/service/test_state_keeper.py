@@ -1,4 +1,4 @@
-"""The state file: what is kept over a restart, what is refused; and nothing stops the gauge."""
+"""The state file: restarts, refused files, and failing disks."""
 
 from __future__ import annotations
 
@@ -6,17 +6,19 @@ import errno
 import hashlib
 import itertools
 import json
+import logging
 import math
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from cangauge._logging import RateLimitFilter
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
@@ -34,7 +36,7 @@ from cangauge.service.state import (
     read_state,
     state_path,
 )
-from live import leaf_model, short_log
+from live import LoggedLines, leaf_model, short_log
 
 MODEL = leaf_model()
 VEHICLE = Vehicle.load("generic")
@@ -47,10 +49,9 @@ DRIVE = [each._replace(time_s=each.time_s + EPOCH_S) for each in samples_of(shor
 
 @dataclass
 class Clock:
-    """Unix and monotonic time that a test sets."""
+    """Unix time that a test sets."""
 
     wall_s: float = EPOCH_S
-    monotonic_s: float = 0.0
 
 
 @dataclass
@@ -59,23 +60,26 @@ class Machine:
 
     path: Path
     clock: Clock = field(default_factory=Clock)
-    said: list[str] = field(default_factory=list)
+    logged: LoggedLines = field(default_factory=lambda: LoggedLines("cangauge.service.state"))
     model: Model = MODEL
     settings: GaugeSettings = field(default_factory=GaugeSettings)
     max_age_s: float = 86400.0
 
     def start(self) -> Service:
+        self.logged.__enter__()
         self.said.clear()
         gauge = Gauge(VEHICLE, self.model, self.settings)
         keeper = StateKeeper(
             StateSettings(self.path, self.max_age_s),
             gauge,
-            self.said.append,
             wall_s=lambda: self.clock.wall_s,
-            monotonic_s=lambda: self.clock.monotonic_s,
         )
         keeper.__enter__()
         return Service(self, gauge, keeper)
+
+    @property
+    def said(self) -> list[str]:
+        return self.logged.lines
 
     @property
     def text(self) -> str:
@@ -115,8 +119,10 @@ def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def machine(tmp_path: Path) -> Machine:
-    return Machine(tmp_path / "state.json")
+def machine(tmp_path: Path) -> Iterator[Machine]:
+    machine = Machine(tmp_path / "state.json")
+    yield machine
+    machine.logged.__exit__()
 
 
 def kept(machine: Machine, samples: int = 1000) -> list[Estimate]:
@@ -171,7 +177,7 @@ def test_a_service_restarted_at_once_goes_on_bit_for_bit(machine: Machine) -> No
     assert again[-1] == whole[-1]
 
 
-def test_until_a_sample_comes_the_restored_soc_is_told_as_stale(machine: Machine) -> None:
+def test_a_restored_soc_is_stale_until_the_first_sample(machine: Machine) -> None:
     last = kept(machine)[-1]
     latest = machine.start().gauge.latest
     assert latest.soc_pct == last.soc_pct
@@ -179,7 +185,7 @@ def test_until_a_sample_comes_the_restored_soc_is_told_as_stale(machine: Machine
     assert latest.reasons & Reason.INPUT_STALE
 
 
-def test_it_is_written_when_asked_and_not_without_new_samples(machine: Machine) -> None:
+def test_the_state_is_written_only_after_new_samples(machine: Machine) -> None:
     service = machine.start()
     service.keep()
     assert not machine.path.exists()
@@ -194,7 +200,7 @@ def test_it_is_written_when_asked_and_not_without_new_samples(machine: Machine) 
     assert read_state(machine.path).estimator.samples == 60
 
 
-def test_a_long_pause_in_a_restart_draws_toward_the_voltage_and_does_not_jump(
+def test_after_a_long_pause_the_soc_approaches_the_voltage(
     machine: Machine,
 ) -> None:
     machine.settings = GaugeSettings(EstimatorSettings(initial_soc_pct=80.0))
@@ -340,7 +346,7 @@ def check_refused(machine: Machine, reason: str) -> None:
 def test_an_old_one_is_refused(machine: Machine) -> None:
     kept(machine)
     machine.clock.wall_s += 86400.0 + 60.0
-    check_refused(machine, "24.0 h old, and older than 24 h is not used")
+    check_refused(machine, "24.0 h old, more than the limit of 24 h")
 
 
 def test_another_models_is_refused(machine: Machine) -> None:
@@ -352,7 +358,7 @@ def test_another_models_is_refused(machine: Machine) -> None:
 def test_another_time_sources_is_refused(machine: Machine) -> None:
     kept(machine)
     rewritten(machine.path, lambda content: content.update(time_source="replay-clock"))
-    check_refused(machine, "time was by replay-clock, and is by receive")
+    check_refused(machine, "saved with time source replay-clock, now it is receive")
 
 
 def overwrite(**changes: Any) -> Callable[[Path], None]:
@@ -379,27 +385,27 @@ def flip(path: Path) -> None:
 
 
 DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
-    "empty": (lambda path: path.write_bytes(b""), "is no JSON"),
-    "zeros": (lambda path: path.write_bytes(bytes(4096)), "is no JSON"),
-    "noise": (lambda path: path.write_bytes(bytes(range(256)) * 9), "is no JSON"),
+    "empty": (lambda path: path.write_bytes(b""), "not JSON"),
+    "zeros": (lambda path: path.write_bytes(bytes(4096)), "not JSON"),
+    "noise": (lambda path: path.write_bytes(bytes(range(256)) * 9), "not JSON"),
     "half": (lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
-             "is no JSON"),
+             "not JSON"),
     "one bit": (flip, ""),
     "utf-16": (lambda path: path.write_bytes(path.read_text("utf-8").encode("utf-16")),
-               "is no JSON"),
+               "not JSON"),
     "utf-32": (lambda path: path.write_bytes(path.read_text("utf-8").encode("utf-32")),
-               "is no JSON"),
+               "not JSON"),
     "byte order mark": (lambda path: path.write_text(path.read_text("utf-8"), "utf-8-sig"),
-                        "is no JSON"),
-    "a list": (lambda path: path.write_text("[]"), "is no cangauge state"),
+                        "not JSON"),
+    "a list": (lambda path: path.write_text("[]"), "not a cangauge state"),
     "a model": (lambda path: path.write_text('{"format": "cangauge-model"}'),
-                "is no cangauge state"),
+                "not a cangauge state"),
     "nested": (lambda path: path.write_text("[" * 200_000), "nested too deeply"),
     "large": (lambda path: path.write_bytes(b" " * ((8 << 20) + 1)), "larger than 8 MB"),
-    "a huge number": (lambda path: path.write_text("9" * 10_000), "is no JSON"),
-    "not a number": (lambda path: path.write_text("NaN"), "is no JSON"),
-    "version": (overwrite(version=2), "this release keeps version 1 (got 2)"),
-    "no version": (overwrite(version=None), "this release keeps version 1"),
+    "a huge number": (lambda path: path.write_text("9" * 10_000), "not JSON"),
+    "not a number": (lambda path: path.write_text("NaN"), "not JSON"),
+    "version": (overwrite(version=2), "this release reads version 1 (got 2)"),
+    "no version": (overwrite(version=None), "this release reads version 1"),
     "hash": (overwrite(sha256="0" * 64), "damaged"),
     "no content": (overwrite(content=None), "damaged"),
     "infinite": (lambda path: path.write_text(
@@ -418,7 +424,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "line backwards": (edited("estimator", "line", "time_s", 3, value=0.0), "must increase"),
     "a word": (edited("estimator", "samples", value="many"), "content.estimator.samples"),
     "effects": (edited("estimator", "effects", value=[[1.0]]), "the model has 0 effects"),
-    "no soc": (edited("estimator", "estimate", 1, value=None), "holds no SoC"),
+    "no soc": (edited("estimator", "estimate", 1, value=None), "has no SoC"),
 }  # fmt: skip
 
 
@@ -461,7 +467,7 @@ def test_flipped_bits_are_noticed(tmp_path: Path) -> None:
 def test_pipes_and_devices_do_not_hold_it_up(machine: Machine) -> None:
     os.mkfifo(machine.path)
     service = machine.start()
-    assert "no regular file" in machine.text
+    assert "not a regular file" in machine.text
     assert service.drive(DRIVE[:10])
 
 
@@ -489,7 +495,7 @@ def fail(error: OSError) -> Callable[..., None]:
     ],
     ids=lambda error: errno.errorcode[error.errno],
 )
-def test_a_disk_that_fails_is_told_of_once_a_minute(
+def test_a_failing_disk_is_reported_at_growing_intervals(
     machine: Machine, monkeypatch: pytest.MonkeyPatch, error: OSError
 ) -> None:
     service = machine.start()
@@ -498,14 +504,19 @@ def test_a_disk_that_fails_is_told_of_once_a_minute(
     before = machine.path.read_bytes()
     with monkeypatch.context() as disk:
         disk.setattr(Path, "write_text", fail(error))
-        machine.said.clear()
+        failures: list[logging.LogRecord] = []
+        monkeypatch.setattr(machine.logged, "handle", failures.append)
         for number in range(7):
             service.drive(DRIVE[100 + number : 101 + number])
             service.keep()
-            machine.clock.monotonic_s += 30.0
-        service.keep()
-        warnings = [line for line in machine.said if "state not written" in line]
-        assert 3 <= len(warnings) <= 4
+        assert [record.getMessage()[:17] for record in failures] == 7 * ["state not written"]
+        now = [0.0]
+        limiter = RateLimitFilter(clock=lambda: now[0])
+        written = 0
+        for now[0] in range(0, 600, 10):  # a checkpoint each
+            written += limiter.filter(failures[0])
+        assert 10 <= written <= 15
+        monkeypatch.undo()
         assert machine.path.read_bytes() == before
         assert [each.name for each in machine.path.parent.iterdir()] == ["state.json"]
     service.drive(DRIVE[200:201])
@@ -541,9 +552,7 @@ def test_a_folder_and_a_file_without_rights(machine: Machine) -> None:
         machine.path.parent.chmod(0o700)
 
 
-def test_a_disk_that_hangs_holds_nothing_up(
-    machine: Machine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_hanging_disk_delays_nothing(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     # SIGTERM is to stop the service within a second, the disk's part included.
     assert STOP_WITHIN_S < 1.0
     monkeypatch.setattr(state_keeper, "STOP_WITHIN_S", STOP_WITHIN_S)
@@ -589,9 +598,7 @@ def test_a_state_holds_no_nan_and_is_plain_json(machine: Machine) -> None:
 
 
 @pytest.mark.parametrize("method", ["ekf", "coulomb"])
-def test_after_a_refused_state_the_given_soc_is_of_an_earlier_start(
-    machine: Machine, method: Any
-) -> None:
+def test_a_refused_state_starts_by_voltage(machine: Machine, method: Any) -> None:
     given = EstimatorSettings(method=method, initial_soc_pct=40.0, initial_soc_std_pct=1.0)
     machine.settings = GaugeSettings(estimator=given)
     first = machine.start()

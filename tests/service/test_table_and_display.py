@@ -5,23 +5,20 @@ from __future__ import annotations
 import errno
 import io
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow.csv
 import pyarrow.parquet
 import pytest
 from rich.console import Console
+from watched import Watched
 
-from cangauge.bus.encoder import FrameEncoder
-from cangauge.bus.vehicle import Vehicle
+from cangauge.cli.run import LiveLine, live_text
 from cangauge.errors import InputError
-from cangauge.estimate.offline import samples_of
-from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate, Reason, Status
 from cangauge.service.estimate_table import EstimateWriter
-from cangauge.service.pipeline import Gauge, GaugeSettings
-from cangauge.service.run import LiveLine, live_text
-from live import leaf_model, short_log
+from live import LoggedLines
 
 ROW = Estimate(
     1.5, 63.2, 1.25, math.nan, 64.0, 370.5, -0.1 / 3.0, Status.DEGRADED,
@@ -74,54 +71,47 @@ def test_other_suffixes_are_refused(tmp_path: Path) -> None:
         EstimateWriter(tmp_path / "soc.xlsx")
 
 
-def test_the_line_tells_soc_status_and_rate() -> None:
-    vehicle = Vehicle.load("generic")
-    gauge = Gauge(vehicle, leaf_model(), GaugeSettings(EstimatorSettings(valid_std_pct=5.0)))
-    assert "SoC – ± –  initialising (no initial soc; input stale)" in live_text(gauge, 0.0).plain
-    encoder = FrameEncoder(vehicle)
-    for sample in samples_of(short_log(90.0)):
-        for frame in encoder.encode(sample):
-            gauge.handle(frame)
-    text = live_text(gauge, 10.0).plain
-    latest = gauge.latest
+def test_the_line_has_soc_status_and_rate() -> None:
+    watched = Watched()
+    text = live_text(watched.monitor.latest).plain
+    assert "SoC – ± –  initialising (no initial soc; input stale)" in text
+    watched.drive(90.0)
+    watched.turn()
+    snapshot = replace(watched.monitor.latest, samples_per_s=10.0)
+    latest, sample = watched.gauge.latest, watched.gauge.latest_sample
+    text = live_text(snapshot).plain
     assert f"SoC {latest.soc_pct:.2f} ± {latest.soc_std_pct:.2f} %  valid" in text
-    assert f"{gauge.latest_sample.voltage_v:.2f} V" in text  # type: ignore[union-attr] # there is one
+    assert sample is not None
+    assert f"{sample.voltage_v:.2f} V" in text
     assert text.endswith("10 samples/s")
 
 
-def test_it_is_drawn_a_few_times_a_second_at_most() -> None:
-    out = io.StringIO()
-    console = Console(file=out, force_terminal=True, width=100)
-    with LiveLine(console, Gauge(Vehicle.load("generic"), leaf_model())) as line:
-        before = out.getvalue().count("samples/s")
-        for millisecond in range(1000):
-            line.show(50.0 + 1e-3 * millisecond)
-        assert out.getvalue().count("samples/s") - before <= 5
-
-
-def test_what_is_wrong_with_the_bus_is_on_the_line() -> None:
+def test_the_line_shows_bus_errors() -> None:
     out = io.StringIO()
     console = Console(file=out, force_terminal=True, width=120)
-    gauge = Gauge(Vehicle.load("generic"), leaf_model())
-    with LiveLine(console, gauge, lambda: "bus away for 12 s") as line:
-        line.show(50.0)
+    with LiveLine(console) as line:
+        line.show(replace(Watched().monitor.latest, bus_trouble="bus away for 12 s"))
     assert "bus away for 12 s" in out.getvalue()
 
 
-def test_a_table_whose_disk_is_full_is_given_up_and_the_service_goes_on(
+def test_a_snapshot_is_made_a_few_times_a_second_at_most() -> None:
+    watched = Watched()
+    assert sum(watched.monitor.turn(200.0 + 1e-3 * ms) for ms in range(1000)) <= 5
+
+
+def test_a_full_disk_abandons_the_table_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    said: list[str] = []
     path = tmp_path / "soc.parquet"
 
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    with EstimateWriter(path, said.append) as table:
+    with LoggedLines("cangauge.service.estimate_table") as logged, EstimateWriter(path) as table:
         monkeypatch.setattr(table, "_write", full)
         for number in range(10_000):
             table.add(0.1 * number, ROW)
     assert table.failed
-    assert len(said) == 1
-    assert "soc.parquet: cannot be written" in said[0]
+    assert len(logged.lines) == 1
+    assert "soc.parquet: cannot be written" in logged.lines[0]
     assert list(tmp_path.iterdir()) == []

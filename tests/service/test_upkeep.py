@@ -1,4 +1,4 @@
-"""Saving now and then and at the end, and telling of frames that the kernel dropped."""
+"""Housekeeping: saving the state, and reporting dropped frames."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import CangaugeError
 from cangauge.estimate.offline import samples_of
 from cangauge.service.loop import Housekeeping, LoopSettings, Outputs, serve
-from live import BrokenBus, network_down, short_log, virtual_port, virtual_service
+from live import BrokenBus, LoggedLines, network_down, short_log, virtual_port, virtual_service
 
 
 @dataclass
@@ -25,7 +25,6 @@ class Saves:
 def run(channel: str, saves: Saves, every_s: float = 0.2) -> list[str]:
     """Serve 5 s of a log for 0.7 s, and note how many samples each save has seen."""
     service = virtual_service(channel)
-    warnings: list[str] = []
 
     def checkpoint() -> None:
         saves.samples.append(service.gauge.samples)
@@ -37,13 +36,15 @@ def run(channel: str, saves: Saves, every_s: float = 0.2) -> list[str]:
         for sample in samples_of(short_log(5.0)):
             for frame in encoder.encode(sample):
                 sender.send(frame)
-        serve(
-            service.port,
-            service.gauge,
-            LoopSettings(duration_s=0.7, checkpoint_every_s=every_s),
-            Outputs(checkpoint=checkpoint, warn=warnings.append),
-            lambda: False,
-        )
+        with LoggedLines("cangauge.service.loop") as logged:
+            serve(
+                service.port,
+                service.gauge,
+                LoopSettings(duration_s=0.7, checkpoint_every_s=every_s),
+                Outputs(checkpoint=checkpoint),
+                lambda: False,
+            )
+            warnings = list(logged.lines)
     return warnings
 
 
@@ -79,20 +80,20 @@ def test_the_state_is_saved_also_when_the_service_breaks() -> None:
     assert saved == [1]
 
 
-def test_frames_lost_in_the_receive_queue_are_told_as_they_come() -> None:
+def test_frames_lost_in_the_receive_queue_are_reported(caplog: pytest.LogCaptureFixture) -> None:
     class Port:
         name = "socketcan can9"
         queue_drops: int | None = None
 
-    port, said = Port(), list[str]()
-    upkeep = Housekeeping(port, warn=said.append)  # type: ignore[arg-type] # all that is looked at
+    port = Port()
+    upkeep = Housekeeping(port)  # type: ignore[arg-type] # all that is looked at
     upkeep.look(1.0)
     port.queue_drops = 7
     upkeep.look(1.05)  # too soon to look
-    assert said == []
+    assert not caplog.messages
     upkeep.look(1.2)
-    assert said == [
-        "warning: socketcan can9: the receive queue overflowed: 7 frames lost (7 so far)"
+    assert caplog.messages == [
+        "socketcan can9: the receive queue overflowed: 7 frames lost (7 so far)"
     ]
     upkeep.look(2.0)
-    assert len(said) == 1
+    assert len(caplog.messages) == 1

@@ -9,9 +9,9 @@ from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.settings import EstimatorSettings
+from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Gauge, GaugeSettings
 from cangauge.service.status import Identity, Monitor
-from cangauge.service.systemd import Notifier
 from live import leaf_model, short_log
 
 IDENTITY = Identity(

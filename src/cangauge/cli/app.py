@@ -1,8 +1,4 @@
-"""What `--json` prints of a command that failed: one object too, so that it can be parsed.
-
-Wrong usage (an option that there is not, an argument that misses): in one line, for `--json`.
-
-The typer application: registers the commands and turns errors into exit codes.
+"""The `cangauge` command: its subcommands, and errors as exit codes.
 
 Exit 0: done; 1: failed; 2: bad usage or input.
 """
@@ -11,107 +7,38 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from importlib import import_module
 from typing import Any, Final
 
 import typer
-from typer.core import TyperGroup
-from typer.main import get_command as made_of
+from typer.core import TyperCommand, TyperGroup
+from typer.main import get_command as build_command
 
 from cangauge import __version__
 from cangauge._resources import one_thread
 from cangauge.cli.output import emit_json, note
-from cangauge.errors import CangaugeError
+from cangauge.errors import CangaugeError, closest
 
-# --- What `--json` prints of a command that failed: one object too, so that it can be parsed
+COMMANDS: Final = {
+    "demo": "Run the main job end to end on the shipped log: fit, replay, live SoC, pages.",
+    "fit": "Identify the voltage model of a pack from recorded logs.",
+    "estimate": "Estimate the state of charge of a recorded log or capture.",
+    "gap": "Diagnose the gap between a model and logs: size, place, probable cause.",
+    "gap-check": "Measure how often `gap` names the right cause, on withheld effects.",
+    "run": "Estimate the state of charge from a bus, and publish it there.",
+    "status": "Show the state of a running service.",
+    "replay": "Play a recorded log or capture on a bus.",
+    "inspect": "Show what a log or capture holds, and the sign of its current.",
+    "twin": "Simulate a log whose truth is known: pack, drive, weather, sensors.",
+}
+"""First help line of each command, `cangauge.cli.NAME.NAME_command`: listed without its import."""
 
-
-def emit_failure(error: Mapping[str, Any], exit_code: int) -> None:
-    """Print `{"error": {…}, "exit_code": …}` on stdout if the command line asks for `--json`.
-
-    Parameters
-    ----------
-    error : mapping
-        As of `CangaugeError.to_dict`.
-    exit_code : int
-        What the process will exit with.
-    """
-    if not _json_asked(sys.argv[1:]) or sys.stdout is None:
-        return
-    try:
-        emit_json({"error": error, "exit_code": exit_code})
-    except OSError:
-        # Nobody reads stdout, or its disk is full. The exit code stays that of the failure, also
-        # when Python flushes stdout once more at the end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _json_asked(arguments: Sequence[str]) -> bool:
-    """Whether `--json` is among them: what is wrong may be the very line that says so."""
-    options = arguments[: arguments.index("--")] if "--" in arguments else arguments
-    return any(word.partition("=")[0] == "--json" for word in options)
-
-
-# --- Wrong usage (an option that there is not, an argument that misses): in one line, for `-…
-
-# typer brings its own copy of click: the base of its errors is reached through the one it exports.
-UsageError: Final[type[Exception]] = typer.BadParameter.__mro__[1]
-
-
-def usage_line(error: Any) -> str:
-    """Return what is wrong with the command line and which help tells more; "" if help was shown.
-
-    Parameters
-    ----------
-    error : UsageError
-    """
-    text = " ".join(error.format_message().split()).replace("Input should be", "must be")
-    if not text or type(error).__name__ == "NoArgsIsHelpError":
-        return ""
-    if not text[1:2].isupper():
-        text = text[0].lower() + text[1:]
-    command = "cangauge"
-    if error.ctx is not None and error.ctx.parent is not None:
-        command = f"cangauge {error.ctx.info_name}"
-    return f"error: {text.rstrip('.')}; see `{command} --help`"
-
-
-def usage_dict(error: Any) -> dict[str, Any]:
-    """Return what `CangaugeError.to_dict` does; the option or argument is the field.
-
-    Parameters
-    ----------
-    error : UsageError
-    """
-    field = getattr(error, "option_name", None)
-    parameter = getattr(error, "param", None)
-    if field is None and parameter is not None:
-        # An argument has no spelling of its own: help shows it by its metavar.
-        is_option = parameter.param_type_name == "option"
-        field = "/".join(parameter.opts) if is_option else parameter.metavar or parameter.name
-    return {**CangaugeError(usage_line(error).removeprefix("error: ")).to_dict(), "field": field}
-
-
-# --- The typer application: registers the commands and turns errors into exit codes
-
-COMMANDS: Final = (
-    "demo",
-    "fit",
-    "estimate",
-    "gap",
-    "gap-check",
-    "run",
-    "status",
-    "replay",
-    "inspect",
-    "twin",
-)
-"""Each is `cangauge.cli.NAME.NAME_command`."""
+_CONTEXT: Final = {"help_option_names": ["-h", "--help"]}
 
 
 class LazyGroup(TyperGroup):
-    """Imports a command only when it is asked for: the service needs no plots, nor any other."""
+    """Import a command only when it is used: the service needs no plots, nor does `--help`."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Return the commands' names."""
@@ -121,12 +48,47 @@ class LazyGroup(TyperGroup):
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return a command; None if there is none of that name."""
         del ctx
-        if cmd_name not in COMMANDS:
-            return None
-        name = cmd_name.replace("-", "_")
-        alone = typer.Typer(rich_markup_mode="markdown", add_completion=False)
-        alone.command(cmd_name)(getattr(import_module(f"cangauge.cli.{name}"), f"{name}_command"))
-        return made_of(alone)
+        return _command(cmd_name) if cmd_name in COMMANDS else None
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the command that the arguments name; suggest one if they name none."""
+        if args[0] not in COMMANDS and not args[0].startswith("-"):
+            near = closest(args[0], COMMANDS)
+            raise UsageError(
+                f"no such command: {args[0]}" + (f". Did you mean {near}?" * bool(near))
+            )
+        return super().resolve_command(ctx, args)
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the root page."""
+        _Listing(self).format_help(ctx, formatter)
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> Any:
+        """Return the commands and options that begin with `incomplete`."""
+        ctx.command = _Listing(self)
+        return ctx.command.shell_complete(ctx, incomplete)
+
+
+class _Listing(TyperGroup):
+    """The same group with stand-ins for its commands: name and help line."""
+
+    def __init__(self, group: LazyGroup) -> None:
+        super().__init__(
+            commands={name: TyperCommand(name, help=text) for name, text in COMMANDS.items()},
+            rich_markup_mode=group.rich_markup_mode,
+        )
+        self.__dict__.update(
+            {key: value for key, value in vars(group).items() if key != "commands"}
+        )
+
+
+def _command(name: str) -> Any:
+    module = name.replace("-", "_")
+    alone = typer.Typer(
+        rich_markup_mode="markdown", add_completion=False, context_settings=_CONTEXT
+    )
+    alone.command(name)(getattr(import_module(f"cangauge.cli.{module}"), f"{module}_command"))
+    return build_command(alone)
 
 
 app = typer.Typer(
@@ -137,7 +99,7 @@ app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
-    add_completion=False,
+    context_settings=_CONTEXT,
 )
 
 
@@ -150,7 +112,7 @@ def _version(wanted: bool) -> None:
 @app.callback()
 def _root(
     version: bool = typer.Option(
-        False, "--version", callback=_version, is_eager=True, help="Print the version and leave."
+        False, "--version", callback=_version, is_eager=True, help="Print the version and exit."
     ),
 ) -> None:
     del version
@@ -158,22 +120,93 @@ def _root(
 
 def main() -> None:
     """Run the command line and exit with its code."""
-    one_thread(os.environ)  # no command has been imported yet, nor numpy
+    one_thread(os.environ)  # before any command imports numpy
     try:
-        code = app(standalone_mode=False)
+        code = app(standalone_mode=False, prog_name="cangauge")
     except CangaugeError as error:
         if not error.logged:
             note(f"error: {error}")
         emit_failure(error.to_dict(), error.exit_code)
         sys.exit(error.exit_code)
     except UsageError as error:
-        if told := usage_line(error):
-            note(told)
+        if line := usage_line(error):
+            note(line)
         emit_failure(usage_dict(error), 2)
         sys.exit(2)
-    except Exception as error:  # a mistake of ours: Python tells where, and exits with 1
+    except Exception as error:  # a bug: Python prints the traceback and exits with 1
         emit_failure(CangaugeError(f"{type(error).__name__}: {error}").to_dict(), 1)
         raise
-    if code == 130:  # what typer makes of Ctrl-C
+    if code == 130:  # typer's code for Ctrl-C
         note("stopped")
     sys.exit(code or 0)
+
+
+# --- Errors -------------------------------------------------------------------------------------
+
+# typer vendors click: the base of its usage errors is reached through the one that it exports.
+UsageError: Final[type[Any]] = typer.BadParameter.__mro__[1]
+
+
+def emit_failure(error: Mapping[str, Any], exit_code: int) -> None:
+    """Print `{"error": {…}, "exit_code": …}` on stdout if the command line asks for `--json`.
+
+    Parameters
+    ----------
+    error : mapping
+        From `CangaugeError.to_dict`.
+    exit_code : int
+        Exit code of the process.
+    """
+    arguments = sys.argv[1:]
+    options = arguments[: arguments.index("--")] if "--" in arguments else arguments
+    # Searched by hand: the error may be one of parsing this command line.
+    wanted = any(word.partition("=")[0] == "--json" for word in options)
+    if not wanted or sys.stdout is None:
+        return
+    try:
+        emit_json({"error": error, "exit_code": exit_code})
+    except OSError:
+        # A closed pipe or a full disk. The exit code stays that of the failure, also when Python
+        # flushes stdout once more at the end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def usage_line(error: Any) -> str:
+    """Return a usage error in one line that names the help page; "" if help was shown.
+
+    Parameters
+    ----------
+    error : UsageError
+    """
+    text = " ".join(error.format_message().split()).replace("Input should be", "must be")
+    if options := getattr(error, "possibilities", None):
+        text = f"no such option: {error.option_name}{_did_you_mean(error.option_name, options)}"
+    if not text or type(error).__name__ == "NoArgsIsHelpError":
+        return ""
+    if not text[1:2].isupper():
+        text = text[0].lower() + text[1:]
+    command = "cangauge"
+    if error.ctx is not None and error.ctx.parent is not None:
+        command = f"cangauge {error.ctx.info_name}"
+    return f"error: {text.rstrip('.')}; see `{command} --help`"
+
+
+def _did_you_mean(word: str, names: Iterable[str]) -> str:
+    near = closest(word, names)
+    return f". Did you mean {near}?" if near else ""
+
+
+def usage_dict(error: Any) -> dict[str, Any]:
+    """Return a usage error as `CangaugeError.to_dict` does; `field` is the option or argument.
+
+    Parameters
+    ----------
+    error : UsageError
+    """
+    field = getattr(error, "option_name", None)
+    parameter = getattr(error, "param", None)
+    if field is None and parameter is not None:
+        # The help page shows an argument by its metavar.
+        is_option = parameter.param_type_name == "option"
+        field = "/".join(parameter.opts) if is_option else parameter.metavar or parameter.name
+    return {**CangaugeError(usage_line(error).removeprefix("error: ")).to_dict(), "field": field}

@@ -1,9 +1,4 @@
-"""What the commands that take a LOG or a capture have in common: options, reading, guards.
-
-What the commands on a bus have in common: options.
-
-Options of `cangauge run` for whoever operates the service.
-"""
+"""What the commands that take a LOG or a capture have in common: options, reading, guards."""
 
 from __future__ import annotations
 
@@ -14,14 +9,11 @@ from typing import Annotated
 import typer
 
 from cangauge._io import check_writable
-from cangauge.bus.vehicle import PRESETS
 from cangauge.cli.output import note
 from cangauge.errors import InputError
 from cangauge.logs import units
 from cangauge.logs.log import Log
 from cangauge.logs.units import TEMPERATURE_SOURCES, TemperatureSource
-
-# --- What the commands that take a LOG or a capture have in common: options, reading, guards
 
 VehicleOption = Annotated[
     str | None,
@@ -210,146 +202,3 @@ def known_temperature_source(given: str | None) -> TemperatureSource | None:
     if given is None:
         return None
     return units.known_temperature_source(given, field="--temperature-source")
-
-
-# --- What the commands on a bus have in common: options
-
-InterfaceOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="I",
-        help="python-can interface: socketcan, udp_multicast, pcan, slcan, … Default: socketcan"
-        " where there is a vcan0, else udp_multicast, whose packets stay on this machine.",
-    ),
-]
-ChannelOption = Annotated[
-    str | None,
-    typer.Option(metavar="C", help="Channel, e.g. can0. Default: vcan0, or 239.74.163.2."),
-]
-BusOptionOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--bus-option", metavar="K=V", help="More for the bus's driver, e.g. bitrate=500000."
-    ),
-]
-BusVehicleOption = Annotated[
-    str | None,
-    typer.Option(
-        "--vehicle",
-        metavar="PRESET",
-        help=f"Whose frames: {', '.join(PRESETS)}. Default: generic, without --dbc and --map.",
-    ),
-]
-BusDbcOption = Annotated[
-    Path | None, typer.Option("--dbc", metavar="FILE", help="Another car's DBC; needs --map.")
-]
-BusMapOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--map",
-        metavar="FILE",
-        help="TOML file: which signals are current, voltage and temperature, with sign and scale.",
-    ),
-]
-BusTemperatureOption = Annotated[
-    float | None,
-    typer.Option("--temperature", metavar="C", help="Constant temperature [°C], not the bus's."),
-]
-EstimateIdOption = Annotated[
-    str | None, typer.Option(metavar="ID", help="Id of SOC_ESTIMATE. Default: 0x5A0.")
-]
-DetailIdOption = Annotated[
-    str | None, typer.Option(metavar="ID", help="Id of SOC_DETAIL. Default: 0x5A1.")
-]
-ClockIdOption = Annotated[
-    str | None, typer.Option(metavar="ID", help="Id of REPLAY_CLOCK. Default: 0x5AF.")
-]
-
-
-def frame_ids(
-    soc_estimate: str | None, soc_detail: str | None, replay_clock: str | None
-) -> dict[str, int]:
-    """Return those of the ids that were given, by their key; "0x…" is hexadecimal.
-
-    Raises
-    ------
-    InputError
-        If one is no number.
-    """
-    given = {
-        "soc_estimate": soc_estimate,
-        "soc_detail": soc_detail,
-        "replay_clock": replay_clock,
-    }
-    ids = {}
-    for key, text in given.items():
-        if text is None:
-            continue
-        try:
-            ids[key] = int(text, 0)
-        except ValueError as error:
-            raise InputError(
-                "no CAN id",
-                field=f"--{key.replace('_', '-')}-id",
-                value=text,
-                cure="write it as 0x5A0",
-            ) from error
-    return ids
-
-
-# --- Options of `cangauge run` for whoever operates the service
-
-RecordOption = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE",
-        help="Record the frames received (.log, .csv, .blf, .mf4): `cangauge estimate` on them"
-        " gives the live numbers, bit for bit. A kill loses the last half second; of an .mf4 the"
-        " whole part. A full disk costs frames of the recording, never the estimate. A recording"
-        " that is there stays: the next run's is FILE-0001, FILE-0002, …",
-    ),
-]
-RecordPartMbOption = Annotated[
-    float | None,
-    typer.Option(
-        metavar="MB",
-        help="Begin a new file after so much [MB]: NAME-RUN-PART. The name NAME-RUN stands"
-        " for all parts.",
-    ),
-]
-RecordPartSOption = Annotated[
-    float | None, typer.Option(metavar="S", help="Begin a new file after so long [s].")
-]
-RecordKeepMbOption = Annotated[
-    float | None,
-    typer.Option(metavar="MB", help="Remove the oldest files of the recording beyond this [MB]."),
-]
-HttpOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="HOST:PORT",
-        help="Serve /status, /healthz and /metrics there (extra `metrics`), e.g. 127.0.0.1:9464."
-        " Anything but loopback requires a token.",
-    ),
-]
-HttpTokenFileOption = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE",
-        help="File with the bearer token that requests must have; or in CANGAUGE_HTTP_TOKEN.",
-    ),
-]
-StatusSocketOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="PATH|auto|off",
-        help="Unix socket for `cangauge status`. Default: auto, in the user's runtime folder.",
-    ),
-]
-LogFormatOption = Annotated[
-    str | None,
-    typer.Option(metavar="text|json", help="Events on stderr, one a line. Default: text."),
-]
-LogLevelOption = Annotated[
-    str | None, typer.Option(metavar="debug|info|warning|error", help="Default: info.")
-]

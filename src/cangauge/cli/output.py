@@ -1,7 +1,4 @@
-"""How commands speak: results on stdout, everything else on stderr.
-
-Results for people: rich tables on stdout.
-"""
+"""Output of the commands: results on stdout, as JSON or tables; everything else on stderr."""
 
 from __future__ import annotations
 
@@ -16,10 +13,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-# --- How commands speak: results on stdout, everything else on stderr
-
 console = Console(stderr=True, highlight=False)
-"""For tables, progress and notes: stderr, so that `--json` alone owns stdout."""
+"""Console for progress and notes: stderr, since stdout is for results."""
 
 
 def note(text: str) -> None:
@@ -34,7 +29,7 @@ def emit_json(result: Mapping[str, Any]) -> None:
     text = json.dumps(plain, ensure_ascii=False)
     try:
         text.encode(sys.stdout.encoding or "utf-8")
-    except UnicodeEncodeError:  # a terminal of few letters, a file name that is no text
+    except UnicodeEncodeError:  # a terminal without these characters, or an undecodable file name
         text = json.dumps(plain)
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
@@ -45,24 +40,21 @@ def _plain(value: Any) -> Any:
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
-    if hasattr(value, "tolist"):  # numpy's, which is not worth importing for --help
+    if hasattr(value, "tolist"):  # numpy, without its import
         return _plain(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
 
 
-# --- Results for people: rich tables on stdout
-
-
 def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table on stdout; its first column is set flush left, cells are plain text.
+    """Print a table of plain text on stdout; its first column is left-aligned.
 
     Parameters
     ----------
     title : str
     head : sequence of str
-        Headings; one that begins with "<" is set flush left, without that sign.
+        Headings; a leading "<" (not shown) left-aligns the column.
     rows : sequence of sequences of str
     """
     table = Table(title=Text(title), title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
@@ -70,6 +62,6 @@ def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) 
         left = number == 0 or heading.startswith("<")
         table.add_column(Text(heading.removeprefix("<")), justify="left" if left else "right")
     for row in rows:
-        # Text: a name with brackets is no markup.
+        # Text: brackets in names are not markup.
         table.add_row(*map(Text, row))
     Console(highlight=False).print(table)

@@ -17,7 +17,7 @@ from cangauge.bus.open import bus_address, open_bus, parse_bus_options
 from cangauge.bus.publish import FrameIds, standard_filter
 from cangauge.bus.recording import open_recording
 from cangauge.bus.vehicle import Vehicle
-from cangauge.cli.options import (
+from cangauge.cli.config_options import (
     BusDbcOption,
     BusMapOption,
     BusOptionOption,
@@ -28,16 +28,16 @@ from cangauge.cli.options import (
     DetailIdOption,
     EstimateIdOption,
     InterfaceOption,
-    JsonOption,
     frame_ids,
 )
+from cangauge.cli.options import JsonOption
 from cangauge.cli.output import console, emit_json, note
 from cangauge.errors import InputError
 from cangauge.logs.read import LogFile
 from cangauge.replay.player import ReplaySettings, ReplayState, play
 from cangauge.replay.steps import CaptureSource, LogSource, Source
 from cangauge.service.config import DEFAULT_VEHICLE
-from cangauge.service.signals import stop_on_signals
+from cangauge.service.lifecycle import stop_on_signals
 
 MAX = "max"
 

@@ -1,4 +1,4 @@
-"""`cangauge status`: how a running service fares."""
+"""`cangauge status`: the state of a running service."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def status_command(
         str | None,
         typer.Option(
             metavar="PATH|URL",
-            help="Unix socket, or http://HOST:PORT, of the service. Default: the one that runs"
-            " on this machine.",
+            help="Unix socket of the service, or http://HOST:PORT. Default: the service running on"
+            " this machine.",
         ),
     ] = None,
     token_file: Annotated[
@@ -34,10 +34,10 @@ def status_command(
     ] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Show how a running service fares: SoC ± standard deviation [%], status, frames, delays.
+    """Show the state of a running service: SoC ± standard deviation [%], frames, delays.
 
-    Exit code 0: the SoC is valid or degraded. 1: it is invalid or not known yet, or no service
-    runs. 2: bad usage. With `--json` the object is printed in the first two cases alike.
+    Exit code 0: the SoC is valid or degraded. 1: it is invalid or unknown, or no service runs.
+    2: bad usage. With `--json` the object is printed with exit codes 0 and 1.
 
     For example:
 
@@ -67,7 +67,7 @@ def _rows(status: dict[str, Any]) -> list[tuple[str, str]]:
     estimate, sample = status["estimate"], status["sample"] or {}
     frames, record = status["frames"], status["record"]
     reasons = "; ".join(each.replace("_", " ") for each in status["reasons"])
-    refused = _counts(status["rejects"])
+    rejected = _counts(status["rejects"])
     rows = [
         ("SoC", f"{number(estimate['soc_pct'], 2)} ± {number(estimate['soc_std_pct'], 2, '%')}"),
         ("status", status["status"] + (f": {reasons}" if reasons else "")),
@@ -83,7 +83,7 @@ def _rows(status: dict[str, Any]) -> list[tuple[str, str]]:
             "frames",
             f"{frames['received']} received, {frames['used']} used, {frames['lost']} lost",
         ),
-        ("refused", refused or "none"),
+        ("rejected", rejected or "none"),
         (
             "bus",
             "; ".join(
@@ -108,7 +108,7 @@ def _rows(status: dict[str, Any]) -> list[tuple[str, str]]:
             )
         )
     if status["loop_stuck"]:
-        rows.insert(0, ("LOOP STUCK", "the receive loop does not turn; restart the service"))
+        rows.insert(0, ("LOOP STUCK", "the receive loop does not run; restart the service"))
     return [
         *rows,
         ("vehicle", status["vehicle"]),

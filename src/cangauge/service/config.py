@@ -1,71 +1,32 @@
-"""Where HTTP is served, and who may ask: loopback, or a bearer token.
+"""Configuration of the service: one model for the TOML file, the command line and the docs.
 
-The token comes from a file or the environment, never from the command line, which other users of
-the machine can read.
+Each key is declared once, as a field of `RunConfig` with its type, bounds, default, unit and help.
+The TOML file has the same keys; `cangauge.cli.config_options` makes the options of the command
+line from them, which take precedence over the file; `python -m cangauge.service.config` prints the
+reference of all keys as Markdown. Paths in a file are relative to it::
 
-How a service is watched and what it records: the part of its configuration for operators.
-
-Keys of the file, and options of `cangauge run` by the same names::
-
-    record = "record/drive.log"     # .log, .csv, .blf, .mf4
-    record_part_mb = 64             # a new file after so much …
-    record_part_s = 3600            # … or after so long
-    record_keep_mb = 2000           # the oldest files are removed beyond this
-
-    status_socket = "auto"          # a path, or "off"
-    http = "127.0.0.1:9464"         # /status, /healthz, /metrics
-    http_token_file = "http-token"  # required where http is not loopback
-    log_format = "json"             # or "text"
-    log_level = "info"
-
-What `cangauge run` can be told: a TOML file, and options of the command line that go before it.
-
-Keys are the options' names, with underscores::
-
-    model = "leaf.json"             # paths are relative to this file
-    interface = "socketcan"
+    model = "leaf.json"
     channel = "can0"
     vehicle = "leaf_aze0"           # or: dbc = "car.dbc" and map = "car.toml"
-    method = "ekf"                  # ekf, newton, coulomb
-    initial_soc = "auto"            # or a number [%]
-    valid_std = 1.5                 # a SoC less certain than this [%] is degraded
-    time_source = "receive"         # or "replay-clock"
-    wait_for_bus = true             # start even if it is not there yet
+    record = "record/drive.log"
 
     [bus_options]
     bitrate = 500000
 
-    [ids]
-    soc_estimate = 0x5A0
-
-    [messages.BATTERY_1DB]          # protection and period: as in a map file, and before it
-    protection = "leaf"
-
-    [checks.voltage]                # likewise: range, rate, how many failures, time-out
+    [checks.voltage]                # as in a map file, and before it
     lowest = 240
     highest = 410
-
-    [full_charge]                   # optional: what the SoC is at some moments
-    voltage_v = 402.0               # at least this …
-    current_a = 3.0                 # … at no more than this, either way
-    hold_s = 60
-
-    [long_rest]
-    after_s = 7200
-    soc_std_pct = 2.0
-
-How the service is watched and what it records: see `ops_config`.
 """
 
 from __future__ import annotations
 
-import ipaddress
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Final, Self
+from typing import Annotated, Any, Final, Literal, Self, get_args, get_origin
 
 from pydantic import (
     BaseModel,
@@ -76,6 +37,7 @@ from pydantic import (
     PrivateAttr,
     StrictBool,
 )
+from pydantic.fields import FieldInfo
 
 from cangauge._config import read_toml, validated
 from cangauge._logging import LogFormat, LogLevel
@@ -83,7 +45,7 @@ from cangauge.bus.mapping import CheckMap, MessageMap, Overrides, RuleMap
 from cangauge.bus.open import BusAddress, bus_address, is_interface_name
 from cangauge.bus.publish import FrameIds
 from cangauge.bus.time_source import TimeSourceName
-from cangauge.bus.vehicle import Vehicle
+from cangauge.bus.vehicle import PRESETS, Vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.settings import (
     VALID_STD_PCT,
@@ -92,222 +54,65 @@ from cangauge.estimate.settings import (
     LongRest,
     Method,
 )
-from cangauge.logs.log import TemperatureSource
+from cangauge.logs.log import TEMPERATURE_SOURCES, TemperatureSource
 from cangauge.model.delay_line import GAP_S
+from cangauge.service.addresses import HttpAddress, http_address
 from cangauge.service.loop import CHECKPOINT_EVERY_S, LoopSettings
 from cangauge.service.pipeline import GaugeSettings
 from cangauge.service.recording import RecordLimits
 from cangauge.service.state import StateSettings, state_path
 
-# --- Where HTTP is served, and who may ask: loopback, or a bearer token
-
-TOKEN_VARIABLE: Final = "CANGAUGE_HTTP_TOKEN"  # noqa: S105 - the variable's name, no secret
-LOOPBACK: Final = "127.0.0.1"
-SHORTEST_TOKEN: Final = 16
-LONGEST_TOKEN: Final = 1024
-
-
-@dataclass(frozen=True, slots=True)
-class HttpAddress:
-    """Where to listen.
-
-    Parameters
-    ----------
-    host : str
-        IP address, or "localhost".
-    port : int
-        0: any free one.
-    token : str or None
-        What a request must bear.
-    """
-
-    host: str
-    port: int
-    token: str | None = field(default=None, repr=False)
-
-    def __str__(self) -> str:
-        """Return it as it is written in a URL."""
-        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
-
-
-def http_address(
-    text: str,
-    token_file: str | PathLike[str] | None = None,
-    environment: Mapping[str, str] | None = None,
-) -> HttpAddress:
-    """Return where to listen and the token, if the two go together.
-
-    Parameters
-    ----------
-    text : str
-        "9464" (on loopback), "127.0.0.1:9464", "0.0.0.0:9464", "[::1]:9464".
-    token_file : path-like, optional
-        By default the environment variable `TOKEN_VARIABLE`, if there is one.
-    environment : mapping, optional
-
-    Raises
-    ------
-    InputError
-        If it is no address, the token cannot be read or is too short, or the address is not
-        loopback and there is no token.
-    """
-    host, port = _host_and_port(text)
-    token = read_token(token_file, os.environ if environment is None else environment)
-    if token is None and not is_loopback_name(host):
-        raise InputError(
-            "this address is open to the network, and there is no token",
-            field="http",
-            value=text,
-            cure=f"put a token into a file for --http-token-file or into {TOKEN_VARIABLE},"
-            f" or listen on {LOOPBACK}:{port}",
-        )
-    return HttpAddress(host, port, token)
-
-
-def is_loopback_name(host: str) -> bool:
-    """Return whether a host is this machine's loopback: "localhost", 127.…, ::1."""
-    host = host.removeprefix("[").removesuffix("]").lower()
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
-def _host_and_port(text: str) -> tuple[str, int]:
-    host, colon, port = text.strip().rpartition(":")
-    if not colon:
-        host = LOOPBACK
-    host = host.removeprefix("[").removesuffix("]")
-    try:
-        if host.lower() != "localhost":
-            ipaddress.ip_address(host)
-        number = int(port)
-    except ValueError:
-        number = -1
-    if not 0 <= number <= 65535:
-        raise InputError(
-            "no address of HOST:PORT, the host an IP address or localhost",
-            field="http",
-            value=text,
-            cure=f"write it as {LOOPBACK}:9464",
-        )
-    return host, number
-
-
-def read_token(path: str | PathLike[str] | None, environment: Mapping[str, str]) -> str | None:
-    """Return the token in a file, or in the environment; None if there is neither.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, or is too short or no printable text.
-    """
-    if path is None:
-        given = environment.get(TOKEN_VARIABLE)
-        return None if given is None else _checked(given, TOKEN_VARIABLE)
-    try:
-        with Path(path).open("rb") as file:
-            content = file.read(LONGEST_TOKEN + 2).decode("utf-8")
-    except FileNotFoundError as error:
-        raise InputError(
-            "no such file", source=path, field="http_token_file", cure="check the path"
-        ) from error
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or "not UTF-8 text"
-        raise InputError(
-            f"cannot be read: {reason}", source=path, field="http_token_file"
-        ) from error
-    return _checked(content, str(path))
-
-
-def _checked(content: str, source: str) -> str:
-    token = content.strip()
-    if not SHORTEST_TOKEN <= len(token) <= LONGEST_TOKEN or not token.isascii() or " " in token:
-        # The value is a secret, if a bad one: it is not repeated.
-        raise InputError(
-            f"a token is {SHORTEST_TOKEN} to {LONGEST_TOKEN} printable characters without spaces",
-            source=source,
-            field="http_token",
-            cure="make one: python -c 'import secrets; print(secrets.token_urlsafe())'",
-        )
-    return token
-
-
-# --- How a service is watched and what it records: the part of its configuration for operators
-
-OPS_PATHS: Final = ("record", "http_token_file")
-"""Keys that are paths, relative to the file that they stand in."""
-
-Megabytes = Annotated[FiniteFloat, Field(gt=0.0, le=1e9)]
-PartSeconds = Annotated[FiniteFloat, Field(ge=1.0, le=1e9)]
-
-
-class OpsConfig(BaseModel):
-    """The keys for operators.
-
-    Parameters
-    ----------
-    record : str, optional
-        File to record the frames into.
-    record_part_mb, record_part_s : float, optional
-        A new file is begun after so many megabytes, or seconds.
-    record_keep_mb : float, optional
-        The oldest files of the recording are removed beyond so many megabytes.
-    http : str, optional
-        Where to serve HTTP.
-    http_token_file : str, optional
-        File with the token that requests must bear.
-    status_socket : str
-        Path of the unix socket for `cangauge status`; "auto", "off".
-    log_format : {"text", "json"}
-    log_level : {"debug", "info", "warning", "error"}
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    record: str | None = None
-    record_part_mb: Megabytes | None = None
-    record_part_s: PartSeconds | None = None
-    record_keep_mb: Megabytes | None = None
-    http: str | None = None
-    http_token_file: str | None = None
-    status_socket: str = "auto"
-    log_format: LogFormat = "text"
-    log_level: LogLevel = "info"
-
-    def http_address(self) -> HttpAddress | None:
-        """Return where HTTP is served, None if it is not; may raise InputError."""
-        return None if self.http is None else http_address(self.http, self.http_token_file)
-
-    def unix_path(self) -> Path | None:
-        """Return the path of the unix socket where one is named."""
-        return None if self.status_socket in {"auto", "off"} else Path(self.status_socket)
-
-    def record_limits(self) -> RecordLimits:
-        """Return when the recording begins a new file, and what it keeps; may raise InputError."""
-        return RecordLimits(
-            part_bytes=_bytes(self.record_part_mb),
-            part_s=self.record_part_s,
-            keep_bytes=_bytes(self.record_keep_mb),
-        )
-
-
-def _bytes(megabytes: float | None) -> int | None:
-    return None if megabytes is None else int(megabytes * 1e6)
-
-
-# --- What `cangauge run` can be told: a TOML file, and options of the command line that go b…
-
 DEFAULT_VEHICLE: Final = "generic"
-"""What `replay` sends by default, so that both commands find each other without options."""
+"""Default of `replay` as well, so that both commands work together without options."""
 
-_PATHS: Final = ("model", "dbc", "map", "output", "state", *OPS_PATHS)
 
-Percent = Annotated[FiniteFloat, Field(ge=0.0, le=100.0)]
-Seconds = Annotated[FiniteFloat, Field(gt=0.0, le=1e9)]
-StandardId = Annotated[int, Field(ge=0, le=0x7FF)]
+@dataclass(frozen=True)
+class OptionInfo:
+    """What the command line and the reference need to know of a key.
+
+    Parameters
+    ----------
+    metavar : str
+        Placeholder of the value in help texts; "" for a key of the file only.
+    flags : tuple of str
+        Option names; empty: the key's name with dashes.
+    unit : str
+    default : str
+        Default in words, where the field's own default is not enough.
+    needs_restart : bool
+        A reload does not apply a change of this key.
+    is_path : bool
+        A path, relative to the file that it is in.
+    """
+
+    metavar: str = ""
+    flags: tuple[str, ...] = ()
+    unit: str = ""
+    default: str = ""
+    needs_restart: bool = False
+    is_path: bool = False
+
+
+def _key(
+    default: Any,
+    text: str,
+    metavar: str = "",
+    *flags: str,
+    unit: str = "",
+    default_text: str = "",
+    needs_restart: bool = False,
+    is_path: bool = False,
+    **bounds: float,
+) -> Any:
+    info = OptionInfo(metavar, flags, unit, default_text, needs_restart, is_path)
+    field: FieldInfo = Field(default, description=text, **bounds)  # type: ignore[call-overload] # bounds are numbers
+    field.metadata.append(info)
+    return field
+
+
+def option_info(field: FieldInfo) -> OptionInfo:
+    """Return the option data of a key's field."""
+    return next((each for each in field.metadata if isinstance(each, OptionInfo)), OptionInfo())
 
 
 def _none_for_auto(value: object) -> object:
@@ -326,138 +131,289 @@ class _Strict(BaseModel):
 
 
 class IdsConfig(_Strict):
-    """Standard ids of the published frames and of the clock."""
+    """Standard ids of the published frames and of the replay clock."""
 
-    soc_estimate: StandardId = 0x5A0
-    soc_detail: StandardId = 0x5A1
-    replay_clock: StandardId = 0x5AF
+    soc_estimate: int = _key(
+        0x5A0, "Id of SOC_ESTIMATE.", "ID", "--soc-estimate-id", ge=0, le=0x7FF
+    )
+    soc_detail: int = _key(0x5A1, "Id of SOC_DETAIL.", "ID", "--soc-detail-id", ge=0, le=0x7FF)
+    replay_clock: int = _key(
+        0x5AF, "Id of REPLAY_CLOCK.", "ID", "--replay-clock-id", ge=0, le=0x7FF, needs_restart=True
+    )
 
 
 class ChecksConfig(_Strict):
-    """When values are believed, by signal; see `CheckMap`."""
+    """Plausibility checks by signal, as in a map file; see `CheckMap`."""
 
-    current: CheckMap = CheckMap()
-    voltage: CheckMap = CheckMap()
-    temperature: CheckMap = CheckMap()
-    soc_reference: CheckMap = CheckMap()
+    current: CheckMap = _key(CheckMap(), "Plausibility check of the current.")
+    voltage: CheckMap = _key(CheckMap(), "Plausibility check of the voltage.")
+    temperature: CheckMap = _key(CheckMap(), "Plausibility check of the temperature.")
+    soc_reference: CheckMap = _key(CheckMap(), "Plausibility check of the vehicle's own SoC.")
 
 
 class FullChargeConfig(_Strict):
-    """When the pack is full; see `FullCharge`."""
+    """Condition of a full pack; see `FullCharge`."""
 
-    voltage_v: Annotated[FiniteFloat, Field(gt=0.0, le=1e4)]
-    current_a: Annotated[FiniteFloat, Field(ge=0.0, le=5e3)]
-    hold_s: Annotated[FiniteFloat, Field(ge=0.0, le=86400.0)] = 60.0
-    soc_pct: Percent = 100.0
-    soc_std_pct: Annotated[FiniteFloat, Field(ge=0.01, le=100.0)] = 0.5
+    voltage_v: FiniteFloat = _key(..., "Least voltage.", unit="V", gt=0.0, le=1e4)
+    current_a: FiniteFloat = _key(..., "Largest current, either way.", unit="A", ge=0.0, le=5e3)
+    hold_s: FiniteFloat = _key(60.0, "Duration of both.", unit="s", ge=0.0, le=86400.0)
+    soc_pct: FiniteFloat = _key(100.0, "SoC then.", unit="%", ge=0.0, le=100.0)
+    soc_std_pct: FiniteFloat = _key(0.5, "Its standard deviation.", unit="%", ge=0.01, le=100.0)
 
 
 class LongRestConfig(_Strict):
-    """When the voltage is the open-circuit voltage; see `LongRest`."""
+    """Condition of an open-circuit voltage at rest; see `LongRest`."""
 
-    after_s: Annotated[FiniteFloat, Field(ge=60.0, le=30.0 * 86400.0)] = 7200.0
-    soc_std_pct: Annotated[FiniteFloat, Field(ge=0.01, le=100.0)] = 2.0
+    after_s: FiniteFloat = _key(
+        7200.0, "Least duration of the rest.", unit="s", ge=60.0, le=30.0 * 86400.0
+    )
+    soc_std_pct: FiniteFloat = _key(
+        2.0, "Standard deviation of the SoC by its voltage.", unit="%", ge=0.01, le=100.0
+    )
 
 
-class RunConfig(OpsConfig):
-    """All that `cangauge run` can be told; defaults are those of the command line.
+class RunConfig(_Strict):
+    """Configuration of the service; each field describes itself."""
 
-    The keys for operators are those of `OpsConfig`.
-
-    Parameters
-    ----------
-    model : str
-        Model file.
-    interface, channel : str, optional
-        By default SocketCAN's vcan0 where there is one, else `udp_multicast`.
-    bus_options : mapping
-        Further arguments of the bus's driver.
-    wait_for_bus : bool
-        Start even if the bus is not there yet.
-    vehicle, dbc, map : str, optional
-        Preset, or DBC and map file; by default what `replay` sends.
-    temperature : float, optional
-        Constant temperature instead of the bus's [°C].
-    temperature_source : str, optional
-        What the temperature is measured on, where the vehicle does not say it.
-    method : {"ekf", "newton", "coulomb"}
-    initial_soc : float or None
-        [%]; None, "auto" in the file: from the first voltages.
-    initial_soc_std : float
-        Its standard deviation [%].
-    valid_std : float
-        A SoC with a larger standard deviation is published as degraded [%].
-    capacity_ah : float, optional
-        Instead of the model's [Ah].
-    max_gap_s : float
-        A longer step between samples is a gap [s].
-    pair_within_s : float, optional
-        Current and voltage at most this far apart belong together [s].
-    time_source : {"receive", "replay-clock"}
-    timeout_s : float
-        Without a sample for so long the estimate is published as stale [s].
-    ids : IdsConfig
-    messages : dict of str to MessageMap
-        Protection and period of messages, by name or id, before those of the vehicle.
-    rules : dict of str to RuleMap
-        Protection rules of one's own.
-    checks : ChecksConfig
-        When values are believed, before what the vehicle's mapping states.
-    output : str, optional
-        File to write the estimates to.
-    duration_s, until_idle_s : float, optional
-        When to end by itself [s].
-    state : str, optional
-        File, or folder of one, that the state is kept in over restarts.
-    state_max_age_s, state_every_s : float
-        An older state is refused; how often it is written [s].
-    full_charge, long_rest : optional
-        Rules that say what the SoC is at some moments.
-    """
-
-    model: str
-    interface: str | None = None
-    channel: str | None = None
-    bus_options: dict[str, StrictBool | int | float | str] = Field(default_factory=dict)
-    wait_for_bus: StrictBool = False
-    vehicle: str | None = None
-    dbc: str | None = None
-    map: str | None = None
-    temperature: Annotated[FiniteFloat, Field(ge=-60.0, le=120.0)] | None = None
-    temperature_source: TemperatureSource | None = None
-    method: Method = "ekf"
-    initial_soc: Annotated[Percent | None, BeforeValidator(_none_for_auto)] = None
-    initial_soc_std: Percent = 1.0
-    valid_std: Annotated[FiniteFloat, Field(ge=0.01, le=100.0)] = VALID_STD_PCT
-    capacity_ah: Annotated[FiniteFloat, Field(ge=1e-3, le=1e5)] | None = None
-    max_gap_s: Annotated[FiniteFloat, Field(ge=1e-3, le=3600.0)] = GAP_S
-    pair_within_s: Annotated[FiniteFloat, Field(ge=0.0, le=1.0)] | None = None
-    time_source: TimeSourceName = "receive"
-    timeout_s: Seconds = 2.0
-    ids: IdsConfig = IdsConfig()
-    messages: dict[str, MessageMap] = Field(default_factory=dict)
-    rules: dict[str, RuleMap] = Field(default_factory=dict)
-    checks: ChecksConfig = ChecksConfig()
-    output: str | None = None
-    duration_s: Seconds | None = None
-    until_idle_s: Seconds | None = None
-    state: str | None = None
-    state_max_age_s: Seconds = 7.0 * 86400.0
-    state_every_s: Annotated[FiniteFloat, Field(ge=0.1, le=86400.0)] = CHECKPOINT_EVERY_S
-    full_charge: FullChargeConfig | None = None
-    long_rest: LongRestConfig | None = None
+    model: str = _key(..., "Model file of `cangauge fit`.", "MODEL", "-m", "--model", is_path=True)
+    interface: str | None = _key(
+        None,
+        "python-can interface: socketcan, udp_multicast, pcan, slcan and others.",
+        "I",
+        default_text="socketcan if there is a vcan0, else udp_multicast on this machine",
+        needs_restart=True,
+    )
+    channel: str | None = _key(
+        None,
+        "Channel, e.g. can0.",
+        "C",
+        default_text="vcan0, or 239.74.163.2",
+        needs_restart=True,
+    )
+    bus_options: dict[str, StrictBool | int | float | str] = _key(
+        {},
+        "Further argument of the bus driver, e.g. bitrate=500000.",
+        "K=V",
+        "--bus-option",
+        needs_restart=True,
+    )
+    wait_for_bus: StrictBool = _key(
+        False,
+        "Start even if the bus is not there yet. A bus lost later is always reconnected.",
+        "",
+        "--wait-for-bus/--need-bus",
+        needs_restart=True,
+    )
+    vehicle: str | None = _key(
+        None,
+        f"Vehicle preset: {', '.join(PRESETS)}.",
+        "PRESET",
+        default_text=f"{DEFAULT_VEHICLE}, without --dbc and --map",
+    )
+    dbc: str | None = _key(None, "DBC file of another vehicle; needs --map.", "FILE", is_path=True)
+    map: str | None = _key(
+        None,
+        "TOML file: which signals are current, voltage and temperature, with sign and scale.",
+        "FILE",
+        is_path=True,
+    )
+    temperature: FiniteFloat | None = _key(
+        None, "Constant temperature, instead of the bus's.", "C", unit="°C", ge=-60.0, le=120.0
+    )
+    temperature_source: TemperatureSource | None = _key(
+        None,
+        "Location of the temperature sensor, if the vehicle does not define it:"
+        f" {', '.join(TEMPERATURE_SOURCES)}.",
+        "SOURCE",
+    )
+    method: Method = _key(
+        "ekf",
+        "Published SoC: fusion (ekf), the inverse of the voltage model (newton), or Coulomb"
+        " counting (coulomb).",
+        "ekf|newton|coulomb",
+    )
+    initial_soc: Annotated[FiniteFloat | None, BeforeValidator(_none_for_auto)] = _key(
+        None,
+        "SoC at the first sample, or auto: by the first voltages.",
+        "P|auto",
+        unit="%",
+        default_text="auto",
+        ge=0.0,
+        le=100.0,
+    )
+    initial_soc_std: FiniteFloat = _key(
+        1.0, "Standard deviation of the initial SoC.", "X", unit="%", ge=0.0, le=100.0
+    )
+    valid_std: FiniteFloat = _key(
+        VALID_STD_PCT,
+        "Standard deviation above which the SoC is published as degraded.",
+        "X",
+        unit="%",
+        ge=0.01,
+        le=100.0,
+    )
+    capacity_ah: FiniteFloat | None = _key(
+        None, "Capacity.", "A", unit="Ah", default_text="the model's", ge=1e-3, le=1e5
+    )
+    max_gap_s: FiniteFloat = _key(
+        GAP_S, "Longest step between samples that is not a gap.", "S", unit="s", ge=1e-3, le=3600.0
+    )
+    pair_within_s: FiniteFloat | None = _key(
+        None,
+        "Largest time between current and voltage of one sample.",
+        "S",
+        unit="s",
+        default_text="0.02",
+        ge=0.0,
+        le=1.0,
+    )
+    time_source: TimeSourceName = _key(
+        "receive",
+        "Bus time: the receive stamps of the frames, or the log time that `cangauge replay` sends"
+        " at speeds other than 1.",
+        "receive|replay-clock",
+        needs_restart=True,
+    )
+    timeout_s: FiniteFloat = _key(
+        2.0, "Time without a sample after which the input is stale.", "S", unit="s", gt=0.0, le=1e9
+    )
+    ids: IdsConfig = _key(IdsConfig(), "Ids of the published frames.")
+    messages: dict[str, MessageMap] = _key(
+        {}, "Protection and period of messages, by name or id; before those of the vehicle."
+    )
+    rules: dict[str, RuleMap] = _key({}, "Further protection rules.")
+    checks: ChecksConfig = _key(
+        ChecksConfig(), "Plausibility checks by signal; before those of the vehicle."
+    )
+    record: str | None = _key(
+        None,
+        "Record the received frames (.log, .csv, .blf, .mf4): `cangauge estimate` on them gives"
+        " the live numbers, bit for bit. A kill loses the last half second, or a whole part of an"
+        " .mf4. A full disk costs frames of the recording, never the estimate. An existing"
+        " recording is kept: the next run is FILE-0001, FILE-0002, …",
+        "FILE",
+        needs_restart=True,
+        is_path=True,
+    )
+    record_part_mb: FiniteFloat | None = _key(
+        None,
+        "Size of a part of the recording: NAME-RUN-PART. NAME-RUN denotes all its parts.",
+        "MB",
+        unit="MB",
+        needs_restart=True,
+        gt=0.0,
+        le=1e9,
+    )
+    record_part_s: FiniteFloat | None = _key(
+        None,
+        "Duration of a part of the recording.",
+        "S",
+        unit="s",
+        needs_restart=True,
+        ge=1.0,
+        le=1e9,
+    )
+    record_keep_mb: FiniteFloat | None = _key(
+        None,
+        "Total size of the recording; the oldest files are removed.",
+        "MB",
+        unit="MB",
+        needs_restart=True,
+        gt=0.0,
+        le=1e9,
+    )
+    output: str | None = _key(
+        None,
+        "Table of the estimates, .csv or .parquet.",
+        "FILE",
+        "-o",
+        "--output",
+        needs_restart=True,
+        is_path=True,
+    )
+    duration_s: FiniteFloat | None = _key(
+        None, "Stop after this time.", "S", "--duration", unit="s", gt=0.0, le=1e9
+    )
+    until_idle_s: FiniteFloat | None = _key(
+        None,
+        "Stop when no sample came for this time, after the first.",
+        "S",
+        "--until-idle",
+        unit="s",
+        gt=0.0,
+        le=1e9,
+    )
+    state: str | None = _key(
+        None,
+        "Keep SoC, its uncertainty and the delay line over restarts in this file, or in a file in"
+        " this folder.",
+        "FILE",
+        default_text="systemd's StateDirectory, if there is one",
+        needs_restart=True,
+        is_path=True,
+    )
+    state_max_age_s: FiniteFloat = _key(
+        7.0 * 86400.0,
+        "Age above which the state is refused.",
+        "S",
+        "--state-max-age",
+        unit="s",
+        needs_restart=True,
+        gt=0.0,
+        le=1e9,
+    )
+    state_every_s: FiniteFloat = _key(
+        CHECKPOINT_EVERY_S,
+        "Interval between writes of the state.",
+        "S",
+        "--state-every",
+        unit="s",
+        ge=0.1,
+        le=86400.0,
+    )
+    full_charge: FullChargeConfig | None = _key(None, "Set the SoC when the pack is full.")
+    long_rest: LongRestConfig | None = _key(None, "Correct the SoC by the voltage of long rests.")
+    http: str | None = _key(
+        None,
+        "Serve /status, /healthz and /metrics (extra `metrics`) there, e.g. 127.0.0.1:9464. An"
+        " address beyond loopback needs a token.",
+        "HOST:PORT",
+        needs_restart=True,
+    )
+    http_token_file: str | None = _key(
+        None,
+        "File with the bearer token that requests need; or in CANGAUGE_HTTP_TOKEN.",
+        "FILE",
+        needs_restart=True,
+        is_path=True,
+    )
+    status_socket: str = _key(
+        "auto",
+        "Unix socket for `cangauge status`; auto: in the user's runtime folder.",
+        "PATH|auto|off",
+        needs_restart=True,
+    )
+    log_format: LogFormat = _key(
+        "text", "Format of the events on stderr, one a line.", "text|json", needs_restart=True
+    )
+    log_level: LogLevel = _key(
+        "info",
+        "Lowest level of the events.",
+        "debug|info|warning|error",
+        needs_restart=True,
+    )
     _file: str = PrivateAttr("the configuration")
 
     def named(self, file: str | PathLike[str]) -> Self:
-        """Note which file it came from, for messages; return itself."""
+        """Set the file that messages name; return self."""
         self._file = str(file)
         return self
 
     def address(self) -> BusAddress:
-        """Return which bus; may raise InputError."""
+        """Return the bus address; may raise InputError."""
         interface = self.interface
         if interface is None and self.wait_for_bus and is_interface_name(self.channel):
-            interface = "socketcan"  # which cannot be seen from what is there now
+            interface = "socketcan"  # cannot be detected while the interface is missing
         return bus_address(interface, self.channel, self.bus_options)
 
     def load_vehicle(self) -> Vehicle:
@@ -475,7 +431,7 @@ class RunConfig(OpsConfig):
         )
 
     def gauge_settings(self) -> GaugeSettings:
-        """Return what the gauge needs; may raise InputError."""
+        """Return the settings of the estimator and its frames; may raise InputError."""
         full, rest = self.full_charge, self.long_rest
         return GaugeSettings(
             estimator=EstimatorSettings(
@@ -493,8 +449,25 @@ class RunConfig(OpsConfig):
             ids=FrameIds(**self.ids.model_dump()),
         )
 
+    def http_address(self) -> HttpAddress | None:
+        """Return the address of HTTP, None without; may raise InputError."""
+        return None if self.http is None else http_address(self.http, self.http_token_file)
+
+    def unix_path(self) -> Path | None:
+        """Return the path of the unix socket, if one is given."""
+        return None if self.status_socket in {"auto", "off"} else Path(self.status_socket)
+
+    def record_limits(self) -> RecordLimits:
+        """Return size and number of the recording's parts; may raise InputError."""
+        part_mb, keep_mb = self.record_part_mb, self.record_keep_mb
+        return RecordLimits(
+            part_bytes=None if part_mb is None else int(part_mb * 1e6),
+            part_s=self.record_part_s,
+            keep_bytes=None if keep_mb is None else int(keep_mb * 1e6),
+        )
+
     def state_settings(self, environment: Mapping[str, str]) -> StateSettings | None:
-        """Return where the state is kept, if anywhere; may raise InputError."""
+        """Return where the state is kept, None if it is not; may raise InputError."""
         path = state_path(self.state, environment)
         if path is None:
             return None
@@ -504,7 +477,7 @@ class RunConfig(OpsConfig):
         return StateSettings(path, self.state_max_age_s, self.state_every_s)
 
     def loop_settings(self) -> LoopSettings:
-        """Return when the service calls its input stale, and when it ends."""
+        """Return time-outs, ends and intervals of the receive loop."""
         return LoopSettings(
             timeout_s=self.timeout_s,
             duration_s=self.duration_s,
@@ -513,26 +486,30 @@ class RunConfig(OpsConfig):
         )
 
 
+_PATHS: Final = tuple(
+    name for name, field in RunConfig.model_fields.items() if option_info(field).is_path
+)
+
+
 def load_config(
     path: str | PathLike[str] | None, overrides: Mapping[str, Any] | None = None
 ) -> RunConfig:
-    """Read a configuration; options of the command line go before the file.
+    """Read a configuration; options of the command line take precedence over the file.
 
     Parameters
     ----------
     path : path-like, optional
         TOML file.
     overrides : mapping, optional
-        By the file's keys; None stands for an option that was not given. Given ids and bus
-        options join those of the file.
+        Values by key; None: not given. Ids and bus options are merged with those of the file.
 
     Raises
     ------
     InputError
-        Names the file (or the command line), the key and the value that are wrong.
+        Names the file (or the option), the key and the value.
     """
     given = {key: value for key, value in (overrides or {}).items() if value not in (None, {})}
-    # Checked on their own first, so that an error names where the value came from.
+    # Checked separately, so that an error names the source of the value.
     _check_options(given)
     if path is None:
         if "model" not in given:
@@ -545,7 +522,7 @@ def load_config(
     folder = Path(path).parent
     data |= {key: str(folder / data[key]) for key in _PATHS if isinstance(data.get(key), str)}
     if given.keys() & {"vehicle", "dbc", "map"}:
-        # A car named on the command line is not mixed with the file's.
+        # A vehicle given as an option replaces the file's as a whole.
         data = {key: value for key, value in data.items() if key not in {"vehicle", "dbc", "map"}}
     for key in ("ids", "bus_options"):
         if key in data and key in given:
@@ -560,16 +537,130 @@ def _check_options(given: Mapping[str, Any]) -> None:
     try:
         validated(RunConfig, _with_model(given), "")
     except InputError as error:
-        key = (error.field or "").split(".")
-        option = "-".join([*key[1:], "id"]) if key[0] == "ids" else key[0]
-        raise InputError(
-            error.problem,
-            field=f"--{option.replace('_', '-')}",
-            value=error.value,
-            cure=error.cure,
-        ) from error
+        key = error.field or ""
+        option = f"--{key.replace('_', '-')}"
+        for each in config_keys():
+            if each.name == key and each.option:
+                option = each.option.rpartition(", ")[2].partition("/")[0]
+        raise InputError(error.problem, field=option, value=error.value, cure=error.cure) from error
 
 
 def _with_model(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return data with a model, so that only what is given is judged."""
+    """Return data with a model, which may come from elsewhere."""
     return {"model": "-", **data}
+
+
+# --- Reference ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ConfigKey:
+    """A key of the configuration, for the reference and the command line.
+
+    Parameters
+    ----------
+    name : str
+        Dotted key of the TOML file, such as "ids.soc_detail".
+    option : str
+        Option names, such as "-m, --model"; "" for a key of the file only.
+    kind : str
+        Type in words.
+    default, unit, bounds, text : str
+    info : OptionInfo
+    """
+
+    name: str
+    option: str
+    kind: str
+    default: str
+    unit: str
+    bounds: str
+    text: str
+    info: OptionInfo
+
+    @property
+    def help(self) -> str:
+        """Help text of the option, with unit and default."""
+        first, dot, rest = self.text.partition(". ")
+        unit = f" [{self.unit}]" if self.unit else ""
+        text = f"{first}{unit}. {rest}" if dot else f"{first.removesuffix('.')}{unit}."
+        return f"{text} Default: {self.default}." if self.default else text
+
+
+def config_keys() -> list[ConfigKey]:
+    """Return all keys of the configuration with option, type, default, unit, bounds and help."""
+    return list(_keys(RunConfig, ""))
+
+
+def _keys(model: type[BaseModel], prefix: str) -> Iterator[ConfigKey]:
+    for name, field in model.model_fields.items():
+        inner = [each for each in (field.annotation, *get_args(field.annotation)) if _is_own(each)]
+        if inner:
+            yield from _keys(inner[0], f"{prefix}{name}.")
+            continue
+        info = option_info(field)
+        flags = info.flags or ((f"--{name.replace('_', '-')}",) if info.metavar else ())
+        yield ConfigKey(
+            name=prefix + name,
+            option=", ".join(flags),
+            kind=_kind(field.annotation),
+            default=info.default or _default(field, info),
+            unit=info.unit,
+            bounds=_bounds(field),
+            text=field.description or "",
+            info=info,
+        )
+
+
+def _is_own(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, _Strict)
+
+
+def _kind(annotation: Any) -> str:
+    if get_origin(annotation) is Annotated:
+        return _kind(get_args(annotation)[0])
+    if get_origin(annotation) is Literal:
+        return "one of " + ", ".join(map(str, get_args(annotation)))
+    if get_origin(annotation) is dict:
+        return "table"
+    if isinstance(annotation, type):
+        names = {bool: "true or false", float: "number", int: "whole number", str: "text"}
+        return names.get(annotation, "table")
+    return next(_kind(each) for each in get_args(annotation) if each is not type(None))
+
+
+def _default(field: FieldInfo, info: OptionInfo) -> str:
+    value = field.default
+    if field.is_required() or value is None or isinstance(value, dict | BaseModel):
+        return ""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if info.metavar == "ID":
+        return f"0x{value:X}"
+    return f"{value:.10g}" if isinstance(value, float) else str(value)
+
+
+def _bounds(field: FieldInfo) -> str:
+    signs = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
+    found = [
+        f"{sign} {getattr(part, name):g}"
+        for part in field.metadata
+        for name, sign in signs.items()
+        if isinstance(getattr(part, name, None), int | float)
+    ]
+    return ", ".join(found)
+
+
+def reference() -> str:
+    """Return the reference of all keys as a Markdown table."""
+    head = ("Key", "Option", "Type", "Default", "Unit", "Bounds", "Meaning")
+    rows: list[tuple[str, ...]] = [head, tuple("---" for _ in head)]
+    for key in config_keys():
+        option = ", ".join(f"`{each}`" for each in key.option.split(", ") if each)
+        cells = (f"`{key.name}`", option, key.kind, key.default, key.unit, key.bounds, key.text)
+        rows.append(tuple(each.replace("|", "\\|") for each in cells))
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+if __name__ == "__main__":
+    sys.stdout.write(reference())

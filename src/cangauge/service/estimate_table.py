@@ -1,9 +1,10 @@
-"""The estimate table, written while the service runs, in memory that does not grow."""
+"""Write the table of estimates while the service runs, in bounded memory."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
 from contextlib import ExitStack, suppress
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
@@ -14,8 +15,10 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 
 from cangauge._io import atomic_path
+from cangauge._logging import emit
 from cangauge.errors import CangaugeError, InputError
 from cangauge.estimate.validity import Estimate, reason_names
+from cangauge.service.async_writer import AsyncWriter
 
 NUMBERS: Final = (
     "soc_pct",
@@ -32,57 +35,61 @@ _SCHEMA: Final = pa.schema(
         ("reasons", pa.string()),
     ]
 )
-_ROWS_AT_ONCE: Final = 4096
+_BLOCK_ROWS: Final = 4096
+_ROW_BYTES: Final = 400
+"""Memory of a row in Python objects [bytes], roughly."""
+_CLOSE_WITHIN_S: Final = 30.0
+_LOG = logging.getLogger(__name__)
 
 
 class EstimateWriter:
-    """Writes a row per sample, as `cangauge estimate` does; use it in a `with` block.
+    """Write one row per sample, as `cangauge estimate` does; use it in a `with` block.
 
-    All or nothing: the file appears when the block ends well.
+    All or nothing: the file appears when the block ends without an exception. If the disk is full
+    or fails, the table is abandoned with an event, and the service continues.
 
     Parameters
     ----------
     path : path-like
         `.parquet` or `.csv`.
-    warn : callable, optional
-        Takes a line of text when the disk is full or fails: the table is then given up, and
-        whoever adds to it goes on. Without it, the OSError is raised.
+
+    Attributes
+    ----------
+    rows : int
+        Number of rows added.
+    failed : bool
+        True once the table is abandoned; there is then no file.
 
     Raises
     ------
     InputError
-        If the suffix is another one, or the folder is absent or not writable.
+        If the suffix is another one, or the folder is missing or not writable.
     """
 
-    def __init__(
-        self, path: str | PathLike[str], warn: Callable[[str], None] | None = None
-    ) -> None:
+    def __init__(self, path: str | PathLike[str]) -> None:
         self._path = Path(path)
         if self._path.suffix.lower() not in {".parquet", ".csv"}:
             raise InputError(
-                "the suffix says neither CSV nor Parquet",
+                "the suffix is neither .csv nor .parquet",
                 source=self._path,
                 field="--output",
                 value=self._path.suffix,
                 cure="name it .csv or .parquet",
             )
-        self._rows: list[tuple[Any, ...]] = []
+        self._block: list[tuple[Any, ...]] = []
         self._names: dict[int, str] = {}
         self._stack = ExitStack()
         self._sink: Any = None
-        self._warn = warn
-        self._error: OSError | None = None
+        self._writer = AsyncWriter(
+            "cangauge-table", max_waiting_bytes=64 << 20, on_error=self._abandon
+        )
         self.rows = 0
-
-    @property
-    def failed(self) -> bool:
-        """Whether the table was given up; there is then no file."""
-        return self._error is not None
+        self.failed = False
 
     def __enter__(self) -> Self:
         part = self._stack.enter_context(atomic_path(self._path))
         if self._path.suffix.lower() == ".csv":
-            # The header by hand: pyarrow always puts quotes around names.
+            # pyarrow always quotes the names of the header.
             file = self._stack.enter_context(part.open("wb"))
             file.write((",".join(_SCHEMA.names) + "\n").encode())
             options = pacsv.WriteOptions(include_header=False, quoting_style="none")
@@ -97,49 +104,51 @@ class EstimateWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if self._error is not None:
-            # The temporary file goes, and nothing is put in place.
-            with suppress(OSError):
-                self._sink.close()
-            with suppress(OSError, CangaugeError):
-                self._stack.__exit__(OSError, self._error, None)
-            return
         if kind is None:
-            self._write()
-        self._sink.close()
-        self._stack.__exit__(kind, error, trace)
+            self._submit()
+            self._writer.submit(lambda: None if self.failed else self._sink.close())
+        if self._writer.close(_CLOSE_WITHIN_S):
+            self._abandon(TimeoutError("the disk is too slow"))
+        if kind is None and not self.failed:
+            self._stack.__exit__(None, None, None)
+            return
+        # An exception makes `atomic_path` remove its temporary file.
+        with suppress(OSError):
+            self._sink.close()
+        with suppress(OSError, CangaugeError):
+            self._stack.__exit__(kind or OSError, error or OSError(), trace)
 
     def add(self, time_s: float, estimate: Estimate) -> None:
         """Add the row of a sample: its time [s] and the estimate after it."""
-        if self._error is not None:
+        if self.failed:
             return
         reasons = int(estimate.reasons)
         words = self._names.get(reasons)
         if words is None:
             words = self._names[reasons] = reason_names(reasons)
-        # The numbers of an estimate stand in the table's order, after its time.
+        # The fields of an estimate are in the table's order, after its time.
         numbers = estimate[1 : 1 + len(NUMBERS)]
-        self._rows.append((time_s, *numbers, estimate.status.name.lower(), words))
+        self._block.append((time_s, *numbers, estimate.status.name.lower(), words))
         self.rows += 1
-        if len(self._rows) >= _ROWS_AT_ONCE:
-            self._write_or_give_up()
+        if len(self._block) >= _BLOCK_ROWS:
+            self._submit()
 
-    def _write_or_give_up(self) -> None:
-        try:
-            self._write()
-        except OSError as error:
-            if self._warn is None:
-                raise
-            self._error = error
-            self._rows.clear()
-            self._warn(f"warning: {self._path}: cannot be written ({error}); given up")
+    def _submit(self) -> None:
+        block, self._block = self._block, []
+        if block and not self._writer.submit(partial(self._write, block), _ROW_BYTES * len(block)):
+            self._abandon(TimeoutError("the disk is too slow"))
 
-    def _write(self) -> None:
-        if not self._rows:
+    def _write(self, block: list[tuple[Any, ...]]) -> None:
+        if self.failed:
             return
         columns = [
             pa.array(values, field.type, from_pandas=True)
-            for field, values in zip(_SCHEMA, zip(*self._rows, strict=True), strict=True)
+            for field, values in zip(_SCHEMA, zip(*block, strict=True), strict=True)
         ]
         self._sink.write_table(pa.Table.from_arrays(columns, schema=_SCHEMA))
-        self._rows.clear()
+
+    def _abandon(self, error: Exception) -> None:
+        if not self.failed:
+            self.failed = True
+            text = f"{self._path}: cannot be written ({error}); the table is abandoned"
+            emit(_LOG, logging.WARNING, "file.failed", text)

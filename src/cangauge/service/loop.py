@@ -11,6 +11,7 @@ It alone knows a clock, a monotonic one: for the rate of publishing, and to noti
 
 from __future__ import annotations
 
+import logging
 import math
 import statistics
 import time
@@ -22,13 +23,15 @@ from typing import Final, Protocol
 import can
 from can.typechecking import CanFilter
 
-from cangauge._logging import Voice
+from cangauge._logging import emit
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.publish import ESTIMATE_EVERY_S, FrameIds, standard_filter
 from cangauge.bus.time_source import is_clock
 from cangauge.errors import CangaugeError
 from cangauge.estimate.validity import Estimate
 from cangauge.service.pipeline import Gauge
+
+_LOG = logging.getLogger(__name__)
 
 # --- Noticing that somebody else sends the frames that this service publishes
 
@@ -62,12 +65,9 @@ class DuplicateSenderDetector:
         What it looks out for.
     """
 
-    def __init__(
-        self, ids: FrameIds, *, echoes: bool, warn: Callable[[str], None] | None = None
-    ) -> None:
+    def __init__(self, ids: FrameIds, *, echoes: bool) -> None:
         self.frames = 0
         self._echoes = echoes
-        self._warn = warn
         self._sent: deque[tuple[int, bytes]] = deque(maxlen=_REMEMBERED)
         self._seen_s: deque[float] = deque(maxlen=SEEN)
         self._quiet_until_s = -math.inf
@@ -116,12 +116,15 @@ class DuplicateSenderDetector:
         self.frames += 1
         self._seen_s.append(now_s)
         is_many = len(self._seen_s) == SEEN and now_s - self._seen_s[0] <= WITHIN_S
-        if is_many and now_s >= self._quiet_until_s and self._warn is not None:
+        if is_many and now_s >= self._quiet_until_s:
             self._quiet_until_s = now_s + AGAIN_S
-            self._warn(
-                f"warning: somebody else sends 0x{frame_id:X} on this bus, which this service"
+            emit(
+                _LOG,
+                logging.WARNING,
+                "bus.duplicate_sender",
+                f"somebody else sends 0x{frame_id:X} on this bus, which this service"
                 " publishes: is another one running? Give one of them other ids"
-                " (--soc-estimate-id, --soc-detail-id)"
+                " (--soc-estimate-id, --soc-detail-id)",
             )
 
 
@@ -149,8 +152,6 @@ class Housekeeping:
     checkpoint : callable, optional
         Saves the state; called after `FIRST_CHECKPOINT_S`, every `every_s`, and at the end.
     every_s : float
-    warn : callable, optional
-        Takes a line of text.
     """
 
     def __init__(
@@ -158,12 +159,10 @@ class Housekeeping:
         port: BusConnection,
         checkpoint: Callable[[], None] | None = None,
         every_s: float = CHECKPOINT_EVERY_S,
-        warn: Callable[[str], None] | None = None,
     ) -> None:
         self._port = port
         self._checkpoint = checkpoint
         self.every_s = every_s
-        self._voice = Voice(warn) if warn is not None else None
         self._look_s = 0.0
         self._save_s: float | None = None
         self._drops = 0
@@ -174,8 +173,6 @@ class Housekeeping:
             return
         self._look_s = now_s + LOOK_EVERY_S
         self._watch_queue()
-        if self._voice is not None:
-            self._voice.look()
         if self._save_s is None:
             self._save_s = now_s + min(FIRST_CHECKPOINT_S, self.every_s)
         elif now_s >= self._save_s:
@@ -189,9 +186,12 @@ class Housekeeping:
     def _watch_queue(self) -> None:
         drops = self._port.queue_drops or 0
         if drops > self._drops:
-            self._say(
-                f"warning: {self._port.name}: the receive queue overflowed:"
-                f" {drops - self._drops} frames lost ({drops} so far)"
+            emit(
+                _LOG,
+                logging.WARNING,
+                "bus.queue_overflow",
+                f"{self._port.name}: the receive queue overflowed:"
+                f" {drops - self._drops} frames lost ({drops} so far)",
             )
             self._drops = drops
 
@@ -202,11 +202,7 @@ class Housekeeping:
             self._checkpoint()
         except (OSError, CangaugeError) as error:
             # A full disk must not stop the estimate.
-            self._say(f"warning: the state could not be saved: {error}")
-
-    def _say(self, text: str) -> None:
-        if self._voice is not None:
-            self._voice.say(text)
+            emit(_LOG, logging.WARNING, "state.failed", f"the state could not be saved: {error}")
 
 
 # --- The receive loop: receives, hands to the gauge, sends
@@ -265,8 +261,6 @@ class Outputs:
         Takes the time [s] of every sample and the estimate after it.
     show : callable, optional
         Called with the monotonic time [s] every `LOOK_EVERY_S` at least.
-    warn : callable, optional
-        Takes a line of text.
     checkpoint : callable, optional
         Saves the state: called every `checkpoint_every_s`, and at the end after the last estimate.
         What it raises as OSError or CangaugeError is a warning.
@@ -284,7 +278,6 @@ class Outputs:
     record: FrameSink | None = None
     table: Callable[[float, Estimate], None] | None = None
     show: Callable[[float], None] | None = None
-    warn: Callable[[str], None] | None = None
     checkpoint: Callable[[], None] | None = None
     reload: Callable[[], LoopSettings | None] | None = None
     stepped: Callable[[float, float, float], None] | None = None
@@ -355,12 +348,8 @@ class _Loop:
         self._gauge = gauge
         self._settings = settings
         self._outputs = outputs
-        self.rivals = DuplicateSenderDetector(
-            gauge.settings.ids, echoes=port.capabilities.echoes, warn=outputs.warn
-        )
-        self._upkeep = Housekeeping(
-            port, outputs.checkpoint, settings.checkpoint_every_s, outputs.warn
-        )
+        self.rivals = DuplicateSenderDetector(gauge.settings.ids, echoes=port.capabilities.echoes)
+        self._upkeep = Housekeeping(port, outputs.checkpoint, settings.checkpoint_every_s)
         self._ignores_clock = self._awaits_clock = gauge.settings.time_source == "receive"
         self._stamps_are_wall_time = port.capabilities.stamps == "kernel"
         self._no_input: frozenset[int] = frozenset()
@@ -492,9 +481,11 @@ class _Loop:
     def _warn_of_clock(self) -> None:
         self._awaits_clock = False
         self._set_filters()
-        if self._outputs.warn is not None:
-            self._outputs.warn(
-                "warning: a replay tells its own time on this bus (REPLAY_CLOCK), but frames are"
-                " taken by their receive stamps; for the log's time run with"
-                " --time-source replay-clock"
-            )
+        emit(
+            _LOG,
+            logging.WARNING,
+            "bus.replay_clock",
+            "a replay sends its own time on this bus (REPLAY_CLOCK), but frames are"
+            " taken by their receive stamps; for the log's time run with"
+            " --time-source replay-clock",
+        )

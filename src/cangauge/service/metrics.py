@@ -31,16 +31,16 @@ except ImportError as error:
     ) from error
 
 _BUS_HELP: Final = {
-    "garbled": "Packets that were no CAN frames.",
-    "error_frames": "Error frames that the controller reported.",
-    "unsent": "Frames given up because the transmit queue stayed full.",
-    "queue_drops": "Frames that the kernel dropped because the receive queue was full.",
-    "losses": "How often the bus was lost; it is opened again until it is back.",
+    "garbled": "Packets that are not CAN frames.",
+    "error_frames": "Error frames of the controller.",
+    "unsent": "Frames dropped since the transmit queue stayed full.",
+    "queue_drops": "Frames that the kernel dropped since the receive queue was full.",
+    "losses": "Losses of the bus; each is followed by reconnecting.",
 }
 
 
 class Exposition:
-    """Renders the latest snapshot, for any thread but the loop's.
+    """Render the latest snapshot; for any thread but the receive loop's.
 
     Parameters
     ----------
@@ -75,12 +75,12 @@ class _SnapshotCollector(Collector):
         yield from _frames(snapshot)
         yield _histogram(
             "cangauge_latency_seconds",
-            "From the receive stamp of the frame that completes a sample to its SoC being sent.",
+            "Time from the receive stamp that completes a sample to its published SoC.",
             snapshot.latency,
         )
         yield _histogram(
             "cangauge_step_seconds",
-            "From receiving the frame that completes a sample to having taken it in.",
+            "Processing time of the frame that completes a sample.",
             snapshot.step,
         )
         yield from _record(snapshot)
@@ -97,15 +97,17 @@ def _about(snapshot: Snapshot, now_s: float) -> Iterator[Metric]:
         "method": identity.method,
         "time_source": identity.time_source,
     }
-    build = GaugeMetricFamily("cangauge_build_info", "What runs here; always 1.", labels=[*labels])
+    build = GaugeMetricFamily(
+        "cangauge_build_info", "Version and setup; always 1.", labels=[*labels]
+    )
     build.add_metric([*labels.values()], 1.0)
     yield build
     yield GaugeMetricFamily(
-        "cangauge_start_time_seconds", "Start, seconds since 1970.", identity.began_s
+        "cangauge_start_time_seconds", "Start time, seconds since 1970.", identity.began_s
     )
     yield GaugeMetricFamily(
         "cangauge_loop_age_seconds",
-        "Since the receive loop last showed that it turns.",
+        "Time since the latest turn of the receive loop.",
         now_s - snapshot.made_s,
     )
 
@@ -115,29 +117,37 @@ def _estimate(snapshot: Snapshot, now_s: float) -> Iterator[Metric]:
     nan = math.nan
     for name, text, value in (
         ("soc_percent", "State of charge [%].", estimate.soc_pct),
-        ("soc_std_percent", "Its standard deviation [%].", estimate.soc_std_pct),
-        ("soc_newton_percent", "By the voltage model's inverse alone.", estimate.soc_newton_pct),
-        ("soc_coulomb_percent", "By Coulomb counting alone [%].", estimate.soc_coulomb_pct),
+        ("soc_std_percent", "Standard deviation of the SoC [%].", estimate.soc_std_pct),
+        (
+            "soc_newton_percent",
+            "SoC by the inverse voltage model [%].",
+            estimate.soc_newton_pct,
+        ),
+        (
+            "soc_coulomb_percent",
+            "SoC by Coulomb counting [%].",
+            estimate.soc_coulomb_pct,
+        ),
         ("residual_volts", "Measured minus predicted voltage.", estimate.residual_v),
         (
             "current_amperes",
-            "Positive current discharges.",
+            "Pack current, positive = discharge.",
             nan if sample is None else sample.current_a,
         ),
         ("voltage_volts", "Pack voltage.", nan if sample is None else sample.voltage_v),
         ("temperature_celsius", "Temperature.", nan if sample is None else sample.temperature_c),
         (
             "sample_age_seconds",
-            "Since the latest sample; infinite before the first.",
+            "Age of the latest sample; infinite before the first.",
             snapshot.age_s(now_s),
         ),
     ):
         yield GaugeMetricFamily(f"cangauge_{name}", text, value)
-    status = GaugeMetricFamily("cangauge_status", "1 for the status that holds.", labels=["status"])
+    status = GaugeMetricFamily("cangauge_status", "1 for the present status.", labels=["status"])
     for each in Status:
         status.add_metric([each.name.lower()], float(each is estimate.status))
     yield status
-    reasons = GaugeMetricFamily("cangauge_reason", "1 for reasons that hold.", labels=["reason"])
+    reasons = GaugeMetricFamily("cangauge_reason", "1 for present reasons.", labels=["reason"])
     held = set(reason_ids(estimate.reasons))
     for name in reason_ids(~Reason.NONE):
         reasons.add_metric([name], float(name in held))
@@ -147,20 +157,24 @@ def _estimate(snapshot: Snapshot, now_s: float) -> Iterator[Metric]:
 def _frames(snapshot: Snapshot) -> Iterator[Metric]:
     for name, text, value in (
         ("frames_received", "Frames that passed the filters.", snapshot.frames),
-        ("frames_wanted", "Frames with a wanted id.", snapshot.wanted),
-        ("frames_used", "Wanted frames not refused.", snapshot.wanted - snapshot.rejected),
-        ("frames_lost", "Wanted frames that their counters say are missing.", snapshot.lost),
-        ("samples", "Samples made of the frames.", snapshot.samples),
+        ("frames_wanted", "Frames with an expected id.", snapshot.wanted),
+        (
+            "frames_used",
+            "Expected frames not rejected.",
+            snapshot.wanted - snapshot.rejected,
+        ),
+        ("frames_lost", "Expected frames missing by their alive counters.", snapshot.lost),
+        ("samples", "Samples completed by frames.", snapshot.samples),
     ):
         yield CounterMetricFamily(f"cangauge_{name}", text, value)
     yield _by_label(
-        "cangauge_rejects", "Frames and values refused, by reason.", "reason", snapshot.rejects
+        "cangauge_rejects", "Rejected frames and values, by reason.", "reason", snapshot.rejects
     )
     for name, value in snapshot.bus.items():
         text = _BUS_HELP.get(name, name.replace("_", " "))
         yield CounterMetricFamily(f"cangauge_bus_{name}", text, value)
     yield GaugeMetricFamily(
-        "cangauge_bus_up", "0 while the bus is away or its controller off.", snapshot.bus_up
+        "cangauge_bus_up", "0 while the bus is lost or its controller is bus-off.", snapshot.bus_up
     )
 
 
@@ -170,13 +184,13 @@ def _record(snapshot: Snapshot) -> Iterator[Metric]:
         return
     yield CounterMetricFamily("cangauge_record_frames", "Frames recorded.", record.frames)
     yield CounterMetricFamily(
-        "cangauge_record_lost_frames", "Frames that the disk did not take.", record.lost_frames
+        "cangauge_record_lost_frames", "Frames that could not be written.", record.lost_frames
     )
     yield CounterMetricFamily(
-        "cangauge_record_written_bytes", "Written to the disk.", record.written_bytes
+        "cangauge_record_written_bytes", "Bytes written.", record.written_bytes
     )
     yield GaugeMetricFamily(
-        "cangauge_record_failing", "1 while nothing can be written.", record.problem is not None
+        "cangauge_record_failing", "1 while the disk rejects data.", record.problem is not None
     )
 
 

@@ -1,20 +1,17 @@
-"""The state file: what the service remembers over a restart. JSON, versioned, with its own hash.
+"""The service's state over restarts: read and checked at the start, written while it runs.
 
     {"format": "cangauge-state", "version": 1, "sha256": "…", "content": {…}}
 
-The hash is that of the content, written without spaces and with sorted keys. Nothing is believed
-before it is checked: size, JSON, format, version, hash, then every field's type and range.
-
-Keeps the gauge's state in a file: read and checked at the start, written as the service runs.
-
-Nothing that happens to the file stops the estimator: it is told of in one line, at most once a
-minute, and the service goes on without.
+The hash is that of the content, written without spaces and with sorted keys. Everything is checked
+before use: size, JSON, format, version, hash, then the type and range of every field. A file that
+cannot be read or written never stops the estimator: it is logged, and the service runs without.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import math
 import os
 import re
@@ -23,6 +20,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, Any, Final, Self
@@ -31,34 +29,265 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from cangauge._formatting import duration, number
 from cangauge._io import write_text_atomic
+from cangauge._logging import emit
 from cangauge.errors import CangaugeError, InputError
 from cangauge.estimate.state import EstimatorState
 from cangauge.model.model_file import Model
-from cangauge.service.async_writer import BackgroundWriter
+from cangauge.service.async_writer import AsyncWriter
 from cangauge.service.loop import CHECKPOINT_EVERY_S
 from cangauge.service.pipeline import Gauge
 
-# --- The state file: what the service remembers over a restart. JSON, versioned, with its ow…
-
 STATE_FORMAT: Final = "cangauge-state"
 STATE_VERSION: Final = 1
-"""To be raised with every change of what an estimator remembers."""
+"""Increase it with every change of the estimator's state."""
 
 LARGEST_BYTES: Final = 8 << 20
-"""A delay line at its fullest takes 0.3 MB."""
+"""Largest state file that is read [bytes]; a full delay line takes 0.3 MB."""
 
+FILE_NAME: Final = "cangauge-state.json"
+"""Name of the file in a folder."""
+
+STOP_WITHIN_S: Final = 0.7
+"""Time limit of the last write when the service ends [s]."""
+
+REBOOT_S: Final = 600.0
+"""Least duration of a pause over a reboot [s]: the clock may have stopped with the machine."""
+
+FUTURE_S: Final = 60.0
+"""A state further in the future than this [s] was written under another clock: age unknown."""
+
+REFUSED_SUFFIX: Final = ".refused"
+
+_LOG = logging.getLogger(__name__)
 Hash = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 
+@dataclass(frozen=True)
+class StateSettings:
+    """Where and how often the state is saved.
+
+    Parameters
+    ----------
+    path : Path
+    max_age_s : float
+        Age above which a state is refused [s].
+    every_s : float
+        Interval between writes [s].
+    """
+
+    path: Path
+    max_age_s: float = 7.0 * 86400.0
+    every_s: float = CHECKPOINT_EVERY_S
+
+
+def state_path(given: str | None, environment: Mapping[str, str]) -> Path | None:
+    """Return the path of the state file, if any.
+
+    For a folder it is a file in it. The default is systemd's `StateDirectory=`, if there is one.
+    """
+    folders = environment.get("STATE_DIRECTORY", "").split(":")
+    chosen = given or folders[0]
+    if not chosen:
+        return None
+    path = Path(chosen)
+    try:
+        return path / FILE_NAME if not given or path.is_dir() else path
+    except OSError as error:  # an impossible file name
+        raise InputError(
+            f"impossible file name: {error.strerror}",
+            field="state",
+            value=f"{str(path)[:40]}…",
+            cure="give a shorter one",
+        ) from error
+
+
+class StateKeeper:
+    """Restore the state at the start, save it on request and at the end; use it in a `with` block.
+
+    Parameters
+    ----------
+    settings : StateSettings
+    gauge : Gauge
+    wall_s : callable
+        Unix time [s].
+    """
+
+    def __init__(
+        self,
+        settings: StateSettings,
+        gauge: Gauge,
+        *,
+        wall_s: Callable[[], float] = time.time,
+    ) -> None:
+        self.settings = settings
+        self._gauge = gauge
+        self._model = gauge.model
+        self._fingerprint = model_fingerprint(gauge.model)
+        self._wall_s = wall_s
+        self._boot_id = boot_id()
+        self._writer = AsyncWriter("cangauge-state", on_error=self._failed)
+        self._samples_kept = 0
+        self._restored_pct: float | None = None
+        self.restored = False
+        """True if the estimator continued from the file."""
+
+    def __enter__(self) -> Self:
+        self._sweep()
+        self._restore()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.checkpoint()
+        if self._writer.close(STOP_WITHIN_S):
+            text = f"{self.settings.path}: the last state was not written in time"
+            emit(_LOG, logging.WARNING, "state.failed", text)
+
+    def checkpoint(self) -> None:
+        """Start writing the state, if a sample came since the last time; return at once."""
+        self._log_verdict()
+        if self._gauge.samples == self._samples_kept:
+            return
+        state = self._gauge.snapshot()
+        if state is None:
+            return
+        self._samples_kept = self._gauge.samples
+        if self._gauge.model is not self._model:
+            # The configuration was read again.
+            self._model = self._gauge.model
+            self._fingerprint = model_fingerprint(self._model)
+        content = StateContent.model_construct(
+            saved_s=self._wall_s(),
+            boot_id=self._boot_id,
+            model=self._fingerprint,
+            model_name=self._model.name[:200],
+            time_source=self._gauge.settings.time_source,
+            estimator=state,
+        )
+        self._writer.replace(partial(self._write, content))
+
+    def flush(self, seconds: float) -> bool:
+        """Wait until the state is written; return False if that takes longer [s]."""
+        return self._writer.flush(seconds)
+
+    def _restore(self) -> None:
+        path = self.settings.path
+        try:
+            content = read_state(path)
+            age_s = self._checked_age(content)
+            latest = self._gauge.restore(content.estimator, age_s)
+        except FileNotFoundError:
+            emit(_LOG, logging.INFO, "state.none", f"{path}: no state yet; starting without")
+            return
+        except InputError as error:
+            self._refuse(error)
+            return
+        self.restored = True
+        self._restored_pct = latest.soc_pct
+        ago = "some time ago" if math.isnan(age_s) else f"{duration(age_s)} ago"
+        soc = f"{number(latest.soc_pct, 2)} ± {number(latest.soc_std_pct, 2, '%')}"
+        emit(_LOG, logging.INFO, "state.restored", f"{path}: going on from {ago}: SoC {soc}")
+
+    def _checked_age(self, content: StateContent) -> float:
+        """Return the least age of the state [s]; NaN if it is unknown."""
+        path = self.settings.path
+        if content.model != self._fingerprint:
+            raise InputError(
+                f"of another model ({content.model_name})",
+                source=path,
+                field="content.model",
+            )
+        time_source = self._gauge.settings.time_source
+        if content.time_source != time_source:
+            raise InputError(
+                f"saved with time source {content.time_source}, now it is {time_source}",
+                source=path,
+                field="content.time_source",
+            )
+        if math.isnan(content.estimator.soc_pct):
+            raise InputError("has no SoC", source=path, field="content.estimator.estimate")
+        if time_source == "replay-clock":
+            return 0.0
+        age_s = self._wall_s() - content.saved_s
+        if age_s > self.settings.max_age_s:
+            raise InputError(
+                f"{age_s / 3600.0:.1f} h old, more than the limit of"
+                f" {self.settings.max_age_s / 3600.0:g} h",
+                source=path,
+            )
+        if age_s < -FUTURE_S:
+            return math.nan
+        age_s = max(age_s, 0.0)
+        return max(age_s, REBOOT_S) if content.boot_id != self._boot_id else age_s
+
+    def _refuse(self, error: InputError) -> None:
+        path = self.settings.path
+        aside = path.with_name(path.name + REFUSED_SUFFIX)
+        try:
+            path.replace(aside)
+            kept = f"; kept as {aside.name}"
+        except OSError as problem:
+            kept = f" (and cannot be put aside: {problem.strerror})"
+        # A configured initial SoC belongs to an earlier start: there is a state, so the car has
+        # been used since. With a wide deviation it would add nothing to the voltage, and Coulomb
+        # counting alone would never correct it.
+        how = (
+            "by voltage, for the given SoC is of an earlier start"
+            if self._gauge.ask_the_voltage()
+            else "without"
+        )
+        text = f"state refused: {error}{kept}; starting {how}"
+        emit(_LOG, logging.WARNING, "state.refused", text)
+
+    def _sweep(self) -> None:
+        """Remove temporary files of a process that was killed while writing."""
+        path = Path(os.path.realpath(self.settings.path))
+        left = re.compile(rf"\.{re.escape(path.stem[:200])}\.[0-9a-f]{{8}}{re.escape(path.suffix)}")
+        with suppress(OSError):
+            for each in path.parent.iterdir():
+                if left.fullmatch(each.name):
+                    each.unlink()
+
+    def _write(self, content: StateContent) -> None:
+        write_text_atomic(self.settings.path, state_text(content))
+
+    def _log_verdict(self) -> None:
+        verdict = self._gauge.pause_verdict
+        if self._restored_pct is None or verdict in {"", "open"}:
+            return
+        before, self._restored_pct = self._restored_pct, None
+        latest = self._gauge.latest
+        soc = f"{number(latest.soc_pct, 1)} ± {number(latest.soc_std_pct, 1, '%')}"
+        words = {
+            "parked": f"the voltage confirms the restored SoC; now {soc}",
+            "moved": f"the voltage refutes the restored SoC of {before:.1f} %; by it {soc}",
+        }
+        text = words.get(verdict, f"restored SoC and voltage are combined; now {soc}")
+        emit(_LOG, logging.INFO, "state.judged", text)
+
+    def _failed(self, error: Exception) -> None:
+        text = str(error)
+        if not isinstance(error, CangaugeError):
+            text = f"{self.settings.path}: {error!r}"
+        emit(_LOG, logging.WARNING, "state.failed", f"state not written: {text}")
+
+
+# --- The file -----------------------------------------------------------------------------------
+
+
 class StateContent(BaseModel):
-    """What the file holds, besides its own hash."""
+    """Content of the file, without its hash."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     saved_s: Annotated[float, Field(allow_inf_nan=False, ge=-1e12, le=1e12)]
-    """Unix time at which it was taken [s]."""
+    """Unix time of the state [s]."""
     boot_id: Annotated[str, Field(max_length=64)] | None
-    """Which start of the machine it belongs to; None where the system does not tell."""
+    """Boot of the machine that it belongs to; None if unknown."""
     model: Hash
     """Fingerprint of the model."""
     model_name: Annotated[str, Field(max_length=200)]
@@ -67,7 +296,7 @@ class StateContent(BaseModel):
 
 
 def model_fingerprint(model: Model) -> str:
-    """Return a hash of all that a model says."""
+    """Return the hash of a model's content."""
     return hashlib.sha256(model.to_json().encode()).hexdigest()
 
 
@@ -86,22 +315,21 @@ def read_state(path: Path) -> StateContent:
     FileNotFoundError
         If there is none.
     InputError
-        If it cannot be read, is damaged, or is of another version; one line with the reason.
+        If it cannot be read, is damaged, or has another version.
     """
     data = _parsed(_bytes(path), path)
     if not isinstance(data, dict) or data.get("format") != STATE_FORMAT:
-        raise InputError("is no cangauge state", source=path, field="format")
+        raise InputError("not a cangauge state file", source=path, field="format")
     if data.get("version") != STATE_VERSION:
         raise InputError(
-            f"this release keeps version {STATE_VERSION}",
+            f"this release reads version {STATE_VERSION}",
             source=path,
             field="version",
             value=_shown(data.get("version")),
         )
     content = data.get("content")
     if not isinstance(content, dict) or data.get("sha256") != _content_hash(content):
-        raise InputError("damaged: its content is not what was written", source=path,
-                         field="sha256")  # fmt: skip
+        raise InputError("damaged: the hash does not match", source=path, field="sha256")
     try:
         return StateContent.model_validate(content)
     except ValidationError as error:
@@ -115,7 +343,7 @@ def read_state(path: Path) -> StateContent:
 
 
 def boot_id() -> str | None:
-    """Return which start of the machine this is; None where the system does not tell."""
+    """Return the kernel's id of this boot; None if there is none."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()[:64]
     except (OSError, ValueError):
@@ -124,9 +352,9 @@ def boot_id() -> str | None:
 
 def _bytes(path: Path) -> bytes:
     try:
-        # A pipe or device could keep the service waiting for ever.
+        # A pipe or device could block for ever.
         if not stat.S_ISREG(path.stat().st_mode):
-            raise InputError("is no regular file", source=path)
+            raise InputError("not a regular file", source=path)
         with path.open("rb") as file:
             if os.fstat(file.fileno()).st_size > LARGEST_BYTES:
                 raise InputError(f"larger than {LARGEST_BYTES >> 20} MB", source=path)
@@ -139,11 +367,11 @@ def _bytes(path: Path) -> bytes:
 
 def _parsed(raw: bytes, path: Path) -> object:
     try:
-        # Decoded here: of bytes, `json` would also take UTF-16 and UTF-32, which is never written.
+        # Decoded here: of bytes, `json` would also accept UTF-16 and UTF-32.
         return json.loads(raw.decode("utf-8"), parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
         reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)[:200]
-        raise InputError(f"is no JSON: {reason}", source=path) from error
+        raise InputError(f"not JSON: {reason}", source=path) from error
 
 
 def _canonical(content: dict[str, Any]) -> str:
@@ -157,265 +385,15 @@ def _hash(text: str) -> str:
 def _content_hash(content: dict[str, Any]) -> str:
     try:
         return _hash(_canonical(content))
-    except (ValueError, RecursionError):  # 1e999 is read as infinity, which no hash is made of
+    except (ValueError, RecursionError):  # 1e999 is read as infinity, which cannot be written
         return ""
 
 
 def _no_constant(name: str) -> float:
-    raise ValueError(f"{name} is no number that a state may hold")
+    raise ValueError(f"{name} is not allowed in a state")
 
 
 def _shown(value: object) -> str | int | float | None:
     if isinstance(value, str):
         return value[:60]
     return value if isinstance(value, int | float) and abs(value) < 1e15 else None
-
-
-# --- Keeps the gauge's state in a file: read and checked at the start, written as the servic…
-
-FILE_NAME: Final = "cangauge-state.json"
-"""What the file is called in a folder."""
-
-WARN_EVERY_S: Final = 60.0
-
-STOP_WITHIN_S: Final = 0.7
-"""How long the last writing may take when the service ends [s]."""
-
-REBOOT_S: Final = 600.0
-"""After the machine was off, its clock may have stood still: the pause counts as at least this
-[s]."""
-
-FUTURE_S: Final = 60.0
-"""A state so much from the future was written under another clock [s]."""
-
-DAMAGED_SUFFIX: Final = ".refused"
-
-
-@dataclass(frozen=True)
-class StateSettings:
-    """Where the state is kept.
-
-    Parameters
-    ----------
-    path : Path
-    max_age_s : float
-        An older one is refused [s].
-    every_s : float
-        How often it is written [s].
-    """
-
-    path: Path
-    max_age_s: float = 7.0 * 86400.0
-    every_s: float = CHECKPOINT_EVERY_S
-
-
-def state_path(given: str | None, environment: Mapping[str, str]) -> Path | None:
-    """Return where the state is to be kept, if anywhere.
-
-    A folder stands for a file in it. If none is given but systemd made a folder for the service
-    (`StateDirectory=`), it is there.
-    """
-    folders = environment.get("STATE_DIRECTORY", "").split(":")
-    chosen = given or folders[0]
-    if not chosen:
-        return None
-    path = Path(chosen)
-    try:
-        return path / FILE_NAME if not given or path.is_dir() else path
-    except OSError as error:  # a name that no file can have
-        raise InputError(
-            f"no file can have this name: {error.strerror}",
-            field="state",
-            value=f"{str(path)[:40]}…",
-            cure="give a shorter one",
-        ) from error
-
-
-class StateKeeper:
-    """Reads the state at the start, writes it when asked and at the end; use it in a `with` block.
-
-    Parameters
-    ----------
-    settings : StateSettings
-    gauge : Gauge
-    tell : callable
-        Takes a line of text for the user.
-    wall_s, monotonic_s : callable
-        Clocks [s]: Unix time, and one that is never set.
-    """
-
-    def __init__(
-        self,
-        settings: StateSettings,
-        gauge: Gauge,
-        tell: Callable[[str], None],
-        *,
-        wall_s: Callable[[], float] = time.time,
-        monotonic_s: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self.settings = settings
-        self._gauge = gauge
-        self._model = gauge.model
-        self._fingerprint = model_fingerprint(gauge.model)
-        self._tell = tell
-        self._wall_s = wall_s
-        self._monotonic_s = monotonic_s
-        self._boot_id = boot_id()
-        self._writer: BackgroundWriter[StateContent] = BackgroundWriter(self._write)
-        self._samples_kept = 0
-        self._warned_s = -math.inf
-        self._restored_pct: float | None = None
-        self.restored = False
-        """Whether the gauge went on from the file."""
-
-    def __enter__(self) -> Self:
-        self._sweep()
-        self._restore()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.checkpoint()
-        if not self._writer.flush(STOP_WITHIN_S):
-            self._tell(f"warning: {self.settings.path}: the last state was not written in time")
-        self._warn_of_errors(at_once=True)
-
-    def checkpoint(self) -> None:
-        """Have the state written, if a sample came since the last time; returns at once."""
-        self._warn_of_errors()
-        self._tell_verdict()
-        if self._gauge.samples == self._samples_kept:
-            return
-        state = self._gauge.snapshot()
-        if state is None:
-            return
-        self._samples_kept = self._gauge.samples
-        if self._gauge.model is not self._model:
-            # The configuration was read again.
-            self._model = self._gauge.model
-            self._fingerprint = model_fingerprint(self._model)
-        self._writer.submit(
-            StateContent.model_construct(
-                saved_s=self._wall_s(),
-                boot_id=self._boot_id,
-                model=self._fingerprint,
-                model_name=self._model.name[:200],
-                time_source=self._gauge.settings.time_source,
-                estimator=state,
-            )
-        )
-
-    def flush(self, seconds: float) -> bool:
-        """Wait until what was asked for is written; False if that takes longer [s]."""
-        return self._writer.flush(seconds)
-
-    # --- at the start -----------------------------------------------------------------------
-
-    def _restore(self) -> None:
-        path = self.settings.path
-        try:
-            content = read_state(path)
-            age_s = self._checked_age(content)
-            latest = self._gauge.restore(content.estimator, age_s)
-        except FileNotFoundError:
-            self._tell(f"{path}: no state yet; starting without")
-            return
-        except InputError as error:
-            self._refuse(error)
-            return
-        self.restored = True
-        self._restored_pct = latest.soc_pct
-        ago = "some time ago" if math.isnan(age_s) else f"{duration(age_s)} ago"
-        soc = f"{number(latest.soc_pct, 2)} ± {number(latest.soc_std_pct, 2, '%')}"
-        self._tell(f"{path}: going on from {ago}: SoC {soc}")
-
-    def _checked_age(self, content: StateContent) -> float:
-        """Return how old the state is at least [s]; NaN if no clock knows."""
-        path = self.settings.path
-        if content.model != self._fingerprint:
-            raise InputError(
-                f"of another model ({content.model_name})", source=path, field="content.model"
-            )
-        time_source = self._gauge.settings.time_source
-        if content.time_source != time_source:
-            raise InputError(
-                f"time was by {content.time_source}, and is by {time_source}",
-                source=path,
-                field="content.time_source",
-            )
-        if math.isnan(content.estimator.soc_pct):
-            raise InputError("holds no SoC", source=path, field="content.estimator.estimate")
-        if time_source == "replay-clock":
-            return 0.0
-        age_s = self._wall_s() - content.saved_s
-        if age_s > self.settings.max_age_s:
-            raise InputError(
-                f"{age_s / 3600.0:.1f} h old, and older than {self.settings.max_age_s / 3600.0:g} h"
-                " is not used",
-                source=path,
-            )
-        if age_s < -FUTURE_S:
-            return math.nan
-        age_s = max(age_s, 0.0)
-        return max(age_s, REBOOT_S) if content.boot_id != self._boot_id else age_s
-
-    def _refuse(self, error: InputError) -> None:
-        path = self.settings.path
-        aside = path.with_name(path.name + DAMAGED_SUFFIX)
-        try:
-            path.replace(aside)
-            kept = f"; kept as {aside.name}"
-        except OSError as problem:
-            kept = f" (and cannot be put aside: {problem.strerror})"
-        # A SoC that the user gave was true at some earlier start: there is a state, so the car has
-        # been used since. Kept with a wide deviation it would tell nothing that the voltage does
-        # not, and counting alone would never be rid of it.
-        how = (
-            "by voltage, for the given SoC is of an earlier start"
-            if (self._gauge.ask_the_voltage())
-            else "without"
-        )
-        self._tell(f"warning: state refused: {error}{kept}; starting {how}")
-
-    def _sweep(self) -> None:
-        """Remove what a process that was killed while writing has left."""
-        path = Path(os.path.realpath(self.settings.path))
-        left = re.compile(rf"\.{re.escape(path.stem[:200])}\.[0-9a-f]{{8}}{re.escape(path.suffix)}")
-        with suppress(OSError):
-            for each in path.parent.iterdir():
-                if left.fullmatch(each.name):
-                    each.unlink()
-
-    # --- as it runs -------------------------------------------------------------------------
-
-    def _write(self, content: StateContent) -> None:
-        write_text_atomic(self.settings.path, state_text(content))
-
-    def _tell_verdict(self) -> None:
-        verdict = self._gauge.pause_verdict
-        if self._restored_pct is None or verdict in {"", "open"}:
-            return
-        before, self._restored_pct = self._restored_pct, None
-        latest = self._gauge.latest
-        soc = f"{number(latest.soc_pct, 1)} ± {number(latest.soc_std_pct, 1, '%')}"
-        words = {
-            "parked": f"the voltage bears the restored SoC out; now {soc}",
-            "moved": f"the voltage refutes the restored SoC of {before:.1f} %; by it {soc}",
-        }
-        self._tell(words.get(verdict, f"restored SoC and voltage are weighed; now {soc}"))
-
-    def _warn_of_errors(self, *, at_once: bool = False) -> None:
-        error = self._writer.take_error()
-        if error is None:
-            return
-        now_s = self._monotonic_s()
-        if now_s - self._warned_s < WARN_EVERY_S and not at_once:
-            return
-        self._warned_s = now_s
-        is_told = isinstance(error, CangaugeError)
-        text = str(error) if is_told else f"{self.settings.path}: {error!r}"
-        self._tell(f"warning: state not written: {text}")

@@ -1,11 +1,7 @@
-"""Counts in fixed buckets: what the loop fills in a fraction of a microsecond, and others read.
+"""Status of a running service: counts of the receive loop as snapshots for other threads.
 
-What a running service shows of itself: an unchanging copy, made by the loop, read by others.
-
-The loop puts a new one in the place of the old one several times a second; whoever reads takes the
-reference and has all the time in the world. No locks.
-
-The loop's side of watching: counts durations, shows snapshots, tells systemd, logs changes.
+`Monitor` replaces its `Snapshot` a few times a second; readers take the reference, without locks.
+It also notifies systemd and logs changes of the status.
 """
 
 from __future__ import annotations
@@ -17,35 +13,59 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from cangauge import __version__
 from cangauge._formatting import number
-from cangauge._logging import Pace, emit
+from cangauge._logging import emit
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.decoder import FrameStatistics
 from cangauge.bus.plausibility import MessageStatistics
 from cangauge.estimate.validity import Estimate, Reason, Sample, Status, reason_name, reason_names
+from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Gauge
-from cangauge.service.systemd import Notifier
+from cangauge.service.recording import Recorder, RecordState
 
-# --- Counts in fixed buckets: what the loop fills in a fraction of a microsecond, and others…
+_LOG = logging.getLogger(__name__)
+
+SCHEMA: Final = 1
+STUCK_S: Final = 2.0
+"""Age of a snapshot above which the receive loop counts as stuck, and its SoC as stale [s]."""
+SHOW_EVERY_S: Final = 0.25
+"""Interval of the snapshots [s]."""
+TELL_EVERY_S: Final = 1.0
+"""Interval of status lines to systemd [s]."""
+RATE_OVER_S: Final = 2.0
+"""Averaging time of the sample rate [s]."""
+CLOCKS_APART_S: Final = 60.0
+"""A receive stamp further than this from the wall clock belongs to another clock [s]."""
+
+BUS_COUNTS: Final = ("garbled", "error_frames", "unsent", "queue_drops", "losses")
+"""Counts of a bus that are shown, if it has them."""
+
+_NO_REJECTS: Final = frozenset({"wanted", "counter_jumps", "frames_lost"})
+_OF_VALUES: Final = frozenset({"not_available", "implausible", "stuck", "held_back"})
+"""Rejected values of frames that were not rejected."""
+_REJECTS: Final = tuple(
+    each.name for each in fields(MessageStatistics) if each.name not in _NO_REJECTS
+)
+
 
 BOUNDS_S: Final = (
     5e-6, 1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4,
     1e-3, 2e-3, 5e-3, 1e-2, 2e-2, 5e-2, 0.1, 0.2, 0.5, 1.0,
 )  # fmt: skip
-"""Upper bounds of the buckets [s]; one more holds what is larger."""
+"""Upper bounds of the buckets [s]; one more bucket holds larger values."""
 
 
 @dataclass(frozen=True, slots=True)
 class HistogramCounts:
-    """An unchanging copy.
+    """Immutable copy of a histogram.
 
     Parameters
     ----------
     counts : tuple of int
-        Per bucket of `BOUNDS_S`, and one for what is larger.
+        Per bucket of `BOUNDS_S`, and one for larger values.
     total_s : float
         Sum of all values [s].
     """
@@ -59,10 +79,9 @@ class HistogramCounts:
         return sum(self.counts)
 
     def at_most_s(self, share: float) -> float | None:
-        """Return a bound that this share of the values keeps [s].
+        """Return the upper bound of the bucket that holds the quantile of this share [s].
 
-        It is a bucket's upper end: the quantile lies at it or below, by no more than the bucket.
-        None without values, infinite where the quantile is above all bounds.
+        None without values; infinite if the quantile is above all bounds.
         """
         count = self.count
         if not count:
@@ -76,7 +95,7 @@ class HistogramCounts:
 
 
 class Histogram:
-    """Counts durations in seconds; for one thread."""
+    """Histogram of durations, filled by one thread."""
 
     def __init__(self) -> None:
         self._counts = [0] * (len(BOUNDS_S) + 1)
@@ -88,20 +107,13 @@ class Histogram:
         self._total_s += value_s
 
     def copy(self) -> HistogramCounts:
-        """Return what was counted so far."""
+        """Return the counts so far."""
         return HistogramCounts(tuple(self._counts), self._total_s)
-
-
-# --- What a running service shows of itself: an unchanging copy, made by the loop, read by o…
-
-SCHEMA: Final = 1
-STUCK_S: Final = 2.0
-"""A loop that shows nothing for so long [s] is taken to be stuck, and its SoC to be old."""
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What does not change while the service runs.
+    """Constant properties of a running service.
 
     Parameters
     ----------
@@ -119,27 +131,6 @@ class Identity:
 
 
 @dataclass(frozen=True, slots=True)
-class RecordState:
-    """How the recording fares.
-
-    Parameters
-    ----------
-    path : str
-        The file that is written.
-    frames, lost_frames, written_bytes : int
-        Frames taken so far; those that the disk did not take; bytes on the disk.
-    problem : str or None
-        Why nothing can be written at present.
-    """
-
-    path: str
-    frames: int
-    lost_frames: int
-    written_bytes: int
-    problem: str | None
-
-
-@dataclass(frozen=True, slots=True)
 class Snapshot:
     """The state of the service at one moment.
 
@@ -147,29 +138,30 @@ class Snapshot:
     ----------
     identity : Identity
     made_s : float
-        When, by the monotonic clock [s].
+        Monotonic time [s].
     uptime_s : float
     estimate : Estimate
-        As it was last published.
+        As last published.
     sample : Sample or None
         The latest.
     sample_age_s : float
-        Since the latest sample, at `made_s` [s]; infinite before the first.
+        Age of the latest sample at `made_s` [s]; infinite before the first.
     samples : int
     samples_per_s : float
     frames, wanted, rejected, lost : int
-        Frames received; of a wanted id; of those refused; missing by their counters.
+        Frames received; those with an expected id; those of them rejected; those missing by
+        their alive counters.
     rejects : mapping
-        Refused frames and values by reason.
+        Rejected frames and values by reason.
     bus : mapping
-        What the bus counts: error frames, frames unsent, …
+        Counts of the bus: error frames, unsent frames, …
     bus_up : bool
-        False while the bus is away or its controller off.
+        False while the bus is lost or its controller is bus-off.
     bus_trouble : str
-        What is or went wrong with the bus, in words; empty if nothing is known to.
+        Problem of the bus in words; empty without one.
     latency, step : HistogramCounts
-        From receive stamp to SoC sent; from receiving the frame that completes a sample to having
-        taken it in.
+        Time from receive stamp to published SoC; processing time of the frame that completes a
+        sample.
     record : RecordState or None
     """
 
@@ -194,18 +186,17 @@ class Snapshot:
     record: RecordState | None
 
     def is_stuck(self, now_s: float) -> bool:
-        """Return whether the loop has shown nothing for too long, at a monotonic time [s]."""
+        """Return whether the receive loop is stuck at a monotonic time [s]."""
         return now_s - self.made_s > STUCK_S
 
     def age_s(self, now_s: float) -> float:
-        """Return the age of the latest sample [s], at a monotonic time [s]."""
+        """Return the age of the latest sample [s] at a monotonic time [s]."""
         return self.sample_age_s + max(now_s - self.made_s, 0.0)
 
     def estimate_at(self, now_s: float) -> Estimate:
-        """Return the estimate as it may be believed at a monotonic time [s].
+        """Return the estimate at a monotonic time [s]: invalid once the loop is stuck.
 
-        The loop judges whether its input is stale. Where the loop itself shows nothing any more,
-        nobody does, and the estimate is invalid.
+        Stale input is detected by the loop itself, while it runs.
         """
         estimate = self.estimate
         if not self.is_stuck(now_s):
@@ -216,12 +207,12 @@ class Snapshot:
 
 
 def reason_ids(reasons: Reason) -> list[str]:
-    """Return the names of the reasons that are set, such as "delay_line_filling"."""
+    """Return the names of the reasons, such as "delay_line_filling"."""
     return [reason_name(each).replace(" ", "_") for each in Reason if each and reasons & each]
 
 
 def as_json(snapshot: Snapshot, now_s: float) -> dict[str, Any]:
-    """Return what `/status` and `cangauge status --json` tell.
+    """Return the object of `/status` and `cangauge status --json`.
 
     Parameters
     ----------
@@ -232,7 +223,7 @@ def as_json(snapshot: Snapshot, now_s: float) -> dict[str, Any]:
     Returns
     -------
     dict
-        Finite numbers, strings and None only.
+        Values are finite numbers, strings and None.
     """
     identity, estimate, sample = snapshot.identity, snapshot.estimate_at(now_s), snapshot.sample
     record = snapshot.record
@@ -307,40 +298,8 @@ def _finite(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else value
 
 
-# --- The loop's side of watching: counts durations, shows snapshots, tells systemd, logs cha…
-
-SHOW_EVERY_S: Final = 0.25
-"""How often a snapshot is made [s]."""
-TELL_EVERY_S: Final = 1.0
-"""How often systemd is told the status line [s]."""
-RATE_OVER_S: Final = 2.0
-"""Over so long the rate of samples is taken [s]."""
-CLOCKS_APART_S: Final = 60.0
-"""A receive stamp further than this from the wall clock is of another clock: no latency [s]."""
-
-BUS_COUNTS: Final = ("garbled", "error_frames", "unsent", "queue_drops", "losses")
-"""Counts of a port that are shown, as far as the port has them."""
-
-_NO_REJECTS: Final = frozenset({"wanted", "counter_jumps", "frames_lost"})
-_OF_VALUES: Final = frozenset({"not_available", "implausible", "stuck", "held_back"})
-"""Counters of values that were refused, while their frame was not."""
-_REJECTS: Final = tuple(
-    each.name for each in fields(MessageStatistics) if each.name not in _NO_REJECTS
-)
-
-_LOG = logging.getLogger(__name__)
-
-
-class Recording(Protocol):
-    """A recording that can say how it fares."""
-
-    @property
-    def state(self) -> RecordState:
-        """How it fares."""
-
-
 class Monitor:
-    """Watches the loop from within; its methods are for the loop's thread.
+    """Collect counts in the receive loop; its methods are for the loop's thread.
 
     Parameters
     ----------
@@ -348,16 +307,16 @@ class Monitor:
     port : BusConnection
     identity : Identity
     notifier : Notifier
-    record : Recording, optional
+    record : Recorder, optional
     clock : callable
         Monotonic time [s].
 
     Attributes
     ----------
     identity : Identity
-        As given; what is told from then on, if it is replaced.
+        Replace it when the configuration changes.
     latest : Snapshot
-        For any thread: it is replaced, never changed.
+        For any thread: replaced, never changed.
     """
 
     def __init__(
@@ -367,7 +326,7 @@ class Monitor:
         *,
         identity: Identity,
         notifier: Notifier,
-        record: Recording | None = None,
+        record: Recorder | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._gauge = gauge
@@ -381,11 +340,10 @@ class Monitor:
         self._due_s = self._tell_s = now_s
         self._ping_s = now_s
         self._sample_s = -math.inf
-        self._untold_stamp_s: float | None = None
+        self._unsent_stamp_s: float | None = None
         self._rate = 0.0
         self._rate_from = (now_s, 0)
         self._status: Status | None = None
-        self._pace = Pace()
         self.latest = self._snapshot(now_s)
 
     def stepped(self, stamp_s: float, step_s: float, came_s: float) -> None:
@@ -396,37 +354,37 @@ class Monitor:
         stamp_s : float
             Receive stamp of the frame that completed the sample, seconds since 1970.
         step_s : float
-            From receiving that frame to having taken the sample in [s].
+            Processing time of the sample [s].
         came_s : float
-            When that frame came in, by the monotonic clock [s].
+            Monotonic time at which that frame was received [s].
         """
         self._sample_s = came_s
-        self._untold_stamp_s = stamp_s
+        self._unsent_stamp_s = stamp_s
         self._step.add(step_s)
 
     def sent(self) -> None:
-        """Count the latency of the latest sample: an estimate that knows it was just sent."""
-        stamp_s, self._untold_stamp_s = self._untold_stamp_s, None
+        """Count the latency of the latest sample, whose estimate was just sent."""
+        stamp_s, self._unsent_stamp_s = self._unsent_stamp_s, None
         if stamp_s is None:
             return
         latency_s = time.time() - stamp_s
-        # Stamps of another clock, and a clock that was set in between, tell nothing.
+        # Not with stamps of another clock, or after the clock was set.
         if 0.0 <= latency_s < CLOCKS_APART_S:
             self._latency.add(latency_s)
 
     @contextmanager
     def reloading(self) -> Iterator[None]:
-        """Tell systemd that the configuration is read again while the block runs."""
+        """Report a reload to systemd while the block runs."""
         self._notifier.reloading()
         try:
             yield
         finally:
             self._notifier.ready(status_line(self.latest))
 
-    def turn(self, now_s: float) -> None:
-        """Take notice that the loop has turned (monotonic clock [s])."""
+    def turn(self, now_s: float) -> bool:
+        """Note a turn of the loop (monotonic time [s]); return whether `latest` is new."""
         if now_s < self._due_s:
-            return
+            return False
         self._due_s = now_s + SHOW_EVERY_S
         self.latest = snapshot = self._snapshot(now_s)
         self._log_status(snapshot)
@@ -437,6 +395,7 @@ class Monitor:
         if self._notifier.active and now_s >= self._tell_s:
             self._tell_s = now_s + TELL_EVERY_S
             self._notifier.status(status_line(snapshot))
+        return True
 
     def _snapshot(self, now_s: float) -> Snapshot:
         gauge = self._gauge
@@ -471,8 +430,7 @@ class Monitor:
 
     def _log_status(self, snapshot: Snapshot) -> None:
         estimate = snapshot.estimate
-        # A change that may not be told yet is told later, if it has not gone by then.
-        if estimate.status is self._status or not self._pace.allows(snapshot.made_s):
+        if estimate.status is self._status:
             return
         before, self._status = self._status, estimate.status
         is_worse = estimate.status is Status.INVALID
@@ -481,7 +439,6 @@ class Monitor:
             logging.WARNING if is_worse else logging.INFO,
             "status.changed",
             status_line(snapshot),
-            always=True,
             status=estimate.status.name.lower(),
             before=None if before is None else before.name.lower(),
             reasons=reason_ids(estimate.reasons),
@@ -491,7 +448,7 @@ class Monitor:
 
 
 def status_line(snapshot: Snapshot) -> str:
-    """Return the state in one line, such as "SoC 71.2 ± 0.8 %, valid, 10.0 samples/s"."""
+    """Return a snapshot in one line, such as "SoC 71.2 ± 0.8 %, valid, 10.0 samples/s"."""
     estimate = snapshot.estimate
     soc = f"SoC {number(estimate.soc_pct, 1)} ± {number(estimate.soc_std_pct, 1, '%')}"
     why = reason_names(int(estimate.reasons))

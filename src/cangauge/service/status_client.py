@@ -1,4 +1,4 @@
-"""Asking a running service how it fares, by its unix socket or by HTTP."""
+"""Fetch the status of a running service by its unix socket or by HTTP."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from typing import Any, Final, cast
 from urllib.parse import urlsplit
 
 from cangauge.errors import CangaugeError, InputError
-from cangauge.service.config import read_token
-from cangauge.service.http import served_sockets
+from cangauge.service.addresses import read_token, served_sockets
 from cangauge.service.status import SCHEMA
 
 ANSWER_WITHIN_S: Final = 3.0
@@ -24,32 +23,32 @@ class NotRunningError(CangaugeError):
 
 
 def find_socket() -> Path:
-    """Return the unix socket of the one service that runs.
+    """Return the unix socket of the running service.
 
     Raises
     ------
     NotRunningError
-        If none does.
+        If no service runs.
     InputError
-        If several do.
+        If several services run.
     """
     found = served_sockets()
     if not found:
         raise NotRunningError(
-            "no running service found: start `cangauge run`, or name it by --endpoint"
-            " (that of another user may need more rights)"
+            "no running service found: start `cangauge run`, or give --endpoint"
+            " (another user's service may need more permissions)"
         )
     if len(found) > 1:
         raise InputError(
-            "several services run",
+            "several services are running",
             field="--endpoint",
-            cure=f"name one of {', '.join(str(path) for path in found)}",
+            cure=f"give one of {', '.join(str(path) for path in found)}",
         )
     return found[0]
 
 
 def fetch_status(endpoint: str, token_file: Path | None = None) -> dict[str, Any]:
-    """Return what a service tells of itself.
+    """Return the status of a service: the JSON object of `/status`.
 
     Parameters
     ----------
@@ -63,9 +62,9 @@ def fetch_status(endpoint: str, token_file: Path | None = None) -> dict[str, Any
     InputError
         If the endpoint is neither.
     NotRunningError
-        If nobody answers there.
+        If no service answers.
     CangaugeError
-        If what answers refuses, or is no such service.
+        If the request is refused, or the answer is not a status.
     """
     token = read_token(token_file, os.environ)
     connection = _http(endpoint) if "://" in endpoint else _UnixConnection(endpoint)
@@ -80,8 +79,8 @@ def fetch_status(endpoint: str, token_file: Path | None = None) -> dict[str, Any
     finally:
         connection.close()
     if response.status != http.client.OK:
-        said = " ".join(body[:200].decode("utf-8", "replace").split())
-        raise CangaugeError(f"{endpoint}: refused ({response.status}): {said}")
+        answer = " ".join(body[:200].decode("utf-8", "replace").split())
+        raise CangaugeError(f"{endpoint}: refused ({response.status}): {answer}")
     return _content(body, endpoint)
 
 

@@ -1,0 +1,114 @@
+"""Options of the commands on a bus, made from the keys of `RunConfig`."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import typer
+
+from cangauge.bus.open import parse_bus_options
+from cangauge.errors import InputError
+from cangauge.service.config import ConfigKey, config_keys
+
+_KEYS: Final = {key.name: key for key in config_keys() if key.option}
+_TYPES: Final[Mapping[str, type]] = {"number": float, "true or false": bool}
+
+
+def config_option(name: str) -> Any:
+    """Return the typer option of a key, such as "ids.soc_detail"."""
+    key = _KEYS[name]
+    return typer.Option(*key.option.split(", "), metavar=key.info.metavar or None, help=key.help)
+
+
+def config_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Replace the `**options` of a command by one option for each key of the configuration."""
+    signature = inspect.signature(command, eval_str=True)
+    own = [each for each in signature.parameters.values() if each.kind is not each.VAR_KEYWORD]
+    made = [
+        inspect.Parameter(
+            _parameter(name),
+            inspect.Parameter.KEYWORD_ONLY,
+            default=None,
+            annotation=Annotated[_type(key) | None, config_option(name)],
+        )
+        for name, key in _KEYS.items()
+    ]
+
+    def with_options(**values: Any) -> None:
+        command(**values)
+
+    with_options.__doc__ = command.__doc__
+    parameters = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in own]
+    with_options.__signature__ = inspect.Signature(parameters + made)  # type: ignore[attr-defined] # read by typer
+    with_options.__annotations__ = {each.name: each.annotation for each in parameters + made}
+    return with_options
+
+
+def config_values(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return given options as the keys of a configuration, for `load_config`.
+
+    Raises
+    ------
+    InputError
+        If a bus option is not K=V, or an id is not a number.
+    """
+    values = {name: options[_parameter(name)] for name in _KEYS if "." not in name}
+    values = {name: str(v) if isinstance(v, Path) else v for name, v in values.items()}
+    values["bus_options"] = parse_bus_options(values["bus_options"] or [])
+    ids = (options[f"{name}_id"] for name in ("soc_estimate", "soc_detail", "replay_clock"))
+    return {**values, "ids": frame_ids(*ids)}
+
+
+def frame_ids(
+    soc_estimate: str | None, soc_detail: str | None, replay_clock: str | None
+) -> dict[str, int]:
+    """Return the given ids by key; "0x…" is hexadecimal.
+
+    Raises
+    ------
+    InputError
+        If one is not a number.
+    """
+    given = {"soc_estimate": soc_estimate, "soc_detail": soc_detail, "replay_clock": replay_clock}
+    ids = {}
+    for key, text in given.items():
+        if text is None:
+            continue
+        try:
+            ids[key] = int(text, 0)
+        except ValueError as error:
+            raise InputError(
+                "not a CAN id",
+                field=_KEYS[f"ids.{key}"].option,
+                value=text,
+                cure="write it as 0x5A0",
+            ) from error
+    return ids
+
+
+def _parameter(name: str) -> str:
+    return f"{name.removeprefix('ids.')}_id" if name.startswith("ids.") else name
+
+
+def _type(key: ConfigKey) -> Any:
+    if key.name == "bus_options":
+        return list[str]
+    if key.info.is_path:
+        return Path
+    # Checked by the configuration, for the same message as in a file; "auto" is no number.
+    return str if key.name == "initial_soc" else _TYPES.get(key.kind, str)
+
+
+InterfaceOption = Annotated[str | None, config_option("interface")]
+ChannelOption = Annotated[str | None, config_option("channel")]
+BusOptionOption = Annotated[list[str] | None, config_option("bus_options")]
+BusVehicleOption = Annotated[str | None, config_option("vehicle")]
+BusDbcOption = Annotated[Path | None, config_option("dbc")]
+BusMapOption = Annotated[Path | None, config_option("map")]
+BusTemperatureOption = Annotated[float | None, config_option("temperature")]
+EstimateIdOption = Annotated[str | None, config_option("ids.soc_estimate")]
+DetailIdOption = Annotated[str | None, config_option("ids.soc_detail")]
+ClockIdOption = Annotated[str | None, config_option("ids.replay_clock")]

@@ -1,0 +1,167 @@
+"""Process control: stop and reload signals, and notifications to systemd (sd_notify(3)).
+
+The sd_notify protocol is implemented here, `KEY=value` datagrams to the socket in NOTIFY_SOCKET:
+the available packages need a C library or are unmaintained.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from types import FrameType
+from typing import Final, Self
+
+NOTIFY_SOCKET: Final = "NOTIFY_SOCKET"
+PINGS_PER_TIMEOUT: Final = 4
+"""Watchdog pings per time-out of systemd."""
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[Callable[[], bool]]:
+    """Yield a function that returns whether SIGINT (Ctrl-C) or SIGTERM was received.
+
+    A second signal has its default effect, so that a process that hangs can still be ended. For
+    the main thread only.
+    """
+    received: list[int] = []
+    kinds = (signal.SIGINT, signal.SIGTERM)
+    before = {kind: signal.getsignal(kind) for kind in kinds}
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        received.append(number)
+        for kind in kinds:
+            signal.signal(kind, before[kind])
+
+    for kind in kinds:
+        signal.signal(kind, note)
+    try:
+        yield lambda: bool(received)
+    finally:
+        for kind in kinds:
+            signal.signal(kind, before[kind])
+
+
+@contextmanager
+def note_hangups() -> Iterator[Callable[[], bool]]:
+    """Yield a function that returns whether SIGHUP was received since its last call.
+
+    A terminal that closes sends SIGHUP too, but means the end: it becomes SIGTERM. For the main
+    thread only; without effect on Windows, which has no SIGHUP.
+    """
+    if not hasattr(signal, "SIGHUP"):
+        yield lambda: False
+        return
+    received: list[int] = []
+    had_terminal = _has_terminal()
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        if had_terminal and not _has_terminal():
+            signal.raise_signal(signal.SIGTERM)
+        else:
+            received.append(number)
+
+    def take() -> bool:
+        if not received:
+            return False
+        received.clear()
+        return True
+
+    before = signal.signal(signal.SIGHUP, note)
+    try:
+        yield take
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def _has_terminal() -> bool:
+    try:
+        os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY))
+    except OSError:
+        return False
+    return True
+
+
+class Notifier:
+    """Notify systemd; without effect if systemd did not ask for it.
+
+    Parameters
+    ----------
+    address : str, optional
+        Path of the datagram socket; a leading "@" denotes the abstract namespace.
+    watchdog_s : float, optional
+        Watchdog time-out of systemd [s].
+
+    Attributes
+    ----------
+    ping_every_s : float or None
+        Longest interval between calls of `ping` [s]; None without a watchdog.
+    """
+
+    def __init__(self, address: str | None = None, watchdog_s: float | None = None) -> None:
+        self._address = "\0" + address[1:] if address and address[0] == "@" else address
+        self.ping_every_s = None if watchdog_s is None else watchdog_s / PINGS_PER_TIMEOUT
+        self._socket: socket.socket | None = None
+        if self._address:
+            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+            self._socket.setblocking(False)
+
+    @classmethod
+    def from_environment(cls, environment: Mapping[str, str] | None = None) -> Self:
+        """Create one from NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID."""
+        given = os.environ if environment is None else environment
+        address = given.get(NOTIFY_SOCKET, "")
+        if not address.startswith(("/", "@")) or not hasattr(socket, "AF_UNIX"):
+            return cls()
+        for_us = given.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+        microseconds = given.get("WATCHDOG_USEC", "")
+        watched = for_us and microseconds.isdecimal() and int(microseconds) > 0
+        return cls(address, int(microseconds) / 1e6 if watched else None)
+
+    @property
+    def active(self) -> bool:
+        """Whether systemd listens."""
+        return self._socket is not None
+
+    def ready(self, status: str) -> None:
+        """Report the end of start-up or reload; `status` is a line for `systemctl status`."""
+        self._send("READY=1", f"STATUS={_line(status)}")
+
+    def status(self, status: str) -> None:
+        """Report the status line."""
+        self._send(f"STATUS={_line(status)}")
+
+    def ping(self) -> None:
+        """Reset the watchdog; call it from the receive loop only, which it supervises."""
+        self._send("WATCHDOG=1")
+
+    def reloading(self) -> None:
+        """Report the begin of a reload; `ready` ends it."""
+        self._send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
+
+    def stopping(self, status: str = "stopping") -> None:
+        """Report that the service stops."""
+        self._send("STOPPING=1", f"STATUS={_line(status)}")
+
+    def close(self) -> None:
+        """Close the socket."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _send(self, *lines: str) -> None:
+        if self._socket is None or self._address is None:
+            return
+        try:
+            self._socket.sendto("\n".join(lines).encode(), self._address)
+        except OSError:
+            # systemd restarts, or its queue is full: the next datagram will do. If not, the
+            # watchdog acts, as it should.
+            return
+
+
+def _line(text: str) -> str:
+    return " ".join(text.split())
