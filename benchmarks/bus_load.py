@@ -46,7 +46,7 @@ from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import load_model
 from cangauge.replay.player import Pacer
-from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
 
 RATE = 4000
@@ -271,7 +271,7 @@ def memory(hours: float = 24.0) -> tuple[Result, list[Row]]:
 
 def _live_a_day(pipe: Any, hours: float) -> None:
     vehicle = load_vehicle("generic")
-    gauge = Gauge(vehicle, load_model(model_path()), GaugeSettings())
+    gauge = Pipeline(vehicle, load_model(model_path()), PipelineSettings())
     encoder = FrameEncoder(vehicle)
     log = long_log()
     columns = (log.current_a.tolist(), log.voltage_v.tolist(), log.temperature_c.tolist())

@@ -6,12 +6,13 @@ import contextlib
 import errno
 import io
 import json
+import logging
 import os
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -19,6 +20,7 @@ from typing import Any, Self
 import can
 import pytest
 
+from cangauge._logging import RepeatFilter
 from cangauge._resources import shared_file
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.open import BusAddress, open_bus
@@ -28,7 +30,7 @@ from cangauge.estimate.validity import Estimate
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model, load_model
 from cangauge.service.loop import LoopSettings, Outputs, RunSummary, serve
-from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from synthetic import synthetic_log
 
 COMMAND = "import sys; from cangauge.cli.app import main; main()"
@@ -59,7 +61,7 @@ class Service:
     """`serve` on a bus of its own, in a thread; estimates and warnings are kept."""
 
     port: BusConnection
-    gauge: Gauge
+    pipeline: Pipeline
     settings: LoopSettings = field(default_factory=LoopSettings)
     record: Any = None
     checkpoint: Callable[[], None] | None = None
@@ -91,13 +93,38 @@ class Service:
         outputs = Outputs(
             record=self.record,
             table=lambda time_s, estimate: self.rows.append((time_s, estimate)),
-            warn=self.warnings.append,
             checkpoint=self.checkpoint,
         )
-        try:
-            self.summary = serve(self.port, self.gauge, self.settings, outputs, self._stop.is_set)
-        except Exception as error:  # noqa: BLE001 - told to the test
-            self.error = error
+        with collected_warnings(self.warnings):
+            try:
+                self.summary = serve(
+                    self.port, self.pipeline, self.settings, outputs, self._stop.is_set
+                )
+            except Exception as error:  # noqa: BLE001 - for the test to look at
+                self.error = error
+
+
+class _Collector(logging.Handler):
+    def __init__(self, texts: list[str]) -> None:
+        super().__init__(logging.WARNING)
+        self._texts = texts
+        self._thread = threading.get_ident()
+        self.addFilter(lambda record: record.thread == self._thread)
+        self.addFilter(RepeatFilter())
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._texts.append(record.getMessage())
+
+
+@contextlib.contextmanager
+def collected_warnings(texts: list[str]) -> Iterator[None]:
+    """Collect this thread's warnings, rate-limited as on stderr."""
+    handler, logger = _Collector(texts), logging.getLogger("cangauge")
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
 
 
 def virtual_port(channel: str, filters: Sequence[Any] | None = None) -> BusConnection:
@@ -106,14 +133,14 @@ def virtual_port(channel: str, filters: Sequence[Any] | None = None) -> BusConne
 
 def virtual_service(
     channel: str,
-    settings: GaugeSettings | None = None,
+    settings: PipelineSettings | None = None,
     loop: LoopSettings | None = None,
     vehicle: Vehicle | None = None,
     record: Any = None,
 ) -> Service:
-    gauge = Gauge(vehicle or load_vehicle("generic"), leaf_model(), settings)
-    port = virtual_port(channel, gauge.filters)
-    return Service(port, gauge, loop or LoopSettings(), record)
+    pipeline = Pipeline(vehicle or load_vehicle("generic"), leaf_model(), settings)
+    port = virtual_port(channel, pipeline.filters)
+    return Service(port, pipeline, loop or LoopSettings(), record)
 
 
 class BrokenBus:

@@ -93,7 +93,7 @@ def run(model: Model, chosen: EstimatorSettings, samples: list[Sample]) -> None:
     known = False
     for sample in samples:
         known = check(estimator.step(sample), chosen.method, known)
-        assert math.isfinite(estimator.offset_a)
+        assert math.isfinite(estimator.filter.offset_a)
     # What it remembers can be kept and used again.
     again = Estimator(model, chosen)
     again.restore(EstimatorState.model_validate(estimator.snapshot().model_dump(mode="json")))
@@ -149,7 +149,7 @@ def test_asking_for_an_estimate_changes_nothing(
     often, seldom = Estimator(MODELS[which], chosen), Estimator(MODELS[which], chosen)
     for number, sample in enumerate(samples_of_rows(drawn)):
         told = often.step(sample)
-        seldom.take(sample)
+        seldom.update(sample)
         if number % asked_every == 0:
             assert repr(seldom.estimate) == repr(told)  # NaN is NaN
     assert repr(seldom.snapshot()) == repr(often.snapshot())

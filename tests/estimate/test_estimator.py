@@ -52,9 +52,9 @@ def test_counter_integrates_irregular_steps_and_limits_gaps() -> None:
     bridged = counter.step(21.0, 36.0)
     assert bridged.discharged_pct == pytest.approx(36.0 * 20.0 / 36000.0 * 100.0)
     assert bridged.gap_std_pct > 0.0
-    before = counter.discharged_pct
+    before = counter.state.discharged_pct
     away = counter.step(21.0 + 8 * 3600.0, 36.0)
-    assert counter.discharged_pct == before
+    assert counter.state.discharged_pct == before
     assert away.gap_std_pct == 30.0
 
 
@@ -124,12 +124,12 @@ def test_a_start_of_which_little_is_claimed_asks_no_question(model: Model) -> No
         )
         for sample in samples_of(log):
             estimator.step(sample)
-        assert len(estimator.snapshot().belief.filters) == stories
+        assert len(estimator.snapshot().filter.hypotheses) == stories
     # Nor for ever: it is merged or settled.
     estimator = Estimator(model, EstimatorSettings(initial_soc_pct=80.0))
     for sample in samples_of(synthetic_log(start_pct=80.0, end_pct=70.0, hours=0.5, seed=11)):
         estimator.step(sample)
-    assert len(estimator.snapshot().belief.filters) == 1
+    assert len(estimator.snapshot().filter.hypotheses) == 1
 
 
 def test_filter_learns_the_offset_that_a_counter_drifts_with(model: Model) -> None:
@@ -143,7 +143,7 @@ def test_filter_learns_the_offset_that_a_counter_drifts_with(model: Model) -> No
     estimator = Estimator(model, settings_)
     for sample in samples:
         estimator.step(sample)
-    assert estimator.offset_a == pytest.approx(2.0, abs=0.5)
+    assert estimator.filter.offset_a == pytest.approx(2.0, abs=0.5)
 
 
 def test_standard_deviation_is_honest(model: Model) -> None:

@@ -81,7 +81,7 @@ def test_charged_or_driven_unseen_is_found_within_minutes(
     assert sum(inside) > 0.97 * len(inside)
     assert max(map(abs, wrong[180:])) < 4.0
     if abs(after_pct - before_pct) > 20.0:
-        assert estimator.pause_verdict == "moved"
+        assert estimator.filter.verdict == "moved"
 
 
 def test_a_little_charge_is_weighed_and_not_lost_in_certainty() -> None:
@@ -98,7 +98,7 @@ def test_an_offset_does_not_count_while_nobody_counts() -> None:
     samples = drive(95.0, 45.0, 0.0, hours=2.0)
     for sample in samples:
         last = estimator.step(sample._replace(current_a=sample.current_a + 1.0))
-    assert estimator.offset_a > 0.5
+    assert estimator.filter.offset_a > 0.5
     after = estimator.step(Sample(last.time_s + 36000.0, 1.0, math.nan, 23.0))
     assert after.soc_pct == pytest.approx(last.soc_pct, abs=0.05)
 
@@ -131,7 +131,7 @@ def test_voltages_that_are_all_outliers_reset_the_filter_and_say_so() -> None:
     marked = [bool(each.reasons & Reason.INNOVATION_LARGE) for each in found]
     assert 150 < marked.index(True) < 300
     assert all(marked[300:])
-    assert estimator.resets > 0
+    assert estimator.snapshot().memory.resets > 0
     assert all(0.0 <= each.soc_pct <= 100.0 for each in found)
     mended = drive(57.0, 53.0, found[-1].time_s + 1.0)
     found = [estimator.step(each) for each in mended]
@@ -144,15 +144,15 @@ def test_a_covariance_that_is_none_any_more_resets_the_filter() -> None:
     samples = drive(60.0, 55.0, 0.0)
     for sample in samples[:600]:
         estimator.step(sample)
-    filter_ = estimator._fusion._filters[0]._ekf
+    filter_ = estimator.filter._filters[0]._ekf
     filter_.P[0, 0] = -1.0
     found = estimator.step(samples[600])
     assert found.reasons & Reason.INNOVATION_LARGE
-    assert estimator.resets == 1
-    filter_ = estimator._fusion._filters[0]._ekf
+    assert estimator.snapshot().memory.resets == 1
+    filter_ = estimator.filter._filters[0]._ekf
     filter_.x[2, 0] = math.nan
     assert estimator.step(samples[601]).soc_pct == pytest.approx(found.soc_pct, abs=10.0)
-    assert estimator.resets == 2
+    assert estimator.snapshot().memory.resets == 2
     for sample in samples[602:]:
         found = estimator.step(sample)
     assert found.soc_pct == pytest.approx(55.0, abs=3.0)

@@ -118,18 +118,6 @@ def test_goes_on_bit_for_bit_while_a_given_soc_is_in_question(start_pct: float, 
     check_goes_on(PLAIN, EstimatorSettings(initial_soc_pct=start_pct), at)
 
 
-def test_a_state_from_before_given_socs_were_questioned_is_taken() -> None:
-    estimator = Estimator(PLAIN, EstimatorSettings(initial_soc_pct=80.0))
-    for sample in EVENTFUL[:20]:
-        estimator.step(sample)
-    data = estimator.snapshot().model_dump(mode="json")
-    del data["belief"]["is_untried"]
-    after = Estimator(PLAIN, EstimatorSettings(initial_soc_pct=80.0))
-    after.restore(EstimatorState.model_validate(data))
-    found, expected = after.step(EVENTFUL[20]), estimator.step(EVENTFUL[20])
-    assert found.soc_pct == expected.soc_pct
-
-
 @pytest.mark.parametrize("effect_id", LIBRARY)
 def test_goes_on_bit_for_bit_with_each_effect(effect_id: str) -> None:
     check_goes_on(extended_by([effect_id]), EstimatorSettings(initial_soc_pct=80.0), 465)
@@ -258,9 +246,9 @@ def test_a_damaged_state_is_refused_or_does_no_harm(changes: list[tuple[Any, Any
 @pytest.mark.parametrize(
     "place",
     [
-        ("belief", "filters", 0, "x", 0),
-        ("belief", "filters", 0, "p", 0, 0),
-        ("belief", "log_odds"),
+        ("filter", "hypotheses", 0, "x", 0),
+        ("filter", "hypotheses", 0, "p", 0, 0),
+        ("filter", "log_odds"),
         ("since", "discharged_pct"),
         ("since", "gap_var_pct2"),
     ],
@@ -282,8 +270,8 @@ def test_what_does_not_bear_the_last_estimate_out_is_refused(place: tuple[Any, .
     [
         (("counter", "time_s"), -0.9),
         (("line", "since_s"), 1e5),
-        (("first_s",), 1e5),
-        (("rest_since_s",), 1e5),
+        (("memory", "first_s"), 1e5),
+        (("memory", "rest_since_s"), 1e5),
     ],
 )
 def test_times_that_do_not_fit_each_other_are_refused(

@@ -16,7 +16,7 @@ from cangauge.estimate.offline import samples_of
 from cangauge.estimate.validity import Estimate
 from cangauge.service import recording as record
 from cangauge.service.capture_estimate import estimate_capture
-from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
 from live import leaf_model, short_log
 
@@ -30,22 +30,22 @@ def a_disk_in_no_hurry(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def live_and_recorded(
-    frames: list[can.Message], settings: GaugeSettings, path: Path, preset: str
+    frames: list[can.Message], settings: PipelineSettings, path: Path, preset: str
 ) -> tuple[list[Estimate], Path]:
     """Handle frames as the loop does, recording them; return the estimates and the recording."""
-    gauge = Gauge(load_vehicle(preset), leaf_model(), settings)
+    pipeline = Pipeline(load_vehicle(preset), leaf_model(), settings)
     found = []
     with Recorder(path) as recorder:
         for frame in frames:
             recorder.write(frame)
-            before = gauge.samples
-            gauge.handle(frame)
-            if gauge.samples != before:
-                found.append(gauge.latest)
-        before = gauge.samples
-        gauge.finish()
-        if gauge.samples != before:
-            found.append(gauge.latest)
+            before = pipeline.samples
+            pipeline.handle(frame)
+            if pipeline.samples != before:
+                found.append(pipeline.latest)
+        before = pipeline.samples
+        pipeline.finish()
+        if pipeline.samples != before:
+            found.append(pipeline.latest)
     return found, recorder.path
 
 
@@ -71,7 +71,7 @@ def test_recorded_stamps_are_the_live_ones(tmp_path: Path, suffix: str, preset: 
     for frame, late_s in zip(frames, np.sort(rng.uniform(0.0, 1.0, len(frames))), strict=True):
         frame.timestamp += float(late_s) - (4000.0 if late_s > 0.5 else 0.0)
     path = tmp_path / f"drive{suffix}"
-    live, path = live_and_recorded(frames, GaugeSettings(), path, preset)
+    live, path = live_and_recorded(frames, PipelineSettings(), path, preset)
     assert_same(live, path, preset)
 
 
@@ -85,7 +85,7 @@ def test_of_a_recorded_replay_time_is_the_logs(tmp_path: Path) -> None:
     for number, frame in enumerate(frames):
         frame.timestamp = 1.7e9 + 1e-4 * number
     path = tmp_path / "replayed.log"
-    settings = GaugeSettings(time_source="replay-clock")
+    settings = PipelineSettings(time_source="replay-clock")
     live, _ = live_and_recorded(frames, settings, path, "generic")
     assert_same(live, path, "generic")
     recorded = estimate_capture(path, load_vehicle("generic"), leaf_model())
@@ -102,7 +102,7 @@ def test_samples_without_voltage_are_estimated_too(tmp_path: Path) -> None:
             if frame.arbitration_id != 0x401 or row % 3:  # every third voltage is missing
                 frames.append(frame)  # noqa: PERF401 - two loops and a condition read better so
     path = tmp_path / "gappy.log"
-    live, _ = live_and_recorded(frames, GaugeSettings(), path, "generic")
+    live, _ = live_and_recorded(frames, PipelineSettings(), path, "generic")
     assert_same(live, path, "generic")
     recorded = estimate_capture(path, load_vehicle("generic"), leaf_model())
     assert np.count_nonzero(np.isnan(recorded.voltage_v)) == 100

@@ -17,7 +17,7 @@ from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Reason, Sample, Status
 from cangauge.service import loop
 from cangauge.service.loop import LoopSettings, Outputs, serve
-from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from live import leaf_model, never
 
 
@@ -70,8 +70,8 @@ def served(
         process_time=time.process_time,
     )
     monkeypatch.setattr(loop, "time", clock)
-    gauge = Gauge(load_vehicle("generic"), leaf_model(), GaugeSettings())
-    serve(desk, gauge, LoopSettings(duration_s=seconds), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for
+    pipeline = Pipeline(load_vehicle("generic"), leaf_model(), PipelineSettings())
+    serve(desk, pipeline, LoopSettings(duration_s=seconds), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for
     return desk
 
 
@@ -127,8 +127,8 @@ def test_a_machine_that_slept_goes_on_the_grid_and_makes_up_for_nothing(
         process_time=time.process_time,
     )
     monkeypatch.setattr(loop, "time", clock)
-    gauge = Gauge(load_vehicle("generic"), leaf_model(), GaugeSettings())
-    serve(desk, gauge, LoopSettings(duration_s=12.0), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for
+    pipeline = Pipeline(load_vehicle("generic"), leaf_model(), PipelineSettings())
+    serve(desk, pipeline, LoopSettings(duration_s=12.0), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for
     told = [at_s for at_s, _ in beats(desk)]
     steps = [b - a for a, b in itertools.pairwise(told)]
     assert sum(step > 0.2 for step in steps) == 1
@@ -175,9 +175,9 @@ def test_a_backlog_is_old_until_it_is_worked_off(
         process_time=time.process_time,
     )
     monkeypatch.setattr(loop, "time", clock)
-    known = GaugeSettings(EstimatorSettings(initial_soc_pct=60.0))
-    gauge = Gauge(load_vehicle("generic"), leaf_model(), known)
-    serve(desk, gauge, LoopSettings(duration_s=14.0), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for
+    known = PipelineSettings(EstimatorSettings(initial_soc_pct=60.0))
+    pipeline = Pipeline(load_vehicle("generic"), leaf_model(), known)
+    serve(desk, pipeline, LoopSettings(duration_s=14.0), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for
     told = beats(desk)
     fresh = [content for at_s, content in told if 0.5 < at_s < 3.0 or at_s > 13.0]
     assert not any(each.reasons & Reason.INPUT_STALE for each in fresh)

@@ -17,7 +17,7 @@ from cangauge.bus.vehicle import Vehicle, VehicleSignal, load_vehicle
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate, Reason, Sample, Status
-from cangauge.service.pipeline import EstimateStream, Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from live import leaf_model, short_log
 
 START = EstimatorSettings(initial_soc_pct=80.0)
@@ -76,23 +76,23 @@ class Told:
     samples: list[Sample]
     estimates: list[Estimate]
     heard: dict[float, SocEstimate]
-    gauge: Gauge
+    pipeline: Pipeline
 
     def heard_at(self, time_s: float) -> SocEstimate:
         return self.heard[min(self.heard, key=lambda each: abs(each - time_s))]
 
 
 def run(frames: list[can.Message], settings: EstimatorSettings = START) -> Told:
-    gauge, reader = Gauge(VEHICLE, leaf_model(), GaugeSettings(settings)), SocReader()
-    told = Told([], [], {}, gauge)
+    pipeline, reader = Pipeline(VEHICLE, leaf_model(), PipelineSettings(settings)), SocReader()
+    told = Told([], [], {}, pipeline)
     for frame in copy.deepcopy(frames):
-        before = gauge.samples
-        gauge.handle(frame)
-        if gauge.samples != before:
-            assert gauge.latest_sample is not None
-            told.samples.append(gauge.latest_sample)
-            told.estimates.append(gauge.latest)
-        heard = reader.read(gauge.heartbeat(is_stale=False)[0])
+        before = pipeline.samples
+        pipeline.handle(frame)
+        if pipeline.samples != before:
+            assert pipeline.latest_sample is not None
+            told.samples.append(pipeline.latest_sample)
+            told.estimates.append(pipeline.latest)
+        heard = reader.read(pipeline.heartbeat(is_stale=False)[0])
         assert isinstance(heard, SocEstimate)
         told.heard[frame.timestamp] = heard
     return told
@@ -147,7 +147,7 @@ def test_a_drive_without_faults_has_nothing_to_say(undisturbed: Told) -> None:
     assert len(undisturbed.samples) == 1300
     after = [each.reasons for each in undisturbed.estimates]
     assert not any(reasons & HEALTH for reasons in after)
-    counts = undisturbed.gauge.counts
+    counts = undisturbed.pipeline.counts
     assert (counts.implausible, counts.stuck, counts.held_back, counts.repeated) == (0, 0, 0, 0)
 
 
@@ -183,7 +183,7 @@ def test_what_fails_is_told_and_never_reaches_the_estimator(
 @pytest.mark.parametrize("frame_id", [CURRENT, VOLTAGE, TEMPERATURE])
 def test_a_few_bad_frames_are_not_worth_a_word(frame_id: int) -> None:
     told = run(spoilt(frame_id, flip, ends_s=BEGINS_S + 0.35))
-    assert told.gauge.counts.crc_errors == 4
+    assert told.pipeline.counts.crc_errors == 4
     assert not any(heard.reasons & HEALTH for heard in list(told.heard.values())[10:])
 
 
@@ -210,15 +210,15 @@ def test_a_message_that_stops_times_out_in_bus_time(frame_id: int, missing: Reas
 def test_a_jump_of_the_counter_is_loss_and_costs_nothing(undisturbed: Told) -> None:
     frames = [f for f in FRAMES if not BEGINS_S < f.timestamp < BEGINS_S + 0.45]
     told = run(frames)
-    assert told.gauge.counts.lost == 12
-    assert told.gauge.counts.repeated == told.gauge.counts.held_back == 0
+    assert told.pipeline.counts.lost == 12
+    assert told.pipeline.counts.repeated == told.pipeline.counts.held_back == 0
     assert len(told.samples) == len(undisturbed.samples) - 4
     assert not any(heard.reasons & HEALTH for heard in list(told.heard.values())[10:])
 
 
 def test_doubled_frames_change_nothing_but_the_count(undisturbed: Told) -> None:
     told = run([frame for frame in FRAMES for _ in range(2)])
-    assert told.gauge.counts.repeated == len(FRAMES)
+    assert told.pipeline.counts.repeated == len(FRAMES)
     assert told.estimates == undisturbed.estimates
 
 
@@ -235,7 +235,7 @@ def test_a_frozen_voltage_is_found_and_charge_counted_on() -> None:
     assert heard.reasons & HEALTH == Reason.VOLTAGE_MISSING | Reason.SIGNAL_STUCK
     assert heard.status is Status.DEGRADED
     assert len(told.samples) == 1300
-    assert told.gauge.counts.stuck > 100
+    assert told.pipeline.counts.stuck > 100
     assert not told.estimates[-1].reasons & HEALTH
 
 
@@ -257,8 +257,8 @@ def test_heartbeats_and_their_clock_never_change_the_numbers() -> None:
     """The estimator's input is a function of the frames and their stamps alone."""
     frames = spoilt(CURRENT, flip)
     watched = run(frames).estimates
-    stream = EstimateStream(VEHICLE, leaf_model(), START)
-    alone = [each for frame in copy.deepcopy(frames) if (each := stream.handle(frame)) is not None]
+    pipeline = Pipeline(VEHICLE, leaf_model(), PipelineSettings(START))
+    alone = [pipeline.latest for frame in copy.deepcopy(frames) if pipeline.handle(frame)]
     assert watched == alone
 
 
@@ -267,7 +267,7 @@ def test_while_nothing_arrives_the_clock_of_the_loop_decides() -> None:
     reader = SocReader()
 
     def heard(silent_s: float) -> SocEstimate:
-        content = reader.read(told.gauge.heartbeat(is_stale=False, silent_s=silent_s)[0])
+        content = reader.read(told.pipeline.heartbeat(is_stale=False, silent_s=silent_s)[0])
         assert isinstance(content, SocEstimate)
         return content
 
@@ -280,14 +280,14 @@ def test_while_nothing_arrives_the_clock_of_the_loop_decides() -> None:
 
 def test_a_slow_source_is_not_stale_between_its_samples() -> None:
     log = short_log(200.0, rate_hz=0.2)
-    gauge = Gauge(VEHICLE, leaf_model(), GaugeSettings(START))
+    pipeline = Pipeline(VEHICLE, leaf_model(), PipelineSettings(START))
     encoder = FrameEncoder(VEHICLE)
     for sample in samples_of(log):
         for frame in encoder.encode(sample):
-            gauge.handle(frame)
-    assert gauge.patience_s == pytest.approx(15.0)
-    replayed = Gauge(VEHICLE, leaf_model(), GaugeSettings(START, "replay-clock"))
-    assert replayed.patience_s == 0.0
+            pipeline.handle(frame)
+    assert pipeline.least_timeout_s == pytest.approx(15.0)
+    replayed = Pipeline(VEHICLE, leaf_model(), PipelineSettings(START, "replay-clock"))
+    assert replayed.least_timeout_s == 0.0
 
 
 def test_never_seen_and_always_refused_says_why() -> None:

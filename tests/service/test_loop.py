@@ -19,7 +19,7 @@ from cangauge.estimate.offline import samples_of
 from cangauge.estimate.validity import Reason, Status
 from cangauge.service.capture_estimate import estimate_capture
 from cangauge.service.loop import LoopSettings
-from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
 from live import (
     BrokenBus,
@@ -80,7 +80,7 @@ def test_silence_becomes_stale_and_input_becomes_valid_again() -> None:
     reader = SocReader()
     with virtual_port("stale") as port, virtual_service("stale", loop=loop) as service:
         send_log(port, 10.0)
-        assert waits(lambda: service.gauge.samples == 100)
+        assert waits(lambda: service.pipeline.samples == 100)
         collect_queue(port)
         contents = [reader.read(frame) for frame in collect(port, 0.8)]
         told = [each for each in contents if isinstance(each, SocEstimate)]
@@ -102,7 +102,7 @@ def test_recording_and_table_hold_what_was_live(tmp_path: Path) -> None:
         virtual_service("record", record=recorder) as service,
     ):
         send_log(port, 20.0)
-        assert waits(lambda: service.gauge.samples == 200)
+        assert waits(lambda: service.pipeline.samples == 200)
     recorded = estimate_capture(path, load_vehicle("generic"), leaf_model())
     assert recorded.table.soc_pct.tolist() == [each.soc_pct for _, each in service.rows]
     assert recorded.table.residual_v.tolist() == [each.residual_v for _, each in service.rows]
@@ -119,7 +119,7 @@ def test_it_ends_after_a_time_or_when_idle() -> None:
         time.sleep(0.5)  # idle from the beginning is no end
         send_log(port, 3.0)
         service.join(3.0)
-    assert service.gauge.samples == 30
+    assert service.pipeline.samples == 30
 
 
 def test_a_replays_clock_on_the_bus_is_warned_of_once_and_not_recorded(tmp_path: Path) -> None:
@@ -132,7 +132,7 @@ def test_a_replays_clock_on_the_bus_is_warned_of_once_and_not_recorded(tmp_path:
         for _ in range(3):
             port.send(ClockFrames().at(5_000_000))
         send_log(port, 2.0)
-        assert waits(lambda: service.gauge.samples == 20)
+        assert waits(lambda: service.pipeline.samples == 20)
     assert len(service.warnings) == 1
     assert "--time-source replay-clock" in service.warnings[0]
     assert "#" in path.read_text()
@@ -140,9 +140,9 @@ def test_a_replays_clock_on_the_bus_is_warned_of_once_and_not_recorded(tmp_path:
 
 
 def serve_on(bus: BrokenBus, seconds: float) -> Service:
-    gauge = Gauge(load_vehicle("generic"), leaf_model(), GaugeSettings())
+    pipeline = Pipeline(load_vehicle("generic"), leaf_model(), PipelineSettings())
     port = BusConnection(bus, "fake bus")  # type: ignore[arg-type] # has what a bus is used for
-    with Service(port, gauge, LoopSettings(duration_s=seconds)) as service:
+    with Service(port, pipeline, LoopSettings(duration_s=seconds)) as service:
         service.join(5.0)
     return service
 
@@ -156,7 +156,7 @@ def test_a_packet_of_junk_is_passed_over() -> None:
 def test_error_frames_are_counted() -> None:
     service = serve_on(BrokenBus([can.Message(is_error_frame=True)]), 0.2)
     assert service.port.error_frames == 1
-    assert service.gauge.counts.frames == 0
+    assert service.pipeline.counts.frames == 0
 
 
 @pytest.mark.parametrize("error", [network_down(), OSError(errno.ENODEV, "No such device")])

@@ -27,7 +27,7 @@ from cangauge.replay.steps import CaptureSource
 from cangauge.service import async_writer as record_file
 from cangauge.service.async_writer import DiskWriter, RecordFile
 from cangauge.service.capture_estimate import estimate_capture
-from cangauge.service.pipeline import Gauge
+from cangauge.service.pipeline import Pipeline
 from cangauge.service.recording import Recorder, RecordLimits
 from live import in_process, leaf_model, leaf_model_path, short_log, waits
 
@@ -70,7 +70,7 @@ def need(suffix: str) -> None:
 def test_parts_are_one_capture_and_give_the_live_numbers(tmp_path: Path, suffix: str) -> None:
     need(suffix)
     messages = frames(60.0)
-    gauge = Gauge(load_vehicle("generic"), leaf_model())
+    gauge = Pipeline(load_vehicle("generic"), leaf_model())
     live = []
     now = [0.0]
     limits = RecordLimits(part_bytes=20_000, part_s=12.0)

@@ -18,7 +18,7 @@ from cangauge.estimate.validity import Reason
 from cangauge.model.model_file import load_model
 from cangauge.service.config import load_config
 from cangauge.service.loop import LoopSettings
-from cangauge.service.pipeline import Gauge
+from cangauge.service.pipeline import Pipeline
 from cangauge.service.run import Reloader
 from live import leaf_model_path, short_log
 
@@ -48,7 +48,7 @@ class Car:
         self.write(text)
         config = load_config(self.path)
         vehicle = config.load_vehicle()
-        self.gauge = Gauge(vehicle, load_model(config.model), config.gauge_settings())
+        self.gauge = Pipeline(vehicle, load_model(config.model), config.gauge_settings())
         self.said: list[str] = []
         self.reloader = Reloader(
             lambda: load_config(self.path), config, vehicle, self.gauge, self.said.append
@@ -63,7 +63,7 @@ class Car:
         sent: list[can.Message] = []
         for frames in self.frames[first:last]:
             for frame in frames:
-                sent += self.gauge.handle(can.Message.__copy__(frame))
+                self.gauge.handle(can.Message.__copy__(frame))
             sent += self.gauge.heartbeat(is_stale=False)
         return sent
 

@@ -12,11 +12,11 @@ from cangauge.bus.connection import BusConnection, backend_capabilities
 from cangauge.bus.open import bus_address, open_bus
 from cangauge.bus.publish import FrameIds
 from cangauge.bus.vehicle import load_vehicle
-from cangauge.service.loop import AGAIN_S, DuplicateSenderDetector
-from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.loop import RIVAL_AGAIN_S, DuplicateSenderDetector
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from live import Service, leaf_model, virtual_service, waits
 
-OTHER_IDS = GaugeSettings(ids=FrameIds(soc_estimate=0x5B0, soc_detail=0x5B1))
+OTHER_IDS = PipelineSettings(ids=FrameIds(soc_estimate=0x5B0, soc_detail=0x5B1))
 
 
 def frame(frame_id: int = 0x5A0, data: bytes = b"12345678") -> can.Message:
@@ -33,7 +33,7 @@ def test_two_services_on_one_bus_notice_each_other_once() -> None:
         assert "--soc-estimate-id" in service.warnings[0]
         assert service.summary is not None
         assert service.summary.rival_frames >= 3
-        assert service.gauge.counts.frames == 0  # they are no input
+        assert service.pipeline.counts.frames == 0  # they are no input
 
 
 def test_other_ids_are_no_rivals() -> None:
@@ -45,10 +45,10 @@ def test_other_ids_are_no_rivals() -> None:
 
 
 def multicast_service(port: int) -> Service:
-    gauge = Gauge(load_vehicle("generic"), leaf_model())
+    pipeline = Pipeline(load_vehicle("generic"), leaf_model())
     address = bus_address("udp_multicast", options={"port": port})
-    bus = open_bus(address, gauge.filters)
-    return Service(BusConnection(bus, str(address), backend_capabilities(address)), gauge)
+    bus = open_bus(address, pipeline.filters)
+    return Service(BusConnection(bus, str(address), backend_capabilities(address)), pipeline)
 
 
 def test_where_ones_own_frames_come_back_they_are_known() -> None:
@@ -58,40 +58,42 @@ def test_where_ones_own_frames_come_back_they_are_known() -> None:
         assert alone.warnings == []
         with multicast_service(port) as second:
             assert waits(lambda: bool(alone.warnings) and bool(second.warnings))
-    assert "somebody else sends 0x5A" in alone.warnings[0]
+    assert "sends 0x5A" in alone.warnings[0]
 
 
 @pytest.mark.parametrize("echoes", [False, True])
-def test_even_the_very_same_frames_of_another_are_noticed(echoes: bool) -> None:
-    warnings = list[str]()
-    rivals = DuplicateSenderDetector(FrameIds(), echoes=echoes, warn=warnings.append)
+def test_even_the_very_same_frames_of_another_are_noticed(
+    echoes: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    rivals = DuplicateSenderDetector(FrameIds(), echoes=echoes)
     for number in range(4):
         mine = frame(data=bytes([number] * 8))
-        rivals.sent(mine)
+        rivals.note_sent(mine)
         if echoes:
-            assert rivals.takes(mine, 1.0 + number)
-        assert rivals.takes(frame(data=bytes([number] * 8)), 1.0 + number)
+            assert rivals.handle(mine, 1.0 + number)
+        assert rivals.handle(frame(data=bytes([number] * 8)), 1.0 + number)
     assert rivals.frames == 4
-    assert len(warnings) == 1
+    assert len(caplog.messages) == 1
 
 
-def test_a_single_frame_is_no_service_and_one_that_stays_is_mentioned_again() -> None:
-    warnings = list[str]()
-    rivals = DuplicateSenderDetector(FrameIds(), echoes=False, warn=warnings.append)
+def test_a_single_frame_is_no_service_and_one_that_stays_is_mentioned_again(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    rivals = DuplicateSenderDetector(FrameIds(), echoes=False)
     for time_s in (0.0, 10.0, 20.0):
-        assert rivals.takes(frame(), time_s)
-    assert warnings == []
-    assert not rivals.takes(frame(0x1DB), 20.0)
-    assert not rivals.takes(can.Message(arbitration_id=0x5A0, is_extended_id=True), 20.0)
+        assert rivals.handle(frame(), time_s)
+    assert caplog.messages == []
+    assert not rivals.handle(frame(0x1DB), 20.0)
+    assert not rivals.handle(can.Message(arbitration_id=0x5A0, is_extended_id=True), 20.0)
     for number in range(20_000):
-        rivals.takes(frame(0x5A1), 30.0 + 0.1 * number)
-    assert len(warnings) == 1 + 2000.0 // AGAIN_S
+        rivals.handle(frame(0x5A1), 30.0 + 0.1 * number)
+    assert len(caplog.messages) == 1 + 2000.0 // RIVAL_AGAIN_S
 
 
 def test_an_echo_that_is_lost_does_not_make_the_next_one_a_rival() -> None:
     rivals = DuplicateSenderDetector(FrameIds(), echoes=True)
     for number in range(200):
-        rivals.sent(frame(data=bytes([number] * 8)))
+        rivals.note_sent(frame(data=bytes([number] * 8)))
         if number % 3:
-            rivals.takes(frame(data=bytes([number] * 8)), 0.1 * number)
+            rivals.handle(frame(data=bytes([number] * 8)), 0.1 * number)
     assert rivals.frames == 0

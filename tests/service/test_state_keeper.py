@@ -25,7 +25,7 @@ from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate, Reason, Sample, Status
 from cangauge.model.model_file import Model
 from cangauge.service import state as state_keeper
-from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.state import (
     FILE_NAME,
     StateContent,
@@ -61,12 +61,12 @@ class Machine:
     clock: Clock = field(default_factory=Clock)
     said: list[str] = field(default_factory=list)
     model: Model = MODEL
-    settings: GaugeSettings = field(default_factory=GaugeSettings)
+    settings: PipelineSettings = field(default_factory=PipelineSettings)
     max_age_s: float = 86400.0
 
     def start(self) -> Service:
         self.said.clear()
-        gauge = Gauge(VEHICLE, self.model, self.settings)
+        gauge = Pipeline(VEHICLE, self.model, self.settings)
         keeper = StateKeeper(
             StateSettings(self.path, self.max_age_s),
             gauge,
@@ -85,7 +85,7 @@ class Machine:
 @dataclass
 class Service:
     machine: Machine
-    gauge: Gauge
+    gauge: Pipeline
     keeper: StateKeeper
     encoder: FrameEncoder = field(default_factory=lambda: FrameEncoder(VEHICLE))
 
@@ -197,7 +197,7 @@ def test_it_is_written_when_asked_and_not_without_new_samples(machine: Machine) 
 def test_a_long_pause_in_a_restart_draws_toward_the_voltage_and_does_not_jump(
     machine: Machine,
 ) -> None:
-    machine.settings = GaugeSettings(EstimatorSettings(initial_soc_pct=80.0))
+    machine.settings = PipelineSettings(EstimatorSettings(initial_soc_pct=80.0))
     last = kept(machine)[-1]
     machine.clock.wall_s += 8 * 3600.0
     # The night's model error is 1.3 V, more than 3 % SoC there: much, and yet within the model's.
@@ -282,13 +282,13 @@ def test_after_the_machine_was_off_its_clock_is_not_believed(machine: Machine) -
     rewritten(machine.path, lambda content: content.update(boot_id="another"))
     service = machine.start()
     service.drive(DRIVE[1000:1001])
-    assert service.gauge.pause_verdict == "open"
+    assert service.gauge.estimator.filter.verdict == "open"
 
 
 @pytest.mark.parametrize("change", [{"method": "coulomb"}, {"capacity_ah": 55.0}])
 def test_a_changed_setting_keeps_the_soc(machine: Machine, change: dict[str, Any]) -> None:
     last = kept(machine)[-1]
-    machine.settings = GaugeSettings(EstimatorSettings(**change))
+    machine.settings = PipelineSettings(EstimatorSettings(**change))
     service = machine.start()
     assert service.keeper.restored
     found = service.drive(DRIVE[1000:1010])
@@ -296,7 +296,7 @@ def test_a_changed_setting_keeps_the_soc(machine: Machine, change: dict[str, Any
 
 
 def test_a_replayed_log_goes_on_and_another_one_begins_anew(machine: Machine) -> None:
-    machine.settings = GaugeSettings(time_source="replay-clock")
+    machine.settings = PipelineSettings(time_source="replay-clock")
     clock = ClockFrames()
 
     def play(service: Service, samples: list[Sample]) -> Estimate:
@@ -593,7 +593,7 @@ def test_after_a_refused_state_the_given_soc_is_of_an_earlier_start(
     machine: Machine, method: Any
 ) -> None:
     given = EstimatorSettings(method=method, initial_soc_pct=40.0, initial_soc_std_pct=1.0)
-    machine.settings = GaugeSettings(estimator=given)
+    machine.settings = PipelineSettings(estimator=given)
     first = machine.start()
     # At a first start it is believed: the drive begins at 80 %, so this shows.
     assert first.drive(DRIVE[:3])[-1].soc_pct == pytest.approx(40.0, abs=2.0)

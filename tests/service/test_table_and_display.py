@@ -19,7 +19,7 @@ from cangauge.estimate.offline import samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate, Reason, Status
 from cangauge.service.estimate_table import EstimateWriter
-from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.run import LiveLine, live_text
 from live import leaf_model, short_log
 
@@ -76,7 +76,7 @@ def test_other_suffixes_are_refused(tmp_path: Path) -> None:
 
 def test_the_line_tells_soc_status_and_rate() -> None:
     vehicle = load_vehicle("generic")
-    gauge = Gauge(vehicle, leaf_model(), GaugeSettings(EstimatorSettings(valid_std_pct=5.0)))
+    gauge = Pipeline(vehicle, leaf_model(), PipelineSettings(EstimatorSettings(valid_std_pct=5.0)))
     assert "SoC – ± –  initialising (no initial soc; input stale)" in live_text(gauge, 0.0).plain
     encoder = FrameEncoder(vehicle)
     for sample in samples_of(short_log(90.0)):
@@ -92,7 +92,7 @@ def test_the_line_tells_soc_status_and_rate() -> None:
 def test_it_is_drawn_a_few_times_a_second_at_most() -> None:
     out = io.StringIO()
     console = Console(file=out, force_terminal=True, width=100)
-    with LiveLine(console, Gauge(load_vehicle("generic"), leaf_model())) as line:
+    with LiveLine(console, Pipeline(load_vehicle("generic"), leaf_model())) as line:
         before = out.getvalue().count("samples/s")
         for millisecond in range(1000):
             line.show(50.0 + 1e-3 * millisecond)
@@ -102,7 +102,7 @@ def test_it_is_drawn_a_few_times_a_second_at_most() -> None:
 def test_what_is_wrong_with_the_bus_is_on_the_line() -> None:
     out = io.StringIO()
     console = Console(file=out, force_terminal=True, width=120)
-    gauge = Gauge(load_vehicle("generic"), leaf_model())
+    gauge = Pipeline(load_vehicle("generic"), leaf_model())
     with LiveLine(console, gauge, lambda: "bus away for 12 s") as line:
         line.show(50.0)
     assert "bus away for 12 s" in out.getvalue()

@@ -13,7 +13,14 @@ from cangauge.bus.vehicle import load_vehicle
 from cangauge.errors import CangaugeError
 from cangauge.estimate.offline import samples_of
 from cangauge.service.loop import Housekeeping, LoopSettings, Outputs, serve
-from live import BrokenBus, network_down, short_log, virtual_port, virtual_service
+from live import (
+    BrokenBus,
+    collected_warnings,
+    network_down,
+    short_log,
+    virtual_port,
+    virtual_service,
+)
 
 
 @dataclass
@@ -28,7 +35,7 @@ def run(channel: str, saves: Saves, every_s: float = 0.2) -> list[str]:
     warnings: list[str] = []
 
     def checkpoint() -> None:
-        saves.samples.append(service.gauge.samples)
+        saves.samples.append(service.pipeline.samples)
         if saves.error is not None:
             raise saves.error
 
@@ -37,13 +44,14 @@ def run(channel: str, saves: Saves, every_s: float = 0.2) -> list[str]:
         for sample in samples_of(short_log(5.0)):
             for frame in encoder.encode(sample):
                 sender.send(frame)
-        serve(
-            service.port,
-            service.gauge,
-            LoopSettings(duration_s=0.7, checkpoint_every_s=every_s),
-            Outputs(checkpoint=checkpoint, warn=warnings.append),
-            lambda: False,
-        )
+        with collected_warnings(warnings):
+            serve(
+                service.port,
+                service.pipeline,
+                LoopSettings(duration_s=0.7, checkpoint_every_s=every_s),
+                Outputs(checkpoint=checkpoint),
+                lambda: False,
+            )
     return warnings
 
 
@@ -70,7 +78,7 @@ def test_a_state_that_cannot_be_saved_is_a_warning(error: Exception) -> None:
 
 def test_the_state_is_saved_also_when_the_service_breaks() -> None:
     saved = []
-    gauge = virtual_service("breaks").gauge
+    gauge = virtual_service("breaks").pipeline
     port = BusConnection(BrokenBus([network_down()]), "fake")  # type: ignore[arg-type] # has what is used
     with pytest.raises(BusError):
         serve(
@@ -79,20 +87,22 @@ def test_the_state_is_saved_also_when_the_service_breaks() -> None:
     assert saved == [1]
 
 
-def test_frames_lost_in_the_receive_queue_are_told_as_they_come() -> None:
+def test_frames_lost_in_the_receive_queue_are_told_as_they_come(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     class Port:
         name = "socketcan can9"
         queue_drops: int | None = None
 
-    port, said = Port(), list[str]()
-    upkeep = Housekeeping(port, warn=said.append)  # type: ignore[arg-type] # all that is looked at
-    upkeep.look(1.0)
+    port = Port()
+    upkeep = Housekeeping(port)  # type: ignore[arg-type] # all that is looked at
+    upkeep.run(1.0)
     port.queue_drops = 7
-    upkeep.look(1.05)  # too soon to look
-    assert said == []
-    upkeep.look(1.2)
-    assert said == [
-        "warning: socketcan can9: the receive queue overflowed: 7 frames lost (7 so far)"
+    upkeep.run(1.05)  # too soon to look
+    assert caplog.messages == []
+    upkeep.run(1.2)
+    assert caplog.messages == [
+        "socketcan can9: the receive queue overflowed: 7 frames lost (7 so far)"
     ]
-    upkeep.look(2.0)
-    assert len(said) == 1
+    upkeep.run(2.0)
+    assert len(caplog.messages) == 1

@@ -29,7 +29,7 @@ from cangauge.estimate.offline import samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Reason, Status
 from cangauge.service.loop import LoopSettings
-from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from live import Command, Service, leaf_model, leaf_model_path, short_log, waits
 
 pytestmark = pytest.mark.socketcan
@@ -67,8 +67,8 @@ class Lasting(Service):
     """The service on a port that lasts; what the port says is kept."""
 
     def __init__(self, address: BusAddress = VCAN, *, wait: bool = False) -> None:
-        known = GaugeSettings(EstimatorSettings(initial_soc_pct=80.0))
-        gauge = Gauge(load_vehicle("generic"), leaf_model(), known)
+        known = PipelineSettings(EstimatorSettings(initial_soc_pct=80.0))
+        gauge = Pipeline(load_vehicle("generic"), leaf_model(), known)
         self.lines: list[str] = []
         port = ReconnectingBus(address, gauge.filters, self.lines.append)
         port.open(wait=wait)
@@ -141,8 +141,8 @@ def is_stale(told: SocEstimate) -> bool:
 def test_an_interface_that_goes_and_comes_back(kind: str) -> None:
     with Lasting() as live:
         with Pack():
-            assert waits(lambda: live.gauge.samples >= 50)
-        before = live.gauge.latest.soc_pct
+            assert waits(lambda: live.pipeline.samples >= 50)
+        before = live.pipeline.latest.soc_pct
         if kind == "down":
             ip("set", "vcan0", "down")
         else:
@@ -163,9 +163,9 @@ def test_an_interface_that_goes_and_comes_back(kind: str) -> None:
             told = listener.next()
             assert is_stale(told)  # it goes on publishing, and says how old that is
             assert told.soc_pct == pytest.approx(before, abs=0.01)
-            samples = live.gauge.samples
+            samples = live.pipeline.samples
             with Pack():
-                assert waits(lambda: live.gauge.samples >= samples + 20)
+                assert waits(lambda: live.pipeline.samples >= samples + 20)
                 told = [listener.next() for _ in range(30)][-1]
             assert not is_stale(told)
             assert told.soc_pct == pytest.approx(before, abs=0.5)
@@ -184,8 +184,8 @@ def test_an_interface_that_comes_and_goes() -> None:
             ip("set", "vcan0", "up")
             time.sleep(0.25)
         assert waits(lambda: not live.lasting.is_away)
-        samples = live.gauge.samples
-        assert waits(lambda: live.gauge.samples >= samples + 20)
+        samples = live.pipeline.samples
+        assert waits(lambda: live.pipeline.samples >= samples + 20)
     assert live.error is None
     assert live.summary is not None
     assert 1 <= live.lasting.losses <= 5
@@ -200,7 +200,7 @@ def test_a_bus_that_does_not_exist_yet() -> None:
         time.sleep(0.5)
         assert live.lasting.is_away
         add("vcan7")
-        assert waits(lambda: live.gauge.samples >= 20)
+        assert waits(lambda: live.pipeline.samples >= 20)
     assert live.error is None
     assert live.lasting.losses == 0
     assert "waiting for it" in live.lines[0]
@@ -239,7 +239,7 @@ def send_error(classes: int, data: bytes = bytes(8)) -> None:
 
 def test_error_frames_are_counted_by_kind_and_bus_off_is_told() -> None:
     with Lasting() as live, Pack():
-        assert waits(lambda: live.gauge.samples >= 10)
+        assert waits(lambda: live.pipeline.samples >= 10)
         for _ in range(5):
             send_error(0x088)
         send_error(0x004, b"\x00\x01" + bytes(6))
@@ -253,8 +253,8 @@ def test_error_frames_are_counted_by_kind_and_bus_off_is_told() -> None:
         assert waits(lambda: bool(live.lines))
         assert "bus-off" in live.lines[0]
         send_error(0x100)
-        frames = live.gauge.counts.frames
-        assert waits(lambda: live.gauge.counts.frames > frames + 20)
+        frames = live.pipeline.counts.frames
+        assert waits(lambda: live.pipeline.counts.frames > frames + 20)
         assert not live.port.is_off
     assert live.error is None
     assert live.lasting.losses == 0
@@ -262,7 +262,7 @@ def test_error_frames_are_counted_by_kind_and_bus_off_is_told() -> None:
 
 def test_two_thousand_error_frames_keep_nothing_from_the_estimate() -> None:
     with Lasting() as live, Pack() as pack:
-        assert waits(lambda: live.gauge.samples >= 10)
+        assert waits(lambda: live.pipeline.samples >= 10)
         with socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw:
             raw.bind(("vcan0",))
             frame = struct.pack("=IB3x8s", socket.CAN_ERR_FLAG | 0x080, 8, bytes(8))
@@ -271,10 +271,10 @@ def test_two_thousand_error_frames_keep_nothing_from_the_estimate() -> None:
                     raw.send(frame)
                 time.sleep(0.01)
         assert waits(lambda: live.port.error_frames == 2000)
-        samples = live.gauge.samples
-        assert waits(lambda: live.gauge.samples >= samples + 20)
+        samples = live.pipeline.samples
+        assert waits(lambda: live.pipeline.samples >= samples + 20)
         assert pack.sent > 0
-    assert live.gauge.counts.lost == live.port.queue_drops == 0
+    assert live.pipeline.counts.lost == live.port.queue_drops == 0
 
 
 def test_the_kernel_stamps_when_a_frame_comes_in_and_not_when_it_is_read() -> None:
@@ -298,7 +298,7 @@ def test_two_services_notice_each_other() -> None:
         assert one.warnings == []
         with Lasting() as two:
             assert waits(lambda: bool(one.warnings) and bool(two.warnings))
-    assert "somebody else sends 0x5A" in one.warnings[0]
+    assert "sends 0x5A" in one.warnings[0]
 
 
 def test_one_service_through_overflow_signals_and_a_bus_that_is_down(tmp_path: Path) -> None:

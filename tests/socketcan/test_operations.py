@@ -19,7 +19,7 @@ from cangauge.service.capture_estimate import estimate_capture
 from cangauge.service.config import http_address
 from cangauge.service.http import Endpoint
 from cangauge.service.loop import LoopSettings, Outputs, serve
-from cangauge.service.pipeline import Gauge
+from cangauge.service.pipeline import Pipeline
 from cangauge.service.recording import Recorder, RecordLimits
 from cangauge.service.status import Identity, Monitor
 from cangauge.service.systemd import Notifier
@@ -38,7 +38,7 @@ def _vcan0() -> None:
 
 
 def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
-    gauge = Gauge(load_vehicle("generic"), leaf_model())
+    gauge = Pipeline(load_vehicle("generic"), leaf_model())
     rows = []
     stop = threading.Event()
     encoder = FrameEncoder(load_vehicle("generic"))
@@ -73,7 +73,9 @@ def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
                 time.sleep(0.002)
                 if number % 50 == 0:
                     # No faster than this machine: what it can carry is not what is tested here.
-                    assert waits(lambda done=number: gauge.samples >= done, 20.0), gauge.counters
+                    assert waits(lambda done=number: gauge.samples >= done, 20.0), (
+                        gauge.decoder.counters
+                    )
                     url = f"http://127.0.0.1:{endpoint.port}/metrics"
                     with urllib.request.urlopen(url, timeout=10.0) as answer:
                         scrapes += b"cangauge_samples_total" in answer.read()

@@ -26,7 +26,7 @@ from cangauge.replay.player import ReplaySettings, play
 from cangauge.replay.steps import CaptureSource, LogSource, quantisation_bound
 from cangauge.service.capture_estimate import estimate_capture
 from cangauge.service.loop import LoopSettings
-from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
 from live import (
     Command,
@@ -59,8 +59,8 @@ def replay_port() -> Iterator[BusConnection]:
         yield port
 
 
-def service(preset: str, settings: GaugeSettings, record: Recorder | None = None) -> Service:
-    gauge = Gauge(load_vehicle(preset), leaf_model(), settings)
+def service(preset: str, settings: PipelineSettings, record: Recorder | None = None) -> Service:
+    gauge = Pipeline(load_vehicle(preset), leaf_model(), settings)
     return Service(
         BusConnection(open_bus(VCAN, gauge.filters), str(VCAN)), gauge, LoopSettings(), record
     )
@@ -120,11 +120,11 @@ def test_a_log_at_full_speed_within_the_bound_and_bit_for_bit(
 ) -> None:
     log, vehicle, path = short_log(60.0), load_vehicle(preset), tmp_path / "vcan0.log"
     estimator = EstimatorSettings(initial_soc_pct=80.0)
-    settings = GaugeSettings(estimator, "replay-clock")
+    settings = PipelineSettings(estimator, "replay-clock")
     with Recorder(path) as recorder, service(preset, settings, recorder) as live:
         state = play(replay_port, LogSource(log, vehicle), MAX, stop=never)
     assert state.acknowledged == len(live.rows) == len(log)
-    assert live.gauge.counts.lost == live.gauge.counts.crc_errors == 0
+    assert live.pipeline.counts.lost == live.pipeline.counts.crc_errors == 0
     soc = np.array([estimate.soc_pct for _, estimate in live.rows])
     residual = np.array([estimate.residual_v for _, estimate in live.rows])
     offline = run_estimator(samples_of(log), leaf_model(), estimator)
@@ -139,11 +139,11 @@ def test_in_real_time_the_kernels_stamps_are_bus_time(
     replay_port: BusConnection, tmp_path: Path
 ) -> None:
     log, path = short_log(6.01), tmp_path / "vcan0.log"
-    with Recorder(path) as recorder, service("generic", GaugeSettings(), recorder) as live:
+    with Recorder(path) as recorder, service("generic", PipelineSettings(), recorder) as live:
         state = play(
             replay_port, LogSource(log, load_vehicle("generic")), ReplaySettings(), stop=never
         )
-        assert waits(lambda: live.gauge.samples == len(log))
+        assert waits(lambda: live.pipeline.samples == len(log))
     assert state.seconds == pytest.approx(6.0, abs=0.1)
     times = np.array([time_s for time_s, _ in live.rows])
     assert np.max(np.abs(times - times[0] - log.time_s)) < 0.1
@@ -154,7 +154,7 @@ def test_in_real_time_the_kernels_stamps_are_bus_time(
 
 
 def test_the_kernel_filters_the_wanted_ids() -> None:
-    gauge = Gauge(load_vehicle("leaf_aze0"), leaf_model())
+    gauge = Pipeline(load_vehicle("leaf_aze0"), leaf_model())
     bus = open_bus(VCAN, gauge.filters)
     raw = bus.socket.getsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, 64)  # type: ignore[attr-defined] # SocketcanBus
     assert len(raw) == 8 * 3
@@ -190,20 +190,20 @@ def test_unwanted_traffic_costs_no_wanted_frame(replay_port: BusConnection, tmp_
                 )
             time_s += 0.01
     vehicle = load_vehicle("leaf_aze0")
-    settings = GaugeSettings(time_source="replay-clock")
+    settings = PipelineSettings(time_source="replay-clock")
     with service("leaf_aze0", settings) as live:
         state = play(replay_port, CaptureSource(path, vehicle), MAX, stop=never)
     assert state.acknowledged == state.samples == 100
-    assert live.gauge.counts.lost == 0
-    assert live.gauge.counts.frames < 150  # the rest never left the kernel
+    assert live.pipeline.counts.lost == 0
+    assert live.pipeline.counts.frames < 150  # the rest never left the kernel
 
 
 def test_what_is_published_can_be_read_by_others(replay_port: BusConnection) -> None:
     listener = can.Bus("vcan0", interface="socketcan", ignore_config=True, can_filters=SOC_FRAMES)
-    with service("generic", GaugeSettings(time_source="replay-clock")) as live:
+    with service("generic", PipelineSettings(time_source="replay-clock")) as live:
         log = short_log(20.0)
         play(replay_port, LogSource(log, load_vehicle("generic")), MAX, stop=never)
-        assert waits(lambda: live.gauge.samples == len(log))
+        assert waits(lambda: live.pipeline.samples == len(log))
         time.sleep(0.3)
     reader = SocReader(FrameIds())
     frames = []

@@ -45,7 +45,7 @@ from cangauge.model.model_file import load_model
 from cangauge.service.config import RunConfig
 from cangauge.service.http import Endpoint, default_path, has_unix_sockets
 from cangauge.service.loop import LoopSettings, Outputs, RunSummary, serve
-from cangauge.service.pipeline import Gauge
+from cangauge.service.pipeline import Pipeline
 from cangauge.service.recording import Recorder
 from cangauge.service.signals import note_hangups, stop_on_signals
 from cangauge.service.state import StateKeeper
@@ -70,13 +70,13 @@ class LiveLine:
     Parameters
     ----------
     console : rich.console.Console
-    gauge : Gauge
+    gauge : Pipeline
     trouble : callable, optional
         Returns what is wrong with the bus, in words; empty if nothing is.
     """
 
     def __init__(
-        self, console: Console, gauge: Gauge, trouble: Callable[[], str] | None = None
+        self, console: Console, gauge: Pipeline, trouble: Callable[[], str] | None = None
     ) -> None:
         self._gauge = gauge
         self._trouble = trouble
@@ -113,7 +113,7 @@ class LiveLine:
         self._live.update(text, refresh=True)
 
 
-def live_text(gauge: Gauge, samples_per_s: float) -> Text:
+def live_text(gauge: Pipeline, samples_per_s: float) -> Text:
     """Return the line."""
     estimate = gauge.latest
     text = Text("SoC ", no_wrap=True, overflow="ellipsis")
@@ -168,7 +168,7 @@ class Reloader:
         The one that the gauge was made of.
     vehicle : Vehicle
         Likewise.
-    gauge : Gauge
+    gauge : Pipeline
     say : callable
         Takes a line of text.
 
@@ -183,7 +183,7 @@ class Reloader:
         read: Callable[[], RunConfig],
         config: RunConfig,
         vehicle: Vehicle,
-        gauge: Gauge,
+        gauge: Pipeline,
         say: Callable[[str], None],
     ) -> None:
         self._read = read
@@ -243,7 +243,7 @@ _LOG = logging.getLogger(__name__)
 
 @contextmanager
 def operated(
-    config: RunConfig, vehicle: str, gauge: Gauge, port: BusConnection, recorder: Recorder | None
+    config: RunConfig, vehicle: str, gauge: Pipeline, port: BusConnection, recorder: Recorder | None
 ) -> Iterator[Monitor]:
     """Yield the monitor of a service whose status is served and of which systemd knows.
 
@@ -308,7 +308,7 @@ def _serve(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None:
 # --- What a run of the service amounted to: one line for the log, one object for `--json`
 
 
-def summary_line(gauge: Gauge, port: ReconnectingBus, summary: RunSummary) -> str:
+def summary_line(gauge: Pipeline, port: ReconnectingBus, summary: RunSummary) -> str:
     """Return the line: frames, losses, the last SoC."""
     counts, latest = gauge.counts, gauge.latest
     soc = f"{number(latest.soc_pct, 2)} ± {number(latest.soc_std_pct, 2, '%')}"
@@ -333,7 +333,7 @@ def _troubles(port: ReconnectingBus, summary: RunSummary) -> str:
     return "".join(f", {count} {what}" for what, count in found.items() if count)
 
 
-def summary_json(gauge: Gauge, port: ReconnectingBus, summary: RunSummary) -> dict[str, Any]:
+def summary_json(gauge: Pipeline, port: ReconnectingBus, summary: RunSummary) -> dict[str, Any]:
     """Return the object."""
     counts, latest = gauge.counts, gauge.latest
     return {
@@ -375,7 +375,7 @@ def summary_json(gauge: Gauge, port: ReconnectingBus, summary: RunSummary) -> di
             "status": latest.status.name.lower(),
             "reasons": reason_names(int(latest.reasons)),
         },
-        "soc_reference_pct": gauge.reference_soc_pct,
+        "soc_reference_pct": gauge.decoder.reference_soc_pct,
     }
 
 
@@ -396,7 +396,7 @@ def run_service(config: RunConfig, read: Callable[[], RunConfig]) -> dict[str, A
     check_outputs([None if config.output is None else Path(config.output)], [Path(config.model)])
     kept = config.state_settings(os.environ)
     vehicle = config.load_vehicle()
-    gauge = Gauge(vehicle, load_model(config.model), config.gauge_settings())
+    gauge = Pipeline(vehicle, load_model(config.model), config.gauge_settings())
     reloader = Reloader(read, config, vehicle, gauge, _voice("config.reload"))
     address = config.address()
     # All that is loaded by now stays until the end. Left out of garbage collection, it costs no
@@ -425,7 +425,6 @@ def run_service(config: RunConfig, read: Callable[[], RunConfig]) -> dict[str, A
             record=recorder,
             table=None if table is None else table.add,
             show=_each_turn(monitor, recorder, line),
-            warn=_voice("service.warning"),
             checkpoint=None if keeper is None else keeper.checkpoint,
             reload=lambda: _reload(reloader, monitor, gauge) if hangup() else None,
             stepped=monitor.stepped,
@@ -459,7 +458,7 @@ def _voice(event: str) -> Callable[[str], None]:
     return speaker(_LOG, event, always=True)
 
 
-def _reload(reloader: Reloader, monitor: Monitor, gauge: Gauge) -> LoopSettings | None:
+def _reload(reloader: Reloader, monitor: Monitor, gauge: Pipeline) -> LoopSettings | None:
     with monitor.reloading():
         settings = reloader.reload()
         monitor.identity = replace(

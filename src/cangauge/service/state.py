@@ -36,7 +36,7 @@ from cangauge.estimate.state import EstimatorState
 from cangauge.model.model_file import Model, model_json
 from cangauge.service.async_writer import BackgroundWriter
 from cangauge.service.loop import CHECKPOINT_EVERY_S
-from cangauge.service.pipeline import Gauge
+from cangauge.service.pipeline import Pipeline
 
 # --- The state file: what the service remembers over a restart. JSON, versioned, with its ow…
 
@@ -237,7 +237,7 @@ class StateKeeper:
     Parameters
     ----------
     settings : StateSettings
-    gauge : Gauge
+    gauge : Pipeline
     tell : callable
         Takes a line of text for the user.
     wall_s, monotonic_s : callable
@@ -247,7 +247,7 @@ class StateKeeper:
     def __init__(
         self,
         settings: StateSettings,
-        gauge: Gauge,
+        gauge: Pipeline,
         tell: Callable[[str], None],
         *,
         wall_s: Callable[[], float] = time.time,
@@ -376,7 +376,7 @@ class StateKeeper:
         # not, and counting alone would never be rid of it.
         how = (
             "by voltage, for the given SoC is of an earlier start"
-            if (self._gauge.ask_the_voltage())
+            if (self._gauge.discard_initial_soc())
             else "without"
         )
         self._tell(f"warning: state refused: {error}{kept}; starting {how}")
@@ -396,7 +396,7 @@ class StateKeeper:
         write_text_atomic(self.settings.path, state_text(content))
 
     def _tell_verdict(self) -> None:
-        verdict = self._gauge.pause_verdict
+        verdict = self._gauge.estimator.filter.verdict
         if self._restored_pct is None or verdict in {"", "open"}:
             return
         before, self._restored_pct = self._restored_pct, None

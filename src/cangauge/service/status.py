@@ -25,7 +25,7 @@ from cangauge._logging import Pace, emit
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.decoder import FrameStatistics, MessageStatistics
 from cangauge.estimate.validity import Estimate, Reason, Sample, Status, reason_name, reason_names
-from cangauge.service.pipeline import Gauge
+from cangauge.service.pipeline import Pipeline
 from cangauge.service.systemd import Notifier
 
 # --- Counts in fixed buckets: what the loop fills in a fraction of a microsecond, and others…
@@ -343,7 +343,7 @@ class Monitor:
 
     Parameters
     ----------
-    gauge : Gauge
+    gauge : Pipeline
     port : BusConnection
     identity : Identity
     notifier : Notifier
@@ -361,7 +361,7 @@ class Monitor:
 
     def __init__(
         self,
-        gauge: Gauge,
+        gauge: Pipeline,
         port: BusConnection,
         *,
         identity: Identity,
@@ -444,7 +444,7 @@ class Monitor:
         if now_s - since_s >= RATE_OVER_S:
             self._rate = (samples - before) / (now_s - since_s)
             self._rate_from = (now_s, samples)
-        counters = gauge.counters
+        counters = gauge.decoder.counters
         rejects = _rejects(counters)
         return Snapshot(
             identity=self.identity,
