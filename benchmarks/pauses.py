@@ -64,7 +64,7 @@ def errors(
         estimate = estimator.step(sample._replace(time_s=time_s))
         if number in at:
             found[number] = (estimate.soc_pct - float(reference[number]), estimate.soc_std_pct)
-    return [found[k][0] for k in at], [found[k][1] for k in at], [estimator.pause_verdict]
+    return [found[k][0] for k in at], [found[k][1] for k in at], [estimator.filter.verdict]
 
 
 def judge(first: Log, second: Log, model: Model, hours: float) -> Pause:

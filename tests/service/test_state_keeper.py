@@ -242,8 +242,8 @@ def test_a_car_that_was_charged_meanwhile_is_found_out_and_told(machine: Machine
 def _shift_soc(content: dict[str, Any], by_pct: float) -> None:
     state = content["estimator"]
     state["estimate"][1] += by_pct
-    state["coulomb_start_pct"] += by_pct
-    for each in state["belief"]["filters"]:
+    state["memory"]["coulomb_start_pct"] += by_pct
+    for each in state["filter"]["hypotheses"]:
         each["x"][0] += by_pct
 
 
@@ -408,15 +408,17 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "unknown key": (edited("more", value=1), "content.more"),
     "soc beyond": (edited("estimator", "estimate", 1, value=130.0), "outside 0–100"),
     "another soc": (edited("estimator", "estimate", 1, value=33.0), "the last estimate"),
-    "later than the latest": (edited("estimator", "rest_since_s", value=1e11), "later than"),
-    "filter beyond": (edited("estimator", "belief", "filters", 0, "x", 0, value=-3.0),
-                      "belief.filters"),
-    "no covariance": (edited("estimator", "belief", "filters", 0, "p", 0, 0, value=-1.0),
-                      "belief.filters"),
-    "a state too many": (edited("estimator", "belief", "filters", 0, "x", value=[1.0] * 9),
-                         "belief.filters"),
+    "later than the latest": (edited("estimator", "memory", "rest_since_s", value=1e11),
+                              "later than"),
+    "filter beyond": (edited("estimator", "filter", "hypotheses", 0, "x", 0, value=-3.0),
+                      "filter.hypotheses"),
+    "no covariance": (edited("estimator", "filter", "hypotheses", 0, "p", 0, 0, value=-1.0),
+                      "filter.hypotheses"),
+    "a state too many": (edited("estimator", "filter", "hypotheses", 0, "x", value=[1.0] * 9),
+                         "filter.hypotheses"),
     "line backwards": (edited("estimator", "line", "time_s", 3, value=0.0), "must increase"),
-    "a word": (edited("estimator", "samples", value="many"), "content.estimator.samples"),
+    "a word": (edited("estimator", "memory", "samples", value="many"),
+               "content.estimator.memory.samples"),
     "effects": (edited("estimator", "effects", value=[[1.0]]), "the model has 0 effects"),
     "no soc": (edited("estimator", "estimate", 1, value=None), "holds no SoC"),
 }  # fmt: skip
@@ -584,7 +586,7 @@ def test_where_the_file_is(tmp_path: Path) -> None:
 def test_a_state_holds_no_nan_and_is_plain_json(machine: Machine) -> None:
     kept(machine, 20)
     data = json.loads(machine.path.read_text(), parse_constant=pytest.fail)
-    assert data["content"]["estimator"]["gap_until_s"] is None
+    assert data["content"]["estimator"]["memory"]["gap_until_s"] is None
     assert math.isfinite(data["content"]["estimator"]["estimate"][1])
 
 

@@ -128,10 +128,10 @@ def _play(model: Path, log: Path, live: Path) -> float:
 
 def _read_estimates(path: Path) -> EstimateTable:
     columns = pq.read_table(path).to_pydict()
-    numbers = {
+    numbers: dict[str, Any] = {
         name: np.array([np.nan if value is None else value for value in columns[name]])
         for name in EstimateTable.__dataclass_fields__
-        if name not in {"status", "reasons"}
+        if name not in {"status", "reasons", "scores"}
     }
     reasons = {text: int(_reasons(text)) for text in set(columns["reasons"])}
     return EstimateTable(

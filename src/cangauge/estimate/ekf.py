@@ -269,14 +269,15 @@ class SocEkf:
         soc_pct = float(ekf.x[0, 0])
         std_v = measurement.std_v(soc_pct)
         ocv_v, slope = self._curve.pseudo_ocv_at(soc_pct)
-        is_contradicted = self._is_contradicted(measurement, ocv_v, slope, std_v, seconds)
+        predicted_v = self._predicted_v(measurement, ocv_v)
+        is_contradicted = self._is_contradicted(measurement, predicted_v, slope, std_v, seconds)
         if is_contradicted:
             ekf.x[2:, 0] = 0.0
             ekf.P = np.diag(
                 [UNKNOWN_SOC_STD_PCT**2, float(ekf.P[1, 1]), self._slow_var, self._lasting_var]
             )
             self._forget_innovations()
-        predicted_v = self._predicted_v(measurement, ocv_v)
+            predicted_v = self._predicted_v(measurement, ocv_v)
         jacobian = np.array([[slope, -self._steady_ohm, 1.0, 1.0]])
         innovation = measurement.voltage_v - predicted_v
         spread = float((jacobian @ ekf.P @ jacobian.T)[0, 0])
@@ -388,7 +389,7 @@ class SocEkf:
     def _is_contradicted(
         self,
         measurement: Measurement,
-        ocv_v: float,
+        predicted_v: float,
         slope: float,
         std_v: float,
         seconds: float,
@@ -400,7 +401,7 @@ class SocEkf:
             self._forget_innovations()
             return False
         bias_v = float(ekf.x[2, 0] + ekf.x[3, 0])
-        unbiased_v = self._predicted_v(measurement, ocv_v) - bias_v
+        unbiased_v = predicted_v - bias_v
         weight = math.exp(-seconds / PERSISTENT_S)
         self._mean_innovation_v *= weight
         self._mean_innovation_v += (1.0 - weight) * (measurement.voltage_v - unbiased_v)

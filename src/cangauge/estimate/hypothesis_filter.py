@@ -109,15 +109,16 @@ class HypothesisFilter:
                 rejecting = self._make_ekf()
                 rejecting.start(measurement.soc_pct, UNKNOWN_SOC_STD_PCT)
                 self._add(rejecting, WRONG_LOG_ODDS)
-        first = self._filters[0]
-        is_contradicted = first.update(measurement, since.seconds)
-        is_outlier = first.was_outlier
-        if len(self._filters) == 1:
-            self._count_outliers(is_outlier, since)
+        first, second = self._filters[0], self._filters[-1]
+        is_contradicted = is_second_contradicted = first.update(measurement, since.seconds)
+        if second is not first:
+            is_second_contradicted = second.update(measurement, since.seconds)
+        if first.was_outlier and second.was_outlier:
+            self._outlier_s += min(since.seconds, OUTLIER_STEP_AT_MOST_S)
+        else:
+            self._outlier_s = 0.0
+        if second is first:
             return is_contradicted
-        second = self._filters[1]
-        is_second_contradicted = second.update(measurement, since.seconds)
-        self._count_outliers(is_outlier and second.was_outlier, since)
         change = second.log_likelihood - first.log_likelihood
         self._log_odds = _bounded(self._log_odds + change)
         self._open_s += since.seconds - since.away_s
@@ -259,12 +260,6 @@ class HypothesisFilter:
         self._filters = [self._restored(merged)]
         if self.verdict == "open":
             self.verdict = verdict
-
-    def _count_outliers(self, is_outlier: bool, since: ChargeSinceUpdate) -> None:
-        if is_outlier:
-            self._outlier_s += min(since.seconds, OUTLIER_STEP_AT_MOST_S)
-        else:
-            self._outlier_s = 0.0
 
 
 def _bounded(log_odds: float) -> float:
