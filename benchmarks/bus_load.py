@@ -45,7 +45,7 @@ from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.replay.player import Pacer
-from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
 from live_service import MODEL, command, service
 
@@ -245,7 +245,7 @@ def memory(hours: float = 24.0) -> tuple[Result, list[Row]]:
 
 def _handle_a_day(pipe: Any, hours: float) -> None:
     vehicle = Vehicle.load("generic")
-    gauge = Gauge(vehicle, Model.load(MODEL), GaugeSettings())
+    gauge = Pipeline(vehicle, Model.load(MODEL), PipelineSettings())
     encoder = FrameEncoder(vehicle)
     log = long_log()
     columns = (log.current_a.tolist(), log.voltage_v.tolist(), log.temperature_c.tolist())

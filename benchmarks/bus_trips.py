@@ -38,7 +38,7 @@ from cangauge.replay.player import ReplaySettings, play
 from cangauge.replay.steps import LogSource, quantisation_bound
 from cangauge.service.capture_estimate import estimate_capture
 from cangauge.service.loop import LoopSettings, Outputs, serve
-from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
 from real_trips import DATA, JUDGED_S, TEST, TRAINING, identify, read_trips
 
@@ -63,9 +63,9 @@ class Comparison:
 
 def over_bus(
     log: Log, vehicle: Vehicle, model: Model, address: BusAddress, record: Path
-) -> tuple[list[Estimate], Gauge, float]:
+) -> tuple[list[Estimate], Pipeline, float]:
     """Replay a log on a bus and estimate it; return the estimates, the gauge and the time [s]."""
-    gauge = Gauge(vehicle, model, GaugeSettings(time_source="replay-clock"))
+    gauge = Pipeline(vehicle, model, PipelineSettings(time_source="replay-clock"))
     rows: list[Estimate] = []
     done = threading.Event()
     with (

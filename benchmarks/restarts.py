@@ -45,7 +45,7 @@ from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate, Reason, Sample
 from cangauge.model.model_file import Model
 from cangauge.service.loop import CHECKPOINT_EVERY_S, FIRST_CHECKPOINT_S
-from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.state import StateKeeper, StateSettings
 
 EVERY_S = CHECKPOINT_EVERY_S
@@ -132,8 +132,8 @@ class ServiceRun:
 
     def __init__(self, model: Model, path: Path | None) -> None:
         self.now_s = EPOCH_S
-        settings = GaugeSettings(EstimatorSettings(initial_soc_pct=START_PCT - 15.0))
-        self.gauge = Gauge(Vehicle.load("generic"), model, settings)
+        settings = PipelineSettings(EstimatorSettings(initial_soc_pct=START_PCT - 15.0))
+        self.gauge = Pipeline(Vehicle.load("generic"), model, settings)
         self.keeper: StateKeeper | None = None
         if path is not None:
             self.keeper = StateKeeper(

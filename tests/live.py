@@ -1,4 +1,4 @@
-"""What the tests of the live side have in common: a short drive, a model, both commands at once."""
+"""Shared by the tests of the service: a short drive, a model, services in threads, commands."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from cangauge.estimate.validity import Estimate
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from cangauge.service.loop import LoopSettings, Outputs, RunSummary, serve
-from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from synthetic import synthetic_log
 
 COMMAND = "import sys; from cangauge.cli.app import main; main()"
@@ -45,7 +45,7 @@ def leaf_model() -> Model:
 
 
 def short_log(seconds: float = 100.0, rate_hz: float = 10.0, *, noise_v: float = 0.3) -> Log:
-    """A drive from 80 %; values of many digits, so that rounding in frames shows."""
+    """Return a drive from 80 %, in values with many digits, so that quantisation shows."""
     return synthetic_log(
         hours=seconds / 3600.0,
         rate_hz=rate_hz,
@@ -93,10 +93,10 @@ class LoggedLines(logging.Handler):
 
 @dataclass
 class Service:
-    """`serve` on a bus of its own, in a thread; estimates and warnings are kept."""
+    """`serve` in a thread; collects estimates and warnings."""
 
     port: BusConnection
-    gauge: Gauge
+    pipeline: Pipeline
     settings: LoopSettings = field(default_factory=LoopSettings)
     record: Any = None
     checkpoint: Callable[[], None] | None = None
@@ -138,8 +138,10 @@ class Service:
             checkpoint=self.checkpoint,
         )
         try:
-            self.summary = serve(self.port, self.gauge, self.settings, outputs, self._stop.is_set)
-        except Exception as error:  # noqa: BLE001 - told to the test
+            self.summary = serve(
+                self.port, self.pipeline, self.settings, outputs, self._stop.is_set
+            )
+        except Exception as error:  # noqa: BLE001 - for the test to look at
             self.error = error
 
 
@@ -149,18 +151,18 @@ def virtual_port(channel: str, filters: Sequence[Any] | None = None) -> BusConne
 
 def virtual_service(
     channel: str,
-    settings: GaugeSettings | None = None,
+    settings: PipelineSettings | None = None,
     loop: LoopSettings | None = None,
     vehicle: Vehicle | None = None,
     record: Any = None,
 ) -> Service:
-    gauge = Gauge(vehicle or Vehicle.load("generic"), leaf_model(), settings)
-    port = virtual_port(channel, gauge.filters)
-    return Service(port, gauge, loop or LoopSettings(), record)
+    pipeline = Pipeline(vehicle or Vehicle.load("generic"), leaf_model(), settings)
+    port = virtual_port(channel, pipeline.filters)
+    return Service(port, pipeline, loop or LoopSettings(), record)
 
 
 class BrokenBus:
-    """A bus whose calls fail as drivers' do."""
+    """A bus whose calls fail as a driver's do."""
 
     protocol = can.CanProtocol.CAN_20
 
@@ -196,12 +198,12 @@ class BrokenBus:
 
 
 def same_frames(found: list[can.Message], expected: list[can.Message]) -> bool:
-    """Whether two lists hold the same frames: every field, the stamp to the last bit."""
+    """Return whether two lists hold the same frames: every field, stamps bit for bit."""
     fields = [name for name in can.Message.__slots__ if name != "__weakref__"]
-    told = [
+    values = [
         [[getattr(each, name) for name in fields] for each in some] for some in (found, expected)
     ]
-    return told[0] == told[1]
+    return values[0] == values[1]
 
 
 def unpack_error() -> can.CanOperationError:
@@ -221,7 +223,7 @@ def never() -> bool:
 
 
 def collect(port: BusConnection, seconds: float) -> list[can.Message]:
-    """All frames that come within that time."""
+    """Return all frames that arrive within that time."""
     until = time.monotonic() + seconds
     found = []
     while (left := until - time.monotonic()) > 0.0:
@@ -244,7 +246,7 @@ class Ended:
 
 
 class Command:
-    """A `cangauge` command in a process of its own."""
+    """A `cangauge` command in another process."""
 
     def __init__(self, *arguments: object) -> None:
         self.process = subprocess.Popen(
@@ -254,16 +256,16 @@ class Command:
             text=True,
             env={**os.environ, "COLUMNS": "200"},
         )
-        self._said: list[str] = []
+        self._stderr: list[str] = []
 
     def wait_for(self, text: str) -> None:
-        """Wait until it says something on stderr."""
+        """Wait for a text on stderr."""
         assert self.process.stderr is not None
         for line in self.process.stderr:
-            self._said.append(line)
+            self._stderr.append(line)
             if text in line:
                 return
-        raise AssertionError(f"ended without {text!r}: {''.join(self._said)}")
+        raise AssertionError(f"ended without {text!r}: {''.join(self._stderr)}")
 
     def end(self, seconds: float = 60.0) -> Ended:
         try:
@@ -271,8 +273,8 @@ class Command:
         except subprocess.TimeoutExpired:
             self.process.kill()
             out, err = self.process.communicate()
-            raise AssertionError(f"did not end: {''.join(self._said)}{err}") from None
-        return Ended(self.process.returncode, out, "".join(self._said) + err)
+            raise AssertionError(f"did not end: {''.join(self._stderr)}{err}") from None
+        return Ended(self.process.returncode, out, "".join(self._stderr) + err)
 
 
 def run_to_end(*arguments: object, seconds: float = 60.0) -> Ended:
@@ -280,7 +282,7 @@ def run_to_end(*arguments: object, seconds: float = 60.0) -> Ended:
 
 
 def in_process(*arguments: object) -> Ended:
-    """A command that ends at once, without the price of a process."""
+    """Run a short command in this process."""
     out, err = io.StringIO(), io.StringIO()
     code: object = 0
     with (
@@ -298,7 +300,7 @@ def in_process(*arguments: object) -> Ended:
 
 
 def waits(condition: Callable[[], bool], seconds: float = 5.0) -> bool:
-    """Whether a condition comes true in time."""
+    """Return whether a condition becomes true in time."""
     until = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > until:

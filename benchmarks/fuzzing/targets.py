@@ -37,7 +37,7 @@ from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.service import state as state_file
 from cangauge.service.config import load_config
-from cangauge.service.pipeline import EstimateStream
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.validation.twin.drive import read_speed
 from fuzzing import corpus
 from fuzzing.mutate import json_bytes, mutate, mutate_json
@@ -191,12 +191,13 @@ def _run_frames(data: bytes) -> bool:
     rng = Random(data)  # noqa: S311 - no secret
     which = rng.randrange(len(_vehicles()))
     vehicle = _vehicles()[which]
-    settings = EstimatorSettings(
+    estimator = EstimatorSettings(
         method=rng.choice(("ekf", "ekf", "newton", "coulomb")),
         initial_soc_pct=rng.choice((None, 0.0, 50.0, 100.0)),
     )
     source = rng.choice(("receive", "receive", "replay-clock"))
-    stream = EstimateStream(vehicle, _model(), settings, source)
+    settings = PipelineSettings(estimator, source)
+    pipeline = Pipeline(vehicle, _model(), settings, publishes=False)
     reader, publisher = SocReader(), SocPublisher()
     good = _good_frames(which)
     now_s = rng.choice((0.0, 1000.0, 1.7e9))
@@ -204,16 +205,16 @@ def _run_frames(data: bytes) -> bool:
         frame = _mutant_frame(rng, good[number % len(good)], vehicle)
         now_s += rng.choice((0.01, 0.01, 0.01, 0.0, 1.0, 5.0, -0.5, 1e5, -1e6, 1e-9))
         frame.timestamp = now_s
-        estimate = stream.handle(frame)
+        is_complete = pipeline.handle(frame)
         reader.read(frame)
-        if estimate is not None:
-            _check_estimate(estimate)
-            for message in publisher.publish(estimate, stream.samples):
+        if is_complete:
+            _check_estimate(pipeline.latest)
+            for message in publisher.publish(pipeline.latest, pipeline.samples):
                 _read_back(rng, reader, message)
-    last = stream.finish()
-    if last is not None:
-        _check_estimate(last)
-    return bool(stream.samples)
+    pipeline.finish()
+    if pipeline.samples:
+        _check_estimate(pipeline.latest)
+    return bool(pipeline.samples)
 
 
 def _read_back(rng: Random, reader: SocReader, message: can.Message) -> None:
@@ -286,10 +287,10 @@ def _run_dbc(data: bytes) -> bool:
         load_dbc(path)
         if b"PackCurrent" in data:
             car = Vehicle.load(dbc=path, map=_own_map())
-            stream = EstimateStream(car, _model())
+            pipeline = Pipeline(car, _model(), publishes=False)
             for key in car.messages:
                 for length in (0, 8, 64):
-                    stream.handle(
+                    pipeline.handle(
                         can.Message(
                             arbitration_id=key & 0x1FFFFFFF,
                             is_extended_id=key > 0x1FFFFFFF,

@@ -1,10 +1,11 @@
-"""The estimator: inverse, counting, fusion, and what it says of itself."""
+"""The estimator: inverse, counting, filter, status and table."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from cangauge.errors import InputError
 from cangauge.estimate.counting import CoulombCounter
 from cangauge.estimate.estimator import Estimator
-from cangauge.estimate.offline import estimate_log, run_estimator, samples_of
+from cangauge.estimate.offline import estimate, estimate_log, run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Reason, Sample, Status
 from cangauge.identify.fit import fit
@@ -29,7 +30,7 @@ def model() -> Model:
 
 
 @given(st.floats(0.0, 100.0), st.floats(0.0, 100.0))
-def test_inverse_undoes_the_model_from_any_start(soc: float, guess: float) -> None:
+def test_inverse_finds_the_soc_from_any_guess(soc: float, guess: float) -> None:
     truth = leaf_2012_model()
     found = soc_from_ocv(truth, truth.pseudo_ocv_at(soc)[0], guess)
     assert found.soc_pct == pytest.approx(soc, abs=1e-6)
@@ -51,9 +52,9 @@ def test_counter_integrates_irregular_steps_and_limits_gaps() -> None:
     bridged = counter.step(21.0, 36.0)
     assert bridged.discharged_pct == pytest.approx(36.0 * 20.0 / 36000.0 * 100.0)
     assert bridged.gap_std_pct > 0.0
-    before = counter.discharged_pct
+    before = counter.state.discharged_pct
     away = counter.step(21.0 + 8 * 3600.0, 36.0)
-    assert counter.discharged_pct == before
+    assert counter.state.discharged_pct == before
     assert away.gap_std_pct == 30.0
 
 
@@ -68,7 +69,7 @@ def test_each_method_follows_a_clean_log(model: Model, method: str) -> None:
     assert np.all((table.soc_pct >= 0.0) & (table.soc_pct <= 100.0))
 
 
-def test_filter_recovers_from_a_wrong_start_and_says_so(model: Model) -> None:
+def test_filter_recovers_from_wrong_initial_soc_and_flags_it(model: Model) -> None:
     log = synthetic_log(start_pct=80.0, end_pct=40.0, noise_v=0.5, seed=11, hours=1.5)
     table, _ = estimate_log(log, model, EstimatorSettings(initial_soc_pct=60.0))
     error = np.abs(table.soc_pct - log.soc_pct)
@@ -78,9 +79,7 @@ def test_filter_recovers_from_a_wrong_start_and_says_so(model: Model) -> None:
 
 
 @pytest.mark.parametrize("wrong_pct", [-60.0, -20.0, 15.0])
-def test_a_wrong_start_leaves_no_trace_once_the_voltages_refute_it(
-    model: Model, wrong_pct: float
-) -> None:
+def test_rejected_initial_soc_leaves_no_trace(model: Model, wrong_pct: float) -> None:
     log = synthetic_log(start_pct=80.0, end_pct=70.0, noise_v=0.5, seed=11, hours=0.5)
     wrong, _ = estimate_log(log, model, EstimatorSettings(initial_soc_pct=80.0 + wrong_pct))
     withheld, _ = estimate_log(log, model, EstimatorSettings())
@@ -90,14 +89,14 @@ def test_a_wrong_start_leaves_no_trace_once_the_voltages_refute_it(
     assert np.array_equal(wrong.soc_std_pct[late], withheld.soc_std_pct[late])
     marked = (wrong.reasons & Reason.INNOVATION_LARGE) != 0
     assert np.any(marked)
-    # Until then the spread of the two stories says how open it is.
+    # Until then the spread of the two hypotheses covers the error.
     error = np.abs(wrong.soc_pct - log.soc_pct)
     turning = (error > 5.0) & (log.time_s > 30.0)
     assert not np.any(turning & (wrong.soc_std_pct < 1.5))
 
 
 @pytest.mark.parametrize("sigmas", [-2.0, 2.0])
-def test_a_right_start_is_believed_though_the_voltages_are_off(sigmas: float) -> None:
+def test_correct_initial_soc_survives_biased_voltages(sigmas: float) -> None:
     model = leaf_2012_model_file()
     bias_v = sigmas * math.hypot(model.noise.slow_std_v, model.noise.lasting_std_v)
     log = synthetic_log(start_pct=80.0, end_pct=70.0, noise_v=0.5, seed=11, hours=0.5)
@@ -110,28 +109,28 @@ def test_a_right_start_is_believed_though_the_voltages_are_off(sigmas: float) ->
     error = np.abs(given.soc_pct - log.soc_pct)[early]
     assert error.max() < 2.0
     assert np.abs(withheld.soc_pct - log.soc_pct)[early].mean() > 2.0 * error.mean()
-    # That it may be wrong all the same widens the band a little, and only at first.
+    # The hypothesis that it is wrong widens the band a little, and only at first.
     assert given.soc_std_pct[early].max() < 1.4
     assert not np.any(given.reasons & Reason.INNOVATION_LARGE)
 
 
-def test_a_start_of_which_little_is_claimed_asks_no_question(model: Model) -> None:
+def test_uncertain_initial_soc_opens_no_hypothesis(model: Model) -> None:
     log = synthetic_log(start_pct=80.0, end_pct=79.0, noise_v=0.5, seed=11, hours=0.1)
-    for std_pct, stories in ((1.0, 2), (30.0, 1)):
+    for std_pct, hypotheses in ((1.0, 2), (30.0, 1)):
         estimator = Estimator(
             model, EstimatorSettings(initial_soc_pct=80.0, initial_soc_std_pct=std_pct)
         )
         for sample in samples_of(log):
             estimator.step(sample)
-        assert len(estimator.snapshot().belief.filters) == stories
-    # Nor for ever: it is merged or settled.
+        assert len(estimator.snapshot().filter.hypotheses) == hypotheses
+    # Two hypotheses do not stay open: they are decided or merged.
     estimator = Estimator(model, EstimatorSettings(initial_soc_pct=80.0))
     for sample in samples_of(synthetic_log(start_pct=80.0, end_pct=70.0, hours=0.5, seed=11)):
         estimator.step(sample)
-    assert len(estimator.snapshot().belief.filters) == 1
+    assert len(estimator.snapshot().filter.hypotheses) == 1
 
 
-def test_filter_learns_the_offset_that_a_counter_drifts_with(model: Model) -> None:
+def test_filter_learns_the_current_offset(model: Model) -> None:
     log = synthetic_log(start_pct=95.0, end_pct=20.0, noise_v=0.5, seed=12)
     samples = [item._replace(current_a=item.current_a + 2.0) for item in samples_of(log)]
     settings_ = EstimatorSettings(initial_soc_pct=95.0)
@@ -142,10 +141,10 @@ def test_filter_learns_the_offset_that_a_counter_drifts_with(model: Model) -> No
     estimator = Estimator(model, settings_)
     for sample in samples:
         estimator.step(sample)
-    assert estimator.offset_a == pytest.approx(2.0, abs=0.5)
+    assert estimator.filter.offset_a == pytest.approx(2.0, abs=0.5)
 
 
-def test_standard_deviation_is_honest(model: Model) -> None:
+def test_two_sigma_covers_the_reference(model: Model) -> None:
     inside, sigma, square = [], [], []
     for seed in range(20, 30):
         log = synthetic_log(start_pct=90.0, end_pct=50.0, noise_v=0.5, seed=seed, hours=1.0)
@@ -157,7 +156,7 @@ def test_standard_deviation_is_honest(model: Model) -> None:
     assert np.mean(inside) >= 0.9
 
 
-def test_starts_without_initial_soc_from_the_first_voltage(model: Model) -> None:
+def test_first_voltage_gives_the_unknown_initial_soc(model: Model) -> None:
     log = synthetic_log(start_pct=70.0, end_pct=60.0, noise_v=0.2, seed=4, hours=0.5)
     first = Estimator(model).step(next(samples_of(log)))
     assert first.soc_pct == pytest.approx(70.0, abs=8.0)
@@ -174,7 +173,7 @@ def test_status_is_valid_once_the_delay_line_is_full(model: Model) -> None:
     assert np.mean(table.status[~filling] == Status.VALID) > 0.95
 
 
-def test_gap_in_current_degrades_for_the_delay_lines_length(model: Model) -> None:
+def test_current_gap_degrades_for_the_longest_delay(model: Model) -> None:
     log = synthetic_log(start_pct=70.0, end_pct=60.0, noise_v=0.2, seed=4, hours=0.5)
     keep = (log.time_s < 600.0) | (log.time_s >= 605.0)
     table, _ = estimate_log(log.rows(keep), model, EstimatorSettings())
@@ -183,7 +182,7 @@ def test_gap_in_current_degrades_for_the_delay_lines_length(model: Model) -> Non
     assert table.time_s[gap].max() == 674.0
 
 
-def test_missing_voltage_and_temperature_keep_the_count_going(model: Model) -> None:
+def test_charge_is_counted_without_voltage_and_temperature(model: Model) -> None:
     log = synthetic_log(start_pct=70.0, end_pct=60.0, noise_v=0.2, seed=4, hours=0.5)
     samples = [
         item._replace(voltage_v=math.nan, temperature_c=math.nan) if item.time_s > 900 else item
@@ -212,7 +211,7 @@ def test_no_input_raises_or_leaves_0_to_100(rows: list[tuple[float, ...]]) -> No
 _MODEL = fit([synthetic_log(noise_v=0.5)], capacity_ah=CAPACITY_AH).model
 
 
-def test_refuses_time_that_does_not_increase(model: Model) -> None:
+def test_time_that_does_not_increase_is_refused(model: Model) -> None:
     estimator = Estimator(model)
     estimator.step(Sample(1.0, 10.0, 380.0, 23.0))
     again = estimator.step(Sample(1.0, 5000.0, 380.0, 23.0))
@@ -220,21 +219,21 @@ def test_refuses_time_that_does_not_increase(model: Model) -> None:
     assert again.samples == 1
 
 
-def test_temperature_measured_elsewhere_degrades(model: Model) -> None:
+def test_temperature_source_mismatch_degrades(model: Model) -> None:
     estimator = Estimator(model, EstimatorSettings(temperature_source="cell"))
     estimate = estimator.step(Sample(0.0, 10.0, 380.0, 23.0))
     assert estimate.reasons & Reason.TEMPERATURE_SOURCE_MISMATCH
 
 
-def test_the_same_samples_give_the_same_numbers(model: Model) -> None:
+def test_same_samples_give_same_numbers(model: Model) -> None:
     log = synthetic_log(hours=0.3, noise_v=0.5)
     first = run_estimator(samples_of(log), model, EstimatorSettings())
     again = run_estimator(samples_of(log), model, EstimatorSettings())
-    for name in vars(first):
+    for name in set(vars(first)) - {"scores"}:
         assert np.array_equal(getattr(first, name), getattr(again, name), equal_nan=True)
 
 
-def test_settings_out_of_range_are_named() -> None:
+def test_setting_out_of_range_is_named() -> None:
     with pytest.raises(InputError, match="initial_soc_pct"):
         EstimatorSettings(initial_soc_pct=140.0)
 
@@ -254,9 +253,9 @@ def test_open_contactors_do_not_disturb_the_filter(model: Model) -> None:
     assert not np.any(table.reasons & Reason.INNOVATION_LARGE)
 
 
-def test_a_long_rest_draws_the_soc_toward_the_rest_voltage(model: Model) -> None:
+def test_long_rest_draws_soc_toward_rest_voltage(model: Model) -> None:
     log = synthetic_log(start_pct=80.0, end_pct=70.0, noise_v=0.3, seed=6, hours=0.4)
-    # The drive ends with a SoC that is 4 % off, and the pack rests for 40 minutes.
+    # The drive ends with a SoC error of 4 %; then the pack rests for 40 minutes.
     soc_pct = float(log.soc_pct[-1])
     rest_v = leaf_2012_model().pseudo_ocv([soc_pct], [23.0])[0]
     end_s = float(log.time_s[-1])
@@ -267,24 +266,24 @@ def test_a_long_rest_draws_the_soc_toward_the_rest_voltage(model: Model) -> None
     sigma = table.soc_std_pct[len(log) :]
     assert abs(error[-1]) < abs(error[0])
     assert abs(error[-1]) < 1.5
-    # After ten minutes slow polarisation has decayed, so the voltage is worth more.
+    # After ten minutes slow polarisation has decayed, and the voltage has more weight.
     assert sigma[620] < sigma[590]
 
 
-def test_a_soc_too_uncertain_is_degraded_and_says_so(model: Model) -> None:
+def test_uncertain_soc_is_degraded(model: Model) -> None:
     log = synthetic_log(start_pct=70.0, end_pct=60.0, noise_v=0.2, seed=4, hours=0.5)
     table, _ = estimate_log(log, model, EstimatorSettings(valid_std_pct=0.8))
     uncertain = (table.reasons & Reason.SOC_UNCERTAIN) != 0
     assert np.array_equal(uncertain, table.soc_std_pct > 0.8)
     assert 0.01 < np.mean(uncertain) < 0.5
     assert not np.any(table.status[uncertain] == Status.VALID)
-    # Nothing but the mark changes.
+    # Only the status changes.
     wide, _ = estimate_log(log, model, EstimatorSettings(valid_std_pct=100.0))
     assert np.array_equal(wide.soc_pct, table.soc_pct)
     assert not np.any(wide.reasons & Reason.SOC_UNCERTAIN)
 
 
-def test_a_gap_just_after_driving_off_is_as_uncertain_as_the_current_at_its_ends() -> None:
+def test_gap_uncertainty_includes_current_at_its_ends() -> None:
     counter = CoulombCounter(capacity_ah=10.0, gap_s=2.0)
     for second in range(60):
         counter.step(float(second), 0.0)
@@ -293,3 +292,26 @@ def test_a_gap_just_after_driving_off_is_as_uncertain_as_the_current_at_its_ends
     assert bridged.gap_std_pct == pytest.approx(100.0 * 30.0 * 30.0 / 36000.0)
     away = counter.step(190.0, 0.0)
     assert away.parked_std_pct > 100.0 * 30.0 * 100.0 / 36000.0 - 0.1
+
+
+def test_estimate_starts_from_the_logs_soc_and_scores_it(model: Model) -> None:
+    log = synthetic_log(start_pct=70.0, end_pct=60.0, noise_v=0.2, seed=4, hours=0.5)
+    table = estimate(log, model)
+    expected, scores = estimate_log(log, model, EstimatorSettings(initial_soc_pct=70.0))
+    assert np.array_equal(table.soc_pct, expected.soc_pct)
+    assert table.scores is not None
+    assert table.scores.soc_mae_pct == scores.soc_mae_pct
+    withheld, _ = estimate_log(log, model, EstimatorSettings())
+    found = estimate(log, model, initial_soc_pct="auto")
+    assert np.array_equal(found.soc_pct, withheld.soc_pct)
+
+
+def test_table_converts_to_arrow_with_words_and_nulls(model: Model) -> None:
+    sample = Sample(0.0, 10.0, math.nan, 23.0)
+    arrow = pa.table(run_estimator([sample], model, EstimatorSettings(initial_soc_pct=80.0)))
+    assert arrow.column_names[:3] == ["time_s", "soc_pct", "soc_std_pct"]
+    (row,) = arrow.to_pylist()
+    assert row["soc_pct"] == 80.0
+    assert row["residual_v"] is None
+    assert row["status"] == "degraded"
+    assert row["reasons"] == "delay line filling; voltage missing"

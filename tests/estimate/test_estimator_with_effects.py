@@ -1,4 +1,4 @@
-"""The estimator with effects in its model: the same voltages as offline, and a better SoC."""
+"""The estimator with effects in its model: the voltages of the offline model, a better SoC."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ each_effect = pytest.mark.parametrize("effect", LIBRARY.values(), ids=lambda eff
 
 
 def upper_half(effect: Effect) -> dict[str, float]:
-    """Values half way to the far bound, shapes in the middle."""
+    """Amplitudes half way to the far bound, shapes in the middle."""
     values = effect.neutral(PACK)
     for parameter in effect.amplitudes:
         low, high = parameter.bounds(PACK)
@@ -32,7 +32,7 @@ def upper_half(effect: Effect) -> dict[str, float]:
 
 
 def log_and_model(effect: Effect) -> tuple[Log, Model]:
-    """A log that the effect alone explains, and the published model with the effect."""
+    """A log that only the effect explains, and the published model with the effect."""
     values = upper_half(effect)
     plain = leaf_2012_model_file()
     wide = {"soc_pct": (0.0, 100.0), "temperature_c": (-30.0, 60.0), "current_a": (-300.0, 300.0)}
@@ -50,7 +50,7 @@ def log_and_model(effect: Effect) -> tuple[Log, Model]:
 
 
 @each_effect
-def test_predicts_the_same_voltage_as_offline(effect: Effect) -> None:
+def test_online_voltage_equals_offline_voltage(effect: Effect) -> None:
     log, model = log_and_model(effect)
     table, _ = estimate_log(
         log, model, EstimatorSettings(method="coulomb", initial_soc_pct=START_PCT)
@@ -65,20 +65,20 @@ def test_predicts_the_same_voltage_as_offline(effect: Effect) -> None:
 
 
 @each_effect
-def test_filter_finds_the_soc_that_the_plain_model_misses(effect: Effect) -> None:
+def test_effect_improves_soc_over_plain_model(effect: Effect) -> None:
     log, model = log_and_model(effect)
     plain = Model.model_validate(model.model_dump() | {"effects": []})
     settings = EstimatorSettings(initial_soc_pct=START_PCT)
     extended = estimate_log(log, model, settings)[1]
     missed = estimate_log(log, plain, settings)[1]
     assert extended.soc_mae_pct < 0.05
-    # Estimates under a skew are a sample or two late, 0.03 % here, which is about what it costs.
+    # With a skew, estimates are a sample or two late: 0.03 % here, as much as the effect costs.
     assert extended.soc_mae_pct < 0.5 * missed.soc_mae_pct or effect.id == "time_skew"
     assert extended.voltage_mae_pct < missed.voltage_mae_pct
 
 
 @pytest.mark.parametrize("effect_id", ["fast_polarization", "slow_diffusion"])
-def test_polarisation_counts_in_full_in_the_steady_resistance(effect_id: str) -> None:
+def test_steady_resistance_includes_polarisation(effect_id: str) -> None:
     effect = LIBRARY[effect_id]
     values = upper_half(effect) | {"activation_k": 0.0}
     model = leaf_2012_model_file().extended_model().with_effect(effect, values)
@@ -88,7 +88,7 @@ def test_polarisation_counts_in_full_in_the_steady_resistance(effect_id: str) ->
 
 
 @each_effect
-def test_the_steady_resistance_lowers_the_voltage_whatever_the_effect(effect: Effect) -> None:
+def test_steady_resistance_is_negative_with_each_effect(effect: Effect) -> None:
     model = log_and_model(effect)[1].extended_model()
     plain = sum(model.model.resistance_ohm)
     assert 3.0 * plain < model.steady_ohm() < 0.0
@@ -96,8 +96,8 @@ def test_the_steady_resistance_lowers_the_voltage_whatever_the_effect(effect: Ef
         assert model.steady_ohm() == pytest.approx(plain, rel=1e-3)
 
 
-def test_an_offset_is_found_though_an_effect_carries_part_of_the_drop() -> None:
-    """With the 13 coefficients' resistance alone the error is 0.31 %."""
+def test_offset_is_found_with_polarisation_effect() -> None:
+    """With the resistance of the 13 coefficients alone the error is 0.31 %."""
     log, model = log_and_model(LIBRARY["slow_diffusion"])
     shown = replace(log, current_a=log.current_a + 3.0)
     table, _ = estimate_log(shown, model, EstimatorSettings(initial_soc_pct=START_PCT))

@@ -1,4 +1,4 @@
-"""An estimator that is interrupted and restored goes on as if it had not been."""
+"""An estimator that is interrupted and restored continues as if it had not been."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from synthetic import synthetic_log
 
 PACK = Pack.of(leaf_2012_model(), CAPACITY_AH)
 PLAIN = leaf_2012_model_file()
-ANCHORS = {"full_charge": FullCharge(400.0, 5.0), "long_rest": LongRest(600.0)}
+RULES = {"full_charge": FullCharge(400.0, 5.0), "long_rest": LongRest(600.0)}
 
 
 def extended_by(ids: list[str]) -> Model:
-    """The published model with effects, half way to their bounds."""
+    """Return the published model with effects, half way to their bounds."""
     chosen = []
     for effect_id in ids:
         effect = LIBRARY[effect_id]
@@ -43,8 +43,8 @@ def extended_by(ids: list[str]) -> Model:
 
 
 def eventful_samples() -> list[Sample]:
-    """A drive with a short gap, a long pause, missing signals, a late sample and a clock set
-    back."""
+    """Return a drive with a gap, an unobserved interval, missing signals, a late sample and a
+    clock that is set back."""
     samples = list(samples_of(synthetic_log(hours=0.15, rate_hz=2.0, start_pct=80.0, end_pct=70.0,
                                             noise_v=0.3, seed=5)))  # fmt: skip
     out = []
@@ -74,22 +74,22 @@ def same(first: list[Estimate], again: list[Estimate]) -> bool:
     return np.array_equal(np.array(first, float), np.array(again, float), equal_nan=True)
 
 
-def remembered(thing: Any, depth: int = 0) -> Any:
-    """All values in an object, down to the bottom, NaN as a word."""
+def inner_state(thing: Any, depth: int = 0) -> Any:
+    """Return all values of an object, recursively, with NaN as a string."""
     if isinstance(thing, float) and math.isnan(thing):
         return "nan"
     if isinstance(thing, np.ndarray):
         return thing.tolist()
     if isinstance(thing, list | tuple) or type(thing).__name__ == "deque":
-        return [remembered(each, depth + 1) for each in thing]
+        return [inner_state(each, depth + 1) for each in thing]
     if hasattr(thing, "__dict__") and not callable(thing) and depth < 8:
-        # What an EKF keeps for its reader only is not needed to go on.
+        # The rest of filterpy's attributes is derived.
         names = {"x", "P"} if type(thing).__name__ == "ExtendedKalmanFilter" else vars(thing)
-        return {name: remembered(vars(thing)[name], depth + 1) for name in sorted(names)}
+        return {name: inner_state(vars(thing)[name], depth + 1) for name in sorted(names)}
     return thing if isinstance(thing, int | float | str | bool | None) else type(thing).__name__
 
 
-def check_goes_on(model: Model, chosen: EstimatorSettings, at: int) -> None:
+def check_continues(model: Model, chosen: EstimatorSettings, at: int) -> None:
     whole = Estimator(model, chosen)
     for sample in EVENTFUL[:at]:
         whole.step(sample)
@@ -97,9 +97,9 @@ def check_goes_on(model: Model, chosen: EstimatorSettings, at: int) -> None:
     after = Estimator(model, chosen)
     after.restore(state)
     rest = EVENTFUL[at:]
-    # The next voltage is used within a second; after it nothing may differ inside either.
+    # The next voltage is used within a second; after it the inner states must agree as well.
     assert same([after.step(each) for each in rest[:8]], [whole.step(each) for each in rest[:8]])
-    assert remembered(after) == remembered(whole)
+    assert inner_state(after) == inner_state(whole)
     assert same([after.step(each) for each in rest[8:]], [whole.step(each) for each in rest[8:]])
 
 
@@ -108,41 +108,29 @@ MOMENTS = [0, 1, 3, 201, 310, 455, 850, 910]
 
 @pytest.mark.parametrize("at", MOMENTS)
 @pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
-def test_goes_on_bit_for_bit(method: Any, at: int) -> None:
-    check_goes_on(PLAIN, EstimatorSettings(method=method, **ANCHORS), at)
+def test_continues_bit_for_bit(method: Any, at: int) -> None:
+    check_continues(PLAIN, EstimatorSettings(method=method, **RULES), at)
 
 
 @pytest.mark.parametrize("at", [0, 1, 3, 40, 201])
 @pytest.mark.parametrize("start_pct", [80.0, 65.0])
-def test_goes_on_bit_for_bit_while_a_given_soc_is_in_question(start_pct: float, at: int) -> None:
-    check_goes_on(PLAIN, EstimatorSettings(initial_soc_pct=start_pct), at)
-
-
-def test_a_state_from_before_given_socs_were_questioned_is_taken() -> None:
-    estimator = Estimator(PLAIN, EstimatorSettings(initial_soc_pct=80.0))
-    for sample in EVENTFUL[:20]:
-        estimator.step(sample)
-    data = estimator.snapshot().model_dump(mode="json")
-    del data["belief"]["is_untried"]
-    after = Estimator(PLAIN, EstimatorSettings(initial_soc_pct=80.0))
-    after.restore(EstimatorState.model_validate(data))
-    found, expected = after.step(EVENTFUL[20]), estimator.step(EVENTFUL[20])
-    assert found.soc_pct == expected.soc_pct
+def test_continues_bit_for_bit_with_untested_initial_soc(start_pct: float, at: int) -> None:
+    check_continues(PLAIN, EstimatorSettings(initial_soc_pct=start_pct), at)
 
 
 @pytest.mark.parametrize("effect_id", LIBRARY)
-def test_goes_on_bit_for_bit_with_each_effect(effect_id: str) -> None:
-    check_goes_on(extended_by([effect_id]), EstimatorSettings(initial_soc_pct=80.0), 465)
+def test_continues_bit_for_bit_with_each_effect(effect_id: str) -> None:
+    check_continues(extended_by([effect_id]), EstimatorSettings(initial_soc_pct=80.0), 465)
 
 
 @pytest.mark.parametrize("at", MOMENTS)
-def test_goes_on_bit_for_bit_with_many_effects(at: int) -> None:
+def test_continues_bit_for_bit_with_many_effects(at: int) -> None:
     ids = ["time_skew", "temperature_lag", "core_temperature", "fast_polarization",
            "slow_diffusion", "hysteresis", "resistance_step", "entropic_coefficient"]  # fmt: skip
-    check_goes_on(extended_by(ids), EstimatorSettings(), at)
+    check_continues(extended_by(ids), EstimatorSettings(), at)
 
 
-def test_a_snapshot_is_not_changed_by_what_comes_after() -> None:
+def test_snapshot_is_a_copy() -> None:
     estimator = Estimator(extended_by(["time_skew", "hysteresis"]))
     for sample in EVENTFUL[:475]:
         estimator.step(sample)
@@ -156,7 +144,7 @@ def test_a_snapshot_is_not_changed_by_what_comes_after() -> None:
 @pytest.mark.parametrize(
     "change", [{"method": "coulomb"}, {"capacity_ah": 45.0}, {"method": "ekf", "capacity_ah": 60.0}]
 )
-def test_with_other_settings_the_soc_stays(change: dict[str, Any]) -> None:
+def test_soc_is_kept_with_other_settings(change: dict[str, Any]) -> None:
     before = Estimator(PLAIN, EstimatorSettings(initial_soc_pct=80.0))
     for sample in EVENTFUL[:300]:
         last = before.step(sample)
@@ -167,7 +155,7 @@ def test_with_other_settings_the_soc_stays(change: dict[str, Any]) -> None:
     assert found.soc_std_pct == pytest.approx(last.soc_std_pct, abs=0.2)
 
 
-def test_another_model_takes_the_soc_over() -> None:
+def test_another_model_takes_over_the_soc() -> None:
     before = Estimator(PLAIN, EstimatorSettings(initial_soc_pct=80.0))
     for sample in EVENTFUL[:300]:
         last = before.step(sample)
@@ -183,7 +171,7 @@ def test_another_model_takes_the_soc_over() -> None:
     assert nothing.step(Sample(0.0, 10.0, math.nan, 23.0)).reasons & Reason.NO_INITIAL_SOC
 
 
-def test_a_state_of_another_model_is_refused() -> None:
+def test_state_of_another_model_is_refused() -> None:
     estimator = Estimator(extended_by(["hysteresis", "fast_polarization"]))
     for sample in EVENTFUL[:100]:
         estimator.step(sample)
@@ -208,7 +196,7 @@ def state_of_a_drive() -> dict[str, Any]:
 
 
 def places(data: Any, here: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Where the numbers are."""
+    """Return the paths of all values."""
     items = (
         data.items()
         if isinstance(data, dict)
@@ -236,7 +224,7 @@ PLACES = [place for place in places(state_of_a_drive()) if "line" not in place]
         max_size=6,
     )
 )  # fmt: skip
-def test_a_damaged_state_is_refused_or_does_no_harm(changes: list[tuple[Any, Any]]) -> None:
+def test_damaged_state_is_refused_or_harmless(changes: list[tuple[Any, Any]]) -> None:
     data = state_of_a_drive()
     for place, value in changes:
         at = data
@@ -246,7 +234,7 @@ def test_a_damaged_state_is_refused_or_does_no_harm(changes: list[tuple[Any, Any
     estimator = Estimator(extended_by(["time_skew", "hysteresis", "slow_diffusion"]))
     try:
         estimator.restore(EstimatorState.model_validate(data))
-    except (InputError, ValueError):  # pydantic's is one
+    except (InputError, ValueError):  # pydantic's ValidationError is one
         return
     for sample in EVENTFUL[465:495]:
         found = estimator.step(sample)
@@ -258,14 +246,14 @@ def test_a_damaged_state_is_refused_or_does_no_harm(changes: list[tuple[Any, Any
 @pytest.mark.parametrize(
     "place",
     [
-        ("belief", "filters", 0, "x", 0),
-        ("belief", "filters", 0, "p", 0, 0),
-        ("belief", "log_odds"),
+        ("filter", "hypotheses", 0, "x", 0),
+        ("filter", "hypotheses", 0, "p", 0, 0),
+        ("filter", "log_odds"),
         ("since", "discharged_pct"),
         ("since", "gap_var_pct2"),
     ],
 )
-def test_what_does_not_bear_the_last_estimate_out_is_refused(place: tuple[Any, ...]) -> None:
+def test_state_contradicting_its_estimate_is_refused(place: tuple[Any, ...]) -> None:
     data = state_of_a_drive()
     at = data
     for key in place[:-1]:
@@ -282,13 +270,11 @@ def test_what_does_not_bear_the_last_estimate_out_is_refused(place: tuple[Any, .
     [
         (("counter", "time_s"), -0.9),
         (("line", "since_s"), 1e5),
-        (("first_s",), 1e5),
-        (("rest_since_s",), 1e5),
+        (("memory", "first_s"), 1e5),
+        (("memory", "rest_since_s"), 1e5),
     ],
 )
-def test_times_that_do_not_fit_each_other_are_refused(
-    place: tuple[str, ...], later_s: float
-) -> None:
+def test_inconsistent_times_are_refused(place: tuple[str, ...], later_s: float) -> None:
     data = state_of_a_drive()
     at = data
     for key in place[:-1]:
@@ -298,7 +284,7 @@ def test_times_that_do_not_fit_each_other_are_refused(
         EstimatorState.model_validate(data)
 
 
-def test_what_an_effect_remembers_lies_before_the_latest_sample() -> None:
+def test_effect_memory_after_latest_sample_is_refused() -> None:
     ids = ["time_skew", "slow_diffusion", "hysteresis", "resistance_step", "core_temperature"]
     whole = Estimator(extended_by(ids))
     for sample in EVENTFUL[:465]:
@@ -306,7 +292,7 @@ def test_what_an_effect_remembers_lies_before_the_latest_sample() -> None:
     state = through_json(whole.snapshot())
     Estimator(extended_by(ids)).restore(state)
     for number in range(len(ids)):
-        # Of `time_skew` the first is how many wait, and the second the time of the first of them.
+        # The memory of `time_skew` starts with the number of waiting samples, then their times.
         at = 1 if number == ids.index("time_skew") else 0
         effects = [list(each) for each in state.effects]
         effects[number][at] = state.clock.last_s + 10.0

@@ -1,4 +1,4 @@
-"""An estimator that goes on where one of another model or other settings stands."""
+"""An estimator that continues from one of another model or with other settings."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def other_model() -> Model:
 
 
 @pytest.mark.parametrize("method", ["ekf", "coulomb"])
-def test_soc_and_its_deviation_go_on_and_the_line_stays_full(method: str) -> None:
+def test_soc_uncertainty_and_delay_line_are_kept(method: str) -> None:
     samples = drive()
     settings = EstimatorSettings(method=method, initial_soc_pct=80.0)  # type: ignore[arg-type] # one of them
     before = Estimator(leaf_model(), settings)
@@ -38,16 +38,16 @@ def test_soc_and_its_deviation_go_on_and_the_line_stays_full(method: str) -> Non
     after = Estimator(other_model(), settings)
     after.take_over(before)
     first = after.step(samples[1500])
-    # One step of 0.1 s moves it, and one voltage, weighed against what was known.
+    # It moves by the charge of 0.1 s and one voltage update.
     assert first.soc_pct == pytest.approx(last.soc_pct, abs=0.25 * last.soc_std_pct)
     assert first.soc_std_pct == pytest.approx(last.soc_std_pct, rel=0.05)
     assert not first.reasons & (Reason.DELAY_LINE_FILLING | Reason.NO_INITIAL_SOC)
     assert first.samples == 1501
-    # The model that it has now is the other one: it predicts other voltages.
+    # The other model predicts other voltages.
     assert first.voltage_model_v == pytest.approx(last.voltage_model_v + 2.0, abs=1.0)
 
 
-def test_no_charge_is_lost_in_between() -> None:
+def test_no_charge_is_lost() -> None:
     samples = [each._replace(current_a=100.0) for each in drive()]
     settings = EstimatorSettings(method="coulomb", initial_soc_pct=80.0)
     whole = stepped(Estimator(leaf_model(), settings), samples)
@@ -57,12 +57,11 @@ def test_no_charge_is_lost_in_between() -> None:
         following = Estimator(leaf_model(), settings)
         following.take_over(part)
         part = following
-    # 20 estimators, each from the last sample of the one before: 100 A × 0.1 s lost each time
-    # would be 0.1 %.
+    # 20 estimators in a row: losing 100 A × 0.1 s each time would be 0.1 %.
     assert stepped(part, samples[1900:]).soc_pct == pytest.approx(whole.soc_pct, abs=1e-9)
 
 
-def test_a_shorter_memory_does_not_feign_a_longer_one() -> None:
+def test_longer_delay_line_must_fill_first() -> None:
     samples = drive()
     short = leaf_model()
     short = short.model_copy(update={"delays_s": [0.0, 1.0, 2.0, 3.0]})
@@ -74,7 +73,7 @@ def test_a_shorter_memory_does_not_feign_a_longer_one() -> None:
     assert after.step(samples[1900]).reasons & Reason.DELAY_LINE_FILLING
 
 
-def test_what_is_not_known_stays_unknown_and_a_sample_before_the_last_is_refused() -> None:
+def test_unknown_soc_stays_unknown_and_old_samples_are_refused() -> None:
     samples = drive()
     before = Estimator(leaf_model())
     after = Estimator(leaf_model())
@@ -87,7 +86,7 @@ def test_what_is_not_known_stays_unknown_and_a_sample_before_the_last_is_refused
     assert after.step(samples[50]).reasons & Reason.IMPLAUSIBLE_INPUT
 
 
-def test_the_inverse_without_a_voltage_goes_on_from_counting() -> None:
+def test_inverse_without_voltage_continues_from_counting() -> None:
     samples = drive()
     settings = EstimatorSettings(method="newton", initial_soc_pct=80.0)
     before = Estimator(leaf_model(), settings)

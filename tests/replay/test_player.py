@@ -26,7 +26,7 @@ from cangauge.estimate.offline import run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.replay.player import ReplaySettings, ReplayState, play
 from cangauge.replay.steps import CaptureSource, LogSource, quantisation_bound
-from cangauge.service.pipeline import NOTHING_YET, GaugeSettings
+from cangauge.service.pipeline import NOTHING_YET, PipelineSettings
 from cangauge.service.recording import Recorder
 from live import (
     Service,
@@ -40,7 +40,7 @@ from live import (
 )
 
 MAX = ReplaySettings(speed=math.inf, acknowledge_s=3.0)
-REPLAYED = GaugeSettings(time_source="replay-clock")
+REPLAYED = PipelineSettings(time_source="replay-clock")
 SOC_FRAMES = [standard_filter(0x5A0), standard_filter(0x5A1)]
 
 
@@ -59,11 +59,11 @@ def play_log(
 def test_replayed_soc_is_offline_soc_within_the_bound(preset: str, method: str) -> None:
     vehicle, log, model = Vehicle.load(preset), short_log(200.0), leaf_model()
     estimator = EstimatorSettings(method=method, initial_soc_pct=80.0)  # type: ignore[arg-type] # parametrised
-    settings = GaugeSettings(estimator, "replay-clock")
+    settings = PipelineSettings(estimator, "replay-clock")
     with virtual_service(f"{preset}{method}", settings, vehicle=vehicle) as service:
         state = play_log(f"{preset}{method}", 200.0, MAX, preset)
     assert state.acknowledged == state.samples == len(log) == len(service.rows)
-    assert service.gauge.counts.lost == 0
+    assert service.pipeline.counts.lost == 0
     offline = run_estimator(samples_of(log), model, estimator).soc_pct
     live = np.array([estimate.soc_pct for _, estimate in service.rows])
     bound = quantisation_bound(vehicle, model, log)
@@ -93,7 +93,7 @@ def test_a_replay_waits_for_the_service_without_loss() -> None:
     time.sleep(0.7)
     with virtual_service("early", REPLAYED) as service:
         player.join(10.0)
-        assert service.gauge.samples == 300
+        assert service.pipeline.samples == 300
     assert result[0].acknowledged == 300
 
 
@@ -175,7 +175,7 @@ def test_lost_frames_are_an_error() -> None:
         port = BusConnection(bus, "lossy")  # type: ignore[arg-type] # has what is used of a bus
         with port, pytest.raises(CangaugeError, match="of 300 samples sent have been processed"):
             play(port, source, settings, stop=never)
-        assert service.gauge.counts.lost > 0
+        assert service.pipeline.counts.lost > 0
 
 
 def test_frames_under_way_are_bounded() -> None:
@@ -258,7 +258,7 @@ def test_the_estimate_does_not_depend_on_the_speed() -> None:
     log, model = short_log(40.0), leaf_model()
     with virtual_service("fast", REPLAYED) as service:
         state = play_log("fast", 40.0, ReplaySettings(speed=40.0, wait_s=3.0))
-        assert waits(lambda: service.gauge.samples == 400)
+        assert waits(lambda: service.pipeline.samples == 400)
     assert state.seconds == pytest.approx(39.9 / 40.0, abs=0.1)
     assert state.acknowledged is None
     sent = FrameEncoder(Vehicle.load("generic")).quantise(log)
@@ -278,9 +278,9 @@ def test_a_loop_runs_until_stopped() -> None:
     with virtual_service("loop", REPLAYED) as service, virtual_port("loop", SOC_FRAMES) as port:
         source = LogSource(short_log(5.0), Vehicle.load("generic"))
         settings = ReplaySettings(speed=math.inf, loop=True)
-        state = play(port, source, settings, stop=lambda: service.gauge.samples >= 220)
+        state = play(port, source, settings, stop=lambda: service.pipeline.samples >= 220)
         assert state.samples >= 220
-        assert service.gauge.counts.beginnings == 0
+        assert service.pipeline.counts.beginnings == 0
         assert service.rows[219][0] == pytest.approx(21.9)
 
 
@@ -302,7 +302,7 @@ def test_fd_frames_need_an_fd_bus(tmp_path: Path) -> None:
 def test_ids_are_configurable() -> None:
     ids = FrameIds(0x111, 0x112, 0x113)
     filters = [standard_filter(0x111), standard_filter(0x112)]
-    settings = GaugeSettings(time_source="replay-clock", ids=ids)
+    settings = PipelineSettings(time_source="replay-clock", ids=ids)
     with virtual_service("ids", settings), virtual_port("ids", filters) as port:
         source = LogSource(short_log(10.0), Vehicle.load("generic"))
         state = play(port, source, ReplaySettings(math.inf, ids=ids), stop=never)

@@ -1,4 +1,4 @@
-"""A recording gives the live numbers, to the last bit."""
+"""A recording gives the live numbers, bit for bit."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cangauge.estimate.offline import samples_of
 from cangauge.estimate.validity import Estimate
 from cangauge.service import recording as record
 from cangauge.service.capture_estimate import estimate_capture
-from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
 from live import leaf_model, short_log
 
@@ -24,28 +24,28 @@ NUMBERS = ("soc_pct", "soc_std_pct", "soc_newton_pct", "voltage_model_v", "resid
 
 
 @pytest.fixture(autouse=True)
-def a_disk_in_no_hurry(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is compared is the recording, not how soon a busy machine completes it."""
+def patient_recorder(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a busy machine take its time to complete the recording."""
     monkeypatch.setattr(record, "CLOSE_WITHIN_S", 30.0)
 
 
 def live_and_recorded(
-    frames: list[can.Message], settings: GaugeSettings, path: Path, preset: str
+    frames: list[can.Message], settings: PipelineSettings, path: Path, preset: str
 ) -> tuple[list[Estimate], Path]:
-    """Handle frames as the loop does, recording them; return the estimates and the recording."""
-    gauge = Gauge(Vehicle.load(preset), leaf_model(), settings)
+    """Handle frames as the loop does; return the estimates and the recording."""
+    pipeline = Pipeline(Vehicle.load(preset), leaf_model(), settings)
     found = []
     with Recorder(path) as recorder:
         for frame in frames:
             recorder.write(frame)
-            before = gauge.samples
-            gauge.handle(frame)
-            if gauge.samples != before:
-                found.append(gauge.latest)
-        before = gauge.samples
-        gauge.finish()
-        if gauge.samples != before:
-            found.append(gauge.latest)
+            before = pipeline.samples
+            pipeline.handle(frame)
+            if pipeline.samples != before:
+                found.append(pipeline.latest)
+        before = pipeline.samples
+        pipeline.finish()
+        if pipeline.samples != before:
+            found.append(pipeline.latest)
     return found, recorder.path
 
 
@@ -67,25 +67,25 @@ def test_recorded_stamps_are_the_live_ones(tmp_path: Path, suffix: str, preset: 
         for frame in encoder.encode(sample, 55.0):
             frame.timestamp += 1.7e9
             frames.append(frame)
-    # Stamps as a kernel gives them, to the nanosecond; and a clock that is set back.
+    # Kernel stamps, to the nanosecond, and a clock that is set back.
     for frame, late_s in zip(frames, np.sort(rng.uniform(0.0, 1.0, len(frames))), strict=True):
         frame.timestamp += float(late_s) - (4000.0 if late_s > 0.5 else 0.0)
     path = tmp_path / f"drive{suffix}"
-    live, path = live_and_recorded(frames, GaugeSettings(), path, preset)
+    live, path = live_and_recorded(frames, PipelineSettings(), path, preset)
     assert_same(live, path, preset)
 
 
-def test_of_a_recorded_replay_time_is_the_logs(tmp_path: Path) -> None:
+def test_recorded_replay_uses_the_logs_time(tmp_path: Path) -> None:
     clock, encoder = ClockFrames(), FrameEncoder(Vehicle.load("generic"))
     frames = []
-    for _ in range(2):  # two replays, one after the other: each log is estimated for itself
+    for _ in range(2):  # two replays in a row: each log is estimated separately
         for sample in samples_of(short_log(30.0)):
             frames.append(clock.at(round(sample.time_s * 1e6)))
             frames += encoder.encode(sample)
     for number, frame in enumerate(frames):
         frame.timestamp = 1.7e9 + 1e-4 * number
     path = tmp_path / "replayed.log"
-    settings = GaugeSettings(time_source="replay-clock")
+    settings = PipelineSettings(time_source="replay-clock")
     live, _ = live_and_recorded(frames, settings, path, "generic")
     assert_same(live, path, "generic")
     recorded = estimate_capture(path, Vehicle.load("generic"), leaf_model())
@@ -102,13 +102,13 @@ def test_samples_without_voltage_are_estimated_too(tmp_path: Path) -> None:
             if frame.arbitration_id != 0x401 or row % 3:  # every third voltage is missing
                 frames.append(frame)  # noqa: PERF401 - two loops and a condition read better so
     path = tmp_path / "gappy.log"
-    live, _ = live_and_recorded(frames, GaugeSettings(), path, "generic")
+    live, _ = live_and_recorded(frames, PipelineSettings(), path, "generic")
     assert_same(live, path, "generic")
     recorded = estimate_capture(path, Vehicle.load("generic"), leaf_model())
     assert np.count_nonzero(np.isnan(recorded.voltage_v)) == 100
 
 
-def test_another_buses_capture_is_refused(tmp_path: Path) -> None:
+def test_capture_of_another_bus_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "other.log"
     with Recorder(path) as recorder:
         recorder.write(can.Message(timestamp=1.0, arbitration_id=5, data=b"1"))
@@ -124,7 +124,7 @@ def test_formats_that_round_stamps_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.real
-def test_a_real_leafs_capture(shared_data: Path) -> None:
+def test_real_leaf_capture(shared_data: Path) -> None:
     path = shared_data / "leaf_can" / "ZE0w24kWhstock.log.gz"
     recorded = estimate_capture(path, Vehicle.load("leaf_ze0"), leaf_model())
     assert recorded.table.soc_pct.size > 100

@@ -1,4 +1,4 @@
-"""The rate of publishing, on a clock that the test turns: it is the loop's own."""
+"""Rate of publishing, on a simulated monotonic clock of the loop."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Reason, Sample, Status
 from cangauge.service import loop
 from cangauge.service.loop import LoopSettings, Outputs, serve
-from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from live import leaf_model, never
 
 
-class Desk:
-    """A port and the clock in one: receiving waits until the next frame, or the time is up."""
+class SimulatedPort:
+    """Port and clock in one: receiving advances the clock to the next frame or the time-out."""
 
     capabilities = UNKNOWN_INTERFACE
     queue_drops = None
@@ -63,85 +63,87 @@ def frames_every(
 
 def served(
     monkeypatch: pytest.MonkeyPatch, frames: list[tuple[float, can.Message]], seconds: float
-) -> Desk:
-    desk = Desk(frames)
+) -> SimulatedPort:
+    port = SimulatedPort(frames)
     clock = SimpleNamespace(
-        monotonic=lambda: desk.now_s,
+        monotonic=lambda: port.now_s,
         process_time=time.process_time,
     )
     monkeypatch.setattr(loop, "time", clock)
-    gauge = Gauge(Vehicle.load("generic"), leaf_model(), GaugeSettings())
-    serve(desk, gauge, LoopSettings(duration_s=seconds), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for
-    return desk
+    pipeline = Pipeline(Vehicle.load("generic"), leaf_model(), PipelineSettings())
+    serve(port, pipeline, LoopSettings(duration_s=seconds), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for
+    return port
 
 
-def beats(desk: Desk) -> list[tuple[float, SocEstimate]]:
+def published_on(port: SimulatedPort) -> list[tuple[float, SocEstimate]]:
     reader = SocReader()
-    read = [(at_s, reader.read(frame)) for at_s, frame in desk.sent]
+    read = [(at_s, reader.read(frame)) for at_s, frame in port.sent]
     return [(at_s, content) for at_s, content in read if isinstance(content, SocEstimate)]
 
 
 @pytest.mark.parametrize("step_s", [0.0007, 0.01, 0.03, 0.1, 0.137, 1.0, 100.0])
-def test_every_100_ms_whatever_comes(monkeypatch: pytest.MonkeyPatch, step_s: float) -> None:
-    desk = served(monkeypatch, frames_every(step_s, 5.0), 5.05)
-    told = [at_s for at_s, _ in beats(desk) if at_s < 5.05]
-    assert len(told) == 51
-    for number, at_s in enumerate(told):
+def test_publishes_every_100_ms_at_any_input_rate(
+    monkeypatch: pytest.MonkeyPatch, step_s: float
+) -> None:
+    port = served(monkeypatch, frames_every(step_s, 5.0), 5.05)
+    published = [at_s for at_s, _ in published_on(port) if at_s < 5.05]
+    assert len(published) == 51
+    for number, at_s in enumerate(published):
         assert 0.1 * number - 1e-9 <= at_s <= 0.1 * number + 0.0101
-    details = [f for _, f in desk.sent if isinstance(SocReader().read(f), SocDetail)]
+    details = [f for _, f in port.sent if isinstance(SocReader().read(f), SocDetail)]
     assert len(details) == 6
 
 
-def test_a_beat_waits_a_little_to_tell_of_the_sample_that_is_about_to_come(
+def test_heartbeat_waits_briefly_for_the_next_sample(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    told = beats(served(monkeypatch, frames_every(0.1, 5.0, from_s=0.004), 5.0))
-    assert [round(at_s, 3) for at_s, _ in told[1:10]] == [
+    published = published_on(served(monkeypatch, frames_every(0.1, 5.0, from_s=0.004), 5.0))
+    assert [round(at_s, 3) for at_s, _ in published[1:10]] == [
         pytest.approx(0.1 * number + 0.004) for number in range(1, 10)
     ]
 
 
-def test_bus_time_that_runs_faster_or_backwards_does_not_matter(
+def test_rate_is_independent_of_bus_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for rate in (40.0, -3.0):
-        desk = served(monkeypatch, frames_every(0.02, 5.0, stamp_rate=rate), 5.05)
-        assert sum(at_s < 5.05 for at_s, _ in beats(desk)) == 51
+        port = served(monkeypatch, frames_every(0.02, 5.0, stamp_rate=rate), 5.05)
+        assert sum(at_s < 5.05 for at_s, _ in published_on(port)) == 51
 
 
-def test_a_machine_that_slept_goes_on_the_grid_and_makes_up_for_nothing(
+def test_missed_heartbeats_are_skipped_on_the_grid(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     frames = [*frames_every(0.1, 2.0), *frames_every(0.1, 12.0, from_s=9.0)]
-    desk = Desk(frames)
-    receive = desk.receive_pending
+    port = SimulatedPort(frames)
+    receive = port.receive_waiting
 
     def sleepy(timeout_s: float) -> list[can.Message]:
-        if 2.0 < desk.now_s - 5000.0 < 2.5:
-            desk.now_s += 5.678
+        if 2.0 < port.now_s - 5000.0 < 2.5:
+            port.now_s += 5.678
         return receive(timeout_s)
 
-    desk.receive_pending = sleepy  # type: ignore[method-assign] # the machine sleeps once
+    port.receive_waiting = sleepy  # type: ignore[method-assign] # suspended once
     clock = SimpleNamespace(
-        monotonic=lambda: desk.now_s,
+        monotonic=lambda: port.now_s,
         process_time=time.process_time,
     )
     monkeypatch.setattr(loop, "time", clock)
-    gauge = Gauge(Vehicle.load("generic"), leaf_model(), GaugeSettings())
-    serve(desk, gauge, LoopSettings(duration_s=12.0), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for
-    told = [at_s for at_s, _ in beats(desk)]
-    steps = [b - a for a, b in itertools.pairwise(told)]
+    pipeline = Pipeline(Vehicle.load("generic"), leaf_model(), PipelineSettings())
+    serve(port, pipeline, LoopSettings(duration_s=12.0), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for
+    published = [at_s for at_s, _ in published_on(port)]
+    steps = [b - a for a, b in itertools.pairwise(published)]
     assert sum(step > 0.2 for step in steps) == 1
     assert min(steps) > 0.02
-    assert all(abs(at_s * 10.0 - round(at_s * 10.0)) < 0.11 for at_s in told[-20:])
+    assert all(abs(at_s * 10.0 - round(at_s * 10.0)) < 0.11 for at_s in published[-20:])
 
 
-def test_old_and_unknown_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    told = beats(served(monkeypatch, frames_every(0.1, 4.0, from_s=1.0), 40.0))
-    unknown = [content for at_s, content in told if at_s < 0.9]
+def test_old_and_unknown_soc_are_distinguished(monkeypatch: pytest.MonkeyPatch) -> None:
+    published = published_on(served(monkeypatch, frames_every(0.1, 4.0, from_s=1.0), 40.0))
+    unknown = [content for at_s, content in published if at_s < 0.9]
     assert {each.status for each in unknown} == {Status.INITIALISING}
     assert all(each.soc_pct != each.soc_pct and each.age_s != each.age_s for each in unknown)
-    old = [(at_s, content) for at_s, content in told if at_s > 5.2]
+    old = [(at_s, content) for at_s, content in published if at_s > 5.2]
     assert {each.status for _, each in old} == {Status.INVALID}
     assert all(each.reasons & Reason.INPUT_STALE for _, each in old)
     assert len({each.soc_pct for _, each in old}) == 1
@@ -152,41 +154,41 @@ def test_old_and_unknown_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 @pytest.mark.parametrize("stamps", ["kernel", "driver"])
-def test_a_backlog_is_old_until_it_is_worked_off(
+def test_backlog_is_stale_until_it_is_processed(
     monkeypatch: pytest.MonkeyPatch, stamps: Stamps
 ) -> None:
-    """Stopped from 3.0 to 9.0 s, the service then reads in two seconds what waited meanwhile."""
-    desk = Desk(frames_every(0.02, 14.0))
-    desk.capabilities = BackendCapabilities(stamps, echoes=False, has_error_classes=False)
-    receive = desk.receive_pending
+    """The service is suspended from 3.0 to 9.0 s, then reads the backlog within two seconds."""
+    port = SimulatedPort(frames_every(0.02, 14.0))
+    port.facts = BackendCapabilities(stamps, echoes=False, has_error_classes=False)
+    receive = port.receive_waiting
 
     def stopped(timeout_s: float) -> list[can.Message]:
-        since_s = desk.now_s - 5000.0
+        since_s = port.now_s - 5000.0
         if 3.0 <= since_s < 3.5:
-            desk.now_s += 6.0
-        # Working off six seconds of fifty samples, two frames each, and what comes meanwhile.
-        desk.work_s = 0.0025 if 9.0 <= since_s < 11.0 else 0.0
+            port.now_s += 6.0
+        # The backlog is six seconds of fifty samples of two frames, plus what arrives meanwhile.
+        port.work_s = 0.0025 if 9.0 <= since_s < 11.0 else 0.0
         return receive(timeout_s)
 
-    desk.receive_pending = stopped  # type: ignore[method-assign] # is stopped once
+    port.receive_waiting = stopped  # type: ignore[method-assign] # suspended once
     clock = SimpleNamespace(
-        monotonic=lambda: desk.now_s,
-        time=lambda: 1.7e9 + desk.now_s - 5000.0,
+        monotonic=lambda: port.now_s,
+        time=lambda: 1.7e9 + port.now_s - 5000.0,
         process_time=time.process_time,
     )
     monkeypatch.setattr(loop, "time", clock)
-    known = GaugeSettings(EstimatorSettings(initial_soc_pct=60.0))
-    gauge = Gauge(Vehicle.load("generic"), leaf_model(), known)
-    serve(desk, gauge, LoopSettings(duration_s=14.0), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for
-    told = beats(desk)
-    fresh = [content for at_s, content in told if 0.5 < at_s < 3.0 or at_s > 13.0]
+    known = PipelineSettings(EstimatorSettings(initial_soc_pct=60.0))
+    pipeline = Pipeline(Vehicle.load("generic"), leaf_model(), known)
+    serve(port, pipeline, LoopSettings(duration_s=14.0), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for
+    published = published_on(port)
+    fresh = [content for at_s, content in published if 0.5 < at_s < 3.0 or at_s > 13.0]
     assert not any(each.reasons & Reason.INPUT_STALE for each in fresh)
-    behind = [content for at_s, content in told if 9.0 < at_s < 9.9]
+    behind = [content for at_s, content in published if 9.0 < at_s < 9.9]
     assert len(behind) >= 9
     if stamps == "kernel":
         assert {each.status for each in behind} == {Status.INVALID}
         assert all(each.reasons & Reason.INPUT_STALE for each in behind)
-        assert behind[0].age_s == 6.0  # and falls by three seconds a second
+        assert behind[0].age_s == 6.0  # falls by three seconds a second
         assert behind[-1].age_s == 3.0
-    else:  # nobody can tell
+    else:  # without kernel stamps the lag is not known
         assert not any(each.reasons & Reason.INPUT_STALE for each in behind[1:])

@@ -1,4 +1,4 @@
-"""Frames that fail, on their whole way: what the estimator gets, what is told, what comes back."""
+"""Faulty frames through the whole pipeline: samples, estimates and published status."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from cangauge.bus.vehicle import Vehicle, VehicleSignal
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate, Reason, Sample, Status
-from cangauge.service.pipeline import EstimateStream, Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from live import leaf_model, short_log
 
 START = EstimatorSettings(initial_soc_pct=80.0)
 BEGINS_S, ENDS_S = 100.0, 104.0
-"""The fault."""
+"""Start and end of the fault [s]."""
 VEHICLE = Vehicle.load("generic")
 CURRENT, VOLTAGE, TEMPERATURE = 0x400, 0x401, 0x402
 SIGNALS: dict[int, VehicleSignal] = {signal.key: signal for signal in VEHICLE.signals}
-Spoil = Callable[[can.Message], None]
+Fault = Callable[[can.Message], None]
 
 
 def recorded(seconds: float = 130.0, vehicle: Vehicle = VEHICLE) -> list[can.Message]:
-    """Frames of a drive; the temperature comes with every sample, as from a cyclic sender."""
+    """Return the frames of a drive, temperature with every sample as from a cyclic sender."""
     log = short_log(seconds)
     frames = []
     for sample in samples_of(log):
-        frames += FrameEncoder(vehicle).encode(sample)  # a new one: slow signals are always due
+        frames += FrameEncoder(vehicle).encode(sample)  # a new encoder: slow signals are always due
     counters: dict[int, int] = {}
     for frame in frames:
         counter = counters.get(frame.arbitration_id, 0)
@@ -46,22 +46,22 @@ def recorded(seconds: float = 130.0, vehicle: Vehicle = VEHICLE) -> list[can.Mes
 FRAMES = recorded()
 
 
-def with_value(value: float) -> Spoil:
-    """The value in a frame that is whole."""
+def with_value(value: float) -> Fault:
+    """Return a fault that puts a value into a frame and keeps its protection valid."""
 
-    def spoil(frame: can.Message) -> None:
+    def fault(frame: can.Message) -> None:
         counter = GENERIC_RULE.counter(frame.data)
         SIGNALS[frame.arbitration_id].encode_into(frame.data, value)
         frame.data = bytearray(GENERIC_RULE.protect(frame.data, counter))
 
-    return spoil
+    return fault
 
 
 def flip(frame: can.Message) -> None:
     frame.data[0] ^= 0x40
 
 
-def stand_still(frame: can.Message) -> None:
+def repeat_counter(frame: can.Message) -> None:
     frame.data = bytearray(GENERIC_RULE.protect(frame.data, 7))
 
 
@@ -70,50 +70,50 @@ def cut(frame: can.Message) -> None:
 
 
 @dataclass
-class Told:
-    """What came out: samples and estimates, and what a heartbeat said after every sample time."""
+class Result:
+    """Samples, estimates, and the heartbeat after every frame by the frame's stamp."""
 
     samples: list[Sample]
     estimates: list[Estimate]
-    heard: dict[float, SocEstimate]
-    gauge: Gauge
+    published: dict[float, SocEstimate]
+    pipeline: Pipeline
 
-    def heard_at(self, time_s: float) -> SocEstimate:
-        return self.heard[min(self.heard, key=lambda each: abs(each - time_s))]
+    def published_at(self, time_s: float) -> SocEstimate:
+        return self.published[min(self.published, key=lambda each: abs(each - time_s))]
 
 
-def run(frames: list[can.Message], settings: EstimatorSettings = START) -> Told:
-    gauge, reader = Gauge(VEHICLE, leaf_model(), GaugeSettings(settings)), SocReader()
-    told = Told([], [], {}, gauge)
+def run(frames: list[can.Message], settings: EstimatorSettings = START) -> Result:
+    pipeline, reader = Pipeline(VEHICLE, leaf_model(), PipelineSettings(settings)), SocReader()
+    result = Result([], [], {}, pipeline)
     for frame in copy.deepcopy(frames):
-        before = gauge.samples
-        gauge.handle(frame)
-        if gauge.samples != before:
-            assert gauge.latest_sample is not None
-            told.samples.append(gauge.latest_sample)
-            told.estimates.append(gauge.latest)
-        heard = reader.read(gauge.heartbeat(is_stale=False)[0])
-        assert isinstance(heard, SocEstimate)
-        told.heard[frame.timestamp] = heard
-    return told
+        before = pipeline.samples
+        pipeline.handle(frame)
+        if pipeline.samples != before:
+            assert pipeline.latest_sample is not None
+            result.samples.append(pipeline.latest_sample)
+            result.estimates.append(pipeline.latest)
+        published = reader.read(pipeline.heartbeat(is_stale=False)[0])
+        assert isinstance(published, SocEstimate)
+        result.published[frame.timestamp] = published
+    return result
 
 
-def spoilt(frame_id: int, spoil: Spoil, begins_s: float = BEGINS_S, ends_s: float = ENDS_S):  # type: ignore[no-untyped-def] # a list of frames
+def with_fault(frame_id: int, fault: Fault, begins_s: float = BEGINS_S, ends_s: float = ENDS_S):  # type: ignore[no-untyped-def] # a list of frames
     frames = copy.deepcopy(FRAMES)
     for frame in frames:
         if frame.arbitration_id == frame_id and begins_s <= frame.timestamp < ends_s:
-            spoil(frame)
+            fault(frame)
     return frames
 
 
 @pytest.fixture(scope="module")
-def undisturbed() -> Told:
+def undisturbed() -> Result:
     return run(FRAMES)
 
 
 FAULTS = {
     "crc": (flip, Reason.PROTECTION_FAILED),
-    "counter": (stand_still, Reason.PROTECTION_FAILED),
+    "counter": (repeat_counter, Reason.PROTECTION_FAILED),
     "short": (cut, Reason.PROTECTION_FAILED),
     "not available": (with_value(math.nan), Reason.NONE),
     "out of range": (with_value(9000.0), Reason.IMPLAUSIBLE_INPUT),
@@ -143,86 +143,86 @@ HEALTH = (
 )
 
 
-def test_a_drive_without_faults_has_nothing_to_say(undisturbed: Told) -> None:
+def test_drive_without_faults_raises_no_reason(undisturbed: Result) -> None:
     assert len(undisturbed.samples) == 1300
     after = [each.reasons for each in undisturbed.estimates]
     assert not any(reasons & HEALTH for reasons in after)
-    counts = undisturbed.gauge.counts
+    counts = undisturbed.pipeline.counts
     assert (counts.implausible, counts.stuck, counts.held_back, counts.repeated) == (0, 0, 0, 0)
 
 
 @pytest.mark.parametrize(("frame_id", "name"), CASES)
-def test_what_fails_is_told_and_never_reaches_the_estimator(
-    undisturbed: Told, frame_id: int, name: str
+def test_faulty_values_are_reported_and_never_used(
+    undisturbed: Result, frame_id: int, name: str
 ) -> None:
-    spoil, why = FAULTS_OF[frame_id][name]
-    ends_s = BEGINS_S + 1.5 if name == "too fast" else ENDS_S  # a lasting step is believed then
-    told = run(spoilt(frame_id, spoil, ends_s=ends_s))
-    # Nothing but what was sent before, or nothing at all.
+    fault, why = FAULTS_OF[frame_id][name]
+    ends_s = BEGINS_S + 1.5 if name == "too fast" else ENDS_S  # a lasting step is accepted then
+    result = run(with_fault(frame_id, fault, ends_s=ends_s))
+    # Only values that were sent before, or none.
     sent = {sample.time_s: sample for sample in undisturbed.samples}
-    for sample in told.samples:
+    for sample in result.samples:
         for value, good in zip(sample, sent[sample.time_s], strict=True):
             assert value == good or math.isnan(value)
-    # Still valid after four failures, missing after five, and why.
+    # Still valid after four failures; missing after five, with the cause.
     missing = MISSING[frame_id]
-    before = told.heard_at(BEGINS_S + 0.35)
+    before = result.published_at(BEGINS_S + 0.35)
     assert not before.reasons & missing
-    during = told.heard_at(ends_s - 0.05)
+    during = result.published_at(ends_s - 0.05)
     assert during.reasons & HEALTH == missing | why
     invalid = frame_id == CURRENT
     assert during.status is (Status.INVALID if invalid else Status.DEGRADED)
-    assert math.isfinite(during.soc_pct)  # old, not unknown
-    # Two good values are not enough to come back, three are.
-    assert told.heard_at(ends_s + 0.1).reasons & missing
-    after = told.heard_at(ends_s + 0.3)
+    assert math.isfinite(during.soc_pct)  # old, but known
+    # It takes three good values to recover.
+    assert result.published_at(ends_s + 0.1).reasons & missing
+    after = result.published_at(ends_s + 0.3)
     assert not after.reasons & HEALTH & ~Reason.CURRENT_GAP
     assert after.status is not Status.INVALID
-    assert told.estimates[-1].soc_pct == pytest.approx(undisturbed.estimates[-1].soc_pct, abs=0.1)
+    assert result.estimates[-1].soc_pct == pytest.approx(undisturbed.estimates[-1].soc_pct, abs=0.1)
 
 
 @pytest.mark.parametrize("frame_id", [CURRENT, VOLTAGE, TEMPERATURE])
-def test_a_few_bad_frames_are_not_worth_a_word(frame_id: int) -> None:
-    told = run(spoilt(frame_id, flip, ends_s=BEGINS_S + 0.35))
-    assert told.gauge.counts.crc_errors == 4
-    assert not any(heard.reasons & HEALTH for heard in list(told.heard.values())[10:])
+def test_a_few_bad_frames_raise_no_reason(frame_id: int) -> None:
+    result = run(with_fault(frame_id, flip, ends_s=BEGINS_S + 0.35))
+    assert result.pipeline.counts.crc_errors == 4
+    assert not any(published.reasons & HEALTH for published in list(result.published.values())[10:])
 
 
 def test_one_sample_without_voltage_is_not_degraded() -> None:
     settled = run(recorded(80.0))
     assert settled.estimates[-1].status is Status.VALID
-    told = run([f for f in recorded(80.0) if f.arbitration_id != VOLTAGE or f.timestamp != 75.0])
-    without = [n for n, sample in enumerate(told.samples) if math.isnan(sample.voltage_v)]
+    result = run([f for f in recorded(80.0) if f.arbitration_id != VOLTAGE or f.timestamp != 75.0])
+    without = [n for n, sample in enumerate(result.samples) if math.isnan(sample.voltage_v)]
     assert len(without) == 1
-    assert told.estimates[without[0]].status is Status.VALID
+    assert result.estimates[without[0]].status is Status.VALID
 
 
 @pytest.mark.parametrize(("frame_id", "missing"), list(MISSING.items()))
-def test_a_message_that_stops_times_out_in_bus_time(frame_id: int, missing: Reason) -> None:
+def test_missing_message_times_out_in_bus_time(frame_id: int, missing: Reason) -> None:
     frames = [f for f in FRAMES if f.arbitration_id != frame_id or f.timestamp < BEGINS_S]
-    told = run(frames)
+    result = run(frames)
     timeout_s = 10.0 if frame_id == TEMPERATURE else 1.0  # ten periods of a cyclic message
-    assert not told.heard_at(BEGINS_S + timeout_s - 0.25).reasons & missing
-    late = told.heard_at(BEGINS_S + timeout_s + 0.15)
+    assert not result.published_at(BEGINS_S + timeout_s - 0.25).reasons & missing
+    late = result.published_at(BEGINS_S + timeout_s + 0.15)
     assert late.reasons & HEALTH == missing
     assert late.status is (Status.INVALID if frame_id == CURRENT else Status.DEGRADED)
 
 
-def test_a_jump_of_the_counter_is_loss_and_costs_nothing(undisturbed: Told) -> None:
+def test_alive_counter_jump_counts_as_loss_only(undisturbed: Result) -> None:
     frames = [f for f in FRAMES if not BEGINS_S < f.timestamp < BEGINS_S + 0.45]
-    told = run(frames)
-    assert told.gauge.counts.lost == 12
-    assert told.gauge.counts.repeated == told.gauge.counts.held_back == 0
-    assert len(told.samples) == len(undisturbed.samples) - 4
-    assert not any(heard.reasons & HEALTH for heard in list(told.heard.values())[10:])
+    result = run(frames)
+    assert result.pipeline.counts.lost == 12
+    assert result.pipeline.counts.repeated == result.pipeline.counts.held_back == 0
+    assert len(result.samples) == len(undisturbed.samples) - 4
+    assert not any(published.reasons & HEALTH for published in list(result.published.values())[10:])
 
 
-def test_doubled_frames_change_nothing_but_the_count(undisturbed: Told) -> None:
-    told = run([frame for frame in FRAMES for _ in range(2)])
-    assert told.gauge.counts.repeated == len(FRAMES)
-    assert told.estimates == undisturbed.estimates
+def test_doubled_frames_change_only_the_counts(undisturbed: Result) -> None:
+    result = run([frame for frame in FRAMES for _ in range(2)])
+    assert result.pipeline.counts.repeated == len(FRAMES)
+    assert result.estimates == undisturbed.estimates
 
 
-def test_a_frozen_voltage_is_found_and_charge_counted_on() -> None:
+def test_stuck_voltage_is_found_and_charge_still_counted() -> None:
     seen: list[float] = []
 
     def freeze(frame: can.Message) -> None:
@@ -230,74 +230,78 @@ def test_a_frozen_voltage_is_found_and_charge_counted_on() -> None:
         seen.append(signal.decode(frame.data))
         with_value(seen[0])(frame)
 
-    told = run(spoilt(VOLTAGE, freeze, begins_s=30.0, ends_s=120.0))
-    heard = told.heard_at(119.9)
-    assert heard.reasons & HEALTH == Reason.VOLTAGE_MISSING | Reason.SIGNAL_STUCK
-    assert heard.status is Status.DEGRADED
-    assert len(told.samples) == 1300
-    assert told.gauge.counts.stuck > 100
-    assert not told.estimates[-1].reasons & HEALTH
+    result = run(with_fault(VOLTAGE, freeze, begins_s=30.0, ends_s=120.0))
+    published = result.published_at(119.9)
+    assert published.reasons & HEALTH == Reason.VOLTAGE_MISSING | Reason.SIGNAL_STUCK
+    assert published.status is Status.DEGRADED
+    assert len(result.samples) == 1300
+    assert result.pipeline.counts.stuck > 100
+    assert not result.estimates[-1].reasons & HEALTH
 
 
-def test_a_frozen_current_makes_the_estimate_invalid() -> None:
+def test_stuck_current_makes_the_estimate_invalid() -> None:
     frames = copy.deepcopy(FRAMES)
     for frame in frames:
         if frame.arbitration_id == CURRENT and frame.timestamp >= 60.0:
             with_value(11.0)(frame)
         if frame.arbitration_id == VOLTAGE and frame.timestamp >= 60.0:
-            # The short drive's currents are gentle: this is what a spirited one shows.
+            # Voltage swings of a drive with stronger currents than the log's.
             with_value(370.0 + 12.0 * math.sin(frame.timestamp))(frame)
-    heard = run(frames).heard_at(129.0)
-    assert heard.status is Status.INVALID
-    assert heard.reasons & HEALTH == Reason.CURRENT_MISSING | Reason.SIGNAL_STUCK
-    assert math.isfinite(heard.soc_pct)
+    published = run(frames).published_at(129.0)
+    assert published.status is Status.INVALID
+    assert published.reasons & HEALTH == Reason.CURRENT_MISSING | Reason.SIGNAL_STUCK
+    assert math.isfinite(published.soc_pct)
 
 
-def test_heartbeats_and_their_clock_never_change_the_numbers() -> None:
-    """The estimator's input is a function of the frames and their stamps alone."""
-    frames = spoilt(CURRENT, flip)
+def test_heartbeats_never_change_the_numbers() -> None:
+    """Estimates depend on the frames and their stamps only."""
+    frames = with_fault(CURRENT, flip)
     watched = run(frames).estimates
-    stream = EstimateStream(VEHICLE, leaf_model(), START)
-    alone = [each for frame in copy.deepcopy(frames) if (each := stream.handle(frame)) is not None]
+    pipeline = Pipeline(VEHICLE, leaf_model(), PipelineSettings(START))
+    alone = [pipeline.latest for frame in copy.deepcopy(frames) if pipeline.handle(frame)]
     assert watched == alone
 
 
-def test_while_nothing_arrives_the_clock_of_the_loop_decides() -> None:
-    told = run(FRAMES[:1200])
+def test_silence_is_timed_by_the_loops_clock() -> None:
+    result = run(FRAMES[:1200])
     reader = SocReader()
 
-    def heard(silent_s: float) -> SocEstimate:
-        content = reader.read(told.gauge.heartbeat(is_stale=False, silent_s=silent_s)[0])
+    def published(silent_s: float) -> SocEstimate:
+        content = reader.read(result.pipeline.heartbeat(is_stale=False, silent_s=silent_s)[0])
         assert isinstance(content, SocEstimate)
         return content
 
-    assert heard(0.9).status is not Status.INVALID  # ten periods of 0.1 s
-    assert heard(1.1).status is Status.INVALID
-    assert heard(1.1).reasons & Reason.INPUT_STALE
-    assert (heard(1.1).age_s, heard(29.0).age_s, heard(86400.0).age_s) == (1.0, 29.0, 30.0)
-    assert heard(86400.0).soc_pct == heard(0.0).soc_pct
+    assert published(0.9).status is not Status.INVALID  # ten periods of 0.1 s
+    assert published(1.1).status is Status.INVALID
+    assert published(1.1).reasons & Reason.INPUT_STALE
+    assert (published(1.1).age_s, published(29.0).age_s, published(86400.0).age_s) == (
+        1.0,
+        29.0,
+        30.0,
+    )
+    assert published(86400.0).soc_pct == published(0.0).soc_pct
 
 
-def test_a_slow_source_is_not_stale_between_its_samples() -> None:
+def test_slow_source_is_not_stale_between_samples() -> None:
     log = short_log(200.0, rate_hz=0.2)
-    gauge = Gauge(VEHICLE, leaf_model(), GaugeSettings(START))
+    pipeline = Pipeline(VEHICLE, leaf_model(), PipelineSettings(START))
     encoder = FrameEncoder(VEHICLE)
     for sample in samples_of(log):
         for frame in encoder.encode(sample):
-            gauge.handle(frame)
-    assert gauge.patience_s == pytest.approx(15.0)
-    replayed = Gauge(VEHICLE, leaf_model(), GaugeSettings(START, "replay-clock"))
-    assert replayed.patience_s == 0.0
+            pipeline.handle(frame)
+    assert pipeline.least_timeout_s == pytest.approx(15.0)
+    replayed = Pipeline(VEHICLE, leaf_model(), PipelineSettings(START, "replay-clock"))
+    assert replayed.least_timeout_s == 0.0
 
 
-def test_never_seen_and_always_refused_says_why() -> None:
+def test_reason_is_given_for_signals_never_accepted() -> None:
     frames = copy.deepcopy(FRAMES[:100])
     for frame in frames:
         flip(frame)
-    told = run(frames)
-    heard = told.heard_at(frames[-1].timestamp)
-    assert heard.status is Status.INITIALISING
-    assert math.isnan(heard.soc_pct)
-    assert math.isnan(heard.age_s)
-    assert heard.reasons & Reason.PROTECTION_FAILED
-    assert heard.reasons & Reason.NO_INITIAL_SOC
+    result = run(frames)
+    published = result.published_at(frames[-1].timestamp)
+    assert published.status is Status.INITIALISING
+    assert math.isnan(published.soc_pct)
+    assert math.isnan(published.age_s)
+    assert published.reasons & Reason.PROTECTION_FAILED
+    assert published.reasons & Reason.NO_INITIAL_SOC

@@ -1,4 +1,4 @@
-"""The receive loop on a bus: rates, silence, ends, a bus that fails."""
+"""The service's loop on a bus: rates, silence, ends, bus failures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cangauge.estimate.offline import samples_of
 from cangauge.estimate.validity import Reason, Status
 from cangauge.service.capture_estimate import estimate_capture
 from cangauge.service.loop import LoopSettings
-from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
 from live import (
     BrokenBus,
@@ -43,18 +43,18 @@ def send_log(port: BusConnection, seconds: float, pause_s: float = 0.0) -> None:
         time.sleep(pause_s)
 
 
-def test_before_any_frame_it_publishes_that_it_knows_nothing() -> None:
+def test_initialising_is_published_before_any_frame() -> None:
     with virtual_port("quiet") as listener, virtual_service("quiet"):
         frames = collect(listener, 1.25)
     reader = SocReader()
     contents = [reader.read(frame) for frame in frames]
-    told = [each for each in contents if isinstance(each, SocEstimate)]
-    assert 11 <= len(told) <= 14
-    assert {each.status for each in told} == {Status.INITIALISING}
+    estimates = [each for each in contents if isinstance(each, SocEstimate)]
+    assert 11 <= len(estimates) <= 14
+    assert {each.status for each in estimates} == {Status.INITIALISING}
     assert sum(isinstance(each, SocDetail) for each in contents) == 2
 
 
-def test_an_estimate_is_published_every_100_ms_also_where_samples_are_slower() -> None:
+def test_publishes_every_100_ms_with_slower_samples() -> None:
     with virtual_port("slow") as port, virtual_service("slow"):
         for sample in samples_of(short_log(2.0, rate_hz=2.0)):
             for frame in FrameEncoder(Vehicle.load("generic")).encode(sample):
@@ -75,26 +75,26 @@ def collect_queue(port: BusConnection) -> list[can.Message]:
     return found
 
 
-def test_silence_becomes_stale_and_input_becomes_valid_again() -> None:
+def test_silence_is_stale_until_input_returns() -> None:
     loop = LoopSettings(timeout_s=0.3)
     reader = SocReader()
     with virtual_port("stale") as port, virtual_service("stale", loop=loop) as service:
         send_log(port, 10.0)
-        assert waits(lambda: service.gauge.samples == 100)
+        assert waits(lambda: service.pipeline.samples == 100)
         collect_queue(port)
         contents = [reader.read(frame) for frame in collect(port, 0.8)]
-        told = [each for each in contents if isinstance(each, SocEstimate)]
-        assert told[0].status is Status.DEGRADED  # not yet: its delay line is filling
-        assert told[-1].status is Status.INVALID
-        assert told[-1].reasons & Reason.INPUT_STALE
+        estimates = [each for each in contents if isinstance(each, SocEstimate)]
+        assert estimates[0].status is Status.DEGRADED  # its delay line is still filling
+        assert estimates[-1].status is Status.INVALID
+        assert estimates[-1].reasons & Reason.INPUT_STALE
         send_log(port, 1.0, pause_s=0.02)
         contents = [reader.read(frame) for frame in collect_queue(port)]
-        told = [each for each in contents if isinstance(each, SocEstimate)]
-        assert told[-1].status is Status.DEGRADED
-        assert not told[-1].reasons & Reason.INPUT_STALE
+        estimates = [each for each in contents if isinstance(each, SocEstimate)]
+        assert estimates[-1].status is Status.DEGRADED
+        assert not estimates[-1].reasons & Reason.INPUT_STALE
 
 
-def test_recording_and_table_hold_what_was_live(tmp_path: Path) -> None:
+def test_recording_and_table_equal_the_live_estimates(tmp_path: Path) -> None:
     path = tmp_path / "live.log"
     with (
         Recorder(path) as recorder,
@@ -102,27 +102,27 @@ def test_recording_and_table_hold_what_was_live(tmp_path: Path) -> None:
         virtual_service("record", record=recorder) as service,
     ):
         send_log(port, 20.0)
-        assert waits(lambda: service.gauge.samples == 200)
+        assert waits(lambda: service.pipeline.samples == 200)
     recorded = estimate_capture(path, Vehicle.load("generic"), leaf_model())
     assert recorded.table.soc_pct.tolist() == [each.soc_pct for _, each in service.rows]
     assert recorded.table.residual_v.tolist() == [each.residual_v for _, each in service.rows]
     assert recorded.time_source == "receive"
 
 
-def test_it_ends_after_a_time_or_when_idle() -> None:
+def test_ends_after_duration_or_when_idle() -> None:
     with virtual_service("brief", loop=LoopSettings(duration_s=0.3)) as service:
         service.join(2.0)
     assert service.summary is not None
     assert service.summary.seconds == pytest.approx(0.3, abs=0.15)
     loop = LoopSettings(until_idle_s=0.3)
     with virtual_port("idle") as port, virtual_service("idle", loop=loop) as service:
-        time.sleep(0.5)  # idle from the beginning is no end
+        time.sleep(0.5)  # idle before the first sample does not end it
         send_log(port, 3.0)
         service.join(3.0)
-    assert service.gauge.samples == 30
+    assert service.pipeline.samples == 30
 
 
-def test_a_replays_clock_on_the_bus_is_warned_of_once_and_not_recorded(tmp_path: Path) -> None:
+def test_ignored_replay_clock_is_warned_of_once(tmp_path: Path) -> None:
     path = tmp_path / "receive.log"
     with (
         Recorder(path) as recorder,
@@ -132,7 +132,7 @@ def test_a_replays_clock_on_the_bus_is_warned_of_once_and_not_recorded(tmp_path:
         for _ in range(3):
             port.send(ClockFrames().at(5_000_000))
         send_log(port, 2.0)
-        assert waits(lambda: service.gauge.samples == 20)
+        assert waits(lambda: service.pipeline.samples == 20)
     assert len(service.warnings) == 1
     assert "--time-source replay-clock" in service.warnings[0]
     assert "#" in path.read_text()
@@ -140,14 +140,14 @@ def test_a_replays_clock_on_the_bus_is_warned_of_once_and_not_recorded(tmp_path:
 
 
 def serve_on(bus: BrokenBus, seconds: float) -> Service:
-    gauge = Gauge(Vehicle.load("generic"), leaf_model(), GaugeSettings())
+    pipeline = Pipeline(Vehicle.load("generic"), leaf_model(), PipelineSettings())
     port = BusConnection(bus, "fake bus")  # type: ignore[arg-type] # has what a bus is used for
-    with Service(port, gauge, LoopSettings(duration_s=seconds)) as service:
+    with Service(port, pipeline, LoopSettings(duration_s=seconds)) as service:
         service.join(5.0)
     return service
 
 
-def test_a_packet_of_junk_is_passed_over() -> None:
+def test_garbled_packets_are_skipped() -> None:
     service = serve_on(BrokenBus([unpack_error(), unpack_error()]), 0.25)
     assert service.error is None
     assert service.port.garbled == 2
@@ -156,25 +156,25 @@ def test_a_packet_of_junk_is_passed_over() -> None:
 def test_error_frames_are_counted() -> None:
     service = serve_on(BrokenBus([can.Message(is_error_frame=True)]), 0.2)
     assert service.port.error_frames == 1
-    assert service.gauge.counts.frames == 0
+    assert service.pipeline.counts.frames == 0
 
 
 @pytest.mark.parametrize("error", [network_down(), OSError(errno.ENODEV, "No such device")])
-def test_a_bus_that_is_gone_ends_the_service_with_a_clear_line(error: BaseException) -> None:
+def test_lost_bus_ends_the_service_with_one_line(error: BaseException) -> None:
     service = serve_on(BrokenBus([error]), 5.0)
     assert isinstance(service.error, BusError)
     assert "fake bus: receiving failed" in str(service.error)
     assert service.error.exit_code == 1
 
 
-def test_a_full_queue_costs_frames_and_not_the_service() -> None:
+def test_full_transmit_queue_costs_frames_only() -> None:
     full = can.CanOperationError("Failed to transmit: No buffer space", errno.ENOBUFS)
     service = serve_on(BrokenBus([], sending=full), 0.5)
     assert service.error is None
     assert service.port.unsent > 2
 
 
-def test_sending_on_a_dead_bus_ends_it() -> None:
+def test_failed_sending_ends_the_service() -> None:
     service = serve_on(BrokenBus([], sending=network_down()), 5.0)
     assert isinstance(service.error, BusError)
     assert "sending failed" in str(service.error)

@@ -1,4 +1,4 @@
-"""Recorded cars: no false alarm about their signals, and real frames spoilt are refused."""
+"""Recorded cars: no false alarms about signals; damaged real frames are refused."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from cangauge.estimate.offline import run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate, Reason, Status
 from cangauge.logs.read import read_log
-from cangauge.service.pipeline import EstimateStream
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from live import leaf_model
 
 pytestmark = pytest.mark.real
@@ -43,39 +43,40 @@ CAPTURES = {
 START = EstimatorSettings(initial_soc_pct=60.0)
 
 
-def capture(shared_data: Path, name: str) -> tuple[EstimateStream, list[can.Message]]:
+def capture(shared_data: Path, name: str) -> tuple[Pipeline, list[can.Message]]:
     preset = CAPTURES[name]
     vehicle = Vehicle.load(preset, temperature_c=20.0 if preset == "leaf_ze1" else None)
     frames = list(open_vehicle_capture(shared_data / "leaf_can" / name, vehicle))
-    return EstimateStream(vehicle, leaf_model(), START), frames
+    return Pipeline(vehicle, leaf_model(), PipelineSettings(START)), frames
 
 
 @pytest.mark.parametrize("name", list(CAPTURES))
-def test_captures_of_real_leafs_raise_no_alarm(shared_data: Path, name: str) -> None:
-    stream, frames = capture(shared_data, name)
-    estimates = [each for frame in frames if (each := stream.handle(frame)) is not None]
+def test_real_leaf_captures_raise_no_alarm(shared_data: Path, name: str) -> None:
+    pipeline, frames = capture(shared_data, name)
+    estimates = [pipeline.latest for frame in frames if pipeline.handle(frame)]
     assert not any(each.reasons & ALARMS for each in estimates)
-    counts = stream.counts
+    counts = pipeline.counts
     assert (counts.implausible, counts.stuck, counts.held_back, counts.repeated) == (0, 0, 0, 0)
-    assert not stream.told.reasons & (ALARMS | Reason.VOLTAGE_MISSING | Reason.TEMPERATURE_MISSING)
+    assert not pipeline.estimate_now().reasons & (
+        ALARMS | Reason.VOLTAGE_MISSING | Reason.TEMPERATURE_MISSING
+    )
 
 
 @pytest.mark.parametrize("preset", ["generic", "leaf_aze0"])
 @pytest.mark.parametrize("trip", ["TripA13", "TripA14", "TripB18"])
-def test_trips_replayed_raise_no_alarm_and_keep_their_numbers(
+def test_replayed_trips_raise_no_alarm_and_match_offline(
     shared_data: Path, trip: str, preset: str
 ) -> None:
-    """In steps of 0.0001 V and of 0.5 V, through traffic and at rest; whole degrees."""
+    """Signals in steps of 0.0001 V or 0.5 V and whole degrees, in traffic and at rest."""
     vehicle = Vehicle.load(preset)
     log = read_log(shared_data / "bmw_i3" / f"{trip}.csv.gz")
-    stream, encoder = EstimateStream(vehicle, leaf_model(), START), FrameEncoder(vehicle)
+    pipeline = Pipeline(vehicle, leaf_model(), PipelineSettings(START))
+    encoder = FrameEncoder(vehicle)
     estimates: list[Estimate] = []
     for sample in samples_of(FrameEncoder(vehicle).quantise(log)):
-        for frame in encoder.encode(sample):
-            estimate = stream.handle(frame)
-            if estimate is not None:
-                estimates.append(estimate)
-    counts = stream.counts
+        frames = encoder.encode(sample)
+        estimates += [pipeline.latest for frame in frames if pipeline.handle(frame)]
+    counts = pipeline.counts
     assert (counts.implausible, counts.stuck, counts.held_back) == (0, 0, 0)
     settings = replace(START, temperature_source=vehicle.temperature_source)
     offline = run_estimator(samples_of(encoder.quantise(log)), leaf_model(), settings)
@@ -87,7 +88,7 @@ def flip(frame: can.Message) -> None:
     frame.data[2] ^= 0x10
 
 
-def stand_still(frame: can.Message) -> None:
+def repeat_counter(frame: can.Message) -> None:
     frame.data = bytearray(LEAF_RULE.protect(frame.data, 1))
 
 
@@ -96,31 +97,31 @@ def cut(frame: can.Message) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "counted"), [(flip, "crc_errors"), (stand_still, "repeated"), (cut, "short")]
+    ("damage", "counted"), [(flip, "crc_errors"), (repeat_counter, "repeated"), (cut, "short")]
 )
-def test_real_frames_spoilt_for_a_second(
-    shared_data: Path, spoil: Callable[[can.Message], None], counted: str
+def test_real_frames_damaged_for_a_second_are_refused(
+    shared_data: Path, damage: Callable[[can.Message], None], counted: str
 ) -> None:
-    stream, frames = capture(shared_data, "ZE0w24kWhstock.log.gz")
+    pipeline, frames = capture(shared_data, "ZE0w24kWhstock.log.gz")
     whole, _ = capture(shared_data, "ZE0w24kWhstock.log.gz")
     begins_s = frames[0].timestamp + 30.0
-    told: dict[float, Estimate] = {}
+    published: dict[float, Estimate] = {}
     frames = [frame for frame in frames if frame.arbitration_id in {0x1DB, 0x55B, 0x5C0}]
     for frame in frames:
         whole.handle(copy.copy(frame))
         at_s = frame.timestamp - begins_s
         if frame.arbitration_id == 0x1DB and 0.0 <= at_s < 1.0:
-            spoil(frame)
-        stream.handle(frame)
-        told[at_s] = stream.told
-    during = [each for at_s, each in told.items() if 0.1 < at_s < 1.0]
+            damage(frame)
+        pipeline.handle(frame)
+        published[at_s] = pipeline.estimate_now()
+    during = [each for at_s, each in published.items() if 0.1 < at_s < 1.0]
     assert all(each.status is Status.INVALID for each in during)
     assert all(
         each.reasons & (Reason.PROTECTION_FAILED | Reason.CURRENT_MISSING)
         == Reason.PROTECTION_FAILED | Reason.CURRENT_MISSING
         for each in during
     )
-    after = [each for at_s, each in told.items() if at_s > 1.05]
+    after = [each for at_s, each in published.items() if at_s > 1.05]
     assert not any(each.reasons & ALARMS for each in after)
-    assert getattr(stream.counts, counted) >= 99
-    assert stream.latest.soc_pct == pytest.approx(whole.latest.soc_pct, abs=0.01)
+    assert getattr(pipeline.counts, counted) >= 99
+    assert pipeline.latest.soc_pct == pytest.approx(whole.latest.soc_pct, abs=0.01)

@@ -26,7 +26,7 @@ from cangauge.estimate.offline import samples_of
 from cangauge.replay.steps import CaptureSource
 from cangauge.service import recording
 from cangauge.service.capture_estimate import estimate_capture
-from cangauge.service.pipeline import Gauge
+from cangauge.service.pipeline import Pipeline
 from cangauge.service.recording import RecordBuffer, Recorder, RecordLimits
 from live import in_process, leaf_model, leaf_model_path, short_log, waits
 
@@ -69,7 +69,7 @@ def need(suffix: str) -> None:
 def test_parts_are_one_capture_and_give_the_live_numbers(tmp_path: Path, suffix: str) -> None:
     need(suffix)
     messages = frames(60.0)
-    gauge = Gauge(Vehicle.load("generic"), leaf_model())
+    gauge = Pipeline(Vehicle.load("generic"), leaf_model())
     live = []
     now = [0.0]
     limits = RecordLimits(part_bytes=20_000, part_s=12.0)

@@ -27,7 +27,7 @@ from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate, Reason, Sample, Status
 from cangauge.model.model_file import Model
 from cangauge.service import state as state_keeper
-from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.state import (
     FILE_NAME,
     StateContent,
@@ -62,13 +62,13 @@ class Machine:
     clock: Clock = field(default_factory=Clock)
     logged: LoggedLines = field(default_factory=lambda: LoggedLines("cangauge.service.state"))
     model: Model = MODEL
-    settings: GaugeSettings = field(default_factory=GaugeSettings)
+    settings: PipelineSettings = field(default_factory=PipelineSettings)
     max_age_s: float = 86400.0
 
     def start(self) -> Service:
         self.logged.__enter__()
         self.said.clear()
-        gauge = Gauge(VEHICLE, self.model, self.settings)
+        gauge = Pipeline(VEHICLE, self.model, self.settings)
         keeper = StateKeeper(
             StateSettings(self.path, self.max_age_s),
             gauge,
@@ -89,7 +89,7 @@ class Machine:
 @dataclass
 class Service:
     machine: Machine
-    gauge: Gauge
+    gauge: Pipeline
     keeper: StateKeeper
     encoder: FrameEncoder = field(default_factory=lambda: FrameEncoder(VEHICLE))
 
@@ -203,7 +203,7 @@ def test_the_state_is_written_only_after_new_samples(machine: Machine) -> None:
 def test_after_a_long_pause_the_soc_approaches_the_voltage(
     machine: Machine,
 ) -> None:
-    machine.settings = GaugeSettings(EstimatorSettings(initial_soc_pct=80.0))
+    machine.settings = PipelineSettings(EstimatorSettings(initial_soc_pct=80.0))
     last = kept(machine)[-1]
     machine.clock.wall_s += 8 * 3600.0
     # The night's model error is 1.3 V, more than 3 % SoC there: much, and yet within the model's.
@@ -248,8 +248,8 @@ def test_a_car_that_was_charged_meanwhile_is_found_out_and_told(machine: Machine
 def _shift_soc(content: dict[str, Any], by_pct: float) -> None:
     state = content["estimator"]
     state["estimate"][1] += by_pct
-    state["coulomb_start_pct"] += by_pct
-    for each in state["belief"]["filters"]:
+    state["memory"]["coulomb_start_pct"] += by_pct
+    for each in state["filter"]["hypotheses"]:
         each["x"][0] += by_pct
 
 
@@ -288,13 +288,13 @@ def test_after_the_machine_was_off_its_clock_is_not_believed(machine: Machine) -
     rewritten(machine.path, lambda content: content.update(boot_id="another"))
     service = machine.start()
     service.drive(DRIVE[1000:1001])
-    assert service.gauge.pause_verdict == "open"
+    assert service.gauge.estimator.filter.verdict == "open"
 
 
 @pytest.mark.parametrize("change", [{"method": "coulomb"}, {"capacity_ah": 55.0}])
 def test_a_changed_setting_keeps_the_soc(machine: Machine, change: dict[str, Any]) -> None:
     last = kept(machine)[-1]
-    machine.settings = GaugeSettings(EstimatorSettings(**change))
+    machine.settings = PipelineSettings(EstimatorSettings(**change))
     service = machine.start()
     assert service.keeper.restored
     found = service.drive(DRIVE[1000:1010])
@@ -302,7 +302,7 @@ def test_a_changed_setting_keeps_the_soc(machine: Machine, change: dict[str, Any
 
 
 def test_a_replayed_log_goes_on_and_another_one_begins_anew(machine: Machine) -> None:
-    machine.settings = GaugeSettings(time_source="replay-clock")
+    machine.settings = PipelineSettings(time_source="replay-clock")
     clock = ClockFrames()
 
     def play(service: Service, samples: list[Sample]) -> Estimate:
@@ -414,15 +414,17 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "unknown key": (edited("more", value=1), "content.more"),
     "soc beyond": (edited("estimator", "estimate", 1, value=130.0), "outside 0–100"),
     "another soc": (edited("estimator", "estimate", 1, value=33.0), "the last estimate"),
-    "later than the latest": (edited("estimator", "rest_since_s", value=1e11), "later than"),
-    "filter beyond": (edited("estimator", "belief", "filters", 0, "x", 0, value=-3.0),
-                      "belief.filters"),
-    "no covariance": (edited("estimator", "belief", "filters", 0, "p", 0, 0, value=-1.0),
-                      "belief.filters"),
-    "a state too many": (edited("estimator", "belief", "filters", 0, "x", value=[1.0] * 9),
-                         "belief.filters"),
+    "later than the latest": (edited("estimator", "memory", "rest_since_s", value=1e11),
+                              "later than"),
+    "filter beyond": (edited("estimator", "filter", "hypotheses", 0, "x", 0, value=-3.0),
+                      "filter.hypotheses"),
+    "no covariance": (edited("estimator", "filter", "hypotheses", 0, "p", 0, 0, value=-1.0),
+                      "filter.hypotheses"),
+    "a state too many": (edited("estimator", "filter", "hypotheses", 0, "x", value=[1.0] * 9),
+                         "filter.hypotheses"),
     "line backwards": (edited("estimator", "line", "time_s", 3, value=0.0), "must increase"),
-    "a word": (edited("estimator", "samples", value="many"), "content.estimator.samples"),
+    "a word": (edited("estimator", "memory", "samples", value="many"),
+               "content.estimator.memory.samples"),
     "effects": (edited("estimator", "effects", value=[[1.0]]), "the model has 0 effects"),
     "no soc": (edited("estimator", "estimate", 1, value=None), "has no SoC"),
 }  # fmt: skip
@@ -593,14 +595,14 @@ def test_where_the_file_is(tmp_path: Path) -> None:
 def test_a_state_holds_no_nan_and_is_plain_json(machine: Machine) -> None:
     kept(machine, 20)
     data = json.loads(machine.path.read_text(), parse_constant=pytest.fail)
-    assert data["content"]["estimator"]["gap_until_s"] is None
+    assert data["content"]["estimator"]["memory"]["gap_until_s"] is None
     assert math.isfinite(data["content"]["estimator"]["estimate"][1])
 
 
 @pytest.mark.parametrize("method", ["ekf", "coulomb"])
 def test_a_refused_state_starts_by_voltage(machine: Machine, method: Any) -> None:
     given = EstimatorSettings(method=method, initial_soc_pct=40.0, initial_soc_std_pct=1.0)
-    machine.settings = GaugeSettings(estimator=given)
+    machine.settings = PipelineSettings(estimator=given)
     first = machine.start()
     # At a first start it is believed: the drive begins at 80 %, so this shows.
     assert first.drive(DRIVE[:3])[-1].soc_pct == pytest.approx(40.0, abs=2.0)

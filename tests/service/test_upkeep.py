@@ -27,7 +27,7 @@ def run(channel: str, saves: Saves, every_s: float = 0.2) -> list[str]:
     service = virtual_service(channel)
 
     def checkpoint() -> None:
-        saves.samples.append(service.gauge.samples)
+        saves.samples.append(service.pipeline.samples)
         if saves.error is not None:
             raise saves.error
 
@@ -71,7 +71,7 @@ def test_a_state_that_cannot_be_saved_is_a_warning(error: Exception) -> None:
 
 def test_the_state_is_saved_also_when_the_service_breaks() -> None:
     saved = []
-    gauge = virtual_service("breaks").gauge
+    gauge = virtual_service("breaks").pipeline
     port = BusConnection(BrokenBus([network_down()]), "fake")  # type: ignore[arg-type] # has what is used
     with pytest.raises(BusError):
         serve(

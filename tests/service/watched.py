@@ -10,7 +10,7 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.service.lifecycle import Notifier
-from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.status import Identity, Monitor
 from live import leaf_model, short_log
 
@@ -43,8 +43,8 @@ class Watched:
     record: Any = None
 
     def __post_init__(self) -> None:
-        known = GaugeSettings(EstimatorSettings(initial_soc_pct=80.0))
-        self.gauge = Gauge(Vehicle.load("generic"), leaf_model(), known)
+        known = PipelineSettings(EstimatorSettings(initial_soc_pct=80.0))
+        self.gauge = Pipeline(Vehicle.load("generic"), leaf_model(), known)
         self.monitor = Monitor(
             self.gauge,
             self.port,

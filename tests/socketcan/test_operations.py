@@ -20,7 +20,7 @@ from cangauge.service.capture_estimate import estimate_capture
 from cangauge.service.http import Endpoint
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.loop import LoopSettings, Outputs, serve
-from cangauge.service.pipeline import Gauge
+from cangauge.service.pipeline import Pipeline
 from cangauge.service.recording import Recorder, RecordLimits
 from cangauge.service.status import Identity, Monitor
 from live import leaf_model, short_log, waits
@@ -38,7 +38,7 @@ def _vcan0() -> None:
 
 
 def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
-    gauge = Gauge(Vehicle.load("generic"), leaf_model())
+    gauge = Pipeline(Vehicle.load("generic"), leaf_model())
     rows = []
     stop = threading.Event()
     encoder = FrameEncoder(Vehicle.load("generic"))

@@ -27,7 +27,7 @@ from cangauge.replay.player import ReplaySettings, play
 from cangauge.replay.steps import CaptureSource, LogSource, quantisation_bound
 from cangauge.service.capture_estimate import estimate_capture
 from cangauge.service.loop import LoopSettings
-from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
 from live import (
     Command,
@@ -60,8 +60,8 @@ def replay_port() -> Iterator[BusConnection]:
         yield port
 
 
-def service(preset: str, settings: GaugeSettings, record: Recorder | None = None) -> Service:
-    gauge = Gauge(Vehicle.load(preset), leaf_model(), settings)
+def service(preset: str, settings: PipelineSettings, record: Recorder | None = None) -> Service:
+    gauge = Pipeline(Vehicle.load(preset), leaf_model(), settings)
     return Service(
         BusConnection(open_bus(VCAN, gauge.filters), str(VCAN)), gauge, LoopSettings(), record
     )
@@ -121,11 +121,11 @@ def test_a_log_at_full_speed_within_the_bound_and_bit_for_bit(
 ) -> None:
     log, vehicle, path = short_log(60.0), Vehicle.load(preset), tmp_path / "vcan0.log"
     estimator = EstimatorSettings(initial_soc_pct=80.0)
-    settings = GaugeSettings(estimator, "replay-clock")
+    settings = PipelineSettings(estimator, "replay-clock")
     with Recorder(path) as recorder, service(preset, settings, recorder) as live:
         state = play(replay_port, LogSource(log, vehicle), MAX, stop=never)
     assert state.acknowledged == len(live.rows) == len(log)
-    assert live.gauge.counts.lost == live.gauge.counts.crc_errors == 0
+    assert live.pipeline.counts.lost == live.pipeline.counts.crc_errors == 0
     soc = np.array([estimate.soc_pct for _, estimate in live.rows])
     residual = np.array([estimate.residual_v for _, estimate in live.rows])
     offline = run_estimator(samples_of(log), leaf_model(), estimator)
@@ -138,11 +138,11 @@ def test_a_log_at_full_speed_within_the_bound_and_bit_for_bit(
 
 def test_real_time_uses_the_kernels_stamps(replay_port: BusConnection, tmp_path: Path) -> None:
     log, path = short_log(6.01), tmp_path / "vcan0.log"
-    with Recorder(path) as recorder, service("generic", GaugeSettings(), recorder) as live:
+    with Recorder(path) as recorder, service("generic", PipelineSettings(), recorder) as live:
         state = play(
             replay_port, LogSource(log, Vehicle.load("generic")), ReplaySettings(), stop=never
         )
-        assert waits(lambda: live.gauge.samples == len(log))
+        assert waits(lambda: live.pipeline.samples == len(log))
     assert state.seconds == pytest.approx(6.0, abs=0.1)
     times = np.array([time_s for time_s, _ in live.rows])
     assert np.max(np.abs(times - times[0] - log.time_s)) < 0.1
@@ -153,7 +153,7 @@ def test_real_time_uses_the_kernels_stamps(replay_port: BusConnection, tmp_path:
 
 
 def test_the_kernel_filters_the_wanted_ids() -> None:
-    gauge = Gauge(Vehicle.load("leaf_aze0"), leaf_model())
+    gauge = Pipeline(Vehicle.load("leaf_aze0"), leaf_model())
     bus = open_bus(VCAN, gauge.filters)
     raw = bus.socket.getsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, 64)  # type: ignore[attr-defined] # SocketcanBus
     assert len(raw) == 8 * 3
@@ -189,7 +189,7 @@ def test_unwanted_traffic_costs_no_wanted_frame(replay_port: BusConnection, tmp_
                 )
             time_s += 0.01
     vehicle = Vehicle.load("leaf_aze0")
-    settings = GaugeSettings(time_source="replay-clock")
+    settings = PipelineSettings(time_source="replay-clock")
     with service("leaf_aze0", settings) as live:
         state = play(replay_port, CaptureSource(path, vehicle), MAX, stop=never)
     assert state.acknowledged == state.samples == 100
@@ -199,7 +199,7 @@ def test_unwanted_traffic_costs_no_wanted_frame(replay_port: BusConnection, tmp_
 
 def test_others_can_read_the_published_frames(replay_port: BusConnection) -> None:
     listener = can.Bus("vcan0", interface="socketcan", ignore_config=True, can_filters=SOC_FRAMES)
-    with service("generic", GaugeSettings(time_source="replay-clock")) as live:
+    with service("generic", PipelineSettings(time_source="replay-clock")) as live:
         log = short_log(20.0)
         play(replay_port, LogSource(log, Vehicle.load("generic")), MAX, stop=never)
         assert waits(lambda: live.gauge.samples == len(log))

@@ -1,178 +1,173 @@
-"""What the estimator believes of the SoC: one filter, or two while there are two stories of it.
+"""Static multiple-model filter over at most two hypotheses of the SoC.
 
-There are two after a time that nobody saw (`pause`): *parked* keeps the SoC to within a little,
-*moved* knows next to nothing of it. And there are two after a SoC was given: the first takes it as
-it was told, the second as *wrong*, and begins from the first voltage as if none had been told. Both
-filters take every voltage, and the likelihood of what each saw moves the odds between them (a
-static multiple-model estimator; Bar-Shalom, Li, Kirubarajan, Estimation with Applications to
-Tracking and Navigation, 2001, ch. 11.6). What is published is the mean of both, weighed by the
-odds, with the spread between them in its standard deviation; so the SoC goes toward the voltage as
-far as the voltage proves, and does not jump. Once the odds are clear the other story is dropped; if
-they never are, the two are merged. A given SoC that the voltages refute thus leaves no trace.
+There are two hypotheses in two cases:
 
-A pause is thereby also the check of a SoC that was kept in a file.
+- After an unobserved interval (see `counting`): *parked* keeps the SoC to within a little, *moved*
+  hardly knows it.
+- After an initial SoC was given: the first hypothesis accepts it, the second rejects it and starts
+  from the first voltage.
+
+Each hypothesis has its own filter. Both use every voltage, and the likelihoods of the voltages
+update the odds between them (static multiple-model estimator; Bar-Shalom, Li, Kirubarajan,
+Estimation with Applications to Tracking and Navigation, 2001, ch. 11.6). The output is the mean
+weighted by the odds; the spread between the hypotheses is part of its standard deviation. So the
+SoC approaches the voltage's as fast as the evidence grows, without a jump. Once the odds are clear
+the other hypothesis is dropped; if they stay unclear the two are merged. A given SoC that the
+voltages reject leaves no trace.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
 
 from cangauge.errors import InputError
-from cangauge.estimate.counting import ChargeStep, moved_log_odds, moved_std_pct
+from cangauge.estimate.counting import moved_log_odds, moved_std_pct
 from cangauge.estimate.ekf import UNKNOWN_SOC_STD_PCT, Measurement, SocEkf
-from cangauge.estimate.state import FilterState, HypothesisFilterState, SinceState
+from cangauge.estimate.state import ChargeSinceUpdate, EkfState, HypothesisFilterState, Verdict
 
 CLEAR_LOG_ODDS = math.log(1000.0)
-"""Beyond this the less likely story is dropped."""
+"""Beyond this the less likely hypothesis is dropped."""
+
+LOG_ODDS_AT_MOST = 50.0
 
 WRONG_LOG_ODDS = -math.log(1000.0)
-"""Of a SoC that was given, before any voltage, that it is another pack's or another day's: a
-guess. It says what error at the start is believed to be a wrong SoC, and not a wrong voltage."""
+"""Prior log odds that a given SoC is wrong, from another pack or day: a guess. It sets from which
+size an initial error is attributed to the given SoC and not to the voltage model."""
 
 OPEN_AT_MOST_S = 900.0
-"""After this long with voltages the stories are merged, if the odds are not clear [s]."""
+"""Time with voltages after which undecided hypotheses are merged [s]."""
 
 DIVERGED_S = 180.0
-"""Voltages that are outliers, all of them and for so long, mean that the filter is lost [s]."""
+"""Time without a voltage that is not an outlier, after which the filter counts as lost [s]."""
 
 OUTLIER_STEP_AT_MOST_S = 10.0
-"""A single outlier counts for no longer than this, however long ago the last voltage was [s]."""
-
-Verdict = Literal["", "open", "parked", "moved", "unclear"]
-"""How the last pause was judged: not at all, still open, one of the stories, or neither."""
-
-
-@dataclass
-class Since:
-    """Charge since the last voltage that was used."""
-
-    seconds: float = 0.0
-    away_s: float = 0.0
-    """Time of it in which no charge was counted [s]."""
-    discharged_pct: float = 0.0
-    moved_pct: float = 0.0
-    gap_var_pct2: float = 0.0
-    """Variance of the charge of gaps that were counted over [%²]."""
-    unseen_var_pct2: float = 0.0
-    """Variance of the charge of times that were not, if nobody charged or drove [%²]."""
-
-    def add(self, charge: ChargeStep) -> None:
-        """Take one step of the counter."""
-        self.seconds += charge.seconds
-        self.discharged_pct += charge.discharged_pct
-        self.moved_pct += abs(charge.discharged_pct)
-        if charge.away_s:
-            self.away_s += charge.away_s
-            self.unseen_var_pct2 += charge.parked_std_pct**2
-        else:
-            self.gap_var_pct2 += charge.gap_std_pct**2
-
-    @property
-    def counted_s(self) -> float:
-        """Time in which charge was counted [s]."""
-        return self.seconds - self.away_s
-
-    def spread_pct2(self) -> float:
-        """Return the variance of the charge of all gaps, both stories weighed [%²]."""
-        total = self.gap_var_pct2 + self.unseen_var_pct2
-        if self.away_s:
-            odds = math.exp(moved_log_odds(self.away_s))
-            total += odds / (1.0 + odds) * moved_std_pct(self.away_s) ** 2
-        return total
-
-    def state(self) -> SinceState:
-        """Return what is to be remembered."""
-        return SinceState.model_construct(**asdict(self))
-
-    @classmethod
-    def of(cls, state: SinceState) -> Since:
-        """Return it from a state."""
-        return cls(**state.model_dump())
+"""Upper bound of what one outlier adds to that time [s]."""
 
 
 class HypothesisFilter:
-    """One filter or two; takes the place of a `SocEkf`.
+    """Filter of one or two hypotheses of the SoC.
 
     Parameters
     ----------
-    make : callable
+    make_ekf : callable
         Returns a new `SocEkf`.
+
+    Attributes
+    ----------
+    verdict : str
+        Result of the test on the last unobserved interval (`state.Verdict`).
     """
 
-    def __init__(self, make: Callable[[], SocEkf]) -> None:
-        self._make = make
-        # Parked, as told, or the only one first.
-        self._filters = [make()]
-        self._is_untried = False
+    def __init__(self, make_ekf: Callable[[], SocEkf]) -> None:
+        self._make_ekf = make_ekf
+        # The null hypothesis first: parked, or the given SoC is right.
+        self._filters = [make_ekf()]
+        self._is_untested = False
         self._log_odds = 0.0
         self._open_s = 0.0
         self._outlier_s = 0.0
         self.verdict: Verdict = ""
 
     def start(self, soc_pct: float, std_pct: float) -> None:
-        """Begin from a SoC with its standard deviation [%]; everything before is forgotten."""
-        self._filters = [self._make()]
+        """Restart from a SoC with its standard deviation [%]."""
+        self._filters = [self._make_ekf()]
         self._filters[0].start(soc_pct, std_pct)
-        self._is_untried = std_pct < UNKNOWN_SOC_STD_PCT
+        self._is_untested = std_pct < UNKNOWN_SOC_STD_PCT
         self._outlier_s = 0.0
         if self.verdict == "open":
             self.verdict = "unclear"
 
-    def predict(self, since: Since) -> None:
-        """Carry the state over the charge counted since the last call."""
-        variances = [since.gap_var_pct2 + since.unseen_var_pct2]
+    def predict(self, since: ChargeSinceUpdate) -> None:
+        """Propagate all hypotheses over the charge counted since the last call."""
+        parked_var_pct2 = since.gap_var_pct2 + since.unseen_var_pct2
+        variances = [parked_var_pct2, parked_var_pct2]
         if since.away_s:
             self._merge("unclear")
-            self._open(self._copy(self._filters[0].state()), moved_log_odds(since.away_s))
+            self._add(self._restored(self._filters[0].snapshot()), moved_log_odds(since.away_s))
             self.verdict = "open"
-            variances.append(since.gap_var_pct2 + moved_std_pct(since.away_s) ** 2)
-        elif len(self._filters) > 1:
-            variances *= 2
-        for each, variance in zip(self._filters, variances, strict=True):
+            variances[1] = since.gap_var_pct2 + moved_std_pct(since.away_s) ** 2
+        for each, variance in zip(self._filters, variances, strict=False):
             each.predict(
                 since.seconds, since.discharged_pct, since.moved_pct, variance, since.away_s
             )
 
-    def update(self, measurement: Measurement, since: Since) -> bool:
-        """Take one voltage in; return True if it shows that the SoC was wrong all the time."""
-        if self._is_untried:
-            self._try(measurement)
-        contradicted = [each.update(measurement, since.seconds) for each in self._filters]
-        self._watch(since)
-        if len(self._filters) == 1:
-            return contradicted[0]
-        first, second = self._filters
+    def update(self, measurement: Measurement, since: ChargeSinceUpdate) -> bool:
+        """Update with one voltage.
+
+        Returns
+        -------
+        bool
+            Whether it shows that the SoC was wrong until now.
+        """
+        if self._is_untested:
+            self._is_untested = False
+            if len(self._filters) == 1:
+                rejecting = self._make_ekf()
+                rejecting.start(measurement.soc_pct, UNKNOWN_SOC_STD_PCT)
+                self._add(rejecting, WRONG_LOG_ODDS)
+        first, second = self._filters[0], self._filters[-1]
+        is_contradicted = is_second_contradicted = first.update(measurement, since.seconds)
+        if second is not first:
+            is_second_contradicted = second.update(measurement, since.seconds)
+        if first.was_outlier and second.was_outlier:
+            self._outlier_s += min(since.seconds, OUTLIER_STEP_AT_MOST_S)
+        else:
+            self._outlier_s = 0.0
+        if second is first:
+            return is_contradicted
         change = second.log_likelihood - first.log_likelihood
-        self._log_odds = min(max(self._log_odds + change, -50.0), 50.0)
-        self._open_s += since.counted_s
-        if contradicted[0] != contradicted[1]:
-            return self._settle(contradicted.index(False))
-        if contradicted[0] or self._is_clear:
-            return self._settle(int(self._log_odds > 0.0), is_doubted=contradicted[0])
+        self._log_odds = _bounded(self._log_odds + change)
+        self._open_s += since.seconds - since.away_s
+        if is_contradicted != is_second_contradicted:
+            return self._decide(int(is_contradicted))
+        # That a given SoC is wrong starts out so unlikely that this alone must not decide.
+        prior = 0.0 if self.verdict == "open" else WRONG_LOG_ODDS
+        is_clear = self._log_odds > CLEAR_LOG_ODDS or self._log_odds < prior - CLEAR_LOG_ODDS
+        if is_contradicted or is_clear:
+            return self._decide(int(self._log_odds > 0.0), is_contradicted=is_contradicted)
         if self._open_s > OPEN_AT_MOST_S:
             self._merge("unclear")
         return False
 
-    def anchor(self, soc_pct: float, std_pct: float) -> None:
-        """Take a SoC in that is known otherwise, with its standard deviation [%]."""
+    def correct(self, soc_pct: float, std_pct: float) -> None:
+        """Update with an external SoC reference and its standard deviation [%]."""
         self._merge("unclear")
-        self._is_untried = False
-        self._filters[0].anchor(soc_pct, std_pct)
+        self._is_untested = False
+        self._filters[0].correct(soc_pct, std_pct)
 
-    def rested(self) -> None:
-        """Take note of a long rest: slow polarisation has decayed, so the bias is smaller."""
+    def shrink_bias(self) -> None:
+        """Reduce the slow bias of all hypotheses after a long rest."""
         for each in self._filters:
-            each.rested()
+            each.shrink_bias()
 
-    @property
     def is_lost(self) -> bool:
-        """Whether the filter cannot be trusted any more and is to be started anew."""
-        return self._outlier_s > DIVERGED_S or not all(each.is_sound for each in self._filters)
+        """Return whether the filter must be restarted: only outliers for long, or not sound."""
+        if self._outlier_s > DIVERGED_S:
+            return True
+        for each in self._filters:  # noqa: SIM110 - called for every voltage
+            if not each.is_sound():
+                return True
+        return False
+
+    def soc_after(self, since: ChargeSinceUpdate) -> tuple[float, float]:
+        """Return SoC and standard deviation [%] after the charge counted since the last update."""
+        counted_s = since.seconds - since.away_s
+        soc_pct, std_pct, offset_pct = self._filters[0].summary(counted_s)
+        if len(self._filters) > 1:
+            first, second = (each.summary(counted_s) for each in self._filters)
+            soc_pct, _, offset_pct = map(self._mean, zip(first, second, strict=True))
+            spread = [std**2 + (soc - soc_pct) ** 2 for soc, std, _ in (first, second)]
+            std_pct = math.sqrt(self._mean(spread))
+        soc_pct -= since.discharged_pct - offset_pct
+        since_var_pct2 = since.gap_var_pct2 + since.unseen_var_pct2
+        if since.away_s:
+            odds = math.exp(moved_log_odds(since.away_s))
+            since_var_pct2 += odds / (1.0 + odds) * moved_std_pct(since.away_s) ** 2
+        return min(max(soc_pct, 0.0), 100.0), math.sqrt(std_pct**2 + since_var_pct2)
 
     @property
     def soc_pct(self) -> float:
@@ -182,131 +177,90 @@ class HypothesisFilter:
         return self._mean([each.soc_pct for each in self._filters])
 
     @property
-    def soc_std_pct(self) -> float:
-        """Its standard deviation [%], the spread between the stories included."""
-        if len(self._filters) == 1:
-            return self._filters[0].soc_std_pct
-        mean = self.soc_pct
-        return math.sqrt(
-            self._mean([each.soc_std_pct**2 + (each.soc_pct - mean) ** 2 for each in self._filters])
-        )
-
-    @property
     def offset_a(self) -> float:
         """Estimated offset of the current sensor [A]."""
         if len(self._filters) == 1:
             return self._filters[0].offset_a
         return self._mean([each.offset_a for each in self._filters])
 
-    def offset_pct(self, seconds: float) -> float:
-        """Return the SoC that the offset alone would feign in some seconds [%]."""
-        if len(self._filters) == 1:
-            return self._filters[0].offset_pct(seconds)
-        return self._mean([each.offset_pct(seconds) for each in self._filters])
-
     def count_std_pct(self, start_var_pct2: float, hours: float, moved_pct: float) -> float:
         """Return the standard deviation of counting alone [%]; see `SocEkf.count_std_pct`."""
         return self._filters[0].count_std_pct(start_var_pct2, hours, moved_pct)
 
-    def state(self) -> HypothesisFilterState:
-        """Return what is to be remembered."""
-        return HypothesisFilterState.model_construct(
-            filters=[each.state() for each in self._filters],
-            is_untried=self._is_untried,
-            log_odds=self._log_odds,
-            open_s=self._open_s,
-            outlier_s=self._outlier_s,
-            verdict=self.verdict,
+    def snapshot(self) -> HypothesisFilterState:
+        """Return a copy of the state."""
+        return HypothesisFilterState(
+            [each.snapshot() for each in self._filters],
+            self._is_untested,
+            self._log_odds,
+            self._open_s,
+            self._outlier_s,
+            self.verdict,
         )
 
     def restore(self, state: HypothesisFilterState) -> None:
-        """Go on from a state.
+        """Continue from a state.
 
         Raises
         ------
         InputError
-            If it is not that of such filters.
+            If a hypothesis is not a sound filter with a SoC within 0–100 %.
         """
-        if not state.filters:
-            raise InputError("holds no filter", field="belief.filters")
-        filters = [self._copy(each) for each in state.filters]
-        if not all(each.is_sound and 0.0 <= each.soc_pct <= 100.0 for each in filters):
-            raise InputError("holds no covariance, or no SoC", field="belief.filters")
+        filters = [self._restored(each) for each in state.hypotheses]
+        if not all(each.is_sound() and 0.0 <= each.soc_pct <= 100.0 for each in filters):
+            raise InputError("holds no covariance, or no SoC", field="filter.hypotheses")
         self._filters = filters
-        self._is_untried = state.is_untried
-        self._log_odds = min(max(state.log_odds, -50.0), 50.0)
+        self._is_untested = state.is_untested
+        self._log_odds = _bounded(state.log_odds)
         self._open_s = state.open_s
         self._outlier_s = state.outlier_s
         self.verdict = state.verdict
 
-    # --- inside -----------------------------------------------------------------------------
+    def _restored(self, state: EkfState) -> SocEkf:
+        ekf = self._make_ekf()
+        ekf.restore(state)
+        return ekf
 
-    def _copy(self, state: FilterState) -> SocEkf:
-        copy = self._make()
-        copy.restore(state)
-        return copy
-
-    @property
-    def _second(self) -> float:
-        """Probability of the second story."""
+    def _second_probability(self) -> float:
         return 1.0 / (1.0 + math.exp(-self._log_odds))
 
     def _mean(self, values: Sequence[float]) -> float:
-        return (1.0 - self._second) * values[0] + self._second * values[1]
+        second = self._second_probability()
+        return (1.0 - second) * values[0] + second * values[1]
 
-    def _open(self, other: SocEkf, log_odds: float) -> None:
-        """Let another filter tell a second story."""
-        self._filters.append(other)
+    def _add(self, ekf: SocEkf, log_odds: float) -> None:
+        """Open a second hypothesis."""
+        self._filters.append(ekf)
         self._log_odds = log_odds
         self._open_s = 0.0
 
-    def _try(self, measurement: Measurement) -> None:
-        """Set the story beside a given SoC that it is wrong, and only the voltage is known."""
-        self._is_untried = False
-        if len(self._filters) == 1:
-            told_wrong = self._make()
-            told_wrong.start(measurement.soc_pct, UNKNOWN_SOC_STD_PCT)
-            self._open(told_wrong, WRONG_LOG_ODDS)
-
-    @property
-    def _is_clear(self) -> bool:
-        """Whether the voltages leave one story only.
-
-        That a given SoC is wrong is so unlikely from the beginning that this alone must not end it.
-        """
-        unlikely = 0.0 if self.verdict == "open" else WRONG_LOG_ODDS
-        return self._log_odds > CLEAR_LOG_ODDS or self._log_odds < unlikely - CLEAR_LOG_ODDS
-
-    def _settle(self, story: int, *, is_doubted: bool = False) -> bool:
-        """Keep one of two stories; return whether the SoC believed so far was wrong."""
-        self._filters = [self._filters[story]]
+    def _decide(self, accepted: int, *, is_contradicted: bool = False) -> bool:
+        """Keep one hypothesis; return whether this changes the SoC assumed so far."""
+        self._filters = [self._filters[accepted]]
         if self.verdict != "open":
-            return is_doubted or story == 1
-        self.verdict = "moved" if story else "parked"
-        return is_doubted
+            return is_contradicted or accepted == 1
+        self.verdict = "moved" if accepted else "parked"
+        return is_contradicted
 
     def _merge(self, verdict: Verdict) -> None:
-        """Replace two filters by one with their mean and spread, weighed by the odds."""
+        """Replace two hypotheses by one with their weighted mean and spread."""
         if len(self._filters) == 1:
             return
-        states = [each.state() for each in self._filters]
-        weights = (1.0 - self._second, self._second)
+        states = [each.snapshot() for each in self._filters]
+        second = self._second_probability()
+        weights = (1.0 - second, second)
         xs, ps = [np.array(each.x) for each in states], [np.array(each.p) for each in states]
         x = weights[0] * xs[0] + weights[1] * xs[1]
         p = sum(
             weight * (cov + np.outer(at - x, at - x))
             for weight, at, cov in zip(weights, xs, ps, strict=True)
         )
-        likelier = states[int(self._second > 0.5)]
-        self._filters = [
-            self._copy(likelier.model_copy(update={"x": x.tolist(), "p": np.asarray(p).tolist()}))
-        ]
+        likelier = states[int(second > 0.5)]
+        merged = replace(likelier, x=x.tolist(), p=np.asarray(p).tolist())
+        self._filters = [self._restored(merged)]
         if self.verdict == "open":
             self.verdict = verdict
 
-    def _watch(self, since: Since) -> None:
-        """Note for how long every voltage has been an outlier, to all filters."""
-        if all(each.was_outlier for each in self._filters):
-            self._outlier_s += min(since.seconds, OUTLIER_STEP_AT_MOST_S)
-        else:
-            self._outlier_s = 0.0
+
+def _bounded(log_odds: float) -> float:
+    return min(max(log_odds, -LOG_ODDS_AT_MOST), LOG_ODDS_AT_MOST)

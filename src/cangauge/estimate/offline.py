@@ -1,28 +1,79 @@
-"""The estimator over a whole log, and how well it did."""
+"""The estimator over a whole log, and its scores against a reference."""
 
 from __future__ import annotations
 
+import importlib
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
+from cangauge.errors import InputError
 from cangauge.estimate.estimator import Estimator
-from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.validity import Estimate, Sample, Status
+from cangauge.estimate.settings import (
+    VALID_STD_PCT,
+    EstimatorSettings,
+    FullCharge,
+    LongRest,
+    Method,
+)
+from cangauge.estimate.validity import Estimate, Sample, Status, reason_names
+from cangauge.inference.rows import usual_gap_s
 from cangauge.logs.log import Log
+from cangauge.model.charge import counted_soc_pct
+from cangauge.model.delay_line import GAP_S
 from cangauge.model.model_file import Model
 
 PROGRESS_EVERY = 5000
 """Samples between two calls of the progress callback."""
 
+NUMBERS = Estimate._fields[:7]
+"""Columns of numbers, from `time_s` to `residual_v`."""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Errors of an estimate; None where there is nothing to compare with."""
+
+    rows: int
+    seconds: float
+    """Computing time [s]."""
+    voltage_mae_pct: float | None
+    """Mean absolute residual relative to the measured voltage [%]."""
+    soc_mae_pct: float | None
+    soc_max_pct: float | None
+    soc_newton_mae_pct: float | None
+    soc_coulomb_mae_pct: float | None
+    """Errors against the log's reference SoC [% SoC]."""
+    cover_2sigma: float | None
+    """Fraction of the samples with the reference within two standard deviations."""
+    valid_fraction: float
+    """Fraction of the samples with a valid estimate."""
+
 
 @dataclass(frozen=True, eq=False)
 class EstimateTable:
-    """Estimates of a whole log, shape (n,) each; the columns of the estimate file."""
+    """Estimates of all n samples of a log: the columns of the estimate file.
+
+    Attributes
+    ----------
+    time_s : array of shape (n,)
+        Time [s].
+    soc_pct, soc_std_pct : array of shape (n,)
+        State of charge of the chosen method and its standard deviation [%]; NaN while unknown.
+    soc_newton_pct, soc_coulomb_pct : array of shape (n,)
+        State of charge by inverse of the voltage model and by counting alone [%].
+    voltage_model_v, residual_v : array of shape (n,)
+        Predicted voltage, and measured minus predicted voltage [V].
+    status, reasons : array of int, shape (n,)
+        `Status` and `Reason` bits.
+    scores : Scores, optional
+        Errors against the log's reference SoC, from `estimate`.
+    """
 
     time_s: FloatArray
     soc_pct: FloatArray
@@ -33,51 +84,155 @@ class EstimateTable:
     residual_v: FloatArray
     status: NDArray[np.int64]
     reasons: NDArray[np.int64]
+    scores: Scores | None = None
 
     @classmethod
     def of(cls, estimates: Iterable[Estimate]) -> EstimateTable:
         """Collect estimates into columns."""
         columns = list(zip(*estimates, strict=True)) or [()] * len(Estimate._fields)
         by_name = dict(zip(Estimate._fields, columns, strict=True))
-        numbers = {
-            name: np.array(by_name[name], dtype=np.float64)
-            for name in Estimate._fields
-            if name not in {"status", "reasons", "samples"}
+        flags: dict[str, Any] = {
+            name: np.array(by_name[name], np.int64) for name in ("status", "reasons")
         }
-        return cls(
-            **numbers,
-            status=np.array([int(item) for item in by_name["status"]], dtype=np.int64),
-            reasons=np.array([int(item) for item in by_name["reasons"]], dtype=np.int64),
+        numbers: dict[str, Any] = {name: np.array(by_name[name], np.float64) for name in NUMBERS}
+        return cls(**numbers, **flags)
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return int(self.time_s.size)
+
+    def to_arrow(self) -> Any:
+        """Return a pyarrow.Table of the columns; unknown is null, status and reasons are words."""
+        import pyarrow as pa  # noqa: PLC0415 - slow to import, and not needed to estimate
+
+        words = {code: reason_names(code) for code in np.unique(self.reasons).tolist()}
+        return pa.table(
+            {
+                **{name: pa.array(getattr(self, name), from_pandas=True) for name in NUMBERS},
+                "status": [Status(code).name.lower() for code in self.status.tolist()],
+                "reasons": [words[code] for code in self.reasons.tolist()],
+            }
         )
 
+    def to_pandas(self) -> Any:
+        """Return a pandas.DataFrame of the columns; see `to_arrow`.
 
-@dataclass(frozen=True)
-class Scores:
-    """How well an estimate did; None where there is no reference."""
+        Raises
+        ------
+        InputError
+            If pandas is not installed.
+        """
+        _require("pandas")
+        return self.to_arrow().to_pandas()
 
-    rows: int
-    seconds: float
-    voltage_mae_pct: float | None
-    soc_mae_pct: float | None
-    soc_max_pct: float | None
-    soc_newton_mae_pct: float | None
-    soc_coulomb_mae_pct: float | None
-    cover_2sigma: float | None
-    valid_fraction: float
+    def to_polars(self) -> Any:
+        """Return a polars.DataFrame of the columns; see `to_arrow`.
+
+        Raises
+        ------
+        InputError
+            If polars is not installed.
+        """
+        return _require("polars").from_arrow(self.to_arrow())
+
+    def __arrow_c_stream__(self, requested_schema: Any = None) -> Any:
+        """Export the columns through the Arrow PyCapsule interface."""
+        return self.to_arrow().__arrow_c_stream__(requested_schema)
+
+
+def estimate(
+    log: Log,
+    model: Model,
+    *,
+    method: Method = "ekf",
+    initial_soc_pct: float | Literal["auto"] | None = None,
+    initial_soc_std_pct: float = 1.0,
+    valid_std_pct: float = VALID_STD_PCT,
+    capacity_ah: float | None = None,
+    gap_s: float | None = None,
+    full_charge: FullCharge | None = None,
+    long_rest: LongRest | None = None,
+) -> EstimateTable:
+    """Estimate the state of charge at every sample of a log.
+
+    Parameters
+    ----------
+    log : Log
+    model : Model
+    method : {"ekf", "newton", "coulomb"}
+        Method whose SoC is `soc_pct`.
+    initial_soc_pct : float or "auto", optional
+        SoC at the first sample [%]; "auto" finds it from the first voltages. By default the log's
+        first reference SoC, counted back to the first sample, or "auto" without one.
+    initial_soc_std_pct : float
+        Its standard deviation [%].
+    valid_std_pct : float
+        A SoC with a larger standard deviation is degraded [%].
+    capacity_ah : float, optional
+        Overrides the model's capacity [Ah].
+    gap_s : float, optional
+        A longer step between samples is a gap in the current [s]; by default 2 s, or three usual
+        steps of a slower log.
+    full_charge : FullCharge, optional
+    long_rest : LongRest, optional
+        Rules for an external SoC reference.
+
+    Returns
+    -------
+    EstimateTable
+        With `scores`.
+
+    Raises
+    ------
+    InputError
+        If a setting is out of range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from cangauge.estimate.offline import estimate
+    >>> from cangauge.logs.log import Log
+    >>> from cangauge.model.published import leaf_2012_model_file
+    >>> rest = np.ones(120)
+    >>> log = Log(np.arange(120.0), 0.0 * rest, 385.0 * rest, 23.0 * rest)
+    >>> table = estimate(log, leaf_2012_model_file(), initial_soc_pct=80.0)
+    >>> len(table), round(float(table.soc_coulomb_pct[-1]), 1)
+    (120, 80.0)
+    """
+    if initial_soc_pct is None and log.first_soc() is not None:
+        start = counted_soc_pct(log, capacity_ah or model.capacity_ah, None)[0]
+        initial_soc_pct = float(np.clip(start, 0.0, 100.0))
+    settings = EstimatorSettings(
+        method=method,
+        initial_soc_pct=None if initial_soc_pct == "auto" else initial_soc_pct,
+        initial_soc_std_pct=initial_soc_std_pct,
+        valid_std_pct=valid_std_pct,
+        capacity_ah=capacity_ah,
+        gap_s=min(usual_gap_s(log.time_s, GAP_S), 3600.0) if gap_s is None else gap_s,
+        temperature_source=log.temperature_source,
+        full_charge=full_charge,
+        long_rest=long_rest,
+    )
+    table, scores = estimate_log(log, model, settings)
+    return replace(table, scores=scores)
+
+
+def estimate_log(
+    log: Log,
+    model: Model,
+    settings: EstimatorSettings,
+    progress: Callable[[int], None] | None = None,
+) -> tuple[EstimateTable, Scores]:
+    """Estimate a log with given settings, and score it; see `run_estimator` and `score`."""
+    began = time.perf_counter()
+    table = run_estimator(samples_of(log), model, settings, progress)
+    return table, score(table, log, time.perf_counter() - began)
 
 
 def samples_of(log: Log) -> Iterator[Sample]:
     """Yield the log's rows as samples."""
-    yield from map(
-        Sample._make,
-        zip(
-            log.time_s.tolist(),
-            log.current_a.tolist(),
-            log.voltage_v.tolist(),
-            log.temperature_c.tolist(),
-            strict=True,
-        ),
-    )
+    columns = (log.time_s, log.current_a, log.voltage_v, log.temperature_c)
+    yield from map(Sample._make, zip(*(each.tolist() for each in columns), strict=True))
 
 
 def run_estimator(
@@ -105,48 +260,42 @@ def run_estimator(
     return EstimateTable.of(estimates)
 
 
-def estimate_log(
-    log: Log,
-    model: Model,
-    settings: EstimatorSettings,
-    progress: Callable[[int], None] | None = None,
-) -> tuple[EstimateTable, Scores]:
-    """Estimate a log and compare with its reference SoC where it has one."""
-    began = time.perf_counter()
-    table = run_estimator(samples_of(log), model, settings, progress)
-    seconds = time.perf_counter() - began
-    return table, score(table, log, seconds)
-
-
 def score(table: EstimateTable, log: Log, seconds: float = 0.0) -> Scores:
-    """Compare estimates with the log that they were made from, over all rows with both."""
-    voltage = np.isfinite(table.residual_v)
-    reference = log.soc_pct if log.soc_pct is not None else np.full(len(log), np.nan)
+    """Compare estimates with the log that they were made from, over all rows that have both."""
+    residual = np.isfinite(table.residual_v)
+    reference = np.full(len(log), np.nan)
+    # A single finite SoC is the assumed start, not a reference.
+    if log.soc_pct is not None and np.isfinite(log.soc_pct).sum() > 1:
+        reference = log.soc_pct
 
-    def mae(values: FloatArray) -> float | None:
+    def absolute_error(values: FloatArray) -> FloatArray:
         error = np.abs(values - reference)
-        known = np.isfinite(error)
-        # One finite value is the assumed start, not a reference to compare with.
-        return (
-            float(error[known].mean()) if np.isfinite(reference).sum() > 1 and known.any() else None
-        )
+        return np.asarray(error[np.isfinite(error)])
 
-    error = np.abs(table.soc_pct - reference)
-    known = np.isfinite(error)
-    compared = np.isfinite(reference).sum() > 1 and bool(known.any())
+    def mean(values: FloatArray) -> float | None:
+        return float(values.mean()) if values.size else None
+
+    error = absolute_error(table.soc_pct)
+    std_pct = table.soc_std_pct[np.isfinite(table.soc_pct - reference)]
     return Scores(
         rows=len(log),
         seconds=seconds,
-        voltage_mae_pct=100.0
-        * float(np.mean(np.abs(table.residual_v[voltage]) / log.voltage_v[voltage]))
-        if voltage.any()
-        else None,
-        soc_mae_pct=mae(table.soc_pct),
-        soc_max_pct=float(error[known].max()) if compared else None,
-        soc_newton_mae_pct=mae(table.soc_newton_pct),
-        soc_coulomb_mae_pct=mae(table.soc_coulomb_pct),
-        cover_2sigma=float(np.mean(error[known] <= 2.0 * table.soc_std_pct[known]))
-        if compared
-        else None,
+        voltage_mae_pct=None
+        if not residual.any()
+        else 100.0 * float(np.mean(np.abs(table.residual_v[residual]) / log.voltage_v[residual])),
+        soc_mae_pct=mean(error),
+        soc_max_pct=float(error.max()) if error.size else None,
+        soc_newton_mae_pct=mean(absolute_error(table.soc_newton_pct)),
+        soc_coulomb_mae_pct=mean(absolute_error(table.soc_coulomb_pct)),
+        cover_2sigma=float(np.mean(error <= 2.0 * std_pct)) if error.size else None,
         valid_fraction=float(np.mean(table.status == Status.VALID)),
     )
+
+
+def _require(package: str) -> Any:
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise InputError(
+            f"{package} is not installed", cure=f"install it: pip install {package}"
+        ) from error

@@ -1,13 +1,16 @@
-"""What an estimator must remember to go on as if it had not been interrupted.
+"""State of an estimator: everything it needs to continue as if never interrupted.
 
-Plain numbers, strictly checked where they come from a file. NaN ("not known yet") is null in JSON,
-infinity is refused; every number is bounded, so that no arithmetic on it overflows.
+The parts are plain dataclasses that their owners update in place; `EstimatorState` collects copies
+of them and validates what is read from a file. NaN means "not known yet" and is null in JSON.
+Infinity is refused, and every number is bounded so that no arithmetic on it overflows.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-from typing import Annotated, Literal, Self
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -20,138 +23,203 @@ from pydantic import (
 )
 
 LARGEST = 1e12
-"""No time [s], current, voltage or charge in a state is larger."""
+"""Upper bound of times [s], voltages, charges and counters in a state."""
+
+PLAUSIBLE_A = 1e5
+"""Upper bound of currents in a state [A]; effects may scale a sample's current."""
 
 DELAY_LINE_AT_MOST = 200_000
-"""Samples that a delay line may hold: 70 s thinned to 9 ms are 8,300."""
+"""Samples that a delay line may hold; 70 s thinned to 9 ms are 8,300."""
 
 EFFECTS_AT_MOST = 64
 EFFECT_NUMBERS_AT_MOST = 50_000
+FILTER_STATES_AT_MOST = 64
 
 
-def _nan_for_null(value: object) -> object:
-    return math.nan if value is None else value
-
-
-def _bounded(value: float) -> float:
-    if abs(value) > LARGEST:  # NaN is not
+def _check_bound(value: float) -> float:
+    if abs(value) > LARGEST:  # false for NaN
         raise ValueError(f"larger than {LARGEST:g}")
     return value
 
 
-def _not_negative(value: float) -> float:
-    if value < 0.0:
+def _check_not_negative(value: float) -> float:
+    if value < 0.0:  # false for NaN
         raise ValueError("negative")
     return value
 
 
-def _null_for_nan(value: float) -> float | None:
-    return None if math.isnan(value) else value
-
-
-PLAUSIBLE_A = 1e5
-"""No current in a state is larger [A]: that of a sample, which `validity` bounds, and what effects
-make of it."""
-
-Finite = Annotated[float, Field(allow_inf_nan=False, ge=-LARGEST, le=LARGEST)]
-Current = Annotated[float, Field(allow_inf_nan=False, ge=-PLAUSIBLE_A, le=PLAUSIBLE_A)]
-NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0.0, le=LARGEST)]
+Finite = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-LARGEST, le=LARGEST)]
+NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0, le=LARGEST)]
+Current = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-PLAUSIBLE_A, le=PLAUSIBLE_A)]
+MeanSquare = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0, le=PLAUSIBLE_A**2)]
 MaybeNan = Annotated[
     float,
-    BeforeValidator(_nan_for_null),
-    AfterValidator(_bounded),
-    PlainSerializer(_null_for_nan, when_used="json"),
+    Field(strict=True),
+    BeforeValidator(lambda value: math.nan if value is None else value),
+    AfterValidator(_check_bound),
+    PlainSerializer(lambda value: None if math.isnan(value) else value, when_used="json"),
 ]
-MaybeSize = Annotated[MaybeNan, AfterValidator(_not_negative)]
-Count = Annotated[int, Field(ge=0, le=1 << 62)]
+NotNegativeOrNan = Annotated[MaybeNan, AfterValidator(_check_not_negative)]
+Flag = Annotated[bool, Field(strict=True)]
+Count = Annotated[int, Field(strict=True, ge=0, le=1 << 62)]
+
+_NO_MORE: Any = ConfigDict(extra="forbid")
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+@dataclass
+class ClockState:
+    """State of an `EstimatorClock`."""
+
+    __pydantic_config__: ClassVar[Any] = _NO_MORE
+    last_s: MaybeNan = math.nan
+    """Time of the last accepted sample [s]; NaN before the first."""
+    shift_s: Finite = 0.0
+    """Estimator time minus stamp [s]."""
+    behind: Count = 0
+    """Consecutive samples stamped before the last accepted one."""
+    behind_s: MaybeNan = math.nan
+    """Stamp of the latest of these [s]."""
 
 
-class CounterState(_Strict):
-    """A `CoulombCounter`."""
+@dataclass
+class CounterState:
+    """State of a `CoulombCounter`."""
 
-    time_s: MaybeNan
+    __pydantic_config__: ClassVar[Any] = _NO_MORE
+    time_s: MaybeNan = math.nan
     """Time of the last sample [s]; NaN before the first."""
-    current_a: Current
-    mean_square_a2: Annotated[float, Field(allow_inf_nan=False, ge=0.0, le=PLAUSIBLE_A**2)]
-    mean_a: Current
-    discharged_pct: Finite
-    moved_pct: NotNegative
-    counted_s: NotNegative
+    current_a: Current = 0.0
+    """Current of the last sample [A]."""
+    mean_square_a2: MeanSquare = 0.0
+    """Running mean square of the current [A²]."""
+    mean_a: Current = 0.0
+    """Running mean of the current [A]."""
+    discharged_pct: Finite = 0.0
+    """Net charge taken out since the first sample [% of capacity]."""
+    moved_pct: NotNegative = 0.0
+    """Charge moved in either direction since the first sample [% of capacity]."""
+    counted_s: NotNegative = 0.0
+    """Time since the first sample in which charge was counted [s]."""
 
 
-class DelayLineState(_Strict):
-    """A `DelayLine`: times [s], increasing, and currents [A]."""
+@dataclass
+class DelayLineState:
+    """Content of a `DelayLine`: increasing times [s] and currents [A]."""
 
+    __pydantic_config__: ClassVar[Any] = _NO_MORE
     time_s: Annotated[list[Finite], Field(max_length=DELAY_LINE_AT_MOST)]
     current_a: Annotated[list[Current], Field(max_length=DELAY_LINE_AT_MOST)]
     since_s: Finite
-
-    @model_validator(mode="after")
-    def _increasing(self) -> Self:
-        if len(self.time_s) != len(self.current_a):
-            raise ValueError("as many currents as times are needed")
-        if any(b <= a for a, b in zip(self.time_s, self.time_s[1:], strict=False)):
-            raise ValueError("times must increase")
-        return self
+    """Start of the gap-free stretch [s]."""
 
 
-class FilterState(_Strict):
-    """A `SocEkf`: state x, covariance P, and the running mean of its innovations."""
+@dataclass
+class EkfState:
+    """State of a `SocEkf`."""
 
-    x: Annotated[list[Finite], Field(max_length=64)]
-    p: Annotated[list[Annotated[list[Finite], Field(max_length=64)]], Field(max_length=64)]
+    __pydantic_config__: ClassVar[Any] = _NO_MORE
+    x: Annotated[list[Finite], Field(max_length=FILTER_STATES_AT_MOST)]
+    p: Annotated[
+        list[Annotated[list[Finite], Field(max_length=FILTER_STATES_AT_MOST)]],
+        Field(max_length=FILTER_STATES_AT_MOST),
+    ]
+    """Covariance, by rows."""
     mean_innovation_v: Finite
+    """Running mean of the innovation [V]."""
     mean_seconds: NotNegative
+    """Time that it covers [s]."""
 
 
-class HypothesisFilterState(_Strict):
-    """A `HypothesisFilter`: one filter, or two while it is open which of two stories is true."""
+Verdict = Literal["", "open", "parked", "moved", "unclear"]
+"""Result of the hypothesis test on the last unobserved interval: none yet, undecided, the accepted
+hypothesis, or merged without a decision."""
 
-    filters: Annotated[list[FilterState], Field(max_length=2)]
-    is_untried: bool = False
-    """Whether a given SoC has not met a voltage yet."""
+
+@dataclass
+class HypothesisFilterState:
+    """State of a `HypothesisFilter`."""
+
+    __pydantic_config__: ClassVar[Any] = _NO_MORE
+    hypotheses: Annotated[list[EkfState], Field(min_length=1, max_length=2)]
+    is_untested: Flag
+    """Whether a given initial SoC has not met a voltage yet."""
     log_odds: Finite
+    """Log odds of the second hypothesis against the first."""
     open_s: NotNegative
+    """Counted time for which two hypotheses have been open [s]."""
     outlier_s: NotNegative
-    verdict: Literal["", "open", "parked", "moved", "unclear"]
+    """Time for which every voltage has been an outlier [s]."""
+    verdict: Verdict
 
 
-class SinceState(_Strict):
-    """Charge since the last voltage that was used."""
+@dataclass
+class ChargeSinceUpdate:
+    """Charge and time since the last voltage update."""
 
-    seconds: NotNegative
-    away_s: NotNegative
-    discharged_pct: Finite
-    moved_pct: NotNegative
-    gap_var_pct2: NotNegative
-    unseen_var_pct2: NotNegative
-
-
-class ClockState(_Strict):
-    """An `EstimatorClock`."""
-
-    last_s: MaybeNan
-    shift_s: Finite
-    behind: Count
-    behind_s: MaybeNan
+    __pydantic_config__: ClassVar[Any] = _NO_MORE
+    seconds: NotNegative = 0.0
+    away_s: NotNegative = 0.0
+    """Part of it in unobserved intervals, in which no charge was counted [s]."""
+    discharged_pct: Finite = 0.0
+    moved_pct: NotNegative = 0.0
+    gap_var_pct2: NotNegative = 0.0
+    """Variance of the charge counted across gaps [%²]."""
+    unseen_var_pct2: NotNegative = 0.0
+    """Variance of the charge of unobserved intervals, if the car was parked [%²]."""
 
 
-class AnchorState(_Strict):
-    """An `AnchorWatch`."""
+@dataclass
+class ReferenceState:
+    """State of a `SocReferenceDetector`."""
 
-    full_since_s: MaybeNan
-    is_full: bool
-    is_rested: bool
+    __pydantic_config__: ClassVar[Any] = _NO_MORE
+    full_since_s: MaybeNan = math.nan
+    """Since when voltage and current have met the full-charge rule [s]; NaN: they do not."""
+    is_full: Flag = False
+    is_rested: Flag = False
 
 
-class EstimatorState(_Strict):
-    """All of an `Estimator` but its model and settings."""
+@dataclass
+class EstimatorMemory:
+    """State of the `Estimator` itself; NaN: not known, or never."""
 
-    method: str
+    __pydantic_config__: ClassVar[Any] = _NO_MORE
+    samples: Count = 0
+    """Accepted samples."""
+    resets: Count = 0
+    """How often the filter was lost and restarted."""
+    first_s: Finite = 0.0
+    """Time of the first sample [s]."""
+    tick: Annotated[int, Field(strict=True, ge=-1, le=1 << 62)] = -1
+    """Last tick of the model's rate at which the voltage was used."""
+    temperature_c: MaybeNan = math.nan
+    """Last known temperature [°C]."""
+    newton_pct: MaybeNan = math.nan
+    """SoC by inverse of the voltage model [%]."""
+    newton_inside: Flag = True
+    """Whether the voltage lay within the model's range."""
+    newton_std_pct: NotNegativeOrNan = math.nan
+    coulomb_start_pct: MaybeNan = math.nan
+    """SoC by counting, plus the charge counted so far [%]."""
+    coulomb_var_pct2: NotNegativeOrNan = math.nan
+    """Variance of the SoC that counting started from, plus gaps [%²]."""
+    coulomb_counted_s: NotNegative = 0.0
+    coulomb_moved_pct: NotNegative = 0.0
+    """The counter's `counted_s` and `moved_pct` when that variance was last known."""
+    gap_until_s: MaybeNan = math.nan
+    """Until when the last gap in the current degrades the estimate [s]."""
+    contradicted_until_s: MaybeNan = math.nan
+    """Until when the last contradiction degrades the estimate [s]."""
+    rest_since_s: MaybeNan = math.nan
+    """Since when the pack has rested [s]; NaN: it does not."""
+
+
+class EstimatorState(BaseModel):
+    """Everything in an `Estimator` but its model and settings."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    method: Annotated[str, Field(strict=True)]
     capacity_ah: NotNegative
     clock: ClockState
     counter: CounterState
@@ -160,32 +228,18 @@ class EstimatorState(_Strict):
         list[Annotated[list[MaybeNan], Field(max_length=EFFECT_NUMBERS_AT_MOST)]],
         Field(max_length=EFFECTS_AT_MOST),
     ]
-    belief: HypothesisFilterState
-    since: SinceState
-    anchors: AnchorState
-    samples: Count
-    resets: Count
-    first_s: Finite
-    tick: Annotated[int, Field(ge=-1, le=1 << 62)]
-    temperature_c: MaybeNan
-    newton_pct: MaybeNan
-    newton_inside: bool
-    newton_std_pct: MaybeSize
-    coulomb_start_pct: MaybeNan
-    coulomb_var_pct2: MaybeSize
-    coulomb_counted_s: NotNegative
-    coulomb_moved_pct: NotNegative
-    gap_until_s: MaybeNan
-    contradicted_until_s: MaybeNan
-    rest_since_s: MaybeNan
+    filter: HypothesisFilterState
+    since: ChargeSinceUpdate
+    references: ReferenceState
+    memory: EstimatorMemory
     estimate: Annotated[list[MaybeNan], Field(min_length=7, max_length=7)]
     """Numbers of the last `Estimate`, in its order, from `time_s` to `residual_v`."""
-    reasons: Annotated[int, Field(ge=0, le=0x1FFFF)]
+    reasons: Annotated[int, Field(strict=True, ge=0, le=0x1FFFF)]
 
     @model_validator(mode="after")
-    def _believable(self) -> Self:
+    def _check_estimate(self) -> Self:
         _, soc_pct, std_pct, newton_pct, coulomb_pct, _, _ = self.estimate
-        for value in (soc_pct, newton_pct, coulomb_pct, self.newton_pct):
+        for value in (soc_pct, newton_pct, coulomb_pct, self.memory.newton_pct):
             if value < 0.0 or value > 100.0:
                 raise ValueError("a state of charge lies outside 0–100 %")
         if std_pct < 0.0:
@@ -193,30 +247,34 @@ class EstimatorState(_Strict):
         return self
 
     @model_validator(mode="after")
-    def _one_time(self) -> Self:
-        """Nothing remembered may lie after the latest sample: time would run backwards."""
-        latest_s, taken_s, line = self.clock.last_s, self.counter.time_s, self.line.time_s
-        if (line[-1] if line else math.nan) != taken_s and (line or not math.isnan(taken_s)):
+    def _check_times(self) -> Self:
+        """Refuse times that do not increase, or lie after the latest sample."""
+        latest_s, counted_s, line = self.clock.last_s, self.counter.time_s, self.line.time_s
+        if len(line) != len(self.line.current_a):
+            raise ValueError("the delay line needs one current per time")
+        if any(b <= a for a, b in itertools.pairwise(line)):
+            raise ValueError("the delay line's times must increase")
+        if (line[-1] if line else math.nan) != counted_s and (line or not math.isnan(counted_s)):
             raise ValueError("counter and delay line end at different times")
-        if math.isnan(latest_s) and not math.isnan(taken_s):
+        if math.isnan(latest_s) and not math.isnan(counted_s):
             raise ValueError("a sample was counted before the first")
         for name, value in (
-            ("counter.time_s", taken_s),
+            ("counter.time_s", counted_s),
             ("line.since_s", self.line.since_s if line else math.nan),
-            ("first_s", self.first_s if self.samples else math.nan),
-            ("rest_since_s", self.rest_since_s),
-            ("anchors.full_since_s", self.anchors.full_since_s),
+            ("memory.first_s", self.memory.first_s if self.memory.samples else math.nan),
+            ("memory.rest_since_s", self.memory.rest_since_s),
+            ("references.full_since_s", self.references.full_since_s),
             ("clock.behind_s", self.clock.behind_s + self.clock.shift_s),
         ):
             if value > latest_s:
                 raise ValueError(f"{name} is later than the latest sample")
         if self.since.away_s > self.since.seconds:
-            raise ValueError("longer away than time passed")
+            raise ValueError("since.away_s is longer than since.seconds")
         if (
-            self.coulomb_counted_s > self.counter.counted_s
-            or self.coulomb_moved_pct > self.counter.moved_pct
+            self.memory.coulomb_counted_s > self.counter.counted_s
+            or self.memory.coulomb_moved_pct > self.counter.moved_pct
         ):
-            raise ValueError("the count began after its end")
+            raise ValueError("counting started after the latest count")
         return self
 
     @property

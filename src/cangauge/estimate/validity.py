@@ -1,7 +1,4 @@
-"""What goes into the estimator and what comes out of it.
-
-When an estimate is not plainly valid, and why.
-"""
+"""Samples, estimates, and the conditions under which an estimate is not plainly valid."""
 
 from __future__ import annotations
 
@@ -12,14 +9,24 @@ from typing import Final, NamedTuple
 from cangauge.logs.log import TemperatureSource
 from cangauge.model.voltage_model import VoltageModel
 
-# --- What goes into the estimator and what comes out of it
+CURRENT_AT_MOST_A = 5000.0
+"""Largest plausible absolute current [A]."""
+TEMPERATURE_WITHIN_C = (-60.0, 120.0)
+"""Plausible temperatures [°C]."""
+VOLTAGE_WITHIN = (0.5, 1.5)
+"""Plausible voltages, relative to the pack's at half charge."""
+
+SOC_MARGIN_PCT = 1.0
+TEMPERATURE_MARGIN_K = 1.0
+CURRENT_MARGIN = 1.1
+"""How far outside the identified range still counts as inside [%, K, relative]."""
 
 
 class Sample(NamedTuple):
-    """One (time, current, voltage, temperature), paired on bus time.
+    """One sample of the pack's signals, paired on bus time.
 
-    `voltage_v` or `temperature_c` may be NaN where that signal is missing: charge is still
-    counted, and the status says so.
+    `voltage_v` and `temperature_c` are NaN where the signal is missing: charge is still counted,
+    and the status reports it. Samples with a NaN time or current are refused by the estimator.
     """
 
     time_s: float
@@ -33,7 +40,7 @@ class Sample(NamedTuple):
 
 
 class Status(enum.IntEnum):
-    """How far an estimate can be trusted; the numbers are those of the published frame."""
+    """Validity of an estimate; the values are those of the published frame."""
 
     INITIALISING = 0
     VALID = 1
@@ -42,62 +49,54 @@ class Status(enum.IntEnum):
 
 
 class Reason(enum.IntFlag):
-    """Why the status is not plainly valid; bit numbers are those of the published frame."""
+    """Reasons for a status other than valid; the bits are those of the published frame."""
 
     NONE = 0
     DELAY_LINE_FILLING = 1 << 0
-    """Less than the longest delay of gap-free current has been seen."""
     CURRENT_GAP = 1 << 1
-    """Current was missing for longer than the allowed gap: charge is uncertain."""
+    """The current was missing for longer than the allowed gap, within the longest delay."""
     VOLTAGE_MISSING = 1 << 2
     TEMPERATURE_MISSING = 1 << 3
     VOLTAGE_OUTSIDE_MODEL = 1 << 4
-    """Newton: the voltage lies outside the model's range; SoC is clipped."""
     SOC_OUTSIDE_MODEL = 1 << 5
-    """SoC lies outside what the model was identified on: extrapolated, bounded."""
     TEMPERATURE_OUTSIDE_MODEL = 1 << 6
     CURRENT_OUTSIDE_MODEL = 1 << 7
     TEMPERATURE_SOURCE_MISMATCH = 1 << 8
-    """The bus's temperature is not measured where the model's was."""
     INNOVATION_LARGE = 1 << 9
-    """Voltage and prediction disagree persistently: the uncertainty was inflated, or the filter,
-    to which every voltage was an outlier for minutes, was started anew."""
+    """A lasting contradiction increased the SoC's uncertainty, or the filter was restarted."""
     NO_INITIAL_SOC = 1 << 10
-    """No initial SoC is known yet."""
     INPUT_STALE = 1 << 11
-    """No wanted frame within the time-out."""
     IMPLAUSIBLE_INPUT = 1 << 12
-    """A value or sample was refused: not finite, out of its range, or changed too fast."""
+    """A value or a whole sample was refused."""
     PROTECTION_FAILED = 1 << 13
-    """Frames were refused, several in a row: CRC wrong, counter standing still, or too short."""
+    """Several consecutive frames were refused."""
     SIGNAL_STUCK = 1 << 14
-    """A signal stands still while another one proves that it should move."""
     CURRENT_MISSING = 1 << 15
-    """No current within its time-out, or none that is believed: charge is not counted."""
     SOC_UNCERTAIN = 1 << 16
-    """The standard deviation is larger than a valid SoC may have."""
 
 
 REASON_WORDS: Final = {
-    Reason.DELAY_LINE_FILLING: "less current has been seen than the model's longest delay needs",
-    Reason.CURRENT_GAP: "current was missing for too long: charge is uncertain",
+    Reason.DELAY_LINE_FILLING: "current has been observed for less than the model's longest delay",
+    Reason.CURRENT_GAP: "the current was missing for too long: charge is uncertain",
     Reason.VOLTAGE_MISSING: "the sample has no voltage",
     Reason.TEMPERATURE_MISSING: "the sample has no temperature",
     Reason.VOLTAGE_OUTSIDE_MODEL: "no SoC of 0–100 % gives this voltage: the inverse is clipped",
-    Reason.SOC_OUTSIDE_MODEL: "the model was not identified at this SoC: it is extrapolated",
+    Reason.SOC_OUTSIDE_MODEL: "the model was not identified at this SoC and is extrapolated",
     Reason.TEMPERATURE_OUTSIDE_MODEL: "the model was not identified at this temperature",
     Reason.CURRENT_OUTSIDE_MODEL: "the model was not identified at this current",
     Reason.TEMPERATURE_SOURCE_MISMATCH: "the temperature is not measured where the model's was",
-    Reason.INNOVATION_LARGE: "voltage and prediction disagree lastingly: σ was enlarged",
-    Reason.NO_INITIAL_SOC: "no SoC is known yet",
+    Reason.INNOVATION_LARGE: "voltage and prediction disagree persistently: σ was increased",
+    Reason.NO_INITIAL_SOC: "the SoC is not known yet",
     Reason.INPUT_STALE: "no wanted frame within the time-out",
-    Reason.IMPLAUSIBLE_INPUT: "a value was refused: out of its range, or it changed too fast",
-    Reason.PROTECTION_FAILED: "frames were refused: CRC wrong, counter still, or too short",
-    Reason.SIGNAL_STUCK: "a signal stands still while another one proves that it should move",
-    Reason.CURRENT_MISSING: "no current that is believed: charge is not counted",
-    Reason.SOC_UNCERTAIN: "the standard deviation is larger than a valid SoC may have",
+    Reason.IMPLAUSIBLE_INPUT: "a value was refused: out of range, or changed too fast",
+    Reason.PROTECTION_FAILED: "frames were refused: wrong CRC, repeated counter, or too short",
+    Reason.SIGNAL_STUCK: "a signal is constant while another proves that it should change",
+    Reason.CURRENT_MISSING: "no plausible current within its time-out: charge is not counted",
+    Reason.SOC_UNCERTAIN: "the standard deviation exceeds the limit of a valid SoC",
 }
-"""What each reason means, for pages and messages."""
+"""Description of each reason, for pages and messages."""
+
+_NO_REASON = Reason.NONE  # used for every sample; looking up an enum member is slow
 
 
 def reason_name(reason: Reason) -> str:
@@ -106,71 +105,60 @@ def reason_name(reason: Reason) -> str:
 
 
 def reason_names(reasons: int) -> str:
-    """Return all reasons that are set, in words, parted by "; "."""
+    """Return the names of all reasons that are set, separated by "; "."""
     return "; ".join(reason_name(reason) for reason in Reason if reasons & reason)
 
 
 class Estimate(NamedTuple):
-    """The estimate after one sample."""
+    """The estimate after one sample; NaN where a quantity is not known."""
 
     time_s: float
     """Bus time of the sample [s]."""
     soc_pct: float
-    """State of charge of the chosen method [%], within 0–100; NaN while unknown."""
+    """State of charge of the chosen method [%], within 0–100."""
     soc_std_pct: float
-    """Its standard deviation [%]; NaN while unknown."""
+    """Its standard deviation [%]."""
     soc_newton_pct: float
-    """State of charge by inverse of the voltage model [%]; NaN while unknown."""
+    """State of charge by inverse of the voltage model [%]."""
     soc_coulomb_pct: float
-    """State of charge by Coulomb counting alone [%]; NaN while unknown."""
+    """State of charge by Coulomb counting alone [%]."""
     voltage_model_v: float
-    """Voltage that the model predicts at `soc_pct` [V]; NaN while unknown."""
+    """Voltage that the model predicts at `soc_pct` [V]."""
     residual_v: float
-    """Measured minus predicted voltage [V]; NaN while unknown."""
+    """Measured minus predicted voltage [V]."""
     status: Status
     reasons: Reason
     samples: int
-    """Samples processed so far."""
+    """Number of samples accepted so far."""
+
+    @classmethod
+    def unknown(cls, reasons: Reason) -> Estimate:
+        """Return the estimate before the first sample."""
+        return cls(*(math.nan,) * 7, status_of(reasons), reasons, 0)
 
 
-# --- When an estimate is not plainly valid, and why
-
-CURRENT_AT_MOST_A = 5000.0
-TEMPERATURE_WITHIN_C = (-60.0, 120.0)
-VOLTAGE_WITHIN = (0.5, 1.5)
-"""Beyond these no current, temperature or voltage (relative to half charge) is believed."""
-
-_NO_REASON = Reason.NONE  # of every sample; members of an enum are slow to look up
-
-SOC_MARGIN_PCT = 1.0
-TEMPERATURE_MARGIN_K = 1.0
-CURRENT_MARGIN = 1.1
-"""How far outside the identified range is still called inside."""
-
-OUTSIDE_SLOPE_ERROR = 0.5
-"""Outside the identified SoC the straight line's slope is uncertain by this much, relative."""
-
-OUTSIDE_TEMPERATURE_V_PER_K = 1e-3
-"""Outside the identified temperatures the voltage is uncertain by this much per K, relative to
-the pack's voltage (0.36 V/K for a Leaf)."""
+def status_of(reasons: Reason) -> Status:
+    """Return the status that follows from the reasons."""
+    if not reasons:
+        return Status.VALID
+    if reasons & Reason.NO_INITIAL_SOC:
+        return Status.INITIALISING
+    if reasons & (Reason.INPUT_STALE | Reason.CURRENT_MISSING):
+        return Status.INVALID
+    return Status.DEGRADED
 
 
-def acceptable(sample: Sample) -> bool:
-    """Whether a sample can be counted: finite time, and a current that a pack can carry."""
-    return math.isfinite(sample.time_s) and abs(sample.current_a) <= CURRENT_AT_MOST_A
-
-
-def cleaned(sample: Sample, usual_v: float) -> tuple[Sample, Reason]:
-    """Return the sample with what cannot be true taken out (NaN), and the reason.
+def drop_implausible(sample: Sample, nominal_v: float) -> tuple[Sample, Reason]:
+    """Return the sample with an implausible voltage or temperature replaced by NaN, and why.
 
     Parameters
     ----------
     sample : Sample
-    usual_v : float
-        Voltage of the pack at half charge [V]; a contactor that is open shows next to nothing.
+    nominal_v : float
+        Voltage of the pack at half charge [V]; behind open contactors it is close to 0.
     """
     reason = _NO_REASON
-    low, high = VOLTAGE_WITHIN[0] * usual_v, VOLTAGE_WITHIN[1] * usual_v
+    low, high = VOLTAGE_WITHIN[0] * nominal_v, VOLTAGE_WITHIN[1] * nominal_v
     if not math.isnan(sample.voltage_v) and not low <= sample.voltage_v <= high:
         sample = sample._replace(voltage_v=math.nan)
         reason = Reason.IMPLAUSIBLE_INPUT
@@ -182,8 +170,8 @@ def cleaned(sample: Sample, usual_v: float) -> tuple[Sample, Reason]:
 
 
 def outside_model(model: VoltageModel, soc_pct: float, sample: Sample) -> Reason:
-    """Return which of SoC, temperature and current the model was not identified on."""
-    reasons = Reason.NONE
+    """Return which of SoC, temperature and current the model was not identified at (NaN: none)."""
+    reasons = _NO_REASON
     low, high = model.soc_range_pct
     if soc_pct < low - SOC_MARGIN_PCT or soc_pct > high + SOC_MARGIN_PCT:
         reasons |= Reason.SOC_OUTSIDE_MODEL
@@ -197,35 +185,8 @@ def outside_model(model: VoltageModel, soc_pct: float, sample: Sample) -> Reason
     return reasons
 
 
-def outside_model_std_v(model: VoltageModel, soc_pct: float, temperature_c: float) -> float:
-    """Return how uncertain the voltage becomes outside what the model was identified on [V]."""
-    low, high = model.soc_range_pct
-    beyond_pct = max(low - soc_pct, soc_pct - high, 0.0) if math.isfinite(soc_pct) else 0.0
-    low, high = model.temperature_range_c
-    beyond_k = 0.0
-    if math.isfinite(temperature_c):
-        beyond_k = max(low - temperature_c, temperature_c - high, 0.0)
-    if beyond_pct == 0.0 and beyond_k == 0.0:
-        return 0.0
-    volts, slope = model.pseudo_ocv_at(soc_pct if math.isfinite(soc_pct) else 50.0)
-    return math.hypot(
-        OUTSIDE_SLOPE_ERROR * slope * beyond_pct, OUTSIDE_TEMPERATURE_V_PER_K * volts * beyond_k
-    )
-
-
 def temperature_mismatch(of_model: TemperatureSource, of_input: TemperatureSource) -> Reason:
-    """Return the mismatch's reason if both are known and differ."""
+    """Return the reason for a mismatch if both sources are known and differ."""
     if "unknown" in {of_model, of_input} or of_model == of_input:
         return Reason.NONE
     return Reason.TEMPERATURE_SOURCE_MISMATCH
-
-
-def status_of(reasons: Reason) -> Status:
-    """Return the status that the reasons amount to."""
-    if not reasons:
-        return Status.VALID
-    if reasons & Reason.NO_INITIAL_SOC:
-        return Status.INITIALISING
-    if reasons & (Reason.INPUT_STALE | Reason.CURRENT_MISSING):
-        return Status.INVALID
-    return Status.DEGRADED

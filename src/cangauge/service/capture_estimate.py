@@ -1,4 +1,4 @@
-"""Estimates of a recorded capture, by the very path that the live service takes."""
+"""Estimates of a recorded capture, by the same pipeline as the live service."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import numpy as np
 from can.typechecking import Channel
 
 from cangauge._typing import FloatArray
+from cangauge.bus.publish import FrameIds
 from cangauge.bus.recording import open_vehicle_capture
 from cangauge.bus.time_source import REPLAY_CLOCK_ID, TimeSourceName, is_clock
 from cangauge.bus.vehicle import Vehicle
@@ -22,7 +23,7 @@ from cangauge.estimate.offline import EstimateTable
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate
 from cangauge.model.model_file import Model
-from cangauge.service.pipeline import EstimateStream, FrameCounts
+from cangauge.service.pipeline import FrameCounts, Pipeline, PipelineSettings
 
 PROGRESS_EVERY: Final = 50_000
 """Frames between two calls of the progress callback."""
@@ -30,7 +31,7 @@ PROGRESS_EVERY: Final = 50_000
 
 @dataclass(frozen=True, eq=False)
 class CaptureEstimate:
-    """Estimates of all samples of a capture, shape (n,) each.
+    """Estimates of all n samples of a capture.
 
     Parameters
     ----------
@@ -40,15 +41,15 @@ class CaptureEstimate:
     voltage_v, temperature_c : array of shape (n,)
         Measured voltage [V] and temperature [°C]; NaN where the sample has none.
     soc_reference_pct : array of shape (n,)
-        The car's own state of charge [%]; NaN where there is none.
+        The vehicle's own state of charge [%]; NaN where there is none.
     counts : FrameCounts
-        What happened to the frames.
+        What became of the frames.
     time_source : {"receive", "replay-clock"}
-        What bus time was taken from.
+        Source of bus time.
     seconds : float
-        How long it took [s].
+        Computing time [s].
     remarks : tuple of str
-        What a user should know, in words.
+        Notes for the user.
     """
 
     table: EstimateTable
@@ -63,24 +64,6 @@ class CaptureEstimate:
     remarks: tuple[str, ...]
 
 
-@dataclass
-class _Lane:
-    """One of the buses in a capture."""
-
-    stream: EstimateStream
-    estimates: list[Estimate] = field(default_factory=list)
-    # Of each sample in turn: time, current, voltage, temperature, the car's own SoC.
-    values: array[float] = field(default_factory=lambda: array("d"))
-
-    def take(self, estimate: Estimate | None) -> None:
-        sample = self.stream.latest_sample
-        if estimate is None or sample is None:
-            return
-        self.estimates.append(estimate)
-        self.values.extend(sample)
-        self.values.append(self.stream.reference_soc_pct)
-
-
 def estimate_capture(
     path: str | PathLike[str],
     vehicle: Vehicle,
@@ -91,7 +74,7 @@ def estimate_capture(
     clock_id: int = REPLAY_CLOCK_ID,
     progress: Callable[[int], None] | None = None,
 ) -> CaptureEstimate:
-    """Estimate a capture: bit for bit what the service makes of the same frames.
+    """Estimate a capture, bit for bit as the service does with the same frames.
 
     Parameters
     ----------
@@ -116,87 +99,86 @@ def estimate_capture(
         If the capture cannot be read, or gives no sample.
     """
     began = time.perf_counter()
-    reader = _Reader(vehicle, model, settings, time_source, clock_id)
+    is_undecided = time_source == "auto"
+    source: TimeSourceName = "receive" if time_source == "auto" else time_source
+    ids = FrameIds(replay_clock=clock_id)
+    buses: dict[Channel | None, _Bus] = {}
     capture = open_vehicle_capture(path, vehicle)
     for number, message in enumerate(capture, start=1):
-        reader.take(message)
+        if is_undecided and is_clock(message, clock_id):
+            # Earlier frames have no log time; a live run starts here as well.
+            is_undecided, source = False, "replay-clock"
+            buses.clear()
+        bus = buses.get(message.channel)
+        if bus is None:
+            chosen = PipelineSettings(settings or EstimatorSettings(), source, ids)
+            bus = buses[message.channel] = _Bus(Pipeline(vehicle, model, chosen, publishes=False))
+        bus.handle(message)
         if progress is not None and number % PROGRESS_EVERY == 0:
             progress(number)
-    lane = reader.finish()
-    if lane is None:
+    for each in buses.values():
+        each.finish()
+    found = [bus for bus in buses.values() if bus.estimates]
+    if not found:
         raise InputError(
             "the capture gives no sample of current",
             source=path,
             field=vehicle.current.message,
-            cure=f"check that this is the bus of {vehicle.name} (`cangauge inspect` tells)",
+            cure=f"check that this is the bus of {vehicle.name} (see `cangauge inspect`)",
         )
-    remarks = [*capture.info.remarks, *reader.remarks(lane)]
-    time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(lane.values).reshape(-1, 5).T
+    best = max(found, key=lambda bus: len(bus.estimates))
+    counts = best.pipeline.counts
+    time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(best.values).reshape(-1, 5).T
     return CaptureEstimate(
-        table=EstimateTable.of(lane.estimates),
+        table=EstimateTable.of(best.estimates),
         time_s=time_s,
         current_a=current_a,
         voltage_v=voltage_v,
         temperature_c=temperature_c,
         soc_reference_pct=soc_pct,
-        counts=lane.stream.counts,
-        time_source=reader.time_source,
+        counts=counts,
+        time_source=source,
         seconds=time.perf_counter() - began,
-        remarks=tuple(remarks),
+        remarks=(*capture.info.remarks, *_remarks(source, counts, len(found))),
     )
 
 
-class _Reader:
-    """Sorts frames by the bus that they were recorded on; each has its own estimator."""
+@dataclass
+class _Bus:
+    """One of the buses in a capture; each has its own pipeline."""
 
-    def __init__(
-        self,
-        vehicle: Vehicle,
-        model: Model,
-        settings: EstimatorSettings | None,
-        time_source: TimeSourceName | Literal["auto"],
-        clock_id: int,
-    ) -> None:
-        self._vehicle = vehicle
-        self._model = model
-        self._settings = settings
-        self._clock_id = clock_id
-        self._is_open = time_source == "auto"
-        self.time_source: TimeSourceName = "receive" if time_source == "auto" else time_source
-        self._lanes: dict[Channel | None, _Lane] = {}
+    pipeline: Pipeline
+    estimates: list[Estimate] = field(default_factory=list)
+    # Time, current, voltage, temperature and the vehicle's own SoC of every sample.
+    values: array[float] = field(default_factory=lambda: array("d"))
 
-    def take(self, message: can.Message) -> None:
-        if self._is_open and is_clock(message, self._clock_id):
-            # What came before the clock has no time in it: a live run starts here, too.
-            self._is_open = False
-            self.time_source = "replay-clock"
-            self._lanes.clear()
-        lane = self._lanes.get(message.channel)
-        if lane is None:
-            stream = EstimateStream(
-                self._vehicle, self._model, self._settings, self.time_source, self._clock_id
-            )
-            lane = self._lanes[message.channel] = _Lane(stream)
-        lane.take(lane.stream.handle(message))
+    def handle(self, message: can.Message) -> None:
+        if self.pipeline.handle(message):
+            self._collect()
 
-    def finish(self) -> _Lane | None:
-        """Return the bus with most samples, if there is any sample."""
-        for lane in self._lanes.values():
-            lane.take(lane.stream.finish())
-        best = max(self._lanes.values(), key=lambda lane: len(lane.estimates), default=None)
-        return best if best is not None and best.estimates else None
+    def finish(self) -> None:
+        before = self.pipeline.samples
+        self.pipeline.finish()
+        if self.pipeline.samples != before:
+            self._collect()
 
-    def remarks(self, lane: _Lane) -> list[str]:
-        counts = lane.stream.counts
-        told = []
-        if self.time_source == "replay-clock":
-            told.append("a recorded replay: time is that of its log (REPLAY_CLOCK)")
-        if counts.beginnings:
-            told.append(f"{counts.beginnings + 1} logs were replayed: each estimated for itself")
-        if counts.crc_errors:
-            told.append(f"{counts.crc_errors} frames refused: CRC wrong")
-        if counts.lost:
-            told.append(f"{counts.lost} frames lost, by their counters")
-        if sum(bool(other.estimates) for other in self._lanes.values()) > 1:
-            told.append("several buses carry the frames: the one with most samples is used")
-        return told
+    def _collect(self) -> None:
+        if self.pipeline.latest_sample is not None:
+            self.estimates.append(self.pipeline.latest)
+            self.values.extend(self.pipeline.latest_sample)
+            self.values.append(self.pipeline.decoder.reference_soc_pct)
+
+
+def _remarks(time_source: TimeSourceName, counts: FrameCounts, buses: int) -> list[str]:
+    remarks = []
+    if time_source == "replay-clock":
+        remarks.append("a recorded replay: time is its log's (REPLAY_CLOCK)")
+    if counts.beginnings:
+        remarks.append(f"{counts.beginnings + 1} logs were replayed; each is estimated separately")
+    if counts.crc_errors:
+        remarks.append(f"{counts.crc_errors} frames refused: wrong CRC")
+    if counts.lost:
+        remarks.append(f"{counts.lost} frames lost, by their alive counters")
+    if buses > 1:
+        remarks.append("several buses carry the frames; the one with most samples is used")
+    return remarks

@@ -58,7 +58,7 @@ from cangauge.logs.log import TEMPERATURE_SOURCES, TemperatureSource
 from cangauge.model.delay_line import GAP_S
 from cangauge.service.addresses import HttpAddress, http_address
 from cangauge.service.loop import CHECKPOINT_EVERY_S, LoopSettings
-from cangauge.service.pipeline import GaugeSettings
+from cangauge.service.pipeline import PipelineSettings
 from cangauge.service.recording import RecordLimits
 from cangauge.service.state import StateSettings, state_path
 
@@ -430,10 +430,10 @@ class RunConfig(_Strict):
             overrides=Overrides(self._file, self.messages, self.rules, dict(self.checks)),
         )
 
-    def gauge_settings(self) -> GaugeSettings:
+    def gauge_settings(self) -> PipelineSettings:
         """Return the settings of the estimator and its frames; may raise InputError."""
         full, rest = self.full_charge, self.long_rest
-        return GaugeSettings(
+        return PipelineSettings(
             estimator=EstimatorSettings(
                 method=self.method,
                 initial_soc_pct=self.initial_soc,

@@ -333,7 +333,7 @@ def write_estimates(path: Path, time_s: FloatArray, table: EstimateTable) -> Non
 def read_estimates(path: Path) -> EstimateTable:
     """Read a Parquet file of estimates, as `write_estimates` or the service wrote it."""
     columns = pa.parquet.read_table(path).to_pydict()
-    numbers = {
+    numbers: dict[str, Any] = {
         name: np.array([np.nan if value is None else value for value in columns[name]])
         for name in ("time_s", *NUMBERS)
     }

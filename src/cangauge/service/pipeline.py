@@ -1,8 +1,7 @@
-"""Frames → estimates: the one path that a live bus and a recorded capture both take.
+"""The pipeline: frames → samples → estimates → frames to publish.
 
-Pure: no bus, no clock, no files. The same frames with the same stamps give the same numbers.
-
-The gauge: frames in, frames out. Pure: no bus, no clock; whoever has both is `loop`.
+A live bus and a recorded capture share it. Pure: no bus, no files, no clock; the same frames with
+the same stamps give the same numbers. `loop` runs it on a bus, `capture_estimate` over a recording.
 """
 
 from __future__ import annotations
@@ -14,61 +13,54 @@ from typing import Final
 import can
 from can.typechecking import CanFilter
 
-from cangauge.bus.decoder import FrameStatistics, SampleDecoder
+from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.plausibility import MISSED_AT_LEAST, Pack
-from cangauge.bus.publish import ACKNOWLEDGE_EVERY, FrameIds, SocPublisher, standard_filter
-from cangauge.bus.time_source import (
-    REPLAY_CLOCK_ID,
-    ReceiveTime,
-    ReplayClock,
-    TimeSourceName,
-    is_clock,
-)
+from cangauge.bus.publish import FrameIds, SocPublisher, standard_filter
+from cangauge.bus.time_source import ReceiveTime, ReplayClock, TimeSourceName, is_clock
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.estimator import Estimator
-from cangauge.estimate.hypothesis_filter import Verdict
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.state import EstimatorState
 from cangauge.estimate.validity import Estimate, Reason, Sample, Status, status_of
 from cangauge.model.model_file import Model, effective_error_std_v
 
-# --- Frames → estimates: the one path that a live bus and a recorded capture both take
+ACKNOWLEDGE_EVERY: Final = 4
+"""Largest number of samples between two SOC_DETAIL under the replay clock: `replay` waits for
+them."""
 
-NOTHING_YET: Final = Estimate(
-    *(math.nan,) * 7, Status.INITIALISING, Reason.NO_INITIAL_SOC | Reason.INPUT_STALE, 0
-)
-"""Stands for the estimate before the first sample."""
+NOTHING_YET: Final = Estimate.unknown(Reason.NO_INITIAL_SOC | Reason.INPUT_STALE)
+"""The estimate before the first sample."""
 
 
 @dataclass(frozen=True)
 class FrameCounts:
-    """What happened to the frames so far."""
+    """What became of the frames, over all logs of a run."""
 
     frames: int = 0
-    """Frames handed over, REPLAY_CLOCK left out."""
+    """Frames handled, REPLAY_CLOCK excluded."""
     samples: int = 0
     """Samples made of them."""
     lost: int = 0
-    """Wanted frames that their counters say are missing."""
+    """Wanted frames missing according to the alive counters."""
     crc_errors: int = 0
     """Wanted frames with a wrong CRC."""
     repeated: int = 0
-    """Wanted frames whose counter stood still."""
+    """Wanted frames whose alive counter did not advance."""
     short: int = 0
     """Wanted frames with too few bytes."""
     not_available: int = 0
-    """Values whose code means "not available"."""
+    """Values coded as "not available"."""
     implausible: int = 0
     """Values out of range, or changed too fast."""
     stuck: int = 0
-    """Values of a signal that stood still while it should move."""
+    """Values of a signal that was constant while it should change."""
     held_back: int = 0
-    """Good values not used yet, because too many before them failed."""
+    """Good values withheld until enough of them follow a failure."""
     untimed: int = 0
-    """Frames before the first REPLAY_CLOCK, where that is the clock."""
+    """Frames before the first REPLAY_CLOCK, where that is the time source."""
     beginnings: int = 0
-    """How often a new log began and everything was forgotten."""
+    """How often a new log began, and decoder and estimator restarted."""
 
     def __add__(self, other: FrameCounts) -> FrameCounts:
         """Return the sums."""
@@ -77,124 +69,140 @@ class FrameCounts:
         )
 
 
-class EstimateStream:
-    """Time source, assembler and estimator in one.
+@dataclass(frozen=True)
+class PipelineSettings:
+    """Settings of a pipeline.
 
-    When the replay clock jumps back, a new log has begun: assembler and estimator start anew.
+    Parameters
+    ----------
+    estimator : EstimatorSettings
+        An unknown temperature source is replaced by the vehicle's.
+    time_source : {"receive", "replay-clock"}
+        Bus time: the frames' receive stamps, or the log time that REPLAY_CLOCK sends.
+    ids : FrameIds
+        Ids of the published frames and of REPLAY_CLOCK.
+    """
+
+    estimator: EstimatorSettings = field(default_factory=EstimatorSettings)
+    time_source: TimeSourceName = "receive"
+    ids: FrameIds = field(default_factory=FrameIds)
+
+
+class Pipeline:
+    """Estimates the SoC from a vehicle's frames, and makes the frames to publish.
+
+    When the replay clock jumps back a new log has begun: decoder and estimator restart.
 
     Parameters
     ----------
     vehicle : Vehicle
     model : Model
-    settings : EstimatorSettings, optional
-        A temperature source that it leaves unknown is the vehicle's.
-    time_source : {"receive", "replay-clock"}
-    clock_id : int
-        REPLAY_CLOCK's id.
+    settings : PipelineSettings, optional
+    publishes : bool
+        False: no frames are made, and the vehicle may use their ids.
+
+    Attributes
+    ----------
+    vehicle, model, settings
+        As in use; see `reconfigure`.
+    decoder : SampleDecoder
+        Frame statistics, signal health and the vehicle's own SoC, of the current log.
+    estimator : Estimator
+    samples : int
+        Samples handed to the estimator, refused ones included, over all logs.
+    latest_sample : Sample or None
+    published : Estimate
+        The estimate in the frames made last.
+
+    Raises
+    ------
+    InputError
+        If a frame to publish has the id of a vehicle's signal.
     """
 
     def __init__(
         self,
         vehicle: Vehicle,
         model: Model,
-        settings: EstimatorSettings | None = None,
-        time_source: TimeSourceName = "receive",
-        clock_id: int = REPLAY_CLOCK_ID,
+        settings: PipelineSettings | None = None,
+        *,
+        publishes: bool = True,
     ) -> None:
-        settings = _filled(settings or EstimatorSettings(), vehicle)
-        self._vehicle = vehicle
-        self._model = model
-        self._settings = settings
-        self._clock_id = clock_id
-        self._time: ReceiveTime | ReplayClock = (
-            ReceiveTime() if time_source == "receive" else ReplayClock(clock_id)
-        )
-        self._past = FrameCounts()
+        self.vehicle = vehicle
+        self.model = model
+        self.settings = settings or PipelineSettings()
+        ids = self.settings.ids
+        self._is_replay = self.settings.time_source == "replay-clock"
+        self._publisher: SocPublisher | None = None
+        if publishes:
+            _check_ids(vehicle, ids)
+            self._publisher = SocPublisher(ids, ACKNOWLEDGE_EVERY if self._is_replay else None)
+        self._time = ReplayClock(ids.replay_clock) if self._is_replay else ReceiveTime()
+        self._earlier_counts = FrameCounts()
         self._untimed = 0
-        self.beginnings = 0
+        self._beginnings = 0
+        self._pack = pack_of(model, self.settings.estimator.capacity_ah)
+        self.decoder = SampleDecoder(vehicle, self._pack)
+        self.estimator = Estimator(model, _with_source(self.settings.estimator, vehicle))
         self.samples = 0
-        """Samples handed to the estimator so far, those that it refused included."""
         self.latest_sample: Sample | None = None
-        self._pack = pack_of(model, settings.capacity_ah)
-        self._assembler = SampleDecoder(vehicle, self._pack)
-        self._estimator = Estimator(model, settings)
-        # The latest estimate as the estimator gave it (None until there was a sample) and judged;
-        # a sample that came since is waiting for somebody to ask for its estimate.
+        self.published = NOTHING_YET
+        # The estimate of the latest sample from the estimator (None: there is none, or it was
+        # restored), and the same with signal health; both wait until they are read.
         self._estimated: Estimate | None = None
         self._latest = NOTHING_YET
         self._is_behind = False
 
-    def handle(self, message: can.Message) -> Estimate | None:
-        """Take one frame; return the estimate after the sample that it completes, if any."""
-        return self.latest if self.take(message) else None
+    # --- frames → estimates ---------------------------------------------------------------
 
-    def take(self, message: can.Message) -> bool:
-        """Take one frame; return whether it completed a sample, of which `latest` then tells.
+    def handle(self, message: can.Message) -> bool:
+        """Process one frame; return whether it completed a sample.
 
-        The message's time stamp is set to bus time.
+        The message's time stamp is set to bus time. `latest` computes the estimate on demand.
         """
         time_s = self._time.time_of(message)
         if time_s is None:
-            if not is_clock(message, self._clock_id):
+            if not is_clock(message, self.settings.ids.replay_clock):
                 self._untimed += 1
             return False
-        if self._time.beginnings != self.beginnings:
-            self._begin_anew()
+        if self._time.beginnings != self._beginnings:
+            self._begin_log()
         message.timestamp = time_s
-        sample = self._assembler.handle(message)
+        sample = self.decoder.handle(message)
         if sample is None:
             return False
-        self._step(sample)
+        self._estimate(sample)
         return True
 
-    def finish(self) -> Estimate | None:
-        """Return the estimate after a last current that still waits for a voltage, if any."""
-        sample = self._assembler.flush()
+    def finish(self) -> list[can.Message]:
+        """Use a last current that still waits for a voltage; return the frames for it, if any."""
+        sample = self.decoder.flush()
         if sample is None:
-            return None
-        self._step(sample)
-        return self.latest
+            return []
+        self._estimate(sample)
+        if self._publisher is None:
+            return []
+        self.published = self.latest
+        return self._publisher.beat(self.published, self.samples, 0.0)
 
     @property
     def latest(self) -> Estimate:
-        """The latest estimate; `NOTHING_YET` before the first."""
-        self._catch_up()
-        return self._latest
+        """The estimate of the latest sample, with the signal health at its time.
 
-    def reconfigure(
-        self, vehicle: Vehicle | None, model: Model, settings: EstimatorSettings
-    ) -> None:
-        """Go on with another vehicle (None: the same), model and settings.
-
-        What does not change is not touched: the numbers then go on bit for bit. Else the
-        estimator is made anew and takes SoC and delay line over; the initial SoC stays what it
-        was.
+        `NOTHING_YET` before the first sample.
         """
-        self._catch_up()
-        old = self._settings
-        settings = replace(
-            _filled(settings, vehicle or self._vehicle),
-            initial_soc_pct=old.initial_soc_pct,
-            initial_soc_std_pct=old.initial_soc_std_pct,
-        )
-        pack = pack_of(model, settings.capacity_ah)
-        if vehicle is not None or pack != self._pack:
-            # What a signal may be follows from both.
-            self._past, self._untimed = self.counts, 0
-            self._vehicle, self._pack = vehicle or self._vehicle, pack
-            self._assembler = SampleDecoder(self._vehicle, pack)
-        if (model, settings) == (self._model, old):
-            return
-        before = self._estimator
-        self._model, self._settings = model, settings
-        self._estimator = Estimator(model, settings)
-        self._estimator.take_over(before)
+        return self._evaluate()
+
+    def estimate_now(self) -> Estimate:
+        """Return the latest estimate with the signal health at the latest wanted frame."""
+        self._evaluate()
+        return self._with_health(self.decoder.now_s)
 
     @property
     def counts(self) -> FrameCounts:
-        """What happened to the frames so far."""
-        now = self._assembler.statistics
-        return self._past + FrameCounts(
+        """What became of the frames so far, over all logs."""
+        now = self.decoder.statistics
+        return self._earlier_counts + FrameCounts(
             frames=now.frames,
             samples=now.samples,
             lost=now.frames_lost,
@@ -208,41 +216,121 @@ class EstimateStream:
             untimed=self._untimed,
         )
 
-    @property
-    def counters(self) -> FrameStatistics:
-        """The same in detail, of the log that is running."""
-        return self._assembler.statistics
+    # --- estimates → frames ---------------------------------------------------------------
 
     @property
-    def reference_soc_pct(self) -> float:
-        """The car's own state of charge [%]; NaN while there is none."""
-        return self._assembler.reference_soc_pct
+    def filters(self) -> list[CanFilter]:
+        """Filters for the vehicle's frames, and for REPLAY_CLOCK where that is the time source."""
+        wanted = [
+            CanFilter(
+                can_id=int(each["can_id"]),
+                can_mask=int(each["can_mask"]),
+                extended=bool(each["extended"]),
+            )
+            for each in self.vehicle.filters
+        ]
+        if self._is_replay:
+            wanted.append(standard_filter(self.settings.ids.replay_clock))
+        return wanted
+
+    def acknowledgement(self) -> list[can.Message]:
+        """Return the frames due with the latest sample of a replay; none with receive stamps."""
+        if not self._is_replay or self._publisher is None:
+            return []
+        self.published = self.latest
+        return self._publisher.publish(self.published, self.samples)
+
+    def heartbeat(self, *, is_stale: bool, silent_s: float = 0.0) -> list[can.Message]:
+        """Return the frames due every `publish.ESTIMATE_EVERY_S`.
+
+        Parameters
+        ----------
+        is_stale : bool
+            No sample within the service's time-out: the latest estimate becomes invalid.
+        silent_s : float
+            Time since the latest sample came in, by the loop's monotonic clock [s]. With receive
+            stamps, a silence longer than the current's own time-out is stale as well.
+        """
+        if self._publisher is None:
+            return []
+        estimate = self.estimate_now()
+        if not self._is_replay:
+            is_stale = is_stale or silent_s > self.decoder.health["current"].timeout_s
+        if is_stale and self.samples:
+            reasons = estimate.reasons | Reason.INPUT_STALE
+            estimate = estimate._replace(status=status_of(reasons), reasons=reasons)
+        self.published = estimate
+        age_s = silent_s if self.samples else math.nan
+        return self._publisher.beat(estimate, self.samples, age_s)
 
     @property
-    def model(self) -> Model:
-        """The model in use."""
-        return self._model
+    def least_timeout_s(self) -> float:
+        """Lower bound of a time-out for samples [s]: a slow source is not stale between two."""
+        period_s = self.decoder.health["current"].period_s
+        return 0.0 if self._is_replay or math.isnan(period_s) else MISSED_AT_LEAST * period_s
 
-    @property
-    def pause_verdict(self) -> Verdict:
-        """How the SoC over the last long pause was judged by the voltage after it."""
-        return self._estimator.pause_verdict
+    # --- another configuration, another process -------------------------------------------
+
+    def reconfigure(
+        self, vehicle: Vehicle | None, model: Model, settings: PipelineSettings
+    ) -> None:
+        """Continue with another configuration, from the SoC known so far.
+
+        What stays the same is not touched, and its numbers continue bit for bit. Otherwise the
+        estimator is replaced, and the new one takes over SoC and delay line.
+
+        Parameters
+        ----------
+        vehicle : Vehicle, optional
+            None: the same.
+        model : Model
+        settings : PipelineSettings
+            Initial SoC and its standard deviation are ignored; time source and REPLAY_CLOCK's id
+            must be the same.
+
+        Raises
+        ------
+        InputError
+            If a frame to publish has the id of a vehicle's signal; the old configuration stays.
+        """
+        if self._publisher is not None:
+            _check_ids(vehicle or self.vehicle, settings.ids)
+        self._evaluate()
+        started = self.estimator.settings
+        estimator_settings = replace(
+            _with_source(settings.estimator, vehicle or self.vehicle),
+            initial_soc_pct=started.initial_soc_pct,
+            initial_soc_std_pct=started.initial_soc_std_pct,
+        )
+        pack = pack_of(model, estimator_settings.capacity_ah)
+        if (model, estimator_settings) != (self.model, started):
+            before, self.estimator = self.estimator, Estimator(model, estimator_settings)
+            self.estimator.take_over(before)
+            self.model = model
+        if vehicle is not None or pack != self._pack:
+            # The plausible range of a signal follows from both.
+            self._earlier_counts, self._untimed = self.counts, 0
+            self.vehicle, self._pack = vehicle or self.vehicle, pack
+            self.decoder = SampleDecoder(self.vehicle, pack)
+        self.settings = settings
+        if self._publisher is not None:
+            self._publisher.ids = settings.ids
 
     def snapshot(self) -> EstimatorState | None:
-        """Return what must be remembered over a restart; None while no SoC is known."""
-        return self._estimator.snapshot() if math.isfinite(self.latest.soc_pct) else None
+        """Return the estimator's state; None while no SoC is known."""
+        return self.estimator.snapshot() if math.isfinite(self.latest.soc_pct) else None
 
     def restore(self, state: EstimatorState, age_s: float = 0.0) -> Estimate:
-        """Go on from a state (see `Estimator.restore`); until a sample comes, it is stale.
+        """Continue from a state (see `Estimator.restore`); it is stale until a sample comes.
 
         Raises
         ------
         InputError
             If the state does not fit the model; nothing is changed then.
         """
-        estimator = Estimator(self._model, self._settings)
+        estimator = Estimator(self.model, self.estimator.settings)
         latest = estimator.restore(state, age_s)
-        self._estimator = estimator
+        self.estimator = estimator
         if isinstance(self._time, ReplayClock):
             self._time.resume(latest.time_s)
         reasons = latest.reasons | Reason.INPUT_STALE
@@ -250,84 +338,72 @@ class EstimateStream:
         self._is_behind = False
         return self._latest
 
-    def ask_the_voltage(self) -> bool:
-        """Begin from the first voltages, whatever initial SoC was given; False if none was.
+    def discard_initial_soc(self) -> bool:
+        """Start from the first voltages instead of the given initial SoC; False if none was given.
 
-        For a start at which the given one is known to be of another time.
+        For a start at which the given SoC is known to be outdated.
         """
-        if self._settings.initial_soc_pct is None:
+        settings = self.estimator.settings
+        if settings.initial_soc_pct is None:
             return False
-        default = EstimatorSettings().initial_soc_std_pct
-        self._settings = replace(self._settings, initial_soc_pct=None, initial_soc_std_pct=default)
-        self._estimator = Estimator(self._model, self._settings)
+        default_std_pct = EstimatorSettings().initial_soc_std_pct
+        settings = replace(settings, initial_soc_pct=None, initial_soc_std_pct=default_std_pct)
+        self.estimator = Estimator(self.model, settings)
         return True
 
-    def _step(self, sample: Sample) -> None:
+    # --- inside ---------------------------------------------------------------------------
+
+    def _estimate(self, sample: Sample) -> None:
         self.samples += 1
         self.latest_sample = sample
-        self._estimator.take(sample)
+        self.estimator.update(sample)
         self._is_behind = True
 
-    def _catch_up(self) -> None:
-        """Ask for the estimate after the latest sample, unless that was done."""
+    def _evaluate(self) -> Estimate:
+        """Compute the estimate of the latest sample, unless that is done."""
         if self._is_behind and self.latest_sample is not None:
             self._is_behind = False
-            self._estimated = self._estimator.estimate
-            self._latest = self._judged(self.latest_sample.time_s)
+            self._estimated = self.estimator.estimate
+            self._latest = self._with_health(self.latest_sample.time_s)
+        return self._latest
 
-    @property
-    def told(self) -> Estimate:
-        """The latest estimate, with what the signals are worth since: for the next heartbeat."""
-        self._catch_up()
-        return self._judged(self._assembler.now_s)
+    def _with_health(self, now_s: float) -> Estimate:
+        """Return the latest estimate, marked by the health of the signals at bus time `now_s`.
 
-    @property
-    def current_timeout_s(self) -> float:
-        """How long a current holds [s]."""
-        return self._assembler.health["current"].timeout_s
-
-    @property
-    def current_patience_s(self) -> float:
-        """How long to wait for a current at least [s]; 0 while its period is not known."""
-        period_s = self._assembler.health["current"].period_s
-        return 0.0 if math.isnan(period_s) else MISSED_AT_LEAST * period_s
-
-    def _judged(self, now_s: float) -> Estimate:
-        """Return the latest estimate, marked by what the signals are worth at bus time `now_s`.
-
-        One voltage that failed or has not come yet is no missing voltage: several in a row are,
-        and one that is too old.
+        A single voltage that failed or has not come yet is not missing; several consecutive ones
+        are, or one that is too old.
         """
-        sample = self.latest_sample
         estimate = self._latest if self._estimated is None else self._estimated
-        missing = self._assembler.reasons(now_s)
         reasons = estimate.reasons
-        if sample is not None and math.isnan(sample.voltage_v):
+        if self.latest_sample is not None and math.isnan(self.latest_sample.voltage_v):
             reasons &= ~Reason.VOLTAGE_MISSING
-        if missing:
+        if missing := self.decoder.reasons(now_s):
             reasons |= missing
         if reasons == estimate.reasons:
             return estimate
         return estimate._replace(reasons=reasons, status=status_of(reasons))
 
-    def _begin_anew(self) -> None:
-        self._catch_up()
-        self._past = replace(self.counts, beginnings=self._past.beginnings + 1)
+    def _begin_log(self) -> None:
+        """Restart decoder and estimator for the next log of a replay."""
+        self._evaluate()
+        self._earlier_counts = replace(self.counts, beginnings=self._earlier_counts.beginnings + 1)
         self._untimed = 0
-        self.beginnings = self._time.beginnings
-        self._assembler = SampleDecoder(self._vehicle, self._pack)
-        self._estimator = Estimator(self._model, self._settings)
+        self._beginnings = self._time.beginnings
+        if self._publisher is not None:
+            self._publisher.restart()
+        self.decoder = SampleDecoder(self.vehicle, self._pack)
+        self.estimator = Estimator(self.model, self.estimator.settings)
         self._estimated = None
 
 
 def pack_of(model: Model, capacity_ah: float | None = None) -> Pack:
-    """Return what a model knows of a pack that helps to judge its signals.
+    """Return the pack's properties by which its signals are judged.
 
     Parameters
     ----------
     model : Model
     capacity_ah : float, optional
-        Instead of the model's [Ah].
+        Overrides the model's [Ah].
     """
     voltage = model.extended_model().model
     return Pack(
@@ -338,224 +414,24 @@ def pack_of(model: Model, capacity_ah: float | None = None) -> Pack:
     )
 
 
-def _filled(settings: EstimatorSettings, vehicle: Vehicle) -> EstimatorSettings:
+def _with_source(settings: EstimatorSettings, vehicle: Vehicle) -> EstimatorSettings:
+    """Return the settings with the vehicle's temperature source where theirs is unknown."""
     if settings.temperature_source != "unknown":
         return settings
     return replace(settings, temperature_source=vehicle.temperature_source)
 
 
-# --- The gauge: frames in, frames out. Pure: no bus, no clock; whoever has both is `loop`
-
-
-@dataclass(frozen=True)
-class GaugeSettings:
-    """What a user may choose.
-
-    Parameters
-    ----------
-    estimator : EstimatorSettings
-    time_source : {"receive", "replay-clock"}
-    ids : FrameIds
-    """
-
-    estimator: EstimatorSettings = field(default_factory=EstimatorSettings)
-    time_source: TimeSourceName = "receive"
-    ids: FrameIds = field(default_factory=FrameIds)
-
-
-class Gauge:
-    """Makes SOC_ESTIMATE and SOC_DETAIL of a vehicle's frames.
-
-    Parameters
-    ----------
-    vehicle : Vehicle
-    model : Model
-    settings : GaugeSettings, optional
-
-    Raises
-    ------
-    InputError
-        If a frame to publish has the id of one that is wanted.
-    """
-
-    def __init__(
-        self, vehicle: Vehicle, model: Model, settings: GaugeSettings | None = None
-    ) -> None:
-        self.settings = settings or GaugeSettings()
-        ids = self.settings.ids
-        self._vehicle = vehicle
-        _check_ids(vehicle, ids)
-        self._stream = EstimateStream(
-            vehicle, model, self.settings.estimator, self.settings.time_source, ids.replay_clock
-        )
-        self._is_replay = self.settings.time_source == "replay-clock"
-        self._publisher = SocPublisher(ids, ACKNOWLEDGE_EVERY if self._is_replay else None)
-        self._beginnings = 0
-        self.published = NOTHING_YET
-        """The estimate as last put on the bus, stale where it was told to be."""
-
-    def reconfigure(self, vehicle: Vehicle | None, model: Model, settings: GaugeSettings) -> None:
-        """Go on with another configuration, from the SoC that is known.
-
-        Parameters
-        ----------
-        vehicle : Vehicle, optional
-            None: the same.
-        model : Model
-        settings : GaugeSettings
-            Of the estimator's, initial SoC and standard deviation stay what they were; time source
-            and REPLAY_CLOCK's id must be what they were.
-
-        Raises
-        ------
-        InputError
-            As when made; the old configuration then stays.
-        """
-        _check_ids(vehicle or self._vehicle, settings.ids)
-        self._vehicle = vehicle or self._vehicle
-        self._stream.reconfigure(vehicle, model, settings.estimator)
-        self.settings = settings
-        self._publisher.ids = settings.ids
-
-    @property
-    def filters(self) -> list[CanFilter]:
-        """What to receive: the vehicle's frames, and REPLAY_CLOCK where that is the clock."""
-        wanted = [
-            CanFilter(
-                can_id=int(each["can_id"]),
-                can_mask=int(each["can_mask"]),
-                extended=bool(each["extended"]),
-            )
-            for each in self._vehicle.filters
-        ]
-        if self.settings.time_source == "replay-clock":
-            wanted.append(standard_filter(self.settings.ids.replay_clock))
-        return wanted
-
-    def take(self, message: can.Message) -> bool:
-        """Take one frame; return whether it completed a sample."""
-        return self._stream.take(message)
-
-    def acknowledgement(self) -> list[can.Message]:
-        """Return what to send at once after a sample, which only a replay's time asks for."""
-        return self._publish(self._stream.latest) if self._is_replay else []
-
-    def handle(self, message: can.Message) -> list[can.Message]:
-        """Take one frame; return those to send at once."""
-        return self.acknowledgement() if self.take(message) else []
-
-    def finish(self) -> list[can.Message]:
-        """Return the last frames to send, at the end."""
-        estimate = self._stream.finish()
-        if estimate is None:
-            return []
-        self.published = estimate
-        return self._publisher.beat(estimate, self.samples, 0.0)
-
-    def heartbeat(self, *, is_stale: bool, silent_s: float = 0.0) -> list[can.Message]:
-        """Return what to send now: every `publish.ESTIMATE_EVERY_S`, or so long after `handle`.
-
-        Parameters
-        ----------
-        is_stale : bool
-            No sample within the service's time-out: the latest estimate is told as invalid.
-        silent_s : float
-            Time since the latest sample came in, by the loop's monotonic clock [s]. While the
-            receive stamps are bus time, the current's own time-out counts, too.
-        """
-        estimate = self._stream.told
-        is_stale = is_stale or (not self._is_replay and silent_s > self._stream.current_timeout_s)
-        if is_stale and self.samples:
-            reasons = estimate.reasons | Reason.INPUT_STALE
-            estimate = estimate._replace(status=status_of(reasons), reasons=reasons)
-        self.published = estimate
-        age_s = silent_s if self.samples else math.nan
-        return self._publisher.beat(estimate, self.samples, age_s)
-
-    @property
-    def patience_s(self) -> float:
-        """How long to wait for a sample at least before the input is stale [s].
-
-        A source that is slower than the service's time-out is not stale between two samples.
-        """
-        return 0.0 if self._is_replay else self._stream.current_patience_s
-
-    @property
-    def latest(self) -> Estimate:
-        """The latest estimate; `stream.NOTHING_YET` before the first."""
-        return self._stream.latest
-
-    @property
-    def latest_sample(self) -> Sample | None:
-        """The latest sample; None before the first."""
-        return self._stream.latest_sample
-
-    @property
-    def samples(self) -> int:
-        """Samples processed so far, those that the estimator refused included."""
-        return self._stream.samples
-
-    @property
-    def counts(self) -> FrameCounts:
-        """What happened to the frames so far."""
-        return self._stream.counts
-
-    @property
-    def counters(self) -> FrameStatistics:
-        """The same in detail, of the log that is running."""
-        return self._stream.counters
-
-    @property
-    def reference_soc_pct(self) -> float:
-        """The car's own state of charge [%]; NaN while there is none."""
-        return self._stream.reference_soc_pct
-
-    @property
-    def vehicle(self) -> Vehicle:
-        """The vehicle in use."""
-        return self._vehicle
-
-    @property
-    def model(self) -> Model:
-        """The model in use."""
-        return self._stream.model
-
-    @property
-    def pause_verdict(self) -> Verdict:
-        """How the SoC over the last long pause was judged by the voltage after it."""
-        return self._stream.pause_verdict
-
-    def snapshot(self) -> EstimatorState | None:
-        """Return what must be remembered over a restart; None while no SoC is known."""
-        return self._stream.snapshot()
-
-    def restore(self, state: EstimatorState, age_s: float = 0.0) -> Estimate:
-        """Go on from a state; see `EstimateStream.restore`."""
-        return self._stream.restore(state, age_s)
-
-    def ask_the_voltage(self) -> bool:
-        """Begin from the voltage; see `EstimateStream.ask_the_voltage`."""
-        return self._stream.ask_the_voltage()
-
-    def _publish(self, estimate: Estimate) -> list[can.Message]:
-        if self._stream.beginnings != self._beginnings:
-            self._beginnings = self._stream.beginnings
-            self._publisher.restart()
-        self.published = estimate
-        return self._publisher.publish(estimate, self.samples)
-
-
 def _check_ids(vehicle: Vehicle, ids: FrameIds) -> None:
-    own = {
+    published = {
         ids.soc_estimate: "soc_estimate",
         ids.soc_detail: "soc_detail",
         ids.replay_clock: "replay_clock",
     }
     for signal in vehicle.signals:
-        if not signal.is_extended and signal.arbitration_id in own:
+        if not signal.is_extended and signal.arbitration_id in published:
             raise InputError(
                 f"{signal.message} of {vehicle.name} has this id",
-                field=f"ids.{own[signal.arbitration_id]}",
+                field=f"ids.{published[signal.arbitration_id]}",
                 value=f"0x{signal.arbitration_id:X}",
                 cure="choose another one",
             )

@@ -27,7 +27,7 @@ from cangauge.service.config import RunConfig, config_keys, load_config
 from cangauge.service.http import Endpoint
 from cangauge.service.lifecycle import Notifier, note_hangups, stop_on_signals
 from cangauge.service.loop import LoopSettings, Outputs, RunSummary, serve
-from cangauge.service.pipeline import Gauge
+from cangauge.service.pipeline import Pipeline
 from cangauge.service.recording import Recorder
 from cangauge.service.state import StateKeeper
 from cangauge.service.status import Identity, Monitor, Snapshot
@@ -52,7 +52,7 @@ class Service:
     ----------
     config : RunConfig
         The configuration in use, except for keys that need a restart.
-    gauge : Gauge
+    gauge : Pipeline
         The estimator.
     on_status : callable or None
         Takes a `Snapshot` four times a second while the service runs.
@@ -89,7 +89,7 @@ class Service:
         self._state = loaded.state_settings(os.environ)
         vehicle = loaded.load_vehicle()
         self._vehicle_key = _vehicle_key(loaded, vehicle)
-        self.gauge = Gauge(vehicle, Model.load(loaded.model), loaded.gauge_settings())
+        self.gauge = Pipeline(vehicle, Model.load(loaded.model), loaded.gauge_settings())
         self._address = loaded.address()
         self._stop = threading.Event()
         self._reload = threading.Event()
@@ -323,7 +323,7 @@ def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None
         )
 
 
-def summary_line(gauge: Gauge, port: ReconnectingBus, summary: RunSummary) -> str:
+def summary_line(gauge: Pipeline, port: ReconnectingBus, summary: RunSummary) -> str:
     """Return a run's frames, losses and last SoC in one line."""
     counts, latest = gauge.counts, gauge.latest
     soc = f"{number(latest.soc_pct, 2)} ± {number(latest.soc_std_pct, 2, '%')}"
@@ -348,7 +348,7 @@ def _bus_errors(port: ReconnectingBus, summary: RunSummary) -> str:
     return "".join(f", {count} {what}" for what, count in found.items() if count)
 
 
-def summary_json(gauge: Gauge, port: ReconnectingBus, summary: RunSummary) -> dict[str, Any]:
+def summary_json(gauge: Pipeline, port: ReconnectingBus, summary: RunSummary) -> dict[str, Any]:
     """Return the summary that `--json` prints."""
     counts, latest = gauge.counts, gauge.latest
     return {
@@ -390,5 +390,5 @@ def summary_json(gauge: Gauge, port: ReconnectingBus, summary: RunSummary) -> di
             "status": latest.status.name.lower(),
             "reasons": reason_names(int(latest.reasons)),
         },
-        "soc_reference_pct": gauge.reference_soc_pct,
+        "soc_reference_pct": gauge.decoder.reference_soc_pct,
     }

@@ -35,7 +35,7 @@ from cangauge.estimate.state import EstimatorState
 from cangauge.model.model_file import Model
 from cangauge.service.async_writer import AsyncWriter
 from cangauge.service.loop import CHECKPOINT_EVERY_S
-from cangauge.service.pipeline import Gauge
+from cangauge.service.pipeline import Pipeline
 
 STATE_FORMAT: Final = "cangauge-state"
 STATE_VERSION: Final = 1
@@ -107,7 +107,7 @@ class StateKeeper:
     Parameters
     ----------
     settings : StateSettings
-    gauge : Gauge
+    gauge : Pipeline
     wall_s : callable
         Unix time [s].
     """
@@ -115,7 +115,7 @@ class StateKeeper:
     def __init__(
         self,
         settings: StateSettings,
-        gauge: Gauge,
+        gauge: Pipeline,
         *,
         wall_s: Callable[[], float] = time.time,
     ) -> None:
@@ -237,7 +237,7 @@ class StateKeeper:
         # counting alone would never correct it.
         how = (
             "by voltage, for the given SoC is of an earlier start"
-            if self._gauge.ask_the_voltage()
+            if self._gauge.discard_initial_soc()
             else "without"
         )
         text = f"state refused: {error}{kept}; starting {how}"
@@ -256,7 +256,7 @@ class StateKeeper:
         write_text_atomic(self.settings.path, state_text(content))
 
     def _log_verdict(self) -> None:
-        verdict = self._gauge.pause_verdict
+        verdict = self._gauge.estimator.filter.verdict
         if self._restored_pct is None or verdict in {"", "open"}:
             return
         before, self._restored_pct = self._restored_pct, None

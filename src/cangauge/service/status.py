@@ -23,7 +23,7 @@ from cangauge.bus.decoder import FrameStatistics
 from cangauge.bus.plausibility import MessageStatistics
 from cangauge.estimate.validity import Estimate, Reason, Sample, Status, reason_name, reason_names
 from cangauge.service.lifecycle import Notifier
-from cangauge.service.pipeline import Gauge
+from cangauge.service.pipeline import Pipeline
 from cangauge.service.recording import Recorder, RecordState
 
 _LOG = logging.getLogger(__name__)
@@ -303,7 +303,7 @@ class Monitor:
 
     Parameters
     ----------
-    gauge : Gauge
+    gauge : Pipeline
     port : BusConnection
     identity : Identity
     notifier : Notifier
@@ -321,7 +321,7 @@ class Monitor:
 
     def __init__(
         self,
-        gauge: Gauge,
+        gauge: Pipeline,
         port: BusConnection,
         *,
         identity: Identity,
@@ -404,7 +404,7 @@ class Monitor:
         if now_s - since_s >= RATE_OVER_S:
             self._rate = (samples - before) / (now_s - since_s)
             self._rate_from = (now_s, samples)
-        counters = gauge.counters
+        counters = gauge.decoder.statistics
         rejects = _rejects(counters)
         return Snapshot(
             identity=self.identity,

@@ -87,7 +87,7 @@ def step_through(
             line.push(reading.time_s, reading.current_a)
             delayed = line.currents()
             online.advance(reading.time_s, reading.current_a, reading.temperature_c, delayed)
-            counted = start - counter.discharged_pct
+            counted = start - counter.state.discharged_pct
             asked = counted if asked_soc_pct is None else float(asked_soc_pct[len(readings)])
             beside = extended.model.offset_at(reading.temperature_c, delayed)
             readings.append(reading)

@@ -1,4 +1,4 @@
-"""After a time that nobody saw: parked or moved, the voltage tells; the SoC does not jump."""
+"""Unobserved intervals (parked or moved), lost filters, clocks, and external SoC references."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ def drive(start_pct: float, end_pct: float, begin_s: float, *, seed: int = 3, bi
     ]
 
 
-def after_pause(
+def after_interval(
     hours: float, before_pct: float, after_pct: float, *, bias_v: float = 0.0, seed: int = 3
 ) -> tuple[Estimate, list[Estimate], Estimator]:
-    """The last estimate before a pause, those after it, and the estimator."""
+    """Return the last estimate before an unobserved interval, those after it, and the estimator."""
     estimator = Estimator(MODEL, EstimatorSettings(initial_soc_pct=before_pct + 3.0))
     for sample in drive(before_pct + 3.0, before_pct, 0.0, seed=seed):
         last = estimator.step(sample)
@@ -52,15 +52,13 @@ def errors(found: list[Estimate], after_pct: float) -> list[float]:
 
 @pytest.mark.parametrize("hours", [0.03, 0.5, 8.0, 24.0])
 @pytest.mark.parametrize("bias_v", [0.0, -1.0, 1.0])
-def test_parked_the_soc_stays_though_the_voltage_says_otherwise(
-    hours: float, bias_v: float
-) -> None:
-    # 1 V is nearly 3 % SoC there; the model's own errors have a standard deviation of 0.95 V.
-    last, found, _ = after_pause(hours, 60.0, 60.0, bias_v=bias_v)
+def test_parked_soc_stays_despite_biased_voltage(hours: float, bias_v: float) -> None:
+    # 1 V is nearly 3 % SoC here; the standard deviation of the model's errors is 0.95 V.
+    last, found, _ = after_interval(hours, 60.0, 60.0, bias_v=bias_v)
     steps = [b.soc_pct - a.soc_pct for a, b in itertools.pairwise([last, *found])]
     assert max(map(abs, steps)) < 0.6
     wrong = errors(found, 60.0)
-    # Without any pause it is 1.9 % after half an hour, by the same voltage.
+    # Without an interval the same voltage gives 1.9 % after half an hour.
     assert max(map(abs, wrong)) < 2.6
     assert max(map(abs, wrong[:120])) < 1.8
     outside = [abs(e) > 2.0 * each.soc_std_pct for e, each in zip(wrong, found, strict=True)]
@@ -72,38 +70,38 @@ def test_parked_the_soc_stays_though_the_voltage_says_otherwise(
     [(8.0, 30.0, 90.0), (8.0, 30.0, 60.0), (8.0, 30.0, 42.0), (0.35, 20.0, 70.0),
      (24.0, 80.0, 20.0), (0.1, 40.0, 50.0)],
 )  # fmt: skip
-def test_charged_or_driven_unseen_is_found_within_minutes(
+def test_unobserved_charge_is_found_within_minutes(
     hours: float, before_pct: float, after_pct: float
 ) -> None:
-    _, found, estimator = after_pause(hours, before_pct, after_pct)
+    _, found, estimator = after_interval(hours, before_pct, after_pct)
     wrong = errors(found, after_pct)
     inside = [abs(e) < 3.0 * each.soc_std_pct for e, each in zip(wrong, found, strict=True)]
     assert sum(inside) > 0.97 * len(inside)
     assert max(map(abs, wrong[180:])) < 4.0
     if abs(after_pct - before_pct) > 20.0:
-        assert estimator.pause_verdict == "moved"
+        assert estimator.filter.verdict == "moved"
 
 
-def test_a_little_charge_is_weighed_and_not_lost_in_certainty() -> None:
-    """6 % charged at night: too little to prove by voltages that may be 3 % wrong."""
-    _, found, _ = after_pause(8.0, 30.0, 36.0)
+def test_small_unobserved_charge_stays_within_uncertainty() -> None:
+    """Charging 6 % at night is too little to prove by voltages that may be 3 % wrong."""
+    _, found, _ = after_interval(8.0, 30.0, 36.0)
     wrong = errors(found, 36.0)
     assert abs(wrong[-1]) < 3.0
     assert all(abs(e) < 2.5 * f.soc_std_pct for e, f in zip(wrong[90:], found[90:], strict=True))
 
 
-def test_an_offset_does_not_count_while_nobody_counts() -> None:
-    """An offset of 1 A over a night of 10 h would be 19 % of the capacity."""
+def test_offset_does_not_accumulate_while_unobserved() -> None:
+    """An offset of 1 A counted over 10 h would be 19 % of the capacity."""
     estimator = Estimator(MODEL, EstimatorSettings(initial_soc_pct=95.0))
     samples = drive(95.0, 45.0, 0.0, hours=2.0)
     for sample in samples:
         last = estimator.step(sample._replace(current_a=sample.current_a + 1.0))
-    assert estimator.offset_a > 0.5
+    assert estimator.filter.offset_a > 0.5
     after = estimator.step(Sample(last.time_s + 36000.0, 1.0, math.nan, 23.0))
     assert after.soc_pct == pytest.approx(last.soc_pct, abs=0.05)
 
 
-def test_pauses_on_pauses() -> None:
+def test_many_unobserved_intervals_keep_the_soc() -> None:
     estimator = Estimator(MODEL, EstimatorSettings(initial_soc_pct=70.0))
     time_s = 0.0
     for number in range(30):
@@ -114,15 +112,15 @@ def test_pauses_on_pauses() -> None:
     assert last.soc_std_pct < 5.0
 
 
-# --- divergence -------------------------------------------------------------------------------
+# --- lost filter ------------------------------------------------------------------------------
 
 
-def test_voltages_that_are_all_outliers_reset_the_filter_and_say_so() -> None:
+def test_persistent_outliers_restart_the_filter() -> None:
     estimator = Estimator(MODEL, EstimatorSettings(initial_soc_pct=60.0))
     for sample in drive(60.0, 58.0, 0.0):
         last = estimator.step(sample)
     assert last.soc_std_pct < 1.5
-    # A loose wire: the voltage swings so widely that its mean still is the right one.
+    # A loose wire: the voltage swings widely around the right mean.
     broken = [
         each._replace(voltage_v=each.voltage_v + (90.0 if number % 2 else -90.0))
         for number, each in enumerate(drive(58.0, 57.0, last.time_s + 1.0))
@@ -131,7 +129,7 @@ def test_voltages_that_are_all_outliers_reset_the_filter_and_say_so() -> None:
     marked = [bool(each.reasons & Reason.INNOVATION_LARGE) for each in found]
     assert 150 < marked.index(True) < 300
     assert all(marked[300:])
-    assert estimator.resets > 0
+    assert estimator.snapshot().memory.resets > 0
     assert all(0.0 <= each.soc_pct <= 100.0 for each in found)
     mended = drive(57.0, 53.0, found[-1].time_s + 1.0)
     found = [estimator.step(each) for each in mended]
@@ -139,27 +137,27 @@ def test_voltages_that_are_all_outliers_reset_the_filter_and_say_so() -> None:
     assert not found[-1].reasons & Reason.INNOVATION_LARGE
 
 
-def test_a_covariance_that_is_none_any_more_resets_the_filter() -> None:
+def test_invalid_covariance_restarts_the_filter() -> None:
     estimator = Estimator(MODEL, EstimatorSettings(initial_soc_pct=60.0))
     samples = drive(60.0, 55.0, 0.0)
     for sample in samples[:600]:
         estimator.step(sample)
-    filter_ = estimator._fusion._filters[0]._ekf
+    filter_ = estimator.filter._filters[0]._ekf
     filter_.P[0, 0] = -1.0
     found = estimator.step(samples[600])
     assert found.reasons & Reason.INNOVATION_LARGE
-    assert estimator.resets == 1
-    filter_ = estimator._fusion._filters[0]._ekf
+    assert estimator.snapshot().memory.resets == 1
+    filter_ = estimator.filter._filters[0]._ekf
     filter_.x[2, 0] = math.nan
     assert estimator.step(samples[601]).soc_pct == pytest.approx(found.soc_pct, abs=10.0)
-    assert estimator.resets == 2
+    assert estimator.snapshot().memory.resets == 2
     for sample in samples[602:]:
         found = estimator.step(sample)
     assert found.soc_pct == pytest.approx(55.0, abs=3.0)
     assert not found.reasons & Reason.INNOVATION_LARGE
 
 
-def test_one_odd_voltage_after_a_pause_is_no_contradiction() -> None:
+def test_single_outlier_after_interval_is_no_contradiction() -> None:
     estimator = Estimator(MODEL, EstimatorSettings(initial_soc_pct=60.0))
     for sample in drive(60.0, 58.0, 0.0):
         last = estimator.step(sample)
@@ -174,7 +172,7 @@ def test_one_odd_voltage_after_a_pause_is_no_contradiction() -> None:
 
 
 @pytest.mark.parametrize("jump_s", [-1e6, -3600.0, -5.0])
-def test_a_clock_set_back_is_followed(jump_s: float) -> None:
+def test_clock_set_back_is_followed(jump_s: float) -> None:
     whole = [Estimator(MODEL, EstimatorSettings(initial_soc_pct=60.0)) for _ in range(2)]
     samples = drive(60.0, 50.0, 1e7)
     refused = 0
@@ -183,12 +181,12 @@ def test_a_clock_set_back_is_followed(jump_s: float) -> None:
         shift_s = jump_s if number >= 900 else 0.0
         found = whole[1].step(sample._replace(time_s=sample.time_s + shift_s))
         refused += bool(found.reasons & Reason.IMPLAUSIBLE_INPUT)
-    # By five seconds the clock itself has caught up with, at a sample a second.
+    # At one sample a second the clock catches up with five seconds by itself.
     assert refused == SET_BACK_SAMPLES - 1 if jump_s < -5.0 else refused <= 5
     assert found.soc_pct == pytest.approx(true.soc_pct, abs=0.3)
 
 
-def test_a_single_stamp_from_the_future_costs_a_few_samples() -> None:
+def test_single_future_stamp_costs_a_few_samples() -> None:
     estimator = Estimator(MODEL, EstimatorSettings(initial_soc_pct=60.0))
     samples = drive(60.0, 50.0, 1e7)
     samples[900] = samples[900]._replace(time_s=5e9)
@@ -197,18 +195,18 @@ def test_a_single_stamp_from_the_future_costs_a_few_samples() -> None:
     assert found[-1].soc_pct == pytest.approx(50.0, abs=1.5)
 
 
-# --- anchors ----------------------------------------------------------------------------------
+# --- external SoC references ------------------------------------------------------------------
 
 
 def charging(estimator: Estimator, end_v: float, hold_s: int, current_a: float) -> list[Estimate]:
-    """A taper at the end of a charge."""
+    """Estimate the end of a charge, with a tapering current."""
     rows = [Sample(float(k), -12.0, 391.0, 23.0) for k in range(120)]
     rows += [Sample(120.0 + k, current_a, end_v, 23.0) for k in range(hold_s)]
     return [estimator.step(each) for each in rows]
 
 
 @pytest.mark.parametrize("method", ["ekf", "coulomb"])
-def test_full_charge_is_an_anchor_if_asked_for(method: Any) -> None:
+def test_full_charge_rule_corrects_the_soc(method: Any) -> None:
     rule = FullCharge(voltage_v=392.0, current_a=2.0, hold_s=30.0, soc_std_pct=0.3)
     end_v = 392.5
     settings = {"method": method, "initial_soc_pct": 93.0, "initial_soc_std_pct": 2.0}
@@ -227,7 +225,7 @@ def test_full_charge_is_an_anchor_if_asked_for(method: Any) -> None:
     assert max(each.soc_std_pct for each in strong[-2:]) > 0.4
 
 
-def test_a_long_rest_is_an_anchor_for_a_count_if_asked_for() -> None:
+def test_long_rest_rule_corrects_the_count() -> None:
     rest_v = CURVE.pseudo_ocv([55.0], [23.0])[0]
     rows = [Sample(float(k), 0.2, rest_v, 23.0) for k in range(0, 3000, 5)]
     settings = {"method": "coulomb", "initial_soc_pct": 62.0, "initial_soc_std_pct": 5.0}
@@ -237,18 +235,18 @@ def test_a_long_rest_is_an_anchor_for_a_count_if_asked_for() -> None:
     assert found[350].soc_pct == pytest.approx(61.9, abs=0.1)
     assert found[370].soc_pct == pytest.approx(55.2, abs=0.3)
     assert found[370].soc_std_pct < 1.2
-    # Once a rest, not at every sample of it.
+    # Once per rest, not at every sample.
     assert found[-1].soc_std_pct > 0.9
 
 
-def test_anchors_are_checked() -> None:
+def test_reference_rules_validate_their_ranges() -> None:
     with pytest.raises(InputError, match=r"full_charge\.voltage_v"):
         FullCharge(voltage_v=math.nan, current_a=2.0)
     with pytest.raises(InputError, match=r"long_rest\.after_s"):
         LongRest(after_s=1.0)
 
 
-def test_the_odds_of_any_time_are_finite_and_grow() -> None:
+def test_moved_odds_are_finite_and_grow_with_time() -> None:
     odds = [moved_log_odds(seconds) for seconds in (5e-324, 1e-9, 2.0, 60.0, 7200.0, 1e300)]
     assert all(math.isfinite(each) for each in odds)
     assert odds == sorted(odds)

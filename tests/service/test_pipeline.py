@@ -1,4 +1,4 @@
-"""Frames in, frames out: the gauge without a bus, against the offline estimator."""
+"""The pipeline without a bus, against the offline estimator."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cangauge.estimate.offline import run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import Estimate, Reason, Status
 from cangauge.logs.log import Log
-from cangauge.service.pipeline import Gauge, GaugeSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from live import leaf_model, short_log
 
 START = EstimatorSettings(initial_soc_pct=80.0)
@@ -36,35 +36,35 @@ def frames_of(log: Log, vehicle: Vehicle, shift_s: float = 0.0) -> list[can.Mess
 
 
 def with_clock(frames: list[can.Message]) -> list[can.Message]:
-    """As replay sends them: the clock ahead, stamps that mean nothing."""
+    """Return the frames as `replay` sends them: after their clock, with arbitrary stamps."""
     clock = ClockFrames()
-    told = []
+    sent = []
     for frame in frames:
-        told += [clock.at(round(frame.timestamp * 1e6)), frame]
+        sent += [clock.at(round(frame.timestamp * 1e6)), frame]
         frame.timestamp = 7.0
-    return told
+    return sent
 
 
-def estimates(gauge: Gauge, frames: list[can.Message]) -> list[Estimate]:
+def estimates(pipeline: Pipeline, frames: list[can.Message]) -> list[Estimate]:
     found = []
     for frame in frames:
-        before = gauge.samples
-        gauge.handle(frame)
-        if gauge.samples != before:
-            found.append(gauge.latest)
+        before = pipeline.samples
+        pipeline.handle(frame)
+        if pipeline.samples != before:
+            found.append(pipeline.latest)
     return found
 
 
 @pytest.mark.parametrize("preset", ["generic", "leaf_aze0"])
 @pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
-def test_live_is_offline_on_what_the_frames_hold(log: Log, preset: str, method: str) -> None:
+def test_live_equals_offline_on_quantised_values(log: Log, preset: str, method: str) -> None:
     vehicle = Vehicle.load(preset)
     settings = EstimatorSettings(method=method, initial_soc_pct=80.0)  # type: ignore[arg-type] # parametrised
-    gauge = Gauge(vehicle, leaf_model(), GaugeSettings(settings, "replay-clock"))
-    live = estimates(gauge, with_clock(frames_of(log, vehicle)))
+    pipeline = Pipeline(vehicle, leaf_model(), PipelineSettings(settings, "replay-clock"))
+    live = estimates(pipeline, with_clock(frames_of(log, vehicle)))
     offline = run_estimator(samples_of(FrameEncoder(vehicle).quantise(log)), leaf_model(), settings)
     assert len(live) == len(log)
-    # To the last bit, and not only nearly.
+    # To the last bit.
     assert [each.soc_pct for each in live] == offline.soc_pct.tolist()
     assert [each.soc_std_pct for each in live] == offline.soc_std_pct.tolist()
     assert [each.residual_v for each in live] == offline.residual_v.tolist()
@@ -72,25 +72,25 @@ def test_live_is_offline_on_what_the_frames_hold(log: Log, preset: str, method: 
 
 def test_receive_stamps_are_bus_time(log: Log) -> None:
     vehicle = Vehicle.load("generic")
-    gauge = Gauge(vehicle, leaf_model(), GaugeSettings(START))
-    live = estimates(gauge, frames_of(log, vehicle, shift_s=1.7e9))
+    pipeline = Pipeline(vehicle, leaf_model(), PipelineSettings(START))
+    live = estimates(pipeline, frames_of(log, vehicle, shift_s=1.7e9))
     assert live[-1].time_s == pytest.approx(1.7e9 + log.time_s[-1])
     counted = run_estimator(samples_of(log), leaf_model(), START).soc_coulomb_pct
     assert live[-1].soc_coulomb_pct == pytest.approx(counted[-1], abs=1e-4)
 
 
-def test_without_a_clock_frame_nothing_is_estimated(log: Log) -> None:
+def test_no_estimate_before_the_first_replay_clock(log: Log) -> None:
     vehicle = Vehicle.load("generic")
-    gauge = Gauge(vehicle, leaf_model(), GaugeSettings(START, "replay-clock"))
+    pipeline = Pipeline(vehicle, leaf_model(), PipelineSettings(START, "replay-clock"))
     frames = frames_of(log, vehicle)[:50]
-    assert estimates(gauge, frames) == []
-    assert gauge.counts.untimed == 50
+    assert estimates(pipeline, frames) == []
+    assert pipeline.counts.untimed == 50
 
 
-def test_before_the_first_sample_it_says_that_it_knows_nothing() -> None:
-    gauge = Gauge(Vehicle.load("generic"), leaf_model())
+def test_initialising_before_the_first_sample() -> None:
+    pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
     reader = SocReader()
-    contents = [reader.read(frame) for frame in gauge.heartbeat(is_stale=False)]
+    contents = [reader.read(frame) for frame in pipeline.heartbeat(is_stale=False)]
     assert isinstance(contents[0], SocEstimate)
     assert math.isnan(contents[0].soc_pct)
     assert contents[0].status is Status.INITIALISING
@@ -99,87 +99,89 @@ def test_before_the_first_sample_it_says_that_it_knows_nothing() -> None:
     assert contents[1] == SocDetail(*contents[1][:3], samples=0)  # type: ignore[index] # a SocDetail
 
 
-def test_silence_is_published_as_invalid_with_the_last_soc(log: Log) -> None:
+def test_silence_is_invalid_with_the_last_soc(log: Log) -> None:
     vehicle = Vehicle.load("generic")
-    gauge = Gauge(vehicle, leaf_model(), GaugeSettings(START))
-    estimates(gauge, frames_of(log, vehicle))
+    pipeline = Pipeline(vehicle, leaf_model(), PipelineSettings(START))
+    estimates(pipeline, frames_of(log, vehicle))
     reader = SocReader()
-    fresh = reader.read(gauge.heartbeat(is_stale=False)[0])
-    stale = reader.read(gauge.heartbeat(is_stale=True, silent_s=7.9)[0])
+    fresh = reader.read(pipeline.heartbeat(is_stale=False)[0])
+    stale = reader.read(pipeline.heartbeat(is_stale=True, silent_s=7.9)[0])
     assert isinstance(fresh, SocEstimate)
     assert isinstance(stale, SocEstimate)
     assert not fresh.reasons & Reason.INPUT_STALE
     assert stale.status is Status.INVALID
     assert stale.reasons & Reason.INPUT_STALE
-    assert stale.soc_pct == fresh.soc_pct == pytest.approx(gauge.latest.soc_pct, abs=0.001)
+    assert stale.soc_pct == fresh.soc_pct == pytest.approx(pipeline.latest.soc_pct, abs=0.001)
     assert (fresh.age_s, stale.age_s) == (0.0, 7.0)
-    # Once frames come again, so does a valid estimate.
+    # The estimate recovers with the next frames.
     again = frames_of(log.rows(slice(0, 2)), vehicle, shift_s=log.time_s[-1] + 0.1)
-    assert estimates(gauge, again)[-1].status is not Status.INVALID
+    assert estimates(pipeline, again)[-1].status is not Status.INVALID
 
 
-def test_the_last_samples_are_acknowledged_once_it_is_quiet(log: Log) -> None:
+def test_heartbeat_acknowledges_the_last_samples(log: Log) -> None:
     vehicle = Vehicle.load("generic")
-    gauge = Gauge(vehicle, leaf_model(), GaugeSettings(START, "replay-clock"))
+    pipeline = Pipeline(vehicle, leaf_model(), PipelineSettings(START, "replay-clock"))
     reader = SocReader()
-    told = 0
+    acknowledged = 0
     for frame in with_clock(frames_of(log.rows(slice(0, 7)), vehicle)):
-        for sent in gauge.handle(frame):
+        for sent in pipeline.acknowledgement() if pipeline.handle(frame) else []:
             content = reader.read(sent)
-            told = content.samples if isinstance(content, SocDetail) else told
-    assert told < 7
-    contents = [reader.read(frame) for frame in gauge.heartbeat(is_stale=False)]
+            acknowledged = content.samples if isinstance(content, SocDetail) else acknowledged
+    assert acknowledged < 7
+    contents = [reader.read(frame) for frame in pipeline.heartbeat(is_stale=False)]
     assert [each.samples for each in contents if isinstance(each, SocDetail)] == [7]
 
 
-def test_a_second_replay_starts_anew_and_counting_goes_on(log: Log) -> None:
+def test_second_replay_restarts_the_estimator(log: Log) -> None:
     vehicle = Vehicle.load("generic")
-    gauge = Gauge(vehicle, leaf_model(), GaugeSettings(START, "replay-clock"))
-    first = estimates(gauge, with_clock(frames_of(log, vehicle)))
-    second = estimates(gauge, with_clock(frames_of(log, vehicle)))
+    pipeline = Pipeline(vehicle, leaf_model(), PipelineSettings(START, "replay-clock"))
+    first = estimates(pipeline, with_clock(frames_of(log, vehicle)))
+    second = estimates(pipeline, with_clock(frames_of(log, vehicle)))
     assert [each.soc_pct for each in second] == [each.soc_pct for each in first]
-    assert gauge.samples == 2 * len(log)
-    assert gauge.counts.samples == 2 * len(log)
-    assert gauge.counts.beginnings == 1
+    assert pipeline.samples == 2 * len(log)
+    assert pipeline.counts.samples == 2 * len(log)
+    assert pipeline.counts.beginnings == 1
 
 
 def test_damaged_and_lost_frames_are_counted(log: Log) -> None:
     vehicle = Vehicle.load("leaf_aze0")
-    gauge = Gauge(vehicle, leaf_model(), GaugeSettings(START))
+    pipeline = Pipeline(vehicle, leaf_model(), PipelineSettings(START))
     frames = [each for each in frames_of(log, vehicle) if each.arbitration_id == 0x1DB]
     frames[10].data[0] ^= 0xFF
     del frames[20]
-    assert len(estimates(gauge, frames)) == len(log) - 2
-    assert gauge.counts.crc_errors == 1
-    assert gauge.counts.lost >= 1
+    assert len(estimates(pipeline, frames)) == len(log) - 2
+    assert pipeline.counts.crc_errors == 1
+    assert pipeline.counts.lost >= 1
 
 
-def test_own_ids_must_not_be_the_vehicles() -> None:
+def test_published_id_of_a_vehicle_signal_is_refused() -> None:
     with pytest.raises(InputError, match="PACK_CURRENT"):
-        Gauge(
-            Vehicle.load("generic"), leaf_model(), GaugeSettings(ids=FrameIds(soc_estimate=0x400))
+        Pipeline(
+            Vehicle.load("generic"),
+            leaf_model(),
+            PipelineSettings(ids=FrameIds(soc_estimate=0x400)),
         )
 
 
 def test_only_wanted_ids_pass_the_filters() -> None:
-    gauge = Gauge(Vehicle.load("leaf_aze0"), leaf_model())
-    assert {each["can_id"] for each in gauge.filters} == {0x1DB, 0x55B, 0x5C0}
-    assert all(each["can_mask"] == 0x7FF and each["extended"] is False for each in gauge.filters)
-    settings = GaugeSettings(time_source="replay-clock")
-    clocked = Gauge(Vehicle.load("leaf_aze0"), leaf_model(), settings)
+    pipeline = Pipeline(Vehicle.load("leaf_aze0"), leaf_model())
+    assert {each["can_id"] for each in pipeline.filters} == {0x1DB, 0x55B, 0x5C0}
+    assert all(each["can_mask"] == 0x7FF and each["extended"] is False for each in pipeline.filters)
+    settings = PipelineSettings(time_source="replay-clock")
+    clocked = Pipeline(Vehicle.load("leaf_aze0"), leaf_model(), settings)
     assert {each["can_id"] for each in clocked.filters} == {0x1DB, 0x55B, 0x5C0, 0x5AF}
 
 
-def test_a_wide_standard_deviation_is_degraded_on_the_bus_and_says_so(log: Log) -> None:
+def test_uncertain_soc_is_published_as_degraded(log: Log) -> None:
     reader = SocReader()
     for limit, status, reasons in (
         (0.5, Status.DEGRADED, Reason.SOC_UNCERTAIN),
         (1.5, Status.VALID, Reason.NONE),
     ):
         given = EstimatorSettings(initial_soc_pct=80.0, valid_std_pct=limit)
-        gauge = Gauge(Vehicle.load("generic"), leaf_model(), GaugeSettings(given))
+        pipeline = Pipeline(Vehicle.load("generic"), leaf_model(), PipelineSettings(given))
         for frame in frames_of(log, Vehicle.load("generic")):
-            gauge.handle(frame)
-        told = reader.read(gauge.heartbeat(is_stale=False)[0])
-        assert isinstance(told, SocEstimate)
-        assert (told.status, told.reasons) == (status, reasons)
+            pipeline.handle(frame)
+        found = reader.read(pipeline.heartbeat(is_stale=False)[0])
+        assert isinstance(found, SocEstimate)
+        assert (found.status, found.reasons) == (status, reasons)
