@@ -45,7 +45,7 @@ def day(seed: int, warmth_c: float, offset_a: float = 0.0) -> Log:
 def model() -> Model:
     logs = [day(1, 8.0), day(2, 15.0), day(3, 22.0), day(4, 29.0)]
     effects = ("resistance_temperature",)
-    return fit(logs, replace(OPTIONS, effects=effects, name="with effects")).model
+    return fit(logs, capacity_ah=CAPACITY_AH, effects=effects, name="with effects").model
 
 
 def test_widened_temperatures_leave_the_effects_where_they_were(model: Model) -> None:
