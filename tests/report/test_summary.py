@@ -36,7 +36,7 @@ def one(name: str, value: float, ci: tuple[float, float] | None) -> dict[str, An
         ("initial_soc", one("offset_pct", -5.0, None),
          "The assumed initial SoC is 5.0 % too high: initial_soc (probability 0.60)."),
         ("hysteresis", one("half_width_v", 2.0, None),
-         "The likely cause is hysteresis (probability 0.60)."),
+         "The most likely cause is hysteresis (probability 0.60)."),
         ("none", {}, ""),
     ],
 )  # fmt: skip

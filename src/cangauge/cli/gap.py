@@ -177,9 +177,7 @@ def _show(found: Diagnosis) -> None:
         probability = number(found.verdict.chances[answer], 2)
         rows.append([answer, probability, NONE_KNOWN, NONE_KNOWN, NONE_KNOWN])
     headings = ["cause", "probability", "evidence", "left [V]", "closed"]
-    print_table(
-        "Candidates: log evidence; error left and gap closed on held-out rows", headings, rows
-    )
+    print_table("Candidates, judged on held-out rows", headings, rows)
     for item in found.candidates:
         if item["effect"] in found.extension.cause:
             typer.echo(f"{item['effect']}: {parameters_text(item['parameters'])}")

@@ -30,7 +30,7 @@ from bokeh.models import (
 from bokeh.plotting import figure
 from numpy.typing import NDArray
 
-from cangauge._formatting import significant
+from cangauge._formatting import number
 from cangauge._typing import FloatArray
 from cangauge.inference.rows import usual_gap_s
 from cangauge.model.delay_line import GAP_S
@@ -218,7 +218,9 @@ def histogram(quantity: str, unit: str, parts: Sequence[tuple[str, FloatArray, s
     return plot
 
 
-def bars(quantity: str, unit: str, entries: Sequence[tuple[str, float, str]]) -> Plot:
+def bars(
+    quantity: str, unit: str, entries: Sequence[tuple[str, float, str]], *, decimals: int
+) -> Plot:
     """Return horizontal bars (name, value, color), each with its value beside it."""
     names = [name for name, _, _ in entries]
     values = np.array([value for _, value, _ in entries])
@@ -227,7 +229,7 @@ def bars(quantity: str, unit: str, entries: Sequence[tuple[str, float, str]]) ->
             "name": names,
             "value": values,
             "color": [color for _, _, color in entries],
-            "text": [f" {significant(value, 3, unit)}" for value in values],
+            "text": [f" {number(value, decimals, unit)}" for value in values],
         }
     )
     low, high = min(0.0, float(values.min())), max(0.0, float(values.max()))
@@ -317,11 +319,11 @@ class Timeline:
             Break over steps longer than this [s]; by default over each log's own gaps.
         """
         positions, drawn = [], []
-        for number, (time_s, values) in enumerate(pieces):
-            limit_s = self._gap_s[number] if gap_s is None else gap_s
+        for k, (time_s, values) in enumerate(pieces):
+            limit_s = self._gap_s[k] if gap_s is None else gap_s
             breaks = np.flatnonzero(np.diff(time_s) > limit_s) + 1
             breaks = np.append(breaks, time_s.size)  # separates this log from the next one
-            at = self.at(number, time_s)
+            at = self.at(k, time_s)
             positions.append(np.insert(at, breaks, at[breaks - 1]))
             drawn.append(np.insert(values, breaks, np.nan))
         return np.concatenate(positions), np.concatenate(drawn)

@@ -214,7 +214,12 @@ def _size(diagnosis: Diagnosis, extended: str) -> list[Block]:
     return [
         Figure(
             "Error and floors",
-            bars("RMS error", "V", [(name, rms_v, color) for name, rms_v, color, _, _ in entries]),
+            bars(
+                "RMS error",
+                "V",
+                [(name, rms_v, color) for name, rms_v, color, _, _ in entries],
+                decimals=2,
+            ),
             _size_caption(diagnosis),
         ),
         Table(
@@ -438,7 +443,7 @@ def _cause(diagnosis: Diagnosis) -> list[Block]:
         Paragraph(_cause_text(diagnosis)),
         Figure(
             "Probability of each cause",
-            bars("probability", "%", probabilities),
+            bars("probability", "%", probabilities, decimals=0),
             "From the evidence and the error that each cause removes, calibrated on other packs"
             " with known causes.",
         ),
@@ -474,7 +479,9 @@ def _closing(diagnosis: Diagnosis) -> Paragraph:
     before = number(diagnosis.baseline_rmse_v, 2, "V")
     after = number(diagnosis.extended_rmse_v, 2, "V")
     text = f"RMS error on held-out rows: {before} with the model as given, {after} extended."
-    if diagnosis.closed is not None:
+    if diagnosis.extended_rmse_v > diagnosis.baseline_rmse_v:
+        text += " The extended model is worse: do not run it."
+    elif diagnosis.closed is not None:
         interval = ""
         if diagnosis.closed_ci is not None:
             interval = f" (95 % interval {percent_span(*diagnosis.closed_ci)})"

@@ -330,7 +330,12 @@ def _energy(result: Identification) -> list[Block]:
     return [
         Figure(
             "Energy at the terminals",
-            bars("energy", "kWh", [(name, kwh, color) for name, kwh, color, _, _ in entries]),
+            bars(
+                "energy",
+                "kWh",
+                [(name, kwh, color) for name, kwh, color, _, _ in entries],
+                decimals=2,
+            ),
             "Net is driven minus regenerated energy; heat is the slope resistance times ∫I².",
         ),
         Table(

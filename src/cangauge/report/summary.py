@@ -78,7 +78,7 @@ def headline(diagnosis: Diagnosis) -> str:
     together = sum(verdict.chances[name] for name in names)
     causes = f"{' or '.join(names)} (probability {together:.2f}{' together' if names[1:] else ''})"
     size = _size(diagnosis)
-    return f"{size}: {causes}." if size else f"The likely cause is {causes}."
+    return f"{size}: {causes}." if size else f"The most likely cause is {causes}."
 
 
 def _size(diagnosis: Diagnosis) -> str:
