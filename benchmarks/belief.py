@@ -1,4 +1,4 @@
-"""Learn the weights of `cangauge.diagnosis.posterior` from labelled cases, and print them.
+"""Learn the weights of `cangauge.diagnosis.classifier` from labelled cases, and print them.
 
     cangauge gap-check --protocol simulated --per-effect 5 --healthy 150 --seed 32 --keep cases
     python benchmarks/belief.py cases…
@@ -29,9 +29,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from cangauge.diagnosis import posterior as belief
-from cangauge.diagnosis.extended_model import library_without
-from cangauge.diagnosis.posterior import ALIKE_FROM, NAMED_FROM, SEEN_BELOW, Compared, compare
+from cangauge.diagnosis import classifier
+from cangauge.diagnosis.classifier import (
+    AMBIGUOUS_FROM,
+    GAP_BELOW,
+    NAMED_FROM,
+    Comparison,
+    compare_effects,
+)
 from cangauge.diagnosis.problem import build_problem
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import load_model
@@ -58,20 +63,20 @@ class Case:
     protocol: str
     world: str
     truth: str
-    compared: Compared
+    compared: Comparison
     learned: bool
     """Whether references have shown how far evidence strays: no other case is learned from."""
 
     @property
     def known(self) -> bool:
         """Whether the cause is among the effects that were compared."""
-        return self.truth in {each.score.effect_id for each in self.compared.witnesses}
+        return self.truth in {each.score.effect_id for each in self.compared.effects}
 
     def without_cause(self) -> Case:
         """Return the case with its cause out of the comparison."""
-        rest = tuple(w for w in self.compared.witnesses if w.score.effect_id != self.truth)
+        rest = tuple(w for w in self.compared.effects if w.score.effect_id != self.truth)
         return replace(
-            self, protocol=f"{self.protocol}, open", compared=replace(self.compared, witnesses=rest)
+            self, protocol=f"{self.protocol}, open", compared=replace(self.compared, effects=rest)
         )
 
 
@@ -85,8 +90,8 @@ def main() -> None:
     judge(cases)
     which = fit_which(cases)
     whether = fit_whether(cases, which)
-    print("WHICH =", tuple(np.round(which, 3).tolist()))
-    for name, weights in zip(("BEST_IS_IT", "IS_ANOTHER"), whether, strict=True):
+    print("EFFECT_WEIGHTS =", tuple(np.round(which, 3).tolist()))
+    for name, weights in zip(("BEST_WEIGHTS", "OTHER_WEIGHTS"), whether, strict=True):
         print(f"{name} =", tuple(np.round(weights, 3).tolist()))
 
 
@@ -117,11 +122,9 @@ def case_of(label: dict[str, Any], folder: Path) -> Case:
             [read_log(path) for path in sorted(place.glob(f"{kind}_*.parquet"))]
             for kind in ("log", "reference")
         )
-        settled = build_problem(
-            logs, load_model(place / "model.json"), references, library_without(())
-        )
-        _, compared = compare(settled)
-        kept.write_bytes(pickle.dumps((compared, bool(settled.error.strays))))
+        problem = build_problem(logs, load_model(place / "model.json"), references)
+        compared = compare_effects(problem)
+        kept.write_bytes(pickle.dumps((compared, bool(problem.error.overdispersion))))
     compared, learned = pickle.loads(kept.read_bytes())  # noqa: S301 - written just above
     truth = label["effects"][0] if label["effects"] else "none"
     world = f"{label['protocol']} {label.get('world_seed', label['seed'])}"
@@ -131,7 +134,9 @@ def case_of(label: dict[str, Any], folder: Path) -> Case:
 def fit_which(cases: Sequence[Case]) -> FloatArray:
     """Return the weights under which the causes are most probable among the effects."""
     seen = [
-        (belief.which_features(case.compared), at) for case in cases if (at := place(case)) >= 0
+        (classifier.effect_features(case.compared), at)
+        for case in cases
+        if (at := place(case)) >= 0
     ]
 
     def loss(weights: FloatArray) -> tuple[float, FloatArray]:
@@ -145,20 +150,20 @@ def fit_which(cases: Sequence[Case]) -> FloatArray:
         n = len(seen)
         return total / n + HELD * weights @ weights, slope / n + 2.0 * HELD * weights
 
-    return lowest(loss, len(belief.WHICH))
+    return lowest(loss, len(classifier.EFFECT_WEIGHTS))
 
 
 def place(case: Case) -> int:
     """Return where the cause is among the effects, −1 if it is not."""
-    names = [each.score.effect_id for each in case.compared.witnesses]
+    names = [each.score.effect_id for each in case.compared.effects]
     return names.index(case.truth) if case.truth in names else -1
 
 
 def ranked(case: Case, which: FloatArray) -> tuple[list[str], FloatArray, FloatArray]:
     """Return effects, the best first, their shares, and what is weighed of the best."""
-    witnesses, shares = belief.ranked(case.compared, which)
-    names = [each.score.effect_id for each in witnesses]
-    return names, shares, belief.whether_features(case.compared, witnesses[0], float(shares[0]))
+    effects, shares = classifier.rank_effects(case.compared, which)
+    names = [each.score.effect_id for each in effects]
+    return names, shares, classifier.presence_features(case.compared, effects[0], float(shares[0]))
 
 
 def fit_whether(cases: Sequence[Case], which: FloatArray) -> FloatArray:
@@ -219,8 +224,8 @@ def judge(cases: Sequence[Case]) -> None:
             logits = np.array([0.0, *(whether @ features)])
             none, best, _ = np.exp(logits - logits.max()) / np.exp(logits - logits.max()).sum()
             verdict = names[0] if best >= NAMED_FROM else "unknown"
-            verdict = verdict if none < SEEN_BELOW else "none"
-            pair = names[1] if shares[1] >= ALIKE_FROM * shares[0] > shares[2] else ""
+            verdict = verdict if none < GAP_BELOW else "none"
+            pair = names[1] if shares[1] >= AMBIGUOUS_FROM * shares[0] > shares[2] else ""
             right = names[0] == case.truth
             said.append((best, right))
             lines.setdefault(case.protocol, []).append(

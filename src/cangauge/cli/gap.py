@@ -24,9 +24,7 @@ from cangauge.cli.options import (
     within,
 )
 from cangauge.cli.output import emit_json, note, print_table
-from cangauge.diagnosis.diagnose import Diagnosis, diagnose, in_words
-from cangauge.diagnosis.extended_model import model_file_of
-from cangauge.diagnosis.posterior import NONE, UNKNOWN
+from cangauge.diagnosis import NONE, UNKNOWN, Diagnosis, diagnose
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model, load_model, model_json
@@ -110,8 +108,8 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     found = diagnose(diagnosed, model_file, references, initial_soc_pct=initial_soc, progress=note)
     with ExitStack() as stack:
         if extended is not None:
-            better = model_file_of(found.extension, model_file, found.extended_rmse_v)
-            stack.enter_context(atomic_path(extended)).write_text(model_json(better))
+            text = model_json(found.extended_model)
+            stack.enter_context(atomic_path(extended)).write_text(text)
         if report is not None:
             # Drawing is slow to import; the diagnosis does without.
             from cangauge.report.diagnosis import gap_report  # noqa: PLC0415
@@ -168,7 +166,7 @@ def _long_enough(log: Log) -> Log:
 
 
 def _show(found: Diagnosis) -> None:
-    typer.echo(in_words(found))
+    typer.echo(found.summary)
     if open_question := verdict_limit(found):
         typer.echo(open_question)
     rows = []
@@ -184,14 +182,14 @@ def _show(found: Diagnosis) -> None:
             ]
         )
     for answer in (UNKNOWN, NONE):
-        chance = f"{found.verdict.chances[answer]:.2f}"
+        chance = f"{found.verdict.probabilities[answer]:.2f}"
         rows.append([answer, chance, NONE_KNOWN, NONE_KNOWN, NONE_KNOWN])
     headings = ["effect", "probability", "evidence [ln]", "left [V]", "closed"]
     print_table("Candidates; error left, and gap closed, on rows held out", headings, rows)
     for item in found.candidates:
         if item["effect"] in found.extension.cause:
             typer.echo(f"{item['effect']}: {_with_units(item['parameters'])}")
-    if found.limits:
+    if found.caveats:
         typer.echo("What these logs cannot show:")
-    for sentence in found.limits:
+    for sentence in found.caveats:
         typer.echo(f"- {sentence}")

@@ -74,16 +74,16 @@ ENOUGH_HZ = 20.0
 """Stretches a second [Hz]. A log with less than twice as many samples is taken as it is."""
 
 
-def resample(log: Log) -> Log:
+def resample(log: Log, rate_hz: float = ENOUGH_HZ) -> Log:
     """Return a log with no more rows than a diagnosis can use.
 
     The means of all signals over a stretch stand at the mean of its times, so nothing is late
     against another and the charge stays; pauses stay pauses. The reference SoC is the first that
     each stretch tells: it may come more slowly than the current.
     """
-    if len(log) < 2 or float(np.median(np.diff(log.time_s))) * 2.0 * ENOUGH_HZ > 1.0:
+    if len(log) < 2 or float(np.median(np.diff(log.time_s))) * 2.0 * rate_hz > 1.0:
         return log
-    stretch = np.floor((log.time_s - log.time_s[0]) * ENOUGH_HZ)
+    stretch = np.floor((log.time_s - log.time_s[0]) * rate_hz)
     first = np.flatnonzero(np.diff(stretch, prepend=-1.0))
     counts = np.diff(first, append=len(log))
 

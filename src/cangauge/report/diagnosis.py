@@ -22,19 +22,21 @@ from bokeh.palettes import Viridis256
 
 from cangauge._formatting import number, significant, span
 from cangauge._typing import FloatArray
-from cangauge.diagnosis.cross_validation import LogErrors, errors_before_and_after, rms
-from cangauge.diagnosis.diagnose import Diagnosis, in_words
-from cangauge.diagnosis.error_breakdown import (
-    APART_S,
-    LEAST_ROWS,
-    Around,
+from cangauge.diagnosis import (
+    MIN_BIN_ROWS,
+    NONE,
+    SEGMENT_S,
+    UNKNOWN,
+    Diagnosis,
     ErrorMap,
-    Moment,
-    Place,
-    around,
+    ErrorShare,
+    LogErrors,
+    SegmentSignals,
+    WorstSegment,
     error_map,
+    rms,
+    segment_signals,
 )
-from cangauge.diagnosis.posterior import NONE, UNKNOWN
 from cangauge.model.effects.library import LIBRARY
 from cangauge.report.charts import (
     BLACK,
@@ -77,20 +79,20 @@ IN_A_ROW = 2
 
 
 def moment_figures(
-    moments: Sequence[Moment], errors: Sequence[LogErrors], extended: str
+    moments: Sequence[WorstSegment], errors: Sequence[LogErrors], extended: str
 ) -> list[Block]:
     """Return a figure for each moment, all on the same scales, and their table.
 
     Parameters
     ----------
-    moments : sequence of Moment
+    moments : sequence of WorstSegment
         The worst first.
     errors : sequence of LogErrors
         Of all diagnosed logs.
     extended : str
         What the extended model adds, in words.
     """
-    seen = [around(moment, errors) for moment in moments]
+    seen = [segment_signals(moment, errors) for moment in moments]
     volts = _moment_range([each.before_v for each in seen] + [each.after_v for each in seen])
     amperes = _moment_range([each.current_a for each in seen])
     drawn = [
@@ -107,7 +109,7 @@ def moment_figures(
     return [*rows, _moments_table(moments, seen)]
 
 
-def _at(each: Around) -> float:
+def _at(each: SegmentSignals) -> float:
     return float(each.after_v[np.argmin(np.abs(each.time_s))])
 
 
@@ -118,9 +120,9 @@ def _moment_range(values: Sequence[FloatArray]) -> tuple[float, float]:
 
 
 def _small(
-    each: Around, volts: tuple[float, float], amperes: tuple[float, float], extended: str
+    each: SegmentSignals, volts: tuple[float, float], amperes: tuple[float, float], extended: str
 ) -> Plot:
-    x_range = Range1d(-APART_S, APART_S)
+    x_range = Range1d(-SEGMENT_S, SEGMENT_S)
     above = plane(
         ("", "measured − model"), "$name: @y{0.00} V<br>at @x{0.0} s", units=("", "V"),
         height=190, x_range=x_range,
@@ -154,7 +156,7 @@ def _small(
     )
 
 
-def _moments_table(moments: Sequence[Moment], seen: Sequence[Around]) -> Table:
+def _moments_table(moments: Sequence[WorstSegment], seen: Sequence[SegmentSignals]) -> Table:
     rows = [
         [
             str(rank),
@@ -290,17 +292,17 @@ def size_blocks(diagnosis: Diagnosis, extended: str) -> list[Block]:
 
 def slope_v_per_pct(diagnosis: Diagnosis) -> float:
     """Return the median slope of the pseudo-OCV over the diagnosed rows [V per %]."""
-    settled = diagnosis.settled
-    soc = np.concatenate([terms.prepared.rows.soc_pct for terms in settled.diagnosed])
-    return float(np.median(settled.as_given.model.pseudo_ocv_slope(soc)))
+    problem = diagnosis.problem
+    soc = np.concatenate([terms.prepared.rows.soc_pct for terms in problem.diagnosed])
+    return float(np.median(problem.given.model.pseudo_ocv_slope(soc)))
 
 
 def _floor_name(diagnosis: Diagnosis) -> str:
-    return "floor: references" if diagnosis.settled.references else "floor: model file"
+    return "floor: references" if diagnosis.problem.references else "floor: model file"
 
 
 def _floor_words(diagnosis: Diagnosis) -> str:
-    if diagnosis.settled.references:
+    if diagnosis.problem.references:
         return "references, with the model as given: sensors and what repeats no better"
     return "what the model file states, for want of references"
 
@@ -308,7 +310,7 @@ def _floor_words(diagnosis: Diagnosis) -> str:
 def _see(diagnosis: Diagnosis) -> str:
     times = diagnosis.baseline_rmse_v / max(diagnosis.floor_v, 1e-9)
     words = f"The model's error here is {times:.1f} times that on the references."
-    if not diagnosis.settled.references:
+    if not diagnosis.problem.references:
         words = f"The model's error here is {times:.1f} times what its file states."
     if diagnosis.explainable_v is None:
         return words + " The second floor, what flexible structure explains, needs more references."
@@ -433,13 +435,13 @@ def heat_map(each: ErrorMap, axis: tuple[str, str], most_v: float) -> Plot:
 
 def _map_words(each: ErrorMap, unit: str) -> str:
     if not np.isfinite(each.rms_v).any():
-        return f"No bin holds {LEAST_ROWS} rows: the logs are too short for a map."
+        return f"No bin holds {MIN_BIN_ROWS} rows: the logs are too short for a map."
     up, across = np.unravel_index(int(np.nanargmax(each.rms_v)), each.rms_v.shape)
     low, high = each.soc_edges_pct[across], each.soc_edges_pct[across + 1]
     return (
         f"Largest {each.rms_v[up, across]:.2f} V (mean {number(float(each.mean_v[up, across]), 2)}"
         f" V) at {span(low, high, 0)} % and {_map_range(each, int(up), unit)}."
-        f" Bins with fewer than {LEAST_ROWS} rows are empty."
+        f" Bins with fewer than {MIN_BIN_ROWS} rows are empty."
         + (" The top and the bottom ones hold all beyond." if each.tails else "")
     )
 
@@ -455,7 +457,7 @@ def _map_range(each: ErrorMap, up: int, unit: str) -> str:
     return span(low, high, digits, unit)
 
 
-def share_figures(places: Sequence[Place]) -> list[Block]:
+def share_figures(places: Sequence[ErrorShare]) -> list[Block]:
     """Return the shares of the squared error over every axis, two figures in a row."""
     drawn = []
     for axis, (quantity, unit) in AXES.items():
@@ -472,7 +474,7 @@ def share_figures(places: Sequence[Place]) -> list[Block]:
     return [Beside(drawn[at : at + 2]) for at in range(0, len(drawn), 2)]
 
 
-def _share_bars(places: Sequence[Place]) -> Plot:
+def _share_bars(places: Sequence[ErrorShare]) -> Plot:
     digits = _digits(places)
     names = [place_range(place, digits) for place in places]
     plot = plane(
@@ -511,7 +513,7 @@ def _share_bars(places: Sequence[Place]) -> Plot:
     return plot
 
 
-def _share_words(places: Sequence[Place], unit: str) -> str:
+def _share_words(places: Sequence[ErrorShare], unit: str) -> str:
     most = max(places, key=lambda place: place.share)
     low, high = most.ci
     where = f"{place_range(most, _digits(places))} {unit}".rstrip()
@@ -521,7 +523,7 @@ def _share_words(places: Sequence[Place], unit: str) -> str:
     )
 
 
-def _digits(places: Sequence[Place]) -> int:
+def _digits(places: Sequence[ErrorShare]) -> int:
     """Return with how many digits the narrowest place has two ends: a cell has few amperes."""
     return digits_of(min(place.high - place.low for place in places))
 
@@ -531,7 +533,7 @@ def digits_of(width: float) -> int:
     return max(0, math.ceil(math.log10(2.0 / max(width, 1e-6))))
 
 
-def place_range(place: Place, digits: int) -> str:
+def place_range(place: ErrorShare, digits: int) -> str:
     """Return a place's range in words, in the unit of `AXES`."""
     if place.axis == "rest":
         return "rest" if place.low > 0.0 else "drive"
@@ -556,29 +558,29 @@ def gap_report(diagnosis: Diagnosis) -> str:
 
 def gap_page(diagnosis: Diagnosis) -> Page:
     """Return the page of a diagnosis."""
-    logs = [terms.prepared.log for terms in diagnosis.settled.diagnosed]
+    logs = [terms.prepared.log for terms in diagnosis.problem.diagnosed]
     names = ", ".join(log.name for log in logs)
-    errors = errors_before_and_after(diagnosis.settled, diagnosis.extension.model)
+    errors = diagnosis.log_errors()
     extended = _extended(diagnosis)
     sections = [
         Section("How large it is", size_blocks(diagnosis, extended)),
         Section(
             "Where it lies",
-            [*map_figures(errors, extended), *share_figures(diagnosis.where)],
+            [*map_figures(errors, extended), *share_figures(diagnosis.error_breakdown)],
         ),
         Section("Which effect", _which(diagnosis)),
         Section("How far it shrinks", [_shrinks(diagnosis), *shrink_figures(errors, extended)]),
-        Section("The worst moments", moment_figures(diagnosis.worst, errors, extended)),
+        Section("The worst moments", moment_figures(diagnosis.worst_segments, errors, extended)),
         Section("How much of each effect these logs can show", _observability(diagnosis)),
         Section("How it was done", [Bullets(_method(diagnosis, names))]),
     ]
-    open_question, cannot = verdict_limit(diagnosis), diagnosis.limits
+    open_question, cannot = verdict_limit(diagnosis), diagnosis.caveats
     if open_question or cannot:
         said = [open_question] if open_question else []
         sections.insert(0, Section("What these logs cannot show", [Bullets([*said, *cannot])]))
     return Page(
         title="Gap between model and log",
-        subtitle=in_words(diagnosis),
+        subtitle=diagnosis.summary,
         tiles=_tiles(diagnosis),
         sections=sections,
         banners=reconstruction_banners(names, *(log.source for log in logs)),
@@ -590,7 +592,7 @@ def _extended(diagnosis: Diagnosis) -> str:
     accepted = diagnosis.extension.cause
     if accepted:
         return f"with {' and '.join(accepted)}"
-    return "with what references add" if diagnosis.settled.references else "nothing added"
+    return "with what references add" if diagnosis.problem.references else "nothing added"
 
 
 def _tiles(diagnosis: Diagnosis) -> list[Tile]:
@@ -601,7 +603,7 @@ def _tiles(diagnosis: Diagnosis) -> list[Tile]:
         Tile("Error of the model", number(diagnosis.baseline_rmse_v, 2, "V"), "RMS, these logs"),
         Tile("Extended model", number(diagnosis.extended_rmse_v, 2, "V"), "RMS, rows left out"),
         Tile(
-            "Floor: references" if diagnosis.settled.references else "Floor: model file",
+            "Floor: references" if diagnosis.problem.references else "Floor: model file",
             number(diagnosis.floor_v, 2, "V"),
             "RMS, model as given",
         ),
@@ -614,12 +616,12 @@ def _tiles(diagnosis: Diagnosis) -> list[Tile]:
                 "RMS, with references' structure",
             )
         )
-    if diagnosis.closed is not None:
+    if diagnosis.closed_fraction is not None:
         hint = "of its square, above the floor"
-        if diagnosis.closed_ci is not None:
-            low, high = diagnosis.closed_ci
+        if diagnosis.closed_fraction_ci is not None:
+            low, high = diagnosis.closed_fraction_ci
             hint = f"squared; 95 %: {_percents(low, high)}"
-        tiles.append(Tile("Gap closed", _percent(diagnosis.closed), hint))
+        tiles.append(Tile("Gap closed", _percent(diagnosis.closed_fraction), hint))
     if before is not None:
         tiles.append(
             Tile(
@@ -634,13 +636,13 @@ def _tiles(diagnosis: Diagnosis) -> list[Tile]:
 def _shrinks(diagnosis: Diagnosis) -> Paragraph:
     before, after = diagnosis.baseline_rmse_v, diagnosis.extended_rmse_v
     words = f"On rows left out of the fit: {before:.2f} V before, {after:.2f} V after."
-    if diagnosis.closed is not None:
-        words += f" That closes {_percent(diagnosis.closed)}"
-        if diagnosis.closed_ci is not None:
-            low, high = diagnosis.closed_ci
+    if diagnosis.closed_fraction is not None:
+        words += f" That closes {_percent(diagnosis.closed_fraction)}"
+        if diagnosis.closed_fraction_ci is not None:
+            low, high = diagnosis.closed_fraction_ci
             words += f" (95 % interval {_percents(low, high)})"
         words += " of the squared gap above the floor."
-    if not diagnosis.settled.references:
+    if not diagnosis.problem.references:
         return Paragraph(words)
     added = "the cause and " if diagnosis.extension.cause else "no cause, only "
     return Paragraph(
@@ -662,7 +664,7 @@ def _which(diagnosis: Diagnosis) -> list[Block]:
     blocks: list[Block] = [Paragraph(_cause_words(diagnosis))]
     ranked = diagnosis.candidates[:SHOWN]
     chances = [
-        (name, 100.0 * verdict.chances[name], BLUE if name == verdict.cause else GREY)
+        (name, 100.0 * verdict.probabilities[name], BLUE if name == verdict.cause else GREY)
         for name in (*(str(item["effect"]) for item in ranked), UNKNOWN, NONE)
     ]
     blocks.append(
@@ -736,24 +738,24 @@ def _observability(diagnosis: Diagnosis) -> list[Block]:
 
 
 def _method(diagnosis: Diagnosis, names: str) -> list[str]:
-    settled = diagnosis.settled
-    error = settled.error
-    rows = int(np.sum([terms.residual_v.size for terms in settled.diagnosed]))
+    problem = diagnosis.problem
+    error = problem.error
+    rows = int(np.sum([terms.residual_v.size for terms in problem.diagnosed]))
     return [
-        f"Diagnosed: {names} ({rows} rows); references: {len(settled.references)}.",
+        f"Diagnosed: {names} ({rows} rows); references: {len(problem.references)}.",
         f"Error expected without a cause: {error.rmse_v:.2f} V, weighed by time scale:"
         f" {error.scale_v2[0] ** 0.5:.2f} V from row to row,"
         f" {error.lasting_v2**0.5:.2f} V·√row over many minutes.",
         "Coefficients, structure that clean logs share, and what differs from log to log without a"
         " cause are integrated out; then every effect is weighed against none.",
-        *settled_remarks(diagnosis),
+        *problem_remarks(diagnosis),
     ]
 
 
-def settled_remarks(diagnosis: Diagnosis) -> list[str]:
+def problem_remarks(diagnosis: Diagnosis) -> list[str]:
     """Return what the reader should know of this diagnosis in particular."""
     remarks = list(diagnosis.extension.remarks)
-    if not diagnosis.settled.references:
+    if not diagnosis.problem.references:
         remarks.append(
             "Without references the model's own noise stands for the floor: give logs on which the"
             " model is known to be good with --reference."

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from cangauge._formatting import number, significant
-from cangauge.diagnosis.diagnose import EVEN, Diagnosis
-from cangauge.diagnosis.posterior import NONE, UNKNOWN
+from cangauge.diagnosis import LIKELY, NONE, UNKNOWN, Diagnosis
 from cangauge.identify.effect_search import FittedEffects
 from cangauge.model.effects.library import LIBRARY
 
@@ -54,7 +53,7 @@ def verdict_limit(diagnosis: Diagnosis) -> str:
     verdict = diagnosis.verdict
     if verdict.cause == NONE:
         beside = ""
-        if diagnosis.settled.references:
+        if diagnosis.problem.references:
             beside = (
                 " beside what the references teach"
                 f" ({number(diagnosis.baseline_rmse_v, 2)} V as given,"
@@ -66,7 +65,7 @@ def verdict_limit(diagnosis: Diagnosis) -> str:
         )
     if verdict.cause == UNKNOWN:
         best = verdict.candidates[0].effect_id
-        floor = "references" if diagnosis.settled.references else "the model file states"
+        floor = "references" if diagnosis.problem.references else "the model file states"
         return (
             f"No cause can be named: the gap is real ({number(diagnosis.baseline_rmse_v, 2, 'V')},"
             f" {floor} {number(diagnosis.floor_v, 2, 'V')}), but no effect of the library is"
@@ -75,7 +74,7 @@ def verdict_limit(diagnosis: Diagnosis) -> str:
             " several act at once, or the model is not of this pack."
         )
     words = []
-    if verdict.probability < EVEN:
+    if verdict.probability < LIKELY:
         words.append(
             f"{verdict.cause} is the likeliest cause, yet with a probability of only"
             f" {verdict.probability:.2f}: do not act on it alone."

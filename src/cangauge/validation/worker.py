@@ -23,8 +23,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from cangauge._io import write_text_atomic
-from cangauge.diagnosis.diagnose import diagnose
-from cangauge.diagnosis.extended_model import model_file_of
+from cangauge.diagnosis import diagnose
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import load_model, model_json
 
@@ -44,9 +43,8 @@ def answer(request: dict[str, Any]) -> dict[str, Any]:
             leave_out=request.get("leave_out", ()),
         )
         if request.get("extended") is not None:
-            better = model_file_of(found.extension, model, found.extended_rmse_v)
-            write_text_atomic(Path(request["extended"]), model_json(better))
-        whole = found.to_dict(request.get("extended"))
+            write_text_atomic(Path(request["extended"]), model_json(found.extended_model))
+        whole = found.to_dict(request.get("extended"), soc_error=False)
     except Exception as error:  # noqa: BLE001 - a case that crashes counts as wrong; the next goes on
         return {
             "error": f"{type(error).__name__}: {error}",
