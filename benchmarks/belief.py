@@ -1,15 +1,15 @@
-"""Fit the weights of the classifier in `cangauge.diagnosis.posterior` to labelled cases.
+"""Learn the weights of `cangauge.diagnosis.classifier` from labelled cases, and print them.
 
     cangauge gap-check --protocol simulated --per-effect 5 --healthy 150 --seed 32 --keep cases
     python benchmarks/belief.py cases…
 
-The weights in use were fitted to 629 cases of seed 71, 267 of them healthy, without gaps below the
-range of the check: `simulated` (--per-effect 7 --healthy 160), `equation` (4, 40), `published`
+The weights in use were learned from 629 cases of seed 71, 267 of them healthy, with no gap below
+what the check counts: `simulated` (--per-effect 7 --healthy 160), `equation` (4, 40), `published`
 (3, 30), `real-bmw_i3` (3, 30), and 43 cases of `real-lg_hg2` (3, 16).
 
-Only cases of development seeds are used. Each faulty case counts a second time, with less weight,
-with its cause removed from the comparison, as do cases with a cause outside the library: no effect
-is correct there. Printed shares are cross-validated over packs (ten folds).
+Only cases of development seeds are taken. Each faulty one counts a second time, a little, with its
+cause out of the comparison, and so do those whose cause is outside the library: then no effect is
+right. Shares are printed for packs left out of the fit (ten parts, no pack in two).
 """
 
 from __future__ import annotations
@@ -29,9 +29,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from cangauge.diagnosis import posterior as belief
-from cangauge.diagnosis.extended_model import library_without
-from cangauge.diagnosis.posterior import ALIKE_FROM, NAMED_FROM, SEEN_BELOW, Compared, compare
+from cangauge.diagnosis import classifier
+from cangauge.diagnosis.classifier import (
+    AMBIGUOUS_FROM,
+    GAP_BELOW,
+    NAMED_FROM,
+    Comparison,
+    compare_effects,
+)
 from cangauge.diagnosis.problem import build_problem
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
@@ -40,12 +45,12 @@ from cangauge.validation.score import LEAST_GAP
 FloatArray = NDArray[np.float64]
 
 OUTSIDE_COUNTS = 0.75
-"""Weight of a case without the correct effect: causes are mostly in the library. A larger weight
-names fewer effects with certainty."""
+"""A case without the right effect counts so much: a cause is more often in the library than not.
+The more, the less is named with certainty, rightly or not."""
 
 
-RIDGE = 0.01
-"""L2 penalty of the weights, for features of standard deviation 1."""
+HELD = 0.01
+"""Weight of the sum of squares of all weights, for features of standard deviation 1."""
 
 PARTS = 10
 NONE, RIGHT, ANOTHER = 0, 1, 2
@@ -53,49 +58,49 @@ NONE, RIGHT, ANOTHER = 0, 1, 2
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Comparison of effects on one case, and its true cause."""
+    """One diagnosis and what is true."""
 
     protocol: str
-    pack: str
+    world: str
     truth: str
-    compared: Compared
+    compared: Comparison
     learned: bool
-    """Whether references gave the overdispersion; other cases are not used."""
+    """Whether references have shown how far evidence strays: no other case is learned from."""
 
     @property
     def known(self) -> bool:
-        """Whether the cause is among the compared effects."""
-        return self.truth in {each.score.effect_id for each in self.compared.witnesses}
+        """Whether the cause is among the effects that were compared."""
+        return self.truth in {each.score.effect_id for each in self.compared.effects}
 
     def without_cause(self) -> Case:
-        """Return the case without its cause in the comparison."""
-        rest = tuple(w for w in self.compared.witnesses if w.score.effect_id != self.truth)
+        """Return the case with its cause out of the comparison."""
+        rest = tuple(w for w in self.compared.effects if w.score.effect_id != self.truth)
         return replace(
-            self, protocol=f"{self.protocol}, open", compared=replace(self.compared, witnesses=rest)
+            self, protocol=f"{self.protocol}, open", compared=replace(self.compared, effects=rest)
         )
 
 
 def main() -> None:
-    """Fit and print the weights."""
+    """Read or diagnose the cases, fit, print."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
-    parser.add_argument("folders", nargs="+", type=Path, help="folders of gap-check --keep")
+    parser.add_argument("folders", nargs="+", type=Path, help="kept by cangauge gap-check --keep")
     cases = [case for folder in parser.parse_args().folders for case in cases_of(folder)]
     cases = [case for case in cases if case.learned]
     cases += [case.without_cause() for case in cases if case.known]
     judge(cases)
     which = fit_which(cases)
     whether = fit_whether(cases, which)
-    print("WHICH =", tuple(np.round(which, 3).tolist()))
-    for name, weights in zip(("BEST_IS_IT", "IS_ANOTHER"), whether, strict=True):
+    print("EFFECT_WEIGHTS =", tuple(np.round(which, 3).tolist()))
+    for name, weights in zip(("BEST_WEIGHTS", "OTHER_WEIGHTS"), whether, strict=True):
         print(f"{name} =", tuple(np.round(weights, 3).tolist()))
 
 
 def cases_of(folder: Path) -> list[Case]:
-    """Return the cases of a folder; comparisons are cached in `compared`."""
+    """Return the cases of a folder; what has been diagnosed once is read from `compared`."""
     about = folder / "tasks.json"
     if about.exists() and json.loads(about.read_text(encoding="utf-8"))["final"]:
-        sys.exit(f"{folder}: cases of the final seeds must not be fitted to")
-    labels = json.loads((folder / "withheld" / "labels.json").read_text(encoding="utf-8"))["labels"]
+        sys.exit(f"{folder}: cases of final seeds are not to be learned from")
+    labels = json.loads((folder / "sealed" / "labels.json").read_text(encoding="utf-8"))["labels"]
     labels = [label for label in labels if "failed" not in label and len(label["effects"]) < 2]
     labels = [
         label
@@ -109,7 +114,7 @@ def cases_of(folder: Path) -> list[Case]:
 
 
 def case_of(label: dict[str, Any], folder: Path) -> Case:
-    """Compare the effects on one case."""
+    """Diagnose one case as far as the comparison of effects."""
     kept = folder / "compared" / f"{label['name']}.pkl"
     if not kept.exists():
         place = folder / "open" / label["name"]
@@ -117,52 +122,52 @@ def case_of(label: dict[str, Any], folder: Path) -> Case:
             [read_log(path) for path in sorted(place.glob(f"{kind}_*.parquet"))]
             for kind in ("log", "reference")
         )
-        settled = build_problem(
-            logs, Model.load(place / "model.json"), references, library_without(())
-        )
-        _, compared = compare(settled)
-        kept.write_bytes(pickle.dumps((compared, bool(settled.error.strays))))
+        problem = build_problem(logs, Model.load(place / "model.json"), references)
+        compared = compare_effects(problem)
+        kept.write_bytes(pickle.dumps((compared, bool(problem.error.overdispersion))))
     compared, learned = pickle.loads(kept.read_bytes())  # noqa: S301 - written just above
     truth = label["effects"][0] if label["effects"] else "none"
-    pack = f"{label['protocol']} {label.get('world_seed', label['seed'])}"
-    return Case(label["protocol"], pack, truth, compared, learned)
+    world = f"{label['protocol']} {label.get('world_seed', label['seed'])}"
+    return Case(label["protocol"], world, truth, compared, learned)
 
 
 def fit_which(cases: Sequence[Case]) -> FloatArray:
-    """Fit the weights of the effects, by the probability of the cause among them."""
-    samples = [
-        (belief.which_features(case.compared), at) for case in cases if (at := place(case)) >= 0
+    """Return the weights under which the causes are most probable among the effects."""
+    seen = [
+        (classifier.effect_features(case.compared), at)
+        for case in cases
+        if (at := place(case)) >= 0
     ]
 
     def loss(weights: FloatArray) -> tuple[float, FloatArray]:
         total, slope = 0.0, np.zeros_like(weights)
-        for features, at in samples:
+        for features, at in seen:
             utility = features @ weights
             chances = np.exp(utility - utility.max())
             chances /= chances.sum()
             total -= np.log(chances[at] + 1e-300)
             slope -= features[at] - chances @ features
-        n = len(samples)
-        return total / n + RIDGE * weights @ weights, slope / n + 2.0 * RIDGE * weights
+        n = len(seen)
+        return total / n + HELD * weights @ weights, slope / n + 2.0 * HELD * weights
 
-    return lowest(loss, len(belief.WHICH))
+    return lowest(loss, len(classifier.EFFECT_WEIGHTS))
 
 
 def place(case: Case) -> int:
-    """Return the index of the cause among the effects, or −1."""
-    names = [each.score.effect_id for each in case.compared.witnesses]
+    """Return where the cause is among the effects, −1 if it is not."""
+    names = [each.score.effect_id for each in case.compared.effects]
     return names.index(case.truth) if case.truth in names else -1
 
 
 def ranked(case: Case, which: FloatArray) -> tuple[list[str], FloatArray, FloatArray]:
-    """Return the effects, best first, their probabilities, and the features of the best."""
-    witnesses, shares = belief.ranked(case.compared, which)
-    names = [each.score.effect_id for each in witnesses]
-    return names, shares, belief.whether_features(case.compared, witnesses[0], float(shares[0]))
+    """Return effects, the best first, their shares, and what is weighed of the best."""
+    effects, shares = classifier.rank_effects(case.compared, which)
+    names = [each.score.effect_id for each in effects]
+    return names, shares, classifier.presence_features(case.compared, effects[0], float(shares[0]))
 
 
 def fit_whether(cases: Sequence[Case], which: FloatArray) -> FloatArray:
-    """Fit the weights of "best is correct" and "another is correct", shape (2, features)."""
+    """Return the weights of "the best is it" and "it is another", shape (2, features)."""
     found = [ranked(case, which) for case in cases]
     features = np.array([each[2] for each in found])
     answers = np.array([answer(case, each[0]) for case, each in zip(cases, found, strict=True)])
@@ -179,7 +184,7 @@ def fit_whether(cases: Sequence[Case], which: FloatArray) -> FloatArray:
         error = ((chances - target) * counts[:, None])[:, 1:].T @ scaled / counts.sum()
         held = weights * (np.arange(weights.shape[1]) > 0)
         total = -np.sum(counts * np.log(np.sum(chances * target, axis=1) + 1e-300)) / counts.sum()
-        return total + RIDGE * np.sum(held**2), (error + 2.0 * RIDGE * held).ravel()
+        return total + HELD * np.sum(held**2), (error + 2.0 * HELD * held).ravel()
 
     weights = lowest(loss, 2 * features.shape[1]).reshape(2, -1) / spread
     weights[:, 0] -= (weights * mean)[:, 1:].sum(axis=1)
@@ -187,42 +192,42 @@ def fit_whether(cases: Sequence[Case], which: FloatArray) -> FloatArray:
 
 
 def weight(case: Case) -> float:
-    """Return the weight of a case."""
+    """Return how much a case counts for whether there is a cause."""
     return 1.0 if case.known or case.truth == "none" else OUTSIDE_COUNTS
 
 
 def answer(case: Case, names: Sequence[str]) -> int:
-    """Return the class of the best effect."""
+    """Return what is right to say of the best effect."""
     if case.truth == "none":
         return NONE
     return RIGHT if names[0] == case.truth else ANOTHER
 
 
 def lowest(loss: Callable[[FloatArray], tuple[float, FloatArray]], size: int) -> FloatArray:
-    """Return the minimum of a convex loss."""
+    """Return where a convex loss is lowest."""
     return np.asarray(minimize(loss, np.zeros(size), jac=True, method="L-BFGS-B").x)
 
 
 def judge(cases: Sequence[Case]) -> None:
-    """Print cross-validated shares."""
-    packs = sorted({case.pack for case in cases})
-    parts = np.random.default_rng(1).integers(PARTS, size=len(packs))
-    part_of = dict(zip(packs, parts.tolist(), strict=True))
+    """Print what packs left out of the fit say."""
+    worlds = sorted({case.world for case in cases})
+    parts = np.random.default_rng(1).integers(PARTS, size=len(worlds))
+    part_of = dict(zip(worlds, parts.tolist(), strict=True))
     lines: dict[str, list[tuple[str, ...]]] = {}
-    stated: list[tuple[float, bool]] = []
+    said: list[tuple[float, bool]] = []
     for part in range(PARTS):
-        known = [case for case in cases if part_of[case.pack] != part]
+        known = [case for case in cases if part_of[case.world] != part]
         which = fit_which(known)
         whether = fit_whether(known, which)
-        for case in (case for case in cases if part_of[case.pack] == part):
+        for case in (case for case in cases if part_of[case.world] == part):
             names, shares, features = ranked(case, which)
             logits = np.array([0.0, *(whether @ features)])
             none, best, _ = np.exp(logits - logits.max()) / np.exp(logits - logits.max()).sum()
             verdict = names[0] if best >= NAMED_FROM else "unknown"
-            verdict = verdict if none < SEEN_BELOW else "none"
-            pair = names[1] if shares[1] >= ALIKE_FROM * shares[0] > shares[2] else ""
+            verdict = verdict if none < GAP_BELOW else "none"
+            pair = names[1] if shares[1] >= AMBIGUOUS_FROM * shares[0] > shares[2] else ""
             right = names[0] == case.truth
-            stated.append((best, right))
+            said.append((best, right))
             lines.setdefault(case.protocol, []).append(
                 (case.truth, verdict, names[0], pair, "sure" if best >= 0.5 else "")
             )
@@ -241,12 +246,9 @@ def judge(cases: Sequence[Case]) -> None:
             share([row[1] != "none" for row in healthy]),
         ]
         print(f"{protocol:28s}{len(rows):5d}", *(f"{each:>7s}" for each in shares_of))
-    stated.sort()
-    for number, group in enumerate(np.array_split(np.array(stated), 8)):
-        print(
-            f"eighth {number + 1}: stated {group[:, 0].mean():.2f},"
-            f" correct {group[:, 1].mean():.2f}"
-        )
+    said.sort()
+    for number, group in enumerate(np.array_split(np.array(said), 8)):
+        print(f"eighth {number + 1}: said {group[:, 0].mean():.2f}, right {group[:, 1].mean():.2f}")
 
 
 def share(flags: Sequence[bool]) -> str:

@@ -245,7 +245,7 @@ def memory(hours: float = 24.0) -> tuple[Result, list[Row]]:
 
 def _handle_a_day(pipe: Any, hours: float) -> None:
     vehicle = Vehicle.load("generic")
-    gauge = Pipeline(vehicle, Model.load(MODEL), PipelineSettings())
+    pipeline = Pipeline(vehicle, Model.load(MODEL), PipelineSettings())
     encoder = FrameEncoder(vehicle)
     log = long_log()
     columns = (log.current_a.tolist(), log.voltage_v.tolist(), log.temperature_c.tolist())
@@ -257,13 +257,13 @@ def _handle_a_day(pipe: Any, hours: float) -> None:
     for number in range(total):
         sample = Sample(1.7e9 + 0.1 * number, *next(rows))
         for frame in encoder.encode(sample):
-            gauge.handle(frame)
-        gauge.heartbeat(is_stale=False)
+            pipeline.handle(frame)
+        pipeline.heartbeat(is_stale=False)
         if number == min(18_000, total // 2):
             first = _resident_mb()
     pipe.send(
         {
-            "samples": gauge.samples,
+            "samples": pipeline.samples,
             "mb_first": first,
             "mb_last": _resident_mb(),
             "seconds": time.monotonic() - began,

@@ -64,18 +64,18 @@ class Comparison:
 def over_bus(
     log: Log, vehicle: Vehicle, model: Model, address: BusAddress, record: Path
 ) -> tuple[list[Estimate], Pipeline, float]:
-    """Replay a log on a bus and estimate it; return the estimates, the gauge and the time [s]."""
-    gauge = Pipeline(vehicle, model, PipelineSettings(time_source="replay-clock"))
+    """Replay a log on a bus and estimate it; return the estimates, the pipeline and the time [s]."""
+    pipeline = Pipeline(vehicle, model, PipelineSettings(time_source="replay-clock"))
     rows: list[Estimate] = []
     done = threading.Event()
     with (
-        BusConnection(open_bus(address, gauge.filters), str(address)) as receiver,
+        BusConnection(open_bus(address, pipeline.filters), str(address)) as receiver,
         BusConnection(open_bus(address, [standard_filter(0x5A1)]), str(address)) as sender,
         Recorder(record) as recorder,
     ):
         outputs = Outputs(record=recorder, table=lambda _, estimate: rows.append(estimate))
         service = threading.Thread(
-            target=serve, args=(receiver, gauge, LoopSettings(), outputs, done.is_set)
+            target=serve, args=(receiver, pipeline, LoopSettings(), outputs, done.is_set)
         )
         service.start()
         began = time.monotonic()
@@ -84,14 +84,14 @@ def over_bus(
         finally:
             done.set()
             service.join()
-        return rows, gauge, time.monotonic() - began
+        return rows, pipeline, time.monotonic() - began
 
 
 def compare(log: Log, vehicle: Vehicle, model: Model, address: BusAddress) -> Comparison:
     """Compare the estimate over the bus with that of the log."""
     with tempfile.TemporaryDirectory() as folder:
         record = Path(folder) / "trip.log"
-        rows, gauge, seconds = over_bus(log, vehicle, model, address, record)
+        rows, pipeline, seconds = over_bus(log, vehicle, model, address, record)
         recorded = estimate_capture(record, vehicle, model).table
     settings = EstimatorSettings(temperature_source=vehicle.temperature_source)
     offline = run_estimator(samples_of(log), model, settings)
@@ -104,7 +104,7 @@ def compare(log: Log, vehicle: Vehicle, model: Model, address: BusAddress) -> Co
     return Comparison(
         trip=log.name,
         samples=len(rows),
-        lost=len(log) - len(rows) + gauge.counts.lost,
+        lost=len(log) - len(rows) + pipeline.counts.lost,
         seconds=seconds,
         difference_pct=largest("soc_pct"),
         bound_pct=bound.ekf_pct,

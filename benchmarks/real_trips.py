@@ -7,7 +7,7 @@ FOLDER holds TripA01.csv.gz … TripA22.csv.gz of "Battery and Heating Data in R
 than 15 minutes judge it. The car's own SoC is the reference. The data ends when the car stops, so
 chained trips are connected by 12 minutes with a current but no voltage, whose charge equals the
 SoC change of the car in each method's capacity, without offset. In the cases "counted" it is the
-true charge, to be counted with the wrong capacity, as by a gauge that is always on. All is done
+true charge, to be counted with the wrong capacity, as by a pipeline that is always on. All is done
 twice: with the 13 coefficients, and with the effects that `--effects auto` finds on the same
 training trips.
 """

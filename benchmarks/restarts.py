@@ -133,11 +133,11 @@ class ServiceRun:
     def __init__(self, model: Model, path: Path | None) -> None:
         self.now_s = EPOCH_S
         settings = PipelineSettings(EstimatorSettings(initial_soc_pct=START_PCT - 15.0))
-        self.gauge = Pipeline(Vehicle.load("generic"), model, settings)
+        self.pipeline = Pipeline(Vehicle.load("generic"), model, settings)
         self.keeper: StateKeeper | None = None
         if path is not None:
             self.keeper = StateKeeper(
-                StateSettings(path, every_s=EVERY_S), self.gauge,
+                StateSettings(path, every_s=EVERY_S), self.pipeline,
                 wall_s=lambda: self.now_s,
             )  # fmt: skip
 
@@ -151,8 +151,8 @@ class ServiceRun:
         """Handle the frames of a sample."""
         self.now_s = sample.time_s
         for frame in encoder.encode(sample):
-            self.gauge.handle(frame)
-        return self.gauge.latest
+            self.pipeline.handle(frame)
+        return self.pipeline.latest
 
     def keep(self) -> None:
         """Write the state and wait for the end of the writing."""

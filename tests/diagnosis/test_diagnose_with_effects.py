@@ -1,4 +1,4 @@
-"""Diagnosis on a model that `fit --effects` made: its effects stay, and are no cause again."""
+"""Diagnosis with a model from `fit --effects`: its effects stay and are no new cause."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cangauge.diagnosis import diagnose
+from cangauge.diagnosis.classifier import decide
 from cangauge.diagnosis.design_matrix import design_matrix
-from cangauge.diagnosis.diagnose import diagnose
-from cangauge.diagnosis.extended_model import model_file_of
-from cangauge.diagnosis.problem import _over_all_temperatures
+from cangauge.diagnosis.problem import build_problem, with_wider_range
 from cangauge.identify.fit import fit
 from cangauge.inference.linearized import residual
 from cangauge.inference.rows import FitOptions, sample_log
@@ -31,10 +31,10 @@ TRUTH = ExtendedModel(
 OPTIONS = FitOptions(capacity_ah=CAPACITY_AH)
 
 
-def day(seed: int, warmth_c: float, offset_a: float = 0.0) -> Log:
-    """A drive on a day of some temperature; the current sensor shows `offset_a` too much."""
+def day(seed: int, temperature_c: float, offset_a: float = 0.0) -> Log:
+    """A drive at some temperature; the current sensor reads `offset_a` too much."""
     log = synthetic_log(hours=0.6, start_pct=85.0, end_pct=60.0, seed=seed, name=f"day {seed}")
-    log = replace(log, temperature_c=log.temperature_c - 23.0 + warmth_c)
+    log = replace(log, temperature_c=log.temperature_c - 23.0 + temperature_c)
     signals = Signals(log.time_s, log.current_a, np.zeros(len(log)), log.temperature_c)
     volts = TRUTH.predict(signals, 85.0, np.arange(len(log))).voltage_v
     noise = np.random.default_rng(seed).normal(0.0, 0.5, len(log))
@@ -48,34 +48,38 @@ def model() -> Model:
     return fit(logs, capacity_ah=CAPACITY_AH, effects=effects, name="with effects").model
 
 
-def test_widened_temperatures_leave_the_effects_where_they_were(model: Model) -> None:
+def test_a_wider_temperature_range_does_not_change_effects(model: Model) -> None:
     given = model.extended_model()
     inside = sample_log(day(5, 18.0), OPTIONS)
-    wider = _over_all_temperatures(given, [day(6, -12.0)])
+    wider = with_wider_range(given, [day(6, -12.0)])
     assert wider.model.temperature_range_c[0] < given.model.temperature_range_c[0] - 10.0
     assert np.array_equal(residual(inside, wider), residual(inside, given))
 
 
-def test_structure_is_told_from_the_effects_that_the_model_has() -> None:
-    """Effects stand in the library's order: the last one need not be the one that was added."""
+def test_structure_is_distinguished_from_the_models_effects() -> None:
+    """Effects are in the library's order: the last need not be the one added."""
     plain = ExtendedModel(TRUTH.model, CAPACITY_AH)
     own = {"ohm": 0.02, "tau_s": 312.7, "spread": 0.0, "activation_k": 0.0, "by_slope": 0.0}
     given = plain.with_effect(LIBRARY["slow_diffusion"], own)
     item = sample_log(day(5, 18.0), OPTIONS)
     (piece, *_) = candidates([LIBRARY["resistance_soc"]], given.pack, item.log.time_s)
     amount = 0.1 * piece.bounds[:, 1]
-    acting = given.with_effect(piece.effect, piece.values(amount))
-    assert acting.effects[0][0].id == "resistance_soc"
-    terms = design_matrix(item, given, [piece], acting)
-    expected = residual(item, acting) + terms.effects[0] @ amount
-    np.testing.assert_allclose(terms.residual_v, expected, atol=1e-9)
+    structured = given.with_effect(piece.effect, piece.values(amount))
+    assert structured.effects[0][0].id == "resistance_soc"
+    matrix = design_matrix(item, given, [piece], structured)
+    expected = residual(item, structured) + matrix.effects[0] @ amount
+    np.testing.assert_allclose(matrix.residual_v, expected, atol=1e-9)
 
 
-def test_a_fault_is_named_beside_effects_that_the_model_has(model: Model) -> None:
-    references = [day(seed, warmth) for seed, warmth in ((11, 9.0), (12, 18.0), (13, 27.0))]
+@pytest.fixture(scope="module")
+def references() -> list[Log]:
+    return [day(seed, celsius) for seed, celsius in ((11, 9.0), (12, 18.0), (13, 27.0))]
+
+
+def test_a_fault_is_named_beside_the_models_effects(model: Model, references: list[Log]) -> None:
     found = diagnose([day(21, 14.0, 4.0), day(22, 24.0, 4.0)], model, references)
     assert "current_offset" in {found.verdict.cause, *found.verdict.ambiguous_with}
-    better = model_file_of(found.extension, model, found.extended_rmse_v).extended_model()
+    better = found.extended_model.extended_model()
     kept = [
         values
         for effect, values in better.effects
@@ -85,7 +89,5 @@ def test_a_fault_is_named_beside_effects_that_the_model_has(model: Model) -> Non
     assert given["reference_c"] in {values["reference_c"] for values in kept}
 
 
-def test_the_effects_that_the_model_has_are_no_gap(model: Model) -> None:
-    references = [day(seed, warmth) for seed, warmth in ((11, 9.0), (12, 18.0), (13, 27.0))]
-    found = diagnose([day(21, 8.0)], model, references)
-    assert found.verdict.cause == "none"
+def test_the_models_effects_are_no_gap(model: Model, references: list[Log]) -> None:
+    assert decide(build_problem([day(21, 8.0)], model, references)).cause == "none"

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cangauge.diagnosis.diagnose import Diagnosis, diagnose
-from cangauge.diagnosis.error_breakdown import MOMENTS, Place
+from cangauge.diagnosis import SEGMENTS, Diagnosis, ErrorShare, diagnose
 from cangauge.errors import InputError
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
@@ -121,8 +120,11 @@ def test_maps_show_before_and_after_in_the_same_shades(page: Page) -> None:
 def test_ten_worst_moments_are_drawn_on_one_scale(page: Page, offset: Diagnosis) -> None:
     part = section(page, "Worst moments")
     drawn = [item for block in part.blocks if isinstance(block, Beside) for item in block.figures]
-    assert len(drawn) == MOMENTS
-    assert drawn[0].title == f"1. {offset.worst[0].log} at {offset.worst[0].time_s:.0f} s"
+    assert len(drawn) == SEGMENTS
+    assert (
+        drawn[0].title
+        == f"1. {offset.worst_segments[0].log} at {offset.worst_segments[0].time_s:.0f} s"
+    )
     ranges = set()
     for each in drawn:
         error, current = stacked(each)
@@ -133,7 +135,7 @@ def test_ten_worst_moments_are_drawn_on_one_scale(page: Page, offset: Diagnosis)
         assert np.abs(x).max() <= 60.0
         ranges.add((error.y_range.start, error.y_range.end))
     assert len(ranges) == 1
-    assert len(tables(part)[0].rows) == MOMENTS
+    assert len(tables(part)[0].rows) == SEGMENTS
 
 
 def test_closing_is_shown_over_time_and_by_log(page: Page) -> None:
@@ -158,7 +160,8 @@ def test_shares_have_intervals(page: Page) -> None:
 def test_shares_of_small_currents_have_distinct_names() -> None:
     edges = [-1.2, -0.06, 0.06, 1.5, 2.9]
     places = [
-        Place("current", low, high, "A", 0.25, 0.1, (0.2, 0.3)) for low, high in pairwise(edges)
+        ErrorShare("current", low, high, "A", 0.25, 0.1, (0.2, 0.3))
+        for low, high in pairwise(edges)
     ]
     (row,) = share_figures(places)
     assert isinstance(row, Beside)
@@ -203,7 +206,7 @@ def test_caveats_of_a_poor_log_come_first(model: Model) -> None:
     assert isinstance(bullets, Bullets)
     words = " ".join(bullets.items)
     for said in ("No cause can be named", "does not prove that there is none", "Shorter than 10",
-                 "One temperature", "A narrow range of SoC", "No reference logs"):  # fmt: skip
+                 "Narrow temperature range", "Narrow SoC range", "No reference logs"):  # fmt: skip
         assert said in words
     assert any(tile.label == "Floor: model file" for tile in page.tiles)
 
@@ -211,7 +214,11 @@ def test_caveats_of_a_poor_log_come_first(model: Model) -> None:
 def test_a_coarse_temperature_is_a_caveat(model: Model) -> None:
     log = synthetic_log(hours=0.5, start_pct=70.0, end_pct=60.0, noise_v=0.5, name="coarse")
     coarse = replace(log, temperature_c=np.round(log.temperature_c))
-    fine_caveats, caveats = (" ".join(diagnose([each], model, []).limits) for each in (log, coarse))
+    fine_caveats, caveats = (
+        " ".join(diagnose([each], model, []).caveats) for each in (log, coarse)
+    )
+        " ".join(diagnose([each], model, []).caveats) for each in (log, coarse)
+    )
     assert "reported in steps" not in fine_caveats
     assert "reported in steps of 1 K" in caveats
 

@@ -178,7 +178,7 @@ def test_the_unix_socket_and_the_command(watched: Watched, tmp_path: Path) -> No
         assert ended.code == 0
         assert "± " in ended.out
         assert "valid" in ended.out
-        watched.gauge.heartbeat(is_stale=True)
+        watched.pipeline.heartbeat(is_stale=True)
         watched.turn()
         ended = in_process("status", "--endpoint", path, "--json")
         assert (ended.code, ended.json["reasons"]) == (1, ["input_stale"])

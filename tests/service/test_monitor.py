@@ -42,8 +42,8 @@ def test_a_snapshot_has_estimate_frames_and_bus() -> None:
     snapshot = watched.monitor.latest
     assert snapshot.samples == 900
     assert snapshot.estimate.status is Status.VALID
-    assert snapshot.estimate.soc_pct == watched.gauge.latest.soc_pct
-    assert snapshot.frames == snapshot.wanted == watched.gauge.counts.frames > 1800
+    assert snapshot.estimate.soc_pct == watched.pipeline.latest.soc_pct
+    assert snapshot.frames == snapshot.wanted == watched.pipeline.counts.frames > 1800
     assert snapshot.rejected == 0
     assert snapshot.bus == {"garbled": 1, "error_frames": 2, "unsent": 3, "queue_drops": 4}
     assert snapshot.step.count == 900
@@ -70,12 +70,12 @@ def test_a_snapshot_never_changes() -> None:
 def test_refused_frames_are_counted_by_reason() -> None:
     watched = Watched()
     watched.drive(5.0)
-    for counters in watched.gauge.decoder.counters.messages.values():
+    for counters in watched.pipeline.decoder.counters.messages.values():
         counters.crc_errors += 2
         counters.not_available += 1
     watched.turn()
     snapshot = watched.monitor.latest
-    messages = len(watched.gauge.decoder.counters.messages)
+    messages = len(watched.pipeline.decoder.counters.messages)
     assert snapshot.rejects["crc_errors"] == 2 * messages
     assert snapshot.rejects["not_available"] == messages
     # A value that is not available refuses no frame.
@@ -97,7 +97,7 @@ def test_a_stuck_loop_makes_the_soc_invalid() -> None:
 def test_a_stale_estimate_is_shown_as_invalid() -> None:
     watched = Watched()
     watched.drive(90.0)
-    watched.gauge.heartbeat(is_stale=True)
+    watched.pipeline.heartbeat(is_stale=True)
     watched.turn()
     assert watched.monitor.latest.estimate.status is Status.INVALID
 
@@ -147,9 +147,9 @@ def test_status_changes_are_logged_and_the_last_always(
     turn(1.0)
     watched.drive(90.0)
     for number in range(200):
-        watched.gauge.heartbeat(is_stale=number % 2 == 0)
+        watched.pipeline.heartbeat(is_stale=number % 2 == 0)
         turn(0.3)
-    watched.gauge.heartbeat(is_stale=True)
+    watched.pipeline.heartbeat(is_stale=True)
     for _ in range(400):
         turn(0.3)
     limiter.close()

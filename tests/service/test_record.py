@@ -69,7 +69,7 @@ def need(suffix: str) -> None:
 def test_parts_are_one_capture_and_give_the_live_numbers(tmp_path: Path, suffix: str) -> None:
     need(suffix)
     messages = frames(60.0)
-    gauge = Pipeline(Vehicle.load("generic"), leaf_model())
+    pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
     live = []
     now = [0.0]
     limits = RecordLimits(part_bytes=20_000, part_s=12.0)
@@ -78,10 +78,10 @@ def test_parts_are_one_capture_and_give_the_live_numbers(tmp_path: Path, suffix:
             now[0] = 0.03 * number
             recorder.write(message)
             recorder.tick(now[0])
-            before = gauge.samples
-            gauge.handle(message)
-            if gauge.samples != before:
-                live.append(gauge.latest)
+            before = pipeline.samples
+            pipeline.handle(message)
+            if pipeline.samples != before:
+                live.append(pipeline.latest)
     assert recorder.state.lost_frames == 0
     assert recorder.path == tmp_path / f"drive-0001{suffix}"
     parts = parts_of_run(recorder.path)

@@ -37,7 +37,7 @@ signal = "temperature_c"
 
 
 class Car:
-    """A gauge with its configuration file, its frames, and what was said."""
+    """A pipeline with its configuration file, its frames, and what was said."""
 
     def __init__(self, folder: Path, text: str = "") -> None:
         self.path = folder / "car.toml"
@@ -45,7 +45,7 @@ class Car:
         shutil.copy(leaf_model_path(), self.model)
         self.write(text)
         self.service = Service(self.path)
-        self.gauge = self.service.gauge
+        self.pipeline = self.service.pipeline
         self.logged = LoggedLines("cangauge.service.run")
         encoder = FrameEncoder(Vehicle.load("generic"))
         self.frames = [encoder.encode(each) for each in samples_of(short_log(200.0))]
@@ -61,8 +61,8 @@ class Car:
         sent: list[can.Message] = []
         for frames in self.frames[first:last]:
             for frame in frames:
-                self.gauge.handle(can.Message.__copy__(frame))
-            sent += self.gauge.heartbeat(is_stale=False)
+                self.pipeline.handle(can.Message.__copy__(frame))
+            sent += self.pipeline.heartbeat(is_stale=False)
         return sent
 
     def reload(self, text: str) -> LoopSettings | None:
@@ -86,32 +86,32 @@ def test_a_reload_of_timeouts_leaves_the_estimate_bit_for_bit(car: Car, tmp_path
     (tmp_path / "undisturbed").mkdir()
     undisturbed = Car(tmp_path / "undisturbed")
     undisturbed.drive(0, 1200)
-    assert car.gauge.latest == undisturbed.gauge.latest
+    assert car.pipeline.latest == undisturbed.pipeline.latest
 
 
 def test_another_model_in_the_same_file_takes_soc_over(car: Car) -> None:
-    before = car.gauge.latest
+    before = car.pipeline.latest
     text = json.loads(car.model.read_text())
     text["capacity_ah"] *= 0.9
     text["coefficients"]["k0"]["value"] += 1.0
     car.model.write_text(json.dumps(text))
     assert car.reload("") is not None
     car.drive(1000, 1001)
-    after = car.gauge.latest
+    after = car.pipeline.latest
     assert after.soc_pct == pytest.approx(before.soc_pct, abs=0.25 * before.soc_std_pct)
     assert after.soc_std_pct == pytest.approx(before.soc_std_pct, rel=0.05)
     assert not after.reasons & Reason.DELAY_LINE_FILLING
     assert after.voltage_model_v != pytest.approx(before.voltage_model_v, abs=0.2)
-    assert car.gauge.samples == 1001
+    assert car.pipeline.samples == 1001
 
 
 def test_a_reload_ignores_the_initial_soc(car: Car) -> None:
-    before = car.gauge.latest
+    before = car.pipeline.latest
     assert car.reload("initial_soc_std = 20\n") is not None
     car.path.write_text('model = "model.json"\ninitial_soc = 20\n')
     assert car.service.reconfigure() is not None
     car.drive(1000, 1001)
-    assert car.gauge.latest.soc_pct == pytest.approx(before.soc_pct, abs=0.05)
+    assert car.pipeline.latest.soc_pct == pytest.approx(before.soc_pct, abs=0.05)
 
 
 def test_published_ids_change_and_their_counters_go_on(car: Car) -> None:
@@ -131,15 +131,15 @@ def estimate_counter(frame: can.Message) -> int:
 
 
 def test_a_reload_changes_the_vehicle_and_keeps_counts(car: Car) -> None:
-    frames = car.gauge.counts.frames
+    frames = car.pipeline.counts.frames
     assert car.reload('vehicle = "leaf_aze0"\n') is not None
     car.drive(1000, 1100)  # the frames of the other car: not wanted now
-    assert car.gauge.samples == 1000
-    assert car.gauge.counts.frames > frames
-    assert 0x1DB in [each["can_id"] for each in car.gauge.filters]
+    assert car.pipeline.samples == 1000
+    assert car.pipeline.counts.frames > frames
+    assert 0x1DB in [each["can_id"] for each in car.pipeline.filters]
     assert car.reload("") is not None
     car.drive(1100, 1110)
-    assert car.gauge.samples >= 1009
+    assert car.pipeline.samples >= 1009
 
 
 def test_a_dbc_or_map_that_changed_is_noticed(tmp_path: Path) -> None:
@@ -147,11 +147,11 @@ def test_a_dbc_or_map_that_changed_is_noticed(tmp_path: Path) -> None:
     (tmp_path / "map.toml").write_text(MAP)
     car = Car(tmp_path, 'map = "map.toml"\n')
     car.drive(0, 100)
-    temperature_c = car.gauge.latest_sample.temperature_c  # type: ignore[union-attr] # there is one
+    temperature_c = car.pipeline.latest_sample.temperature_c  # type: ignore[union-attr] # there is one
     (tmp_path / "map.toml").write_text(MAP + "offset = 5\n")
     assert car.service.reconfigure() is not None
     car.drive(100, 200)
-    assert car.gauge.latest_sample.temperature_c == pytest.approx(  # type: ignore[union-attr] # as above
+    assert car.pipeline.latest_sample.temperature_c == pytest.approx(  # type: ignore[union-attr] # as above
         temperature_c + 5.0, abs=1.0
     )
 
@@ -169,22 +169,26 @@ def test_a_dbc_or_map_that_changed_is_noticed(tmp_path: Path) -> None:
     ],
 )
 def test_an_invalid_configuration_is_refused_as_a_whole(car: Car, text: str, say: str) -> None:
-    settings, filters, latest = car.gauge.settings, car.gauge.filters, car.gauge.latest
+    settings, filters, latest = car.pipeline.settings, car.pipeline.filters, car.pipeline.latest
     assert car.reload(text) is None
     assert len(car.said) == 1
     assert car.said[0].startswith("warning: new configuration refused, the old one stays: ")
     assert say in car.said[0]
     assert "\n" not in car.said[0]
-    assert (car.gauge.settings, car.gauge.filters, car.gauge.latest) == (settings, filters, latest)
+    assert (car.pipeline.settings, car.pipeline.filters, car.pipeline.latest) == (
+        settings,
+        filters,
+        latest,
+    )
     car.drive(1000, 1001)
-    assert car.gauge.samples == 1001
+    assert car.pipeline.samples == 1001
 
 
 def test_an_id_of_the_new_vehicle_is_refused_without_changes(car: Car) -> None:
-    filters = car.gauge.filters
+    filters = car.pipeline.filters
     assert car.reload('vehicle = "leaf_aze0"\n[ids]\nsoc_estimate = 0x1DB\n') is None
     assert "0x1DB" in car.said[0]
-    assert car.gauge.filters == filters
+    assert car.pipeline.filters == filters
 
 
 @pytest.mark.parametrize("content", [b"", b'{"format": "cangauge-model"', b"\xff\xfe\x00"])
@@ -200,8 +204,8 @@ def test_a_broken_model_is_refused(car: Car, content: bytes) -> None:
 def test_keys_that_need_a_restart_are_logged_and_unchanged(car: Car) -> None:
     text = 'channel = "can5"\ntime_source = "replay-clock"\n[ids]\nreplay_clock = 0x111\n'
     assert car.reload(text) is not None
-    assert car.gauge.settings.time_source == "receive"
-    assert car.gauge.settings.ids.replay_clock == 0x5AF
+    assert car.pipeline.settings.time_source == "receive"
+    assert car.pipeline.settings.ids.replay_clock == 0x5AF
     assert car.said[1] == (
         "warning: channel, time_source, ids.replay_clock: takes effect when the service is"
         " restarted"

@@ -68,14 +68,14 @@ class Machine:
     def start(self) -> Service:
         self.logged.__enter__()
         self.said.clear()
-        gauge = Pipeline(VEHICLE, self.model, self.settings)
+        pipeline = Pipeline(VEHICLE, self.model, self.settings)
         keeper = StateKeeper(
             StateSettings(self.path, self.max_age_s),
-            gauge,
+            pipeline,
             wall_s=lambda: self.clock.wall_s,
         )
         keeper.__enter__()
-        return Service(self, gauge, keeper)
+        return Service(self, pipeline, keeper)
 
     @property
     def said(self) -> list[str]:
@@ -89,7 +89,7 @@ class Machine:
 @dataclass
 class Service:
     machine: Machine
-    gauge: Pipeline
+    pipeline: Pipeline
     keeper: StateKeeper
     encoder: FrameEncoder = field(default_factory=lambda: FrameEncoder(VEHICLE))
 
@@ -97,10 +97,10 @@ class Service:
         found = []
         for sample in samples:
             for frame in self.encoder.encode(sample):
-                before = self.gauge.samples
-                self.gauge.handle(frame)
-                if self.gauge.samples != before:
-                    found.append(self.gauge.latest)
+                before = self.pipeline.samples
+                self.pipeline.handle(frame)
+                if self.pipeline.samples != before:
+                    found.append(self.pipeline.latest)
             self.machine.clock.wall_s = max(self.machine.clock.wall_s, sample.time_s)
         return found
 
@@ -179,7 +179,7 @@ def test_a_service_restarted_at_once_goes_on_bit_for_bit(machine: Machine) -> No
 
 def test_a_restored_soc_is_stale_until_the_first_sample(machine: Machine) -> None:
     last = kept(machine)[-1]
-    latest = machine.start().gauge.latest
+    latest = machine.start().pipeline.latest
     assert latest.soc_pct == last.soc_pct
     assert latest.status is Status.INVALID
     assert latest.reasons & Reason.INPUT_STALE
@@ -288,7 +288,7 @@ def test_after_the_machine_was_off_its_clock_is_not_believed(machine: Machine) -
     rewritten(machine.path, lambda content: content.update(boot_id="another"))
     service = machine.start()
     service.drive(DRIVE[1000:1001])
-    assert service.gauge.estimator.filter.verdict == "open"
+    assert service.pipeline.estimator.filter.verdict == "open"
 
 
 @pytest.mark.parametrize("change", [{"method": "coulomb"}, {"capacity_ah": 55.0}])
@@ -307,10 +307,10 @@ def test_a_replayed_log_goes_on_and_another_one_begins_anew(machine: Machine) ->
 
     def play(service: Service, samples: list[Sample]) -> Estimate:
         for sample in samples:
-            service.gauge.handle(clock.at(round((sample.time_s - EPOCH_S) * 1e6)))
+            service.pipeline.handle(clock.at(round((sample.time_s - EPOCH_S) * 1e6)))
             for frame in service.encoder.encode(sample):
-                service.gauge.handle(frame)
-        return service.gauge.latest
+                service.pipeline.handle(frame)
+        return service.pipeline.latest
 
     whole = play(Machine(machine.path.with_name("b"), settings=machine.settings).start(), DRIVE)
     service = machine.start()
@@ -320,7 +320,7 @@ def test_a_replayed_log_goes_on_and_another_one_begins_anew(machine: Machine) ->
     assert play(machine.start(), DRIVE[1000:]) == whole
     service = machine.start()
     fresh = play(service, DRIVE[:100])
-    assert service.gauge.counts.beginnings == 1
+    assert service.pipeline.counts.beginnings == 1
     assert fresh.samples == 100
 
 
@@ -614,5 +614,5 @@ def test_a_refused_state_starts_by_voltage(machine: Machine, method: Any) -> Non
     assert abs(found.soc_pct - 79.0) < 3.0 * found.soc_std_pct
     assert found.soc_pct == pytest.approx(79.0, abs=4.0)
     # Nor is it taken up again when the configuration is read again.
-    again.gauge.reconfigure(None, machine.model, machine.settings)
+    again.pipeline.reconfigure(None, machine.model, machine.settings)
     assert again.drive(DRIVE[1000:1010])[-1].soc_pct == pytest.approx(79.0, abs=4.0)

@@ -78,7 +78,7 @@ def test_the_line_has_soc_status_and_rate() -> None:
     watched.drive(90.0)
     watched.turn()
     snapshot = replace(watched.monitor.latest, samples_per_s=10.0)
-    latest, sample = watched.gauge.latest, watched.gauge.latest_sample
+    latest, sample = watched.pipeline.latest, watched.pipeline.latest_sample
     text = live_text(snapshot).plain
     assert f"SoC {latest.soc_pct:.2f} ± {latest.soc_std_pct:.2f} %  valid" in text
     assert sample is not None

@@ -39,7 +39,7 @@ def run(channel: str, saves: Saves, every_s: float = 0.2) -> list[str]:
         with LoggedLines("cangauge.service.loop") as logged:
             serve(
                 service.port,
-                service.gauge,
+                service.pipeline,
                 LoopSettings(duration_s=0.7, checkpoint_every_s=every_s),
                 Outputs(checkpoint=checkpoint),
                 lambda: False,
@@ -71,11 +71,15 @@ def test_a_state_that_cannot_be_saved_is_a_warning(error: Exception) -> None:
 
 def test_the_state_is_saved_also_when_the_service_breaks() -> None:
     saved = []
-    gauge = virtual_service("breaks").pipeline
+    pipeline = virtual_service("breaks").pipeline
     port = BusConnection(BrokenBus([network_down()]), "fake")  # type: ignore[arg-type] # has what is used
     with pytest.raises(BusError):
         serve(
-            port, gauge, LoopSettings(), Outputs(checkpoint=lambda: saved.append(1)), lambda: False
+            port,
+            pipeline,
+            LoopSettings(),
+            Outputs(checkpoint=lambda: saved.append(1)),
+            lambda: False,
         )
     assert saved == [1]
 

@@ -1,4 +1,4 @@
-"""A gauge, a port and a monitor over it, without a bus."""
+"""A pipeline, a port and a monitor over it, without a bus."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ class Watched:
 
     def __post_init__(self) -> None:
         known = PipelineSettings(EstimatorSettings(initial_soc_pct=80.0))
-        self.gauge = Pipeline(Vehicle.load("generic"), leaf_model(), known)
+        self.pipeline = Pipeline(Vehicle.load("generic"), leaf_model(), known)
         self.monitor = Monitor(
-            self.gauge,
+            self.pipeline,
             self.port,
             identity=IDENTITY,
             notifier=self.notifier,
@@ -59,11 +59,11 @@ class Watched:
         encoder = FrameEncoder(Vehicle.load("generic"))
         for sample in samples_of(short_log(seconds)):
             for frame in encoder.encode(sample):
-                before = self.gauge.samples
-                self.gauge.handle(frame)
-                if self.gauge.samples != before:
+                before = self.pipeline.samples
+                self.pipeline.handle(frame)
+                if self.pipeline.samples != before:
                     self.monitor.stepped(frame.timestamp, 30e-6, self.now_s)
-        self.gauge.heartbeat(is_stale=False)
+        self.pipeline.heartbeat(is_stale=False)
 
     def turn(self, later_s: float = 1.0) -> None:
         self.now_s += later_s

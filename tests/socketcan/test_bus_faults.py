@@ -69,11 +69,11 @@ class Reconnecting(Service):
 
     def __init__(self, address: BusAddress = VCAN, *, wait: bool = False) -> None:
         known = PipelineSettings(EstimatorSettings(initial_soc_pct=80.0))
-        gauge = Pipeline(Vehicle.load("generic"), leaf_model(), known)
+        pipeline = Pipeline(Vehicle.load("generic"), leaf_model(), known)
         self.log = BusLog()
-        port = ReconnectingBus(address, gauge.filters)
+        port = ReconnectingBus(address, pipeline.filters)
         port.open(wait=wait)
-        super().__init__(port, gauge, LoopSettings(timeout_s=STALE_S))
+        super().__init__(port, pipeline, LoopSettings(timeout_s=STALE_S))
 
     def __enter__(self) -> Self:
         self.log.__enter__()
@@ -172,9 +172,9 @@ def test_an_interface_that_is_lost_and_returns(kind: str) -> None:
             estimate = listener.next()
             assert is_stale(estimate)  # it keeps publishing, with the age
             assert estimate.soc_pct == pytest.approx(before, abs=0.01)
-            samples = live.gauge.samples
+            samples = live.pipeline.samples
             with Pack():
-                assert waits(lambda: live.gauge.samples >= samples + 20)
+                assert waits(lambda: live.pipeline.samples >= samples + 20)
                 estimate = [listener.next() for _ in range(30)][-1]
             assert not is_stale(estimate)
             assert estimate.soc_pct == pytest.approx(before, abs=0.5)
@@ -193,8 +193,8 @@ def test_an_interface_that_flaps() -> None:
             ip("set", "vcan0", "up")
             time.sleep(0.25)
         assert waits(lambda: not live.bus.is_away)
-        samples = live.gauge.samples
-        assert waits(lambda: live.gauge.samples >= samples + 20)
+        samples = live.pipeline.samples
+        assert waits(lambda: live.pipeline.samples >= samples + 20)
     assert live.error is None
     assert live.summary is not None
     assert 1 <= live.bus.losses <= 5
@@ -248,7 +248,7 @@ def send_error(classes: int, data: bytes = bytes(8)) -> None:
 
 def test_error_frames_are_counted_and_bus_off_is_logged() -> None:
     with Reconnecting() as live, Pack():
-        assert waits(lambda: live.gauge.samples >= 10)
+        assert waits(lambda: live.pipeline.samples >= 10)
         for _ in range(5):
             send_error(0x088)
         send_error(0x004, b"\x00\x01" + bytes(6))
@@ -271,7 +271,7 @@ def test_error_frames_are_counted_and_bus_off_is_logged() -> None:
 
 def test_two_thousand_error_frames_cost_no_sample() -> None:
     with Reconnecting() as live, Pack() as pack:
-        assert waits(lambda: live.gauge.samples >= 10)
+        assert waits(lambda: live.pipeline.samples >= 10)
         with socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw:
             raw.bind(("vcan0",))
             frame = struct.pack("=IB3x8s", socket.CAN_ERR_FLAG | 0x080, 8, bytes(8))

@@ -38,17 +38,17 @@ def _vcan0() -> None:
 
 
 def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
-    gauge = Pipeline(Vehicle.load("generic"), leaf_model())
+    pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
     rows = []
     stop = threading.Event()
     encoder = FrameEncoder(Vehicle.load("generic"))
     frames = [encoder.encode(sample) for sample in samples_of(short_log(50.0))]
     with (
-        BusConnection(open_bus(VCAN, gauge.filters), "vcan0") as port,
+        BusConnection(open_bus(VCAN, pipeline.filters), "vcan0") as port,
         BusConnection(open_bus(VCAN, []), "sender") as sender,
         Recorder(tmp_path / "seen.blf", RecordLimits(part_bytes=5_000)) as recorder,
     ):
-        monitor = Monitor(gauge, port, identity=IDENTITY, notifier=Notifier(), record=recorder)
+        monitor = Monitor(pipeline, port, identity=IDENTITY, notifier=Notifier(), record=recorder)
 
         def turn(now_s: float) -> None:
             monitor.turn(now_s)
@@ -62,7 +62,7 @@ def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
             sent=monitor.sent,
         )
         loop = threading.Thread(
-            target=serve, args=(port, gauge, LoopSettings(), outputs, stop.is_set)
+            target=serve, args=(port, pipeline, LoopSettings(), outputs, stop.is_set)
         )
         loop.start()
         with Endpoint(lambda: monitor.latest, http=http_address("127.0.0.1:0")) as endpoint:
@@ -73,7 +73,9 @@ def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
                 time.sleep(0.002)
                 if number % 50 == 0:
                     # Paced by the receiver: throughput is not tested here.
-                    assert waits(lambda done=number: gauge.samples >= done, 20.0), gauge.counters
+                    assert waits(lambda done=number: pipeline.samples >= done, 20.0), (
+                        pipeline.counters
+                    )
                     url = f"http://127.0.0.1:{endpoint.port}/metrics"
                     with urllib.request.urlopen(url, timeout=10.0) as answer:
                         scrapes += b"cangauge_samples_total" in answer.read()

@@ -61,9 +61,9 @@ def replay_port() -> Iterator[BusConnection]:
 
 
 def service(preset: str, settings: PipelineSettings, record: Recorder | None = None) -> Service:
-    gauge = Pipeline(Vehicle.load(preset), leaf_model(), settings)
+    pipeline = Pipeline(Vehicle.load(preset), leaf_model(), settings)
     return Service(
-        BusConnection(open_bus(VCAN, gauge.filters), str(VCAN)), gauge, LoopSettings(), record
+        BusConnection(open_bus(VCAN, pipeline.filters), str(VCAN)), pipeline, LoopSettings(), record
     )
 
 
@@ -153,8 +153,8 @@ def test_real_time_uses_the_kernels_stamps(replay_port: BusConnection, tmp_path:
 
 
 def test_the_kernel_filters_the_wanted_ids() -> None:
-    gauge = Pipeline(Vehicle.load("leaf_aze0"), leaf_model())
-    bus = open_bus(VCAN, gauge.filters)
+    pipeline = Pipeline(Vehicle.load("leaf_aze0"), leaf_model())
+    bus = open_bus(VCAN, pipeline.filters)
     raw = bus.socket.getsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, 64)  # type: ignore[attr-defined] # SocketcanBus
     assert len(raw) == 8 * 3
     sender = can.Bus("vcan0", interface="socketcan", ignore_config=True)
@@ -193,8 +193,8 @@ def test_unwanted_traffic_costs_no_wanted_frame(replay_port: BusConnection, tmp_
     with service("leaf_aze0", settings) as live:
         state = play(replay_port, CaptureSource(path, vehicle), MAX, stop=never)
     assert state.acknowledged == state.samples == 100
-    assert live.gauge.counts.lost == 0
-    assert live.gauge.counts.frames < 150  # the rest is dropped in the kernel
+    assert live.pipeline.counts.lost == 0
+    assert live.pipeline.counts.frames < 150  # the rest is dropped in the kernel
 
 
 def test_others_can_read_the_published_frames(replay_port: BusConnection) -> None:
@@ -202,7 +202,7 @@ def test_others_can_read_the_published_frames(replay_port: BusConnection) -> Non
     with service("generic", PipelineSettings(time_source="replay-clock")) as live:
         log = short_log(20.0)
         play(replay_port, LogSource(log, Vehicle.load("generic")), MAX, stop=never)
-        assert waits(lambda: live.gauge.samples == len(log))
+        assert waits(lambda: live.pipeline.samples == len(log))
         time.sleep(0.3)
     reader = SocReader(FrameIds())
     frames = []

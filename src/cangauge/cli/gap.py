@@ -23,9 +23,7 @@ from cangauge.cli.options import (
     within,
 )
 from cangauge.cli.output import emit_json, note, print_table
-from cangauge.diagnosis.diagnose import Diagnosis, diagnose, in_words
-from cangauge.diagnosis.extended_model import model_file_of
-from cangauge.diagnosis.posterior import NONE, UNKNOWN
+from cangauge.diagnosis import NONE, UNKNOWN, Diagnosis, diagnose
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
@@ -111,8 +109,8 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     found = diagnose(diagnosed, model_file, references, initial_soc_pct=initial_soc, progress=note)
     with ExitStack() as stack:
         if extended is not None:
-            better = model_file_of(found.extension, model_file, found.extended_rmse_v)
-            stack.enter_context(atomic_path(extended)).write_text(better.to_json())
+            text = found.extended_model.to_json()
+            stack.enter_context(atomic_path(extended)).write_text(text)
         if report is not None:
             # bokeh takes half a second to import.
             from cangauge.report.diagnosis import gap_report  # noqa: PLC0415
@@ -155,7 +153,7 @@ def _long_enough(log: Log) -> Log:
 def _show(found: Diagnosis) -> None:
     for sentence in (
         headline(found),
-        in_words(found),
+        found.summary,
         open_question(found),
         next_step(found),
     ):
@@ -174,14 +172,14 @@ def _show(found: Diagnosis) -> None:
             ]
         )
     for answer in (UNKNOWN, NONE):
-        probability = number(found.verdict.chances[answer], 2)
+        probability = number(found.verdict.probabilities[answer], 2)
         rows.append([answer, probability, NONE_KNOWN, NONE_KNOWN, NONE_KNOWN])
     headings = ["cause", "probability", "evidence", "left [V]", "closed"]
     print_table("Candidates, judged on held-out rows", headings, rows)
     for item in found.candidates:
         if item["effect"] in found.extension.cause:
             typer.echo(f"{item['effect']}: {parameters_text(item['parameters'])}")
-    if found.limits:
+    if found.caveats:
         typer.echo("What these logs cannot show:")
-    for sentence in found.limits:
+    for sentence in found.caveats:
         typer.echo(f"- {sentence}")

@@ -1,25 +1,63 @@
-"""Diagnosis of the gap between a model and a log: where, which effect, how far it shrinks.
+"""Diagnosis: how large the gap between a model and logs is, where it lies, and what causes it.
 
-What follows what, and where::
+    >>> from cangauge.diagnosis import diagnose
+    >>> found = diagnose(logs, model, references)  # doctest: +SKIP
+    >>> found.summary, found.extended_model  # doctest: +SKIP
 
-    diagnose       logs, model file, references → Diagnosis: all of the below
-      settle       → Settled: everything that is the same for all verdicts
-        columns      a log → LogTerms: its residual, and how that moves with every amplitude
-        frame        the candidates: which are structure, which a log's own, where their columns are
-        evidence     LogTerms → Gram (products, by time scale) → Evidence (all but effects
-                     integrated out)
-        references   references → ErrorModel: error by time scale, how much logs differ, how far
-                     healthy logs stray; with levels, thinned, covered
-        learned      references → the model as they know it, and its structure; with structure
-      verdict      → Verdict: an effect, none or unknown
-        compared     Evidence → Compared: each effect looked at in six ways; with scores, remainder
-        belief       Compared → Belief: the six weighed, as probabilities
-      held_out     errors with and without the cause, on rows that its fit did not see
-      extend       → Extension: the model with the cause; with at_cause, at_moment, bounded
-      where, maps, moments, before_after, soc_error, limits: what the page shows
+Modules, in the order in which a diagnosis uses them:
 
-Words: a *candidate* is one effect at one shape (a time constant, say), its *amplitudes* are what
-the voltage follows linearly. *Structure* is what healthy days share beyond the voltage model, *own*
-what each of them has of its own. A log's *baseline* is the voltage model's coefficients; *as given*
-is the model of the file. References *stray* by what they bring up though they are healthy.
+==================  ==============================================================================
+diagnose            `diagnose` and its result, `Diagnosis`
+problem             what all verdicts share: checked logs, hypotheses, error model, coverage
+input_checks        logs of this pack, alive, given once, without outliers
+hypotheses          candidate effects: cause, shared structure, per-log effects
+design_matrix       sensitivity of a log's voltage residual to every amplitude
+linear_gaussian     normal equations of logs; posterior of the amplitudes
+error_model         error of healthy logs by time scale, prior scales, overdispersion
+structure           structure that the references need, and the model that has it
+bayes_factors       every effect against no effect
+classifier          effect features → probabilities → verdict
+cross_validation    errors on held-out rows, closed fraction, SoC error
+extended_model      refined amplitudes, change points; the extended model file
+error_breakdown     shares of the error, worst segments, maps
+caveats             what the logs cannot show
+==================  ==============================================================================
+
+The method is described in docs/diagnosis.md.
 """
+
+from cangauge.diagnosis.classifier import NONE, UNKNOWN, Verdict
+from cangauge.diagnosis.cross_validation import rms
+from cangauge.diagnosis.diagnose import LIKELY, Diagnosis, diagnose
+from cangauge.diagnosis.error_breakdown import (
+    MIN_BIN_ROWS,
+    SEGMENT_S,
+    SEGMENTS,
+    ErrorMap,
+    ErrorShare,
+    LogErrors,
+    SegmentSignals,
+    WorstSegment,
+    error_map,
+    segment_signals,
+)
+
+__all__ = [
+    "LIKELY",
+    "MIN_BIN_ROWS",
+    "NONE",
+    "SEGMENTS",
+    "SEGMENT_S",
+    "UNKNOWN",
+    "Diagnosis",
+    "ErrorMap",
+    "ErrorShare",
+    "LogErrors",
+    "SegmentSignals",
+    "Verdict",
+    "WorstSegment",
+    "diagnose",
+    "error_map",
+    "rms",
+    "segment_signals",
+]

@@ -1,7 +1,4 @@
-"""Every effect's score: its Bayes factor against no effect, at its best shape or mixture of two.
-
-What is left of logs: by how much, beyond chance, with and without an effect.
-"""
+"""Bayes factor of every effect against no effect, and the error that logs keep with it."""
 
 from __future__ import annotations
 
@@ -12,64 +9,56 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from cangauge._typing import FloatArray
-from cangauge.diagnosis.hypotheses import Frame
-from cangauge.diagnosis.linear_gaussian import Evidence, Gram, prior_precision, without_own
+from cangauge.diagnosis.hypotheses import Hypotheses
+from cangauge.diagnosis.linear_gaussian import (
+    NormalEquations,
+    Posterior,
+    marginalize_per_log,
+    prior_precision,
+)
 from cangauge.inference.time_scales import SCALES
 
-# --- Every effect's score: its Bayes factor against no effect, at its best shape or mixture …
+PRIOR_WIDTHS = (1.0, 0.3, 0.1, 0.03)
+"""Widths of the amplitude prior in parts of the bounds' own, equally probable: an effect may be as
+large as its bounds or much smaller."""
 
-PRIOR_PARTS = (1.0, 0.3, 0.1, 0.03)
-"""An effect may be as large as its bounds, or much smaller: the prior's width in parts of that of
-the bounds, each as probable as the others."""
+NOISE_VARIATION = 0.2
+"""Part by which the error variance differs between healthy logs."""
 
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """One effect, at its best shape."""
+    """One effect at its best shape."""
 
     effect_id: str
     log_bayes_factor: float
     """Against no effect, averaged over the effect's shapes."""
     candidates: tuple[int, ...]
-    """Index of the best shape's candidate, or of two whose mixture is better than either."""
+    """Candidate of the best shape, or two whose mixture is better than either."""
     amplitude: FloatArray
-    """Most probable amplitudes beside the neutral ones, within bounds, of all of them, (k,)."""
+    """Most probable amplitudes relative to neutral, within bounds, shape (k,)."""
     covariance: FloatArray
     """Shape (k, k)."""
     explained: float
-    """By how much the weighted sum of squares falls."""
+    """Decrease of the weighted sum of squares."""
 
 
-def condition_on(evidence: Evidence, given: Sequence[int]) -> Evidence:
-    """Return the evidence once some candidates are in the model, their amplitudes left free."""
-    taken = evidence.frame.amplitudes_of(given)
-    block = evidence.curvature[np.ix_(taken, taken)]
-    block = block + prior_precision(evidence.frame.bounds_of(given))
-    gain = np.linalg.solve(block, evidence.curvature[taken]).T
-    return replace(
-        evidence,
-        gradient=evidence.gradient - gain @ evidence.gradient[taken],
-        curvature=evidence.curvature - gain @ evidence.curvature[taken],
-        squares=evidence.squares
-        - float(evidence.gradient[taken] @ np.linalg.solve(block, evidence.gradient[taken])),
-    )
-
-
-def scores(evidence: Evidence, leave_out: Sequence[str] = ()) -> list[Score]:
-    """Return every effect's score, the best first.
+def scores(posterior: Posterior, leave_out: Sequence[str] = ()) -> list[Score]:
+    """Score every effect that can be a cause, best first.
 
     Parameters
     ----------
-    evidence : Evidence
+    posterior : Posterior
     leave_out : sequence of str
-        Effects that are not asked for.
+        Effects to skip.
     """
-    choices = evidence.frame.choices
+    hypotheses = posterior.hypotheses
     by_effect: dict[str, list[Score]] = {}
-    for chosen in (*((k,) for k in range(len(choices))), *evidence.frame.neighbours):
-        effect = choices[chosen[0]].effect
+    singles = [(k,) for k in range(len(hypotheses.candidates))]
+    for chosen in (*singles, *hypotheses.mixtures):
+        effect = hypotheses.candidates[chosen[0]].effect
         if effect.is_cause and effect.id not in leave_out:
-            score = _score(evidence, chosen)
+            score = _score(posterior, chosen)
             if score is not None:
                 by_effect.setdefault(effect.id, []).append(score)
     best = []
@@ -80,23 +69,22 @@ def scores(evidence: Evidence, leave_out: Sequence[str] = ()) -> list[Score]:
     return sorted(best, key=lambda score: -score.log_bayes_factor)
 
 
-def _score(evidence: Evidence, chosen: tuple[int, ...]) -> Score | None:
-    """Return the score of a candidate or of a mixture, None where physics allows no mixture."""
-    frame = evidence.frame
-    at, bounds = frame.amplitudes_of(chosen), frame.bounds_of(chosen)
-    effect_id = frame.choices[chosen[0]].effect.id
-    # What references left out bring up as well is worth so much less.
-    strays = evidence.error.strays.get(effect_id, 1.0)
-    gradient = evidence.gradient[at] / strays
-    curvature = evidence.curvature[np.ix_(at, at)] / strays
+def _score(posterior: Posterior, chosen: tuple[int, ...]) -> Score | None:
+    """Score a candidate or a mixture of two; None where bounds exclude the mixture."""
+    hypotheses = posterior.hypotheses
+    at, bounds = hypotheses.amplitudes_of(chosen), hypotheses.bounds_of(chosen)
+    effect_id = hypotheses.candidates[chosen[0]].effect.id
+    overdispersion = posterior.error.overdispersion.get(effect_id, 1.0)
+    gradient = posterior.gradient[at] / overdispersion
+    curvature = posterior.curvature[np.ix_(at, at)] / overdispersion
     prior = prior_precision(bounds)
     total = curvature + prior
     amplitude = np.linalg.solve(total, gradient)
     within = np.clip(amplitude, bounds[:, 0], bounds[:, 1])
     if len(chosen) > 1 and np.any(within != amplitude):
-        return None  # then one of them alone is the best that the bounds allow
+        return None  # one of the two alone is the best within bounds
     factors = [
-        _log_bayes_factor(gradient, curvature, prior / part**2, bounds) for part in PRIOR_PARTS
+        _log_bayes_factor(gradient, curvature, prior / width**2, bounds) for width in PRIOR_WIDTHS
     ]
     return Score(
         effect_id=effect_id,
@@ -104,17 +92,17 @@ def _score(evidence: Evidence, chosen: tuple[int, ...]) -> Score | None:
         candidates=chosen,
         amplitude=within,
         covariance=np.asarray(np.linalg.inv(total), dtype=np.float64),
-        explained=strays * float(2.0 * gradient @ within - within @ curvature @ within),
+        explained=overdispersion * float(2.0 * gradient @ within - within @ curvature @ within),
     )
 
 
 def _log_bayes_factor(
     gradient: FloatArray, curvature: FloatArray, prior: FloatArray, bounds: FloatArray
 ) -> float:
-    """Return ln of the Bayes factor of amplitudes with this prior against none."""
+    """Return ln of the Bayes factor of amplitudes with this prior precision against none."""
     total = curvature + prior
     occam = 0.5 * float(np.linalg.slogdet(np.linalg.solve(prior, total))[1])
-    if gradient.size == 1 and np.any(bounds == 0.0):  # one sign only: a half-normal prior
+    if gradient.size == 1 and np.any(bounds == 0.0):  # one sign only: half-normal prior
         sign = 1.0 if bounds[0, 0] == 0.0 else -1.0
         root = float(np.sqrt(total[0, 0]))
         at = sign * float(gradient[0]) / root
@@ -128,127 +116,127 @@ def _log_mean(values: Sequence[float]) -> float:
     return float(np.log(np.mean(np.exp(array - array.max()))) + array.max())
 
 
-# --- What is left of logs: by how much, beyond chance, with and without an effect
+def condition_on(posterior: Posterior, given: Sequence[int]) -> Posterior:
+    """Return the posterior with some candidates in the model and their amplitudes marginalised."""
+    taken = posterior.hypotheses.amplitudes_of(given)
+    block = posterior.curvature[np.ix_(taken, taken)]
+    block = block + prior_precision(posterior.hypotheses.bounds_of(given))
+    gain = np.linalg.solve(block, posterior.curvature[taken]).T
+    explained = posterior.gradient[taken] @ np.linalg.solve(block, posterior.gradient[taken])
+    return replace(
+        posterior,
+        gradient=posterior.gradient - gain @ posterior.gradient[taken],
+        curvature=posterior.curvature - gain @ posterior.curvature[taken],
+        chi_square=posterior.chi_square - float(explained),
+    )
 
-NOISIER = 0.2
-"""Errors' variance differs from log to log by this part without a cause."""
 
+def mean_square_v2(
+    hypotheses: Hypotheses,
+    log: NormalEquations,
+    solution: FloatArray,
+    score: Score | None = None,
+) -> float:
+    """Return a log's mean square error with the shared solution and one effect [V²].
 
-def left_over(
-    evidence: Evidence, diagnosed: Sequence[Gram], chosen: Sequence[int], amplitude: FloatArray
-) -> FloatArray:
-    """Return the diagnosed logs' squares once some candidates explain them, shape (SCALES,) [V²].
+    Per-log effects are not subtracted: they could hide a gap that no effect explains.
 
     Parameters
     ----------
-    evidence : Evidence
-    diagnosed : sequence of Gram
-        Of the diagnosed logs, the last ones of the evidence.
-    chosen : sequence of int
-        Candidates.
-    amplitude : array
-        Of all of them, in order.
+    hypotheses : Hypotheses
+    log : NormalEquations
+        Of a diagnosed log.
+    solution : array
+        As `Posterior.mean`.
+    score : Score, optional
+        Effect to include.
     """
-    frame = evidence.frame
-    layout, at = frame.diagnosed, frame.amplitudes_of(chosen)
-    solution = evidence.mean - evidence.per_amplitude[:, at] @ amplitude
-    known = np.zeros(solution.size + int(frame.first[-1]) + 1)
+    layout = hypotheses.diagnosed_layout
+    weights = np.zeros(log.products.shape[1])
+    weights[layout.shared] -= solution
+    if score is not None:
+        weights[layout.effects[hypotheses.amplitudes_of(score.candidates)]] -= score.amplitude
+    weights[layout.residual] = 1.0
+    return float(np.sum((log.products @ weights) @ weights) / np.sum(log.counts))
+
+
+def expected_mean_square_v2(log: NormalEquations, references: Posterior) -> float:
+    """Return the mean square error that a diagnosed log would have without a cause [V²].
+
+    Sum of the references' error, the per-log effects, and the uncertainty of coefficients and
+    structure at the operating points of this log.
+
+    Parameters
+    ----------
+    log : NormalEquations
+        Of a diagnosed log.
+    references : Posterior
+        Of the references alone.
+    """
+    error, layout = references.error, references.hypotheses.diagnosed_layout
+    shared, per_log = layout.shared, layout.per_log
+    products = log.products.sum(axis=0)
+    balance = 1.0 / np.sqrt(np.diag(references.precision))
+    covariance = np.linalg.inv(references.precision * balance * balance[:, None])
+    covariance *= balance * balance[:, None]
+    squares = float(np.sum(products[np.ix_(shared, shared)] * covariance))
+    squares += float(np.diag(products)[per_log] @ np.array(error.per_log_std) ** 2)
+    squares += float(log.counts @ np.array(error.scale_v2))
+    return squares / float(np.sum(log.counts))
+
+
+def excess_chi_square(
+    posterior: Posterior,
+    diagnosed: Sequence[NormalEquations],
+    reference_chi_square: float,
+    score: Score | None = None,
+) -> float:
+    """Return the weighted squares that the diagnosed logs add beyond chance.
+
+    These are the squares of their errors, of their per-log effects and of the coefficients' change,
+    and the increase of the references' squares. Errors count scale by scale and only beyond their
+    variation between healthy logs: a slightly noisier sensor is no gap.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    diagnosed : sequence of NormalEquations
+        Diagnosed logs of the posterior.
+    reference_chi_square : float
+        Weighted squares of the references alone.
+    score : Score, optional
+        Effect to include.
+    """
+    total = posterior.chi_square - reference_chi_square
+    total -= 0.0 if score is None else score.explained
+    counts = np.sum([log.counts for log in diagnosed], axis=0)
+    errors = _residual_squares_v2(posterior, diagnosed, score) / np.array(posterior.error.scale_v2)
+    usual = (1.0 + NOISE_VARIATION) * counts + 2.0 * np.sqrt(2.0 * counts)
+    adjusted = max(total - float(errors.sum()), 0.0)
+    return adjusted + float(np.sum(np.maximum(errors - usual, 0.0)))
+
+
+def _residual_squares_v2(
+    posterior: Posterior, diagnosed: Sequence[NormalEquations], score: Score | None
+) -> FloatArray:
+    """Return the diagnosed logs' squared errors with an effect included, shape (SCALES,) [V²]."""
+    hypotheses = posterior.hypotheses
+    layout = hypotheses.diagnosed_layout
+    at = hypotheses.amplitudes_of(() if score is None else score.candidates)
+    amplitude = np.zeros(0) if score is None else score.amplitude
+    solution = posterior.mean - posterior.sensitivity[:, at] @ amplitude
+    known = np.zeros(solution.size + int(hypotheses.offsets[-1]) + 1)
     known[: solution.size] = -solution
     known[solution.size + at] = -amplitude
     known[-1] = 1.0
     total = np.zeros(SCALES)
     for log in diagnosed:
-        _, follows, _ = without_own(log, frame, evidence.error, is_reference=False)
-        mine = follows @ known
+        _, response, _ = marginalize_per_log(log, hypotheses, posterior.error, is_reference=False)
         weights = np.zeros(log.products.shape[1])
-        # A candidate may be structure, a log's own and the cause at once.
+        # A candidate may be structure, per-log effect and cause at once.
         weights[layout.shared] -= solution
-        weights[layout.own] -= mine
+        weights[layout.per_log] -= response @ known
         weights[layout.effects[at]] -= amplitude
         weights[layout.residual] = 1.0
         total += (log.products @ weights) @ weights
     return total
-
-
-def kept_v2(
-    frame: Frame,
-    log: Gram,
-    solution: FloatArray,
-    chosen: Sequence[int] = (),
-    amplitude: FloatArray | None = None,
-) -> float:
-    """Return a log's mean square error with what is shared and some effects alone [V²].
-
-    What is the log's own is not taken off: it could hide a gap that no effect explains.
-
-    Parameters
-    ----------
-    frame : Frame
-    log : Gram
-        With the columns of all of the frame's candidates.
-    solution : array
-        Coefficients and repairs, as `Evidence.mean`.
-    chosen, amplitude : optional
-        Candidates and all their amplitudes.
-    """
-    layout = frame.diagnosed
-    weights = np.zeros(log.products.shape[1])
-    weights[layout.shared] -= solution
-    if amplitude is not None:
-        weights[layout.effects[frame.amplitudes_of(chosen)]] -= amplitude
-    weights[layout.residual] = 1.0
-    return float(np.sum((log.products @ weights) @ weights) / np.sum(log.counts))
-
-
-def expected_v2(log: Gram, alone: Evidence) -> float:
-    """Return the mean square error to expect of a log without a cause [V²].
-
-    Errors as the references have them, what is each log's own, and how surely the references and
-    the model file know the coefficients and the structure where this log went.
-
-    Parameters
-    ----------
-    log : Gram
-        With the columns of all of the frame's candidates.
-    alone : Evidence
-        Of the references alone.
-    """
-    error, layout = alone.error, alone.frame.diagnosed
-    shared, own = layout.shared, layout.own
-    products = log.products.sum(axis=0)
-    balance = 1.0 / np.sqrt(np.diag(alone.precision))
-    spread = np.linalg.inv(alone.precision * balance * balance[:, None])
-    spread *= balance * balance[:, None]
-    squares = float(np.sum(products[np.ix_(shared, shared)] * spread))
-    squares += float(np.diag(products)[own] @ np.array(error.own_std) ** 2)
-    squares += float(log.counts @ np.array(error.scale_v2))
-    return squares / float(np.sum(log.counts))
-
-
-def excess(
-    evidence: Evidence, diagnosed: Sequence[Gram], clean: float, score: Score | None = None
-) -> float:
-    """Return by how much the weighted squares of some logs exceed what chance leaves.
-
-    These are the squares of their errors, of what their own terms and the coefficients had to
-    give, and of what the references lost by it. Errors count only scale by scale and beyond what
-    varies from log to log: a sensor that is a little noisier is no gap.
-
-    Parameters
-    ----------
-    evidence : Evidence
-    diagnosed : sequence of Gram
-        The last logs of the evidence.
-    clean : float
-        Squares of the references alone.
-    score : Score, optional
-        An effect to add.
-    """
-    chosen = () if score is None else score.candidates
-    amplitude = np.zeros(0) if score is None else score.amplitude
-    total = evidence.squares - clean - (0.0 if score is None else score.explained)
-    counts = np.sum([gram.counts for gram in diagnosed], axis=0)
-    errors = left_over(evidence, diagnosed, chosen, amplitude) / np.array(evidence.error.scale_v2)
-    usual = (1.0 + NOISIER) * counts + 2.0 * np.sqrt(2.0 * counts)
-    given = max(total - float(errors.sum()), 0.0)
-    return given + float(np.sum(np.maximum(errors - usual, 0.0)))

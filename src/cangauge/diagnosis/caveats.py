@@ -1,7 +1,4 @@
-"""What logs cannot show, whatever the evidence says: too short, too narrow, nothing to compare.
-
-Each limit is a sentence: what the logs are like, and what can therefore not be concluded.
-"""
+"""Caveats: what the logs cannot show, whatever the verdict; one or two sentences each."""
 
 from __future__ import annotations
 
@@ -15,126 +12,178 @@ from cangauge.logs.log import TemperatureSource
 from cangauge.model.charge import BRIDGE_S
 
 SHORT_S = 600.0
-"""In a shorter log little builds up [s]."""
+"""Duration below which slow effects hardly develop [s]."""
 
-ONE_TEMPERATURE_K, ONE_SOC_PCT = 3.0, 10.0
-"""Logs within less than this show nothing of temperature, or of SoC [K, %]."""
+NARROW_K, NARROW_PCT = 3.0, 10.0
+"""Ranges of temperature and SoC below which their influence is not visible [K, %]."""
 
 REST_C_RATE, REST_PART = 0.02, 0.005
-"""Charging or resting for less than this part of the rows counts as never; a current below this
-is rest [1/h]."""
+"""Current below which the pack rests [1/h], and the part of the rows below which it never charges
+or rests."""
 
-STEPS_PART = 0.5
-"""Half a step of the reported temperature that makes less than this part of the floor is little."""
+STEP_PART = 0.5
+"""Part of the floor below which half a step of the temperature is negligible."""
 
-MISSED_PART, ODD_TIMES, STATED_TIMES = 0.005, 3.0, 5.0
-"""A reference is missed by more than this part of the voltage, and by so many times what the others
-are, or what the model file states."""
+POOR_FIT_PART, POOR_FIT_TIMES, STATED_TIMES = 0.005, 3.0, 5.0
+"""A reference fits poorly with an error above this part of the voltage, and above the first
+multiple of the others' or the second of the model file's."""
 
 FEW_REFERENCES = 3
-"""Fewer tell hardly how much logs differ without a cause."""
+"""Fewer hardly show how much healthy logs differ."""
 
 
-def limits(
+def log_caveats(
     logs: Sequence[SampledLog],
     references: Sequence[SampledLog],
     capacity_ah: float,
     initial_soc_pct: float | None = None,
     temperature_source: TemperatureSource = "unknown",
 ) -> list[str]:
-    """Return what these logs cannot show and why; nothing for logs without such limits.
+    """Return the caveats of the diagnosed logs and references.
 
     Parameters
     ----------
-    logs : sequence of SampledLog
-        Diagnosed logs.
-    references : sequence of SampledLog
+    logs, references : sequence of SampledLog
     capacity_ah : float
         Of the model [Ah].
     initial_soc_pct : float, optional
-        SoC at each diagnosed log's first row, if it was given [%].
+        SoC at each diagnosed log's first row, if given by the user [%].
     temperature_source : str
-        What the model's temperature was measured on.
+        Where the model's temperature was measured.
     """
     found = [
         _duration(logs),
-        _temperature(logs, references),
-        _soc(logs, references),
+        *_temperature(logs, references),
+        *_soc(logs, references),
         _pauses(logs),
         _source([*logs, *references], temperature_source),
-        _start(logs, initial_soc_pct),
-        _reference_start(references),
-        _charging(logs, capacity_ah),
+        _initial_soc(logs, initial_soc_pct),
+        _reference_initial_soc(references),
+        *_current(logs, capacity_ah),
         _reference_number(len(references)),
     ]
     return [sentence for sentence in found if sentence]
 
 
-def stepped_temperature(step_k: float, kt_v_per_k: float, floor_v: float) -> str:
-    """Return what a temperature that is reported in steps leaves open; "" if it is little.
+def temperature_step_caveat(step_k: float, kt_v_per_k: float, floor_v: float) -> str:
+    """Return the caveat of a temperature reported in coarse steps; "" if negligible.
 
     Parameters
     ----------
     step_k : float
-        Of the reports [K].
+        Step of the reported temperature [K].
     kt_v_per_k : float
-        By how much the model's voltage follows the temperature [V/K].
+        Temperature coefficient of the model [V/K].
     floor_v : float
-        The model's error without a cause [V].
+        Error of the model without a cause [V].
     """
     half_v = 0.5 * step_k * abs(kt_v_per_k)
-    if half_v < STEPS_PART * floor_v:
+    if half_v < STEP_PART * floor_v:
         return ""
     return (
-        f"The temperature is reported in steps of {step_k:g} K, and the model's voltage follows it"
-        f" by {1e3 * kt_v_per_k:.0f} mV/K: up to {half_v:.2f} V for as long as a report stands. It"
-        " is read between the steps here, as far as they tell; a service cannot look ahead, and its"
-        " voltage model errs by so much. A temperature with a finer step shows smaller causes."
+        f"The temperature is reported in steps of {step_k:g} K; at the model's"
+        f" {1e3 * kt_v_per_k:.0f} mV/K that is an error of up to {half_v:.2f} V as long as the"
+        " value does not change. The diagnosis interpolates between the steps; a service cannot."
+        " A finer temperature would reveal smaller causes."
     )
 
 
-def reference_fit(misses: Sequence[tuple[str, float]], stated_v: float, voltage_v: float) -> str:
-    """Return what references mean that the model does not fit; "" where it does.
+def reference_fit_caveat(
+    errors_v: Sequence[tuple[str, float]], stated_v: float, voltage_v: float
+) -> str:
+    """Return the caveat of references that the given model does not fit; "" if it fits.
 
     Parameters
     ----------
-    misses : sequence of (str, float)
-        Each reference's name, and the given model's RMS error on it [V].
+    errors_v : sequence of (str, float)
+        Name and RMS error of each reference [V].
     stated_v : float
-        What the model file states of itself [V].
+        RMS error that the model file states [V].
     voltage_v : float
-        The pack's usual voltage [V].
+        Usual voltage of the pack [V].
     """
-    if not misses:
+    if not errors_v:
         return ""
-    *others, (name, worst_v) = sorted(misses, key=lambda miss: miss[1])
+    *others, (name, worst_v) = sorted(errors_v, key=lambda item: item[1])
     others_v = float(np.median([volts for _, volts in others])) if others else worst_v
     part = worst_v / voltage_v
-    if part > MISSED_PART and worst_v > ODD_TIMES * others_v:
+    if part > POOR_FIT_PART and worst_v > POOR_FIT_TIMES * others_v:
         return (
-            f"The model misses the reference {name} by {worst_v:.1f} V"
-            f" ({100.0 * part:.0f} % of the voltage), the others by {others_v:.2f} V: is"
-            " it a log of this pack, with the right SoC at its start? What is learned from it can"
-            " hide a cause."
+            f"The model does not fit the reference {name}: {worst_v:.1f} V RMS"
+            f" ({100.0 * part:.0f} % of the voltage), the others {others_v:.2f} V. Check that it is"
+            " a log of this pack with the right initial SoC; it can hide a cause."
         )
-    usual = float(np.median([volts for _, volts in misses]))
-    if usual > MISSED_PART * voltage_v and usual > STATED_TIMES * stated_v:
+    usual_v = float(np.median([volts for _, volts in errors_v]))
+    if usual_v > POOR_FIT_PART * voltage_v and usual_v > STATED_TIMES * stated_v:
         return (
-            f"The model misses its references by {usual:.2f} V where its file states"
-            f" {stated_v:.2f} V. If the capacity, the SoC at their start or the pack is wrong, a"
-            " cause can hide behind that."
+            f"The model does not fit its references: {usual_v:.2f} V RMS; the model file states"
+            f" {stated_v:.2f} V. If their capacity, initial SoC or pack is wrong, that can hide a"
+            " cause."
         )
     return ""
 
 
-def worse_with(baseline_v: float, extended_v: float) -> str:
-    """Return that an extended model is no better on rows left out [V]; "" where it is."""
+def extension_caveat(baseline_v: float, extended_v: float) -> str:
+    """Return the caveat of an extended model with a larger error on held-out rows [V]."""
     if extended_v <= baseline_v:
         return ""
     return (
-        f"On rows left out the extended model errs by {extended_v:.2f} V, the given one by"
-        f" {baseline_v:.2f} V: do not run it. The cause may be the right one; its size is not."
+        f"The extended model is worse on held-out rows: {extended_v:.2f} V, the given one"
+        f" {baseline_v:.2f} V. Do not use it: the cause may be right, but its size is not."
     )
+
+
+def _duration(logs: Sequence[SampledLog]) -> str:
+    short = [item.log for item in logs if item.log.duration_s < SHORT_S]
+    if not short:
+        return ""
+    names = ", ".join(f"{log.name} ({log.duration_s / 60.0:.1f} min)" for log in short)
+    return (
+        f"Shorter than {SHORT_S / 60.0:.0f} min: {names}. Effects that develop over minutes to"
+        " hours (slow_diffusion, core_temperature, hysteresis, and a drift of the charge by"
+        " current_offset, current_gain, capacity or coulombic_efficiency) can be neither named nor"
+        " excluded."
+    )
+
+
+def _temperature(logs: Sequence[SampledLog], references: Sequence[SampledLog]) -> list[str]:
+    low, high = _range([item.rows.temperature_c for item in logs])
+    sentences = []
+    if high - low < NARROW_K:
+        sentences.append(
+            f"Narrow temperature range ({low:.1f} … {high:.1f} °C): resistance_temperature,"
+            " entropic_coefficient and temperature_lag look like any change of the resistance or"
+            " of the OCV."
+        )
+    if references:
+        known = _range([item.rows.temperature_c for item in references])
+        if low < known[0] - COVERED_K or high > known[1] + COVERED_K:
+            sentences.append(
+                f"Temperatures of {low:.1f} … {high:.1f} °C, references {known[0]:.1f} …"
+                f" {known[1]:.1f} °C: outside the references' range the behaviour of a healthy pack"
+                " is not known and may look like a cause."
+            )
+    return sentences
+
+
+def _soc(logs: Sequence[SampledLog], references: Sequence[SampledLog]) -> list[str]:
+    low, high = _range([item.rows.soc_pct for item in logs])
+    sentences = []
+    if high - low < NARROW_PCT:
+        sentences.append(
+            f"Narrow SoC range ({low:.1f} … {high:.1f} %): initial_soc, capacity, voltage_gain,"
+            " voltage_offset, ocv_shape and weak_cell look alike, and resistance_soc looks like any"
+            " other resistance."
+        )
+    if references:
+        known = _range([item.rows.soc_pct for item in references])
+        if low < known[0] - COVERED_PCT or high > known[1] + COVERED_PCT:
+            sentences.append(
+                f"SoC of {low:.0f} … {high:.0f} %, references {known[0]:.0f} … {known[1]:.0f} %:"
+                " outside the references' range an error of the model's OCV may look like a cause."
+                " Rows there count less, and not at all outside the range of the model's own logs."
+            )
+    return sentences
 
 
 def _pauses(logs: Sequence[SampledLog]) -> str:
@@ -145,91 +194,13 @@ def _pauses(logs: Sequence[SampledLog]) -> str:
         at = int(np.argmax(steps))
         if steps[at] > BRIDGE_S:
             after_h = (time_s[at] - time_s[0]) / 3600.0
-            found.append(f"{item.log.name} ({steps[at] / 60.0:.0f} min, {after_h:.1f} h in)")
+            found.append(f"{item.log.name} ({steps[at] / 60.0:.0f} min after {after_h:.1f} h)")
     if not found:
         return ""
     return (
-        f"Nothing was recorded for a while: {', '.join(found)}. The pack is taken to have rested;"
-        " charge that moved meanwhile looks like initial_soc, capacity or an error of the voltage,"
-        " and none of these can be concluded. Give the parts as logs of their own, each with its"
-        " SoC."
-    )
-
-
-def _duration(logs: Sequence[SampledLog]) -> str:
-    short = [item.log for item in logs if item.log.duration_s < SHORT_S]
-    if not short:
-        return ""
-    lasting = ", ".join(f"{log.name} ({log.duration_s / 60.0:.1f} min)" for log in short)
-    return (
-        f"Shorter than {SHORT_S / 60.0:.0f} min: {lasting}. What builds up over minutes to hours"
-        " (slow_diffusion, core_temperature, hysteresis, a drift of the count by current_offset,"
-        " current_gain, capacity or coulombic_efficiency) can be neither named nor ruled out"
-        " there, because it has hardly begun to show."
-    )
-
-
-def _temperature(logs: Sequence[SampledLog], references: Sequence[SampledLog]) -> str:
-    low, high = _range([item.rows.temperature_c for item in logs])
-    sentences = []
-    if high - low < ONE_TEMPERATURE_K:
-        sentences.append(
-            f"One temperature ({low:.1f} … {high:.1f} °C): how the gap changes with temperature"
-            " cannot be concluded from these logs alone, so resistance_temperature,"
-            " entropic_coefficient and temperature_lag look like any change of the resistance or"
-            " of the OCV."
-        )
-    if references:
-        known = _range([item.rows.temperature_c for item in references])
-        if low < known[0] - COVERED_K or high > known[1] + COVERED_K:
-            sentences.append(
-                f"Temperatures of {low:.1f} … {high:.1f} °C where the references have"
-                f" {known[0]:.1f} … {known[1]:.1f} °C: what the temperature alone does to a pack"
-                " without a fault is not known there, and cannot be told safely from a cause."
-            )
-    return " ".join(sentences)
-
-
-def _soc(logs: Sequence[SampledLog], references: Sequence[SampledLog]) -> str:
-    low, high = _range([item.rows.soc_pct for item in logs])
-    sentences = []
-    if high - low < ONE_SOC_PCT:
-        sentences.append(
-            f"A narrow range of SoC ({low:.1f} … {high:.1f} %): how the gap changes with SoC cannot"
-            " be concluded, so initial_soc, capacity, voltage_gain, voltage_offset, ocv_shape and"
-            " weak_cell look alike, and resistance_soc looks like any other resistance."
-        )
-    if references:
-        known = _range([item.rows.soc_pct for item in references])
-        if low < known[0] - COVERED_PCT or high > known[1] + COVERED_PCT:
-            sentences.append(
-                f"SoC of {low:.0f} … {high:.0f} % where the references have"
-                f" {known[0]:.0f} … {known[1]:.0f} %: outside it the model's own OCV may be wrong,"
-                " and that cannot be told safely from a cause. Rows there count less, and not at"
-                " all where the model's own logs have not been either."
-            )
-    return " ".join(sentences)
-
-
-def _start(logs: Sequence[SampledLog], initial_soc_pct: float | None) -> str:
-    names = [item.log.name for item in logs if item.log.first_soc() is None]
-    if initial_soc_pct is not None or not names:
-        return ""
-    return (
-        f"No SoC at the start of {', '.join(names)}: 100 % was assumed. If that is wrong, it looks"
-        " like initial_soc, voltage_offset or capacity, and none of these can be concluded; give"
-        " the SoC with --initial-soc."
-    )
-
-
-def _reference_start(references: Sequence[SampledLog]) -> str:
-    names = [item.log.name for item in references if item.log.first_soc() is None]
-    if not names:
-        return ""
-    return (
-        f"No SoC at the start of the reference{'s' if len(names) > 1 else ''} {', '.join(names)}:"
-        " 100 % was assumed. If that is wrong, what is learned of the clean pack is wrong; give"
-        " references with soc_pct, one value is enough."
+        f"Gap in the recording: {', '.join(found)}. The pack is assumed to have rested; charge"
+        " moved meanwhile looks like initial_soc, capacity or an error of the voltage. Give the"
+        " parts as separate logs, each with its SoC."
     )
 
 
@@ -239,27 +210,47 @@ def _source(logs: Sequence[SampledLog], of_model: TemperatureSource) -> str:
         return ""
     return (
         f"The model's temperature was measured on {of_model}, that of these logs on"
-        f" {', '.join(others)}: what the temperature does to voltage and resistance cannot be"
-        " concluded, because it is another temperature."
+        f" {', '.join(others)}: effects of the temperature on voltage and resistance cannot be"
+        " judged."
     )
 
 
-def _charging(logs: Sequence[SampledLog], capacity_ah: float) -> str:
+def _initial_soc(logs: Sequence[SampledLog], initial_soc_pct: float | None) -> str:
+    names = [item.log.name for item in logs if item.log.first_soc() is None]
+    if initial_soc_pct is not None or not names:
+        return ""
+    return (
+        f"No initial SoC of {', '.join(names)}: 100 % assumed. A wrong one looks like initial_soc,"
+        " voltage_offset or capacity. Give it with --initial-soc."
+    )
+
+
+def _reference_initial_soc(references: Sequence[SampledLog]) -> str:
+    names = [item.log.name for item in references if item.log.first_soc() is None]
+    if not names:
+        return ""
+    return (
+        f"No initial SoC of the reference{'s' if len(names) > 1 else ''} {', '.join(names)}: 100 %"
+        " assumed. A wrong one falsifies what is learned of the healthy pack. Give references with"
+        " soc_pct; one value is enough."
+    )
+
+
+def _current(logs: Sequence[SampledLog], capacity_ah: float) -> list[str]:
     current = np.concatenate([item.rows.delayed_current_a[:, 0] for item in logs])
     least_a = REST_C_RATE * capacity_ah
     sentences = []
     if np.mean(current < -least_a) < REST_PART:
         sentences.append(
-            "The pack is never charged: resistance_asymmetry and coulombic_efficiency cannot be"
-            " seen, and hysteresis not told from an offset of the OCV."
+            "The pack is never charged: resistance_asymmetry and coulombic_efficiency are not"
+            " visible, and hysteresis looks like an offset of the OCV."
         )
     if np.mean(np.abs(current) < least_a) < REST_PART:
         sentences.append(
-            "The pack never rests: what decays without current (slow_diffusion) cannot be told"
-            " from what stays (hysteresis), nor an error of the voltage from one of the resistance"
-            " by looking at rest."
+            "The pack never rests: relaxation (slow_diffusion) looks like hysteresis, and an error"
+            " of the voltage like one of the resistance."
         )
-    return " ".join(sentences)
+    return sentences
 
 
 def _reference_number(number: int) -> str:
@@ -267,13 +258,13 @@ def _reference_number(number: int) -> str:
         return ""
     if not number:
         return (
-            "No reference logs: whether the model was ever right on this pack cannot be concluded;"
-            " the error that the model file states stands for the floor, and structure that the"
-            " model never had counts as a cause."
+            "No reference logs: the floor is the error that the model file states, whether or not"
+            " the model was ever right on this pack, and structure that the model lacks counts as a"
+            " cause."
         )
     return (
-        f"Only {number} reference log{'s' if number > 1 else ''}: how much logs of this pack differ"
-        " without a cause is hardly known, so probabilities are less sure than they look."
+        f"Only {number} reference log{'s' if number > 1 else ''}: differences between healthy logs"
+        " are hardly known, and probabilities are less certain than they look."
     )
 
 

@@ -1,8 +1,8 @@
-"""A log seen by every effect of the library: how the residual would move with each amplitude.
+"""Design matrix of a log: sensitivity of the voltage residual to every amplitude.
 
-The residual is U_corrected − U_model. An effect's column is minus the derivative of the residual
-by its amplitude, for each value of its shape on a grid; it is taken by a finite difference through
-the effect's own offline code, so what the diagnosis weighs is what the extended model does.
+The residual is U_corrected − U_model. A column is minus the derivative of the residual with respect
+to an amplitude, taken as a finite difference of the effect's own offline code, so that the
+diagnosis and the extended model agree.
 """
 
 from __future__ import annotations
@@ -25,39 +25,41 @@ from cangauge.inference.linearized import (
 )
 from cangauge.inference.rows import SampledLog
 from cangauge.model.effects.base import Pack
-from cangauge.model.effects.library import Candidate, candidates
+from cangauge.model.effects.library import Candidate
+from cangauge.model.effects.library import candidates as library_candidates
 from cangauge.model.extended import ExtendedModel
 
-LEVELS = ("slow polarisation", "resistance level")
-"""What differs from log to log beside the effects, in parts of the pack's resistance: trips of one
-pack differ in the state that they begin from, and in how warm the cells inside are."""
+PER_LOG_STATES = ("slow polarisation", "resistance level")
+"""State of a log that no signal shows, in parts of the pack resistance: trips of one pack differ in
+their initial polarisation, and in the temperature inside the cells."""
 
-OWN_SLOW_S = 150.0
-"""Time constant of a log's own slow polarisation [s]."""
+SLOW_POLARISATION_S = 150.0
+"""Time constant of the per-log slow polarisation [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class DesignMatrix:
-    """Everything that the evidence needs of one log; m rows."""
+    """Residual and columns of one log with m rows."""
 
     prepared: SampledLog
     residual_v: FloatArray
-    """What the columns are to explain, shape (m,): of the model as it is or, so that they are exact
-    where the structure acts, of the acting one and what they say that its structure does."""
-    baseline: FloatArray
-    """Columns of the voltage model's coefficients, shape (m, 9 + delays)."""
-    own: FloatArray
-    """Columns of `LEVELS`, shape (m, 2)."""
+    """Residual that the columns explain, shape (m,) [V]. With a structured model it is that model's
+    residual plus what the columns attribute to its structure, so that columns are exact there."""
+    coefficients: FloatArray
+    """Columns of the voltage model coefficients, shape (m, 9 + delays)."""
+    per_log_states: FloatArray
+    """Columns of `PER_LOG_STATES`, shape (m, 2)."""
     effects: tuple[FloatArray, ...]
-    """Columns of each candidate (of a reference: of those in `Frame.shown`), shape (m, k) each."""
+    """Columns of each candidate, shape (m, amplitudes) each; of a reference those of
+    `Hypotheses.reference_columns`."""
 
-    def at(self, keep: NDArray[np.bool_]) -> DesignMatrix:
-        """Return the terms on some of the rows."""
+    def rows(self, keep: NDArray[np.bool_]) -> DesignMatrix:
+        """Return the matrix restricted to some rows."""
         return replace(
             self,
             residual_v=self.residual_v[keep],
-            baseline=self.baseline[keep],
-            own=self.own[keep],
+            coefficients=self.coefficients[keep],
+            per_log_states=self.per_log_states[keep],
             effects=tuple(columns[keep] for columns in self.effects),
         )
 
@@ -65,41 +67,45 @@ class DesignMatrix:
 def design_matrix(
     prepared: SampledLog,
     model: ExtendedModel,
-    choices: Sequence[Candidate],
-    acting: ExtendedModel | None = None,
+    candidates: Sequence[Candidate],
+    structured: ExtendedModel | None = None,
 ) -> DesignMatrix:
-    """Return the terms of one log, with the columns of some candidates.
+    """Linearise the residual of one log in all amplitudes.
 
     Parameters
     ----------
     prepared : SampledLog
     model : ExtendedModel
-    choices : sequence of Candidate
-    acting : ExtendedModel, optional
-        The model with the structure that references call for, whose residual the columns keep. A
-        temperature that is wrong shows through all that follows the temperature, and in `model`
-        that is one coefficient.
+        Model to linearise about.
+    candidates : sequence of Candidate
+        Their shapes as of this log (`candidates_for`).
+    structured : ExtendedModel, optional
+        `model` with the structure that the references need. The residual, and the columns of
+        thermal effects, are taken about it: a wrong temperature shows through everything that
+        depends on temperature, and in `model` that is one coefficient only.
     """
     voltage_model = model.model
     rows = prepared.rows
-    remembering = prepared.with_history_cache()  # until all columns are there
-    current = prepared.log.current_a
-    slow = remembering.signals.history.lagged_a(OWN_SLOW_S)
-    own = np.column_stack(
+    remembering = (
+        prepared.with_history_cache()
+    )  # keeps intermediate results until all columns exist
+    slow = remembering.signals.history.lagged_a(SLOW_POLARISATION_S)
+    per_log_states = np.column_stack(
         [
             -model.pack.resistance_ohm * slow[prepared.at],
-            -model.pack.resistance_ohm * current[prepared.at],
+            -model.pack.resistance_ohm * prepared.log.current_a[prepared.at],
         ]
     )
     smooth = with_modelled_voltage(remembering, model)
-    here = residual(smooth, model)
-    state = pack_state(smooth, model)
-    if acting is not None:
-        smooth_acting = with_modelled_voltage(remembering, acting)
-        here_acting = residual(smooth_acting, acting)
-        state_acting = pack_state(smooth_acting, acting)
-    # Effects that the model has already may scale what its coefficients multiply.
-    baseline = (
+    at_model = (residual(smooth, model), pack_state(smooth, model))
+    if structured is not None:
+        smooth_structured = with_modelled_voltage(remembering, structured)
+        at_structured = (
+            residual(smooth_structured, structured),
+            pack_state(smooth_structured, structured),
+        )
+    # Effects of the given model may scale the columns of its coefficients.
+    coefficients = (
         coefficient_columns(model, [prepared], predict_logs(model, [prepared]))
         if model.effects
         else np.column_stack(
@@ -111,52 +117,54 @@ def design_matrix(
         )
     )
     effects = tuple(
-        effect_columns(smooth_acting, acting, choice, here_acting, state_acting)
-        if acting is not None and choice.effect.family == "thermal"
-        else effect_columns(smooth, model, choice, here, state)
-        for choice in choices
+        effect_columns(smooth_structured, structured, candidate, *at_structured)
+        if structured is not None and candidate.effect.family == "thermal"
+        else effect_columns(smooth, model, candidate, *at_model)
+        for candidate in candidates
     )
-    residual_v = residual(remembering, acting or model)
-    if acting is not None:
-        change = acting.model.coefficients - voltage_model.coefficients
-        residual_v += baseline @ change + _structure_v(model, acting, choices, effects)
-    return DesignMatrix(prepared, residual_v, baseline, own, effects)
+    residual_v = residual(remembering, structured or model)
+    if structured is not None:
+        change = structured.model.coefficients - voltage_model.coefficients
+        residual_v += coefficients @ change + _structure_v(model, structured, candidates, effects)
+    return DesignMatrix(prepared, residual_v, coefficients, per_log_states, effects)
 
 
-def own_choices(choices: Sequence[Candidate], pack: Pack, prepared: SampledLog) -> list[Candidate]:
-    """Return the candidates as they are on one log: a moment is a part of its length.
+def candidates_for(
+    candidates: Sequence[Candidate], pack: Pack, prepared: SampledLog
+) -> list[Candidate]:
+    """Return the candidates with their shapes on one log: times of onset scale with its length.
 
     Raises
     ------
     InputError
-        If they are not as many.
+        If the log has other candidates.
     """
-    effects = list(dict.fromkeys(choice.effect for choice in choices))
-    own = candidates(effects, pack, prepared.log.time_s, for_diagnosis=True)
-    if [each.effect.id for each in own] != [each.effect.id for each in choices]:
+    effects = list(dict.fromkeys(candidate.effect for candidate in candidates))
+    found = library_candidates(effects, pack, prepared.log.time_s, for_diagnosis=True)
+    if [each.effect.id for each in found] != [each.effect.id for each in candidates]:
         raise InputError("the effects' shapes differ between logs", source=prepared.log.source)
-    return own
+    return found
 
 
 def _structure_v(
     model: ExtendedModel,
-    acting: ExtendedModel,
-    choices: Sequence[Candidate],
+    structured: ExtendedModel,
+    candidates: Sequence[Candidate],
     columns: Sequence[FloatArray],
 ) -> FloatArray:
-    """Return what the columns say that the acting model's structure does, shape (m,) [V]."""
+    """Return the voltage that the columns attribute to the structured model, shape (m,) [V]."""
     volts = np.zeros(columns[0].shape[0])
-    added = list(acting.effects)
+    added = list(structured.effects)
     for given in model.effects:
-        added.remove(given)  # they stand in the library's order, not in that of being added
+        added.remove(given)  # effects are in the order of the library, not of being added
     for effect, values in added:
-        # Shapes are relative to the capacity at most, which coefficients leave alone.
+        # Shapes depend on the capacity at most, which coefficients do not change.
         at = next(
             k
-            for k, choice in enumerate(choices)
-            if choice.effect.id == effect.id
-            and all(values[name] == value for name, value in choice.shape.items())
+            for k, candidate in enumerate(candidates)
+            if candidate.effect.id == effect.id
+            and all(values[name] == value for name, value in candidate.shape.items())
         )
-        amplitudes = [values[name] for name in choices[at].amplitudes]
-        volts += columns[at] @ (np.array(amplitudes) - choices[at].neutral)
+        amplitudes = [values[name] for name in candidates[at].amplitudes]
+        volts += columns[at] @ (np.array(amplitudes) - candidates[at].neutral)
     return volts

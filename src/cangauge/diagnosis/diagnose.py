@@ -1,104 +1,214 @@
-"""The diagnosis: model, references and logs in; where, which, how far out."""
+"""Diagnosis of the gap between a model and logs: size, place, cause, and what an effect closes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from cangauge.diagnosis.caveats import limits, reference_fit, stepped_temperature, worse_with
-from cangauge.diagnosis.cross_validation import (
-    Fold,
-    Judged,
-    closed_fraction,
-    closed_interval,
-    folds,
-    judge,
-    rms,
-    soc_mae_pct,
+from cangauge._typing import FloatArray
+from cangauge.diagnosis.caveats import (
+    extension_caveat,
+    log_caveats,
+    reference_fit_caveat,
+    temperature_step_caveat,
 )
-from cangauge.diagnosis.error_breakdown import Moment, Place, places, worst_moments
-from cangauge.diagnosis.extended_model import (
-    Extension,
-    cause_parameters,
-    extend,
-    library_without,
-    model_file_of,
-)
-from cangauge.diagnosis.linear_gaussian import gather
-from cangauge.diagnosis.posterior import (
-    ACCEPT_LOG_BAYES,
+from cangauge.diagnosis.classifier import (
+    MIN_LOG_BAYES,
     NONE,
-    OF_TEMPERATURE,
+    TEMPERATURE_EFFECTS,
     UNKNOWN,
     Verdict,
     decide,
 )
-from cangauge.diagnosis.problem import DiagnosisProblem, build_problem
+from cangauge.diagnosis.cross_validation import (
+    Fold,
+    HeldOutErrors,
+    closed_fraction,
+    closed_fraction_interval,
+    folds,
+    held_out_errors,
+    rms,
+    soc_mae_pct,
+)
+from cangauge.diagnosis.error_breakdown import (
+    ErrorShare,
+    LogErrors,
+    WorstSegment,
+    error_shares,
+    worst_segments,
+)
+from cangauge.diagnosis.extended_model import (
+    Extension,
+    extend,
+    extended_model_file,
+    parameters_of,
+)
+from cangauge.diagnosis.problem import DiagnosisProblem, build_problem, no_progress
 from cangauge.errors import InputError
+from cangauge.inference.linearized import residual
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 
-EVEN = 0.5
-"""A verdict with less is as likely wrong as right."""
+LIKELY = 0.5
+"""A verdict with less probability is more likely wrong than right."""
 
-SHOWN = 6
-"""So many candidates are judged on rows held out and listed in full."""
+CROSS_VALIDATED = 6
+"""Number of candidates with errors on held-out rows."""
 
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """What the diagnosis found."""
+    """Result of `diagnose`.
 
-    settled: DiagnosisProblem
+    Errors are RMS errors of the voltage on the diagnosed logs, on rows that the fit of the effect
+    did not see.
+
+    See Also
+    --------
+    Diagnosis.summary : The verdict in one or two sentences.
+    Diagnosis.to_dict : All results as one JSON object.
+    """
+
+    logs: tuple[Log, ...]
+    """Diagnosed logs, as given."""
+    model: Model
+    """Diagnosed model."""
+    problem: DiagnosisProblem
+    """What the verdict rests on: error model, hypotheses, design matrices."""
     verdict: Verdict
-    baseline_rmse_v: float
-    extended_rmse_v: float
-    floor_v: float
-    stated_v: float
-    """RMS error that the model file states [V]."""
-    explainable_v: float | None
-    """What the most flexible structure of the references leaves of one that is left out [V]."""
-    baseline_soc_mae_pct: float | None
-    extended_soc_mae_pct: float | None
-    """By the online estimator, initial SoC withheld; None where the logs do not tell their SoC."""
-    closed: float | None
-    closed_ci: tuple[float, float] | None
-    where: tuple[Place, ...]
-    worst: tuple[Moment, ...]
-    candidates: tuple[dict[str, Any], ...]
-    observability: tuple[dict[str, object], ...]
+    """Cause (an effect, `none` or `unknown`) with probabilities."""
     extension: Extension
+    """Parameters of the accepted effects, and the extended model's equations."""
+    baseline_rmse_v: float
+    """Error of the given model [V]."""
+    extended_rmse_v: float
+    """Error of the extended model [V]."""
+    floor_v: float
+    """Error of the given model on the references, or that stated in the model file without any
+    [V]."""
+    explainable_v: float | None
+    """Error on a left-out reference with the structure of the others [V]; None below two
+    references."""
+    closed_fraction: float | None
+    """Closed part of the squared error above the floor; None without a gap."""
+    closed_fraction_ci: tuple[float, float] | None
+    """95 % interval of the closed fraction."""
+    error_breakdown: tuple[ErrorShare, ...]
+    """Shares of the squared error over SoC, temperature, current, rest, time and time scale."""
+    worst_segments: tuple[WorstSegment, ...]
+    """Segments with the largest errors, worst first."""
+    candidates: tuple[dict[str, Any], ...]
+    """Every effect, most probable first: probability, log Bayes factor, error, parameters."""
+    observability: tuple[dict[str, object], ...]
+    """Visible part of each effect's physical range (0–1), and what would separate the effect."""
+
+    @cached_property
+    def extended_model(self) -> Model:
+        """Model with the references' structure and the accepted effects, ready to save and run."""
+        return extended_model_file(self.extension, self.model, self.extended_rmse_v)
+
+    @cached_property
+    def baseline_soc_mae_pct(self) -> float | None:
+        """Mean absolute SoC error of the estimator with the given model [%].
+
+        Runs the estimator over the diagnosed logs at the model's rate, with the initial SoC
+        withheld; None if no log has a reference SoC.
+        """
+        return soc_mae_pct(self.logs, self.model)
+
+    @cached_property
+    def extended_soc_mae_pct(self) -> float | None:
+        """Mean absolute SoC error of the estimator with the extended model [%], likewise."""
+        return soc_mae_pct(self.logs, self.extended_model)
 
     @property
-    def limits(self) -> list[str]:
-        """What these logs cannot show, whatever the verdict, a sentence each."""
-        settled = self.settled
-        found = limits(
-            [terms.prepared for terms in settled.diagnosed],
-            [terms.prepared for terms in settled.references],
-            settled.model.capacity_ah,
-            settled.options.initial_soc_pct,
-            settled.temperature_source,
+    def summary(self) -> str:
+        """Verdict in one or two sentences."""
+        verdict, has_references = self.verdict, bool(self.problem.references)
+        floor = "references" if has_references else "stated in the model file"
+        sizes = f"{self.baseline_rmse_v:.2f} V; {floor} {self.floor_v:.2f} V"
+        if verdict.cause == NONE:
+            if has_references and self.baseline_rmse_v > self.floor_v:
+                sizes += f"; {self.extended_rmse_v:.2f} V with the structure of the references"
+            error = "reference error" if has_references else "error stated in the model file"
+            return (
+                f"No significant gap beyond the {error} ({sizes})."
+                f" P(no fault) = {verdict.probability:.2f}."
+            )
+        if verdict.cause == UNKNOWN:
+            return (
+                f"Gap of unknown cause ({sizes}): no effect of the library is likely."
+                f" P(unknown cause) = {verdict.probability:.2f}."
+            )
+        ambiguous = ""
+        if verdict.ambiguous_with:
+            ambiguous = f", not distinguishable from {', '.join(verdict.ambiguous_with)}"
+        worse = ", worse than without it" if self.extended_rmse_v > self.baseline_rmse_v else ""
+        text = (
+            f"{verdict.cause} (probability {verdict.probability:.2f}{ambiguous}): gap of {sizes};"
+            f" {self.extended_rmse_v:.2f} V with it on held-out rows{worse}."
         )
-        steps = stepped_temperature(
-            settled.temperature_step_k, settled.model.model.kt_v_per_k, self.floor_v
-        )
-        misses = [
-            (terms.prepared.log.name, rms(errors))
-            for terms, errors in zip(settled.references, settled.given_errors_v[0], strict=True)
+        if not self.problem.covered and verdict.cause in TEMPERATURE_EFFECTS:
+            text += (
+                " No reference covers these temperatures, where healthy cells behave like that:"
+                " this does not indicate a fault."
+            )
+        return text
+
+    @property
+    def caveats(self) -> list[str]:
+        """What these logs cannot show, whatever the verdict; one or two sentences each."""
+        problem = self.problem
+        fits = [
+            (matrix.prepared.log.name, rms(errors))
+            for matrix, errors in zip(problem.references, problem.reference_errors_v, strict=True)
         ]
-        fit = reference_fit(misses, self.stated_v, settled.as_given.pack.voltage_v)
+        stated_v = self.model.noise.voltage_rmse_v
         worse = ""
         if self.extension.cause:
-            worse = worse_with(self.baseline_rmse_v, self.extended_rmse_v)
-        said = [*settled.left_out, worse, fit, *found, steps]
-        return [sentence for sentence in said if sentence]
+            worse = extension_caveat(self.baseline_rmse_v, self.extended_rmse_v)
+        found = [
+            *problem.outliers,
+            worse,
+            reference_fit_caveat(fits, stated_v, problem.given.pack.voltage_v),
+            *log_caveats(
+                [matrix.prepared for matrix in problem.diagnosed],
+                [matrix.prepared for matrix in problem.references],
+                problem.model.capacity_ah,
+                problem.options.initial_soc_pct,
+                problem.temperature_source,
+            ),
+            temperature_step_caveat(
+                problem.temperature_step_k, problem.model.model.kt_v_per_k, self.floor_v
+            ),
+        ]
+        return [sentence for sentence in found if sentence]
 
-    def to_dict(self, extended_model: str | None = None) -> dict[str, Any]:
-        """Return the object that `cangauge gap --json` prints."""
+    def log_errors(self) -> list[LogErrors]:
+        """Return the errors of each diagnosed log with the given and the extended model."""
+        return [
+            LogErrors(matrix.prepared, before_v, residual(matrix.prepared, self.extension.model))
+            for matrix, before_v in zip(
+                self.problem.diagnosed, self.problem.diagnosed_errors_v, strict=True
+            )
+        ]
+
+    def to_dict(
+        self, extended_model: str | None = None, *, soc_error: bool = True
+    ) -> dict[str, Any]:
+        """Return the object that `cangauge gap --json` prints.
+
+        Parameters
+        ----------
+        extended_model : str, optional
+            Path of the extended model's file, to be reported.
+        soc_error : bool
+            Run the estimator for the SoC error with either model; otherwise these are None.
+        """
         verdict = self.verdict
         return {
             "schema": 1,
@@ -107,219 +217,203 @@ class Diagnosis:
                 "extended_rmse_v": self.extended_rmse_v,
                 "floor_sensor_v": self.floor_v,
                 "floor_explainable_v": self.explainable_v,
-                "closed_fraction": self.closed,
-                "closed_fraction_ci": None if self.closed_ci is None else list(self.closed_ci),
-                "baseline_soc_mae_pct": self.baseline_soc_mae_pct,
-                "extended_soc_mae_pct": self.extended_soc_mae_pct,
+                "closed_fraction": self.closed_fraction,
+                "closed_fraction_ci": self.closed_fraction_ci and list(self.closed_fraction_ci),
+                "baseline_soc_mae_pct": self.baseline_soc_mae_pct if soc_error else None,
+                "extended_soc_mae_pct": self.extended_soc_mae_pct if soc_error else None,
             },
-            "where": [place.to_dict() for place in self.where],
-            "worst_moments": [moment.to_dict() for moment in self.worst],
+            "where": [share.to_dict() for share in self.error_breakdown],
+            "worst_moments": [segment.to_dict() for segment in self.worst_segments],
             "cause": {
                 "verdict": verdict.cause,
                 "probability": verdict.probability,
-                "probability_unknown": verdict.chances[UNKNOWN],
-                "probability_none": verdict.chances[NONE],
+                "probability_unknown": verdict.probabilities[UNKNOWN],
+                "probability_none": verdict.probabilities[NONE],
                 "ambiguous_with": list(verdict.ambiguous_with),
                 "explained_fraction": verdict.explained,
                 "accepted": [
                     {
                         "effect": effect_id,
                         "parameters": values,
-                        "closed_fraction": self.closed,
+                        "closed_fraction": self.closed_fraction,
                     }
                     for effect_id, values in self.extension.cause.items()
                 ],
                 "candidates": list(self.candidates),
             },
             "observability": list(self.observability),
-            "limits": self.limits,
+            "limits": self.caveats,
             "extended_model": extended_model,
         }
 
 
 def diagnose(
     logs: Sequence[Log],
-    model_file: Model,
-    references: Sequence[Log],
+    model: Model,
+    references: Sequence[Log] = (),
     *,
     leave_out: Sequence[str] = (),
     initial_soc_pct: float | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
-    """Find where, which and how far.
+    """Diagnose the gap between a model and logs.
 
     Parameters
     ----------
     logs : sequence of Log
-        Logs that the model does not explain, sharing one cause.
-    model_file : Model
+        Logs with a gap, which share one cause; at least 10 min each.
+    model : Model
+        Model of this pack, from `fit` or a model file.
     references : sequence of Log
-        Logs on which the model is known to be good.
+        Logs on which the model is good, at least three for sound probabilities. They show the error
+        to expect without a cause. Each needs an SoC at its start, or starts full.
     leave_out : sequence of str
-        Effects that the library is to be without.
+        Effects to leave out of the library.
     initial_soc_pct : float, optional
-        SoC at each diagnosed log's first row [%].
+        SoC at the first row of each diagnosed log, instead of the log's own [%].
     progress : callable, optional
         Called with a line of text before each long step.
+
+    Returns
+    -------
+    Diagnosis
+        Sizes of gap and floor [V], the verdict with probabilities, parameters of the cause with
+        95 % intervals, where the error lies, caveats, and the extended model.
 
     Raises
     ------
     InputError
-        If a log cannot be diagnosed: too short, of another pack, counted out of 0–100 %.
+        If a log is too short, of another pack, given twice, has a dead channel, or has no SoC
+        within 0–100 % that explains it; or without references and an information matrix in `model`.
+
+    Examples
+    --------
+    >>> from cangauge.diagnosis import diagnose
+    >>> from cangauge.logs.read import read_log
+    >>> from cangauge.model.model_file import Model
+    >>> found = diagnose(
+    ...     logs=[read_log("monday.csv")],
+    ...     model=Model.load("pack.json"),
+    ...     references=[read_log(f"reference{k}.csv") for k in (1, 2, 3)],
+    ... )  # doctest: +SKIP
+    >>> print(found.summary)  # doctest: +SKIP
+    current_offset (probability 0.93): gap of 1.32 V; references 0.50 V; 0.51 V with it on …
+    >>> found.extended_soc_mae_pct  # doctest: +SKIP
+    0.8
     """
-    say = progress or _silent
-    settled = build_problem(
+    progress = progress or no_progress
+    problem = build_problem(
         logs,
-        model_file,
+        model,
         references,
-        library_without(leave_out),
+        leave_out=leave_out,
         initial_soc_pct=initial_soc_pct,
         progress=progress,
     )
-    held_out = folds(settled)
+    held_out = folds(problem)
     if not held_out:
         raise InputError(
-            f"{logs[0].duration_s:.0f} s are too short to leave rows out and judge on them:"
-            " nothing can be concluded",
+            f"{logs[0].duration_s:.0f} s are too short to hold rows out: nothing can be concluded",
             source=logs[0].source or logs[0].name,
             cure="give a log of at least 10 min, better half an hour with changing load and SoC",
         )
-    say("weighing the evidence")
-    verdict = decide(settled)
-    accepted = [score.effect_id for score in verdict.accepted]
-    say("judging on rows left out")
-    judged = judge(settled, held_out, accepted)
-    floor = _floor_v(settled, model_file)
-    baseline = rms(np.concatenate([item.baseline_v for item in judged]))
-    extended = rms(np.concatenate([item.extended_v for item in judged]))
+    progress("classifying the effects")
+    verdict = decide(problem)
+    progress("cross-validating")
+    errors = held_out_errors(problem, held_out, [score.effect_id for score in verdict.accepted])
+    progress("refining the extended model")
+    extension = extend(problem, verdict.accepted)
+    floor_v = model.noise.voltage_rmse_v
+    if problem.references:
+        floor_v = rms(np.concatenate(problem.reference_errors_v))
+    baseline_v, extended_v, closed, interval = _closed(errors, floor_v)
     is_gap = verdict.cause != NONE
-    say("extending the model")
-    extension = extend(settled, verdict.accepted)
-    say("running the estimator with either model")
-    better = model_file_of(extension, model_file, extended)
-    clean_v2 = settled.error.clean_v2
-    _, given_v = settled.given_errors_v
+    reference_v2 = problem.error.reference_v2
     return Diagnosis(
-        settled=settled,
+        logs=tuple(logs),
+        model=model,
+        problem=problem,
         verdict=verdict,
-        baseline_rmse_v=baseline,
-        extended_rmse_v=extended,
-        floor_v=floor,
-        stated_v=model_file.noise.voltage_rmse_v,
-        explainable_v=float(np.sqrt(clean_v2)) if clean_v2 > 0.0 else None,
-        baseline_soc_mae_pct=soc_mae_pct(logs, model_file),
-        extended_soc_mae_pct=soc_mae_pct(logs, better),
-        closed=closed_fraction(baseline, extended, floor) if is_gap else None,
-        closed_ci=closed_interval(settled, judged, floor) if is_gap else None,
-        where=tuple(places(settled.diagnosed, given_v, model_file.capacity_ah)),
-        worst=tuple(worst_moments(settled.diagnosed, given_v)),
-        candidates=tuple(_candidates(settled, held_out, verdict, floor, extension)),
-        observability=tuple(_observability(settled)),
         extension=extension,
+        baseline_rmse_v=baseline_v,
+        extended_rmse_v=extended_v,
+        floor_v=floor_v,
+        explainable_v=float(np.sqrt(reference_v2)) if reference_v2 > 0.0 else None,
+        closed_fraction=closed if is_gap else None,
+        closed_fraction_ci=interval if is_gap else None,
+        error_breakdown=tuple(
+            error_shares(problem.diagnosed, problem.diagnosed_errors_v, model.capacity_ah)
+        ),
+        worst_segments=tuple(worst_segments(problem.diagnosed, problem.diagnosed_errors_v)),
+        candidates=tuple(_candidates(problem, held_out, verdict, floor_v, extension)),
+        observability=tuple(_observability(problem)),
     )
 
 
+def _closed(
+    errors: Sequence[HeldOutErrors], floor_v: float
+) -> tuple[float, float, float | None, tuple[float, float] | None]:
+    """Return RMS errors before and after [V], the closed fraction and its 95 % interval."""
+
+    def together(parts: Sequence[FloatArray]) -> float:
+        return rms(np.concatenate(parts))
+
+    baseline_v = together([item.baseline_v for item in errors])
+    extended_v = together([item.extended_v for item in errors])
+    fraction = closed_fraction(baseline_v, extended_v, floor_v)
+    return baseline_v, extended_v, fraction, closed_fraction_interval(errors, floor_v)
+
+
 def _candidates(
-    settled: DiagnosisProblem,
+    problem: DiagnosisProblem,
     held_out: Sequence[Fold],
     verdict: Verdict,
-    floor: float,
+    floor_v: float,
     extension: Extension,
 ) -> list[dict[str, Any]]:
+    """Return one JSON object for each effect; the first ones are cross-validated."""
     result = []
     for number, score in enumerate(verdict.candidates):
-        judged = judge(settled, held_out, [score.effect_id]) if number < SHOWN else []
+        rmse_v, closed, interval = None, None, None
+        if number < CROSS_VALIDATED:
+            errors = held_out_errors(problem, held_out, [score.effect_id])
+            _, rmse_v, closed, interval = _closed(errors, floor_v)
         result.append(
             {
                 "effect": score.effect_id,
-                "probability": verdict.chances[score.effect_id],
+                "probability": verdict.probabilities[score.effect_id],
                 "log_bayes_factor": score.log_bayes_factor,
-                **_errors(settled, judged, floor),
-                "parameters": cause_parameters(score, settled, extension),
+                "rmse_v": rmse_v,
+                "closed_fraction": closed,
+                "ci": None if interval is None else list(interval),
+                "parameters": parameters_of(score, problem, extension),
             }
         )
     return result
 
 
-def _errors(settled: DiagnosisProblem, judged: Sequence[Judged], floor: float) -> dict[str, Any]:
-    if not judged:
-        return {"rmse_v": None, "closed_fraction": None, "ci": None}
-    baseline = rms(np.concatenate([item.baseline_v for item in judged]))
-    extended = rms(np.concatenate([item.extended_v for item in judged]))
-    interval = closed_interval(settled, judged, floor)
-    return {
-        "rmse_v": extended,
-        "closed_fraction": closed_fraction(baseline, extended, floor),
-        "ci": None if interval is None else list(interval),
-    }
+def _observability(problem: DiagnosisProblem) -> list[dict[str, object]]:
+    """Return the part of each effect's physical range that these logs could show.
 
-
-def _floor_v(settled: DiagnosisProblem, model_file: Model) -> float:
-    """Return the model's error on the references, or what the model file states without any."""
-    if not settled.references:
-        return model_file.noise.voltage_rmse_v
-    return rms(np.concatenate(settled.given_errors_v[0]))
-
-
-def _observability(settled: DiagnosisProblem) -> list[dict[str, object]]:
-    """Return how much of each effect's physical range these logs could show.
-
-    `visible` is 1 less the smallest amplitude that would have the evidence of `ACCEPT_LOG_BAYES`,
-    as far as references stray, in parts of the bounds.
+    `visible` is 1 minus the smallest amplitude, in parts of the bounds, whose evidence would reach
+    `MIN_LOG_BAYES` with the references' overdispersion.
     """
-    evidence = gather(settled.frame, settled.reference_grams, settled.judged_grams, settled.error)
+    hypotheses, error = problem.hypotheses, problem.error
     best: dict[str, float] = {}
     needs: dict[str, str] = {}
-    for k, choice in enumerate(settled.frame.choices):
-        if not choice.effect.is_cause:
+    for k, candidate in enumerate(hypotheses.candidates):
+        effect = candidate.effect
+        if not effect.is_cause:
             continue
-        at = evidence.of(k)
-        strays = settled.error.strays.get(choice.effect.id, 1.0)
-        information = np.diag(evidence.curvature[at, at]) / strays
-        reach = np.abs(choice.bounds).max(axis=1)
-        smallest = np.sqrt(2.0 * (ACCEPT_LOG_BAYES + 2.0) / np.maximum(information, 1e-30)) / reach
+        at = problem.posterior.slice_of(k)
+        overdispersion = error.overdispersion.get(effect.id, 1.0)
+        information = np.diag(problem.posterior.curvature[at, at]) / overdispersion
+        largest = np.abs(candidate.bounds).max(axis=1)
+        smallest = np.sqrt(2.0 * (MIN_LOG_BAYES + 2.0) / np.maximum(information, 1e-30)) / largest
         visible = float(np.clip(1.0 - smallest.min(), 0.0, 1.0))
-        best[choice.effect.id] = max(best.get(choice.effect.id, 0.0), visible)
-        needs[choice.effect.id] = choice.effect.separated_by
+        best[effect.id] = max(best.get(effect.id, 0.0), visible)
+        needs[effect.id] = effect.separated_by
     return [
         {"effect": effect_id, "visible": visible, "needs": needs[effect_id]}
         for effect_id, visible in sorted(best.items(), key=lambda item: -item[1])
     ]
-
-
-def in_words(diagnosis: Diagnosis) -> str:
-    """Return the verdict in one sentence."""
-    verdict, references = diagnosis.verdict, diagnosis.settled.references
-    floor = "references show" if references else "the model file states"
-    gap = f"{diagnosis.baseline_rmse_v:.2f} V where {floor} {diagnosis.floor_v:.2f} V"
-    if verdict.cause == NONE:
-        if references and diagnosis.baseline_rmse_v > diagnosis.floor_v:
-            gap += f", {diagnosis.extended_rmse_v:.2f} V with what they teach"
-        beyond = "references show or explain" if references else "model file states"
-        if verdict.probability < EVEN or not diagnosis.settled.covered:
-            chance = f"that there is none has a probability of {verdict.probability:.2f}"
-            return f"No gap that is certain beyond what the {beyond} ({gap}); {chance}."
-        return f"No gap beyond what the {beyond} ({gap})."
-    if verdict.cause == UNKNOWN:
-        return f"A gap ({gap}) that no effect in the library is likely to be the cause of."
-    alike = (
-        f", not to be told from {', '.join(verdict.ambiguous_with)}"
-        if verdict.ambiguous_with
-        else ""
-    )
-    after = f"with it {diagnosis.extended_rmse_v:.2f} V on rows left out"
-    if diagnosis.extended_rmse_v > diagnosis.baseline_rmse_v:
-        after += ", more than without"
-    healthy = ""
-    if not diagnosis.settled.covered and verdict.cause in OF_TEMPERATURE:
-        healthy = (
-            " No reference has these temperatures, and there healthy cells do so as well: it tells"
-            " no fault."
-        )
-    return (
-        f"{gap}: {verdict.cause} (probability {verdict.probability:.2f}{alike}); {after}.{healthy}"
-    )
-
-
-def _silent(_text: str) -> None:
-    """Say nothing."""

@@ -1,6 +1,10 @@
-"""What all evidence of one diagnosis shares: candidates, what is structure, what is a log's own.
+"""Hypotheses of a diagnosis: candidate effects, and the role of each in the linear model.
 
-A log's products (`evidence.Gram`) have a column for each of these; `Layout` says where.
+A *candidate* is one effect at one shape (a time constant, say); its *amplitudes* enter the voltage
+linearly. Every candidate is tested as the cause of the diagnosed logs. Some have further roles:
+
+- *shared structure*: effects that healthy logs show as well, with amplitudes common to all logs;
+- *per-log effects*: effects by which healthy logs may differ a little, with amplitudes of each log.
 """
 
 from __future__ import annotations
@@ -13,117 +17,124 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
-from cangauge.diagnosis.design_matrix import LEVELS
+from cangauge.diagnosis.design_matrix import PER_LOG_STATES
 from cangauge.model.effects.library import Candidate
+
+Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Where a log's columns are in its products (`Gram`), as indices."""
+    """Column indices of a log's normal equations."""
 
-    coefficients: NDArray[np.intp]
-    structure: NDArray[np.intp]
-    effects: NDArray[np.intp]
-    """Amplitudes of all candidates, those of structure and own among them; none of a reference."""
-    own: NDArray[np.intp]
-    """What is each log's own: amplitudes of `Frame.own`, then `columns.LEVELS`."""
+    coefficients: Indices
+    """Voltage model coefficients."""
+    structure: Indices
+    """Amplitudes of the shared structure."""
+    effects: Indices
+    """Amplitudes of all candidates, including those with another role; empty for a reference."""
+    per_log: Indices
+    """Amplitudes of the per-log effects, then `PER_LOG_STATES`."""
     residual: int
 
     @property
-    def shared(self) -> NDArray[np.intp]:
-        """What all logs share, in the order of a solution."""
+    def shared(self) -> Indices:
+        """Columns whose amplitudes all logs share, in the order of a solution."""
         return np.concatenate((self.coefficients, self.structure))
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
-    """What all evidence of one diagnosis shares."""
+class Hypotheses:
+    """Candidates of a diagnosis with their roles, and the prior of the voltage model.
 
-    choices: tuple[Candidate, ...]
+    The number of voltage model coefficients is p; their columns are divided by `column_scale`.
+    """
+
+    candidates: tuple[Candidate, ...]
     prior_root: FloatArray | None
-    """Square root of the coefficients' information, shape (p, p), in scaled columns."""
-    scale: FloatArray
-    """Scale of the baseline's columns, shape (p,)."""
-    repairs: tuple[int, ...] = ()
-    """Candidates that clean logs show too; all logs share their amplitudes."""
-    own: tuple[int, ...] = ()
-    """Candidates by which logs may differ without a cause: every effect, a little."""
-    own_prior: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """How much so before references were seen, as standard deviations: of the amplitudes of `own`,
-    then of `columns.LEVELS`."""
-    centre: FloatArray | None = None
-    """Where the information holds the coefficients, in scaled columns, shape (p,); 0 if None."""
+    """Square root of the coefficients' information in the model file, shape (p, p)."""
+    column_scale: FloatArray
+    """Scale of the coefficient columns, shape (p,)."""
+    structure: tuple[int, ...] = ()
+    """Candidates of the shared structure."""
+    per_log: tuple[int, ...] = ()
+    """Candidates of the per-log effects."""
+    per_log_prior_std: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """Prior standard deviations: amplitudes of `per_log`, then `PER_LOG_STATES`."""
+    prior_mean: FloatArray | None = None
+    """Mean of the coefficients' prior in scaled columns, shape (p,); 0 if None."""
 
     @cached_property
-    def first(self) -> NDArray[np.intp]:
-        """Index of each candidate's first amplitude, one more than candidates."""
-        widths = [len(choice.amplitudes) for choice in self.choices]
+    def offsets(self) -> Indices:
+        """Index of each candidate's first amplitude, and the number of amplitudes at the end."""
+        widths = [len(candidate.amplitudes) for candidate in self.candidates]
         return np.concatenate(([0], np.cumsum(widths))).astype(np.intp)
 
     @cached_property
-    def neighbours(self) -> tuple[tuple[int, int], ...]:
-        """Pairs of candidates next to each other in one shape: what lies in between is a mixture.
+    def mixtures(self) -> tuple[tuple[int, int], ...]:
+        """Pairs of candidates adjacent in one shape parameter.
 
-        A time constant between two of the grid, or a spread of them, is none of the grid's.
+        A mixture of both stands for a time constant between two grid values, or a spread of them.
         """
-        found = []
-        for a, one in enumerate(self.choices):
-            values = _shape_values(self.choices, one.effect.id)
-            for b in range(a + 1, len(self.choices)):
-                other = self.choices[b]
+        pairs = []
+        for a, one in enumerate(self.candidates):
+            grids = _shape_grids(self.candidates, one.effect.id)
+            for b in range(a + 1, len(self.candidates)):
+                other = self.candidates[b]
                 if other.effect.id != one.effect.id:
                     break
-                differ = [name for name in one.shape if one.shape[name] != other.shape[name]]
-                if len(differ) == 1:
-                    grid = values[differ[0]]
-                    places = grid.index(one.shape[differ[0]]), grid.index(other.shape[differ[0]])
+                differing = [name for name in one.shape if one.shape[name] != other.shape[name]]
+                if len(differing) == 1:
+                    name = differing[0]
+                    places = [grids[name].index(each.shape[name]) for each in (one, other)]
                     if abs(places[0] - places[1]) == 1:
-                        found.append((a, b))
-        return tuple(found)
+                        pairs.append((a, b))
+        return tuple(pairs)
 
     @cached_property
-    def diagnosed(self) -> Layout:
-        """Where the columns of a log are that is diagnosed: those of all candidates."""
-        p, amplitudes = self.scale.size, int(self.first[-1])
+    def diagnosed_layout(self) -> Layout:
+        """Columns of a diagnosed log: those of all candidates."""
+        p, amplitudes = self.column_scale.size, int(self.offsets[-1])
         end = p + amplitudes
+        states = end + np.arange(len(PER_LOG_STATES))
         return Layout(
             coefficients=np.arange(p),
-            structure=p + self.amplitudes_of(self.repairs),
+            structure=p + self.amplitudes_of(self.structure),
             effects=p + np.arange(amplitudes),
-            own=np.concatenate((p + self.amplitudes_of(self.own), end + np.arange(len(LEVELS)))),
-            residual=end + len(LEVELS),
+            per_log=np.concatenate((p + self.amplitudes_of(self.per_log), states)),
+            residual=end + len(PER_LOG_STATES),
         )
 
     @cached_property
-    def reference(self) -> Layout:
-        """Where the columns of a reference are: those of `shown` alone."""
-        p = self.scale.size
-        shared = p + self.amplitudes_of(self.repairs).size
-        end = shared + self.amplitudes_of(self.own).size + len(LEVELS)
+    def reference_layout(self) -> Layout:
+        """Columns of a reference: those of `reference_columns` only."""
+        p = self.column_scale.size
+        shared = p + self.amplitudes_of(self.structure).size
+        end = shared + self.amplitudes_of(self.per_log).size + len(PER_LOG_STATES)
         return Layout(
             coefficients=np.arange(p),
             structure=np.arange(p, shared),
             effects=np.zeros(0, dtype=np.intp),
-            own=np.arange(shared, end),
+            per_log=np.arange(shared, end),
             residual=end,
         )
 
     @property
-    def shown(self) -> tuple[int, ...]:
-        """Candidates whose columns are wanted of references too: repairs, then own."""
-        return (*self.repairs, *self.own)
+    def reference_columns(self) -> tuple[int, ...]:
+        """Candidates with columns in the references: shared structure, then per-log effects."""
+        return (*self.structure, *self.per_log)
 
-    def amplitudes_of(self, chosen: Sequence[int]) -> NDArray[np.intp]:
-        """Return the indices of some candidates' amplitudes."""
-        parts = [np.arange(self.first[k], self.first[k + 1]) for k in chosen]
+    def amplitudes_of(self, chosen: Sequence[int]) -> Indices:
+        """Return the amplitude indices of some candidates."""
+        parts = [np.arange(self.offsets[k], self.offsets[k + 1]) for k in chosen]
         return np.concatenate([np.zeros(0, dtype=np.intp), *parts])
 
     def bounds_of(self, chosen: Sequence[int]) -> FloatArray:
-        """Return the bounds of some candidates' amplitudes, shape (…, 2)."""
-        return np.vstack([np.zeros((0, 2)), *(self.choices[k].bounds for k in chosen)])
+        """Return the amplitude bounds of some candidates, shape (amplitudes, 2)."""
+        return np.vstack([np.zeros((0, 2)), *(self.candidates[k].bounds for k in chosen)])
 
 
-def _shape_values(choices: Sequence[Candidate], effect_id: str) -> dict[str, list[float]]:
-    """Return each shape's values on an effect's grid, ascending."""
-    shapes = [choice.shape for choice in choices if choice.effect.id == effect_id]
+def _shape_grids(candidates: Sequence[Candidate], effect_id: str) -> dict[str, list[float]]:
+    """Return the ascending grid of each shape parameter of an effect."""
+    shapes = [candidate.shape for candidate in candidates if candidate.effect.id == effect_id]
     return {name: sorted({shape[name] for shape in shapes}) for name in shapes[0]}

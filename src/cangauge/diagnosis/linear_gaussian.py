@@ -1,24 +1,21 @@
-"""The evidence for each effect: one linear Gaussian model of all logs, references and diagnosed.
+"""Linear Gaussian model of all logs, references and diagnosed.
 
-    residual = baseline·δθ + own·o + repairs·ρ + effect·a + error
+    residual = coefficients·δθ + structure·ρ + per-log·o + effect·a + error
 
-δθ are the voltage model's coefficients, held by the information that its own logs gave; o is what
-differs from log to log without a cause (`Frame.own`), held by how much clean logs differ; ρ are
-effects that clean logs show too; a is the effect in question, which only the diagnosed logs have.
-All but a are integrated out. What is left is a quadratic form in a, for all candidates at once:
+δθ, the change of the voltage model coefficients, has the model file's information as prior; ρ are
+the amplitudes of the shared structure; o are the per-log effects, whose prior is how much healthy
+logs differ; a are the amplitudes of the tested effect, which only diagnosed logs have. Everything
+but a is marginalised. What remains is quadratic in a, for all candidates at once:
 
-    ln evidence(a) = g·a − ½ a·S·a,    and with a ~ N(0, τ²) the Bayes factor against no effect.
+    ln p(residual | a) = g·a − ½ a·S·a + const.
 
-The error is correlated in time, so rows are weighed scale by scale (`scales`), each scale by the
-error that the references show there. How alike two effects look to these logs is the correlation
-in S.
-
-The most probable coefficients, structure and amplitudes that physics allows.
+The error is correlated in time: products are formed for each time scale of a Haar transform
+(`inference.time_scales`) and weighted by the error variance at that scale.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,46 +23,43 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.design_matrix import DesignMatrix
-from cangauge.diagnosis.hypotheses import Frame
+from cangauge.diagnosis.hypotheses import Hypotheses
 from cangauge.errors import InputError
 from cangauge.inference.least_squares import nearest_rising
 from cangauge.inference.linearized import SLOPE_CHECKS
 from cangauge.inference.time_scales import haar_transform
 from cangauge.model.voltage_model import BASIS_NAMES, SLOPE_AT_LEAST, VoltageModel, ocv_basis_slope
 
-# --- The evidence for each effect: one linear Gaussian model of all logs, references and dia…
-
 PRIOR_SIGMAS = 2.0
-"""Half the width of an amplitude's bounds is this many prior standard deviations."""
+"""Half the width of an amplitude's bounds in prior standard deviations."""
 
-PIN = 0.1
-"""How far the structure of clean logs may move with the diagnosed ones, in parts of its bounds."""
+STRUCTURE_STD = 0.1
+"""Standard deviation by which diagnosed logs may move the structure that the references show, in
+parts of its bounds. Unrestricted it would absorb a cause of its own kind."""
 
 JITTER = 1e-10
-"""Relative diagonal load: coefficients that no log moves stay where they are."""
+"""Relative diagonal load: coefficients without information stay at their prior mean."""
 
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """How far residuals stray without a cause."""
+    """Error of the voltage model on healthy logs, and the prior scales that go with it."""
 
     scale_v2: tuple[float, ...]
-    """Variance of the coefficients of each scale (`scales.haar_transform`) [V²]."""
-    own_std: tuple[float, ...]
-    """Standard deviation, from log to log, of what is each log's own (`Frame.own_prior`)."""
+    """Error variance at each time scale (`time_scales.by_scale`) [V²]."""
+    per_log_std: tuple[float, ...]
+    """Standard deviation of the per-log amplitudes (`Hypotheses.per_log_prior_std`)."""
     rmse_v: float
-    """Root mean square error of a row, what is each log's own apart [V]."""
-    strays: Mapping[str, float] = field(default_factory=dict)
-    """By how much the squared evidence for each effect exceeds, on references left out, what
-    chance alone would give; 1 where it is not listed."""
-    clean_v2: float = 0.0
-    """Mean square of what references left out keep, their own terms not taken off [V²]."""
-    trust: float = 1.0
-    """Weight of the information that the model file brings: less than 1 where the references
-    contradict it."""
+    """RMS error of a row without the per-log effects [V]."""
+    overdispersion: Mapping[str, float] = field(default_factory=dict)
+    """Ratio of each effect's squared evidence on left-out references to its expectation by chance;
+    1 where not listed."""
+    reference_v2: float = 0.0
+    """Mean square error of left-out references, per-log effects included [V²]."""
+    information_weight: float = 1.0
+    """Weight of the model file's information: below 1 where references contradict it."""
     structure: Mapping[str, float] = field(default_factory=dict)
-    """How much of its physical range the structure of each effect may take (`Frame.repairs`); 1
-    where it is not listed."""
+    """Prior scale of each structure effect in parts of its physical range; 1 where not listed."""
 
     @property
     def lasting_v2(self) -> float:
@@ -74,246 +68,249 @@ class ErrorModel:
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
-    """The quadratic form of all candidates' amplitudes."""
+class NormalEquations:
+    """Products of a log's columns with each other, by time scale.
 
-    frame: Frame
-    error: ErrorModel
-    gradient: FloatArray
-    """g, shape (all amplitudes,)."""
-    curvature: FloatArray
-    """S, shape (all amplitudes, all amplitudes)."""
-    squares: float
-    """Weighted sum of squares that is left without any effect."""
-    mean: FloatArray
-    """Solution without any effect: δθ (scaled), repairs."""
-    per_amplitude: FloatArray
-    """How that solution falls as an amplitude rises, shape (…, all amplitudes)."""
-    precision: FloatArray
-    """Of that solution, shape (…, …)."""
-
-    def of(self, k: int) -> slice:
-        """Return where candidate k's amplitudes are."""
-        return slice(int(self.frame.first[k]), int(self.frame.first[k + 1]))
-
-
-@dataclass(frozen=True, eq=False)
-class Gram:
-    """Products of a log's columns with each other: all that linear models need of its rows.
-
-    Columns: baseline (p), amplitudes (of all candidates; of a reference: of the repairs, then of
-    what is each log's own), `columns.LEVELS`, residual; `Frame.diagnosed` and `Frame.reference`
-    tell where.
+    Columns: coefficients (p); amplitudes (of all candidates; of a reference those of
+    `Hypotheses.reference_columns`); `PER_LOG_STATES`; residual. See `Hypotheses.diagnosed_layout`
+    and `Hypotheses.reference_layout`.
     """
 
     products: FloatArray
-    """One matrix a scale, shape (SCALES, columns, columns)."""
+    """Shape (SCALES, columns, columns)."""
     counts: FloatArray
-    """Coefficients of each scale, shape (SCALES,); fewer, if rows count less."""
+    """Haar coefficients of each scale, shape (SCALES,); reduced where rows have less weight."""
+    _last_weighted: dict[tuple[float, ...], FloatArray] = field(default_factory=dict, repr=False)
 
-    def weakened(self, factor: float) -> Gram:
-        """Return the products as if the errors' variance were `factor` times larger."""
-        return Gram(self.products / factor, self.counts)
+    def inflated(self, factor: float) -> NormalEquations:
+        """Return the products for an error variance `factor` times as large."""
+        return NormalEquations(self.products / factor, self.counts)
 
-    def weighed(self, error: ErrorModel) -> FloatArray:
-        """Return the products, each scale by the inverse of its variance, summed [-]."""
-        return np.asarray(np.tensordot(1.0 / np.array(error.scale_v2), self.products, axes=1))
+    def weighted(self, error: ErrorModel) -> FloatArray:
+        """Return the sum of the products over the scales, each divided by its variance [-]."""
+        known = self._last_weighted
+        if error.scale_v2 not in known:  # the same for many trials of the prior scales
+            known.clear()
+            factors = 1.0 / np.array(error.scale_v2)
+            known[error.scale_v2] = np.asarray(np.tensordot(factors, self.products, axes=1))
+        return known[error.scale_v2]
 
 
-def gram_of(terms: DesignMatrix, scale: FloatArray, weight: FloatArray | None = None) -> Gram:
-    """Return a log's products, baseline columns divided by `scale`.
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Log likelihood of all candidate amplitudes, and the shared solution without any effect."""
+
+    hypotheses: Hypotheses
+    error: ErrorModel
+    gradient: FloatArray
+    """g, shape (amplitudes,)."""
+    curvature: FloatArray
+    """S, shape (amplitudes, amplitudes)."""
+    chi_square: float
+    """Weighted sum of squares without any effect."""
+    mean: FloatArray
+    """Solution without any effect: scaled δθ, then ρ; shape (n,)."""
+    sensitivity: FloatArray
+    """Decrease of that solution per amplitude, shape (n, amplitudes)."""
+    precision: FloatArray
+    """Of that solution, shape (n, n)."""
+
+    def slice_of(self, k: int) -> slice:
+        """Return the amplitudes of candidate k."""
+        return slice(int(self.hypotheses.offsets[k]), int(self.hypotheses.offsets[k + 1]))
+
+
+def normal_equations(
+    matrix: DesignMatrix, column_scale: FloatArray, weight: FloatArray | None = None
+) -> NormalEquations:
+    """Form the products of a log's columns.
 
     Parameters
     ----------
-    terms : DesignMatrix
-    scale : array of shape (p,)
+    matrix : DesignMatrix
+        With m rows.
+    column_scale : array of shape (p,)
+        Divides the coefficient columns.
     weight : array of shape (m,), optional
-        Weight of each row: one of a half counts as one whose error is twice as large. Rows of
-        weight 0 are as if they had not been recorded.
+        Weight of each row: ½ means twice the error, 0 leaves the row out.
     """
-    columns = np.column_stack([terms.baseline / scale, *terms.effects, terms.own, terms.residual_v])
-    part = 1.0
+    columns = np.column_stack(
+        [
+            matrix.coefficients / column_scale,
+            *matrix.effects,
+            matrix.per_log_states,
+            matrix.residual_v,
+        ]
+    )
+    count_factor = 1.0
     if weight is not None:
         keep = weight > 0.0
         columns = columns[keep] * weight[keep, None]
-        part = float(np.mean(weight[keep] ** 2))
-    parts = haar_transform(columns)
-    return Gram(
-        np.stack([each.T @ each for each in parts]),
-        part * np.array([float(len(each)) for each in parts]),
+        count_factor = float(np.mean(weight[keep] ** 2))
+    scales = haar_transform(columns)
+    return NormalEquations(
+        np.stack([each.T @ each for each in scales]),
+        count_factor * np.array([float(len(each)) for each in scales]),
     )
 
 
-def gather(
-    frame: Frame, references: Sequence[Gram], diagnosed: Sequence[Gram], error: ErrorModel
-) -> Evidence:
-    """Integrate out everything but the effects.
+def marginalize(
+    hypotheses: Hypotheses,
+    references: Sequence[NormalEquations],
+    diagnosed: Sequence[NormalEquations],
+    error: ErrorModel,
+) -> Posterior:
+    """Integrate out everything but the amplitudes of the candidates.
 
     Parameters
     ----------
-    frame : Frame
-    references, diagnosed : sequence of Gram
-        Logs without and with the effect in question.
+    hypotheses : Hypotheses
+    references, diagnosed : sequence of NormalEquations
+        Logs without and with the tested effect.
     error : ErrorModel
     """
-    amplitudes, shared = int(frame.first[-1]), frame.reference.shared.size
+    amplitudes = int(hypotheses.offsets[-1])
+    shared = hypotheses.reference_layout.shared.size
     effects = shared + np.arange(amplitudes)
     precision, right = np.zeros((shared, shared)), np.zeros(shared)
     cross = np.zeros((shared, amplitudes))
-    curvature, gradient, squares = np.zeros((amplitudes, amplitudes)), np.zeros(amplitudes), 0.0
-    for log in references:
-        products, _, _ = without_own(log, frame, error, is_reference=True)
+    curvature, gradient = np.zeros((amplitudes, amplitudes)), np.zeros(amplitudes)
+    chi_square = 0.0
+    for number, log in enumerate((*references, *diagnosed)):
+        is_reference = number < len(references)
+        products, _, _ = marginalize_per_log(log, hypotheses, error, is_reference=is_reference)
         precision += products[:shared, :shared]
         right += products[:shared, -1]
-        squares += float(products[-1, -1])
-    for log in diagnosed:
-        products, _, _ = without_own(log, frame, error, is_reference=False)
-        precision += products[:shared, :shared]
-        right += products[:shared, -1]
-        squares += float(products[-1, -1])
-        cross += products[np.ix_(np.arange(shared), effects)]
-        curvature += products[np.ix_(effects, effects)]
-        gradient += products[effects, -1]
-    squares += _add_priors(precision, right, frame, error)
-    if references and diagnosed and frame.repairs:
-        clean = gather(frame, references, [], error).mean
-        squares += _pin_repairs(precision, right, frame, clean)
-    solve = _solver(precision)
-    mean, per_amplitude = solve(right), solve(cross)
-    return Evidence(
-        frame=frame,
+        chi_square += float(products[-1, -1])
+        if not is_reference:
+            cross += products[np.ix_(np.arange(shared), effects)]
+            curvature += products[np.ix_(effects, effects)]
+            gradient += products[effects, -1]
+    chi_square += _add_priors(precision, right, hypotheses, error)
+    if references and diagnosed and hypotheses.structure:
+        healthy = marginalize(hypotheses, references, [], error).mean
+        chi_square += _hold_structure(precision, right, hypotheses, healthy)
+    balance = 1.0 / np.sqrt(np.diag(precision))
+    factor = cho_factor(precision * balance * balance[:, None])
+    mean = np.asarray(balance * cho_solve(factor, balance * right))
+    sensitivity = np.asarray(balance[:, None] * cho_solve(factor, balance[:, None] * cross))
+    return Posterior(
+        hypotheses=hypotheses,
         error=error,
         gradient=gradient - cross.T @ mean,
-        curvature=curvature - cross.T @ per_amplitude,
-        squares=squares - float(right @ mean),
+        curvature=curvature - cross.T @ sensitivity,
+        chi_square=chi_square - float(right @ mean),
         mean=mean,
-        per_amplitude=per_amplitude,
+        sensitivity=sensitivity,
         precision=precision,
     )
 
 
-def without_own(
-    log: Gram, frame: Frame, error: ErrorModel, *, is_reference: bool
+def marginalize_per_log(
+    log: NormalEquations, hypotheses: Hypotheses, error: ErrorModel, *, is_reference: bool
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Integrate out what is a log's own.
+    """Integrate out the per-log amplitudes.
 
     Returns
     -------
     products : array
-        Weighed products of the shared columns, all amplitudes' (not of a reference), residual.
-    own : array
-        By how much the log's own amplitudes follow each of these, shape (own, …).
-    volume : float
-        ln det of their precision over that of their prior.
+        Weighted products of the shared columns, all amplitudes (not of a reference), residual.
+    response : array
+        Change of the per-log amplitudes with each of these, shape (per-log amplitudes, …).
+    log_det : float
+        ln det of their posterior precision over their prior's.
     """
-    weighed = log.weighed(error)
-    layout = frame.reference if is_reference else frame.diagnosed
-    own = layout.own
+    weighted = log.weighted(error)
+    layout = hypotheses.reference_layout if is_reference else hypotheses.diagnosed_layout
+    per_log = layout.per_log
     kept = np.concatenate((layout.shared, layout.effects, [layout.residual]))
-    # In units of how much logs differ, so that the prior is 1.
-    std = np.array(error.own_std)
-    block = weighed[np.ix_(own, own)] * std * std[:, None]
-    block[np.diag_indices(own.size)] += 1.0
-    toward = std[:, None] * weighed[np.ix_(own, kept)]
+    # In units of their standard deviation, so that the prior precision is 1.
+    std = np.array(error.per_log_std)
+    block = weighted[np.ix_(per_log, per_log)] * std * std[:, None]
+    block[np.diag_indices(per_log.size)] += 1.0
+    toward = std[:, None] * weighted[np.ix_(per_log, kept)]
     factor = cho_factor(block)
-    follows = cho_solve(factor, toward)
-    volume = 2.0 * float(np.sum(np.log(np.diag(factor[0]))))
-    return weighed[np.ix_(kept, kept)] - toward.T @ follows, std[:, None] * follows, volume
+    response = cho_solve(factor, toward)
+    log_det = 2.0 * float(np.sum(np.log(np.diag(factor[0]))))
+    products = weighted[np.ix_(kept, kept)] - toward.T @ response
+    return products, std[:, None] * response, log_det
 
 
-def log_likelihood(frame: Frame, references: Sequence[Gram], error: ErrorModel) -> float:
-    """Return ln of the probability of some references, but for what no error model changes.
-
-    Parameters
-    ----------
-    frame : Frame
-    references : sequence of Gram
-    error : ErrorModel
-    """
-    shared = frame.reference.shared.size
+def log_likelihood(
+    hypotheses: Hypotheses, references: Sequence[NormalEquations], error: ErrorModel
+) -> float:
+    """Return the log marginal likelihood of the references, up to a constant."""
+    shared = hypotheses.reference_layout.shared.size
     precision, right, squares = np.zeros((shared, shared)), np.zeros(shared), 0.0
-    volume = 0.0
+    log_det = 0.0
     for log in references:
-        products, _, own_volume = without_own(log, frame, error, is_reference=True)
+        products, _, per_log_det = marginalize_per_log(log, hypotheses, error, is_reference=True)
         precision += products[:shared, :shared]
         right += products[:shared, -1]
         squares += float(products[-1, -1])
-        volume += own_volume + float(log.counts @ np.log(error.scale_v2))
-    squares += _add_priors(precision, right, frame, error)
-    volume -= float(np.sum(np.log(structure_precision(frame, error))))
-    return log_integral(precision, right) - 0.5 * (squares + volume)
+        log_det += per_log_det + float(log.counts @ np.log(error.scale_v2))
+    squares += _add_priors(precision, right, hypotheses, error)
+    log_det -= float(np.sum(np.log(structure_precision(hypotheses, error))))
+    return log_gaussian_integral(precision, right) - 0.5 * (squares + log_det)
 
 
-def _add_priors(precision: FloatArray, right: FloatArray, frame: Frame, error: ErrorModel) -> float:
-    """Add the priors (in place); return the square of what they are centred at."""
-    squares = 0.0
-    p = frame.scale.size
-    block = precision[:p, :p]
-    if frame.prior_root is not None:
-        information = information_of(frame, error)
-        block += information
-        if frame.centre is not None:
-            right[:p] += information @ frame.centre
-            squares = float(frame.centre @ information @ frame.centre)
-    block[np.diag_indices(p)] += JITTER * np.trace(block) / p
-    repairs = structure_precision(frame, error)
-    at = p + np.arange(repairs.size)
-    precision[at, at] += repairs
-    return squares
-
-
-def structure_precision(frame: Frame, error: ErrorModel) -> FloatArray:
-    """Return the precision with which each of the repairs' amplitudes is held at none."""
-    repairs = [frame.choices[k] for k in frame.repairs]
-    levels = [error.structure.get(item.effect.id, 1.0) for item in repairs for _ in item.amplitudes]
-    prior = np.diag(prior_precision(frame.bounds_of(frame.repairs)))
-    return np.asarray(prior / np.array(levels) ** 2)
-
-
-def information_of(frame: Frame, error: ErrorModel) -> FloatArray:
-    """Return the precision with which the model file holds the scaled coefficients, (p, p)."""
-    if frame.prior_root is None:
-        return np.zeros((frame.scale.size, frame.scale.size))
-    return np.asarray(error.trust * frame.prior_root.T @ frame.prior_root / error.lasting_v2)
-
-
-def _pin_repairs(
-    precision: FloatArray, right: FloatArray, frame: Frame, clean: FloatArray
+def _add_priors(
+    precision: FloatArray, right: FloatArray, hypotheses: Hypotheses, error: ErrorModel
 ) -> float:
-    """Hold the structure of clean logs near what the references say of it.
-
-    Else it would take up a cause of its own kind: cold logs would only teach what resistance does
-    in the cold, and nothing would be left to attribute. Returns the square of the pins' centre.
-    """
-    p = frame.scale.size
-    bounds = frame.bounds_of(frame.repairs)
-    at = p + np.arange(bounds.shape[0])
-    pin = (PIN * (bounds[:, 1] - bounds[:, 0])) ** -2.0
-    precision[at, at] += pin
-    right[at] += pin * clean[at]
-    return float(np.sum(pin * clean[at] ** 2))
-
-
-def _solver(precision: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Return what solves precision·x = right, balanced by the diagonal."""
-    scale = 1.0 / np.sqrt(np.diag(precision))
-    factor = cho_factor(precision * scale * scale[:, None])
-
-    def solve(right: FloatArray) -> FloatArray:
-        balance = scale if right.ndim == 1 else scale[:, None]
-        return np.asarray(balance * cho_solve(factor, balance * right))
-
-    return solve
+    """Add the priors in place; return the square of their mean."""
+    square = 0.0
+    p = hypotheses.column_scale.size
+    block = precision[:p, :p]
+    if hypotheses.prior_root is not None:
+        information = prior_information(hypotheses, error)
+        block += information
+        if hypotheses.prior_mean is not None:
+            right[:p] += information @ hypotheses.prior_mean
+            square = float(hypotheses.prior_mean @ information @ hypotheses.prior_mean)
+    block[np.diag_indices(p)] += JITTER * np.trace(block) / p
+    structure = structure_precision(hypotheses, error)
+    at = p + np.arange(structure.size)
+    precision[at, at] += structure
+    return square
 
 
-def log_integral(precision: FloatArray, right: FloatArray) -> float:
-    """Return ln of the integral over x of exp(right·x − ½ x·precision·x), but for the 2π.
+def structure_precision(hypotheses: Hypotheses, error: ErrorModel) -> FloatArray:
+    """Return the prior precision of each structure amplitude, shape (amplitudes,)."""
+    candidates = [hypotheses.candidates[k] for k in hypotheses.structure]
+    scales = [error.structure.get(each.effect.id, 1.0) for each in candidates
+              for _ in each.amplitudes]  # fmt: skip
+    prior = np.diag(prior_precision(hypotheses.bounds_of(hypotheses.structure)))
+    return np.asarray(prior / np.array(scales) ** 2)
+
+
+def prior_information(hypotheses: Hypotheses, error: ErrorModel) -> FloatArray:
+    """Return the model file's precision of the scaled coefficients, shape (p, p)."""
+    root = hypotheses.prior_root
+    if root is None:
+        return np.zeros((hypotheses.column_scale.size, hypotheses.column_scale.size))
+    return np.asarray(error.information_weight * root.T @ root / error.lasting_v2)
+
+
+def _hold_structure(
+    precision: FloatArray, right: FloatArray, hypotheses: Hypotheses, healthy: FloatArray
+) -> float:
+    """Hold the structure near the references' solution, in place; return the square of its mean."""
+    bounds = hypotheses.bounds_of(hypotheses.structure)
+    at = hypotheses.column_scale.size + np.arange(bounds.shape[0])
+    held = (STRUCTURE_STD * (bounds[:, 1] - bounds[:, 0])) ** -2.0
+    precision[at, at] += held
+    right[at] += held * healthy[at]
+    return float(np.sum(held * healthy[at] ** 2))
+
+
+def log_gaussian_integral(precision: FloatArray, right: FloatArray) -> float:
+    """Return ln ∫ exp(right·x − ½ x·precision·x) dx without the powers of 2π.
 
     Parameters
     ----------
-    precision : array, shape (n, n)
+    precision : array of shape (n, n)
         Positive definite.
-    right : array, shape (n,)
+    right : array of shape (n,)
     """
     balance = 1.0 / np.sqrt(np.diag(precision))
     root = np.linalg.cholesky(precision * balance * balance[:, None])
@@ -323,73 +320,67 @@ def log_integral(precision: FloatArray, right: FloatArray) -> float:
 
 
 def prior_precision(bounds: FloatArray) -> FloatArray:
-    """Return the precision of amplitudes with these bounds, shape (k, k)."""
+    """Return the prior precision of amplitudes with bounds of shape (k, 2), shape (k, k)."""
     return np.diag((2.0 * PRIOR_SIGMAS / (bounds[:, 1] - bounds[:, 0])) ** 2)
 
 
-# --- The most probable coefficients, structure and amplitudes that physics allows
-
-
-def within_bounds(
-    evidence: Evidence, model: VoltageModel, chosen: Sequence[int]
+def constrained_mode(
+    posterior: Posterior, model: VoltageModel, chosen: Sequence[int]
 ) -> tuple[FloatArray, list[FloatArray]]:
-    """Return the most probable coefficients, structure and amplitudes that physics allows.
+    """Return the most probable coefficients, structure and amplitudes within physical bounds.
 
-    One convex problem for all of them, so that what a bound takes from one goes to the others:
-    the pseudo-OCV rises over the identified SoC, and structure and effects keep their bounds.
+    One convex problem: the pseudo-OCV rises over the identified SoC, structure and effects keep
+    their bounds, and what a bound takes from one parameter is taken up by the others.
 
     Parameters
     ----------
-    evidence : Evidence
+    posterior : Posterior
     model : VoltageModel
-        That the evidence starts from.
+        Model that the design matrices were linearised about.
     chosen : sequence of int
-        Candidates to be in the model.
+        Candidates to include.
 
     Returns
     -------
     solution : array
-        δθ [V, V/K, Ω], then the amplitudes of `frame.repairs`.
+        δθ [V, V/K, Ω], then the amplitudes of the structure.
     amplitudes : list of arrays
-        Of each accepted effect, beside the neutral values.
+        Of each chosen candidate, relative to the neutral values.
     """
-    frame = evidence.frame
-    p, n = frame.scale.size, len(BASIS_NAMES)
-    at = frame.amplitudes_of(chosen)
-    limits = np.vstack([frame.bounds_of(frame.repairs), frame.bounds_of(chosen)])
-    first, size = evidence.precision.shape[0], evidence.precision.shape[0] + at.size
-    curvature = evidence.curvature[np.ix_(at, at)] + prior_precision(frame.bounds_of(chosen))
-    upper = _root(evidence.precision)
+    hypotheses = posterior.hypotheses
+    p, n = hypotheses.column_scale.size, len(BASIS_NAMES)
+    at = hypotheses.amplitudes_of(chosen)
+    bounds = hypotheses.bounds_of(chosen)
+    limits = np.vstack([hypotheses.bounds_of(hypotheses.structure), bounds])
+    first, size = posterior.precision.shape[0], posterior.precision.shape[0] + at.size
+    curvature = posterior.curvature[np.ix_(at, at)] + prior_precision(bounds)
+    upper = _root(posterior.precision)
     root, target = np.zeros((size, size)), np.zeros(size)
     root[:first, :first] = upper
-    root[:first, first:] = upper @ evidence.per_amplitude[:, at]
-    target[:first] = upper @ evidence.mean
+    root[:first, first:] = upper @ posterior.sensitivity[:, at]
+    target[:first] = upper @ posterior.mean
     if at.size:
         lower = _root(curvature)
         root[first:, first:] = lower
-        target[first:] = lower @ np.linalg.solve(curvature, evidence.gradient[at])
+        target[first:] = lower @ np.linalg.solve(curvature, posterior.gradient[at])
     slopes = ocv_basis_slope(np.linspace(*model.soc_range_pct, SLOPE_CHECKS), model.epsilon)
     rising = np.zeros((SLOPE_CHECKS, size))
-    rising[:, :n] = slopes / frame.scale[:n]
-    needed = SLOPE_AT_LEAST * model.pseudo_ocv_at(50.0)[0] - slopes @ np.array(model.ocv_v)
-    repairs = p + np.arange(limits.shape[0] - at.size)
-    bounded = np.concatenate((repairs, first + np.arange(at.size)))
-    kept = np.zeros((bounded.size, size))
-    kept[np.arange(bounded.size), bounded] = 1.0
+    rising[:, :n] = slopes / hypotheses.column_scale[:n]
+    required = SLOPE_AT_LEAST * model.pseudo_ocv_at(50.0)[0] - slopes @ np.array(model.ocv_v)
+    structure = p + np.arange(limits.shape[0] - at.size)
+    bounded = np.concatenate((structure, first + np.arange(at.size)))
+    selected = np.zeros((bounded.size, size))
+    selected[np.arange(bounded.size), bounded] = 1.0
     found = nearest_rising(
         root,
         target,
-        np.vstack([rising, kept, -kept]),
-        np.concatenate((needed, limits[:, 0], -limits[:, 1])),
+        np.vstack([rising, selected, -selected]),
+        np.concatenate((required, limits[:, 0], -limits[:, 1])),
     )
-    solution = found[: p + repairs.size].copy()
-    solution[:p] /= frame.scale
-    amplitudes, begin = [], first
-    for k in chosen:
-        end = begin + len(frame.choices[k].amplitudes)
-        amplitudes.append(found[begin:end])
-        begin = end
-    return solution, amplitudes
+    solution = found[: p + structure.size].copy()
+    solution[:p] /= hypotheses.column_scale
+    widths = [len(hypotheses.candidates[k].amplitudes) for k in chosen]
+    return solution, np.split(found[first:], np.cumsum(widths)[:-1]) if widths else []
 
 
 def _root(matrix: FloatArray) -> FloatArray:
@@ -398,8 +389,8 @@ def _root(matrix: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.cholesky(matrix / scale / scale[:, None]).T * scale)
 
 
-def moved(model: VoltageModel, change: FloatArray) -> VoltageModel | None:
-    """Return the model with its coefficients moved; None if its pseudo-OCV would not rise."""
+def with_change(model: VoltageModel, change: FloatArray) -> VoltageModel | None:
+    """Return the model with changed coefficients; None if its pseudo-OCV would not rise."""
     try:
         return model.with_coefficients(model.coefficients + change)
     except InputError:

@@ -1,6 +1,8 @@
-"""Where references have been: the temperatures and the charge at which the model is known.
+"""The diagnosis problem: what all verdicts of one diagnosis share.
 
-What all verdicts of one diagnosis rest on: candidates, logs as products, the error to expect.
+Checks the logs, assigns the hypotheses, learns error model and structure from the references and
+linearises the diagnosed logs. Also decides where the references cover the diagnosed logs in
+temperature and SoC.
 """
 
 from __future__ import annotations
@@ -14,95 +16,392 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
-from cangauge.diagnosis.design_matrix import DesignMatrix, design_matrix, own_choices
-from cangauge.diagnosis.hypotheses import Frame
-from cangauge.diagnosis.input_checks import check_inputs
-from cangauge.diagnosis.linear_gaussian import ErrorModel, Gram, gram_of
-from cangauge.diagnosis.references import (
-    LEAST_TRUST_BEYOND,
+from cangauge.diagnosis.design_matrix import DesignMatrix, candidates_for, design_matrix
+from cangauge.diagnosis.error_model import (
     error_from_noise,
     error_from_references,
-    learn,
-    reference_grams,
-    reference_terms,
-    with_strays,
+    with_overdispersion,
 )
+from cangauge.diagnosis.hypotheses import Hypotheses
+from cangauge.diagnosis.input_checks import check_inputs
+from cangauge.diagnosis.linear_gaussian import (
+    ErrorModel,
+    NormalEquations,
+    Posterior,
+    marginalize,
+    normal_equations,
+)
+from cangauge.diagnosis.structure import learn, reference_equations, reference_matrices
 from cangauge.errors import InputError
 from cangauge.inference.linearized import residual
 from cangauge.inference.rows import FitOptions, SampledLog, sample_log
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.resample import dequantize, resample, usual_step_k
-from cangauge.model.effects.base import Effect
-from cangauge.model.effects.library import Candidate, candidates
+from cangauge.model.effects.library import LIBRARY, Candidate, candidates
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Model
 
-# --- Where references have been: the temperatures and the charge at which the model is known
-
 COVERED_K, COVERED_PCT = 3.0, 3.0
-"""References cover temperatures and SoC up to this far outside their own [K, %]."""
+"""References cover temperatures and SoC up to this far outside their own range [K, %]."""
 
 COLDER_PART, WARMER_PART = 0.2, 0.5
-"""Nor are temperatures foreign that lie below or above by less than these parts of the range that
-references have: how the pack follows the temperature, they have shown. In the cold resistance
-grows ever faster. (On trips that the check is made of, winter is 0.3 below summer.)"""
+"""References also cover temperatures below and above by these parts of their range, having shown
+the temperature dependence; less in the cold, where resistance rises ever faster. (On the trips of
+the check, winter is 0.3 below summer.)"""
 
 BEYOND_WEIGHT = 0.3
-"""Weight of a row at a charge that no reference has been at: its error is expected to be larger by
-the inverse. What the pseudo-OCV is there, nobody has looked at since the model's own logs. Chosen
-on development cases, where no such row had counted before; 0.3 is the only value that was run."""
+"""Weight of a row at an SoC that only the model's own logs cover. Chosen on development cases,
+where such rows had not counted before; the only value that was run."""
 
-LEAST_COUNT = 0.1
-"""A reference that went where no other has been still counts so much."""
+LEAST_REFERENCE_WEIGHT = 0.1
+"""Weight of a reference at operating points that no other covers."""
+
+LEAST_COVERED = 0.2
+"""Rows at an SoC that neither references nor the model's own logs cover are left out, if the others
+are at least this part of a log."""
+
+SOC_STD_PCT = 0.5
+"""Prior standard deviation of a healthy log's initial SoC [%]."""
+
+SLOW_STD, RESISTANCE_STD = 0.08, 0.03
+"""Prior standard deviations of `PER_LOG_STATES`, in parts of the pack resistance."""
+
+OTHER_STD = 0.01
+"""Prior standard deviation of the other per-log effects, in parts of their physical range."""
+
+LEAST_WEIGHT_BEYOND = 0.1
+"""Least information weight at temperatures that no reference covers, where the model file is the
+only source."""
+
+TEMPERATURE_STRUCTURE = frozenset({"charge_transfer", "inner_temperature"})
+"""Structure that depends on temperature whatever its shape."""
+
+
+@dataclass(frozen=True, eq=False)
+class DiagnosisProblem:
+    """Common ground of all verdicts of one diagnosis."""
+
+    model: ExtendedModel
+    """Given model with the references' coefficients, without their structure; columns other than
+    those of thermal effects are about it."""
+    options: FitOptions
+    hypotheses: Hypotheses
+    error: ErrorModel
+    references: tuple[DesignMatrix, ...]
+    diagnosed: tuple[DesignMatrix, ...]
+    given: ExtendedModel
+    """Given model with its own temperature range; the gap is its error."""
+    covered: bool = True
+    """Whether the references cover the diagnosed logs' temperatures."""
+    structured: ExtendedModel | None = None
+    """`model` with the structure that the references need (`design_matrix`)."""
+    temperature_step_k: float = 0.0
+    """Coarsest step of a diagnosed log's reported temperature [K]."""
+    temperature_source: TemperatureSource = "unknown"
+    """Where the model's temperature was measured."""
+    outliers: tuple[str, ...] = ()
+    """One sentence for each row left out as an outlier."""
+
+    @cached_property
+    def reference_errors_v(self) -> tuple[FloatArray, ...]:
+        """Errors of the given model on each reference, shape (m,) [V]."""
+        return tuple(residual(matrix.prepared, self.given) for matrix in self.references)
+
+    @cached_property
+    def diagnosed_errors_v(self) -> tuple[FloatArray, ...]:
+        """Errors of the given model on each diagnosed log, shape (m,) [V]."""
+        return tuple(residual(matrix.prepared, self.given) for matrix in self.diagnosed)
+
+    @cached_property
+    def reference_equations(self) -> tuple[NormalEquations, ...]:
+        """Normal equations of the references."""
+        return reference_equations(self.references, self.hypotheses)
+
+    @cached_property
+    def diagnosed_equations(self) -> tuple[NormalEquations, ...]:
+        """Normal equations of the diagnosed logs, by their noise scale."""
+        return tuple(self.equations_of(matrix) for matrix in self.diagnosed)
+
+    @cached_property
+    def weighted_equations(self) -> tuple[NormalEquations, ...]:
+        """Normal equations of the diagnosed logs with rows weighted by SoC coverage.
+
+        Outside the SoC that the references cover, an error may be the cause or the extrapolated
+        pseudo-OCV. Logs with too few covered rows are left out; if that leaves none, all rows
+        count.
+        """
+        references = [matrix.prepared for matrix in self.references]
+        found = []
+        for matrix, equations in zip(self.diagnosed, self.diagnosed_equations, strict=True):
+            weight = soc_weight(matrix.prepared, references, self.given.model.soc_range_pct)
+            if np.all(weight == 1.0):
+                found.append(equations)
+            elif np.mean(weight > 0.0) >= LEAST_COVERED:
+                found.append(self.equations_of(matrix, weight))
+        return tuple(found) or self.diagnosed_equations
+
+    @cached_property
+    def posterior(self) -> Posterior:
+        """Posterior of all effects, from the references and the weighted diagnosed logs."""
+        return marginalize(
+            self.hypotheses, self.reference_equations, self.weighted_equations, self.error
+        )
+
+    def equations_of(
+        self, matrix: DesignMatrix, weight: FloatArray | None = None
+    ) -> NormalEquations:
+        """Return the normal equations of a diagnosed log, by its noise scale."""
+        equations = normal_equations(matrix, self.hypotheses.column_scale, weight)
+        return equations.inflated(self.noise_scale(matrix))
+
+    def noise_scale(self, matrix: DesignMatrix) -> float:
+        """Return a log's error variance relative to that of the references, at least 1.
+
+        The model's error grows with the current: twice the mean square current, twice the variance.
+        """
+        if not self.references:
+            return 1.0
+        usual = float(np.mean([_mean_square_current(each) for each in self.references]))
+        return max(1.0, _mean_square_current(matrix) / max(usual, 1e-12))
+
+
+def no_progress(_text: str) -> None:
+    """Ignore a progress message."""
+
+
+def build_problem(
+    logs: Sequence[Log],
+    model: Model,
+    references: Sequence[Log],
+    *,
+    leave_out: Sequence[str] = (),
+    initial_soc_pct: float | None = None,
+    progress: Callable[[str], None] = no_progress,
+) -> DiagnosisProblem:
+    """Prepare a diagnosis up to the verdict; parameters as of `diagnose`.
+
+    Raises
+    ------
+    InputError
+        If a log gives no rows, is of another pack, has a dead channel or is given twice, or if
+        there are neither references nor an information matrix in the model file.
+    """
+    given = model.extended_model()
+    logs, references, outliers = check_inputs(logs, references, given)
+    widened = with_wider_range(given, [*logs, *references])
+    options = FitOptions(
+        capacity_ah=model.capacity_ah,
+        initial_soc_pct=initial_soc_pct,
+        rate_hz=model.rate_hz,
+        delay_s=widened.model.delay_s,
+        epsilon=model.epsilon,
+        t_ref_c=model.t_ref_c,
+    )
+    if not references and model.information is None:
+        raise InputError(
+            "the model file has no information matrix and there are no references: an error of the"
+            " model cannot be distinguished from a cause",
+            source=model.name,
+            field="information",
+            cure="give logs on which the model is good with --reference",
+        )
+    library = [effect for effect in LIBRARY.values() if effect.id not in leave_out]
+    choices = candidates(library, widened.pack, logs[0].time_s, for_diagnosis=True)
+    # Steps of the temperature are visible only before averaging.
+    of_logs = [sample_log(resample(dequantize(log)), options) for log in logs]
+    without_start = replace(options, initial_soc_pct=None)
+    of_references = [sample_log(resample(dequantize(log)), without_start) for log in references]
+    covered = not of_references or temperatures_covered(of_references, of_logs)
+    hypotheses = _hypotheses(model, choices, has_references=bool(of_references), covered=covered)
+    error = error_from_noise(model.noise, model.rate_hz, hypotheses)
+    known, structured = widened, None
+    matrices: tuple[DesignMatrix, ...] = ()
+    if of_references:
+        progress("learning the error model from the references")
+        several = len(of_references) > 1
+        equations = reference_equations(
+            reference_matrices(of_references, widened, hypotheses), hypotheses
+        )
+        if several:
+            least_weight = 0.0 if covered else LEAST_WEIGHT_BEYOND
+            error = error_from_references(hypotheses, equations, error, least_weight)
+        expected = error if covered or not several else _error_beyond(error)
+        progress("learning the structure from the references")
+        learned = learn(of_references, widened, hypotheses, equations, expected)
+        known, structured, hypotheses = learned.model, learned.structured, learned.hypotheses
+        matrices = learned.matrices
+        if several:
+            diagnosed_like = [
+                _covered_equations(number, learned.matrices, learned.equations, hypotheses, given)
+                for number in range(len(matrices))
+            ]
+            weights = _reference_weights(of_references, of_logs)
+            error = with_overdispersion(
+                hypotheses, learned.equations, error, weights, diagnosed_like
+            )
+            error = error if covered else _error_beyond(error)
+    diagnosed = []
+    for item in of_logs:
+        progress(f"testing every effect on {item.log.name}")
+        of_log = candidates_for(choices, known.pack, item)
+        diagnosed.append(design_matrix(item, known, of_log, structured))
+    return DiagnosisProblem(
+        model=known,
+        options=options,
+        hypotheses=hypotheses,
+        error=error,
+        references=matrices,
+        diagnosed=tuple(diagnosed),
+        given=given,
+        covered=covered,
+        structured=structured,
+        temperature_step_k=max(usual_step_k(log) for log in logs),
+        temperature_source=model.temperature_source,
+        outliers=tuple(outliers),
+    )
+
+
+def with_wider_range(model: ExtendedModel, logs: Sequence[Log]) -> ExtendedModel:
+    """Return the model with its temperature and current ranges widened to those of the logs.
+
+    Outside its range the model holds the temperature; inside, it can learn from the logs. The SoC
+    range stays, as the pseudo-OCV does not extrapolate.
+    """
+    low_c, high_c = model.model.temperature_range_c
+    low_a, high_a = model.model.current_range_a
+    for log in logs:
+        low_c = min(low_c, float(log.temperature_c.min()))
+        high_c = max(high_c, float(log.temperature_c.max()))
+        low_a = min(low_a, float(log.current_a.min()))
+        high_a = max(high_a, float(log.current_a.max()))
+    voltage_model = replace(
+        model.model, temperature_range_c=(low_c, high_c), current_range_a=(low_a, high_a)
+    )
+    return replace(model, model=voltage_model)
+
+
+def _hypotheses(
+    model: Model, choices: Sequence[Candidate], *, has_references: bool, covered: bool
+) -> Hypotheses:
+    """Assign the candidates' roles and the prior of the voltage model."""
+    # References cannot show the temperature dependence at temperatures that they do not cover.
+    structure = tuple(
+        k
+        for k, choice in enumerate(choices)
+        if has_references
+        and choice.effect.is_structure
+        and (covered or not _depends_on_temperature(choice))
+    )
+    per_log, per_log_std = _per_log_effects(choices, model)
+    information = model.information
+    root, scale = None, np.ones(9 + len(model.delays_s))
+    if information is not None:
+        root, scale = np.array(information.root), np.array(information.scale)
+    return Hypotheses(tuple(choices), root, scale, structure, per_log, per_log_std)
+
+
+def _depends_on_temperature(choice: Candidate) -> bool:
+    return choice.effect.id in TEMPERATURE_STRUCTURE or bool(choice.shape.get("activation_k"))
+
+
+def _per_log_effects(
+    choices: Sequence[Candidate], model: Model
+) -> tuple[tuple[int, ...], FloatArray]:
+    """Return the per-log effects, every effect at its usual shapes, with their prior deviations."""
+    by_effect: dict[str, dict[tuple[object, ...], int]] = {}
+    for k, choice in enumerate(choices):
+        if choice.effect.is_cause and choice.is_for_fit:
+            # The first candidate of a shape is linearised at a small effect; only a cause is large.
+            shapes = by_effect.setdefault(choice.effect.id, {})
+            shapes.setdefault(tuple(choice.shape.items()), k)
+    noise = model.noise
+    constant_v = max(noise.lasting_std_v, 0.25 * math.hypot(noise.fast_std_v, noise.slow_std_v))
+    known_std = {"voltage_offset": [constant_v], "initial_soc": [SOC_STD_PCT]}
+    per_log: list[int] = []
+    stds: list[float] = []
+    for effect_id, shapes in by_effect.items():
+        for k in shapes.values():
+            widths = choices[k].bounds[:, 1] - choices[k].bounds[:, 0]
+            usual = known_std.get(effect_id, (OTHER_STD * widths).tolist())
+            # The shapes together have the effect's variance.
+            stds.extend(std / math.sqrt(len(shapes)) for std in usual)
+            per_log.append(k)
+    return tuple(per_log), np.array([*stds, SLOW_STD, RESISTANCE_STD])
+
+
+def _covered_equations(
+    number: int,
+    matrices: Sequence[DesignMatrix],
+    equations: Sequence[NormalEquations],
+    hypotheses: Hypotheses,
+    given: ExtendedModel,
+) -> NormalEquations:
+    """Return a reference's normal equations as if it were diagnosed with the others."""
+    others = [matrix.prepared for k, matrix in enumerate(matrices) if k != number]
+    weight = soc_weight(matrices[number].prepared, others, given.model.soc_range_pct)
+    if np.all(weight == 1.0) or np.mean(weight > 0.0) < LEAST_COVERED:
+        return equations[number]
+    return normal_equations(matrices[number], hypotheses.column_scale, weight)
+
+
+def _error_beyond(error: ErrorModel) -> ErrorModel:
+    """Return the error model at temperatures that no reference covers.
+
+    Neither the correlation of the error nor overdispersion is known there: all scales get the
+    variance of the slowest.
+    """
+    return replace(error, scale_v2=(error.lasting_v2,) * len(error.scale_v2), overdispersion={})
 
 
 def temperatures_covered(references: Sequence[SampledLog], diagnosed: Sequence[SampledLog]) -> bool:
-    """Return whether most rows of the diagnosed logs are at temperatures that references teach."""
-    seen = np.concatenate([item.rows.temperature_c for item in references])
-    asked = np.concatenate([item.rows.temperature_c for item in diagnosed])
-    spread = float(np.ptp(seen))
-    low = seen.min() - max(COVERED_K, COLDER_PART * spread)
-    high = seen.max() + max(COVERED_K, WARMER_PART * spread)
-    return bool(np.mean((asked >= low) & (asked <= high)) > 0.5)
+    """Return whether the references cover the temperatures of most diagnosed rows."""
+    known = np.concatenate([item.rows.temperature_c for item in references])
+    values = np.concatenate([item.rows.temperature_c for item in diagnosed])
+    spread = float(np.ptp(known))
+    low = known.min() - max(COVERED_K, COLDER_PART * spread)
+    high = known.max() + max(COVERED_K, WARMER_PART * spread)
+    return bool(np.mean((values >= low) & (values <= high)) > 0.5)
 
 
-def charge_weight(
-    item: SampledLog, references: Sequence[SampledLog], taught_pct: tuple[float, float]
+def soc_weight(
+    item: SampledLog, references: Sequence[SampledLog], model_range_pct: tuple[float, float]
 ) -> FloatArray:
-    """Return how much each row of a log tells by where it is charged, shape (m,).
+    """Return the weight of each row of a log by SoC coverage, shape (m,).
 
     Parameters
     ----------
     item : SampledLog
     references : sequence of SampledLog
-    taught_pct : tuple of float
-        SoC that the model was fitted on, low and high [%].
+    model_range_pct : tuple of float
+        SoC range that the model was fitted on [%].
 
     Returns
     -------
     array of shape (m,)
-        1 where references have been; `BEYOND_WEIGHT` where only the model's own logs have; 0 where
-        the pseudo-OCV's formula goes on by itself. All 1 without references.
+        1 where references cover the SoC; `BEYOND_WEIGHT` where only the model's own logs do; 0
+        where the pseudo-OCV extrapolates. All 1 without references.
     """
     soc_pct = item.rows.soc_pct
     if not references:
         return np.ones(soc_pct.size)
-    taught = (soc_pct >= taught_pct[0]) & (soc_pct <= taught_pct[1])
-    beyond = np.where(taught, BEYOND_WEIGHT, 0.0)
+    fitted = (soc_pct >= model_range_pct[0]) & (soc_pct <= model_range_pct[1])
+    beyond = np.where(fitted, BEYOND_WEIGHT, 0.0)
     return np.where(_inside(item, references, "soc_pct", COVERED_PCT), 1.0, beyond)
 
 
-def counting(references: Sequence[SampledLog], diagnosed: Sequence[SampledLog]) -> list[float]:
-    """Return how much each reference says of how far the diagnosed logs may stray.
+def _reference_weights(
+    references: Sequence[SampledLog], diagnosed: Sequence[SampledLog]
+) -> list[float]:
+    """Return the weight of each reference for overdispersion.
 
-    One that went where no other has been shows how the model extrapolates. If the diagnosed logs
-    stay where references have been, that is another question, and it counts little.
+    A reference at operating points that no other covers shows how the model extrapolates. That
+    counts little if the diagnosed logs stay within the references' operating points.
     """
-    asked = min(_part_inside(item, references) for item in diagnosed)
+    covered = min(_part_inside(item, references) for item in diagnosed)
     return [
         max(
-            LEAST_COUNT,
-            1.0 - asked,
+            LEAST_REFERENCE_WEIGHT,
+            1.0 - covered,
             _part_inside(item, [other for other in references if other is not item]),
         )
         for item in references
@@ -110,316 +409,21 @@ def counting(references: Sequence[SampledLog], diagnosed: Sequence[SampledLog]) 
 
 
 def _part_inside(item: SampledLog, others: Sequence[SampledLog]) -> float:
-    """Return the part of a log's rows within the temperatures and SoC of others [-]."""
-    warm = _inside(item, others, "temperature_c", COVERED_K)
-    charged = _inside(item, others, "soc_pct", COVERED_PCT)
-    return float(np.mean(warm & charged))
+    """Return the part of a log's rows within the temperature and SoC ranges of others."""
+    in_temperature = _inside(item, others, "temperature_c", COVERED_K)
+    return float(np.mean(in_temperature & _inside(item, others, "soc_pct", COVERED_PCT)))
 
 
 def _inside(
     item: SampledLog, others: Sequence[SampledLog], name: str, margin: float
 ) -> NDArray[np.bool_]:
-    """Return which rows lie within the range of others; all of them, if there are no others."""
+    """Return which rows lie within the range of others; all rows without others."""
     values = getattr(item.rows, name)
     if not others:
         return np.ones(values.size, dtype=bool)
-    seen = np.concatenate([getattr(other.rows, name) for other in others])
-    return np.asarray((values >= seen.min() - margin) & (values <= seen.max() + margin))
+    known = np.concatenate([getattr(other.rows, name) for other in others])
+    return np.asarray((values >= known.min() - margin) & (values <= known.max() + margin))
 
 
-# --- What all verdicts of one diagnosis rest on: candidates, logs as products, the error to …
-
-SOC_STD_PCT = 0.5
-"""How well a log's assumed initial SoC is known without a cause [%]."""
-
-SLOW_STD, LEVEL_STD = 0.08, 0.03
-"""How much slow polarisation and resistance differ from log to log without a cause, in parts of
-the pack's resistance."""
-
-OWN_PART = 0.01
-"""How much every other effect does, in parts of its physical range."""
-
-ALWAYS_OF_TEMPERATURE = frozenset({"charge_transfer", "inner_temperature"})
-"""Structure that follows the temperature whatever its shape."""
-
-LEAST_INSIDE = 0.2
-"""Rows where neither references nor the model's own logs have been as charged do not count, if the
-others are at least this part of a log."""
-
-
-@dataclass(frozen=True, eq=False)
-class DiagnosisProblem:
-    """The common ground of a diagnosis."""
-
-    model: ExtendedModel
-    """As given, with the references' coefficients and without their structure: all columns but
-    those of temperatures are of it."""
-    options: FitOptions
-    frame: Frame
-    error: ErrorModel
-    references: tuple[DesignMatrix, ...]
-    diagnosed: tuple[DesignMatrix, ...]
-    as_given: ExtendedModel
-    """The model before its temperatures were widened; what the gap is measured from."""
-    covered: bool = True
-    """Whether references have been at the diagnosed logs' temperatures."""
-    acting: ExtendedModel | None = None
-    """The model with the structure that references call for, about which all columns are linear
-    (`columns.log_terms`)."""
-    temperature_step_k: float = 0.0
-    """The coarsest step in which a diagnosed log's temperature is reported [K]."""
-    temperature_source: TemperatureSource = "unknown"
-    """What the model's temperature was measured on."""
-    left_out: tuple[str, ...] = ()
-    """Rows that no pack makes, a sentence each."""
-
-    @cached_property
-    def given_errors_v(self) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...]]:
-        """Errors of the model as given on the references and on the diagnosed logs [V]."""
-        return (
-            tuple(residual(terms.prepared, self.as_given) for terms in self.references),
-            tuple(residual(terms.prepared, self.as_given) for terms in self.diagnosed),
-        )
-
-    @cached_property
-    def reference_grams(self) -> tuple[Gram, ...]:
-        """Products of the references."""
-        return tuple(gram_of(terms, self.frame.scale) for terms in self.references)
-
-    @cached_property
-    def diagnosed_grams(self) -> tuple[Gram, ...]:
-        """Products of the diagnosed logs, weakened where they are driven harder."""
-        return tuple(
-            gram_of(terms, self.frame.scale).weakened(self.hardness(terms))
-            for terms in self.diagnosed
-        )
-
-    @cached_property
-    def judged_grams(self) -> tuple[Gram, ...]:
-        """Products of the diagnosed logs, less of them where references have not been as charged.
-
-        How a pseudo-OCV goes on beyond the charge that it was taught, nobody has seen: what shows
-        there may be the cause or the model. Without enough of other rows, those of all.
-        """
-        prepared = [item.prepared for item in self.references]
-        grams = []
-        for terms, gram in zip(self.diagnosed, self.diagnosed_grams, strict=True):
-            weight = charge_weight(terms.prepared, prepared, self.as_given.model.soc_range_pct)
-            if np.all(weight == 1.0):
-                grams.append(gram)
-            elif np.mean(weight > 0.0) >= LEAST_INSIDE:
-                judged = gram_of(terms, self.frame.scale, weight)
-                grams.append(judged.weakened(self.hardness(terms)))
-        return tuple(grams) or self.diagnosed_grams
-
-    def hardness(self, terms: DesignMatrix) -> float:
-        """Return how much larger a log's error may be than the references', as variance.
-
-        What a voltage model lacks grows with the current, so a log with twice the mean square
-        current gets twice the variance.
-        """
-        if not self.references:
-            return 1.0
-        usual = float(np.mean([_mean_square(each) for each in self.references]))
-        return max(1.0, _mean_square(terms) / max(usual, 1e-12))
-
-
-def build_problem(
-    logs: Sequence[Log],
-    model_file: Model,
-    references: Sequence[Log],
-    effects: Sequence[Effect],
-    *,
-    initial_soc_pct: float | None = None,
-    progress: Callable[[str], None] | None = None,
-) -> DiagnosisProblem:
-    """Prepare everything that the verdicts need.
-
-    Parameters
-    ----------
-    logs, references : sequence of Log
-        Diagnosed logs, which share one cause, and logs on which the model is known to be good.
-    model_file : Model
-    effects : sequence of Effect
-        The library to choose from.
-    initial_soc_pct : float, optional
-        SoC at each log's first row [%].
-    progress : callable, optional
-        Called with a line of text before each long step.
-
-    Raises
-    ------
-    InputError
-        If a log gives no rows, does not match the model's pack, has a dead channel or is given
-        twice, or if neither references nor the model file tell how well the model is known.
-    """
-    given = model_file.extended_model()
-    logs, references, left_out = check_inputs(logs, references, given)
-    model = _over_all_temperatures(given, [*logs, *references])
-    options = FitOptions(
-        capacity_ah=model_file.capacity_ah,
-        initial_soc_pct=initial_soc_pct,
-        rate_hz=model_file.rate_hz,
-        delay_s=model.model.delay_s,
-        epsilon=model_file.epsilon,
-        t_ref_c=model_file.t_ref_c,
-    )
-    if not references and model_file.information is None:
-        raise InputError(
-            "tells nothing of how well its coefficients are known, and there are no references:"
-            " no error can be told from a cause",
-            source=model_file.name,
-            field="information",
-            cure="give logs on which the model is good with --reference",
-        )
-    choices = candidates(effects, model.pack, logs[0].time_s, for_diagnosis=True)
-    say = progress or _silent
-    # Steps are found in the reports, before means blur them.
-    of_logs = [sample_log(resample(dequantize(log)), options) for log in logs]
-    without_start = replace(options, initial_soc_pct=None)
-    of_references = [sample_log(resample(dequantize(log)), without_start) for log in references]
-    covered = not of_references or temperatures_covered(of_references, of_logs)
-    frame = _frame(model_file, choices, has_references=bool(of_references), covered=covered)
-    error = error_from_noise(model_file.noise, model_file.rate_hz, frame)
-    acting: ExtendedModel | None = None
-    terms_of_references: tuple[DesignMatrix, ...] = ()
-    if of_references:
-        say("learning from the references")
-        grams = reference_grams(reference_terms(of_references, model, frame), frame)
-        if len(grams) > 1:
-            least_trust = 0.0 if covered else LEAST_TRUST_BEYOND
-            error = error_from_references(frame, grams, error, least_trust)
-        expected = error if covered or len(grams) == 1 else _beyond_the_references(error)
-        say("repairing the structure")
-        learned = learn(of_references, model, frame, grams, expected)
-        model, acting, frame = learned.model, learned.acting, learned.frame
-        terms_of_references = learned.references
-        if len(grams) > 1:
-            judged = _judged(learned.references, learned.grams, frame, given)
-            weights = counting(of_references, of_logs)
-            error = with_strays(frame, learned.grams, error, weights, judged)
-            error = error if covered else _beyond_the_references(error)
-    diagnosed = []
-    for item in of_logs:
-        say(f"weighing {item.log.name} against every effect")
-        diagnosed.append(design_matrix(item, model, own_choices(choices, model.pack, item), acting))
-    return DiagnosisProblem(
-        model=model,
-        options=options,
-        frame=frame,
-        error=error,
-        references=terms_of_references,
-        diagnosed=tuple(diagnosed),
-        as_given=given,
-        covered=covered,
-        acting=acting,
-        temperature_step_k=max(usual_step_k(log) for log in logs),
-        temperature_source=model_file.temperature_source,
-        left_out=tuple(left_out),
-    )
-
-
-def _judged(
-    references: Sequence[DesignMatrix], grams: Sequence[Gram], frame: Frame, model: ExtendedModel
-) -> list[Gram]:
-    """Return each reference's products as if it were diagnosed beside the others."""
-    found = []
-    for terms, gram in zip(references, grams, strict=True):
-        others = [other.prepared for other in references if other is not terms]
-        weight = charge_weight(terms.prepared, others, model.model.soc_range_pct)
-        whole = bool(np.all(weight == 1.0)) or np.mean(weight > 0.0) < LEAST_INSIDE
-        found.append(gram if whole else gram_of(terms, frame.scale, weight))
-    return found
-
-
-def _frame(
-    model_file: Model,
-    choices: Sequence[Candidate],
-    *,
-    has_references: bool,
-    covered: bool,
-) -> Frame:
-    # References that were never so cold cannot have shown what resistance does there.
-    repairs = tuple(
-        k
-        for k, choice in enumerate(choices)
-        if has_references
-        and choice.effect.is_structure
-        and (covered or not _follows_temperature(choice))
-    )
-    own, own_prior = _own(choices, model_file)
-    information = model_file.information
-    root, scale = None, np.ones(9 + len(model_file.delays_s))
-    if information is not None:
-        root, scale = np.array(information.root), np.array(information.scale)
-    return Frame(tuple(choices), root, scale, repairs, own, own_prior)
-
-
-def _follows_temperature(choice: Candidate) -> bool:
-    return choice.effect.id in ALWAYS_OF_TEMPERATURE or bool(choice.shape.get("activation_k"))
-
-
-def _own(choices: Sequence[Candidate], model_file: Model) -> tuple[tuple[int, ...], FloatArray]:
-    """Return by which candidates logs may differ, every effect, and how much at first.
-
-    At their usual shapes: what little logs differ by has no more of a shape than that.
-    """
-    by_effect: dict[str, dict[tuple[object, ...], int]] = {}
-    for k, choice in enumerate(choices):
-        if choice.effect.is_cause and choice.is_for_fit:
-            # The first of one shape is what an effect does when it is small. What it does when it
-            # is large differs from log to log by a cause alone.
-            of_one = by_effect.setdefault(choice.effect.id, {})
-            of_one.setdefault(tuple(choice.shape.items()), k)
-    noise = model_file.noise
-    constant_v = max(noise.lasting_std_v, 0.25 * math.hypot(noise.fast_std_v, noise.slow_std_v))
-    own: list[int] = []
-    stds: list[float] = []
-    for effect_id, of_one in by_effect.items():
-        for k in of_one.values():
-            widths = choices[k].bounds[:, 1] - choices[k].bounds[:, 0]
-            usual = {"voltage_offset": [constant_v], "initial_soc": [SOC_STD_PCT]}.get(
-                effect_id, (OWN_PART * widths).tolist()
-            )
-            # All shapes together make up what the effect may differ by.
-            stds.extend(std / math.sqrt(len(of_one)) for std in usual)
-            own.append(k)
-    return tuple(own), np.array([*stds, SLOW_STD, LEVEL_STD])
-
-
-def _over_all_temperatures(model: ExtendedModel, logs: Sequence[Log]) -> ExtendedModel:
-    """Return the model with its temperature and current ranges widened to those of the logs.
-
-    It is about to learn from them; where it held the temperature at the edge of what it had seen,
-    it may now follow. Its SoC stays as it is: beyond, the pseudo-OCV's formula is not to be used.
-    """
-    low, high = model.model.temperature_range_c
-    least, most = model.model.current_range_a
-    for log in logs:
-        low, high = (
-            min(low, float(log.temperature_c.min())),
-            max(high, float(log.temperature_c.max())),
-        )
-        least, most = min(least, float(log.current_a.min())), max(most, float(log.current_a.max()))
-    voltage_model = replace(
-        model.model, temperature_range_c=(low, high), current_range_a=(least, most)
-    )
-    return replace(model, model=voltage_model)
-
-
-def _beyond_the_references(error: ErrorModel) -> ErrorModel:
-    """Return the error to expect at temperatures that no reference has.
-
-    How well the model follows from row to row there, and how far it strays, nobody has seen: all
-    scales are given the variance of the slowest.
-    """
-    return replace(error, scale_v2=(error.lasting_v2,) * len(error.scale_v2), strays={})
-
-
-def _mean_square(terms: DesignMatrix) -> float:
-    current = terms.prepared.rows.delayed_current_a[:, 0]
-    return float(np.mean(current**2))
-
-
-def _silent(_text: str) -> None:
-    """Say nothing."""
+def _mean_square_current(matrix: DesignMatrix) -> float:
+    return float(np.mean(matrix.prepared.rows.delayed_current_a[:, 0] ** 2))

@@ -60,8 +60,8 @@ def _midpoints(values: FloatArray, change: IntArray) -> FloatArray:
     return np.asarray(0.5 * (values[change] + values[change + 1]))
 
 
-def resample(log: Log) -> Log:
-    """Return a log averaged over bins of 1 / `ENOUGH_HZ`.
+def resample(log: Log, rate_hz: float = ENOUGH_HZ) -> Log:
+    """Return a log averaged over bins of 1 / `rate_hz`.
 
     A diagnosis tries hundreds of effects over all samples; none of them acts within less than a
     few tenths of a second, while a car's bus brings a hundred samples a second.
@@ -70,9 +70,9 @@ def resample(log: Log) -> Log:
     another, charge and unobserved intervals are kept. The reference SoC is the first finite value
     of each bin.
     """
-    if len(log) < 2 or float(np.median(np.diff(log.time_s))) * 2.0 * ENOUGH_HZ > 1.0:
+    if len(log) < 2 or float(np.median(np.diff(log.time_s))) * 2.0 * rate_hz > 1.0:
         return log
-    bins = np.floor((log.time_s - log.time_s[0]) * ENOUGH_HZ)
+    bins = np.floor((log.time_s - log.time_s[0]) * rate_hz)
     first = np.flatnonzero(np.diff(bins, prepend=-1.0))
     counts = np.diff(first, append=len(log))
 

@@ -13,19 +13,21 @@ from bokeh.palettes import Viridis256
 
 from cangauge._formatting import number, significant, span
 from cangauge._typing import FloatArray
-from cangauge.diagnosis.cross_validation import LogErrors, errors_before_and_after, rms
-from cangauge.diagnosis.diagnose import Diagnosis, in_words
-from cangauge.diagnosis.error_breakdown import (
-    APART_S,
-    LEAST_ROWS,
-    Around,
+from cangauge.diagnosis import (
+    MIN_BIN_ROWS,
+    NONE,
+    SEGMENT_S,
+    UNKNOWN,
+    Diagnosis,
     ErrorMap,
-    Moment,
-    Place,
-    around,
+    ErrorShare,
+    LogErrors,
+    SegmentSignals,
+    WorstSegment,
     error_map,
+    rms,
+    segment_signals,
 )
-from cangauge.diagnosis.posterior import NONE, UNKNOWN
 from cangauge.model.effects.library import LIBRARY
 from cangauge.report.charts import (
     BLACK,
@@ -98,27 +100,30 @@ def gap_report(diagnosis: Diagnosis, model: InputFile | None = None) -> str:
 
 def gap_page(diagnosis: Diagnosis, model: InputFile | None = None) -> Page:
     """Return the report's content (see `gap_report`); `figures` holds the bokeh figures."""
-    settled = diagnosis.settled
-    logs = [terms.prepared.log for terms in settled.diagnosed]
-    references = [terms.prepared.log for terms in settled.references]
-    errors = errors_before_and_after(settled, diagnosis.extension.model)
+    problem = diagnosis.problem
+    logs = [terms.prepared.log for terms in problem.diagnosed]
+    references = [terms.prepared.log for terms in problem.references]
+    errors = diagnosis.log_errors()
     extended = _extended_name(diagnosis)
     sections = [
         Section("How large the gap is", _size(diagnosis, extended)),
-        Section("Where the gap is", [*_maps(errors, extended), *share_figures(diagnosis.where)]),
+        Section(
+            "Where the gap is",
+            [*_maps(errors, extended), *share_figures(diagnosis.error_breakdown)],
+        ),
         Section("Cause", _cause(diagnosis)),
         Section("How far the gap closes", [_closing(diagnosis), *_over_time(errors, extended)]),
-        Section("Worst moments", _moments(diagnosis.worst, errors, extended)),
+        Section("Worst moments", _moments(diagnosis.worst_segments, errors, extended)),
         Section("What these logs can show", [_observability(diagnosis)]),
         Section("Method", [Bullets(_method(diagnosis))]),
     ]
-    caveats = [text for text in (open_question(diagnosis), *diagnosis.limits) if text]
+    caveats = [text for text in (open_question(diagnosis), *diagnosis.caveats) if text]
     if caveats:
         sections.insert(0, Section("What these logs cannot show", [Bullets(caveats)]))
     title = f"Diagnosis of {joined([log.name for log in logs])}"
     if model is not None:
         title += f" with model {model.name}"
-    size, verdict = headline(diagnosis), in_words(diagnosis)
+    size, verdict = headline(diagnosis), diagnosis.summary
     return Page(
         title=title,
         lead=size or verdict,
@@ -139,7 +144,7 @@ def _extended_name(diagnosis: Diagnosis) -> str:
     accepted = diagnosis.extension.cause
     if accepted:
         return f"with {' and '.join(accepted)}"
-    return "adapted to the references" if diagnosis.settled.references else "nothing added"
+    return "adapted to the references" if diagnosis.problem.references else "nothing added"
 
 
 def _tiles(diagnosis: Diagnosis) -> list[Tile]:
@@ -150,7 +155,7 @@ def _tiles(diagnosis: Diagnosis) -> list[Tile]:
         Tile("Error of the model", number(diagnosis.baseline_rmse_v, 2, "V"), "RMS, these logs"),
         Tile("Extended model", number(diagnosis.extended_rmse_v, 2, "V"), "RMS, held-out rows"),
         Tile(
-            "Floor: references" if diagnosis.settled.references else "Floor: model file",
+            "Floor: references" if diagnosis.problem.references else "Floor: model file",
             number(diagnosis.floor_v, 2, "V"),
             "RMS, model as given",
         ),
@@ -163,11 +168,11 @@ def _tiles(diagnosis: Diagnosis) -> list[Tile]:
                 "RMS, adapted to references",
             )
         )
-    if diagnosis.closed is not None:
+    if diagnosis.closed_fraction is not None:
         hint = "of the squared gap above the floor"
-        if diagnosis.closed_ci is not None:
-            hint = f"squared; 95 %: {percent_span(*diagnosis.closed_ci)}"
-        tiles.append(Tile("Gap closed", _percent(diagnosis.closed), hint))
+        if diagnosis.closed_fraction_ci is not None:
+            hint = f"squared; 95 %: {percent_span(*diagnosis.closed_fraction_ci)}"
+        tiles.append(Tile("Gap closed", _percent(diagnosis.closed_fraction), hint))
     if before is not None:
         tiles.append(
             Tile(
@@ -187,12 +192,12 @@ def _percent(fraction: float) -> str:
 
 
 def _size(diagnosis: Diagnosis, extended: str) -> list[Block]:
-    settled = diagnosis.settled
-    soc = np.concatenate([terms.prepared.rows.soc_pct for terms in settled.diagnosed])
-    slope_v_per_pct = float(np.median(settled.as_given.model.pseudo_ocv_slope(soc)))
+    problem = diagnosis.problem
+    soc = np.concatenate([terms.prepared.rows.soc_pct for terms in problem.diagnosed])
+    slope_v_per_pct = float(np.median(problem.given.model.pseudo_ocv_slope(soc)))
     floor = (
         ("floor: references", "the references, model as given: sensors and what does not repeat")
-        if settled.references
+        if problem.references
         else ("floor: model file", "the model file's own statement, in place of references")
     )
     entries = [
@@ -234,7 +239,7 @@ def _size(diagnosis: Diagnosis, extended: str) -> list[Block]:
 
 def _size_caption(diagnosis: Diagnosis) -> str:
     ratio = number(diagnosis.baseline_rmse_v / max(diagnosis.floor_v, 1e-9), 1)
-    floor = "that on the references" if diagnosis.settled.references else "what its file states"
+    floor = "that on the references" if diagnosis.problem.references else "what its file states"
     text = f"The model's error on these logs is {ratio} times {floor}."
     if diagnosis.explainable_v is None:
         return f"{text} The second floor, the error of an adapted model, needs more references."
@@ -321,13 +326,13 @@ def _heat_map(each: ErrorMap, axis: tuple[str, str], largest_v: float) -> Plot:
 
 def _map_caption(each: ErrorMap, unit: str) -> str:
     if not np.isfinite(each.rms_v).any():
-        return f"No bin holds {LEAST_ROWS} rows: the logs are too short for a map."
+        return f"No bin holds {MIN_BIN_ROWS} rows: the logs are too short for a map."
     up, across = np.unravel_index(int(np.nanargmax(each.rms_v)), each.rms_v.shape)
     low, high = each.soc_edges_pct[across], each.soc_edges_pct[across + 1]
     return (
         f"Largest {number(float(each.rms_v[up, across]), 2, 'V')} (mean"
         f" {number(float(each.mean_v[up, across]), 2, 'V')}) at {span(low, high, 0, '%')} SoC and"
-        f" {_bin_range(each, int(up), unit)}. Bins with fewer than {LEAST_ROWS} rows are empty."
+        f" {_bin_range(each, int(up), unit)}. Bins with fewer than {MIN_BIN_ROWS} rows are empty."
         + (" The top and bottom bins include everything beyond." if each.tails else "")
     )
 
@@ -348,7 +353,7 @@ def _digits(width: float) -> int:
     return max(0, math.ceil(math.log10(2.0 / max(width, 1e-6))))
 
 
-def share_figures(places: Sequence[Place]) -> list[Block]:
+def share_figures(places: Sequence[ErrorShare]) -> list[Block]:
     """Return the shares of the squared error over every axis, two figures in a row."""
     figures = []
     for axis, (quantity, unit) in _AXES.items():
@@ -370,7 +375,7 @@ def share_figures(places: Sequence[Place]) -> list[Block]:
     return [Beside(figures[at : at + 2]) for at in range(0, len(figures), 2)]
 
 
-def _place_range(place: Place, digits: int) -> str:
+def _place_range(place: ErrorShare, digits: int) -> str:
     """Return a place's range in words, in the unit of `_AXES`."""
     if place.axis == "rest":
         return "rest" if place.low > 0.0 else "drive"
@@ -382,7 +387,7 @@ def _place_range(place: Place, digits: int) -> str:
     return span(place.low, place.high, digits)
 
 
-def _share_bars(places: Sequence[Place], digits: int) -> Plot:
+def _share_bars(places: Sequence[ErrorShare], digits: int) -> Plot:
     ranges = [_place_range(place, digits) for place in places]
     plot = new_figure(
         ("share of the squared error", ""),
@@ -426,7 +431,7 @@ def _cause(diagnosis: Diagnosis) -> list[Block]:
     shown = diagnosis.candidates[:_SHOWN_CANDIDATES]
     names = [*(str(item["effect"]) for item in shown), UNKNOWN, NONE]
     probabilities = [
-        (name, 100.0 * verdict.chances[name], BLUE if name == verdict.cause else GREY)
+        (name, 100.0 * verdict.probabilities[name], BLUE if name == verdict.cause else GREY)
         for name in names
     ]
     rows = [
@@ -481,13 +486,14 @@ def _closing(diagnosis: Diagnosis) -> Paragraph:
     text = f"RMS error on held-out rows: {before} with the model as given, {after} extended."
     if diagnosis.extended_rmse_v > diagnosis.baseline_rmse_v:
         text += " The extended model is worse: do not run it."
-    elif diagnosis.closed is not None:
+    elif diagnosis.closed_fraction is not None:
         interval = ""
-        if diagnosis.closed_ci is not None:
-            interval = f" (95 % interval {percent_span(*diagnosis.closed_ci)})"
-        text += f" This closes {_percent(diagnosis.closed)}{interval} of the squared gap above the"
+        if diagnosis.closed_fraction_ci is not None:
+            interval = f" (95 % interval {percent_span(*diagnosis.closed_fraction_ci)})"
+        closed = _percent(diagnosis.closed_fraction)
+        text += f" This closes {closed}{interval} of the squared gap above the"
         text += " floor."
-    if diagnosis.settled.references:
+    if diagnosis.problem.references:
         cause = "the cause and " if diagnosis.extension.cause else "no cause, only "
         text += (
             f" The extended model has {cause}what the references show: adjusted coefficients, and"
@@ -551,9 +557,11 @@ def _log_table(errors: Sequence[LogErrors]) -> Table:
 # The worst moments as small multiples: error before and after, and current, a minute around.
 
 
-def _moments(moments: Sequence[Moment], errors: Sequence[LogErrors], extended: str) -> list[Block]:
+def _moments(
+    moments: Sequence[WorstSegment], errors: Sequence[LogErrors], extended: str
+) -> list[Block]:
     """Return a figure for each moment, all on the same scales, and their table."""
-    nearby = [around(moment, errors) for moment in moments]
+    nearby = [segment_signals(moment, errors) for moment in moments]
     volts = _common_range([part for each in nearby for part in (each.before_v, each.after_v)])
     amperes = _common_range([each.current_a for each in nearby])
     figures, rows = [], []
@@ -598,9 +606,9 @@ def _common_range(values: Sequence[FloatArray]) -> tuple[float, float]:
 
 
 def _moment_plot(
-    each: Around, volts: tuple[float, float], amperes: tuple[float, float], extended: str
+    each: SegmentSignals, volts: tuple[float, float], amperes: tuple[float, float], extended: str
 ) -> Plot:
-    x_range = Range1d(-APART_S, APART_S)
+    x_range = Range1d(-SEGMENT_S, SEGMENT_S)
     error = new_figure(
         ("", "measured − model"), "$name: @y{0.00} V<br>at @x{0.0} s", units=("", "V"),
         height=190, x_range=x_range,
@@ -651,12 +659,12 @@ def _observability(diagnosis: Diagnosis) -> Table:
 
 
 def _method(diagnosis: Diagnosis) -> list[str]:
-    settled = diagnosis.settled
-    error = settled.error
-    rows = sum(terms.residual_v.size for terms in settled.diagnosed)
-    names = ", ".join(terms.prepared.log.name for terms in settled.diagnosed)
+    problem = diagnosis.problem
+    error = problem.error
+    rows = sum(terms.residual_v.size for terms in problem.diagnosed)
+    names = ", ".join(terms.prepared.log.name for terms in problem.diagnosed)
     remarks = [
-        f"Diagnosed: {names} ({rows:,} rows); references: {len(settled.references)}.",
+        f"Diagnosed: {names} ({rows:,} rows); references: {len(problem.references)}.",
         f"Expected error without a fault: {error.rmse_v:.2f} V, weighted by time scale:"
         f" {error.scale_v2[0] ** 0.5:.2f} V from row to row,"
         f" {error.lasting_v2**0.5:.2f} V·√row over many minutes.",
@@ -664,7 +672,7 @@ def _method(diagnosis: Diagnosis) -> list[str]:
         " log are marginalised; then every effect is compared with none.",
         *diagnosis.extension.remarks,
     ]
-    if not settled.references:
+    if not problem.references:
         remarks.append(
             "Without references the model file's own noise is the floor: give logs on which the"
             " model is known to be good with --reference."

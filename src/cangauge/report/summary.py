@@ -6,8 +6,7 @@ import math
 from typing import Any, Final
 
 from cangauge._formatting import number, significant, span
-from cangauge.diagnosis.diagnose import EVEN, Diagnosis
-from cangauge.diagnosis.posterior import NONE, UNKNOWN
+from cangauge.diagnosis import LIKELY, NONE, UNKNOWN, Diagnosis
 from cangauge.identify.effect_search import FittedEffects
 from cangauge.model.effects.library import LIBRARY
 
@@ -75,7 +74,7 @@ def headline(diagnosis: Diagnosis) -> str:
     if verdict.cause in {NONE, UNKNOWN}:
         return ""
     names = [verdict.cause, *verdict.ambiguous_with]
-    together = sum(verdict.chances[name] for name in names)
+    together = sum(verdict.probabilities[name] for name in names)
     causes = f"{' or '.join(names)} (probability {together:.2f}{' together' if names[1:] else ''})"
     size = _size(diagnosis)
     return f"{size}: {causes}." if size else f"The most likely cause is {causes}."
@@ -111,7 +110,7 @@ def next_step(diagnosis: Diagnosis) -> str:
 
 def open_question(diagnosis: Diagnosis) -> str:
     """Return what the verdict leaves open; "" for a clear cause."""
-    verdict, references = diagnosis.verdict, diagnosis.settled.references
+    verdict, references = diagnosis.verdict, diagnosis.problem.references
     baseline = number(diagnosis.baseline_rmse_v, 2, "V")
     if verdict.cause == NONE:
         learned = ""
@@ -132,7 +131,7 @@ def open_question(diagnosis: Diagnosis) -> str:
             " act at once, or the model is not of this pack."
         )
     sentences = []
-    if verdict.probability < EVEN:
+    if verdict.probability < LIKELY:
         sentences.append(
             f"{verdict.cause} is the most likely cause, but its probability is only"
             f" {verdict.probability:.2f}: do not act on it alone."

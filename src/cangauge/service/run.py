@@ -52,7 +52,7 @@ class Service:
     ----------
     config : RunConfig
         The configuration in use, except for keys that need a restart.
-    gauge : Pipeline
+    pipeline : Pipeline
         The estimator.
     on_status : callable or None
         Takes a `Snapshot` four times a second while the service runs.
@@ -89,7 +89,7 @@ class Service:
         self._state = loaded.state_settings(os.environ)
         vehicle = loaded.load_vehicle()
         self._vehicle_key = _vehicle_key(loaded, vehicle)
-        self.gauge = Pipeline(vehicle, Model.load(loaded.model), loaded.gauge_settings())
+        self.pipeline = Pipeline(vehicle, Model.load(loaded.model), loaded.pipeline_settings())
         self._address = loaded.address()
         self._stop = threading.Event()
         self._reload = threading.Event()
@@ -118,7 +118,7 @@ class Service:
         CangaugeError
             If the bus, the recording or an address cannot be opened.
         """
-        config, gauge = self.config, self.gauge
+        config, pipeline = self.config, self.pipeline
         with ExitStack() as stack:
             # Signals first: the service may be stopped at any moment after its start.
             stop, hangup = self._stop.is_set, self._take_reload
@@ -127,11 +127,11 @@ class Service:
                 hung_up = stack.enter_context(note_hangups())
                 stop = lambda: signalled() or self._stop.is_set()  # noqa: E731
                 hangup = lambda: hung_up() or self._take_reload()  # noqa: E731
-            port = stack.enter_context(ReconnectingBus(self._address, gauge.filters))
+            port = stack.enter_context(ReconnectingBus(self._address, pipeline.filters))
             port.open(wait=config.wait_for_bus)
             recorder = table = keeper = None
             if self._state is not None:
-                keeper = stack.enter_context(StateKeeper(self._state, gauge))
+                keeper = stack.enter_context(StateKeeper(self._state, pipeline))
             if config.record is not None:
                 recorder = stack.enter_context(Recorder(config.record, config.record_limits()))
             if config.output is not None:
@@ -149,9 +149,9 @@ class Service:
                 stepped=monitor.stepped,
                 sent=monitor.sent,
             )
-            summary = serve(port, gauge, config.loop_settings(), outputs, stop)
-        emit(_LOG, logging.INFO, "service.stopped", summary_line(gauge, port, summary))
-        if not gauge.counts.frames:
+            summary = serve(port, pipeline, config.loop_settings(), outputs, stop)
+        emit(_LOG, logging.INFO, "service.stopped", summary_line(pipeline, port, summary))
+        if not pipeline.counts.frames:
             emit(
                 _LOG,
                 logging.WARNING,
@@ -167,7 +167,7 @@ class Service:
         }
         for path in filter(None, written.values()):
             emit(_LOG, logging.INFO, "file.written", f"written: {path}", limit=path, path=path)
-        return summary_json(gauge, port, summary) | {"state": config.state} | written
+        return summary_json(pipeline, port, summary) | {"state": config.state} | written
 
     def reconfigure(self) -> LoopSettings | None:
         """Read the configuration again and apply it as a whole; the SoC continues.
@@ -184,10 +184,10 @@ class Service:
             config = self._read()
             vehicle, model = config.load_vehicle(), Model.load(config.model)
             key = _vehicle_key(config, vehicle)
-            settings = config.gauge_settings()
-            started = self.gauge.settings
+            settings = config.pipeline_settings()
+            started = self.pipeline.settings
             ids = replace(settings.ids, replay_clock=started.ids.replay_clock)
-            self.gauge.reconfigure(
+            self.pipeline.reconfigure(
                 None if key == self._vehicle_key else vehicle,
                 model,
                 replace(settings, ids=ids, time_source=started.time_source),
@@ -211,9 +211,9 @@ class Service:
             settings = self.reconfigure()
             monitor.identity = replace(
                 monitor.identity,
-                vehicle=self.gauge.vehicle.name,
+                vehicle=self.pipeline.vehicle.name,
                 model=self.config.model,
-                method=self.gauge.settings.estimator.method,
+                method=self.pipeline.settings.estimator.method,
             )
         return settings
 
@@ -230,7 +230,7 @@ class Service:
     @contextmanager
     def _supervised(self, port: ReconnectingBus, recorder: Recorder | None) -> Iterator[Monitor]:
         """Yield the monitor, with its status served and systemd notified."""
-        config, vehicle = self.config, self.gauge.vehicle.name
+        config, vehicle = self.config, self.pipeline.vehicle.name
         identity = Identity(
             bus=port.name,
             vehicle=vehicle,
@@ -243,7 +243,7 @@ class Service:
             notifier = Notifier.from_environment()
             stack.callback(notifier.close)
             monitor = Monitor(
-                self.gauge, port, identity=identity, notifier=notifier, record=recorder
+                self.pipeline, port, identity=identity, notifier=notifier, record=recorder
             )
             _serve_status(config, monitor, stack)
             emit(
@@ -323,9 +323,9 @@ def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None
         )
 
 
-def summary_line(gauge: Pipeline, port: ReconnectingBus, summary: RunSummary) -> str:
+def summary_line(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary) -> str:
     """Return a run's frames, losses and last SoC in one line."""
-    counts, latest = gauge.counts, gauge.latest
+    counts, latest = pipeline.counts, pipeline.latest
     soc = f"{number(latest.soc_pct, 2)} ± {number(latest.soc_std_pct, 2, '%')}"
     step = number(summary.step_p50_us, 0, "µs")
     return (
@@ -348,9 +348,9 @@ def _bus_errors(port: ReconnectingBus, summary: RunSummary) -> str:
     return "".join(f", {count} {what}" for what, count in found.items() if count)
 
 
-def summary_json(gauge: Pipeline, port: ReconnectingBus, summary: RunSummary) -> dict[str, Any]:
+def summary_json(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary) -> dict[str, Any]:
     """Return the summary that `--json` prints."""
-    counts, latest = gauge.counts, gauge.latest
+    counts, latest = pipeline.counts, pipeline.latest
     return {
         "bus": port.name,
         "seconds": summary.seconds,
@@ -390,5 +390,5 @@ def summary_json(gauge: Pipeline, port: ReconnectingBus, summary: RunSummary) ->
             "status": latest.status.name.lower(),
             "reasons": reason_names(int(latest.reasons)),
         },
-        "soc_reference_pct": gauge.decoder.reference_soc_pct,
+        "soc_reference_pct": pipeline.decoder.reference_soc_pct,
     }

@@ -107,7 +107,7 @@ class StateKeeper:
     Parameters
     ----------
     settings : StateSettings
-    gauge : Pipeline
+    pipeline : Pipeline
     wall_s : callable
         Unix time [s].
     """
@@ -115,14 +115,14 @@ class StateKeeper:
     def __init__(
         self,
         settings: StateSettings,
-        gauge: Pipeline,
+        pipeline: Pipeline,
         *,
         wall_s: Callable[[], float] = time.time,
     ) -> None:
         self.settings = settings
-        self._gauge = gauge
-        self._model = gauge.model
-        self._fingerprint = model_fingerprint(gauge.model)
+        self._pipeline = pipeline
+        self._model = pipeline.model
+        self._fingerprint = model_fingerprint(pipeline.model)
         self._wall_s = wall_s
         self._boot_id = boot_id()
         self._writer = AsyncWriter("cangauge-state", on_error=self._failed)
@@ -150,22 +150,22 @@ class StateKeeper:
     def checkpoint(self) -> None:
         """Start writing the state, if a sample came since the last time; return at once."""
         self._log_verdict()
-        if self._gauge.samples == self._samples_kept:
+        if self._pipeline.samples == self._samples_kept:
             return
-        state = self._gauge.snapshot()
+        state = self._pipeline.snapshot()
         if state is None:
             return
-        self._samples_kept = self._gauge.samples
-        if self._gauge.model is not self._model:
+        self._samples_kept = self._pipeline.samples
+        if self._pipeline.model is not self._model:
             # The configuration was read again.
-            self._model = self._gauge.model
+            self._model = self._pipeline.model
             self._fingerprint = model_fingerprint(self._model)
         content = StateContent.model_construct(
             saved_s=self._wall_s(),
             boot_id=self._boot_id,
             model=self._fingerprint,
             model_name=self._model.name[:200],
-            time_source=self._gauge.settings.time_source,
+            time_source=self._pipeline.settings.time_source,
             estimator=state,
         )
         self._writer.replace(partial(self._write, content))
@@ -179,7 +179,7 @@ class StateKeeper:
         try:
             content = read_state(path)
             age_s = self._checked_age(content)
-            latest = self._gauge.restore(content.estimator, age_s)
+            latest = self._pipeline.restore(content.estimator, age_s)
         except FileNotFoundError:
             emit(_LOG, logging.INFO, "state.none", f"{path}: no state yet; starting without")
             return
@@ -201,7 +201,7 @@ class StateKeeper:
                 source=path,
                 field="content.model",
             )
-        time_source = self._gauge.settings.time_source
+        time_source = self._pipeline.settings.time_source
         if content.time_source != time_source:
             raise InputError(
                 f"saved with time source {content.time_source}, now it is {time_source}",
@@ -237,7 +237,7 @@ class StateKeeper:
         # counting alone would never correct it.
         how = (
             "by voltage, for the given SoC is of an earlier start"
-            if self._gauge.discard_initial_soc()
+            if self._pipeline.discard_initial_soc()
             else "without"
         )
         text = f"state refused: {error}{kept}; starting {how}"
@@ -256,11 +256,11 @@ class StateKeeper:
         write_text_atomic(self.settings.path, state_text(content))
 
     def _log_verdict(self) -> None:
-        verdict = self._gauge.estimator.filter.verdict
+        verdict = self._pipeline.estimator.filter.verdict
         if self._restored_pct is None or verdict in {"", "open"}:
             return
         before, self._restored_pct = self._restored_pct, None
-        latest = self._gauge.latest
+        latest = self._pipeline.latest
         soc = f"{number(latest.soc_pct, 1)} ± {number(latest.soc_std_pct, 1, '%')}"
         words = {
             "parked": f"the voltage confirms the restored SoC; now {soc}",

@@ -303,7 +303,7 @@ class Monitor:
 
     Parameters
     ----------
-    gauge : Pipeline
+    pipeline : Pipeline
     port : BusConnection
     identity : Identity
     notifier : Notifier
@@ -321,7 +321,7 @@ class Monitor:
 
     def __init__(
         self,
-        gauge: Pipeline,
+        pipeline: Pipeline,
         port: BusConnection,
         *,
         identity: Identity,
@@ -329,7 +329,7 @@ class Monitor:
         record: Recorder | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._gauge = gauge
+        self._pipeline = pipeline
         self._port = port
         self.identity = identity
         self._notifier = notifier
@@ -398,20 +398,20 @@ class Monitor:
         return True
 
     def _snapshot(self, now_s: float) -> Snapshot:
-        gauge = self._gauge
-        samples = gauge.samples
+        pipeline = self._pipeline
+        samples = pipeline.samples
         since_s, before = self._rate_from
         if now_s - since_s >= RATE_OVER_S:
             self._rate = (samples - before) / (now_s - since_s)
             self._rate_from = (now_s, samples)
-        counters = gauge.decoder.statistics
+        counters = pipeline.decoder.statistics
         rejects = _rejects(counters)
         return Snapshot(
             identity=self.identity,
             made_s=now_s,
             uptime_s=now_s - self._began_s,
-            estimate=gauge.published,
-            sample=gauge.latest_sample,
+            estimate=pipeline.published,
+            sample=pipeline.latest_sample,
             sample_age_s=now_s - self._sample_s,
             samples=samples,
             samples_per_s=self._rate,

@@ -22,8 +22,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from cangauge.diagnosis.diagnose import diagnose
-from cangauge.diagnosis.extended_model import model_file_of
+from cangauge.diagnosis import diagnose
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 
@@ -43,9 +42,8 @@ def answer(request: dict[str, Any]) -> dict[str, Any]:
             leave_out=request.get("leave_out", ()),
         )
         if request.get("extended") is not None:
-            better = model_file_of(found.extension, model, found.extended_rmse_v)
-            better.save(Path(request["extended"]))
-        whole = found.to_dict(request.get("extended"))
+            found.extended_model.save(Path(request["extended"]))
+        whole = found.to_dict(request.get("extended"), soc_error=False)
     except Exception as error:  # noqa: BLE001 - a crash counts as a wrong answer
         return {
             "error": f"{type(error).__name__}: {error}",

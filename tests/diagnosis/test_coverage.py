@@ -1,4 +1,4 @@
-"""Which temperatures references teach, beyond those that they have been at."""
+"""Coverage: temperatures and SoC that the references cover."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cangauge.diagnosis.problem import BEYOND_WEIGHT, charge_weight, temperatures_covered
+from cangauge.diagnosis.problem import BEYOND_WEIGHT, soc_weight, temperatures_covered
 from cangauge.model.effects.base import Pack
 from cangauge.model.effects.library import LIBRARY, candidates
 
@@ -26,11 +26,11 @@ def log(low_c: float, high_c: float) -> Any:
         ((0.0, 30.0), (-6.0, -4.0), True),  # few below many
         ((0.0, 30.0), (-20.0, -14.0), False),
         ((16.0, 32.0), (36.0, 39.0), True),
-        ((16.0, 32.0), (9.0, 12.0), False),  # as far below: the cold is another matter
+        ((16.0, 32.0), (9.0, 12.0), False),  # as far below: resistance rises in the cold
         ((16.0, 32.0), (5.0, 27.0), True),  # most rows inside
     ],
 )
-def test_a_pack_is_known_a_little_beyond_its_temperatures(
+def test_references_cover_a_little_more_than_their_temperatures(
     references_c: tuple[float, float], log_c: tuple[float, float], covered: bool
 ) -> None:
     middle = sum(references_c) / 2.0
@@ -38,19 +38,19 @@ def test_a_pack_is_known_a_little_beyond_its_temperatures(
     assert temperatures_covered(references, [log(*log_c)]) is covered
 
 
-def at_charge(*soc_pct: float) -> Any:
+def at_soc(*soc_pct: float) -> Any:
     return SimpleNamespace(rows=SimpleNamespace(soc_pct=np.array(soc_pct)))
 
 
-def test_a_pseudo_ocv_is_known_best_where_references_have_been() -> None:
-    references = [at_charge(40.0, 50.0), at_charge(70.0, 60.0)]
-    log = at_charge(20.0, 36.0, 38.0, 55.0, 72.0, 74.0, 92.0)
-    weight = charge_weight(log, references, (30.0, 90.0))
+def test_rows_outside_the_references_soc_count_less() -> None:
+    references = [at_soc(40.0, 50.0), at_soc(70.0, 60.0)]
+    log = at_soc(20.0, 36.0, 38.0, 55.0, 72.0, 74.0, 92.0)
+    weight = soc_weight(log, references, (30.0, 90.0))
     assert weight.tolist() == [0.0, BEYOND_WEIGHT, 1.0, 1.0, 1.0, BEYOND_WEIGHT, 0.0]
-    assert np.all(charge_weight(at_charge(10.0, 90.0), [], (30.0, 80.0)) == 1.0)
+    assert np.all(soc_weight(at_soc(10.0, 90.0), [], (30.0, 80.0)) == 1.0)
 
 
-def test_a_diagnosis_tries_spread_diffusion_and_a_fit_does_not() -> None:
+def test_only_a_diagnosis_tries_spread_diffusion() -> None:
     pack = Pack(voltage_v=360.0, capacity_ah=60.0, resistance_ohm=0.1, cells=96)
     tried = [
         {

@@ -1,4 +1,4 @@
-"""Fast logs are averaged for a diagnosis: charge, pauses and times stay what they are."""
+"""Resampling of fast logs keeps charge, pauses and times."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def drive(rate_hz: float, seconds: float = 120.0, pause_s: float = 0.0) -> Log:
 
 
 @pytest.mark.parametrize("rate_hz", [0.5, 1.0, 10.0, 20.0, 39.0])
-def test_a_log_that_is_not_fast_stays_itself(rate_hz: float) -> None:
+def test_a_slow_log_is_unchanged(rate_hz: float) -> None:
     log = drive(rate_hz)
     assert resample(log) is log
 
 
 @pytest.mark.parametrize("rate_hz", [50.0, 100.0, 333.0])
-def test_a_fast_log_keeps_its_charge_and_what_goes_with_what(rate_hz: float) -> None:
+def test_a_fast_log_keeps_its_charge_and_alignment(rate_hz: float) -> None:
     log = drive(rate_hz, pause_s=50.0)
     few = resample(log)
     assert len(few) == pytest.approx(120.0 * ENOUGH_HZ, abs=2)
@@ -41,15 +41,15 @@ def test_a_fast_log_keeps_its_charge_and_what_goes_with_what(rate_hz: float) -> 
     assert few.soc_pct[0] == log.soc_pct[0]
 
 
-def test_a_soc_that_comes_more_slowly_than_the_current_is_kept() -> None:
+def test_a_soc_slower_than_the_current_is_kept() -> None:
     log = drive(100.0)
-    told = np.where(np.arange(len(log)) % 100 == 3, log.soc_pct, np.nan)
-    few = resample(replace(log, soc_pct=told))
+    known = np.where(np.arange(len(log)) % 100 == 3, log.soc_pct, np.nan)
+    few = resample(replace(log, soc_pct=known))
     assert few.soc_pct is not None
-    assert np.isfinite(few.soc_pct).sum() == np.isfinite(told).sum()
-    assert few.first_soc() == (0, told[3])
+    assert np.isfinite(few.soc_pct).sum() == np.isfinite(known).sum()
+    assert few.first_soc() == (0, known[3])
 
 
-def test_a_log_of_one_row_is_left_to_those_who_say_what_is_wrong_with_it() -> None:
+def test_a_log_of_one_row_is_unchanged() -> None:
     log = drive(1.0, seconds=1.0)
     assert resample(log) is log

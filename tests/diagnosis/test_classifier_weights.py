@@ -1,4 +1,4 @@
-"""The weights of beliefs are what makes known causes probable (`benchmarks/belief.py`)."""
+"""The weights of the classifier make known causes probable (`benchmarks/belief.py`)."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 import belief as learning
-from cangauge.diagnosis import posterior as belief
+from cangauge.diagnosis import classifier
 from cangauge.diagnosis.bayes_factors import Score
-from cangauge.diagnosis.posterior import Compared, Witness
+from cangauge.diagnosis.classifier import Comparison, EffectFeatures
 
 TRUE = np.array([0.2, 1.0, 2.0, 0.5, 0.5, 0.4])
 EFFECTS = 6
 
 
 def case(rng: np.random.Generator, number: int) -> learning.Case:
-    """A comparison at random, its cause drawn as likely as the true weights say."""
-    witnesses = tuple(
-        Witness(
+    """A random comparison whose cause is drawn with the true weights."""
+    effects = tuple(
+        EffectFeatures(
             Score(f"effect_{k}", evidence, (0,), np.zeros(1), np.eye(1), 0.0),
             evidence,
             3.0 * evidence,
@@ -29,27 +29,27 @@ def case(rng: np.random.Generator, number: int) -> learning.Case:
         )
         for k, evidence in enumerate(rng.uniform(-1.0, 60.0, EFFECTS).tolist())
     )
-    compared = Compared(witnesses, 1.5, 0.5, 1000.0, 0.6)
-    utility = belief.which_features(compared) @ TRUE
+    compared = Comparison(effects, 1.5, 0.5, 1000.0, 0.6)
+    utility = classifier.effect_features(compared) @ TRUE
     chances = np.exp(utility) / np.exp(utility).sum()
     truth = f"effect_{rng.choice(EFFECTS, p=chances)}"
     return learning.Case("simulated", f"world {number}", truth, compared, learned=True)
 
 
-def test_the_weights_that_causes_were_drawn_by_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(learning, "RIDGE", 1e-6)  # of many cases they are found without
+def test_training_recovers_the_true_weights(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(learning, "HELD", 1e-6)  # many cases need no regularisation
     rng = np.random.default_rng(3)
     cases = [case(rng, number) for number in range(3000)]
     found = learning.fit_which(cases)
     assert found[2] == pytest.approx(TRUE[2], abs=0.3)
     assert found[3] == pytest.approx(TRUE[3], abs=0.2)
-    # Here an effect strays as much as all: its lead is one and the same, by halves.
+    # All effects have the same overdispersion here, so both leads are equal.
     assert found[4:].sum() == pytest.approx(TRUE[4:].sum(), abs=0.2)
-    # Evidence and its lead without strays say nearly the same.
+    # Evidence and its lead without overdispersion are nearly redundant.
     assert found[:2].sum() == pytest.approx(TRUE[:2].sum(), abs=0.4)
 
 
-def test_a_case_without_its_cause_is_another() -> None:
+def test_a_case_without_its_cause_has_another() -> None:
     rng = np.random.default_rng(4)
     known = case(rng, 0)
     unknown = known.without_cause()
@@ -59,7 +59,7 @@ def test_a_case_without_its_cause_is_another() -> None:
     assert learning.answer(unknown, names) == learning.ANOTHER
 
 
-def test_final_seeds_are_not_learned_from(tmp_path: Path) -> None:
+def test_final_seeds_are_not_used_for_training(tmp_path: Path) -> None:
     (tmp_path / "tasks.json").write_text(json.dumps({"final": True}), encoding="utf-8")
     with pytest.raises(SystemExit, match="final seeds"):
         learning.cases_of(tmp_path)

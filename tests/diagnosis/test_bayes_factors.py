@@ -1,4 +1,4 @@
-"""The evidence: Bayes factors against quadrature, and faults that physics' bounds rule out."""
+"""Bayes factors against quadrature, and faults that physical bounds exclude."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from days import short_day
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.stats import halfnorm, norm
 
-from cangauge.diagnosis.bayes_factors import PRIOR_PARTS, scores
-from cangauge.diagnosis.diagnose import diagnose
-from cangauge.diagnosis.hypotheses import Frame
-from cangauge.diagnosis.linear_gaussian import ErrorModel, Evidence
-from cangauge.identify.fit import fit
+from cangauge.diagnosis import diagnose
+from cangauge.diagnosis.bayes_factors import PRIOR_WIDTHS, scores
+from cangauge.diagnosis.hypotheses import Hypotheses
+from cangauge.diagnosis.linear_gaussian import ErrorModel, Posterior
 from cangauge.inference.time_scales import SCALES
 from cangauge.logs.log import Log
 from cangauge.model.effects.base import Pack
@@ -24,22 +24,21 @@ from cangauge.model.effects.first_order import low_passed
 from cangauge.model.effects.library import LIBRARY, Candidate, candidates
 from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
-from synthetic import synthetic_log
 
 PACK = Pack.of(leaf_2012_model(), CAPACITY_AH)
 ERROR = ErrorModel((0.25,) * SCALES, (), 0.5)
 
 
-def alone(choice: Candidate, gradient: float, curvature: float, error: ErrorModel) -> Evidence:
-    """The evidence for one candidate of one amplitude: ln p(a) = g·a − S·a²/2."""
-    return Evidence(
-        frame=Frame((choice,), None, np.ones(1)),
+def alone(choice: Candidate, gradient: float, curvature: float, error: ErrorModel) -> Posterior:
+    """The posterior of one candidate with one amplitude: ln p(a) = g·a − S·a²/2."""
+    return Posterior(
+        hypotheses=Hypotheses((choice,), None, np.ones(1)),
         error=error,
         gradient=np.array([gradient]),
         curvature=np.array([[curvature]]),
-        squares=0.0,
+        chi_square=0.0,
         mean=np.zeros(1),
-        per_amplitude=np.zeros((1, 1)),
+        sensitivity=np.zeros((1, 1)),
         precision=np.eye(1),
     )
 
@@ -49,30 +48,31 @@ def candidate(effect_id: str) -> Candidate:
 
 
 @pytest.mark.parametrize("effect_id", ["slow_diffusion", "voltage_offset", "coulombic_efficiency"])
-# Rounded: next to nothing, but not nothing, is too much for the quadrature.
+# Rounded: the quadrature fails on tiny gradients.
 @given(
     st.floats(-6.0, 6.0).map(lambda value: round(value, 6)),
     st.floats(0.1, 100.0),
     st.floats(1.0, 5.0),
 )
 def test_bayes_factor_is_the_mean_over_the_prior(
-    effect_id: str, toward: float, sharpness: float, strays: float
+    effect_id: str, toward: float, sharpness: float, overdispersion: float
 ) -> None:
-    """Against quadrature: a normal prior, or half of one where the bounds allow one sign only.
+    """Against quadrature: a normal prior, or a half-normal one where bounds allow one sign only.
 
-    `sharpness` is how much narrower the evidence is than the bounds' own prior, `toward` how many
-    of its deviations its peak is away from nothing.
+    `sharpness` is the width of the bounds' prior over that of the likelihood, `toward` the distance
+    of its peak from zero in standard deviations.
     """
     choice = candidate(effect_id)
     (low, high) = choice.bounds[0].tolist()
     width = (high - low) / 4.0
     curvature = (sharpness / width) ** 2
     gradient = toward * sharpness / width
-    error = replace(ERROR, strays={effect_id: strays})
-    (found,) = scores(alone(choice, strays * gradient, strays * curvature, error))
+    error = replace(ERROR, overdispersion={effect_id: overdispersion})
+    scaled = overdispersion * gradient, overdispersion * curvature
+    (found,) = scores(alone(choice, *scaled, error))
 
     factors = []
-    for part in PRIOR_PARTS:
+    for part in PRIOR_WIDTHS:
         prior = halfnorm(scale=part * width) if 0.0 in (low, high) else norm(scale=part * width)
         sign = -1.0 if high == 0.0 else 1.0
         peak = gradient / (curvature + (part * width) ** -2.0) * sign
@@ -84,7 +84,7 @@ def test_bayes_factor_is_the_mean_over_the_prior(
                 ),
                 begin,
                 max(peak, 0.0) + 12.0 * part * width,
-                # Where nothing pulls up, all that counts lies close to zero.
+                # Without an upward pull the integrand is near zero.
                 points=[max(peak, begin), *(begin + k / abs(gradient) for k in (1.0, 5.0, 25.0))]
                 if gradient
                 else None,
@@ -93,13 +93,13 @@ def test_bayes_factor_is_the_mean_over_the_prior(
         )
     expected = np.log(np.mean(factors))
     if 0.0 in (low, high) or abs(gradient / curvature) < high:
-        # Beyond its bounds an amplitude of either sign is held there, and the factor with it.
+        # Outside its bounds an amplitude of either sign is clipped, and so is the factor.
         assert found.log_bayes_factor == pytest.approx(expected, rel=1e-5, abs=1e-6)
 
 
 @given(st.floats(0.0, 30.0), st.floats(0.5, 100.0))
-def test_what_points_the_wrong_way_is_no_evidence(toward: float, sharpness: float) -> None:
-    """A polarisation cannot be negative: the more it would have to be, the less it is believed."""
+def test_a_forbidden_sign_is_no_evidence(toward: float, sharpness: float) -> None:
+    """A polarisation cannot be negative: the more negative, the less evidence."""
     choice = candidate("slow_diffusion")
     width = float(choice.bounds[0, 1]) / 4.0
     wrong, worse = (
@@ -112,25 +112,13 @@ def test_what_points_the_wrong_way_is_no_evidence(toward: float, sharpness: floa
     assert wrong.explained == 0.0
 
 
-def day(seed: int) -> Log:
-    return synthetic_log(
-        hours=0.6, start_pct=85.0, end_pct=65.0, noise_v=0.5, seed=seed, name=f"day {seed}"
-    )
-
-
-@pytest.fixture(scope="module")
-def model() -> Model:
-    logs = [synthetic_log(noise_v=0.5, seed=seed) for seed in (1, 2, 3)]
-    return fit(logs, capacity_ah=CAPACITY_AH).model
-
-
 def polarised(log: Log, ohm: float) -> Log:
     lagged = low_passed(log.time_s, log.current_a, 400.0, 0.0)
     return replace(log, voltage_v=log.voltage_v - ohm * lagged)
 
 
 def efficient(log: Log, part: float) -> Log:
-    """As if charge came back with an efficiency of 1 + part."""
+    """Charge with an efficiency of 1 + part."""
     gained = np.concatenate(
         ([0.0], np.cumsum(np.diff(log.time_s) * np.maximum(-log.current_a[1:], 0.0)))
     )
@@ -145,17 +133,15 @@ def efficient(log: Log, part: float) -> Log:
         ("coulombic_efficiency", lambda log: efficient(log, 0.6)),
     ],
 )
-def test_a_fault_that_bounds_rule_out_is_not_named(
-    effect_id: str, change: Callable[[Log], Log], model: Model
+def test_a_fault_outside_its_bounds_is_not_named(
+    effect_id: str, change: Callable[[Log], Log], model: Model, short_references: list[Log]
 ) -> None:
-    """Its opposite may well be; whatever is found keeps its bounds."""
-    found = diagnose(
-        [change(day(seed)) for seed in (21, 22)], model, [day(seed) for seed in (11, 12, 13)]
-    )
+    """Its opposite may be; every effect found keeps its bounds."""
+    found = diagnose([change(short_day(seed)) for seed in (21, 22)], model, short_references)
     assert effect_id not in {found.verdict.cause, *found.verdict.ambiguous_with}
     (mine,) = [item for item in found.verdict.candidates if item.effect_id == effect_id]
     assert mine.log_bayes_factor < 0.5
-    # Those of the model that is diagnosed: the extended one's coefficients have moved a little.
+    # Bounds of the diagnosed model: the extended one's coefficients differ a little.
     pack = model.extended_model().pack
     for effect, values in found.extension.model.effects:
         for parameter in effect.parameters:

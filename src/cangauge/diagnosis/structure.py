@@ -1,0 +1,253 @@
+"""Structure that the references need beyond the voltage model, and the model that has it.
+
+The verdict marginalises over all structure. A model file has only the few pieces (candidates of the
+shared structure) that make the references more probable.
+
+Structure acts on what coefficients multiply: cells warmer than their sensor show as kt times the
+rise, so both cannot be solved for at once with columns of a model with another kt. Coefficients and
+structure are solved for repeatedly about the last solution (Gauss–Newton), until the references are
+no less probable than under the first one.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cangauge._typing import FloatArray
+from cangauge.diagnosis.design_matrix import DesignMatrix, candidates_for, design_matrix
+from cangauge.diagnosis.hypotheses import Hypotheses
+from cangauge.diagnosis.linear_gaussian import (
+    ErrorModel,
+    NormalEquations,
+    constrained_mode,
+    log_gaussian_integral,
+    log_likelihood,
+    marginalize,
+    normal_equations,
+    structure_precision,
+    with_change,
+)
+from cangauge.inference.rows import SampledLog
+from cangauge.model.effects.library import Candidate
+from cangauge.model.extended import ExtendedModel
+
+MIN_LOG_GAIN = 3.0
+"""Increase of the references' log probability that a further piece needs."""
+
+NEGLIGIBLE = 1e-3
+"""Size, in parts of its bounds, below which a piece is left out of a model."""
+
+MAX_PIECES = 14
+"""More pieces made no measurable difference."""
+
+MAX_STEPS = 3
+"""Gauss–Newton steps. Without convergence the step with the most probable references is taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceModel:
+    """Model as the references know it, and the references linearised about it."""
+
+    model: ExtendedModel
+    """With their coefficients, without their structure."""
+    structured: ExtendedModel | None
+    """With both; None if its pseudo-OCV would not rise."""
+    hypotheses: Hypotheses
+    matrices: tuple[DesignMatrix, ...]
+    equations: tuple[NormalEquations, ...]
+
+
+def learn(
+    references: Sequence[SampledLog],
+    model: ExtendedModel,
+    hypotheses: Hypotheses,
+    equations: Sequence[NormalEquations],
+    error: ErrorModel,
+) -> ReferenceModel:
+    """Learn coefficients and structure from the references.
+
+    Parameters
+    ----------
+    references : sequence of SampledLog
+    model : ExtendedModel
+        Model as given.
+    hypotheses : Hypotheses
+    equations : sequence of NormalEquations
+        Of the references, linearised about `model`.
+    error : ErrorModel
+    """
+    target, best = log_likelihood(hypotheses, equations, error) - MIN_LOG_GAIN, -np.inf
+    # Coefficients first: with too small a kt in the columns, a temperature rise comes out too
+    # large.
+    start = ReferenceModel(model, None, hypotheses, (), tuple(equations))
+    moved, about = _with_coefficients(start, error)
+    matrices = reference_matrices(references, moved, about)
+    last = found = ReferenceModel(moved, None, about, (), reference_equations(matrices, about))
+    del matrices
+    for left in reversed(range(MAX_STEPS)):
+        step = _step(references, last, error)
+        probability = log_likelihood(step.hypotheses, step.equations, error)
+        if probability >= target or (probability > best and left == 0):
+            return step
+        last = replace(step, matrices=())
+        del step  # one set of matrices takes hundreds of megabytes with long references
+        if probability > best:
+            found, best = last, probability
+    matrices = reference_matrices(references, found.model, found.hypotheses, found.structured)
+    return replace(found, matrices=matrices)
+
+
+def _step(
+    references: Sequence[SampledLog], last: ReferenceModel, error: ErrorModel
+) -> ReferenceModel:
+    """Solve for coefficients and structure with columns about the last solution."""
+    structured = _structured(last.model, last.hypotheses, last.equations, error)
+    model, hypotheses = _with_coefficients(last, error)
+    matrices = reference_matrices(references, model, hypotheses, structured)
+    equations = reference_equations(matrices, hypotheses)
+    return ReferenceModel(model, structured, hypotheses, matrices, equations)
+
+
+def _with_coefficients(last: ReferenceModel, error: ErrorModel) -> tuple[ExtendedModel, Hypotheses]:
+    """Return the model with the references' coefficients, and the hypotheses about it."""
+    hypotheses = last.hypotheses
+    posterior = marginalize(hypotheses, last.equations, [], error)
+    solution, _ = constrained_mode(posterior, last.model.model, [])
+    change = solution[: hypotheses.column_scale.size]
+    voltage_model = with_change(last.model.model, change)
+    if voltage_model is None:
+        return last.model, hypotheses
+    mean = hypotheses.prior_mean
+    mean = np.zeros(change.size) if mean is None else mean
+    return (
+        replace(last.model, model=voltage_model),
+        replace(hypotheses, prior_mean=mean - change * hypotheses.column_scale),
+    )
+
+
+def _structured(
+    model: ExtendedModel,
+    hypotheses: Hypotheses,
+    references: Sequence[NormalEquations],
+    error: ErrorModel,
+) -> ExtendedModel | None:
+    """Return the model with the references' coefficients and needed structure, or None."""
+    pieces = select_structure(hypotheses, references, error)
+    whole = marginalize(hypotheses, references, [], error)
+    p = hypotheses.column_scale.size
+    spans = dict(zip(hypotheses.structure, _spans(hypotheses), strict=True))
+    at = np.concatenate([np.arange(p), *(np.arange(*spans[k]) for k in pieces)])
+    precision = whole.precision[np.ix_(at, at)]
+    balance = 1.0 / np.sqrt(np.diag(precision))
+    right = (whole.precision @ whole.mean)[at]
+    mean = balance * np.linalg.solve(precision * balance * balance[:, None], balance * right)
+    selected = replace(hypotheses, structure=pieces)
+    posterior = replace(
+        whole,
+        hypotheses=selected,
+        precision=precision,
+        mean=mean,
+        sensitivity=whole.sensitivity[at],
+    )
+    solution, _ = constrained_mode(posterior, model.model, [])
+    voltage_model = with_change(model.model, solution[:p])
+    if voltage_model is None:
+        return None
+    return with_structure(replace(model, model=voltage_model), selected, solution[p:])
+
+
+def select_structure(
+    hypotheses: Hypotheses, references: Sequence[NormalEquations], error: ErrorModel
+) -> tuple[int, ...]:
+    """Return the pieces of structure that the references need, most needed first.
+
+    Forward selection: each step adds the piece that makes the references most probable beside those
+    before it, with all amplitudes and coefficients marginalised.
+    """
+    whole = marginalize(hypotheses, references, [], error)
+    right = whole.precision @ whole.mean
+    prior = structure_precision(hypotheses, error)
+    p = hypotheses.column_scale.size
+    spans = _spans(hypotheses)
+
+    def log_probability(pieces: Sequence[int]) -> float:
+        at = np.concatenate([np.arange(p), *(np.arange(*spans[j]) for j in pieces)])
+        log_prior = 0.5 * float(np.sum(np.log(prior[at[p:] - p])))
+        return log_gaussian_integral(whole.precision[np.ix_(at, at)], right[at]) + log_prior
+
+    chosen: list[int] = []
+    best = log_probability(chosen)
+    while len(chosen) < min(MAX_PIECES, len(hypotheses.structure)):
+        rest = [j for j in range(len(hypotheses.structure)) if j not in chosen]
+        values = [log_probability([*chosen, j]) for j in rest]
+        if max(values) < best + MIN_LOG_GAIN:
+            break
+        best = max(values)
+        chosen.append(rest[int(np.argmax(values))])
+    return tuple(hypotheses.structure[j] for j in chosen)
+
+
+def with_structure(
+    model: ExtendedModel, hypotheses: Hypotheses, amplitudes: FloatArray
+) -> ExtendedModel:
+    """Return a model with the structure that is not negligible.
+
+    Parameters
+    ----------
+    model : ExtendedModel
+    hypotheses : Hypotheses
+    amplitudes : array
+        Of the whole structure, in order, relative to the neutral values.
+    """
+    at = 0
+    totals: dict[tuple[object, ...], tuple[Candidate, FloatArray]] = {}
+    for k in hypotheses.structure:
+        candidate = hypotheses.candidates[k]
+        amplitude = amplitudes[at : at + len(candidate.amplitudes)]
+        at += amplitude.size
+        # Candidates of one shape differ in the size that their columns were linearised at.
+        key = (candidate.effect.id, *candidate.shape.items())
+        totals[key] = (candidate, amplitude + (totals[key][1] if key in totals else 0.0))
+    for candidate, total in totals.values():
+        low, high = candidate.bounds[:, 0], candidate.bounds[:, 1]
+        amplitude = np.clip(total, low, high)
+        if np.any(np.abs(amplitude) > NEGLIGIBLE * (high - low)):
+            # Bounds depend on the pack, which changes with the coefficients.
+            values = candidate.effect.clipped(candidate.values(amplitude), model.pack)
+            model = model.with_effect(candidate.effect, values)
+    return model
+
+
+def _spans(hypotheses: Hypotheses) -> list[tuple[int, int]]:
+    """Return the first and last (exclusive) index of each piece's amplitudes in a solution."""
+    widths = [len(hypotheses.candidates[k].amplitudes) for k in hypotheses.structure]
+    ends = hypotheses.column_scale.size + np.cumsum([0, *widths])
+    return list(itertools.pairwise(ends.tolist()))
+
+
+def reference_matrices(
+    references: Sequence[SampledLog],
+    model: ExtendedModel,
+    hypotheses: Hypotheses,
+    structured: ExtendedModel | None = None,
+) -> tuple[DesignMatrix, ...]:
+    """Return the references' design matrices, with the columns `Hypotheses.reference_columns`."""
+    columns = hypotheses.reference_columns
+    unique = tuple(dict.fromkeys(columns))  # structure may be a per-log effect as well
+    at = [unique.index(k) for k in columns]
+    found = []
+    for item in references:
+        candidates = candidates_for(hypotheses.candidates, model.pack, item)
+        found.append(design_matrix(item, model, [candidates[k] for k in unique], structured))
+    return tuple(replace(matrix, effects=tuple(matrix.effects[k] for k in at)) for matrix in found)
+
+
+def reference_equations(
+    matrices: Sequence[DesignMatrix], hypotheses: Hypotheses
+) -> tuple[NormalEquations, ...]:
+    """Return the references' normal equations."""
+    return tuple(normal_equations(matrix, hypotheses.column_scale) for matrix in matrices)
