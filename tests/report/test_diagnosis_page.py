@@ -217,8 +217,6 @@ def test_a_coarse_temperature_is_a_caveat(model: Model) -> None:
     fine_caveats, caveats = (
         " ".join(diagnose([each], model, []).caveats) for each in (log, coarse)
     )
-        " ".join(diagnose([each], model, []).caveats) for each in (log, coarse)
-    )
     assert "reported in steps" not in fine_caveats
     assert "reported in steps of 1 K" in caveats
 
