@@ -116,7 +116,7 @@ def test_a_service_that_fails(made: Path, monkeypatch: pytest.MonkeyPatch, log_f
     def fail(*_: object) -> None:
         raise CangaugeError("the bus is on fire")
 
-    monkeypatch.setattr("cangauge.cli.run.run_service", fail)
+    monkeypatch.setattr("cangauge.cli.run.Service.run", fail)
     ended = in_process("run", "-m", made / "model.json", "--log-format", log_format, "--json")
     assert error_of(ended, 1) == dict.fromkeys(PARTS) | {"message": "the bus is on fire"}
     (line,) = ended.err.splitlines()

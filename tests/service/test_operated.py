@@ -89,7 +89,7 @@ def test_a_disk_that_is_full_does_not_stop_the_service(bus: list[str], tmp_path:
 @pytest.mark.parametrize(
     ("arguments", "say"),
     [
-        (["--http", "0.0.0.0:9464"], "open to the network"),
+        (["--http", "0.0.0.0:9464"], "reachable from the network"),
         (["--http", "here"], "HOST:PORT"),
         (["--http", "127.0.0.1:0", "--http-token-file", "/nowhere/token"], "/nowhere/token"),
         (["--status-socket", "/nowhere/x.sock"], "/nowhere/x.sock"),
