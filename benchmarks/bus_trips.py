@@ -64,7 +64,7 @@ class Comparison:
 def over_bus(
     log: Log, vehicle: Vehicle, model: Model, address: BusAddress, record: Path
 ) -> tuple[list[Estimate], Pipeline, float]:
-    """Replay a log on a bus and estimate it; return the estimates, the pipeline and the time [s]."""
+    """Replay a log on a bus and estimate it; return estimates, pipeline and time [s]."""
     pipeline = Pipeline(vehicle, model, PipelineSettings(time_source="replay-clock"))
     rows: list[Estimate] = []
     done = threading.Event()

@@ -430,7 +430,7 @@ class RunConfig(_Strict):
             overrides=Overrides(self._file, self.messages, self.rules, dict(self.checks)),
         )
 
-    def gauge_settings(self) -> PipelineSettings:
+    def pipeline_settings(self) -> PipelineSettings:
         """Return the settings of the estimator and its frames; may raise InputError."""
         full, rest = self.full_charge, self.long_rest
         return PipelineSettings(
