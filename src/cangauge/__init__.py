@@ -1,7 +1,103 @@
-"""cangauge: state of charge from CAN frames by an identified voltage model.
+"""State of charge from CAN frames by an identified voltage model, and the diagnosis of its gaps.
 
-Data flows one way: frames → samples → estimate → frames, and log → model.
+Data flows one way: logs → model; frames → samples → estimate → frames; model + logs → diagnosis.
 Positive current discharges, everywhere.
+
+========================================  ==========================================================
+`read_log`, `Log`                         a log, capture or data frame as time series
+`fit`, `Identification`                   logs → model, with its errors
+`Model`                                   the identified voltage model and its file
+`estimate`, `EstimateTable`               SoC at every sample of a log
+`Estimator`, `Sample`, `Estimate`         the same, one sample at a time
+`diagnose`, `Diagnosis`                   where an error lies, what causes it, how far it shrinks
+`Vehicle`, `Service`                      the signals of a car; the service on its bus
+`simulate`, `Simulation`                  a simulated pack and drive, with or without faults
+`CangaugeError`, `InputError`             failures; wrong input, with field, value and cure
+========================================  ==========================================================
+
+A name is loaded when it is first used: `import cangauge` alone costs next to nothing.
+
+Examples
+--------
+>>> import cangauge
+>>> drives = [cangauge.simulate(seed=1, drive=number, hours=1.0).log for number in (1, 2, 3)]
+>>> model = cangauge.fit(drives[:2], capacity_ah=60.0).model
+>>> table = cangauge.estimate(drives[2], model)
 """
 
-__version__ = "0.1.0"
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
+
+from cangauge._version import __version__
+
+if TYPE_CHECKING:
+    from cangauge.bus.recording import read_recording as read_log
+    from cangauge.bus.vehicle import Vehicle
+    from cangauge.diagnosis import Diagnosis, diagnose
+    from cangauge.errors import CangaugeError, InputError
+    from cangauge.estimate.estimator import Estimator
+    from cangauge.estimate.offline import EstimateTable, estimate
+    from cangauge.estimate.validity import Estimate, Sample
+    from cangauge.identify.fit import Identification, fit
+    from cangauge.logs.log import Log
+    from cangauge.model.model_file import Model
+    from cangauge.service.run import Service
+    from cangauge.validation import Simulation, simulate
+
+__all__ = [
+    "CangaugeError",
+    "Diagnosis",
+    "Estimate",
+    "EstimateTable",
+    "Estimator",
+    "Identification",
+    "InputError",
+    "Log",
+    "Model",
+    "Sample",
+    "Service",
+    "Simulation",
+    "Vehicle",
+    "__version__",
+    "diagnose",
+    "estimate",
+    "fit",
+    "read_log",
+    "simulate",
+]
+
+_PLACES: Final = {
+    "CangaugeError": "errors",
+    "Diagnosis": "diagnosis",
+    "Estimate": "estimate.validity",
+    "EstimateTable": "estimate.offline",
+    "Estimator": "estimate.estimator",
+    "Identification": "identify.fit",
+    "InputError": "errors",
+    "Log": "logs.log",
+    "Model": "model.model_file",
+    "Sample": "estimate.validity",
+    "Service": "service.run",
+    "Simulation": "validation",
+    "Vehicle": "bus.vehicle",
+    "diagnose": "diagnosis",
+    "estimate": "estimate.offline",
+    "fit": "identify.fit",
+    "read_log": "bus.recording:read_recording",
+    "simulate": "validation",
+}
+"""Module of each public name, and the name there where it differs."""
+
+
+def __getattr__(name: str) -> Any:
+    place = _PLACES.get(name)
+    if place is None:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, _, own = place.partition(":")
+    return getattr(import_module(f"{__name__}.{module}"), own or name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

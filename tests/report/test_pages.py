@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from markupsafe import escape
 
-from cangauge import __version__
+from cangauge._version import __version__
 from cangauge.estimate.offline import estimate_log
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.estimate.validity import REASON_WORDS, Reason

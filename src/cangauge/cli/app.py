@@ -15,8 +15,8 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command as build_command
 
-from cangauge import __version__
 from cangauge._resources import one_thread
+from cangauge._version import __version__
 from cangauge.cli.output import emit_json, note
 from cangauge.errors import CangaugeError, closest
 

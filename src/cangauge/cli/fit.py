@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
@@ -25,7 +23,7 @@ from cangauge.cli.options import (
     load_log,
     within,
 )
-from cangauge.cli.output import console, emit_json, note, print_table
+from cangauge.cli.output import console, emit_json, note, print_table, progress_shown
 from cangauge.errors import InputError
 from cangauge.identify.delays import DelaySearch, search_delays
 from cangauge.identify.effect_search import parse_effect_ids
@@ -142,7 +140,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         if capacity_ah == FROM_SOC:
             capacity = capacity_from_reference(recorded)
         search = None
-        with _progress(status.update):
+        with progress_shown("cangauge.identify", status.update):
             if delays == AUTO:
                 if capacity is None:
                     capacity = capacity_from_full_discharge(recorded, initial_soc)
@@ -180,33 +178,6 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
     for remark in result.remarks:
         note(f"note: {remark}")
     note(f"model: {output}" + (f"\nreport: {report}" if report else ""))
-
-
-class _ProgressHandler(logging.Handler):
-    """Show each step of a fit as status; print its decisions (INFO)."""
-
-    def __init__(self, show: Callable[[str], None]) -> None:
-        super().__init__()
-        self._show = show
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Show one record."""
-        if record.levelno >= logging.INFO:
-            note(record.getMessage())
-        self._show(record.getMessage())
-
-
-@contextmanager
-def _progress(show: Callable[[str], None]) -> Iterator[None]:
-    logger, handler = logging.getLogger("cangauge.identify"), _ProgressHandler(show)
-    level = logger.level
-    logger.addHandler(handler)
-    logger.setLevel(logging.DEBUG)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
-        logger.setLevel(level)
 
 
 def _capacity(given: str | None) -> float | None:

@@ -22,7 +22,7 @@ from cangauge.cli.options import (
     load_log,
     within,
 )
-from cangauge.cli.output import emit_json, note, print_table
+from cangauge.cli.output import emit_json, note, print_table, progress_shown
 from cangauge.diagnosis import NONE, UNKNOWN, Diagnosis, diagnose
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
@@ -106,7 +106,8 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
 
     diagnosed = [_long_enough(read(path)) for path in logs]
     references = [read(path) for path in given]
-    found = diagnose(diagnosed, model_file, references, initial_soc_pct=initial_soc, progress=note)
+    with progress_shown("cangauge.diagnosis"):
+        found = diagnose(diagnosed, model_file, references, initial_soc_pct=initial_soc)
     with ExitStack() as stack:
         if extended is not None:
             text = found.extended_model.to_json()

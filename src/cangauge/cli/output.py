@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from rich import box
@@ -21,6 +23,41 @@ def note(text: str) -> None:
     """Print one line on stderr."""
     sys.stderr.write(text.rstrip() + "\n")
     sys.stderr.flush()
+
+
+@contextmanager
+def progress_shown(logger: str, show: Callable[[str], None] | None = None) -> Iterator[None]:
+    """Show what a long computation logs: decisions (INFO) as lines, every step by `show`.
+
+    Parameters
+    ----------
+    logger : str
+        Name of the logger, such as "cangauge.identify".
+    show : callable, optional
+        Takes the text of each step, to show it in passing.
+    """
+    own, handler = logging.getLogger(logger), _ProgressHandler(show)
+    level = own.level
+    own.addHandler(handler)
+    own.setLevel(logging.DEBUG)
+    try:
+        yield
+    finally:
+        own.removeHandler(handler)
+        own.setLevel(level)
+
+
+class _ProgressHandler(logging.Handler):
+    def __init__(self, show: Callable[[str], None] | None) -> None:
+        super().__init__()
+        self._show = show
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = record.getMessage()
+        if record.levelno >= logging.INFO:
+            note(text)
+        if self._show is not None:
+            self._show(text)
 
 
 def emit_json(result: Mapping[str, Any]) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -47,11 +48,13 @@ from cangauge.diagnosis.extended_model import (
     extended_model_file,
     parameters_of,
 )
-from cangauge.diagnosis.problem import DiagnosisProblem, build_problem, no_progress
+from cangauge.diagnosis.problem import DiagnosisProblem, build_problem
 from cangauge.errors import InputError
 from cangauge.inference.linearized import residual
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
+
+_LOG = logging.getLogger(__name__)
 
 LIKELY = 0.5
 """A verdict with less probability is more likely wrong than right."""
@@ -254,7 +257,6 @@ def diagnose(
     *,
     leave_out: Sequence[str] = (),
     initial_soc_pct: float | None = None,
-    progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Diagnose the gap between a model and logs.
 
@@ -271,8 +273,6 @@ def diagnose(
         Effects to leave out of the library.
     initial_soc_pct : float, optional
         SoC at the first row of each diagnosed log, instead of the log's own [%].
-    progress : callable, optional
-        Called with a line of text before each long step.
 
     Returns
     -------
@@ -301,14 +301,12 @@ def diagnose(
     >>> found.extended_soc_mae_pct  # doctest: +SKIP
     0.8
     """
-    progress = progress or no_progress
     problem = build_problem(
         logs,
         model,
         references,
         leave_out=leave_out,
         initial_soc_pct=initial_soc_pct,
-        progress=progress,
     )
     held_out = folds(problem)
     if not held_out:
@@ -317,11 +315,11 @@ def diagnose(
             source=logs[0].source or logs[0].name,
             cure="give a log of at least 10 min, better half an hour with changing load and SoC",
         )
-    progress("classifying the effects")
+    _LOG.info("classifying the effects")
     verdict = decide(problem)
-    progress("cross-validating")
+    _LOG.info("cross-validating")
     errors = held_out_errors(problem, held_out, [score.effect_id for score in verdict.accepted])
-    progress("refining the extended model")
+    _LOG.info("refining the extended model")
     extension = extend(problem, verdict.accepted)
     floor_v = model.noise.voltage_rmse_v
     if problem.references:

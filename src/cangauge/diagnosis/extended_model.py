@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from cangauge import __version__
 from cangauge._typing import FloatArray
+from cangauge._version import __version__
 from cangauge.diagnosis.bayes_factors import Score
 from cangauge.diagnosis.design_matrix import DesignMatrix
 from cangauge.diagnosis.linear_gaussian import (

@@ -7,8 +7,9 @@ temperature and SoC.
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -40,6 +41,8 @@ from cangauge.logs.resample import dequantize, resample, usual_step_k
 from cangauge.model.effects.library import LIBRARY, Candidate, candidates
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Model
+
+_LOG = logging.getLogger(__name__)
 
 COVERED_K, COVERED_PCT = 3.0, 3.0
 """References cover temperatures and SoC up to this far outside their own range [K, %]."""
@@ -165,10 +168,6 @@ class DiagnosisProblem:
         return max(1.0, _mean_square_current(matrix) / max(usual, 1e-12))
 
 
-def no_progress(_text: str) -> None:
-    """Ignore a progress message."""
-
-
 def build_problem(
     logs: Sequence[Log],
     model: Model,
@@ -176,7 +175,6 @@ def build_problem(
     *,
     leave_out: Sequence[str] = (),
     initial_soc_pct: float | None = None,
-    progress: Callable[[str], None] = no_progress,
 ) -> DiagnosisProblem:
     """Prepare a diagnosis up to the verdict; parameters as of `diagnose`.
 
@@ -217,7 +215,7 @@ def build_problem(
     known, structured = widened, None
     matrices: tuple[DesignMatrix, ...] = ()
     if of_references:
-        progress("learning the error model from the references")
+        _LOG.info("learning the error model from the references")
         several = len(of_references) > 1
         equations = reference_equations(
             reference_matrices(of_references, widened, hypotheses), hypotheses
@@ -226,7 +224,7 @@ def build_problem(
             least_weight = 0.0 if covered else LEAST_WEIGHT_BEYOND
             error = error_from_references(hypotheses, equations, error, least_weight)
         expected = error if covered or not several else _error_beyond(error)
-        progress("learning the structure from the references")
+        _LOG.info("learning the structure from the references")
         learned = learn(of_references, widened, hypotheses, equations, expected)
         known, structured, hypotheses = learned.model, learned.structured, learned.hypotheses
         matrices = learned.matrices
@@ -242,7 +240,7 @@ def build_problem(
             error = error if covered else _error_beyond(error)
     diagnosed = []
     for item in of_logs:
-        progress(f"testing every effect on {item.log.name}")
+        _LOG.info("testing every effect on %s", item.log.name)
         of_log = candidates_for(choices, known.pack, item)
         diagnosed.append(design_matrix(item, known, of_log, structured))
     return DiagnosisProblem(

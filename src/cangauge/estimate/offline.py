@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -11,8 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from cangauge._dataframes import ArrowExport
 from cangauge._typing import FloatArray
-from cangauge.errors import InputError
 from cangauge.estimate.estimator import Estimator
 from cangauge.estimate.settings import (
     VALID_STD_PCT,
@@ -56,7 +55,7 @@ class Scores:
 
 
 @dataclass(frozen=True, eq=False)
-class EstimateTable:
+class EstimateTable(ArrowExport):
     """Estimates of all n samples of a log: the columns of the estimate file.
 
     Attributes
@@ -113,31 +112,6 @@ class EstimateTable:
                 "reasons": [words[code] for code in self.reasons.tolist()],
             }
         )
-
-    def to_pandas(self) -> Any:
-        """Return a pandas.DataFrame of the columns; see `to_arrow`.
-
-        Raises
-        ------
-        InputError
-            If pandas is not installed.
-        """
-        _require("pandas")
-        return self.to_arrow().to_pandas()
-
-    def to_polars(self) -> Any:
-        """Return a polars.DataFrame of the columns; see `to_arrow`.
-
-        Raises
-        ------
-        InputError
-            If polars is not installed.
-        """
-        return _require("polars").from_arrow(self.to_arrow())
-
-    def __arrow_c_stream__(self, requested_schema: Any = None) -> Any:
-        """Export the columns through the Arrow PyCapsule interface."""
-        return self.to_arrow().__arrow_c_stream__(requested_schema)
 
 
 def estimate(
@@ -290,12 +264,3 @@ def score(table: EstimateTable, log: Log, seconds: float = 0.0) -> Scores:
         cover_2sigma=float(np.mean(error <= 2.0 * std_pct)) if error.size else None,
         valid_fraction=float(np.mean(table.status == Status.VALID)),
     )
-
-
-def _require(package: str) -> Any:
-    try:
-        return importlib.import_module(package)
-    except ImportError as error:
-        raise InputError(
-            f"{package} is not installed", cure=f"install it: pip install {package}"
-        ) from error

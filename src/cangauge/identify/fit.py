@@ -11,8 +11,8 @@ from typing import Literal
 
 import numpy as np
 
-from cangauge import __version__
 from cangauge._typing import FloatArray
+from cangauge._version import __version__
 from cangauge.errors import InputError
 from cangauge.identify.effect_search import FittedEffects, fit_effects, parse_effect_ids
 from cangauge.identify.evaluate import (

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cangauge._dataframes import ArrowExport
 from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.errors import InputError
 from cangauge.logs.units import (
@@ -22,7 +22,7 @@ __all__ = ["TEMPERATURE_SOURCES", "Log", "TemperatureSource"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Log:
+class Log(ArrowExport):
     """One drive or test.
 
     Parameters
@@ -192,31 +192,6 @@ class Log:
             columns["soc_pct"] = self.soc_pct
         return build_table(columns, self.temperature_source)
 
-    def to_pandas(self) -> Any:
-        """Return a pandas.DataFrame of the columns; missing SoC is NaN.
-
-        Raises
-        ------
-        InputError
-            If pandas is not installed.
-        """
-        _require("pandas")
-        return self.to_arrow().to_pandas()
-
-    def to_polars(self) -> Any:
-        """Return a polars.DataFrame of the columns; missing SoC is null.
-
-        Raises
-        ------
-        InputError
-            If polars is not installed.
-        """
-        return _require("polars").from_arrow(self.to_arrow())
-
-    def __arrow_c_stream__(self, requested_schema: Any = None) -> Any:
-        """Export the columns through the Arrow PyCapsule interface."""
-        return self.to_arrow().__arrow_c_stream__(requested_schema)
-
     def __len__(self) -> int:
         """Return the number of rows."""
         return int(self.time_s.size)
@@ -249,12 +224,3 @@ def _read_only(values: ArrayLike) -> FloatArray:
     array = np.array(values, dtype=np.float64, copy=True)
     array.flags.writeable = False
     return array
-
-
-def _require(package: str) -> Any:
-    try:
-        return importlib.import_module(package)
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"{package} is not installed", cure=f"install it: pip install {package}"
-        ) from error

@@ -20,7 +20,7 @@ from bokeh.resources import Resources
 from bokeh.themes import Theme
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from cangauge import __version__
+from cangauge._version import __version__
 from cangauge.model.model_file import Model
 from cangauge.report.charts import MAX_POINTS
 

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Final
 
-from cangauge import __version__
+from cangauge._version import __version__
 from cangauge.errors import InputError
 from cangauge.estimate.validity import Reason, Status
 from cangauge.service.status import BOUNDS_S, HistogramCounts, Snapshot, reason_ids

@@ -15,9 +15,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from typing import Any, Final
 
-from cangauge import __version__
 from cangauge._formatting import number
 from cangauge._logging import emit
+from cangauge._version import __version__
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.decoder import FrameStatistics
 from cangauge.bus.plausibility import MessageStatistics

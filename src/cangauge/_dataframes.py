@@ -1,0 +1,56 @@
+"""Export of tables to data frames: pandas, polars, and whatever reads the Arrow interface."""
+
+from __future__ import annotations
+
+import importlib
+from abc import abstractmethod
+from typing import Any
+
+from cangauge.errors import InputError
+
+
+class ArrowExport:
+    """Data frames of anything with columns that can be an Arrow table.
+
+    pandas and polars are imported when asked for; neither is a dependency.
+    """
+
+    __slots__ = ()
+
+    @abstractmethod
+    def to_arrow(self) -> Any:
+        """Return a pyarrow.Table."""
+
+    def to_pandas(self) -> Any:
+        """Return a pandas.DataFrame of the columns; unknown numbers are NaN.
+
+        Raises
+        ------
+        InputError
+            If pandas is not installed.
+        """
+        _import("pandas")
+        return self.to_arrow().to_pandas()
+
+    def to_polars(self) -> Any:
+        """Return a polars.DataFrame of the columns; unknown numbers are null.
+
+        Raises
+        ------
+        InputError
+            If polars is not installed.
+        """
+        return _import("polars").from_arrow(self.to_arrow())
+
+    def __arrow_c_stream__(self, requested_schema: Any = None) -> Any:
+        """Export the columns through the Arrow PyCapsule interface."""
+        return self.to_arrow().__arrow_c_stream__(requested_schema)
+
+
+def _import(package: str) -> Any:
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise InputError(
+            f"{package} is not installed", cure=f"install it: pip install {package}"
+        ) from error
