@@ -258,13 +258,18 @@ class Command:
         )
         self._stderr: list[str] = []
 
-    def wait_for(self, text: str) -> None:
-        """Wait for a text on stderr."""
+    def wait_for(self, text: str, seconds: float = 60.0) -> None:
+        """Wait for a text on stderr; a process that never writes it is killed."""
         assert self.process.stderr is not None
-        for line in self.process.stderr:
-            self._stderr.append(line)
-            if text in line:
-                return
+        deadline = threading.Timer(seconds, self.process.kill)
+        deadline.start()
+        try:
+            for line in self.process.stderr:
+                self._stderr.append(line)
+                if text in line:
+                    return
+        finally:
+            deadline.cancel()
         raise AssertionError(f"ended without {text!r}: {''.join(self._stderr)}")
 
     def end(self, seconds: float = 60.0) -> Ended:

@@ -328,7 +328,7 @@ def _run_config(data: bytes) -> bool:
     with _file(data, "config.toml") as path:
         config = load_config(path, {"timeout_s": 3.0} if data[:1] == b"m" else None)
         config.address()
-        config.gauge_settings()
+        config.pipeline_settings()
         config.loop_settings()
         config.load_vehicle()
     return True

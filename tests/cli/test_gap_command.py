@@ -64,8 +64,8 @@ def test_text_gives_verdict_candidates_and_caveats(run: Run, made: Path, days: P
     ran = run("gap", days / "good11.parquet", "-m", made / "model.json")
     assert ran.code == 0
     for text in (
-        "No gap beyond what the model file states", "probability", "left [V]", "closed",
-        "What these logs cannot show:", "- No reference logs: whether",
+        "No significant gap beyond the error stated in the model file", "probability", "left [V]", "closed",
+        "What these logs cannot show:", "- No reference logs: the floor is",
     ):  # fmt: skip
         assert text in ran.out
     table = {line.split()[0] for line in ran.out.splitlines() if line.strip()}

@@ -16,7 +16,7 @@ def diagnosis(
     """Return as much of a diagnosis as a headline needs."""
     chances = {cause: 0.6} | dict.fromkeys(alike, 0.3)
     return SimpleNamespace(
-        verdict=SimpleNamespace(cause=cause, ambiguous_with=alike, chances=chances),
+        verdict=SimpleNamespace(cause=cause, ambiguous_with=alike, probabilities=chances),
         candidates=[{"effect": cause, "parameters": parameters}],
     )
 

@@ -88,7 +88,7 @@ def test_a_capture_in_real_time(bus: list[str], tmp_path: Path) -> None:
         "run", *bus, *MODEL, "--vehicle", "leaf_aze0", "--record", again, "--until-idle", "1",
         "--json",
     )  # fmt: skip
-    service.wait_for("listening")
+    service.wait_for("service.ready")
     replayed = run_to_end("replay", capture, *bus, "--json")
     assert replayed.json["seconds"] == pytest.approx(6.0, abs=0.1)
     result = service.end().json
@@ -109,7 +109,7 @@ def test_a_signal_ends_the_service_within_a_second(
 ) -> None:
     output = tmp_path / "live.csv"
     service = Command("run", *bus, *MODEL, "-o", output, "--json")
-    service.wait_for("listening")
+    service.wait_for("service.ready")
     began = time.monotonic()
     service.process.send_signal(kind)
     ended = service.end(5.0)
@@ -128,13 +128,13 @@ def test_a_hangup_reads_the_configuration_again_and_soc_goes_on(
     path = tmp_path / "car.toml"
     path.write_text("timeout_s = 1\n")
     service = Command("run", *bus, *MODEL, "--config", path, "--json")
-    service.wait_for("listening")
+    service.wait_for("service.ready")
     path.write_text("timeout_s = [")
     service.process.send_signal(signal.SIGHUP)
-    service.wait_for("new configuration refused, the old one goes on: ")
+    service.wait_for("config.refused")
     path.write_text("timeout_s = 0.5\n")
     service.process.send_signal(signal.SIGHUP)
-    service.wait_for("configuration read again; changed: timeout_s")
+    service.wait_for("config.reloaded")
     service.process.terminate()
     ended = service.end(5.0)
     assert ended.code == 0

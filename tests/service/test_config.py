@@ -45,7 +45,7 @@ def test_a_whole_file(tmp_path: Path) -> None:
     address = config.address()
     assert (address.interface, address.channel) == ("socketcan", "can3")
     assert dict(address.options) == {"bitrate": 500000, "fd": False}
-    settings = config.gauge_settings()
+    settings = config.pipeline_settings()
     assert settings.ids.soc_estimate == 0x123
     assert settings.ids.soc_detail == 0x5A1
     assert settings.time_source == "replay-clock"
@@ -125,7 +125,7 @@ def test_errors_of_the_command_line_name_the_option(options: dict[str, object], 
 def test_equal_ids_are_refused(tmp_path: Path) -> None:
     config = load_config(write(tmp_path, 'model = "m"\n[ids]\nsoc_detail = 0x5A0\n'))
     with pytest.raises(InputError, match="same id"):
-        config.gauge_settings()
+        config.pipeline_settings()
 
 
 def test_no_such_file() -> None:

@@ -116,14 +116,14 @@ def test_missed_heartbeats_are_skipped_on_the_grid(
 ) -> None:
     frames = [*frames_every(0.1, 2.0), *frames_every(0.1, 12.0, from_s=9.0)]
     port = SimulatedPort(frames)
-    receive = port.receive_waiting
+    receive = port.receive_pending
 
     def sleepy(timeout_s: float) -> list[can.Message]:
         if 2.0 < port.now_s - 5000.0 < 2.5:
             port.now_s += 5.678
         return receive(timeout_s)
 
-    port.receive_waiting = sleepy  # type: ignore[method-assign] # suspended once
+    port.receive_pending = sleepy  # type: ignore[method-assign] # suspended once
     clock = SimpleNamespace(
         monotonic=lambda: port.now_s,
         process_time=time.process_time,
@@ -159,8 +159,8 @@ def test_backlog_is_stale_until_it_is_processed(
 ) -> None:
     """The service is suspended from 3.0 to 9.0 s, then reads the backlog within two seconds."""
     port = SimulatedPort(frames_every(0.02, 14.0))
-    port.facts = BackendCapabilities(stamps, echoes=False, has_error_classes=False)
-    receive = port.receive_waiting
+    port.capabilities = BackendCapabilities(stamps, echoes=False, has_error_classes=False)
+    receive = port.receive_pending
 
     def stopped(timeout_s: float) -> list[can.Message]:
         since_s = port.now_s - 5000.0
@@ -170,7 +170,7 @@ def test_backlog_is_stale_until_it_is_processed(
         port.work_s = 0.0025 if 9.0 <= since_s < 11.0 else 0.0
         return receive(timeout_s)
 
-    port.receive_waiting = stopped  # type: ignore[method-assign] # suspended once
+    port.receive_pending = stopped  # type: ignore[method-assign] # suspended once
     clock = SimpleNamespace(
         monotonic=lambda: port.now_s,
         time=lambda: 1.7e9 + port.now_s - 5000.0,

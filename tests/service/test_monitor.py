@@ -70,12 +70,12 @@ def test_a_snapshot_never_changes() -> None:
 def test_refused_frames_are_counted_by_reason() -> None:
     watched = Watched()
     watched.drive(5.0)
-    for counters in watched.pipeline.decoder.counters.messages.values():
+    for counters in watched.pipeline.decoder.statistics.messages.values():
         counters.crc_errors += 2
         counters.not_available += 1
     watched.turn()
     snapshot = watched.monitor.latest
-    messages = len(watched.pipeline.decoder.counters.messages)
+    messages = len(watched.pipeline.decoder.statistics.messages)
     assert snapshot.rejects["crc_errors"] == 2 * messages
     assert snapshot.rejects["not_available"] == messages
     # A value that is not available refuses no frame.

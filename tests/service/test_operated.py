@@ -43,7 +43,7 @@ def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
         "--record", tmp_path / "seen.blf", "--record-part-mb", "0.02",
     )  # fmt: skip
     service.wait_for("http.listening")
-    http_port = json.loads(service._said[-1])["port"]
+    http_port = json.loads(service._stderr[-1])["port"]
     service.wait_for("service.ready")
     assert run_to_end("replay", log, *bus, "--speed", "max").code == 0
     found = in_process("status", "--endpoint", sock, "--json")

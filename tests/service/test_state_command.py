@@ -45,12 +45,12 @@ def drive(port: BusConnection, first: int, after: int) -> None:
 def run(path: Path) -> Command:
     service = Command("run", *BUS, *MODEL, "--state", path, "--state-every", "0.2", "--json",
                       "--initial-soc", "80")  # fmt: skip
-    service.wait_for("listening")
+    service.wait_for("service.ready")
     return service
 
 
 def samples_kept(path: Path) -> int:
-    return read_state(path).estimator.samples if path.exists() else 0
+    return read_state(path).estimator.memory.samples if path.exists() else 0
 
 
 @pytest.mark.slow

@@ -197,7 +197,7 @@ def test_the_state_is_written_only_after_new_samples(machine: Machine) -> None:
     assert machine.path.read_bytes() == first
     service.drive(DRIVE[50:60])
     service.stop()
-    assert read_state(machine.path).estimator.samples == 60
+    assert read_state(machine.path).estimator.memory.samples == 60
 
 
 def test_after_a_long_pause_the_soc_approaches_the_voltage(
@@ -523,7 +523,7 @@ def test_a_failing_disk_is_reported_at_growing_intervals(
         assert [each.name for each in machine.path.parent.iterdir()] == ["state.json"]
     service.drive(DRIVE[200:201])
     service.stop()
-    assert read_state(machine.path).estimator.samples == 108
+    assert read_state(machine.path).estimator.memory.samples == 108
 
 
 def test_a_folder_that_is_not_there(machine: Machine) -> None:

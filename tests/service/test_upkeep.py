@@ -91,13 +91,13 @@ def test_frames_lost_in_the_receive_queue_are_reported(caplog: pytest.LogCapture
 
     port = Port()
     upkeep = Housekeeping(port)  # type: ignore[arg-type] # all that is looked at
-    upkeep.look(1.0)
+    upkeep.run(1.0)
     port.queue_drops = 7
-    upkeep.look(1.05)  # too soon to look
+    upkeep.run(1.05)  # too soon to look
     assert not caplog.messages
-    upkeep.look(1.2)
+    upkeep.run(1.2)
     assert caplog.messages == [
         "socketcan can9: the receive queue overflowed: 7 frames lost (7 so far)"
     ]
-    upkeep.look(2.0)
+    upkeep.run(2.0)
     assert len(caplog.messages) == 1

@@ -243,7 +243,7 @@ def test_both_commands_until_the_bus_goes_down(tmp_path: Path) -> None:
         pytest.skip("no `ip` command to take the interface down")
     subprocess.run(["ip", "link", "set", "vcan0", "down"], check=True)
     try:
-        live.wait_for("Trying again until it is back")
+        live.wait_for("bus.lost")
         live.process.terminate()
         ended = live.end(20.0)
     finally:
