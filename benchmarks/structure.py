@@ -27,19 +27,29 @@ from types import FrameType
 from typing import Any
 
 LAYERS = (
-    ("errors", "_typing", "_io", "_config", "_logging", "_formatting", "_resources"),
+    (
+        "errors",
+        "_typing",
+        "_version",
+        "_io",
+        "_config",
+        "_logging",
+        "_formatting",
+        "_resources",
+        "_dataframes",
+    ),
     ("logs",),
     ("model",),
     ("inference",),
     ("identify",),
-    ("estimate",),
+    ("estimate", "estimation"),
     ("diagnosis",),
     ("bus",),
     ("service",),
     ("replay",),
     ("inspect",),
-    ("report",),
     ("validation",),
+    ("report",),
     ("cli",),
 )
 """Packages from the lowest to the highest; an import of a higher one by a lower one is upward."""
@@ -266,7 +276,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parents[1])
     parser.add_argument("--data", type=Path, help="folder of recorded logs; without: no traces")
-    parser.add_argument("--frame-entry", default="service/pipeline.py:Pipeline.take")
+    parser.add_argument("--frame-entry", default="service/pipeline.py:Pipeline.handle")
     parser.add_argument("--diagnosis-entry", default="diagnosis/diagnose.py:diagnose")
     parser.add_argument("--list", action="store_true", help="also list upward imports")
     options = parser.parse_args()

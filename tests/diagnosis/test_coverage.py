@@ -56,9 +56,9 @@ def test_only_a_diagnosis_tries_spread_diffusion() -> None:
         {
             choice.shape["spread"]
             for choice in candidates(
-                [LIBRARY["slow_diffusion"]], pack, np.arange(10.0), elsewhere=elsewhere
+                [LIBRARY["slow_diffusion"]], pack, np.arange(10.0), for_diagnosis=for_diagnosis
             )
         }
-        for elsewhere in (False, True)
+        for for_diagnosis in (False, True)
     ]
     assert tried == [{0.0}, {0.0, 1.0}]

@@ -97,7 +97,12 @@ def test_hash_is_printed_before_the_diagnosis(ran: dict[str, Any]) -> None:
 
 
 def test_page_shows_matrix_reliability_and_targets(ran: dict[str, Any]) -> None:
-    for words in ("What was said of what", "Reliability", "By size of the gap", "false alarms"):
+    for words in (
+        "Verdict against truth",
+        "Reliability",
+        "Detection by size of the gap",
+        "false alarms",
+    ):
         assert words in ran["page"]
     assert "default-src 'none'" in ran["page"]
 

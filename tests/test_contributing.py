@@ -1,0 +1,123 @@
+"""The recipes of CONTRIBUTING.md, followed step by step."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+import cangauge
+from cangauge.bus.decoder import SampleDecoder
+from cangauge.bus.encoder import FrameEncoder
+from cangauge.bus.mapping import SignalMap, TemperatureMap, VehicleMap
+from cangauge.bus.vehicle import PRESETS, Preset, Vehicle
+from cangauge.estimate.validity import Sample
+from cangauge.logs import read
+from cangauge.logs.draft import DraftLog
+from cangauge.logs.file_content import FileContent
+from cangauge.model.effects.base import Effect, OnlineEffect, Pack, PackState, Parameter, Values
+from cangauge.model.effects.library import LIBRARY
+from cangauge.model.voltage_model import VoltageModel
+from cangauge.report.charts import new_figure
+from cangauge.report.page import Figure, Page, Paragraph, Section, Tile, render
+from synthetic import synthetic_log
+
+
+class HeaterDrop(Effect):
+    """A constant drop at every current, as a worked example."""
+
+    id = "heater_drop"
+    family = "voltage_sensing"
+    parameters = (Parameter("drop_v", "V", -0.04, 0.04, scale="voltage"),)
+    signature = "a constant"
+    equation = "U = OCV − drop"
+    source = "an example"
+    separated_by = "nothing"
+
+    def extra_voltage(
+        self, state: PackState, values: Values, model: VoltageModel, pack: Pack
+    ) -> np.ndarray:
+        return np.full(state.soc_pct.size, -values["drop_v"])
+
+    def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
+        effect = OnlineEffect()
+        effect.volts = -values["drop_v"]
+        return effect
+
+
+def test_an_effect_of_your_own_is_identified(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(LIBRARY, "heater_drop", HeaterDrop())  # type: ignore[misc] # a dict
+    log = synthetic_log(hours=1.0, seed=4)
+    model = cangauge.fit([log], capacity_ah=60.0).model
+    entry = {"id": "heater_drop", "parameters": {"drop_v": 2.0}}
+    worse = model.model_copy(update={"effects": [entry]})
+    difference = model.predict(log).voltage_v - worse.predict(log).voltage_v
+    assert difference == pytest.approx(2.0)
+
+
+def test_a_reader_of_your_own_reads(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def is_mine(content: FileContent) -> bool:
+        return content.first_line.startswith("MYLOGGER")
+
+    def read_mine(content: FileContent) -> DraftLog:
+        rows = [line.split() for line in content.read().decode().splitlines()[1:]]
+        time_s, current_a, voltage_v = np.array(rows, dtype=float).T
+        return DraftLog(
+            name="mine",
+            source=str(content.path),
+            values={
+                "time_s": time_s,
+                "current_a": current_a,
+                "voltage_v": voltage_v,
+                "temperature_c": np.full(time_s.size, 21.0),
+            },
+        )
+
+    monkeypatch.setattr(read, "_TEXT_FORMATS", ((is_mine, read_mine), *read._TEXT_FORMATS))
+    path = tmp_path / "mine.txt"
+    path.write_text(
+        "MYLOGGER 1\n" + "".join(f"{k} {10 + k % 3} {380 - k % 3}\n" for k in range(60))
+    )
+    log = cangauge.read_log(path)
+    assert len(log) == 60
+    assert log.current_a[1] == 11.0
+
+
+def test_a_preset_of_your_own_decodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    preset = Preset(
+        dbc="generic_pack.dbc",
+        about="an example",
+        mapping=VehicleMap(
+            name="mine",
+            current=SignalMap(signal="current_a", sign=-1),
+            voltage=SignalMap(signal="voltage_v"),
+            temperature=TemperatureMap(signal="temperature_c"),
+        ),
+    )
+    monkeypatch.setitem(PRESETS, "mine", preset)
+    vehicle = Vehicle.load("mine")
+    decoder, samples = SampleDecoder(vehicle), []
+    for frame in FrameEncoder(vehicle).encode(Sample(1.0, 12.0, 380.0, 21.0)):
+        frame.timestamp = 1.0
+        assert isinstance(frame, can.Message)
+        samples.append(decoder.handle(frame))
+    (sample,) = [each for each in samples if each is not None]
+    assert sample.current_a == pytest.approx(12.0, abs=0.01)
+
+
+def test_a_page_of_your_own_renders() -> None:
+    plot = new_figure(("time", "voltage"), "@y", units=("s", "V"))
+    plot.line([0.0, 1.0], [380.0, 379.0])
+    page = Page(
+        "My page",
+        "an example",
+        [Tile("voltage", "380 V")],
+        [Section("One", [Paragraph("Words & more"), Figure("Voltage", plot, "It falls.")])],
+        lead="The voltage falls.",
+    )
+    text = render(page)
+    assert "<title>My page" in text
+    assert "Words &amp; more" in text
+    assert "Content-Security-Policy" in text  # nothing is fetched
