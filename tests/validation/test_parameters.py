@@ -56,7 +56,7 @@ def errors_v(model: ExtendedModel, log: Log) -> NDArray[np.float64]:
     assert start is not None
     signals = Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
     rows = np.flatnonzero(log.time_s - log.time_s[0] >= 70.0)
-    return model.predict(signals, start[1], rows, anchor_row=start[0]).residual_v
+    return model.predict(signals, start[1], rows, initial_row=start[0]).residual_v
 
 
 def test_comparable_faults_are_mapped() -> None:

@@ -55,8 +55,8 @@ def log_caveats(
         _duration(logs),
         *_temperature(logs, references),
         *_soc(logs, references),
-        _pauses(logs),
-        _source([*logs, *references], temperature_source),
+        _recording_gaps(logs),
+        _temperature_source([*logs, *references], temperature_source),
         _initial_soc(logs, initial_soc_pct),
         _reference_initial_soc(references),
         *_current(logs, capacity_ah),
@@ -186,7 +186,7 @@ def _soc(logs: Sequence[SampledLog], references: Sequence[SampledLog]) -> list[s
     return sentences
 
 
-def _pauses(logs: Sequence[SampledLog]) -> str:
+def _recording_gaps(logs: Sequence[SampledLog]) -> str:
     found = []
     for item in logs:
         time_s = item.log.time_s
@@ -204,7 +204,7 @@ def _pauses(logs: Sequence[SampledLog]) -> str:
     )
 
 
-def _source(logs: Sequence[SampledLog], of_model: TemperatureSource) -> str:
+def _temperature_source(logs: Sequence[SampledLog], of_model: TemperatureSource) -> str:
     others = sorted({item.log.temperature_source for item in logs} - {of_model, "unknown"})
     if of_model == "unknown" or not others:
         return ""

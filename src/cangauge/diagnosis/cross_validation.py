@@ -70,7 +70,7 @@ def folds(problem: DiagnosisProblem) -> list[Fold]:
             rest = [log for k, log in enumerate(equations) if k != number]
             held_out.append((rest, number, np.ones(matrix.residual_v.size, dtype=bool)))
     else:
-        time_s = logs[0].prepared.rows.time_s
+        time_s = logs[0].sampled.rows.time_s
         elapsed = time_s - time_s[0]
         block = (elapsed // BLOCK_S).astype(np.intp)
         since = elapsed % BLOCK_S
@@ -104,7 +104,7 @@ def held_out_errors(
         columns = np.column_stack([matrix.coefficients, *matrix.effects])
         result.append(
             HeldOutErrors(
-                matrix.prepared.rows.time_s[fold.rows],
+                matrix.sampled.rows.time_s[fold.rows],
                 problem.diagnosed_errors_v[fold.log][fold.rows],
                 matrix.residual_v - columns @ _solution(fold.posterior, effects),
             )

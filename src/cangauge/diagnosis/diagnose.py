@@ -167,7 +167,7 @@ class Diagnosis:
         """What these logs cannot show, whatever the verdict; one or two sentences each."""
         problem = self.problem
         fits = [
-            (matrix.prepared.log.name, rms(errors))
+            (matrix.sampled.log.name, rms(errors))
             for matrix, errors in zip(problem.references, problem.reference_errors_v, strict=True)
         ]
         stated_v = self.model.noise.voltage_rmse_v
@@ -179,8 +179,8 @@ class Diagnosis:
             worse,
             reference_fit_caveat(fits, stated_v, problem.given.pack.voltage_v),
             *log_caveats(
-                [matrix.prepared for matrix in problem.diagnosed],
-                [matrix.prepared for matrix in problem.references],
+                [matrix.sampled for matrix in problem.diagnosed],
+                [matrix.sampled for matrix in problem.references],
                 problem.model.capacity_ah,
                 problem.options.initial_soc_pct,
                 problem.temperature_source,
@@ -194,7 +194,7 @@ class Diagnosis:
     def log_errors(self) -> list[LogErrors]:
         """Return the errors of each diagnosed log with the given and the extended model."""
         return [
-            LogErrors(matrix.prepared, before_v, residual(matrix.prepared, self.extension.model))
+            LogErrors(matrix.sampled, before_v, residual(matrix.sampled, self.extension.model))
             for matrix, before_v in zip(
                 self.problem.diagnosed, self.problem.diagnosed_errors_v, strict=True
             )

@@ -45,7 +45,7 @@ MIN_BIN_WIDTH = 1.0
 class LogErrors:
     """Errors of one diagnosed log; m rows at the model's rate."""
 
-    prepared: SampledLog
+    sampled: SampledLog
     before_v: FloatArray
     """Measured − given model, shape (m,) [V]."""
     after_v: FloatArray
@@ -113,7 +113,7 @@ def _axes(
     logs: Sequence[DesignMatrix], capacity_ah: float
 ) -> Iterator[tuple[str, str, FloatArray, FloatArray]]:
     """Yield name, unit, values of all rows and edges of each axis."""
-    rows = [matrix.prepared.rows for matrix in logs]
+    rows = [matrix.sampled.rows for matrix in logs]
     current = np.concatenate([item.delayed_current_a[:, 0] for item in rows])
     yield "soc", "%", np.concatenate([item.soc_pct for item in rows]), np.linspace(-5, 105, 12)
     temperature = np.concatenate([item.temperature_c for item in rows])
@@ -129,7 +129,7 @@ def _axes(
     resting = (np.abs(current) < REST_C_RATE * capacity_ah).astype(np.float64)
     yield "rest", "1 = rest", resting, np.array([0.0, 0.5, 1.0])
     elapsed = np.concatenate(
-        [matrix.prepared.rows.time_s - matrix.prepared.log.time_s[0] for matrix in logs]
+        [matrix.sampled.rows.time_s - matrix.sampled.log.time_s[0] for matrix in logs]
     )
     yield "time", "s", elapsed, np.linspace(0.0, float(elapsed.max()) + 1e-9, 6)
 
@@ -154,7 +154,7 @@ def _time_scale_shares(
     bands: list[list[FloatArray]] = [[] for _ in TIME_SCALES_S[1:]]
     for matrix, error_v in zip(logs, errors_v, strict=True):
         rest = error_v
-        step_s = float(np.median(np.diff(matrix.prepared.rows.time_s)))
+        step_s = float(np.median(np.diff(matrix.sampled.rows.time_s)))
         for k, width_s in enumerate(TIME_SCALES_S[1:]):
             smooth = _moving_average(rest, width_s / step_s)
             bands[k].append(rest - smooth if np.isfinite(width_s) else rest)
@@ -185,7 +185,7 @@ def _pieces(logs: Sequence[DesignMatrix]) -> NDArray[np.intp]:
     """Return the number of each row's piece for the bootstrap, counted over all logs."""
     numbers, first = [], 0
     for matrix in logs:
-        time_s = matrix.prepared.rows.time_s
+        time_s = matrix.sampled.rows.time_s
         number = ((time_s - time_s[0]) // PIECE_S).astype(np.intp) + first
         first = int(number[-1]) + 1
         numbers.append(number)
@@ -246,7 +246,7 @@ def worst_segments(
     """
     found: list[WorstSegment] = []
     for k, (matrix, error_v) in enumerate(zip(logs, errors_v, strict=True)):
-        rows = matrix.prepared.rows
+        rows = matrix.sampled.rows
         found += [
             WorstSegment(
                 number=k,
@@ -285,7 +285,7 @@ def segment_signals(segment: WorstSegment, errors: Sequence[LogErrors]) -> Segme
         Of all diagnosed logs.
     """
     of_log = errors[segment.number]
-    time_s, log = of_log.prepared.rows.time_s - segment.time_s, of_log.prepared.log
+    time_s, log = of_log.sampled.rows.time_s - segment.time_s, of_log.sampled.log
     near = np.abs(time_s) <= SEGMENT_S
     current_time_s = log.time_s - segment.time_s
     current_near = np.abs(current_time_s) <= SEGMENT_S

@@ -236,7 +236,7 @@ def _best_onset(
     logs: Sequence[DesignMatrix], model: ExtendedModel, effect: Effect, values: Values, name: str
 ) -> float:
     """Return the onset [s] that explains most, common to all logs."""
-    states = [pack_state(matrix.prepared, model) for matrix in logs]
+    states = [pack_state(matrix.sampled, model) for matrix in logs]
     # What the coefficients or the per-log states explain as well is no change.
     known = [np.linalg.qr(np.column_stack([m.coefficients, m.per_log_states]))[0] for m in logs]
 
@@ -249,11 +249,11 @@ def _best_onset(
         columns = []
         for matrix, state in zip(logs, states, strict=True):
             extra_v = effect.extra_voltage(state, trial, model.model, model.pack)
-            rows = matrix.prepared.at
+            rows = matrix.sampled.at
             columns.append(np.zeros(rows.size) if extra_v is None else extra_v[rows])
         return columns
 
-    residual_v = unexplained([residual(matrix.prepared, model) for matrix in logs])
+    residual_v = unexplained([residual(matrix.sampled, model) for matrix in logs])
     least_v2 = MIN_ONSET_PART * float(np.sum(np.concatenate(columns_of(0.0)) ** 2))
 
     def explained_v2(onset_s: float) -> float:
@@ -261,7 +261,7 @@ def _best_onset(
         square = float(column @ column)
         return float(column @ residual_v) ** 2 / square if square > least_v2 else 0.0
 
-    longest_s = max(float(np.ptp(matrix.prepared.log.time_s)) for matrix in logs)
+    longest_s = max(float(np.ptp(matrix.sampled.log.time_s)) for matrix in logs)
     step_s = longest_s / ONSETS
     tried = [values[name], *np.arange(ONSETS) * step_s]
     best = float(max(tried, key=explained_v2))
@@ -289,7 +289,7 @@ def _refine_parameters(
         values = (centre + unit * scale).tolist()
         return {p.name: value for p, value in zip(parameters, values, strict=True)} | constants
 
-    logs = [matrix.prepared.with_history_cache() for matrix in problem.diagnosed]
+    logs = [matrix.sampled.with_history_cache() for matrix in problem.diagnosed]
 
     def errors(unit: FloatArray) -> FloatArray:
         trial = model.with_effect(effect, values_of(unit))
@@ -373,11 +373,11 @@ def _jackknife_variance(
     its size is then wrong by the slope, which noise does not reveal. (Grouped jackknife: Efron, The
     Jackknife, the Bootstrap and Other Resampling Plans, 1982, ch. 3.)
     """
-    soc_pct = np.concatenate([matrix.prepared.rows.soc_pct for matrix in matrices])
+    soc_pct = np.concatenate([matrix.sampled.rows.soc_pct for matrix in matrices])
     edges = np.quantile(soc_pct, np.linspace(0.0, 1.0, SOC_BANDS + 1)[1:-1])
     by_band: list[dict[int, NormalEquations]] = []
     for matrix in matrices:
-        band = np.searchsorted(edges, matrix.prepared.rows.soc_pct)
+        band = np.searchsorted(edges, matrix.sampled.rows.soc_pct)
         scale, factor = problem.hypotheses.column_scale, problem.noise_scale(matrix)
         by_band.append(
             {
@@ -426,12 +426,12 @@ def _at_causes(
     tangents: bool = True,
 ) -> DesignMatrix:
     """Return a design matrix with the causes in its residual, and their tangents there."""
-    prepared, base = matrix.prepared.with_history_cache(), problem.structured or problem.model
+    sampled, base = matrix.sampled.with_history_cache(), problem.structured or problem.model
     with_all = _with_causes(base, causes)
-    change_v = residual(prepared, with_all) - residual(prepared, base)
+    change_v = residual(sampled, with_all) - residual(sampled, base)
     effects = list(matrix.effects)
     if tangents:
-        smooth = with_modelled_voltage(prepared, with_all)
+        smooth = with_modelled_voltage(sampled, with_all)
         here = residual(smooth, with_all)
         for number, cause in enumerate(causes):
             columns = np.empty_like(effects[cause.number])

@@ -108,12 +108,12 @@ class DiagnosisProblem:
     @cached_property
     def reference_errors_v(self) -> tuple[FloatArray, ...]:
         """Errors of the given model on each reference, shape (m,) [V]."""
-        return tuple(residual(matrix.prepared, self.given) for matrix in self.references)
+        return tuple(residual(matrix.sampled, self.given) for matrix in self.references)
 
     @cached_property
     def diagnosed_errors_v(self) -> tuple[FloatArray, ...]:
         """Errors of the given model on each diagnosed log, shape (m,) [V]."""
-        return tuple(residual(matrix.prepared, self.given) for matrix in self.diagnosed)
+        return tuple(residual(matrix.sampled, self.given) for matrix in self.diagnosed)
 
     @cached_property
     def reference_equations(self) -> tuple[NormalEquations, ...]:
@@ -133,10 +133,10 @@ class DiagnosisProblem:
         pseudo-OCV. Logs with too few covered rows are left out; if that leaves none, all rows
         count.
         """
-        references = [matrix.prepared for matrix in self.references]
+        references = [matrix.sampled for matrix in self.references]
         found = []
         for matrix, equations in zip(self.diagnosed, self.diagnosed_equations, strict=True):
-            weight = soc_weight(matrix.prepared, references, self.given.model.soc_range_pct)
+            weight = soc_weight(matrix.sampled, references, self.given.model.soc_range_pct)
             if np.all(weight == 1.0):
                 found.append(equations)
             elif np.mean(weight > 0.0) >= LEAST_COVERED:
@@ -335,8 +335,8 @@ def _covered_equations(
     given: ExtendedModel,
 ) -> NormalEquations:
     """Return a reference's normal equations as if it were diagnosed with the others."""
-    others = [matrix.prepared for k, matrix in enumerate(matrices) if k != number]
-    weight = soc_weight(matrices[number].prepared, others, given.model.soc_range_pct)
+    others = [matrix.sampled for k, matrix in enumerate(matrices) if k != number]
+    weight = soc_weight(matrices[number].sampled, others, given.model.soc_range_pct)
     if np.all(weight == 1.0) or np.mean(weight > 0.0) < LEAST_COVERED:
         return equations[number]
     return normal_equations(matrices[number], hypotheses.column_scale, weight)
@@ -424,4 +424,4 @@ def _inside(
 
 
 def _mean_square_current(matrix: DesignMatrix) -> float:
-    return float(np.mean(matrix.prepared.rows.delayed_current_a[:, 0] ** 2))
+    return float(np.mean(matrix.sampled.rows.delayed_current_a[:, 0] ** 2))

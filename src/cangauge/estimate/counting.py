@@ -180,11 +180,11 @@ the last sample. Fewer are late or damaged samples, and refused."""
 EARLY_S = 5.0
 """Tolerance of the stamps against the known length of an interruption [s]."""
 
-SHORTEST_PAUSE_S = 1e-3
-LONGEST_PAUSE_S = 30.0 * 86400.0
+SHORTEST_INTERRUPTION_S = 1e-3
+LONGEST_INTERRUPTION_S = 30.0 * 86400.0
 """Bounds of an interruption's length [s]; a longer step may be a faulty clock."""
 
-UNKNOWN_PAUSE_S = 86400.0
+UNKNOWN_INTERRUPTION_S = 86400.0
 """Assumed length of an interruption that no clock measured [s]."""
 
 
@@ -215,14 +215,15 @@ class EstimatorClock:
         age_s, self.age_s = self.age_s, None
         if age_s is not None and not step_s >= _least_step_s(age_s):
             # The stamps restarted, or their clock was set back or stopped.
-            pause_s = UNKNOWN_PAUSE_S if math.isnan(age_s) else max(age_s, SHORTEST_PAUSE_S)
-            shift_s += pause_s - step_s
+            is_unknown = math.isnan(age_s)
+            least_s = UNKNOWN_INTERRUPTION_S if is_unknown else max(age_s, SHORTEST_INTERRUPTION_S)
+            shift_s += least_s - step_s
         elif step_s < SHORTEST_STEP_S:
             if not self._is_set_back(stamp_s, step_s):
                 return None
             shift_s += stamp_s - state.behind_s - step_s
-        elif step_s > LONGEST_PAUSE_S:
-            shift_s += LONGEST_PAUSE_S - step_s
+        elif step_s > LONGEST_INTERRUPTION_S:
+            shift_s += LONGEST_INTERRUPTION_S - step_s
         time_s = stamp_s + shift_s
         if time_s - state.last_s < SHORTEST_STEP_S:
             return None
@@ -259,4 +260,4 @@ class EstimatorClock:
 
 def _least_step_s(age_s: float) -> float:
     """Return the smallest step of the stamps that agrees with an age [s]."""
-    return max((UNKNOWN_PAUSE_S if math.isnan(age_s) else age_s) - EARLY_S, SHORTEST_STEP_S)
+    return max((UNKNOWN_INTERRUPTION_S if math.isnan(age_s) else age_s) - EARLY_S, SHORTEST_STEP_S)

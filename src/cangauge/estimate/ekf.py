@@ -145,7 +145,7 @@ class MeasurementNoise:
 
         return std_v
 
-    def _filling_var_v2(self, settled_var_v2: float, filled_s: float) -> float:
+    def _filling_var_v2(self, filled_var_v2: float, filled_s: float) -> float:
         """Return the error's variance while the delay line fills [V²].
 
         Each sample gets the variance of all that share the unknown currents, so that together
@@ -157,7 +157,7 @@ class MeasurementNoise:
             for resistance, delay in zip(model.resistance_ohm, model.delay_s, strict=True)
             if delay > filled_s
         )
-        return (settled_var_v2 + (unknown_ohm * self._usual_a) ** 2) * self._shared_by
+        return (filled_var_v2 + (unknown_ohm * self._usual_a) ** 2) * self._shared_by
 
 
 class Measurement(NamedTuple):
@@ -337,7 +337,7 @@ class SocEkf:
         self._mean_innovation_v = state.mean_innovation_v
         self._mean_seconds = state.mean_seconds
 
-    def is_sound(self) -> bool:
+    def is_valid(self) -> bool:
         """Return whether state and covariance are finite and the covariance is still one."""
         covariance = self._ekf.P
         variance = np.diag(covariance)

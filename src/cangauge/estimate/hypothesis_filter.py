@@ -149,7 +149,7 @@ class HypothesisFilter:
         if self._outlier_s > DIVERGED_S:
             return True
         for each in self._filters:  # noqa: SIM110 - called for every voltage
-            if not each.is_sound():
+            if not each.is_valid():
                 return True
         return False
 
@@ -207,7 +207,7 @@ class HypothesisFilter:
             If a hypothesis is not a sound filter with a SoC within 0–100 %.
         """
         filters = [self._restored(each) for each in state.hypotheses]
-        if not all(each.is_sound() and 0.0 <= each.soc_pct <= 100.0 for each in filters):
+        if not all(each.is_valid() and 0.0 <= each.soc_pct <= 100.0 for each in filters):
             raise InputError("holds no covariance, or no SoC", field="filter.hypotheses")
         self._filters = filters
         self._is_untested = state.is_untested

@@ -18,7 +18,7 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.errors import CangaugeError, InputError
 from cangauge.identify.cross_validation import Comparison, CrossValidation, HeldOutErrors, compare
-from cangauge.inference.least_squares import BLOCK_S, Solution
+from cangauge.inference.least_squares import CLUSTER_S, Solution
 from cangauge.inference.linearized import (
     ROUGHLY_CONVERGED,
     Linearization,
@@ -238,7 +238,7 @@ def fit_effects(
         errors = search.validation.errors(model)
     linear = linearize(model, logs)
     rows = [item.rows for item in logs]
-    whole = solution_at(linear, block_numbers(rows, BLOCK_S))
+    whole = solution_at(linear, block_numbers(rows, CLUSTER_S))
     n = model.model.coefficients.size
     ends = np.cumsum([len(item) for item in rows])[:-1]
     return FittedEffects(

@@ -29,7 +29,7 @@ from cangauge.inference.time_scales import SCALES, haar_transform
 SINGULAR = 1e-11
 """Singular values below this, relative to the largest, are truncated."""
 
-BLOCK_S = 300.0
+CLUSTER_S = 300.0
 """Distance from which residuals count as independent in the standard errors [s]."""
 
 FEASIBLE = 1e-9
@@ -62,7 +62,7 @@ class Solution:
     coefficients: FloatArray
     """Shape (p,), in the units of the columns."""
     std_error: FloatArray
-    """Shape (p,); robust against residuals correlated within `BLOCK_S`."""
+    """Shape (p,); robust against residuals correlated within `CLUSTER_S`."""
     condition_number: float
     """Of the scaled columns."""
     constrained: bool

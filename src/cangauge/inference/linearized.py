@@ -42,7 +42,7 @@ STEPS_AT_MOST, HALVINGS_AT_MOST = 12, 4
 CONVERGED, ROUGHLY_CONVERGED = 1e-5, 1e-3
 """Relative decrease of the sum of squares at which the iteration stops; roughly, in a search."""
 
-KT_PRIOR_PER_K = 2.5e-3
+WIDE_KT_PRIOR_PER_K = 2.5e-3
 """Wide prior standard deviation of kt, relative to the voltage [1/K]: 10 mV/K per cell, more than
 the published one. Held-out logs judge kt, but a constant temperature would leave it undefined."""
 
@@ -152,7 +152,7 @@ class Linearization:
     residual_v: FloatArray
     """Shape (n,)."""
     kt_weight: float
-    """Weight of the prior row kt = 0 V/K [K]; see `KT_PRIOR_PER_K`."""
+    """Weight of the prior row kt = 0 V/K [K]; see `WIDE_KT_PRIOR_PER_K`."""
 
     @property
     def prior_row(self) -> FloatArray:
@@ -232,7 +232,7 @@ def linearize(
 def _kt_weight(model: ExtendedModel, at_model: Sequence[Prediction]) -> float:
     """Return the weight of the prior row kt = 0 V/K for white errors [K]."""
     residual_v = np.concatenate([item.residual_v for item in at_model])
-    return float(np.sqrt(np.mean(residual_v**2))) / (KT_PRIOR_PER_K * model.pack.voltage_v)
+    return float(np.sqrt(np.mean(residual_v**2))) / (WIDE_KT_PRIOR_PER_K * model.pack.voltage_v)
 
 
 def coefficient_columns(

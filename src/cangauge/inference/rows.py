@@ -26,7 +26,7 @@ from cangauge.errors import InputError
 from cangauge.logs.log import Log
 from cangauge.logs.resample import dequantize
 from cangauge.model.charge import counted_soc_pct, discharged_ah
-from cangauge.model.delay_line import GAP_S, delayed_currents, settled
+from cangauge.model.delay_line import GAP_S, delayed_currents, filled_at
 from cangauge.model.effects.base import Signals
 
 DELAYS_S = (0.0, 10.0, 30.0, 70.0)
@@ -146,7 +146,7 @@ def fit_rows(log: Log, options: FitOptions, *, gap_s: float = GAP_S) -> FitRows:
         )
     ticks = decimate(log.time_s, options.rate_hz)
     running = running_rows(log.time_s, log.voltage_v)[ticks]
-    full = settled(log.time_s, max(delay_s), log.time_s[ticks], usual_gap_s(log.time_s, gap_s))
+    full = filled_at(log.time_s, max(delay_s), log.time_s[ticks], usual_gap_s(log.time_s, gap_s))
     keep = ticks[running & full]
     if keep.size < 2:
         raise InputError(

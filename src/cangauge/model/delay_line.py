@@ -36,7 +36,7 @@ def delayed_currents(
     return np.column_stack([np.interp(at - delay, time_s, current_a) for delay in delay_s])
 
 
-def settled(
+def filled_at(
     time_s: FloatArray, longest_delay_s: float, at_s: ArrayLike, gap_s: float = GAP_S
 ) -> NDArray[np.bool_]:
     """Return at which of the times `at_s` the delay line is full and free of gaps, shape (m,).

@@ -293,7 +293,7 @@ class Model(_Strict):
         row, soc_pct = anchor
         signals = Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
         rows = np.arange(len(log))
-        return self.extended_model().predict(signals, soc_pct, rows, anchor_row=row)
+        return self.extended_model().predict(signals, soc_pct, rows, initial_row=row)
 
 
 def resistance_names(number: int) -> list[str]:
