@@ -8,8 +8,8 @@ described by several features, and a classifier trained on cases with known caus
    1974), given that one of the effects is the cause.
 2. *Whether there is a cause*: a multinomial logit of three answers: none, the best effect, another.
 
-No feature depends on the name of an effect. `benchmarks/belief.py` trains the weights on simulated
-packs; none of them is part of a release's check.
+No feature depends on the name of an effect. `benchmarks/classifier_weights.py` fits the weights to
+development cases; none of them is part of a release's check.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The page of `cangauge gap`: size, place and cause of the gap, and the part that a cause closes."""
+"""The page of `cangauge gap`: size, place and cause of the gap, and how far a cause closes it."""
 
 from __future__ import annotations
 
