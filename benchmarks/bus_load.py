@@ -68,9 +68,6 @@ def bus() -> BusAddress:
     return bus_address("udp_multicast", options={"port": PORT})
 
 
-# --- load -------------------------------------------------------------------------------------
-
-
 def load(seconds: float) -> tuple[Result, list[Row]]:
     """Measure `cangauge run` and a bare loop on a saturated bus."""
     with service(bus(), "--until-idle", "1.5") as process:
@@ -158,9 +155,6 @@ def _count_frames(pipe: Any) -> None:
     receiver.shutdown()
 
 
-# --- speed and timing -------------------------------------------------------------------------
-
-
 def full_speed() -> tuple[Result, list[Row]]:
     """Measure a 2.5 h log through the bus."""
     path = shared_file("replay", "leaf2012_reconstruction_white.parquet")
@@ -222,9 +216,6 @@ def timing(seconds: float = 120.0) -> tuple[Result, list[Row]]:
     return replay, rows
 
 
-# --- memory -----------------------------------------------------------------------------------
-
-
 def memory(hours: float = 24.0) -> tuple[Result, list[Row]]:
     """Measure the memory of a process over a day of bus time."""
     context = multiprocessing.get_context("spawn")
@@ -274,9 +265,6 @@ def _handle_a_day(pipe: Any, hours: float) -> None:
 def _resident_mb() -> float:
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
-# --- main -------------------------------------------------------------------------------------
 
 
 def main() -> int:

@@ -179,8 +179,7 @@ def _seam(
 
 def _reference(trip: Log) -> np.ndarray:
     if trip.soc_pct is None:
-        msg = f"{trip.name} has no reference SoC"
-        raise SystemExit(msg)
+        raise SystemExit(f"{trip.name} has no reference SoC")
     return trip.soc_pct
 
 
@@ -250,11 +249,11 @@ def judge(
         )
     result["trips"] = trips
     cases = {name: pooled([trip["cases"][name] for trip in trips]) for name in trips[0]["cases"]}
-    for name, (offset_a, error, is_gauge_capacity) in chains.items():
+    for name, (offset_a, error, counts_with_capacity) in chains.items():
         console.print(f"estimating the {name.replace('_', ' ')} …")
         capacity_ah = model.capacity_ah * (1.0 + error)
         samples, soc = chain(
-            tests, capacity_ah if is_gauge_capacity else model.capacity_ah, offset_a
+            tests, capacity_ah if counts_with_capacity else model.capacity_ah, offset_a
         )
         settings = EstimatorSettings(initial_soc_pct=float(soc[0]), capacity_ah=capacity_ah)
         table = run_estimator(samples, model, settings)
