@@ -9,7 +9,7 @@ import pytest
 
 from cangauge.validation.score import Outcome, estimate, outcome_of, proportion, score
 from cangauge.validation.tables import judge_targets
-from cangauge.validation.workers import Task
+from cangauge.validation.worker_pool import Task
 
 
 def label(*effects: str, size: float = 0.0, gap_v: float = 2.0, **more: Any) -> dict[str, Any]:

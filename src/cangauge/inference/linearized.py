@@ -44,7 +44,7 @@ CONVERGED, ROUGHLY_CONVERGED = 1e-5, 1e-3
 
 WIDE_KT_PRIOR_PER_K = 2.5e-3
 """Wide prior standard deviation of kt, relative to the voltage [1/K]: 10 mV/K per cell, more than
-the published one. Held-out logs judge kt, but a constant temperature would leave it undefined."""
+the published one. Cross-validation tests kt; the prior only defines it at constant temperature."""
 
 
 def residual(log: SampledLog, model: ExtendedModel) -> FloatArray:
@@ -69,7 +69,7 @@ def pack_state(log: SampledLog, model: ExtendedModel) -> PackState:
 
 
 def with_modelled_voltage(log: SampledLog, model: ExtendedModel) -> SampledLog:
-    """Return the log with the model's voltage in place of the measured one.
+    """Return the log with the model's voltage instead of the measured one.
 
     The derivative by an effect in proportion to the voltage would otherwise contain its noise.
     """

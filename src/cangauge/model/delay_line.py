@@ -1,7 +1,7 @@
 """Delayed currents I(t − dj): over a whole log, and online from a ring buffer.
 
-Both interpolate linearly between time stamps, at any and irregular rates; before the first sample
-the current counts as that of the first sample. Tests hold the two forms together.
+Both interpolate linearly between time stamps, which may be irregular, and hold the current of the
+first sample before it. A test checks that the two forms agree.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ def filled_at(
 ) -> NDArray[np.bool_]:
     """Return at which of the times `at_s` the delay line is full and free of gaps, shape (m,).
 
-    It is not in the first `longest_delay_s` of a log and as long after a gap longer than `gap_s`.
+    It is filling in the first `longest_delay_s` of a log, and as long after a gap longer than
+    `gap_s`.
     """
     at = np.asarray(at_s, dtype=np.float64)
     after_gap = np.flatnonzero(np.diff(time_s) > gap_s) + 1

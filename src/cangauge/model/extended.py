@@ -27,11 +27,11 @@ SLOPE_STEP_PCT = 0.05
 """Half step of the finite difference of the effects' voltage over SoC [%]."""
 
 STEADY_S, STEADY_STEP_S = 4.0 * 3600.0, 10.0
-"""Duration of a constant current until the voltage counts as settled, and its time step [s]."""
+"""Duration of a constant current until the voltage counts as steady, and its time step [s]."""
 
 STEADY_C_RATE = 1.0 / 3.0
 STEADY_CHANGE = 0.05
-"""Current at which the change of the settled voltage is taken, in both directions [1/h] (20 A at
+"""Current at which the change of the steady voltage is taken, in both directions [1/h] (20 A at
 60 Ah, as in driving), and the relative change of current."""
 
 _ORDER = {effect_id: number for number, effect_id in enumerate(LIBRARY)}

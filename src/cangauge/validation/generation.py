@@ -71,16 +71,16 @@ def draw_group(group: Group, folder: Path, withheld: Path, data: Path | None) ->
     ----------
     group : Group
     folder : Path
-        Gets a folder for each case.
+        Parent of the case folders.
     withheld : Path
-        Gets the held-out logs of laboratory cases.
+        Folder of the held-out logs of laboratory cases.
     data : Path, optional
         Folder of the recorded logs.
 
     Returns
     -------
     list of dict
-        Labels; of a case that cannot be drawn with the reason under `failed`.
+        Labels; a case that cannot be drawn has the reason under `failed`.
     """
     try:
         if group.protocol in _SIMULATED:
@@ -125,7 +125,7 @@ def _draw_simulated(group: Group, folder: Path) -> list[Label]:
             seed = case.seed + attempt * _NEXT_SEED
             drawn = draw_case(seed, case.effects, scenario, options)
             if not case.effects or drawn.gap_v >= LEAST_GAP * floor_v:
-                break  # else physics allows too small a gap on these drives
+                break  # otherwise the physical limits allow only a smaller gap on these drives
         writer.write(case.name, drawn.logs, capacity_ah)
         labels.append(_label(group.protocol, case, drawn, known))
     return labels

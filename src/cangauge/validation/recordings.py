@@ -6,8 +6,8 @@ held-out ones; and laboratory cases, where the cause is what the laboratory chan
 - `cold-bmw_i3`: winter trips of a car against the model of its summer trips. Each trip is left out
   in turn; one more case has all of them.
 - `cold-lg_hg2`: drive cycles of a cell at 0 and 10 °C against 25 °C.
-- `hysteresis-a123_lfp`: slow discharge and charge of an LFP cell against drive cycles, which
-  discharge: the model fits the discharge as well as the drives, not the charge.
+- `hysteresis-a123_lfp`: slow discharge and charge of an LFP cell against drive cycles. The cycles
+  discharge the cell, so the model fits the slow discharge but not the slow charge.
 """
 
 from __future__ import annotations

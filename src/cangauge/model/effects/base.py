@@ -7,8 +7,8 @@ An effect acts in up to three places, in this order:
 2. `count`: how charge becomes SoC (capacity, initial_soc, coulombic_efficiency);
 3. `extra_voltage`: a voltage added to the voltage model's (resistances, dynamics, hysteresis …).
 
-Each effect is written twice in its file, over whole logs as arrays and one sample at a time; tests
-hold the two together. At its neutral values an effect changes nothing.
+Each effect has two forms in its file, over whole logs as arrays and one sample at a time; a test
+checks that they agree. At its neutral values an effect changes nothing.
 
 Parameters are of three kinds. *Amplitudes* have a neutral value and enter the voltage (nearly)
 linearly. *Shapes* (a time constant, a change point) have a grid of trial values and no meaning
@@ -199,7 +199,7 @@ class CurrentHistory:
     def _low_passed(self, tau_s: float, *, squared: bool) -> FloatArray:
         key = (tau_s, squared)
         if key not in self._lagged:
-            while len(self._lagged) >= MOST_LAGS:  # a fit asks for ever new ones
+            while len(self._lagged) >= MOST_LAGS:  # a fit varies the time constants
                 del self._lagged[next(iter(self._lagged))]
             values = self.current_a**2 if squared else self.current_a
             self._lagged[key] = low_passed(self.time_s, values, tau_s, 0.0, rest_s=BRIDGE_S)
@@ -400,15 +400,15 @@ class Effect:
     family: ClassVar[Family]
     parameters: ClassVar[tuple[Parameter, ...]]
     signature: ClassVar[str]
-    """Its appearance in U_measured − U_model, in words."""
+    """Its signature in U_measured − U_model, in words."""
     equation: ClassVar[str]
     source: ClassVar[str]
     separated_by: ClassVar[str]
     """The test that separates it from effects that look alike."""
     is_cause: ClassVar[bool] = True
-    """Whether a diagnosis may name it; else it is structure that only reference logs teach."""
+    """Whether a diagnosis may name it; otherwise it is structure, learned from references only."""
     is_structure: ClassVar[bool] = False
-    """Whether a healthy pack may have it: then what the references show of it is no cause."""
+    """Whether a healthy pack may have it: the part that references show is then not a cause."""
     secant_points: ClassVar[tuple[float, ...]] = ()
     """For an effect far from linear in its only amplitude: fractions of the widest bound at which
     the diagnosis takes the change of the voltage, besides a small one."""

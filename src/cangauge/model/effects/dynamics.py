@@ -90,7 +90,7 @@ TAU_RATIO: Final = 4.0
 """Ratio of the time constants of neighbouring elements."""
 
 RESISTANCE_RATIO: Final = 2.0
-"""Ratio of their resistances: that of diffusion goes with the square root of time."""
+"""Ratio of their resistances: that of diffusion scales with the square root of time."""
 
 MEAN_SLOPE_PCT: Final = (10.0, 90.0)
 """SoC between which the mean slope of the open-circuit voltage is taken [%]."""
