@@ -1,4 +1,4 @@
-"""Caveats: what the logs cannot show, whatever the verdict; one or two sentences each."""
+"""Caveats: limits of what the logs can show, whatever the verdict; one or two sentences each."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def temperature_step_caveat(step_k: float, kt_v_per_k: float, floor_v: float) ->
 def reference_fit_caveat(
     errors_v: Sequence[tuple[str, float]], stated_v: float, voltage_v: float
 ) -> str:
-    """Return the caveat of references that the given model does not fit; "" if it fits.
+    """Return the caveat of references that the given model does not fit; "" if it fits them.
 
     Parameters
     ----------

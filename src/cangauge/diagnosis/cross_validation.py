@@ -1,8 +1,8 @@
 """Cross-validation of the gap: errors on rows that the fit of the effects did not see.
 
-Of several logs each is left out in turn. One log is cut into blocks of 240 s, of which every fourth
-is left out in turn, except for the last; the middle 120 s of a left-out block are judged, so that
-60 s on either side separate them from the rows of the fit.
+Of several logs each is left out in turn. A single log is divided into blocks of 240 s, of which
+every fourth is left out in turn, except for the last; the error is evaluated on the middle 120 s of
+a left-out block, separated by 60 s on either side from the rows of the fit.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ start."""
 
 @dataclass(frozen=True, eq=False)
 class Fold:
-    """Posterior without some rows, and the rows of one log that judge it."""
+    """Posterior without some rows, and the rows of one log to evaluate it on."""
 
     posterior: Posterior
     log: int
@@ -89,7 +89,7 @@ def folds(problem: DiagnosisProblem) -> list[Fold]:
 def held_out_errors(
     problem: DiagnosisProblem, held_out: Sequence[Fold], effects: Sequence[str]
 ) -> list[HeldOutErrors]:
-    """Return the errors with some effects, each fold fitted without the rows that judge it.
+    """Return the errors with some effects, each fold fitted without the rows it is evaluated on.
 
     Parameters
     ----------

@@ -30,8 +30,8 @@ from cangauge.model.effects.library import candidates as library_candidates
 from cangauge.model.extended import ExtendedModel
 
 PER_LOG_STATES = ("slow polarisation", "resistance level")
-"""State of a log that no signal shows, in parts of the pack resistance: trips of one pack differ in
-their initial polarisation, and in the temperature inside the cells."""
+"""Unmeasured states of a log, in parts of the pack resistance: trips of one pack differ in their
+initial polarisation, and in the temperature inside the cells."""
 
 SLOW_POLARISATION_S = 150.0
 """Time constant of the per-log slow polarisation [s]."""
@@ -80,24 +80,24 @@ def design_matrix(
     candidates : sequence of Candidate
         Their shapes as of this log (`candidates_for`).
     structured : ExtendedModel, optional
-        `model` with the structure that the references need. The residual, and the columns of
-        thermal effects, are taken about it: a wrong temperature shows through everything that
-        depends on temperature, and in `model` that is one coefficient only.
+        `model` with the structure that the references need. The residual and the columns of
+        thermal effects are taken about it: a wrong temperature acts through everything that depends
+        on temperature, which in `model` is a single coefficient.
     """
     voltage_model = model.model
     rows = sampled.rows
-    remembering = sampled.with_history_cache()  # keeps intermediate results until all columns exist
-    slow = remembering.signals.history.lagged_a(SLOW_POLARISATION_S)
+    cached = sampled.with_history_cache()  # until all columns are computed
+    slow = cached.signals.history.lagged_a(SLOW_POLARISATION_S)
     per_log_states = np.column_stack(
         [
             -model.pack.resistance_ohm * slow[sampled.at],
             -model.pack.resistance_ohm * sampled.log.current_a[sampled.at],
         ]
     )
-    smooth = with_modelled_voltage(remembering, model)
+    smooth = with_modelled_voltage(cached, model)
     at_model = (residual(smooth, model), pack_state(smooth, model))
     if structured is not None:
-        smooth_structured = with_modelled_voltage(remembering, structured)
+        smooth_structured = with_modelled_voltage(cached, structured)
         at_structured = (
             residual(smooth_structured, structured),
             pack_state(smooth_structured, structured),
@@ -120,7 +120,7 @@ def design_matrix(
         else effect_columns(smooth, model, candidate, *at_model)
         for candidate in candidates
     )
-    residual_v = residual(remembering, structured or model)
+    residual_v = residual(cached, structured or model)
     if structured is not None:
         change = structured.model.coefficients - voltage_model.coefficients
         residual_v += coefficients @ change + _structure_v(model, structured, candidates, effects)

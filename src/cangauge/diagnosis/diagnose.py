@@ -1,4 +1,4 @@
-"""Diagnosis of the gap between a model and logs: size, place, cause, and what an effect closes."""
+"""Diagnosis of the gap between a model and logs: size, place, cause, and closed fraction."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class Diagnosis:
     model: Model
     """Diagnosed model."""
     problem: DiagnosisProblem
-    """What the verdict rests on: error model, hypotheses, design matrices."""
+    """Basis of the verdict: error model, hypotheses, design matrices."""
     verdict: Verdict
     """Cause (an effect, `none` or `unknown`) with probabilities."""
     extension: Extension
@@ -125,7 +125,7 @@ class Diagnosis:
 
     @cached_property
     def extended_soc_mae_pct(self) -> float | None:
-        """Mean absolute SoC error of the estimator with the extended model [%], likewise."""
+        """The same with the extended model [%]."""
         return soc_mae_pct(self.logs, self.extended_model)
 
     @property
@@ -164,7 +164,7 @@ class Diagnosis:
 
     @property
     def caveats(self) -> list[str]:
-        """What these logs cannot show, whatever the verdict; one or two sentences each."""
+        """Limits of what these logs can show, whatever the verdict; one or two sentences each."""
         problem = self.problem
         fits = [
             (matrix.sampled.log.name, rms(errors))

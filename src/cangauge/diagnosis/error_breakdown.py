@@ -1,4 +1,4 @@
-"""Where the error lies: shares along each axis, worst segments, and maps over two quantities."""
+"""Error breakdown: shares along each axis, worst segments, and maps over two quantities."""
 
 from __future__ import annotations
 
@@ -311,7 +311,7 @@ class ErrorMap:
     rms_v: FloatArray
     """RMS error, shape (k, m) [V]; NaN in bins with fewer than `MIN_BIN_ROWS` rows."""
     mean_v: FloatArray
-    """Mean error, likewise."""
+    """Mean error, shape (k, m) [V]; NaN in the same bins."""
     tails: bool = False
     """Whether the outer bins of the second quantity include everything beyond them."""
 
@@ -332,7 +332,7 @@ def error_map(
         Put long tails of `values` into the outer bins.
     """
     if tails:
-        # One pulse of 400 A must not squeeze a drive at 50 A into two rows of bins.
+        # Otherwise one pulse of 400 A would compress a drive at 50 A into two rows of bins.
         part = float(np.clip(TAIL_ROWS / values.size, *TAIL_PART))
         values = np.clip(values, *np.quantile(values, [part, 1.0 - part]))
     most = max(MIN_BINS, soc_pct.size // ROWS_PER_BIN)

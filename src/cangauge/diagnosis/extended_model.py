@@ -1,9 +1,9 @@
 """The extended model: the given model, the references' structure, and the accepted causes.
 
 A verdict linearises the voltage about no effect. A skew of seconds or a fifth of the capacity is
-far from that, so the accepted causes are fitted through the model's own equations, and residual and
-tangents are taken again at the values found (Gauss–Newton), with everything else marginalised as
-for the verdict.
+far from that point, so the accepted causes are fitted through the model's own equations, with
+residual and tangents at the current values (Gauss–Newton) and everything else marginalised as for
+the verdict.
 """
 
 from __future__ import annotations
@@ -53,8 +53,9 @@ ONSETS = 100
 """Times of onset tried over the longest log, then between the neighbours of the best."""
 
 MIN_ONSET_PART = 0.02
-"""A change must keep this part of the squares that its column has from the start of the log, beside
-the coefficients. Less means next to no rows before or after it: a wrong row, not a change."""
+"""Least part of the squares of a change's column, with the coefficients projected out, relative to
+that of a change at the start of the log. With less, hardly any rows lie before or after the change:
+it is a wrong row."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +223,7 @@ def _with_change_point(
 ) -> dict[str, float]:
     """Return an effect's values with the onsets that leave the least squares of the voltage.
 
-    By trying them: the voltage jumps at the onset, so no gradient leads there. The sizes of the
+    Grid search, since the voltage jumps at the onset and has no gradient there. The sizes of the
     amplitudes do not matter, only their proportions.
     """
     values = dict(start)
@@ -237,7 +238,7 @@ def _best_onset(
 ) -> float:
     """Return the onset [s] that explains most, common to all logs."""
     states = [pack_state(matrix.sampled, model) for matrix in logs]
-    # What the coefficients or the per-log states explain as well is no change.
+    # A part that coefficients or per-log states also explain is no evidence of a change.
     known = [np.linalg.qr(np.column_stack([m.coefficients, m.per_log_states]))[0] for m in logs]
 
     def unexplained(volts: Sequence[FloatArray]) -> FloatArray:

@@ -1,8 +1,8 @@
-"""The diagnosis problem: what all verdicts of one diagnosis share.
+"""The diagnosis problem: everything that a verdict is computed from.
 
-Checks the logs, assigns the hypotheses, learns error model and structure from the references and
-linearises the diagnosed logs. Also decides where the references cover the diagnosed logs in
-temperature and SoC.
+Checks the logs, assigns the roles of the hypotheses, estimates error model and structure from the
+references, and linearises the diagnosed logs. Reference coverage, in temperature and SoC, limits
+the conclusions beyond the references' operating points.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ COVERED_K, COVERED_PCT = 3.0, 3.0
 """References cover temperatures and SoC up to this far outside their own range [K, %]."""
 
 COLDER_PART, WARMER_PART = 0.2, 0.5
-"""References also cover temperatures below and above by these parts of their range, having shown
-the temperature dependence; less in the cold, where resistance rises ever faster. (On the trips of
-the check, winter is 0.3 below summer.)"""
+"""References also cover temperatures below and above their range by these parts of it, since they
+show the temperature dependence; less in the cold, where resistance rises more steeply. (On the
+trips of the check, winter is 0.3 below summer.)"""
 
 BEYOND_WEIGHT = 0.3
-"""Weight of a row at an SoC that only the model's own logs cover. Chosen on development cases,
-where such rows had not counted before; the only value that was run."""
+"""Weight of a row at an SoC that only the model's own logs cover. The only value tested, on
+development cases, against a weight of 0."""
 
 LEAST_REFERENCE_WEIGHT = 0.1
 """Weight of a reference at operating points that no other covers."""
@@ -82,7 +82,7 @@ TEMPERATURE_STRUCTURE = frozenset({"charge_transfer", "inner_temperature"})
 
 @dataclass(frozen=True, eq=False)
 class DiagnosisProblem:
-    """Common ground of all verdicts of one diagnosis."""
+    """Checked logs, hypotheses, error model and design matrices of one diagnosis."""
 
     model: ExtendedModel
     """Given model with the references' coefficients, without their structure; columns other than

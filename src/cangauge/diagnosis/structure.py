@@ -1,12 +1,12 @@
-"""Structure that the references need beyond the voltage model, and the model that has it.
+"""Structure that the references need beyond the voltage model, and the model with it.
 
 The verdict marginalises over all structure. A model file has only the few pieces (candidates of the
 shared structure) that make the references more probable.
 
-Structure acts on what coefficients multiply: cells warmer than their sensor show as kt times the
-rise, so both cannot be solved for at once with columns of a model with another kt. Coefficients and
-structure are solved for repeatedly about the last solution (Gauss–Newton), until the references are
-no less probable than under the first one.
+Structure changes the factors of coefficients: cells warmer than their sensor change the voltage by
+kt times the rise, so the columns of a model with another kt cannot give both at once. Coefficients
+and structure are therefore solved for repeatedly about the last solution (Gauss–Newton), until the
+references are no less probable than under the first one.
 """
 
 from __future__ import annotations

@@ -5,11 +5,11 @@ their charge is uncertain by the whole recent current. Across a restart, the cur
 of the gap count for as long as a driver holds a current, and the mean of the last minute for the
 rest.
 
-Anything longer is an *unobserved interval*: the bus was asleep, or the service not running. No
-charge is counted, and two hypotheses describe the interval. *Parked*: small consumers only, so the
-SoC is what it was, within a little. *Moved*: the car was charged or driven, so the SoC may be
-anything that a fast charger can reach. The prior probability of *moved* grows with the length of
-the interval; afterwards the voltage decides (see `hypothesis_filter`).
+A longer step is an *unobserved interval*: the bus was asleep, or the service not running. No charge
+is counted, and there are two hypotheses. *Parked*: self-discharge and small consumers only, so the
+SoC has hardly changed. *Moved*: the car was charged or driven, by at most the rate of a fast
+charger. The prior probability of *moved* grows with the length of the interval; the voltages after
+it test both (see `hypothesis_filter`).
 """
 
 from __future__ import annotations
@@ -140,8 +140,8 @@ class CoulombCounter:
         kept = math.exp(-seconds / MEAN_MEMORY_S)
         state.mean_a = kept * state.mean_a + (1.0 - kept) * current_a
         kept = math.exp(-seconds / MEAN_SQUARE_MEMORY_S)
-        # The mean square is slow to notice the start of a drive: the currents at the ends of the
-        # gap bound it from below.
+        # At the start of a drive the mean square lags: the currents at the ends of the gap bound it
+        # from below.
         mean_square_a2 = state.mean_square_a2
         state.mean_square_a2 = kept * state.mean_square_a2 + (1.0 - kept) * current_a**2
         if seconds > BRIDGE_S:

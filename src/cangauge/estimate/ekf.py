@@ -161,7 +161,7 @@ class MeasurementNoise:
 
 
 class Measurement(NamedTuple):
-    """One voltage, with what is needed to predict it."""
+    """One measured voltage with the terms of its prediction."""
 
     voltage_v: float
     without_ocv_v: float
@@ -326,19 +326,19 @@ class SocEkf:
         Raises
         ------
         InputError
-            If its number of variables is another one.
+            If it has another number of variables.
         """
         ekf = self._ekf
         size = ekf.dim_x
         if [len(state.x), *map(len, state.p)] != [size] * (size + 1) or len(state.p) != size:
-            raise InputError(f"is not a filter of {size} states", field="filter.hypotheses")
+            raise InputError(f"not a filter of {size} states", field="filter.hypotheses")
         ekf.x = np.array(state.x).reshape(size, 1)
         ekf.P = np.array(state.p)
         self._mean_innovation_v = state.mean_innovation_v
         self._mean_seconds = state.mean_seconds
 
     def is_valid(self) -> bool:
-        """Return whether state and covariance are finite and the covariance is still one."""
+        """Return whether state and covariance are finite, and the covariance semidefinite."""
         covariance = self._ekf.P
         variance = np.diag(covariance)
         if not (np.isfinite(covariance).all() and (variance >= 0.0).all()):

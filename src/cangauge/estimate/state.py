@@ -1,8 +1,8 @@
 """State of an estimator: everything it needs to continue as if never interrupted.
 
 The parts are plain dataclasses that their owners update in place; `EstimatorState` collects copies
-of them and validates what is read from a file. NaN means "not known yet" and is null in JSON.
-Infinity is refused, and every number is bounded so that no arithmetic on it overflows.
+of them and validates the content of a file. NaN means "not known yet" and is null in JSON. Infinity
+is refused, and every number is bounded so that no arithmetic on it overflows.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PLAUSIBLE_A = 1e5
 """Upper bound of currents in a state [A]; effects may scale a sample's current."""
 
 DELAY_LINE_AT_MOST = 200_000
-"""Samples that a delay line may hold; 70 s thinned to 9 ms are 8,300."""
+"""Samples that a delay line may hold; 70 s at the least spacing of 9 ms are 8,300."""
 
 EFFECTS_AT_MOST = 64
 EFFECT_NUMBERS_AT_MOST = 50_000
@@ -142,7 +142,7 @@ class HypothesisFilterState:
     __pydantic_config__: ClassVar[Any] = _NO_MORE
     hypotheses: Annotated[list[EkfState], Field(min_length=1, max_length=2)]
     is_untested: Flag
-    """Whether a given initial SoC has not met a voltage yet."""
+    """Whether no voltage has tested a given initial SoC yet."""
     log_odds: Finite
     """Log odds of the second hypothesis against the first."""
     open_s: NotNegative

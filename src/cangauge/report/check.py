@@ -158,7 +158,7 @@ def _method(result: Result) -> list[Block]:
     cost = result["cost"]
     lines = [
         f"SHA-256 of the sealed causes, published before the diagnosis: {result['labels_sha256']}.",
-        f"{result['jobs']} diagnosing processes, each with logs, model and request alone.",
+        f"{result['jobs']} diagnosing processes, whose only inputs are logs, model and request.",
         "A floor, the unit of a gap, is the error of a model of training and reference logs on"
         " unseen days without a fault.",
         "Intervals: Wilson's for shares, bootstrap for medians and the Brier score.",
