@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from cangauge.diagnosis.error_breakdown import REST_C_RATE
 from cangauge.diagnosis.problem import COVERED_K, COVERED_PCT
 from cangauge.inference.rows import SampledLog
 from cangauge.logs.log import TemperatureSource
@@ -17,9 +18,8 @@ SHORT_S = 600.0
 NARROW_K, NARROW_PCT = 3.0, 10.0
 """Ranges of temperature and SoC below which their influence is not visible [K, %]."""
 
-REST_C_RATE, REST_PART = 0.02, 0.005
-"""Current below which the pack rests [1/h], and the part of the rows below which it never charges
-or rests."""
+REST_PART = 0.005
+"""Part of the rows below which the pack counts as never charged, or never at rest."""
 
 STEP_PART = 0.5
 """Part of the floor below which half a step of the temperature is negligible."""

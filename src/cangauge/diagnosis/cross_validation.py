@@ -19,11 +19,13 @@ from cangauge.diagnosis.linear_gaussian import NormalEquations, Posterior, margi
 from cangauge.diagnosis.problem import DiagnosisProblem
 from cangauge.estimate.offline import run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
+from cangauge.inference.rows import BLOCK_GUARD_S, BLOCK_S
 from cangauge.logs.log import Log
 from cangauge.logs.resample import resample
 from cangauge.model.model_file import Model
 
-BLOCK_S, GUARD_S, FOLDS = 240.0, 60.0, 4
+FOLDS = 4
+"""One block of a single log in this number is left out in turn."""
 
 PIECE_S = 300.0
 """Length of the pieces that the bootstrap draws, beyond the correlation of errors [s]."""
@@ -76,7 +78,7 @@ def folds(problem: DiagnosisProblem) -> list[Fold]:
         since = elapsed % BLOCK_S
         for fold in range(FOLDS):
             left_out = (block % FOLDS == fold) & (block < block[-1])
-            core = left_out & (since >= GUARD_S) & (since < BLOCK_S - GUARD_S)
+            core = left_out & (since >= BLOCK_GUARD_S) & (since < BLOCK_S - BLOCK_GUARD_S)
             if core.any():
                 held_out.append(([problem.equations_of(logs[0], 1.0 - left_out)], 0, core))
     references = problem.reference_equations

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.cross_validation import DRAWS, PIECE_S
 from cangauge.diagnosis.design_matrix import DesignMatrix
-from cangauge.inference.rows import SampledLog
+from cangauge.inference.rows import SampledLog, block_numbers
 
 TIME_SCALES_S = (0.0, 10.0, 100.0, 1000.0, np.inf)
 """Edges of the time scales: faster than 10 s, 10–100 s, …, slower than 1000 s."""
@@ -95,7 +95,7 @@ def error_shares(
         Defines rest [Ah].
     """
     square = np.concatenate(errors_v) ** 2
-    piece = _pieces(logs)
+    piece = block_numbers([matrix.sampled.rows for matrix in logs], PIECE_S)
     result = []
     for axis, unit, values, edges in _axes(logs, capacity_ah):
         for low, high in itertools.pairwise(edges.tolist()):
@@ -179,17 +179,6 @@ def _moving_average(values: FloatArray, width: float) -> FloatArray:
     at = np.arange(values.size)
     low, high = np.maximum(at - half, 0), np.minimum(at + half + 1, values.size)
     return np.asarray((total[high] - total[low]) / (high - low))
-
-
-def _pieces(logs: Sequence[DesignMatrix]) -> NDArray[np.intp]:
-    """Return the number of each row's piece for the bootstrap, counted over all logs."""
-    numbers, first = [], 0
-    for matrix in logs:
-        time_s = matrix.sampled.rows.time_s
-        number = ((time_s - time_s[0]) // PIECE_S).astype(np.intp) + first
-        first = int(number[-1]) + 1
-        numbers.append(number)
-    return np.concatenate(numbers)
 
 
 @dataclass(frozen=True)

@@ -81,6 +81,26 @@ ROUNDING = 1e-6
 """Tolerance of a covariance's correlations."""
 
 
+def count_std_pct(
+    capacity_ah: float, start_var_pct2: float, hours: float, moved_pct: float
+) -> float:
+    """Return the standard deviation of the SoC by counting alone [%].
+
+    Parameters
+    ----------
+    capacity_ah : float
+        Charge from 100 to 0 % [Ah].
+    start_var_pct2 : float
+        Variance of the SoC that counting started from, and of gaps [%²].
+    hours, moved_pct : float
+        Time [h] and charge moved in either direction [%] since.
+    """
+    pct_per_as = 100.0 / (3600.0 * capacity_ah)
+    offset_pct = OFFSET_STD_PER_AH * capacity_ah * 3600.0 * hours * pct_per_as
+    capacity_pct2 = CAPACITY_STD**2 * CAPACITY_SPAN_PCT * moved_pct
+    return math.sqrt(start_var_pct2 + offset_pct**2 + capacity_pct2)
+
+
 class MeasurementNoise:
     """Fast error of the voltages that the filter uses; the slow errors are states of the filter.
 
@@ -366,20 +386,6 @@ class SocEkf:
         x = self._ekf.x
         std_pct = math.sqrt(max(float(self._ekf.P[0, 0]), 0.0))
         return float(x[0, 0]), std_pct, self._pct_per_as * counted_s * float(x[1, 0])
-
-    def count_std_pct(self, start_var_pct2: float, hours: float, moved_pct: float) -> float:
-        """Return the standard deviation of counting alone [%].
-
-        Parameters
-        ----------
-        start_var_pct2 : float
-            Variance of the SoC that counting started from, and of gaps [%²].
-        hours, moved_pct : float
-            Time [h] and charge moved in either direction [%] since.
-        """
-        offset_pct = self._offset_std_a * 3600.0 * hours * self._pct_per_as
-        capacity_pct2 = CAPACITY_STD**2 * CAPACITY_SPAN_PCT * moved_pct
-        return math.sqrt(start_var_pct2 + offset_pct**2 + capacity_pct2)
 
     def _predicted_v(self, measurement: Measurement, ocv_v: float) -> float:
         x = self._ekf.x

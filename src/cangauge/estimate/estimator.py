@@ -11,7 +11,13 @@ from dataclasses import replace
 
 from cangauge.errors import InputError
 from cangauge.estimate.counting import CoulombCounter, EstimatorClock
-from cangauge.estimate.ekf import UNKNOWN_SOC_STD_PCT, Measurement, MeasurementNoise, SocEkf
+from cangauge.estimate.ekf import (
+    UNKNOWN_SOC_STD_PCT,
+    Measurement,
+    MeasurementNoise,
+    SocEkf,
+    count_std_pct,
+)
 from cangauge.estimate.hypothesis_filter import HypothesisFilter
 from cangauge.estimate.settings import (
     EstimatorSettings,
@@ -344,7 +350,7 @@ class Estimator:
         memory, counter = self._memory, self._counter.state
         hours = (counter.counted_s - memory.coulomb_counted_s) / 3600.0
         moved_pct = counter.moved_pct - memory.coulomb_moved_pct
-        return self.filter.count_std_pct(memory.coulomb_var_pct2, hours, moved_pct)
+        return count_std_pct(self.capacity_ah, memory.coulomb_var_pct2, hours, moved_pct)
 
     def _reasons(self, sample: Sample, soc_pct: float, std_pct: float) -> Reason:
         # Operations on flags are slow, and usually none is set. Comparisons with NaN are false.

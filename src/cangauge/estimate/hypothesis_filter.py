@@ -183,10 +183,6 @@ class HypothesisFilter:
             return self._filters[0].offset_a
         return self._mean([each.offset_a for each in self._filters])
 
-    def count_std_pct(self, start_var_pct2: float, hours: float, moved_pct: float) -> float:
-        """Return the standard deviation of counting alone [%]; see `SocEkf.count_std_pct`."""
-        return self._filters[0].count_std_pct(start_var_pct2, hours, moved_pct)
-
     def snapshot(self) -> HypothesisFilterState:
         """Return a copy of the state."""
         return HypothesisFilterState(

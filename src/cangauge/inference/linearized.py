@@ -22,15 +22,13 @@ from cangauge.errors import InputError
 from cangauge.inference.least_squares import Solution, solve
 from cangauge.inference.rows import Mask, SampledLog
 from cangauge.model.effects.base import PackState, Parameter
-from cangauge.model.effects.library import Candidate
+from cangauge.model.effects.library import STEP, Candidate
 from cangauge.model.extended import ExtendedModel, Prediction
 from cangauge.model.voltage_model import BASIS_NAMES, SLOPE_AT_LEAST, ocv_basis_slope
 
 SLOPE_CHECKS = 201
 """Points over the identified SoC at which the pseudo-OCV must rise."""
 
-STEP = 0.02
-"""Finite-difference step, relative to the width of an amplitude's bounds or to a shape."""
 
 SHAPE_STEP = (0.7, 1.4)
 """Factors by which one Gauss–Newton step may change a shape: the model is not linear in it."""

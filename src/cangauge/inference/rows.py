@@ -45,8 +45,13 @@ LOGS_AT_LEAST = 3
 """From this number of logs on, whole logs are held out."""
 
 FOLDS_AT_MOST = 12
+"""With more logs, several are held out together."""
+
 BLOCK_S, BLOCK_GUARD_S = 240.0, 60.0
+"""Length of a held-out block, and the guard at either end that is not evaluated [s]."""
+
 BLOCK_FOLDS = 5
+"""One block in this number is held out in turn."""
 
 Mask = NDArray[np.bool_]
 

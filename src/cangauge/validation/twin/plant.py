@@ -94,12 +94,7 @@ class Plant(Protocol):
 
 
 class TwinPlant:
-    """Cells with kinetics, diffusion and spread.
-
-    Parameters
-    ----------
-    pack : Pack
-    """
+    """Cells with kinetics, diffusion and spread."""
 
     name = "twin"
     temperature_tolerance_k = 0.05
