@@ -42,12 +42,17 @@ DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "bmw_i3"
 TRAINING = [f"A{number:02d}" for number in range(1, 22, 2)]
 TEST = [f"A{number:02d}" for number in range(2, 23, 2)]
 JUDGED_S = 15 * 60.0
+"""Only longer test trips are evaluated [s]."""
 SETTLED_S = 5 * 60.0
+"""Excluded start of a trip without an initial SoC [s]."""
 RECOVERED_S = 10 * 60.0
+"""Excluded start of a trip with a wrong initial SoC [s]."""
 SEAM_S, SEAM_CHARGING_S = 720, 600
+"""Time between two chained trips, and its part with a current [s]."""
 OFFSET_A = 3.0
 CAPACITY_ERROR = 0.05
 WRONG_PCT = 20.0
+"""Error of a wrong initial SoC [%]."""
 
 
 @dataclass(frozen=True)

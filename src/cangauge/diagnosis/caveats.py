@@ -231,7 +231,7 @@ def _reference_initial_soc(references: Sequence[SampledLog]) -> str:
         return ""
     return (
         f"No initial SoC of the reference{'s' if len(names) > 1 else ''} {', '.join(names)}: 100 %"
-        " assumed. A wrong one falsifies what is learned of the healthy pack. Give references with"
+        " assumed. A wrong one falsifies the model of the healthy pack. Give references with"
         " soc_pct; one value is enough."
     )
 
@@ -264,7 +264,7 @@ def _reference_number(number: int) -> str:
         )
     return (
         f"Only {number} reference log{'s' if number > 1 else ''}: differences between healthy logs"
-        " are hardly known, and probabilities are less certain than they look."
+        " are hardly known, and probabilities are less reliable."
     )
 
 

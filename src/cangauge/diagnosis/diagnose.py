@@ -267,8 +267,8 @@ def diagnose(
     model : Model
         Model of this pack, from `fit` or a model file.
     references : sequence of Log
-        Logs on which the model is good, at least three for sound probabilities. They show the error
-        to expect without a cause. Each needs an SoC at its start, or starts full.
+        Logs on which the model is good, at least three for reliable probabilities. They show the
+        error to expect without a cause. Each needs an initial SoC, or starts full.
     leave_out : sequence of str
         Effects to leave out of the library.
     initial_soc_pct : float, optional

@@ -32,7 +32,7 @@ from cangauge.diagnosis.linear_gaussian import (
     marginalize,
     normal_equations,
 )
-from cangauge.diagnosis.structure import learn, reference_equations, reference_matrices
+from cangauge.diagnosis.structure import learn_structure, reference_equations, reference_matrices
 from cangauge.errors import InputError
 from cangauge.inference.linearized import residual
 from cangauge.inference.rows import FitOptions, SampledLog, sample_log
@@ -225,7 +225,7 @@ def build_problem(
             error = error_from_references(hypotheses, equations, error, least_weight)
         expected = error if covered or not several else _error_beyond(error)
         _LOG.info("learning the structure from the references")
-        learned = learn(of_references, widened, hypotheses, equations, expected)
+        learned = learn_structure(of_references, widened, hypotheses, equations, expected)
         known, structured, hypotheses = learned.model, learned.structured, learned.hypotheses
         matrices = learned.matrices
         if several:

@@ -61,7 +61,7 @@ class ReferenceModel:
     equations: tuple[NormalEquations, ...]
 
 
-def learn(
+def learn_structure(
     references: Sequence[SampledLog],
     model: ExtendedModel,
     hypotheses: Hypotheses,

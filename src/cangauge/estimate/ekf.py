@@ -237,7 +237,7 @@ class SocEkf:
         self._ekf.P = np.diag(
             [soc_std_pct**2, self._offset_std_a**2, self._slow_var, self._lasting_var]
         )
-        self._forget_innovations()
+        self._reset_innovations()
 
     def predict(
         self,
@@ -296,7 +296,7 @@ class SocEkf:
             ekf.P = np.diag(
                 [UNKNOWN_SOC_STD_PCT**2, float(ekf.P[1, 1]), self._slow_var, self._lasting_var]
             )
-            self._forget_innovations()
+            self._reset_innovations()
             predicted_v = self._predicted_v(measurement, ocv_v)
         jacobian = np.array([[slope, -self._steady_ohm, 1.0, 1.0]])
         innovation = measurement.voltage_v - predicted_v
@@ -404,7 +404,7 @@ class SocEkf:
         ekf = self._ekf
         if seconds > PERSISTENT_S:
             # After an interval without voltages, earlier innovations carry no information.
-            self._forget_innovations()
+            self._reset_innovations()
             return False
         bias_v = float(ekf.x[2, 0] + ekf.x[3, 0])
         unbiased_v = predicted_v - bias_v
@@ -420,7 +420,7 @@ class SocEkf:
         mean = self._mean_innovation_v / seen
         return mean**2 > PERSISTENT_SIGMAS**2 * mean_var
 
-    def _forget_innovations(self) -> None:
+    def _reset_innovations(self) -> None:
         self._mean_innovation_v = 0.0
         self._mean_seconds = 0.0
 

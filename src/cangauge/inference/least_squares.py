@@ -203,7 +203,7 @@ class KtPrior:
     """Standard error of kt from the logs alone [V/K]."""
     prior_std_v_per_k: float
     """Prior standard deviation [V/K]."""
-    own_k: FloatArray
+    orthogonal_k: FloatArray
     """Part of the temperature column orthogonal to the other columns, shape (n,) [K]."""
     shift_per_kt: FloatArray
     """Change of the other coefficients with kt, shape (p,), 0 for kt itself."""
@@ -214,10 +214,12 @@ class KtPrior:
     def row_weight(self) -> float:
         """Weight of the row kt = 0 V/K that makes least squares shrink kt by `shrinkage` [K].
 
-        At least that for white errors: a temperature that never moves has no `own_k`, and nothing
+        At least that for white errors: a temperature that never moves has no `orthogonal_k`, and nothing
         else would bound its coefficient.
         """
-        weight = float(np.sqrt((1.0 / self.shrinkage - 1.0) * (self.own_k @ self.own_k)))
+        weight = float(
+            np.sqrt((1.0 / self.shrinkage - 1.0) * (self.orthogonal_k @ self.orthogonal_k))
+        )
         return max(weight, self.residual_std_v / self.prior_std_v_per_k)
 
     @property
@@ -265,11 +267,11 @@ def kt_prior(
     total = np.asarray(information)
     total[np.diag_indices(len(total))] += JITTER * np.trace(total) / len(total)
     kt_variance = float(np.linalg.inv(total)[kt, kt])
-    own_k, shift_per_kt = _orthogonal_part(columns, kt)
+    orthogonal_k, shift_per_kt = _orthogonal_part(columns, kt)
     return KtPrior(
         data_std_v_per_k=float(np.sqrt(kt_variance)) / float(scale[kt]),
         prior_std_v_per_k=KT_PRIOR_PER_K * float(np.median(volts)),
-        own_k=own_k,
+        orthogonal_k=orthogonal_k,
         shift_per_kt=shift_per_kt,
         residual_std_v=float(np.sqrt(np.mean(residual_v**2))),
     )

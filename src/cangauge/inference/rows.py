@@ -10,7 +10,7 @@ A row passes these rules, in this order:
 
 Three logs or more: whole logs are held out in turn. One or two logs: interleaved blocks with a
 guard between them. The first and the last block of a log always belong to the training rows, since
-the 1/s⁴ terms explode beyond the SoC of the fit.
+the 1/s⁴ terms diverge beyond the SoC of the fit.
 """
 
 from __future__ import annotations

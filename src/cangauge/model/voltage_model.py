@@ -6,7 +6,7 @@
 Published for a 2012 Nissan Leaf on a chassis dynamometer with delays of 0, 10, 30 and 70 s,
 ε = 0.05 and T_r = 20 °C. Positive current discharges, so the resistances Rj are negative.
 
-Outside the identified SoC the powers of 1/s explode, so the pseudo-OCV is extrapolated linearly;
+Outside the identified SoC the powers of 1/s diverge, so the pseudo-OCV is extrapolated linearly;
 the temperature is limited to the identified range ± `TEMPERATURE_MARGIN_K`.
 
 `soc_from_ocv` inverts the pseudo-OCV by Newton's method inside a bracket. It rises with SoC, so

@@ -137,7 +137,7 @@ def add_line(plot: Plot, name: str, x: FloatArray, y: FloatArray, pen: Pen) -> N
 
 def add_cloud(plot: Plot, name: str, x: FloatArray, y: FloatArray, color: str) -> None:
     """Draw points, evenly sampled if there are many."""
-    sample = every(x.size)
+    sample = sampling_slice(x.size)
     cloud = plot.scatter(
         x="x",
         y="y",
@@ -519,7 +519,7 @@ def envelope(
     return rows[:, 0], np.where(known, lowest, np.nan), np.where(known, highest, np.nan)
 
 
-def every(n: int, max_points: int = MAX_POINTS) -> slice:
+def sampling_slice(n: int, max_points: int = MAX_POINTS) -> slice:
     """Return the slice that samples n points evenly, at most `max_points` of them."""
     return slice(None, None, max(1, -(-n // max_points)))
 

@@ -175,8 +175,9 @@ MOST_LAGS = 64
 class CurrentHistory:
     """Delayed and lagged currents of one log, each computed once.
 
-    Effects and their shapes share them, and they are most of the work on a long log. `time_s` and
-    `current_a` have shape (n,), positive = discharge. The arrays returned must not be written to.
+    Effects and their shapes share them, since they dominate the computing time of a long log.
+    `time_s` and `current_a` have shape (n,), positive = discharge. Callers must not write to the
+    arrays returned.
     """
 
     time_s: FloatArray
@@ -222,7 +223,7 @@ class CurrentHistory:
 def _history_of(
     time_s: FloatArray, current_a: FloatArray, cached: CurrentHistory | None
 ) -> CurrentHistory:
-    """Return the cached history if it belongs to these very arrays, else a new one."""
+    """Return the cached history if it was made of the same array objects, else a new one."""
     if cached is not None and cached.current_a is current_a and cached.time_s is time_s:
         return cached
     return CurrentHistory(time_s, current_a)
@@ -312,7 +313,7 @@ def scaled_drop_at(drop_v: float, current_a: float, delayed: float, resistance_o
 
 
 class Reading(NamedTuple):
-    """One sample on its way through the corrections.
+    """One sample during its correction.
 
     Voltage and temperature may be NaN where that signal is missing; current never is.
     """
