@@ -214,12 +214,11 @@ class KtPrior:
     def row_weight(self) -> float:
         """Weight of the row kt = 0 V/K that makes least squares shrink kt by `shrinkage` [K].
 
-        At least that for white errors: a temperature that never moves has no `orthogonal_k`, and nothing
-        else would bound its coefficient.
+        At least the weight for white errors, which bounds kt where the temperature is constant and
+        `orthogonal_k` is zero.
         """
-        weight = float(
-            np.sqrt((1.0 / self.shrinkage - 1.0) * (self.orthogonal_k @ self.orthogonal_k))
-        )
+        square_k2 = self.orthogonal_k @ self.orthogonal_k
+        weight = float(np.sqrt((1.0 / self.shrinkage - 1.0) * square_k2))
         return max(weight, self.residual_std_v / self.prior_std_v_per_k)
 
     @property
