@@ -78,7 +78,7 @@ class Identification:
     soc_newton_mae_pct: float
     remarks: tuple[str, ...] = ()
     effects: FittedEffects | None = None
-    """Effects, if any were asked for."""
+    """Fitted effects; None if none were requested."""
 
     def to_dict(self) -> dict[str, object]:
         """Return the object that `cangauge fit --json` prints."""

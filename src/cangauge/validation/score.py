@@ -48,7 +48,7 @@ def share(flags: Sequence[bool]) -> Figures:
     return proportion(sum(flags), len(flags))
 
 
-def estimate(values: Sequence[float], statistic: Callable[..., Any]) -> Figures:
+def bootstrapped(values: Sequence[float], statistic: Callable[..., Any]) -> Figures:
     """Return a statistic with its bootstrap percentile interval (fixed seed).
 
     Parameters
@@ -386,8 +386,8 @@ def _accuracy(items: Sequence[Outcome]) -> Figures:
         "correct_and_confident": share([i.probability >= _CONFIDENT for i in correct]),
         "closed": {
             floor: {
-                "all": estimate(_closed_share(items, floor), np.median),
-                "detected": estimate(
+                "all": bootstrapped(_closed_share(items, floor), np.median),
+                "detected": bootstrapped(
                     _closed_share((i for i in items if i.names_effect), floor), np.median
                 ),
             }
@@ -472,7 +472,7 @@ def reliability(outcomes: Sequence[Outcome]) -> Figures:
             }
         )
     squares = [(i.probability - float(i.strict)) ** 2 for i in stated]
-    return {"brier": estimate(squares, np.mean), "bins": bins}
+    return {"brier": bootstrapped(squares, np.mean), "bins": bins}
 
 
 def confusion(items: Sequence[Outcome]) -> Figures:
