@@ -175,7 +175,7 @@ def in_process(kills: int, seed: int, folder: Path, console: Console) -> Result:
     restarts, begun = [], None
     first = saved = refused = 0
     was_pct = 0.0
-    for number, (alive, gone) in enumerate(zip(lives.tolist(), away.tolist(), strict=True)):
+    for number, (alive, down) in enumerate(zip(lives.tolist(), away.tolist(), strict=True)):
         due = first + int(FIRST_CHECKPOINT_S * RATE_HZ)
         for at in range(first, first + alive):
             truth, found = whole.handle(samples[at], other), life.handle(samples[at], encoder)
@@ -195,8 +195,8 @@ def in_process(kills: int, seed: int, folder: Path, console: Console) -> Result:
         # Killed: only the state file is used again.
         if rng.random() < 0.1:
             (folder / f".state.{number:08x}.json").write_bytes(b'{"format": "cangauge-st')
-        first += alive + gone
-        for at in range(first - gone, min(first, len(samples))):
+        first += alive + down
+        for at in range(first - down, min(first, len(samples))):
             whole.handle(samples[at], other)
         life = ServiceRun(model, path)
         life.begin(EPOCH_S + first / RATE_HZ)

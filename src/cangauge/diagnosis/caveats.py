@@ -29,7 +29,7 @@ POOR_FIT_PART, POOR_FIT_TIMES, STATED_TIMES = 0.005, 3.0, 5.0
 multiple of the others' or the second of the model file's."""
 
 FEW_REFERENCES = 3
-"""Fewer hardly show how much healthy logs differ."""
+"""Number of references below which the spread between healthy logs is uncertain."""
 
 
 def log_caveats(

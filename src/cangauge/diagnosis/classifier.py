@@ -93,9 +93,9 @@ LIBRARY_AT_MOST = 0.9
 """Largest part of "another cause" that other effects of the library take."""
 
 SECOND_MIN_LOG_BAYES, SECOND_MIN_PART, MAX_CAUSES = 12.0, 0.05, 2
-"""Log Bayes factor that a further cause needs beside those accepted, also relative to the first's:
-the misfit of a large cause's shape resembles a second cause. Chosen on development cases: of 14
-false second causes nine were below, of five true ones one."""
+"""Log Bayes factor that a further cause needs in addition to those accepted, also relative to the
+first's: the misfit of a large cause's shape resembles a second cause. Chosen on development cases:
+of 14 false second causes nine were below, of five true ones one."""
 
 TEMPERATURE_EFFECTS = ("resistance_temperature",)
 EXPECTED_FACTOR = 1.6
@@ -305,7 +305,7 @@ class Verdict:
     ambiguous_with: tuple[str, ...]
     """Other effects with a similar probability."""
     accepted: tuple[Score, ...]
-    """The named cause, and a second one beside it; empty without a named cause."""
+    """The named cause, and a second one if the logs show it; empty without a named cause."""
     candidates: tuple[Score, ...]
     """All effects, best first."""
     probabilities: dict[str, float]
@@ -403,7 +403,7 @@ def _probabilities(found: Classification) -> dict[str, float]:
 
 
 def _causes(posterior: Posterior, best: Score, ambiguous: Sequence[str]) -> tuple[Score, ...]:
-    """Return the best effect and a second cause that the logs show beside it."""
+    """Return the best effect, and a second cause if the logs show one."""
     accepted = [best]
     needed = max(SECOND_MIN_LOG_BAYES, SECOND_MIN_PART * best.log_bayes_factor)
     while len(accepted) < MAX_CAUSES:

@@ -73,7 +73,7 @@ logarithm."""
 
 
 def error_from_noise(noise: ModelNoise, rate_hz: float, hypotheses: Hypotheses) -> ErrorModel:
-    """Return the error model that a model file states, for lack of references."""
+    """Return the error model that a model file states, used without references."""
     slow_v2, fast_v2 = noise.slow_std_v**2, noise.fast_std_v**2
     total_v2 = max(slow_v2 + fast_v2, 1e-12)
     variance = scale_variances(
@@ -240,8 +240,8 @@ def _structure_scales(
 ) -> dict[str, float]:
     """Return the most probable prior scale of each structure effect.
 
-    First one scale for all, then that of each beside the others: a scale that one effect needs
-    would leave the others unconstrained where no reference has been.
+    First one scale for all, then that of each given the others: a scale that one effect needs would
+    leave the others unconstrained at operating points without references.
     """
     found = marginalize(hypotheses, references, [], error)
     p = hypotheses.column_scale.size

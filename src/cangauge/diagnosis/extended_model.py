@@ -190,11 +190,11 @@ def _initial_causes(problem: DiagnosisProblem, accepted: Sequence[Score]) -> lis
         candidates = [problem.hypotheses.candidates[k] for k in score.candidates]
         start = _mixture(candidates, [next(rest) for _ in candidates])
         effect = candidates[0].effect
-        # Search for the onset also beside the references' model: the linear solution may have taken
-        # a late change for a resistance.
+        # Search for the onset with the references' model too: the linear solution may have
+        # attributed a late change to a resistance.
         found = [
-            _with_change_point(problem.diagnosed, beside, effect, start)
-            for beside in (model, problem.structured or problem.model)
+            _with_change_point(problem.diagnosed, base, effect, start)
+            for base in (model, problem.structured or problem.model)
         ]
         starts = [values for k, values in enumerate(found) if values not in found[:k]]
         refined = [_refine_parameters(problem, model, effect, values) for values in starts]
@@ -277,7 +277,7 @@ def _refine_parameters(
     free = (*effect.amplitudes, *(shape for shape in effect.shapes if not shape.is_change_point))
     parameters = free or effect.parameters
     constants = {p.name: start[p.name] for p in effect.parameters if p not in parameters}
-    pack = problem.model.pack  # not of `model`, whose structure has taken much of its resistance
+    pack = problem.model.pack  # in `model`, structure represents much of the resistance
     bounds = np.array([parameter.bounds(pack) for parameter in parameters])
     neutral = effect.neutral(pack)
     centre = np.array([neutral[parameter.name] for parameter in parameters])

@@ -92,7 +92,7 @@ def without_outliers(log: Log, model: ExtendedModel) -> tuple[Log, NDArray[np.in
     returns_a = across_a < RETURN_PART * np.abs(jump_a)
     returns = returns_a | (across_v < RETURN_PART * np.abs(jump_v))
     impossible = (mismatch_v > CONTRADICTION_PART * model.pack.voltage_v) & returns
-    # Or a current larger than the span of all others, gone in the next row, without a response.
+    # Or a current beyond the span of all others for one row, without a response of the voltage.
     ordered = np.sort(log.current_a)
     span_a = float(ordered[-1 - MAX_OUTLIERS] - ordered[MAX_OUTLIERS])
     least_a = max(span_a, LARGE_C_RATE * model.capacity_ah)

@@ -262,8 +262,8 @@ def build_problem(
 def with_wider_range(model: ExtendedModel, logs: Sequence[Log]) -> ExtendedModel:
     """Return the model with its temperature and current ranges widened to those of the logs.
 
-    Outside its range the model holds the temperature; inside, it can learn from the logs. The SoC
-    range stays, as the pseudo-OCV does not extrapolate.
+    Outside its range the model limits the temperature, so that logs there carry no information on
+    the temperature dependence. The SoC range stays, as the pseudo-OCV does not extrapolate.
     """
     low_c, high_c = model.model.temperature_range_c
     low_a, high_a = model.model.current_range_a
@@ -309,7 +309,7 @@ def _per_log_effects(
     by_effect: dict[str, dict[tuple[object, ...], int]] = {}
     for k, choice in enumerate(choices):
         if choice.effect.is_cause and choice.is_for_fit:
-            # The first candidate of a shape is linearised at a small effect; only a cause is large.
+            # The first candidate of a shape is linearised at a small effect, as per-log ones are.
             shapes = by_effect.setdefault(choice.effect.id, {})
             shapes.setdefault(tuple(choice.shape.items()), k)
     noise = model.noise

@@ -81,8 +81,7 @@ def learn_structure(
     error : ErrorModel
     """
     target, best = log_likelihood(hypotheses, equations, error) - MIN_LOG_GAIN, -np.inf
-    # Coefficients first: with too small a kt in the columns, a temperature rise comes out too
-    # large.
+    # Coefficients first: with too small a kt in the columns, a temperature rise is overestimated.
     start = ReferenceModel(model, None, hypotheses, (), tuple(equations))
     moved, about = _with_coefficients(start, error)
     matrices = reference_matrices(references, moved, about)
@@ -165,8 +164,8 @@ def select_structure(
 ) -> tuple[int, ...]:
     """Return the pieces of structure that the references need, most needed first.
 
-    Forward selection: each step adds the piece that makes the references most probable beside those
-    before it, with all amplitudes and coefficients marginalised.
+    Forward selection: each step adds the piece that makes the references most probable together
+    with the pieces selected before, with all amplitudes and coefficients marginalised.
     """
     whole = marginalize(hypotheses, references, [], error)
     right = whole.precision @ whole.mean

@@ -28,8 +28,8 @@ DRAIN_AT_MOST_PCT = 5.0
 """Self-discharge and consumers of a parked car [% per hour; %]: 1.2 % a day."""
 
 MOVED_AT_MOST = 0.3
-"""Prior probability that the car was charged or driven in a long unobserved interval: a guess, to
-which the result is insensitive once there are voltages."""
+"""Prior probability that the car was charged or driven in a long unobserved interval: an
+assumption, to which the result is insensitive after a few voltages."""
 
 MOVED_TIME_S = 1800.0
 """Time constant with which that probability grows [s]."""

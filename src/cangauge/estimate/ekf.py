@@ -72,7 +72,7 @@ LASTING_SPAN_PCT = 8.0
 with a constant bias the filter would slide along the curve until its shape fits."""
 
 LASTING_TIME_S = 7200.0
-"""Time constant of the lasting bias [s]; the logs that show it are seldom longer."""
+"""Time constant of the lasting bias [s]; the logs that it is identified on are seldom longer."""
 
 RESTED_BIAS = 0.6
 """The bias after a long rest, in units of its standard deviation while driving."""

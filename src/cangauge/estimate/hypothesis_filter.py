@@ -35,8 +35,8 @@ CLEAR_LOG_ODDS = math.log(1000.0)
 LOG_ODDS_AT_MOST = 50.0
 
 WRONG_LOG_ODDS = -math.log(1000.0)
-"""Prior log odds that a given SoC is wrong, from another pack or day: a guess. It sets from which
-size an initial error is attributed to the given SoC and not to the voltage model."""
+"""Prior log odds that a given SoC is wrong, such as one of another pack or day: an assumption. It
+sets the size from which an initial error is attributed to the given SoC, not to the model."""
 
 OPEN_AT_MOST_S = 900.0
 """Time with voltages after which undecided hypotheses are merged [s]."""

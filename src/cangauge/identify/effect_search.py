@@ -372,7 +372,7 @@ class _Search:
     ) -> _Trial | None:
         """Return the model with one effect replaced by a better one, or None.
 
-        An effect added early may have represented later ones and need not be the best beside them.
+        An effect added early may have represented later ones and need not be the best with them.
         """
         for (removed, _), without in zip(model.effects, fewer, strict=True):
             pool = [LIBRARY[effect_id] for effect_id in SEARCHED if effect_id != removed.id]

@@ -49,7 +49,7 @@ GROWTH_AT_MOST = np.log(4.0)
 """Growth of the log variance of errors from one scale to the next: that of a random walk."""
 
 GROWTH_SCALES = 3
-"""Number of the slowest well-observed scales from which the growth is read."""
+"""Number of the slowest well-observed scales from which the growth is estimated."""
 
 JITTER = 1e-9
 """Ridge on the information matrix, relative to its mean diagonal."""

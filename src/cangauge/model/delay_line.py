@@ -41,7 +41,7 @@ def filled_at(
 ) -> NDArray[np.bool_]:
     """Return at which of the times `at_s` the delay line is full and free of gaps, shape (m,).
 
-    It is filling in the first `longest_delay_s` of a log, and as long after a gap longer than
+    It is filling for `longest_delay_s` after the start of a log, and after each gap longer than
     `gap_s`.
     """
     at = np.asarray(at_s, dtype=np.float64)

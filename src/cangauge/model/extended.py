@@ -214,7 +214,7 @@ class ExtendedModel:
 class OnlineExtendedModel:
     """Sample-by-sample form of the extended model, for the estimator.
 
-    Call `correct`, then `advance` for each reading that comes out; `pseudo_ocv_at` then includes
+    Call `correct`, then `advance` for each reading it returns; `pseudo_ocv_at` then includes
     the effects' voltages.
 
     Parameters
@@ -227,7 +227,7 @@ class OnlineExtendedModel:
     def __init__(self, extended: ExtendedModel, capacity_ah: float | None = None) -> None:
         self.model = extended.model
         self._extended = extended
-        # Any SoC will do: capacity and efficiency do not depend on it.
+        # Capacity and efficiency do not depend on the SoC.
         self._counting = extended.counting(50.0)
         self.capacity_ah = capacity_ah or self._counting.capacity_ah
         """Capacity for the Coulomb counter [Ah]."""

@@ -345,10 +345,10 @@ class OnlineEffect:
     lags: Sequence[LowPass] = ()
 
     def correct(self, reading: Reading) -> Sequence[Reading]:
-        """Return the readings that ideal sensors would have shown, as far as known by now.
+        """Return the corrected readings that are complete.
 
-        Usually one for each that comes in. `time_skew`, which needs a later current for a voltage,
-        delays readings: they come out in order with their own times, none added or dropped.
+        Usually one for each input. `time_skew`, which needs a later current for a voltage, delays
+        readings: it returns all of them in order with unchanged times.
         """
         return (reading,)
 
@@ -411,8 +411,8 @@ class Effect:
     is_structure: ClassVar[bool] = False
     """Whether a healthy pack may have it: the part that references show is then not a cause."""
     secant_points: ClassVar[tuple[float, ...]] = ()
-    """For an effect far from linear in its only amplitude: fractions of the widest bound at which
-    the diagnosis takes the change of the voltage, besides a small one."""
+    """For an effect that is strongly nonlinear in its only amplitude: fractions of the widest bound
+    at which the diagnosis takes the change of the voltage, besides a small one."""
 
     @property
     def amplitudes(self) -> tuple[Parameter, ...]:

@@ -134,7 +134,7 @@ class _CoreTemperatureOnline(OnlineEffect):
 class InnerTemperature(Effect):
     """Voltage and resistance of a cell interior that lags behind the measured temperature.
 
-    Every pack that is heated or cooled from outside shows it, the more the larger its cells: it is
+    Every pack that is heated or cooled from outside has it, and larger cells have more of it: it is
     structure, not a fault. The diagnosis learns it from reference logs and never names it.
     """
 
