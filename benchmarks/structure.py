@@ -27,7 +27,10 @@ from types import FrameType
 from typing import Any
 
 LAYERS = (
-    ("errors", "_typing", "_io", "_config", "_logging", "_formatting", "_resources"),
+    (
+        "errors", "_typing", "_io", "_config", "_logging", "_formatting", "_resources", "_version",
+        "_dataframes",
+    ),
     ("logs",),
     ("model",),
     ("inference",),
@@ -38,10 +41,10 @@ LAYERS = (
     ("service",),
     ("replay",),
     ("inspect",),
-    ("report",),
     ("validation",),
+    ("report",),
     ("cli",),
-)
+)  # fmt: skip
 """Packages from the lowest to the highest; an import of a higher one by a lower one is upward."""
 
 
