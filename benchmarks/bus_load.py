@@ -49,9 +49,9 @@ from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
 from live_service import MODEL, command, service
 
-RATE = 4000
+RATE_HZ = 4000
 """Frame rate of a saturated 500 kbit/s bus [1/s]."""
-WANTED_RATE = 200
+WANTED_RATE_HZ = 200
 PORT = 43_555
 
 Result = dict[str, Any]
@@ -66,9 +66,6 @@ def long_log() -> Log:
 def bus() -> BusAddress:
     """Return a bus of this benchmark only."""
     return bus_address("udp_multicast", options={"port": PORT})
-
-
-# --- load -------------------------------------------------------------------------------------
 
 
 def load(seconds: float) -> tuple[Result, list[Row]]:
@@ -90,7 +87,7 @@ def load(seconds: float) -> tuple[Result, list[Row]]:
     }
     rows = [
         ("frames sent", f"{sent['frames'] / sent['seconds']:.0f}/s over {sent['seconds']:.1f} s",
-         f"{RATE}/s"),
+         f"{RATE_HZ}/s"),
         ("wanted frames", f"{wanted / sent['seconds']:.0f}/s", ""),
         ("wanted frames lost", f"{result['wanted_lost']} of {wanted}", "0"),
         ("CPU of `cangauge run`", f"{100 * result['run_cores']:.1f} % of a core", "< 50 %"),
@@ -108,17 +105,17 @@ def send_load(seconds: float) -> Result:
         can.Message(arbitration_id=0x200 + number, is_extended_id=False, data=bytes(8))
         for number in range(100)
     )
-    every = RATE // WANTED_RATE
+    every = RATE_HZ // WANTED_RATE_HZ
     sender = open_bus(bus())
     pacer = Pacer(1.0, lambda: False)
     began = time.monotonic()
     pacer.wait(0)
     frames = wanted = 0
     queue: list[can.Message] = []
-    for number in range(int(seconds * RATE)):
+    for number in range(int(seconds * RATE_HZ)):
         if number % every == 0:
             if not queue:
-                time_s = number / RATE
+                time_s = number / RATE_HZ
                 queue = encoder.encode(Sample(time_s, 20 + 10 * math.sin(time_s), 380.0, 25.0))
             sender.send(queue.pop(0))
             wanted += 1
@@ -126,7 +123,7 @@ def send_load(seconds: float) -> Result:
             sender.send(next(others))
         frames += 1
         if number % 4 == 3:
-            pacer.wait(int((number + 1) * 1e6 / RATE))
+            pacer.wait(int((number + 1) * 1e6 / RATE_HZ))
     took = time.monotonic() - began
     sender.shutdown()
     return {"frames": frames, "wanted": wanted, "seconds": took}
@@ -156,9 +153,6 @@ def _count_frames(pipe: Any) -> None:
         frames += 1
     pipe.send({"frames": frames, "cpu_seconds": time.process_time() - cpu})
     receiver.shutdown()
-
-
-# --- speed and timing -------------------------------------------------------------------------
 
 
 def full_speed() -> tuple[Result, list[Row]]:
@@ -222,9 +216,6 @@ def timing(seconds: float = 120.0) -> tuple[Result, list[Row]]:
     return replay, rows
 
 
-# --- memory -----------------------------------------------------------------------------------
-
-
 def memory(hours: float = 24.0) -> tuple[Result, list[Row]]:
     """Measure the memory of a process over a day of bus time."""
     context = multiprocessing.get_context("spawn")
@@ -274,9 +265,6 @@ def _handle_a_day(pipe: Any, hours: float) -> None:
 def _resident_mb() -> float:
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
-# --- main -------------------------------------------------------------------------------------
 
 
 def main() -> int:

@@ -7,7 +7,7 @@ Inputs are mutants of small valid files of every format (bus frames, captures, l
 files, configurations, maps, DBC files, speed traces). Each must be accepted, or refused by an
 `InputError` with a one-line message. Anything else is a finding: another exception, a numpy
 warning, more than 2 s of CPU time, more than 128 MB of memory, a SoC outside 0–100 %, a process
-that dies or hangs. Exit status 1 if there is one. The same seed gives the same inputs.
+that dies or hangs. Exit status 1 on a finding. The same seed gives the same inputs.
 
 Bombs, devices and pipes are tested by name in `tests/fuzz`.
 """

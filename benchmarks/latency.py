@@ -65,9 +65,6 @@ CONTEXT: Final = multiprocessing.get_context("spawn")
 Result = dict[str, Any]
 
 
-# --- latency ------------------------------------------------------------------------------------
-
-
 def latency(address: BusAddress, seconds: float, rounds: int) -> Result:
     """Measure service and bare loop in alternation."""
     found: dict[str, list[float]] = {"service": [], "bare": []}
@@ -111,7 +108,7 @@ def _latencies(address: BusAddress, seconds: float) -> list[float]:
         if is_new and done_s[number - 1] > first + WARM_S:
             found.append((number, message.timestamp - done_s[number - 1]))
         if message.timestamp - done_s[-1] > 1.0:
-            break  # only repetitions of the service are left
+            break  # from here on the service only repeats frames
     sender.join()
     listener.shutdown()
     # The heartbeat repeats a count: its first frame is that of the sample.
@@ -147,7 +144,7 @@ def _bare(address: BusAddress, loop: Any) -> Iterator[Connection]:
 
 
 def _echo(pipe: Connection, address: BusAddress) -> None:
-    """Receive, decode, send: the minimum of any service."""
+    """Receive, decode and send: the minimum work of a service."""
     messages = _messages()
     wanted = [0x400, 0x401, 0x402, 0x403, 0x5AF]
     filters = [{"can_id": each, "can_mask": 0x7FF, "extended": False} for each in wanted]
@@ -176,9 +173,6 @@ def _messages() -> dict[int, cantools.database.can.Message]:
         database = cantools.database.load_file(shared_file("dbc", name))
         found |= {each.frame_id: each for each in database.messages}
     return found
-
-
-# --- loss ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -313,9 +307,6 @@ def _put(bus: can.BusABC, frame: can.Message) -> None:
             time.sleep(0.0005)
         else:
             return
-
-
-# --- main ---------------------------------------------------------------------------------------
 
 
 def main() -> int:

@@ -4,7 +4,7 @@
 
 FOLDER holds owners' captures of the EV-CAN. The model was identified on one new car in 2012, at a
 *room* temperature of 20–26 °C; the captures are of other, older cars in the cold, seconds to a
-minute long. The table shows the consequences; it does not rate the method.
+minute long. The table shows the effect of that extrapolation, not the quality of the method.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`cangauge` commands on a bus of the benchmarks, in processes of their own."""
+"""`cangauge` commands on a bus of the benchmarks, in separate processes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from cangauge._resources import shared_file
 from cangauge.bus.open import BusAddress
 
 MODEL = shared_file("replay", "leaf2012_published_model.json")
-_ENTRY = "import sys; from cangauge.cli.app import main; main()"
+ENTRY = "import sys; from cangauge.cli.app import main; main()"
+"""Code that runs the command line."""
 
 
 def command(address: BusAddress, name: str, *arguments: object) -> list[str]:
@@ -19,12 +20,12 @@ def command(address: BusAddress, name: str, *arguments: object) -> list[str]:
     on = ["--interface", address.interface, "--channel", address.channel]
     for key, value in address.options.items():
         on += ["--bus-option", f"{key}={value}"]
-    return [sys.executable, "-c", _ENTRY, name, *map(str, arguments), *on, "--json"]
+    return [sys.executable, "-c", ENTRY, name, *map(str, arguments), *on, "--json"]
 
 
 @contextmanager
 def service(address: BusAddress, *arguments: object) -> Iterator[subprocess.Popen[str]]:
-    """Run `cangauge run` during the block, which starts when the service listens."""
+    """Run `cangauge run`; enter the block once it listens, and kill it afterwards."""
     process = subprocess.Popen(
         command(address, "run", "-m", MODEL, *arguments),
         stdout=subprocess.PIPE,

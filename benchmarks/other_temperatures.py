@@ -1,4 +1,4 @@
-"""Error of models of few logs at other temperatures, with kt free and with its prior.
+"""Voltage error at other temperatures of models fitted to few logs, with and without the kt prior.
 
     python benchmarks/other_temperatures.py --data FOLDER
 
@@ -47,8 +47,8 @@ def main() -> None:
     folder = parser.parse_args().data
     table = Table(title="Voltage error on other logs, median over the models [V]")
     for heading in (
-        "model of", "tested on", "models", "kt free", "kt held", "held is better in",
-        "kt free [V/K]", "kt held [V/K]",
+        "model of", "tested on", "models", "without prior", "with prior", "better with prior",
+        "kt without prior [V/K]", "kt with prior [V/K]",
     ):  # fmt: skip
         table.add_column(heading, justify="right")
     at_25c = [_pack(folder / "lg_hg2" / f"{name}.parquet") for name in LG_25C]
@@ -74,23 +74,26 @@ def main() -> None:
 def evaluated(
     models: Sequence[Sequence[Log]], logs: Sequence[Log], options: FitOptions
 ) -> tuple[str, ...]:
-    """Return the cells of a row, from the number of models on."""
+    """Return the cells of a row, starting with the number of models."""
     found, kt = [], []
     for training in models:
         rows = [fit_rows(log, options) for log in training]
         try:
-            two = [fit_voltage_model(rows, options, is_held=held)[0] for held in (False, True)]
+            two = [
+                fit_voltage_model(rows, options, with_kt_prior=with_prior)[0]
+                for with_prior in (False, True)
+            ]
         except InputError:  # SoC range too small
             continue
         kt.append([model.kt_v_per_k for model in two])
         found.append([error_v([log for log in logs if log not in training], options, model)
                       for model in two])  # fmt: skip
-    free, held = np.array(found).T
+    without, with_ = np.array(found).T
     return (
         str(len(found)),
-        f"{np.median(free):.2f}",
-        f"{np.median(held):.2f}",
-        f"{np.sum(held < free)} of {len(found)}",
+        f"{np.median(without):.2f}",
+        f"{np.median(with_):.2f}",
+        f"{np.sum(with_ < without)} of {len(found)}",
         *(f"{min(each):.2f} … {max(each):.2f}" for each in zip(*kt, strict=True)),
     )
 

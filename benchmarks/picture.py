@@ -34,8 +34,8 @@ def main() -> None:
     counted = (table.soc_coulomb_pct - reference)[known]
     fused = (table.soc_pct - reference)[known]
     sys.stdout.write(
-        f"Coulomb counting ends {counted[-1]:+.1f} % off,"
-        f" the EKF is {np.abs(fused).max():.1f} % off at most\n"
+        f"error at the end by Coulomb counting {counted[-1]:+.1f} %;"
+        f" largest error of the EKF {np.abs(fused).max():.1f} %\n"
     )
     hours, every = table.time_s / 3600.0, slice(None, None, 20)
     figure, axes = plt.subplots(figsize=(10, 4.2), dpi=110)
@@ -55,7 +55,7 @@ def main() -> None:
         ylabel="SoC [%]",
         ylim=(0, 100),
         xlim=(0, float(np.max(hours))),
-        title=f"Current sensor {OFFSET_A:+.0f} A off: the voltage model holds the SoC",
+        title=f"Current sensor offset {OFFSET_A:+.0f} A: the voltage model corrects the SoC",
     )
     axes.legend(loc="lower left", fontsize=9)
     axes.grid(alpha=0.3)

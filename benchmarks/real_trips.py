@@ -42,12 +42,17 @@ DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "bmw_i3"
 TRAINING = [f"A{number:02d}" for number in range(1, 22, 2)]
 TEST = [f"A{number:02d}" for number in range(2, 23, 2)]
 JUDGED_S = 15 * 60.0
+"""Only longer test trips are evaluated [s]."""
 SETTLED_S = 5 * 60.0
+"""Excluded start of a trip without an initial SoC [s]."""
 RECOVERED_S = 10 * 60.0
+"""Excluded start of a trip with a wrong initial SoC [s]."""
 SEAM_S, SEAM_CHARGING_S = 720, 600
+"""Time between two chained trips, and its part with a current [s]."""
 OFFSET_A = 3.0
 CAPACITY_ERROR = 0.05
 WRONG_PCT = 20.0
+"""Error of a wrong initial SoC [%]."""
 
 
 @dataclass(frozen=True)
@@ -179,8 +184,7 @@ def _seam(
 
 def _reference(trip: Log) -> np.ndarray:
     if trip.soc_pct is None:
-        msg = f"{trip.name} has no reference SoC"
-        raise SystemExit(msg)
+        raise SystemExit(f"{trip.name} has no reference SoC")
     return trip.soc_pct
 
 
@@ -250,11 +254,11 @@ def judge(
         )
     result["trips"] = trips
     cases = {name: pooled([trip["cases"][name] for trip in trips]) for name in trips[0]["cases"]}
-    for name, (offset_a, error, is_gauge_capacity) in chains.items():
+    for name, (offset_a, error, counts_with_capacity) in chains.items():
         console.print(f"estimating the {name.replace('_', ' ')} …")
         capacity_ah = model.capacity_ah * (1.0 + error)
         samples, soc = chain(
-            tests, capacity_ah if is_gauge_capacity else model.capacity_ah, offset_a
+            tests, capacity_ah if counts_with_capacity else model.capacity_ah, offset_a
         )
         settings = EstimatorSettings(initial_soc_pct=float(soc[0]), capacity_ah=capacity_ah)
         table = run_estimator(samples, model, settings)

@@ -47,6 +47,7 @@ from cangauge.model.model_file import Model
 from cangauge.service.loop import CHECKPOINT_EVERY_S, FIRST_CHECKPOINT_S
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.state import StateKeeper, StateSettings
+from live_service import ENTRY
 
 EVERY_S = CHECKPOINT_EVERY_S
 RATE_HZ = 10
@@ -56,7 +57,6 @@ EPOCH_S = 1_700_000_000.0
 PORT = 43_777
 CHANNEL = "239.74.163.2"
 REAL_EVERY_S = 1.0
-COMMAND = "import sys; from cangauge.cli.app import main; main()"
 
 Result = dict[str, Any]
 
@@ -102,9 +102,6 @@ def main() -> None:
         Console().print(table_of(results))
 
 
-# --- in this process --------------------------------------------------------------------------
-
-
 def drive(seconds: float, model: Model, seed: int) -> list[Sample]:
     """Return a drive with pulses, discharging and charging in turn, with the model's voltage."""
     rng = np.random.default_rng(seed)
@@ -147,15 +144,15 @@ class ServiceRun:
         if self.keeper is not None:
             self.keeper.__enter__()
 
-    def take(self, sample: Sample, encoder: FrameEncoder) -> Estimate:
+    def handle(self, sample: Sample, encoder: FrameEncoder) -> Estimate:
         """Handle the frames of a sample."""
         self.now_s = sample.time_s
         for frame in encoder.encode(sample):
             self.pipeline.handle(frame)
         return self.pipeline.latest
 
-    def keep(self) -> None:
-        """Write the state and wait for the end of the writing."""
+    def save(self) -> None:
+        """Write the state and wait until it is written."""
         if self.keeper is None:
             return
         self.keeper.checkpoint()
@@ -178,10 +175,10 @@ def in_process(kills: int, seed: int, folder: Path, console: Console) -> Result:
     restarts, begun = [], None
     first = saved = refused = 0
     was_pct = 0.0
-    for number, (alive, gone) in enumerate(zip(lives.tolist(), away.tolist(), strict=True)):
+    for number, (alive, down) in enumerate(zip(lives.tolist(), away.tolist(), strict=True)):
         due = first + int(FIRST_CHECKPOINT_S * RATE_HZ)
         for at in range(first, first + alive):
-            truth, found = whole.take(samples[at], other), life.take(samples[at], encoder)
+            truth, found = whole.handle(samples[at], other), life.handle(samples[at], encoder)
             if at == first and number:
                 counted_pct = found.soc_coulomb_pct - truth.soc_coulomb_pct
                 begun = (
@@ -191,16 +188,16 @@ def in_process(kills: int, seed: int, folder: Path, console: Console) -> Result:
                 )  # fmt: skip
                 was_pct = counted_pct
             if at >= due:
-                life.keep()
+                life.save()
                 due, saved = at + int(EVERY_S * RATE_HZ), at
         if begun is not None:
             restarts.append(Restart(*begun, found.soc_pct - truth.soc_pct))
         # Killed: only the state file is used again.
         if rng.random() < 0.1:
             (folder / f".state.{number:08x}.json").write_bytes(b'{"format": "cangauge-st')
-        first += alive + gone
-        for at in range(first - gone, min(first, len(samples))):
-            whole.take(samples[at], other)
+        first += alive + down
+        for at in range(first - down, min(first, len(samples))):
+            whole.handle(samples[at], other)
         life = ServiceRun(model, path)
         life.begin(EPOCH_S + first / RATE_HZ)
         refused += not (life.keeper is not None and life.keeper.restored)
@@ -246,9 +243,8 @@ def summary(restarts: list[Restart], rms_30s_pct: float) -> Result:
     return result
 
 
-# --- in processes of their own ----------------------------------------------------------------
-
 KILLED_ID, WHOLE_ID = 0x5A0, 0x5B0
+"""SOC_ESTIMATE of the killed and of the uninterrupted service."""
 
 
 def real_process(kills: int, seed: int, folder: Path, console: Console) -> Result:
@@ -361,32 +357,32 @@ class Player(threading.Thread):
             "run", "-m", model, "--interface", "udp_multicast", "--channel", CHANNEL,
             "--bus-option", f"port={PORT}", "--initial-soc", START_PCT - 15.0,
             "--soc-estimate-id", f"0x{frame_id:X}", "--soc-detail-id", f"0x{frame_id + 1:X}",
-            "--replay-clock-id", f"0x{frame_id + 15:X}", *kept,
+            "--replay-clock-id", f"0x{frame_id + 15:X}", "--log-format", "json", *kept,
         ]  # fmt: skip
         with self._log.open("ab") as log:
             return subprocess.Popen(
-                [sys.executable, "-c", COMMAND, *map(str, arguments)],
+                [sys.executable, "-c", ENTRY, *map(str, arguments)],
                 stderr=log,
                 stdout=subprocess.DEVNULL,
             )
 
     def restored(self) -> int:
         """Return the number of starts that restored a state, by the log of the service."""
-        return self._log.read_text(encoding="utf-8").count("going on from")
+        return self._log.read_text(encoding="utf-8").count('"state.restored"')
 
 
 def table_of(results: Result) -> Table:
     """Return the results as a table."""
-    table = Table(title="killed and started again", title_justify="left")
+    table = Table(title="Cost of a restart", title_justify="left")
     for name in ("", *results):
         table.add_column(name, justify="right" if name else "left")
     rows = {
-        "unsaved_s": "time not saved, until the first frame after [s]",
-        "flowed_pct": "charge that flowed in it, either way [%]",
-        "net_pct": "net: lost if nothing were counted across the gap [%]",
-        "lost_pct": "charge (process: SoC) lost [%]",
-        "soc_pct": "SoC off at the first frame after [%]",
-        "later_pct": "SoC off at the end of that life [%]",
+        "unsaved_s": "time from the last writing to the first frame after the restart [s]",
+        "flowed_pct": "charge in both directions in that time [%]",
+        "net_pct": "net charge in that time: lost without counting across the gap [%]",
+        "lost_pct": "permanent error of the charge (process: of the SoC) [%]",
+        "soc_pct": "SoC error at the first frame after the restart [%]",
+        "later_pct": "SoC error at the next kill [%]",
     }
     table.add_row("restarts", *(str(each["restarts"]) for each in results.values()))
     for name, words in rows.items():
@@ -394,14 +390,14 @@ def table_of(results: Result) -> Table:
             " / ".join(f"{each[name][part]:.3f}" for part in ("median", "p99", "most"))
             for each in results.values()
         ]
-        table.add_row(escape(f"{words}: median / p99 / most"), *cells)
+        table.add_row(escape(f"{words}: median / p99 / maximum"), *cells)
     carried = (f"{each['rms_30s_pct']:.3f}" for each in results.values())
-    table.add_row("30 s at the drive's rms current carry [%]", *carried)
+    table.add_row("charge of 30 s at the RMS current of the drive [%]", *carried)
     for name, words in (
-        ("lost_more_than_30s", "lost more than 30 s at the drive's rms current carry"),
-        ("lost_more_than_flowed", "lost more than flowed (a guess of the wrong sign)"),
-        ("refused", "state refused or absent at the start"),
-        ("left_over", "temporary files left over"),
+        ("lost_more_than_30s", "restarts with a larger charge error than that"),
+        ("lost_more_than_flowed", "restarts with a charge error above the charge that flowed"),
+        ("refused", "starts without a usable state"),
+        ("left_over", "temporary files left"),
     ):
         table.add_row(words, *(str(each.get(name, "–")) for each in results.values()))
     return table

@@ -1,12 +1,12 @@
-"""Measure the structure of the code: size, coupling, documentation, and the way of one frame.
+"""Measure the structure of the code: size, coupling, documentation, and the path of one frame.
 
     python benchmarks/structure.py                       # this checkout
     python benchmarks/structure.py --data ../shared/data # and trace one frame and one diagnosis
 
 Tracing runs `cangauge estimate` on a Leaf capture and `cangauge gap` on two real trips in this
-process and counts the calls of functions that live under `src`. Another checkout is measured with
-its own Python and `--root`; the functions that take a frame and start a diagnosis are options
-because their names differ between versions.
+process and counts the calls of functions under `src`. To measure another checkout, run its own
+Python with `--root`; the functions that handle a frame and start a diagnosis are options, because
+their names differ between versions.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ LAYERS = (
     ("validation",),
     ("report",),
     ("cli",),
-)
+)  # fmt: skip
 """Packages from the lowest to the highest; an import of a higher one by a lower one is upward."""
 
 
@@ -96,7 +96,7 @@ def read_modules(folder: Path, prefix: str = "") -> dict[str, Module]:
 
 
 def imports_of(modules: dict[str, Module]) -> dict[str, set[str]]:
-    """Return for each module the modules of the package that it imports, at any level."""
+    """Return the modules of the package that each module imports, lazy imports included."""
     result: dict[str, set[str]] = {}
     for name, module in modules.items():
         result[name] = set()
@@ -178,14 +178,14 @@ class Trace:
     source: Path
     entry: str
     needs: str = ""
-    """Only entries are kept in which a function of a file with this ending ran."""
+    """Keep only entries that call a function of a file with this ending."""
     calls: list[list[tuple[str, str]]] = field(default_factory=list)
     _open: list[tuple[str, str]] | None = None
     _entered: FrameType | None = None
     _known: dict[Any, str | None] = field(default_factory=dict)
 
     def __call__(self, frame: FrameType, event: str, _: Any) -> None:
-        """Take one event of `sys.setprofile`."""
+        """Record one event of `sys.setprofile`."""
         if event not in {"call", "return"}:
             return
         code = frame.f_code
@@ -221,7 +221,7 @@ class Trace:
 
 @contextmanager
 def profiled(trace: Trace) -> Iterator[None]:
-    """Trace this thread while the block runs; its output is thrown away."""
+    """Trace this thread while the block runs, and discard its output."""
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         sys.setprofile(trace)
         try:
@@ -237,9 +237,9 @@ def run_command(*arguments: object) -> None:
     before, sys.argv = sys.argv, ["cangauge", *map(str, arguments)]
     try:
         main()
-    except SystemExit as left:
-        if left.code:
-            raise RuntimeError(f"cangauge {arguments[0]} exited with {left.code}") from None
+    except SystemExit as ended:
+        if ended.code:
+            raise RuntimeError(f"cangauge {arguments[0]} exited with {ended.code}") from None
     finally:
         sys.argv = before
 
@@ -256,7 +256,7 @@ def trace_frames(root: Path, data: Path, entry: str) -> Trace:
 
 
 def trace_diagnosis(root: Path, data: Path, entry: str) -> Trace:
-    """Trace one diagnosis of a winter trip beside two summer trips."""
+    """Trace one diagnosis of a winter trip with two summer trips as references."""
     trace, trips = Trace(root / "src/cangauge", entry), data / "bmw_i3"
     with tempfile.TemporaryDirectory() as folder:
         model = Path(folder) / "model.json"

@@ -1,8 +1,8 @@
-"""Make the logs in this folder: a reconstruction of the published 2012 Leaf test.
+"""Write the logs in this folder: a reconstruction of the published 2012 Leaf test.
 
-The original log (Argonne, chassis dynamometer) may not be redistributed. This is NOT that log: a
-road-load model of the car on the public drive schedules gives the battery power, the published
-equation and coefficients give the voltage, and a measurement error is added.
+The original log (Argonne, chassis dynamometer) must not be redistributed, and this is NOT that log.
+The battery power comes from a road-load model of the car on the public drive schedules, the voltage
+from the published equation and coefficients; a measurement error is added.
 
     python replay/make_leaf_reconstruction.py --schedules DIR [-o DIR]
 
@@ -26,12 +26,12 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cangauge._io import atomic_path
+from cangauge._typing import FloatArray
 from cangauge.errors import CangaugeError, InputError
 from cangauge.model.charge import discharged_ah
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.published import CAPACITY_AH, VOLTAGE_MAE_PCT, leaf_2012_model
 
-FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 RATE_HZ = 10

@@ -3,8 +3,7 @@
     make faults
     PYTHONPATH=benchmarks python -m faults [--only NAME]… [--bus udp|vcan|both] [--json]
 
-Prints the estimated time first. Exit status 1 if a fault failed, or nothing
-could be judged.
+Prints the estimated time first. Exit status 1 if a fault failed, or if no run could be judged.
 """
 
 from __future__ import annotations

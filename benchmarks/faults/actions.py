@@ -84,7 +84,7 @@ def _fill(path: Path) -> None:
                 file.write(bytes(1024))
                 file.flush()
     except OSError:
-        return  # full: as wanted
+        return  # full, as intended
 
 
 def clock_set(seconds: float) -> Plan:

@@ -83,7 +83,7 @@ class Bench:
     ----------
     line : BusLine
     profile : Profile
-    setting : ServiceSetup
+    setup : ServiceSetup
     folder : Path
         Folder of its files.
     rng : Random
@@ -91,7 +91,7 @@ class Bench:
     """
 
     def __init__(
-        self, line: BusLine, profile: Profile, setting: ServiceSetup, folder: Path, rng: Random
+        self, line: BusLine, profile: Profile, setup: ServiceSetup, folder: Path, rng: Random
     ) -> None:
         self.line = line
         self.profile = profile
@@ -102,7 +102,7 @@ class Bench:
         self.state_path.parent.mkdir()
         self.expected_silence_s: list[tuple[float, float]] = []
         self.incidents: list[str] = []
-        self._setting = setting
+        self._setup = setup
         self._at_end: list[Callable[[], None]] = []
         self.config: dict[str, Any] = {
             "model": str(shared_file("replay", MODEL)),
@@ -111,22 +111,20 @@ class Bench:
             "bus_options": line.options,
             "time_source": "receive" if profile.is_real_time else "replay-clock",
             "initial_soc": initial_soc_pct(profile),
-            **vehicle_config(setting.vehicle, folder),
-            **setting.config,
+            **vehicle_config(setup.vehicle, folder),
+            **setup.config,
         }
         self.write_config()
-        self.service = self.another_service("service", with_state=setting.with_state)
+        self.service = self.another_service("service", with_state=setup.with_state)
         self.others: list[Process] = []
-
-    # --- service --------------------------------------------------------------------------
 
     def another_service(self, name: str, *, with_state: bool = False) -> Process:
         """Return another service, not started yet."""
         arguments = ["run", "--config", str(self.config_path)]
         if with_state:
             arguments += ["--state", str(self.state_path)]
-        log, setting = self.folder / f"{name}.txt", self._setting
-        return Process(arguments, log, setting.target, cold=setting.cold)
+        log, setup = self.folder / f"{name}.txt", self._setup
+        return Process(arguments, log, setup.target, cold=setup.cold)
 
     def write_config(self, **changes: object) -> None:
         """Write the configuration with permanent changes."""
@@ -152,7 +150,7 @@ class Bench:
         """Reload the configuration."""
         self.service.signal(signal.SIGHUP)
 
-    def pause(self) -> None:
+    def suspend(self) -> None:
         """Suspend the process of the service."""
         self.service.signal(signal.SIGSTOP)
         self.expect_silence(self.profile.seconds)  # shortened by `resume`
@@ -178,8 +176,6 @@ class Bench:
         """Expect no published frames for a time from now [s]."""
         now_s = time.monotonic()
         self.expected_silence_s.append((now_s, now_s + seconds))
-
-    # --- bus ------------------------------------------------------------------------------
 
     @contextmanager
     def without_bus(self) -> Iterator[None]:

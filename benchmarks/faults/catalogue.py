@@ -1,6 +1,6 @@
-"""All named faults, by what they disturb.
+"""All named faults, grouped by what they disturb.
 
-To add a fault, append a `Fault` to the list of its kind: a name, what is done, and one or more of
+To add a fault, append a `Fault` to the list of its kind: name, description, and one or more of
 `values` (changes of samples), `frames` (changes of frames, see `frames`) and `plan` (actions on the
 service, the bus or the machine, see `actions`).
 """
@@ -27,7 +27,7 @@ CURRENT, VOLTAGE, TEMPERATURE = (("current",), ("voltage",), ("temperature",))
 
 
 def _either(rng: Random, low: float, high: float) -> float:
-    """Return a number of that size, of either sign."""
+    """Return a number between `low` and `high` with random sign."""
     return rng.choice((-1.0, 1.0)) * rng.uniform(low, high)
 
 
@@ -221,9 +221,9 @@ CONFIG = [
 
 MACHINE = [
     Fault("process paused", "SIGSTOP for 10 s, then SIGCONT", REAL,
-          plan=during((do.BEGIN, Bench.pause), (0.55, Bench.resume))),
+          plan=during((do.BEGIN, Bench.suspend), (0.55, Bench.resume))),
     Fault("paused in a burst", "SIGSTOP for 5 s, 2,000 foreign frames/s for 10 s", REAL,
-          plan=during((do.BEGIN, Bench.pause), (0.3, Bench.resume)),
+          plan=during((do.BEGIN, Bench.suspend), (0.3, Bench.resume)),
           frames=change.flood(change.foreign, 2000.0, 10.0)),
     Fault("two services", "a second service with the same ids on the bus", REAL,
           plan=at(do.BEGIN, do.second_service)),
@@ -283,7 +283,7 @@ ON_ANY_BUS: Final = [
 ]  # fmt: skip
 ON_UDP: Final = [*ON_ANY_BUS, *UDP_PACKETS]
 _ON_KERNEL: Final = ("error frames", "remote frames")
-"""Faults that a kernel's bus treats in its own way: run on vcan too."""
+"""Faults that SocketCAN handles differently: run on vcan too."""
 _VCAN_ONLY: Final = [*INTERFACE, *DISK, *MACHINE_CLOCK]
 ON_VCAN: Final = [*_VCAN_ONLY, *(fault for fault in ON_ANY_BUS if fault.name in _ON_KERNEL)]
 """Faults that run on vcan by default; all of `ON_ANY_BUS` can."""

@@ -1,4 +1,4 @@
-"""Faults: a name, a description, and what is changed or done."""
+"""Faults: a name, a description, changes of samples and frames, and planned actions."""
 
 from __future__ import annotations
 

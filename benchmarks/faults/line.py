@@ -83,8 +83,8 @@ def udp(number: int) -> BusLine:
 def _own_block() -> tuple[int, socket.socket]:
     """Claim a block of ports for the lifetime of this process.
 
-    Multicast ports can be shared, so that a clash goes unnoticed: an abstract socket name, which
-    only one process can bind, marks the block.
+    Several processes can bind a multicast port, so a clash would not raise an error. An abstract
+    socket name, which only one process can bind, reserves the block.
     """
     for block in range(BLOCKS):
         claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -94,7 +94,7 @@ def _own_block() -> tuple[int, socket.socket]:
             claim.close()
         else:
             return block, claim
-    raise CangaugeError("no ports are left for buses of their own")
+    raise CangaugeError("no block of ports is free for a separate bus")
 
 
 def vcan(number: int) -> BusLine:

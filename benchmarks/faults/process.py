@@ -1,8 +1,7 @@
 """Process of the service: start, signals, and detection of an unexpected end.
 
-Processes are forked from one that has imported the service (multiprocessing's
-forkserver), so that many start quickly; `cold` starts a fresh interpreter, as a
-service manager does.
+Processes are forked from one that has imported the service (multiprocessing's forkserver), so that
+many start quickly; `cold` starts a fresh interpreter, as a service manager does.
 """
 
 from __future__ import annotations

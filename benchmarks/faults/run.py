@@ -52,13 +52,13 @@ def run_fault(fault: Fault, line: BusLine, seed: int, target: Target = cangauge)
     """
     folder = Path(tempfile.mkdtemp(prefix="fault-"))
     rng = Random(f"{seed} {fault.name}")  # noqa: S311 - must be repeatable
-    setting = ServiceSetup(
+    setup = ServiceSetup(
         fault.config, fault.vehicle, with_state="state" in fault.needs, cold=fault.cold,
         target=target,
     )  # fmt: skip
     if line.is_vcan:
         line.create()
-    bench = Bench(line, fault.profile, setting, folder, rng)
+    bench = Bench(line, fault.profile, setup, folder, rng)
     listener = Listener(line)
     sender = HarnessBus(line, published_only=True)
     try:
@@ -82,16 +82,16 @@ def _played(
     bench.service.start()
     if not listener.wait(FIRST_START_S, bench.service.check):
         bench.incidents.append("does not start: " + " ".join(bench.service.output().split())[-200:])
-        # Nothing to play to; what is missing is judged all the same.
+        # The missing estimates are judged as in other runs.
         found, actions = found[:1], []
     observed = Observation(published=listener.published)
     player = _FramePlayer(sender, observed, profile.speed)
     player.begin()
-    doer = _ActionThread(bench, actions, observed.began_s, profile.speed)
-    doer.start()
+    action_thread = _ActionThread(bench, actions, observed.began_s, profile.speed)
+    action_thread.start()
     player.play(found)
     time.sleep(LISTEN_AFTER_S)
-    doer.join(30.0)
+    action_thread.join(30.0)
     bench.service.check()
     listener.stop_listening()
     bench.end()
@@ -103,7 +103,7 @@ def _played(
     observed.recovered_from_s = observed.began_s + RECOVERED_SHARE * profile.seconds
     observed.expected_silence_s = list(bench.expected_silence_s)
     processes = (bench.service, *bench.others)
-    observed.incidents = [*bench.incidents, *doer.incidents]
+    observed.incidents = [*bench.incidents, *action_thread.incidents]
     for process in processes:
         observed.incidents += process.incidents
         if "Traceback" in process.output():
@@ -163,7 +163,7 @@ class _ActionThread(threading.Thread):
 
     def __init__(self, bench: Bench, actions: list[Action], began_s: float, speed: float) -> None:
         super().__init__(daemon=True)
-        self._stage = bench
+        self._bench = bench
         self._actions = sorted(actions, key=lambda action: action.at_s)
         self._began_s = began_s
         self._speed = speed
@@ -174,9 +174,9 @@ class _ActionThread(threading.Thread):
             due_s = self._began_s + action.at_s / self._speed
             time.sleep(max(due_s - time.monotonic(), 0.0))
             try:
-                action.do(self._stage)
+                action.do(self._bench)
             except (CangaugeError, OSError) as error:
-                self.incidents.append(f"the harness could not do it: {error}")
+                self.incidents.append(f"an action of the harness failed: {error}")
 
 
 class Listener(threading.Thread):
@@ -186,7 +186,7 @@ class Listener(threading.Thread):
         super().__init__(daemon=True)
         database = cantools.database.load_file(shared_file("dbc", "soc_estimate.dbc"))
         self._message = database.get_message_by_name("SOC_ESTIMATE")
-        self._wire = HarnessBus(line, published_only=True)
+        self._bus = HarnessBus(line, published_only=True)
         self._stopped = threading.Event()
         self._first = threading.Event()
         self.published: list[Estimate] = []
@@ -195,7 +195,7 @@ class Listener(threading.Thread):
     def run(self) -> None:
         """Listen until stopped."""
         while not self._stopped.is_set():
-            frame = self._wire.receive(0.1)
+            frame = self._bus.receive(0.1)
             if frame is not None and frame.arbitration_id == self._message.frame_id:
                 self._take(frame)
 
@@ -203,7 +203,7 @@ class Listener(threading.Thread):
         if frame.is_extended_id or frame.is_error_frame or frame.is_remote_frame:
             return
         values = self._message.decode(frame.data, decode_choices=False, allow_truncated=True)
-        # The raw codes for "not available" are the largest that the field holds.
+        # The raw code for "not available" is the largest of the field.
         soc_pct = float(values["soc_pct"])
         self.published.append(
             Estimate(
@@ -233,11 +233,11 @@ class Listener(threading.Thread):
     def end(self) -> None:
         """Close the bus."""
         self.stop_listening()
-        self._wire.close()
+        self._bus.close()
 
 
 OVERHEAD_S: Final = 4.0
-"""Time of a run parallels its frames: start, end [s]."""
+"""Time of a run besides its frames, for start and end [s]."""
 
 IMPORT_S: Final = 10.0
 """Time to import the service once [s]."""
@@ -250,8 +250,7 @@ class Jobs:
     Parameters
     ----------
     fast, real : int
-        By the replay clock (a quarter of a core each), and in real time
-        (little load).
+        By the replay clock (a quarter of a core each), and in real time (little load).
     """
 
     fast: int = 3
@@ -259,8 +258,8 @@ class Jobs:
 
 
 MAX_SEND_DELAY_S: Final = 1.5
-"""Delay of the harness itself between frames that invalidates a run: it is close to
-the time-outs of the service [s]."""
+"""Delay of the harness between frames that invalidates a run: it is close to the time-outs of the
+service [s]."""
 
 
 @dataclass(frozen=True)
@@ -312,7 +311,7 @@ def run_all(
     target : callable
         The service.
     progress : callable
-        Estimate the name of each run that is over.
+        Called with the name of each finished run.
     retry_if_disturbed : bool
         Whether to repeat once a run that the machine delayed, and an undisturbed run that is
         not valid.
@@ -321,7 +320,6 @@ def run_all(
     -------
     list of Result
         In the order of `faults`, the undisturbed runs first.
-
     """
     runs = _with_undisturbed(faults)
     free: queue.SimpleQueue[BusLine] = queue.SimpleQueue()

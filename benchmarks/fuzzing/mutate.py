@@ -14,7 +14,7 @@ from random import Random
 from typing import Any
 
 MAX_BYTES = 20_000
-"""Largest mutant; large files have tests of their own."""
+"""Largest mutant; large files have separate tests."""
 
 NUMBERS = (
     "0", "-1", "1", "2", "7", "8", "9", "63", "64", "65", "127", "128", "255", "256", "1023",

@@ -1,4 +1,4 @@
-"""Fuzzing targets: inputs, and what cangauge does with them."""
+"""Fuzzing targets: how inputs are made, and the code that reads them."""
 
 from __future__ import annotations
 
@@ -49,9 +49,6 @@ ESTIMATED_ROWS = 200
 """Longer logs are read and inspected, not estimated."""
 
 
-# --- a place for files ---------------------------------------------------------------------------
-
-
 @cache
 def _folder() -> Path:
     """Return a temporary folder of this process, in memory if possible."""
@@ -74,9 +71,6 @@ def _file(data: bytes, name: str = "input") -> Iterator[Path]:
     path = _folder() / name
     path.write_bytes(data)
     yield path
-
-
-# --- logs ----------------------------------------------------------------------------------------
 
 
 @cache
@@ -134,9 +128,6 @@ def _check_estimate(estimate: Estimate) -> None:
 def _run_speed(data: bytes) -> bool:
     with _file(data) as path:
         return bool(read_speed(path).size)
-
-
-# --- captures and frames -------------------------------------------------------------------------
 
 
 @cache
@@ -263,9 +254,6 @@ def _mutant_frame(rng: Random, frame: can.Message, vehicle: Vehicle) -> can.Mess
     return can.Message(arbitration_id=number, is_extended_id=extended, data=data, **kinds)
 
 
-# --- DBC, map, configuration ---------------------------------------------------------------------
-
-
 def _make_dbc(rng: Random) -> bytes:
     seeds = _dbc_seeds()
     data = rng.choice(list(seeds.values()))
@@ -334,9 +322,6 @@ def _run_config(data: bytes) -> bool:
     return True
 
 
-# --- model files, state files --------------------------------------------------------------------
-
-
 def _make_model(rng: Random) -> bytes:
     tree = corpus.model_tree()
     if rng.randrange(4) == 0:
@@ -392,9 +377,6 @@ def _run_state(data: bytes) -> bool:
     for t, i, u, temp, _ in corpus.log_rows():
         _check_estimate(estimator.step(Sample(2e9 + t, i, u, temp)))
     return True
-
-
-# --- all -----------------------------------------------------------------------------------------
 
 
 def targets() -> tuple[Target, ...]:

@@ -36,12 +36,12 @@ OPTIONS = FitOptions(
 )
 
 
-def prepared(log: Log) -> SampledLog:
+def sampled(log: Log) -> SampledLog:
     return sample_log(log, OPTIONS)
 
 
 def matrix(log: Log) -> DesignMatrix:
-    item = prepared(log)
+    item = sampled(log)
     none = np.zeros((len(item.rows), 0))
     return DesignMatrix(item, np.zeros(len(item.rows)), none, none, ())
 
@@ -105,7 +105,7 @@ def test_worst_segments_are_a_minute_apart() -> None:
     spikes = [[(500, -9.0), (510, -8.0), (900, 5.0)], [(700, 8.5)], [(k, 6.0) for k in (100, 300)]]
     errors = []
     for item, put in zip(logs, spikes, strict=True):
-        error = 0.01 * np.sin(np.arange(len(item.prepared.rows)))
+        error = 0.01 * np.sin(np.arange(len(item.sampled.rows)))
         for at, volts in put:
             error[at] = volts
         errors.append(error)
@@ -115,7 +115,7 @@ def test_worst_segments_are_a_minute_apart() -> None:
     assert [(m.log, m.residual_v) for m in found[:5]] == [
         ("one", -9.0), ("two", 8.5), ("three", 6.0), ("three", 6.0), ("one", 5.0),
     ]  # fmt: skip
-    assert found[0].time_s == logs[0].prepared.rows.time_s[500]
+    assert found[0].time_s == logs[0].sampled.rows.time_s[500]
     for name in ("one", "two", "three"):
         times = sorted(m.time_s for m in found if m.log == name)
         assert np.all(np.diff(times) >= 60.0)
@@ -124,17 +124,17 @@ def test_worst_segments_are_a_minute_apart() -> None:
 
 def test_a_segment_is_a_minute_either_side_in_its_log() -> None:
     logs = [matrix(long_log(name=name)) for name in ("one", "two")]
-    rows = [len(item.prepared.rows) for item in logs]
+    rows = [len(item.sampled.rows) for item in logs]
     errors = [np.zeros(rows[0]), np.zeros(rows[1])]
     errors[1][400] = 7.0
-    both = [LogErrors(item.prepared, e, 0.1 * e) for item, e in zip(logs, errors, strict=True)]
+    both = [LogErrors(item.sampled, e, 0.1 * e) for item, e in zip(logs, errors, strict=True)]
     segment = worst_segments(logs, errors, 1)[0]
     seen = segment_signals(segment, both)
     assert segment.log == "two"
     assert (seen.time_s.min(), seen.time_s.max()) == (-60.0, 60.0)
     assert seen.before_v[seen.time_s == 0.0] == 7.0
     assert seen.after_v[seen.time_s == 0.0] == pytest.approx(0.7)
-    log = logs[1].prepared.log
+    log = logs[1].sampled.log
     assert np.array_equal(
         seen.current_a, log.current_a[np.abs(log.time_s - segment.time_s) <= 60.0]
     )
@@ -144,8 +144,8 @@ def test_a_segment_is_a_minute_either_side_in_its_log() -> None:
 
 
 def caveats(log: Log, references: int = 3, initial_soc_pct: float | None = None) -> str:
-    known = [prepared(long_log(name=f"reference {k}")) for k in range(references)]
-    return " ".join(log_caveats([prepared(log)], known, CAPACITY_AH, initial_soc_pct))
+    known = [sampled(long_log(name=f"reference {k}")) for k in range(references)]
+    return " ".join(log_caveats([sampled(log)], known, CAPACITY_AH, initial_soc_pct))
 
 
 def test_a_good_log_has_no_caveat() -> None:
@@ -182,13 +182,13 @@ def test_each_limitation_has_its_caveat(log: Log, references: int, sentence: str
 
 
 def test_a_reference_without_soc_is_a_caveat() -> None:
-    known = [prepared(long_log()), prepared(long_log(soc_pct=None, name="silent"))]
-    words = " ".join(log_caveats([prepared(long_log())], known, CAPACITY_AH))
+    known = [sampled(long_log()), sampled(long_log(soc_pct=None, name="silent"))]
+    words = " ".join(log_caveats([sampled(long_log())], known, CAPACITY_AH))
     assert "No initial SoC of the reference silent: 100 % assumed" in words
 
 
 def test_another_temperature_source_is_a_caveat() -> None:
-    log, known = [prepared(long_log())], [prepared(long_log())] * 3
+    log, known = [sampled(long_log())], [sampled(long_log())] * 3
     assert log_caveats(log, known, CAPACITY_AH, None, "room") == log_caveats(
         log, known, CAPACITY_AH
     )
@@ -198,9 +198,9 @@ def test_another_temperature_source_is_a_caveat() -> None:
 
 def test_time_counts_from_the_start_of_the_log() -> None:
     item = matrix(long_log())
-    spans = [p for p in error_shares([item], [np.ones(len(item.prepared.rows))], CAPACITY_AH)
+    spans = [p for p in error_shares([item], [np.ones(len(item.sampled.rows))], CAPACITY_AH)
              if p.axis == "time"]  # fmt: skip
-    assert spans[-1].high == pytest.approx(item.prepared.log.duration_s, abs=2.0)
+    assert spans[-1].high == pytest.approx(item.sampled.log.duration_s, abs=2.0)
 
 
 def test_a_given_initial_soc_needs_no_caveat() -> None:

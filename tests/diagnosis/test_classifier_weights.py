@@ -1,4 +1,4 @@
-"""The weights of the classifier make known causes probable (`benchmarks/belief.py`)."""
+"""The weights of the classifier make known causes probable (`benchmarks/classifier_weights.py`)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import belief as learning
+import classifier_weights as training
 from cangauge.diagnosis import classifier
 from cangauge.diagnosis.bayes_factors import Score
 from cangauge.diagnosis.classifier import Comparison, EffectFeatures
@@ -17,7 +17,7 @@ TRUE = np.array([0.2, 1.0, 2.0, 0.5, 0.5, 0.4])
 EFFECTS = 6
 
 
-def case(rng: np.random.Generator, number: int) -> learning.Case:
+def case(rng: np.random.Generator, number: int) -> training.Case:
     """A random comparison whose cause is drawn with the true weights."""
     effects = tuple(
         EffectFeatures(
@@ -29,18 +29,18 @@ def case(rng: np.random.Generator, number: int) -> learning.Case:
         )
         for k, evidence in enumerate(rng.uniform(-1.0, 60.0, EFFECTS).tolist())
     )
-    compared = Comparison(effects, 1.5, 0.5, 1000.0, 0.6)
-    utility = classifier.effect_features(compared) @ TRUE
+    comparison = Comparison(effects, 1.5, 0.5, 1000.0, 0.6)
+    utility = classifier.effect_features(comparison) @ TRUE
     chances = np.exp(utility) / np.exp(utility).sum()
     truth = f"effect_{rng.choice(EFFECTS, p=chances)}"
-    return learning.Case("simulated", f"world {number}", truth, compared, learned=True)
+    return training.Case("simulated", f"pack {number}", truth, comparison, has_overdispersion=True)
 
 
 def test_training_recovers_the_true_weights(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(learning, "HELD", 1e-6)  # many cases need no regularisation
+    monkeypatch.setattr(training, "RIDGE", 1e-6)  # many cases need no regularisation
     rng = np.random.default_rng(3)
     cases = [case(rng, number) for number in range(3000)]
-    found = learning.fit_which(cases)
+    found = training.fit_effect_weights(cases)
     assert found[2] == pytest.approx(TRUE[2], abs=0.3)
     assert found[3] == pytest.approx(TRUE[3], abs=0.2)
     # All effects have the same overdispersion here, so both leads are equal.
@@ -53,13 +53,13 @@ def test_a_case_without_its_cause_has_another() -> None:
     rng = np.random.default_rng(4)
     known = case(rng, 0)
     unknown = known.without_cause()
-    assert known.known
-    assert not unknown.known
-    names, _, _ = learning.ranked(unknown, TRUE)
-    assert learning.answer(unknown, names) == learning.ANOTHER
+    assert known.has_cause
+    assert not unknown.has_cause
+    names, _, _ = training.ranked(unknown, TRUE)
+    assert training.class_of(unknown, names) == training.ANOTHER
 
 
 def test_final_seeds_are_not_used_for_training(tmp_path: Path) -> None:
     (tmp_path / "tasks.json").write_text(json.dumps({"final": True}), encoding="utf-8")
     with pytest.raises(SystemExit, match="final seeds"):
-        learning.cases_of(tmp_path)
+        training.read_cases(tmp_path)

@@ -245,7 +245,7 @@ def test_temperature_steps_of_a_fast_log_are_interpolated(model: Model) -> None:
     warming_c = 20.0 + 3.0 * (1.0 - np.exp(-fast.time_s / 1500.0)) + 0.2 * np.sin(fast.time_s / 400)
     coarse = replace(fast, temperature_c=np.floor(warming_c + 0.5))
     problem = build_problem([coarse], model, [])
-    seen = problem.diagnosed[0].prepared.log
+    seen = problem.diagnosed[0].sampled.log
     error_k = seen.temperature_c - np.interp(seen.time_s, fast.time_s, warming_c)
     assert np.sqrt(np.mean(error_k**2)) < 0.13
     assert problem.temperature_step_k == 1.0

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge.errors import InputError
-from cangauge.model.delay_line import DelayLine, delayed_currents, settled
+from cangauge.model.delay_line import DelayLine, delayed_currents, filled_at
 from cangauge.model.published import leaf_2012_model
 from cangauge.model.voltage_model import VoltageModel
 
@@ -115,13 +115,13 @@ def test_ring_buffer_equals_interpolation_of_the_log(
     for k, (time, current) in enumerate(zip(time_s.tolist(), current_a.tolist(), strict=True)):
         line.push(time, current)
         assert line.currents() == pytest.approx(expected[k].tolist(), abs=1e-6)
-    full = settled(time_s, 70.0, time_s)
+    full = filled_at(time_s, 70.0, time_s)
     assert line.full == bool(full[-1])
 
 
 def test_a_gap_empties_the_delay_line_in_both_forms() -> None:
     time_s = np.concatenate([np.arange(0.0, 100.0), np.arange(103.0, 300.0)])
-    full = settled(time_s, 70.0, time_s)
+    full = filled_at(time_s, 70.0, time_s)
     assert full[time_s < 100.0].sum() == 30
     assert time_s[time_s > 100.0][np.argmax(full[time_s > 100.0])] == 173.0
     line = DelayLine((0.0, 70.0))

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cangauge.report.charts import envelope, every, extremes
+from cangauge.report.charts import envelope, extremes, sampling_slice
 
 VALUES = st.one_of(st.floats(-1e6, 1e6), st.just(float("nan")))
 SERIES = arrays(np.float64, st.integers(0, 400), elements=VALUES)
@@ -43,7 +43,7 @@ def test_a_reduced_band_covers_all_rows(values: np.ndarray, max_points: int) -> 
 
 @given(n=st.integers(0, 100_000), max_points=st.integers(1, 5000))
 def test_a_cloud_is_sampled_evenly(n: int, max_points: int) -> None:
-    assert len(range(n)[every(n, max_points)]) <= max_points
+    assert len(range(n)[sampling_slice(n, max_points)]) <= max_points
 
 
 def test_a_single_spike_in_a_long_series_is_drawn() -> None:

@@ -28,7 +28,7 @@ SECTIONS = [
     "Where the gap is",
     "Cause",
     "How far the gap closes",
-    "Worst moments",
+    "Worst segments",
     "What these logs can show",
 ]
 
@@ -117,8 +117,8 @@ def test_maps_show_before_and_after_in_the_same_shades(page: Page) -> None:
     assert np.isfinite(before).all()
 
 
-def test_ten_worst_moments_are_drawn_on_one_scale(page: Page, offset: Diagnosis) -> None:
-    part = section(page, "Worst moments")
+def test_ten_worst_segments_are_drawn_on_one_scale(page: Page, offset: Diagnosis) -> None:
+    part = section(page, "Worst segments")
     drawn = [item for block in part.blocks if isinstance(block, Beside) for item in block.figures]
     assert len(drawn) == SEGMENTS
     assert (

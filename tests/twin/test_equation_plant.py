@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from cangauge.identify.fit import fit
 from cangauge.validation.cases import Scenario, draw_scenario
-from cangauge.validation.recordings import fit_model
 from cangauge.validation.twin.faults import Fault, fault_kind, fault_kinds
 from cangauge.validation.twin.recording import GroundTruth, record_drive, rms, simulate_truth
 
@@ -23,14 +23,14 @@ def healthy(scenario: Scenario) -> GroundTruth:
 
 def test_healthy_log_is_fitted_to_the_sensor_floor(scenario: Scenario) -> None:
     training = scenario.training[0]
-    fitted = fit_model([training.log], scenario.pack.capacity_ah)
+    fitted = fit([training.log], capacity_ah=scenario.pack.capacity_ah)
     assert fitted.voltage_rmse_v < 1.3 * rms(training.sensor_error_v)
 
 
 def test_reported_core_fits_all_logs_to_the_floor() -> None:
     scenario = draw_scenario(8, kind="leaf40", plant_name="published")
     clean = (*scenario.training, *scenario.references)
-    fitted = fit_model([recording.log for recording in clean], scenario.pack.capacity_ah)
+    fitted = fit([recording.log for recording in clean], capacity_ah=scenario.pack.capacity_ah)
     sensor_floor_v = rms(np.concatenate([recording.sensor_error_v for recording in clean]))
     assert fitted.voltage_rmse_v < 1.05 * sensor_floor_v
 

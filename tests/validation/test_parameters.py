@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.effects.base import Signals
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.extended import ExtendedModel
 from cangauge.validation.cases import CaseOptions, Scenario
-from cangauge.validation.recordings import fit_model
 from cangauge.validation.score import COMPARABLE, expected_parameters
 from cangauge.validation.twin.drive import Drive
 from cangauge.validation.twin.faults import Fault, fault_kinds
@@ -43,7 +43,7 @@ def scenario() -> Scenario:
 @pytest.fixture(scope="module")
 def model(scenario: Scenario) -> ExtendedModel:
     logs = [recording.log for recording in (*scenario.training, *scenario.references)]
-    return fit_model(logs, scenario.pack.capacity_ah).model.extended_model()
+    return fit(logs, capacity_ah=scenario.pack.capacity_ah).model.extended_model()
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def errors_v(model: ExtendedModel, log: Log) -> NDArray[np.float64]:
     assert start is not None
     signals = Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
     rows = np.flatnonzero(log.time_s - log.time_s[0] >= 70.0)
-    return model.predict(signals, start[1], rows, anchor_row=start[0]).residual_v
+    return model.predict(signals, start[1], rows, initial_row=start[0]).residual_v
 
 
 def test_comparable_faults_are_mapped() -> None:

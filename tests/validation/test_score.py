@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cangauge.validation.score import Outcome, estimate, outcome_of, proportion, score
+from cangauge.validation.score import Outcome, bootstrapped, outcome_of, proportion, score
 from cangauge.validation.tables import judge_targets
-from cangauge.validation.workers import Task
+from cangauge.validation.worker_pool import Task
 
 
 def label(*effects: str, size: float = 0.0, gap_v: float = 2.0, **more: Any) -> dict[str, Any]:
@@ -191,7 +191,7 @@ def test_wilson_interval() -> None:
 
 
 def test_bootstrap_covers_a_mean() -> None:
-    found = estimate([0.0, 1.0] * 50, np.mean)
+    found = bootstrapped([0.0, 1.0] * 50, np.mean)
     assert found["value"] == 0.5
     assert found["ci"] == pytest.approx([0.4, 0.6], abs=0.02)
 

@@ -1,4 +1,4 @@
-"""Diagnosis: how large the gap between a model and logs is, where it lies, and what causes it.
+"""Diagnosis: size, place and cause of the gap between a model and logs.
 
     >>> from cangauge.diagnosis import diagnose
     >>> found = diagnose(logs, model, references)  # doctest: +SKIP
@@ -8,19 +8,19 @@ Modules, in the order in which a diagnosis uses them:
 
 ==================  ==============================================================================
 diagnose            `diagnose` and its result, `Diagnosis`
-problem             what all verdicts share: checked logs, hypotheses, error model, coverage
-input_checks        logs of this pack, alive, given once, without outliers
+problem             checked logs, hypotheses, error model and coverage: the basis of the verdict
+input_checks        errors for logs of another pack, dead channels, duplicates; removes outliers
 hypotheses          candidate effects: cause, shared structure, per-log effects
 design_matrix       sensitivity of a log's voltage residual to every amplitude
 linear_gaussian     normal equations of logs; posterior of the amplitudes
 error_model         error of healthy logs by time scale, prior scales, overdispersion
-structure           structure that the references need, and the model that has it
-bayes_factors       every effect against no effect
+structure           structure that the references need, and the model with it
+bayes_factors       Bayes factor of every effect against no effect
 classifier          effect features → probabilities → verdict
 cross_validation    errors on held-out rows, closed fraction, SoC error
 extended_model      refined amplitudes, change points; the extended model file
 error_breakdown     shares of the error, worst segments, maps
-caveats             what the logs cannot show
+caveats             limits of what the logs can show
 ==================  ==============================================================================
 
 The method is described in docs/diagnosis.md.

@@ -1,4 +1,4 @@
-"""Bayes factor of every effect against no effect, and the error that logs keep with it."""
+"""Bayes factor of every effect against no effect, and the error that remains with it."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from cangauge.diagnosis.linear_gaussian import (
 from cangauge.inference.time_scales import SCALES
 
 PRIOR_WIDTHS = (1.0, 0.3, 0.1, 0.03)
-"""Widths of the amplitude prior in parts of the bounds' own, equally probable: an effect may be as
-large as its bounds or much smaller."""
+"""Equally probable widths of the amplitude prior, relative to that of the bounds: an effect may be
+as large as its bounds or much smaller."""
 
 NOISE_VARIATION = 0.2
 """Part by which the error variance differs between healthy logs."""
@@ -194,8 +194,8 @@ def excess_chi_square(
     """Return the weighted squares that the diagnosed logs add beyond chance.
 
     These are the squares of their errors, of their per-log effects and of the coefficients' change,
-    and the increase of the references' squares. Errors count scale by scale and only beyond their
-    variation between healthy logs: a slightly noisier sensor is no gap.
+    and the increase of the references' squares. Errors count by time scale, and only beyond their
+    variation between healthy logs: a slightly noisier sensor is not a gap.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Caveats: what the logs cannot show, whatever the verdict; one or two sentences each."""
+"""Caveats: limits of what the logs can show, whatever the verdict; one or two sentences each."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from cangauge.diagnosis.error_breakdown import REST_C_RATE
 from cangauge.diagnosis.problem import COVERED_K, COVERED_PCT
 from cangauge.inference.rows import SampledLog
 from cangauge.logs.log import TemperatureSource
@@ -17,9 +18,8 @@ SHORT_S = 600.0
 NARROW_K, NARROW_PCT = 3.0, 10.0
 """Ranges of temperature and SoC below which their influence is not visible [K, %]."""
 
-REST_C_RATE, REST_PART = 0.02, 0.005
-"""Current below which the pack rests [1/h], and the part of the rows below which it never charges
-or rests."""
+REST_PART = 0.005
+"""Part of the rows below which the pack counts as never charged, or never at rest."""
 
 STEP_PART = 0.5
 """Part of the floor below which half a step of the temperature is negligible."""
@@ -29,7 +29,7 @@ POOR_FIT_PART, POOR_FIT_TIMES, STATED_TIMES = 0.005, 3.0, 5.0
 multiple of the others' or the second of the model file's."""
 
 FEW_REFERENCES = 3
-"""Fewer hardly show how much healthy logs differ."""
+"""Number of references below which the spread between healthy logs is uncertain."""
 
 
 def log_caveats(
@@ -55,8 +55,8 @@ def log_caveats(
         _duration(logs),
         *_temperature(logs, references),
         *_soc(logs, references),
-        _pauses(logs),
-        _source([*logs, *references], temperature_source),
+        _recording_gaps(logs),
+        _temperature_source([*logs, *references], temperature_source),
         _initial_soc(logs, initial_soc_pct),
         _reference_initial_soc(references),
         *_current(logs, capacity_ah),
@@ -91,7 +91,7 @@ def temperature_step_caveat(step_k: float, kt_v_per_k: float, floor_v: float) ->
 def reference_fit_caveat(
     errors_v: Sequence[tuple[str, float]], stated_v: float, voltage_v: float
 ) -> str:
-    """Return the caveat of references that the given model does not fit; "" if it fits.
+    """Return the caveat of references that the given model does not fit; "" if it fits them.
 
     Parameters
     ----------
@@ -186,7 +186,7 @@ def _soc(logs: Sequence[SampledLog], references: Sequence[SampledLog]) -> list[s
     return sentences
 
 
-def _pauses(logs: Sequence[SampledLog]) -> str:
+def _recording_gaps(logs: Sequence[SampledLog]) -> str:
     found = []
     for item in logs:
         time_s = item.log.time_s
@@ -204,7 +204,7 @@ def _pauses(logs: Sequence[SampledLog]) -> str:
     )
 
 
-def _source(logs: Sequence[SampledLog], of_model: TemperatureSource) -> str:
+def _temperature_source(logs: Sequence[SampledLog], of_model: TemperatureSource) -> str:
     others = sorted({item.log.temperature_source for item in logs} - {of_model, "unknown"})
     if of_model == "unknown" or not others:
         return ""
@@ -231,7 +231,7 @@ def _reference_initial_soc(references: Sequence[SampledLog]) -> str:
         return ""
     return (
         f"No initial SoC of the reference{'s' if len(names) > 1 else ''} {', '.join(names)}: 100 %"
-        " assumed. A wrong one falsifies what is learned of the healthy pack. Give references with"
+        " assumed. A wrong one falsifies the model of the healthy pack. Give references with"
         " soc_pct; one value is enough."
     )
 
@@ -264,7 +264,7 @@ def _reference_number(number: int) -> str:
         )
     return (
         f"Only {number} reference log{'s' if number > 1 else ''}: differences between healthy logs"
-        " are hardly known, and probabilities are less certain than they look."
+        " are hardly known, and probabilities are less reliable."
     )
 
 

@@ -1,15 +1,16 @@
 """From Bayes factors to a verdict: an effect, `none` or `unknown`, with probabilities.
 
 A Bayes factor is exact only if the pack obeys the model and its error is that of the references. On
-real packs an effect may have the most evidence and yet leave most of the gap. So each effect is
-described by several features, and a classifier trained on cases with known cause weighs them:
+real packs an effect may have the most evidence and yet leave most of the gap unexplained. Each
+effect is therefore described by several features, which a classifier fitted to cases with known
+cause weighs:
 
 1. *Which effect*: a conditional logit over the library (McFadden, in Frontiers in Econometrics,
    1974), given that one of the effects is the cause.
 2. *Whether there is a cause*: a multinomial logit of three answers: none, the best effect, another.
 
-No feature depends on the name of an effect. `benchmarks/belief.py` trains the weights on simulated
-packs; none of them is part of a release's check.
+No feature depends on the name of an effect. `benchmarks/classifier_weights.py` fits the weights to
+development cases; none of them is part of a release's check.
 """
 
 from __future__ import annotations
@@ -92,9 +93,9 @@ LIBRARY_AT_MOST = 0.9
 """Largest part of "another cause" that other effects of the library take."""
 
 SECOND_MIN_LOG_BAYES, SECOND_MIN_PART, MAX_CAUSES = 12.0, 0.05, 2
-"""Log Bayes factor that a further cause needs beside those accepted, also relative to the first's:
-the misfit of a large cause's shape resembles a second cause. Chosen on development cases: of 14
-false second causes nine were below, of five true ones one."""
+"""Log Bayes factor that a further cause needs in addition to those accepted, also relative to the
+first's: the misfit of a large cause's shape resembles a second cause. Chosen on development cases:
+of 14 false second causes nine were below, of five true ones one."""
 
 TEMPERATURE_EFFECTS = ("resistance_temperature",)
 EXPECTED_FACTOR = 1.6
@@ -105,11 +106,11 @@ needed 1.5; not tested on other data."""
 
 @dataclass(frozen=True, eq=False)
 class EffectFeatures:
-    """Evidence for one effect and what remains with it."""
+    """Evidence for one effect, and the remaining error with it."""
 
     score: Score
-    """With the mean overdispersion of all effects: a smaller one of its own does not make an effect
-    more likely."""
+    """With the mean overdispersion of all effects: an individual smaller one does not make an
+    effect more likely."""
     own_log_bayes: float
     """Log Bayes factor with the effect's own overdispersion."""
     raw_log_bayes: float
@@ -239,7 +240,7 @@ def rank_effects(
     """Return the effects, best first, and the share of each, by weights of `effect_features`."""
     utility = np.round(effect_features(comparison) @ weights, TIE_DECIMALS)
     remaining = [(each.rmse_v, each.excess) for each in comparison.effects]
-    # Ties go to the effect that leaves less, so that the order of the library does not matter.
+    # Ties are broken by the smaller remaining error, so that the library's order does not matter.
     order = sorted(range(len(remaining)), key=lambda k: (-utility[k], *remaining[k]))
     shares = np.exp(utility[order] - utility.max())
     return tuple(comparison.effects[k] for k in order), shares / shares.sum()
@@ -304,7 +305,7 @@ class Verdict:
     ambiguous_with: tuple[str, ...]
     """Other effects with a similar probability."""
     accepted: tuple[Score, ...]
-    """The named cause, and a second one beside it; empty without a named cause."""
+    """The named cause, and a second one if the logs show it; empty without a named cause."""
     candidates: tuple[Score, ...]
     """All effects, best first."""
     probabilities: dict[str, float]
@@ -376,7 +377,7 @@ def _capped(found: Classification, *, named: bool) -> Classification:
         none = max(found.none, 1.0 - PROBABILITY_CAP)
         return replace(found, none=none, best=min(found.best, 0.5 * (1.0 - none)))
     best = min(found.best, PROBABILITY_CAP)
-    # The rest goes to `none`: healthy logs may look like that.
+    # The remainder is assigned to `none`: healthy logs may have the same features.
     none = found.none + found.best - best
     return replace(found, best=best, none=min(none, 0.5 * (1.0 - best)))
 
@@ -384,7 +385,8 @@ def _capped(found: Classification, *, named: bool) -> Classification:
 def _probabilities(found: Classification) -> dict[str, float]:
     """Return the probability of every effect, of `none` and of `unknown`.
 
-    The probability of another cause goes to the other effects by their shares; the rest is unknown.
+    The probability of another cause is divided among the other effects by their shares; the
+    remainder is `unknown`.
     """
     another = max(1.0 - found.none - found.best, 0.0)
     others = found.best * found.shares[1:] / found.shares[0]
@@ -401,7 +403,7 @@ def _probabilities(found: Classification) -> dict[str, float]:
 
 
 def _causes(posterior: Posterior, best: Score, ambiguous: Sequence[str]) -> tuple[Score, ...]:
-    """Return the best effect and a second cause that the logs show beside it."""
+    """Return the best effect, and a second cause if the logs show one."""
     accepted = [best]
     needed = max(SECOND_MIN_LOG_BAYES, SECOND_MIN_PART * best.log_bayes_factor)
     while len(accepted) < MAX_CAUSES:

@@ -1,8 +1,8 @@
 """Cross-validation of the gap: errors on rows that the fit of the effects did not see.
 
-Of several logs each is left out in turn. One log is cut into blocks of 240 s, of which every fourth
-is left out in turn, except for the last; the middle 120 s of a left-out block are judged, so that
-60 s on either side separate them from the rows of the fit.
+Of several logs each is left out in turn. A single log is divided into blocks of 240 s, of which
+every fourth is left out in turn, except for the last; the error is evaluated on the middle 120 s of
+a left-out block, separated by 60 s on either side from the rows of the fit.
 """
 
 from __future__ import annotations
@@ -19,11 +19,13 @@ from cangauge.diagnosis.linear_gaussian import NormalEquations, Posterior, margi
 from cangauge.diagnosis.problem import DiagnosisProblem
 from cangauge.estimate.offline import run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
+from cangauge.inference.rows import BLOCK_GUARD_S, BLOCK_S
 from cangauge.logs.log import Log
 from cangauge.logs.resample import resample
 from cangauge.model.model_file import Model
 
-BLOCK_S, GUARD_S, FOLDS = 240.0, 60.0, 4
+FOLDS = 4
+"""One block of a single log in this number is left out in turn."""
 
 PIECE_S = 300.0
 """Length of the pieces that the bootstrap draws, beyond the correlation of errors [s]."""
@@ -41,7 +43,7 @@ start."""
 
 @dataclass(frozen=True, eq=False)
 class Fold:
-    """Posterior without some rows, and the rows of one log that judge it."""
+    """Posterior without some rows, and the rows of one log to evaluate it on."""
 
     posterior: Posterior
     log: int
@@ -70,13 +72,13 @@ def folds(problem: DiagnosisProblem) -> list[Fold]:
             rest = [log for k, log in enumerate(equations) if k != number]
             held_out.append((rest, number, np.ones(matrix.residual_v.size, dtype=bool)))
     else:
-        time_s = logs[0].prepared.rows.time_s
+        time_s = logs[0].sampled.rows.time_s
         elapsed = time_s - time_s[0]
         block = (elapsed // BLOCK_S).astype(np.intp)
         since = elapsed % BLOCK_S
         for fold in range(FOLDS):
             left_out = (block % FOLDS == fold) & (block < block[-1])
-            core = left_out & (since >= GUARD_S) & (since < BLOCK_S - GUARD_S)
+            core = left_out & (since >= BLOCK_GUARD_S) & (since < BLOCK_S - BLOCK_GUARD_S)
             if core.any():
                 held_out.append(([problem.equations_of(logs[0], 1.0 - left_out)], 0, core))
     references = problem.reference_equations
@@ -89,7 +91,7 @@ def folds(problem: DiagnosisProblem) -> list[Fold]:
 def held_out_errors(
     problem: DiagnosisProblem, held_out: Sequence[Fold], effects: Sequence[str]
 ) -> list[HeldOutErrors]:
-    """Return the errors with some effects, each fold fitted without the rows that judge it.
+    """Return the errors with some effects, each fold fitted without the rows it is evaluated on.
 
     Parameters
     ----------
@@ -104,7 +106,7 @@ def held_out_errors(
         columns = np.column_stack([matrix.coefficients, *matrix.effects])
         result.append(
             HeldOutErrors(
-                matrix.prepared.rows.time_s[fold.rows],
+                matrix.sampled.rows.time_s[fold.rows],
                 problem.diagnosed_errors_v[fold.log][fold.rows],
                 matrix.residual_v - columns @ _solution(fold.posterior, effects),
             )

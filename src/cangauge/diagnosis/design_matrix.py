@@ -30,8 +30,8 @@ from cangauge.model.effects.library import candidates as library_candidates
 from cangauge.model.extended import ExtendedModel
 
 PER_LOG_STATES = ("slow polarisation", "resistance level")
-"""State of a log that no signal shows, in parts of the pack resistance: trips of one pack differ in
-their initial polarisation, and in the temperature inside the cells."""
+"""Unmeasured states of a log, in parts of the pack resistance: trips of one pack differ in their
+initial polarisation, and in the temperature inside the cells."""
 
 SLOW_POLARISATION_S = 150.0
 """Time constant of the per-log slow polarisation [s]."""
@@ -41,7 +41,7 @@ SLOW_POLARISATION_S = 150.0
 class DesignMatrix:
     """Residual and columns of one log with m rows."""
 
-    prepared: SampledLog
+    sampled: SampledLog
     residual_v: FloatArray
     """Residual that the columns explain, shape (m,) [V]. With a structured model it is that model's
     residual plus what the columns attribute to its structure, so that columns are exact there."""
@@ -65,7 +65,7 @@ class DesignMatrix:
 
 
 def design_matrix(
-    prepared: SampledLog,
+    sampled: SampledLog,
     model: ExtendedModel,
     candidates: Sequence[Candidate],
     structured: ExtendedModel | None = None,
@@ -74,39 +74,37 @@ def design_matrix(
 
     Parameters
     ----------
-    prepared : SampledLog
+    sampled : SampledLog
     model : ExtendedModel
         Model to linearise about.
     candidates : sequence of Candidate
         Their shapes as of this log (`candidates_for`).
     structured : ExtendedModel, optional
-        `model` with the structure that the references need. The residual, and the columns of
-        thermal effects, are taken about it: a wrong temperature shows through everything that
-        depends on temperature, and in `model` that is one coefficient only.
+        `model` with the structure that the references need. The residual and the columns of
+        thermal effects are taken about it: a wrong temperature acts through everything that depends
+        on temperature, which in `model` is a single coefficient.
     """
     voltage_model = model.model
-    rows = prepared.rows
-    remembering = (
-        prepared.with_history_cache()
-    )  # keeps intermediate results until all columns exist
-    slow = remembering.signals.history.lagged_a(SLOW_POLARISATION_S)
+    rows = sampled.rows
+    cached = sampled.with_history_cache()  # until all columns are computed
+    slow = cached.signals.history.lagged_a(SLOW_POLARISATION_S)
     per_log_states = np.column_stack(
         [
-            -model.pack.resistance_ohm * slow[prepared.at],
-            -model.pack.resistance_ohm * prepared.log.current_a[prepared.at],
+            -model.pack.resistance_ohm * slow[sampled.at],
+            -model.pack.resistance_ohm * sampled.log.current_a[sampled.at],
         ]
     )
-    smooth = with_modelled_voltage(remembering, model)
+    smooth = with_modelled_voltage(cached, model)
     at_model = (residual(smooth, model), pack_state(smooth, model))
     if structured is not None:
-        smooth_structured = with_modelled_voltage(remembering, structured)
+        smooth_structured = with_modelled_voltage(cached, structured)
         at_structured = (
             residual(smooth_structured, structured),
             pack_state(smooth_structured, structured),
         )
     # Effects of the given model may scale the columns of its coefficients.
     coefficients = (
-        coefficient_columns(model, [prepared], predict_logs(model, [prepared]))
+        coefficient_columns(model, [sampled], predict_logs(model, [sampled]))
         if model.effects
         else np.column_stack(
             [
@@ -122,15 +120,15 @@ def design_matrix(
         else effect_columns(smooth, model, candidate, *at_model)
         for candidate in candidates
     )
-    residual_v = residual(remembering, structured or model)
+    residual_v = residual(cached, structured or model)
     if structured is not None:
         change = structured.model.coefficients - voltage_model.coefficients
         residual_v += coefficients @ change + _structure_v(model, structured, candidates, effects)
-    return DesignMatrix(prepared, residual_v, coefficients, per_log_states, effects)
+    return DesignMatrix(sampled, residual_v, coefficients, per_log_states, effects)
 
 
 def candidates_for(
-    candidates: Sequence[Candidate], pack: Pack, prepared: SampledLog
+    candidates: Sequence[Candidate], pack: Pack, sampled: SampledLog
 ) -> list[Candidate]:
     """Return the candidates with their shapes on one log: times of onset scale with its length.
 
@@ -140,9 +138,9 @@ def candidates_for(
         If the log has other candidates.
     """
     effects = list(dict.fromkeys(candidate.effect for candidate in candidates))
-    found = library_candidates(effects, pack, prepared.log.time_s, for_diagnosis=True)
+    found = library_candidates(effects, pack, sampled.log.time_s, for_diagnosis=True)
     if [each.effect.id for each in found] != [each.effect.id for each in candidates]:
-        raise InputError("the effects' shapes differ between logs", source=prepared.log.source)
+        raise InputError("the effects' shapes differ between logs", source=sampled.log.source)
     return found
 
 

@@ -1,4 +1,4 @@
-"""Diagnosis of the gap between a model and logs: size, place, cause, and what an effect closes."""
+"""Diagnosis of the gap between a model and logs: size, place, cause, and closed fraction."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class Diagnosis:
     model: Model
     """Diagnosed model."""
     problem: DiagnosisProblem
-    """What the verdict rests on: error model, hypotheses, design matrices."""
+    """Basis of the verdict: error model, hypotheses, design matrices."""
     verdict: Verdict
     """Cause (an effect, `none` or `unknown`) with probabilities."""
     extension: Extension
@@ -125,7 +125,7 @@ class Diagnosis:
 
     @cached_property
     def extended_soc_mae_pct(self) -> float | None:
-        """Mean absolute SoC error of the estimator with the extended model [%], likewise."""
+        """The same with the extended model [%]."""
         return soc_mae_pct(self.logs, self.extended_model)
 
     @property
@@ -164,10 +164,10 @@ class Diagnosis:
 
     @property
     def caveats(self) -> list[str]:
-        """What these logs cannot show, whatever the verdict; one or two sentences each."""
+        """Limits of what these logs can show, whatever the verdict; one or two sentences each."""
         problem = self.problem
         fits = [
-            (matrix.prepared.log.name, rms(errors))
+            (matrix.sampled.log.name, rms(errors))
             for matrix, errors in zip(problem.references, problem.reference_errors_v, strict=True)
         ]
         stated_v = self.model.noise.voltage_rmse_v
@@ -179,8 +179,8 @@ class Diagnosis:
             worse,
             reference_fit_caveat(fits, stated_v, problem.given.pack.voltage_v),
             *log_caveats(
-                [matrix.prepared for matrix in problem.diagnosed],
-                [matrix.prepared for matrix in problem.references],
+                [matrix.sampled for matrix in problem.diagnosed],
+                [matrix.sampled for matrix in problem.references],
                 problem.model.capacity_ah,
                 problem.options.initial_soc_pct,
                 problem.temperature_source,
@@ -194,7 +194,7 @@ class Diagnosis:
     def log_errors(self) -> list[LogErrors]:
         """Return the errors of each diagnosed log with the given and the extended model."""
         return [
-            LogErrors(matrix.prepared, before_v, residual(matrix.prepared, self.extension.model))
+            LogErrors(matrix.sampled, before_v, residual(matrix.sampled, self.extension.model))
             for matrix, before_v in zip(
                 self.problem.diagnosed, self.problem.diagnosed_errors_v, strict=True
             )
@@ -267,8 +267,8 @@ def diagnose(
     model : Model
         Model of this pack, from `fit` or a model file.
     references : sequence of Log
-        Logs on which the model is good, at least three for sound probabilities. They show the error
-        to expect without a cause. Each needs an SoC at its start, or starts full.
+        Logs on which the model is good, at least three for reliable probabilities. They show the
+        error to expect without a cause. Each needs an initial SoC, or starts full.
     leave_out : sequence of str
         Effects to leave out of the library.
     initial_soc_pct : float, optional

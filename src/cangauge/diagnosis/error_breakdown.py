@@ -1,4 +1,4 @@
-"""Where the error lies: shares along each axis, worst segments, and maps over two quantities."""
+"""Error breakdown: shares along each axis, worst segments, and maps over two quantities."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.cross_validation import DRAWS, PIECE_S
 from cangauge.diagnosis.design_matrix import DesignMatrix
-from cangauge.inference.rows import SampledLog
+from cangauge.inference.rows import SampledLog, block_numbers
 
 TIME_SCALES_S = (0.0, 10.0, 100.0, 1000.0, np.inf)
 """Edges of the time scales: faster than 10 s, 10–100 s, …, slower than 1000 s."""
@@ -45,7 +45,7 @@ MIN_BIN_WIDTH = 1.0
 class LogErrors:
     """Errors of one diagnosed log; m rows at the model's rate."""
 
-    prepared: SampledLog
+    sampled: SampledLog
     before_v: FloatArray
     """Measured − given model, shape (m,) [V]."""
     after_v: FloatArray
@@ -95,7 +95,7 @@ def error_shares(
         Defines rest [Ah].
     """
     square = np.concatenate(errors_v) ** 2
-    piece = _pieces(logs)
+    piece = block_numbers([matrix.sampled.rows for matrix in logs], PIECE_S)
     result = []
     for axis, unit, values, edges in _axes(logs, capacity_ah):
         for low, high in itertools.pairwise(edges.tolist()):
@@ -113,7 +113,7 @@ def _axes(
     logs: Sequence[DesignMatrix], capacity_ah: float
 ) -> Iterator[tuple[str, str, FloatArray, FloatArray]]:
     """Yield name, unit, values of all rows and edges of each axis."""
-    rows = [matrix.prepared.rows for matrix in logs]
+    rows = [matrix.sampled.rows for matrix in logs]
     current = np.concatenate([item.delayed_current_a[:, 0] for item in rows])
     yield "soc", "%", np.concatenate([item.soc_pct for item in rows]), np.linspace(-5, 105, 12)
     temperature = np.concatenate([item.temperature_c for item in rows])
@@ -129,7 +129,7 @@ def _axes(
     resting = (np.abs(current) < REST_C_RATE * capacity_ah).astype(np.float64)
     yield "rest", "1 = rest", resting, np.array([0.0, 0.5, 1.0])
     elapsed = np.concatenate(
-        [matrix.prepared.rows.time_s - matrix.prepared.log.time_s[0] for matrix in logs]
+        [matrix.sampled.rows.time_s - matrix.sampled.log.time_s[0] for matrix in logs]
     )
     yield "time", "s", elapsed, np.linspace(0.0, float(elapsed.max()) + 1e-9, 6)
 
@@ -154,7 +154,7 @@ def _time_scale_shares(
     bands: list[list[FloatArray]] = [[] for _ in TIME_SCALES_S[1:]]
     for matrix, error_v in zip(logs, errors_v, strict=True):
         rest = error_v
-        step_s = float(np.median(np.diff(matrix.prepared.rows.time_s)))
+        step_s = float(np.median(np.diff(matrix.sampled.rows.time_s)))
         for k, width_s in enumerate(TIME_SCALES_S[1:]):
             smooth = _moving_average(rest, width_s / step_s)
             bands[k].append(rest - smooth if np.isfinite(width_s) else rest)
@@ -179,17 +179,6 @@ def _moving_average(values: FloatArray, width: float) -> FloatArray:
     at = np.arange(values.size)
     low, high = np.maximum(at - half, 0), np.minimum(at + half + 1, values.size)
     return np.asarray((total[high] - total[low]) / (high - low))
-
-
-def _pieces(logs: Sequence[DesignMatrix]) -> NDArray[np.intp]:
-    """Return the number of each row's piece for the bootstrap, counted over all logs."""
-    numbers, first = [], 0
-    for matrix in logs:
-        time_s = matrix.prepared.rows.time_s
-        number = ((time_s - time_s[0]) // PIECE_S).astype(np.intp) + first
-        first = int(number[-1]) + 1
-        numbers.append(number)
-    return np.concatenate(numbers)
 
 
 @dataclass(frozen=True)
@@ -246,7 +235,7 @@ def worst_segments(
     """
     found: list[WorstSegment] = []
     for k, (matrix, error_v) in enumerate(zip(logs, errors_v, strict=True)):
-        rows = matrix.prepared.rows
+        rows = matrix.sampled.rows
         found += [
             WorstSegment(
                 number=k,
@@ -285,7 +274,7 @@ def segment_signals(segment: WorstSegment, errors: Sequence[LogErrors]) -> Segme
         Of all diagnosed logs.
     """
     of_log = errors[segment.number]
-    time_s, log = of_log.prepared.rows.time_s - segment.time_s, of_log.prepared.log
+    time_s, log = of_log.sampled.rows.time_s - segment.time_s, of_log.sampled.log
     near = np.abs(time_s) <= SEGMENT_S
     current_time_s = log.time_s - segment.time_s
     current_near = np.abs(current_time_s) <= SEGMENT_S
@@ -311,7 +300,7 @@ class ErrorMap:
     rms_v: FloatArray
     """RMS error, shape (k, m) [V]; NaN in bins with fewer than `MIN_BIN_ROWS` rows."""
     mean_v: FloatArray
-    """Mean error, likewise."""
+    """Mean error, shape (k, m) [V]; NaN in the same bins."""
     tails: bool = False
     """Whether the outer bins of the second quantity include everything beyond them."""
 
@@ -332,7 +321,7 @@ def error_map(
         Put long tails of `values` into the outer bins.
     """
     if tails:
-        # One pulse of 400 A must not squeeze a drive at 50 A into two rows of bins.
+        # Otherwise one pulse of 400 A would compress a drive at 50 A into two rows of bins.
         part = float(np.clip(TAIL_ROWS / values.size, *TAIL_PART))
         values = np.clip(values, *np.quantile(values, [part, 1.0 - part]))
     most = max(MIN_BINS, soc_pct.size // ROWS_PER_BIN)

@@ -1,9 +1,8 @@
 """Error model of healthy logs, estimated from the references.
 
-Every quantity is judged by leaving one reference out: it is predicted from the coefficients that
-the others and the model file leave open, and what remains gives the error variance at each time
-scale and the size of the per-log effects. With fewer than two references the model file's own noise
-is used.
+Each reference is left out in turn and predicted from the others and the model file; the residual
+gives the error variance at each time scale and the size of the per-log effects. With fewer than two
+references the model file's noise is used.
 
 Prior scales of the shared structure and of the per-log effects maximise the marginal likelihood of
 the references (automatic relevance determination: MacKay, Neural Computation 4 (1992) 415).
@@ -38,8 +37,8 @@ EM_ROUNDS = 4
 """Rounds of expectation maximisation."""
 
 STATED_LOGS = 0.05
-"""Number of reference logs that the model file's noise counts as. It was judged on logs left out of
-a fit to a few, so it may be many times too large."""
+"""Number of reference logs that the model file's noise counts as. It comes from logs held out of
+fits to few logs, so it may be many times too large."""
 
 AGREEING_COEFFICIENTS = 2.0
 """Coefficients assumed to agree with the model file, in addition to those compared."""
@@ -74,7 +73,7 @@ logarithm."""
 
 
 def error_from_noise(noise: ModelNoise, rate_hz: float, hypotheses: Hypotheses) -> ErrorModel:
-    """Return the error model that a model file states, for lack of references."""
+    """Return the error model that a model file states, used without references."""
     slow_v2, fast_v2 = noise.slow_std_v**2, noise.fast_std_v**2
     total_v2 = max(slow_v2 + fast_v2, 1e-12)
     variance = scale_variances(
@@ -120,8 +119,8 @@ def error_from_references(
     def weight() -> float:
         return _information_weight(hypotheses, references, error, least_weight)
 
-    # The information weight comes first: under information that is too certain, what all references
-    # share would be taken for differences between logs.
+    # The information weight comes first: with overconfident information, a deviation common to all
+    # references would be attributed to differences between logs.
     error = replace(error, information_weight=weight())
     stated_v2 = np.array(stated.scale_v2)
     counts = np.sum([log.counts for log in references], axis=0)
@@ -151,10 +150,10 @@ def with_overdispersion(
 ) -> ErrorModel:
     """Return the error model with the overdispersion of each effect's evidence.
 
-    A model that lacks something shows it as if it were an effect, more on one day than on another.
-    Each reference is diagnosed with the others as references. The mean of its squared evidence over
-    that expected by chance divides the effect's evidence (quasi-likelihood: McCullagh, Nelder,
-    Generalized Linear Models, 2nd ed. 1989, ch. 9).
+    Structure that the model lacks resembles an effect, more on one day than on another. Each
+    reference is diagnosed with the others as references. The mean of an effect's squared evidence,
+    relative to that expected by chance, divides the effect's evidence (quasi-likelihood: McCullagh,
+    Nelder, Generalized Linear Models, 2nd ed. 1989, ch. 9).
 
     Parameters
     ----------
@@ -196,8 +195,8 @@ def with_overdispersion(
     for effect_id, seen in ratios.items():  # all shapes of the first reference, then of the next
         each = np.reshape(seen, (len(references), -1)).mean(axis=1)
         overdispersion[effect_id] = max(1.0, few * float(np.average(each, weights=weight)))
-    # A model that is wrong in some ways is wrong in others too. The median: one large deviation
-    # says nothing about a different one.
+    # A model with some errors has others too. The median, since a large deviation of one effect is
+    # no evidence on another.
     usual = float(np.median([*overdispersion.values()]))
     return replace(
         error,
@@ -214,8 +213,8 @@ def _information_weight(
 ) -> float:
     """Return the most probable weight of the model file's information.
 
-    If the references put the coefficients ten times further away than the file says they may lie,
-    its information counts about a hundredth.
+    If the references' coefficients deviate ten times as far as the file's standard errors allow,
+    its information gets a weight of about a hundredth.
     """
     p = hypotheses.column_scale.size
     if hypotheses.prior_root is None:
@@ -241,8 +240,8 @@ def _structure_scales(
 ) -> dict[str, float]:
     """Return the most probable prior scale of each structure effect.
 
-    First one scale for all, then that of each beside the others: a scale that one effect needs
-    would leave the others unconstrained where no reference has been.
+    First one scale for all, then that of each given the others: a scale that one effect needs would
+    leave the others unconstrained at operating points without references.
     """
     found = marginalize(hypotheses, references, [], error)
     p = hypotheses.column_scale.size

@@ -1,9 +1,9 @@
 """The extended model: the given model, the references' structure, and the accepted causes.
 
 A verdict linearises the voltage about no effect. A skew of seconds or a fifth of the capacity is
-far from that, so the accepted causes are fitted through the model's own equations, and residual and
-tangents are taken again at the values found (Gauss–Newton), with everything else marginalised as
-for the verdict.
+far from that point, so the accepted causes are fitted through the model's own equations, with
+residual and tangents at the current values (Gauss–Newton) and everything else marginalised as for
+the verdict.
 """
 
 from __future__ import annotations
@@ -53,8 +53,9 @@ ONSETS = 100
 """Times of onset tried over the longest log, then between the neighbours of the best."""
 
 MIN_ONSET_PART = 0.02
-"""A change must keep this part of the squares that its column has from the start of the log, beside
-the coefficients. Less means next to no rows before or after it: a wrong row, not a change."""
+"""Least part of the squares of a change's column, with the coefficients projected out, relative to
+that of a change at the start of the log. With less, hardly any rows lie before or after the change:
+it is a wrong row."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,11 +190,11 @@ def _initial_causes(problem: DiagnosisProblem, accepted: Sequence[Score]) -> lis
         candidates = [problem.hypotheses.candidates[k] for k in score.candidates]
         start = _mixture(candidates, [next(rest) for _ in candidates])
         effect = candidates[0].effect
-        # Search for the onset also beside the references' model: the linear solution may have taken
-        # a late change for a resistance.
+        # Search for the onset with the references' model too: the linear solution may have
+        # attributed a late change to a resistance.
         found = [
-            _with_change_point(problem.diagnosed, beside, effect, start)
-            for beside in (model, problem.structured or problem.model)
+            _with_change_point(problem.diagnosed, base, effect, start)
+            for base in (model, problem.structured or problem.model)
         ]
         starts = [values for k, values in enumerate(found) if values not in found[:k]]
         refined = [_refine_parameters(problem, model, effect, values) for values in starts]
@@ -222,7 +223,7 @@ def _with_change_point(
 ) -> dict[str, float]:
     """Return an effect's values with the onsets that leave the least squares of the voltage.
 
-    By trying them: the voltage jumps at the onset, so no gradient leads there. The sizes of the
+    Grid search, since the voltage jumps at the onset and has no gradient there. The sizes of the
     amplitudes do not matter, only their proportions.
     """
     values = dict(start)
@@ -236,8 +237,8 @@ def _best_onset(
     logs: Sequence[DesignMatrix], model: ExtendedModel, effect: Effect, values: Values, name: str
 ) -> float:
     """Return the onset [s] that explains most, common to all logs."""
-    states = [pack_state(matrix.prepared, model) for matrix in logs]
-    # What the coefficients or the per-log states explain as well is no change.
+    states = [pack_state(matrix.sampled, model) for matrix in logs]
+    # A part that coefficients or per-log states also explain is no evidence of a change.
     known = [np.linalg.qr(np.column_stack([m.coefficients, m.per_log_states]))[0] for m in logs]
 
     def unexplained(volts: Sequence[FloatArray]) -> FloatArray:
@@ -249,11 +250,11 @@ def _best_onset(
         columns = []
         for matrix, state in zip(logs, states, strict=True):
             extra_v = effect.extra_voltage(state, trial, model.model, model.pack)
-            rows = matrix.prepared.at
+            rows = matrix.sampled.at
             columns.append(np.zeros(rows.size) if extra_v is None else extra_v[rows])
         return columns
 
-    residual_v = unexplained([residual(matrix.prepared, model) for matrix in logs])
+    residual_v = unexplained([residual(matrix.sampled, model) for matrix in logs])
     least_v2 = MIN_ONSET_PART * float(np.sum(np.concatenate(columns_of(0.0)) ** 2))
 
     def explained_v2(onset_s: float) -> float:
@@ -261,7 +262,7 @@ def _best_onset(
         square = float(column @ column)
         return float(column @ residual_v) ** 2 / square if square > least_v2 else 0.0
 
-    longest_s = max(float(np.ptp(matrix.prepared.log.time_s)) for matrix in logs)
+    longest_s = max(float(np.ptp(matrix.sampled.log.time_s)) for matrix in logs)
     step_s = longest_s / ONSETS
     tried = [values[name], *np.arange(ONSETS) * step_s]
     best = float(max(tried, key=explained_v2))
@@ -276,7 +277,7 @@ def _refine_parameters(
     free = (*effect.amplitudes, *(shape for shape in effect.shapes if not shape.is_change_point))
     parameters = free or effect.parameters
     constants = {p.name: start[p.name] for p in effect.parameters if p not in parameters}
-    pack = problem.model.pack  # not of `model`, whose structure has taken much of its resistance
+    pack = problem.model.pack  # in `model`, structure represents much of the resistance
     bounds = np.array([parameter.bounds(pack) for parameter in parameters])
     neutral = effect.neutral(pack)
     centre = np.array([neutral[parameter.name] for parameter in parameters])
@@ -289,7 +290,7 @@ def _refine_parameters(
         values = (centre + unit * scale).tolist()
         return {p.name: value for p, value in zip(parameters, values, strict=True)} | constants
 
-    logs = [matrix.prepared.with_history_cache() for matrix in problem.diagnosed]
+    logs = [matrix.sampled.with_history_cache() for matrix in problem.diagnosed]
 
     def errors(unit: FloatArray) -> FloatArray:
         trial = model.with_effect(effect, values_of(unit))
@@ -373,11 +374,11 @@ def _jackknife_variance(
     its size is then wrong by the slope, which noise does not reveal. (Grouped jackknife: Efron, The
     Jackknife, the Bootstrap and Other Resampling Plans, 1982, ch. 3.)
     """
-    soc_pct = np.concatenate([matrix.prepared.rows.soc_pct for matrix in matrices])
+    soc_pct = np.concatenate([matrix.sampled.rows.soc_pct for matrix in matrices])
     edges = np.quantile(soc_pct, np.linspace(0.0, 1.0, SOC_BANDS + 1)[1:-1])
     by_band: list[dict[int, NormalEquations]] = []
     for matrix in matrices:
-        band = np.searchsorted(edges, matrix.prepared.rows.soc_pct)
+        band = np.searchsorted(edges, matrix.sampled.rows.soc_pct)
         scale, factor = problem.hypotheses.column_scale, problem.noise_scale(matrix)
         by_band.append(
             {
@@ -426,12 +427,12 @@ def _at_causes(
     tangents: bool = True,
 ) -> DesignMatrix:
     """Return a design matrix with the causes in its residual, and their tangents there."""
-    prepared, base = matrix.prepared.with_history_cache(), problem.structured or problem.model
+    sampled, base = matrix.sampled.with_history_cache(), problem.structured or problem.model
     with_all = _with_causes(base, causes)
-    change_v = residual(prepared, with_all) - residual(prepared, base)
+    change_v = residual(sampled, with_all) - residual(sampled, base)
     effects = list(matrix.effects)
     if tangents:
-        smooth = with_modelled_voltage(prepared, with_all)
+        smooth = with_modelled_voltage(sampled, with_all)
         here = residual(smooth, with_all)
         for number, cause in enumerate(causes):
             columns = np.empty_like(effects[cause.number])

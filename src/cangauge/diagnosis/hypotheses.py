@@ -1,7 +1,8 @@
 """Hypotheses of a diagnosis: candidate effects, and the role of each in the linear model.
 
-A *candidate* is one effect at one shape (a time constant, say); its *amplitudes* enter the voltage
-linearly. Every candidate is tested as the cause of the diagnosed logs. Some have further roles:
+A *candidate* is one effect at one shape, such as a time constant; its *amplitudes* enter the
+voltage linearly. Every candidate is tested as the cause of the diagnosed logs. Some have further
+roles:
 
 - *shared structure*: effects that healthy logs show as well, with amplitudes common to all logs;
 - *per-log effects*: effects by which healthy logs may differ a little, with amplitudes of each log.
@@ -74,7 +75,7 @@ class Hypotheses:
     def mixtures(self) -> tuple[tuple[int, int], ...]:
         """Pairs of candidates adjacent in one shape parameter.
 
-        A mixture of both stands for a time constant between two grid values, or a spread of them.
+        A mixture of both represents a time constant between two grid values, or a spread of them.
         """
         pairs = []
         for a, one in enumerate(self.candidates):

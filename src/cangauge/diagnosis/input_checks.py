@@ -1,6 +1,6 @@
-"""Input checks: logs of this pack, alive, given once, and without outliers.
+"""Input checks: refuse logs of another pack, dead channels and duplicates; remove outliers.
 
-What cannot be corrected raises an error; rows that are left out are reported.
+An outlier is removed and reported; everything else raises an error.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ pack voltage. Of the 4,711 logs of a check two have such rows, many each: bursts
 noise."""
 
 MAX_OUTLIERS = 5
-"""More outliers in one log are no accident: they stay and are diagnosed."""
+"""More outliers in one log are not incidental: they stay and are diagnosed."""
 
 LEAST_RESISTANCE, MOST_RESISTANCE = 0.5, 3.0
 """Limits of the pack's immediate resistance relative to the model's."""
@@ -78,7 +78,7 @@ def without_outliers(log: Log, model: ExtendedModel) -> tuple[Log, NDArray[np.in
     ----------
     log : Log
     model : ExtendedModel
-        Its immediate resistance and voltage define what is possible.
+        Its immediate resistance and voltage define which rows are possible.
     """
     none = np.zeros(0, dtype=np.intp)
     if len(log) < MIN_ROWS:
@@ -92,7 +92,7 @@ def without_outliers(log: Log, model: ExtendedModel) -> tuple[Log, NDArray[np.in
     returns_a = across_a < RETURN_PART * np.abs(jump_a)
     returns = returns_a | (across_v < RETURN_PART * np.abs(jump_v))
     impossible = (mismatch_v > CONTRADICTION_PART * model.pack.voltage_v) & returns
-    # Or a current larger than the span of all others, gone in the next row, without a response.
+    # Or a current beyond the span of all others for one row, without a response of the voltage.
     ordered = np.sort(log.current_a)
     span_a = float(ordered[-1 - MAX_OUTLIERS] - ordered[MAX_OUTLIERS])
     least_a = max(span_a, LARGE_C_RATE * model.capacity_ah)
@@ -109,7 +109,7 @@ def without_outliers(log: Log, model: ExtendedModel) -> tuple[Log, NDArray[np.in
 
 
 def _jump(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return each inner row's distance from the mean of its neighbours, and theirs from another."""
+    """Return each inner row's deviation from its neighbours' mean, and |difference| of those."""
     before, here, after = values[:-2], values[1:-1], values[2:]
     return here - 0.5 * (before + after), np.abs(after - before)
 

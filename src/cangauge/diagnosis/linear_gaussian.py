@@ -2,10 +2,10 @@
 
     residual = coefficients·δθ + structure·ρ + per-log·o + effect·a + error
 
-δθ, the change of the voltage model coefficients, has the model file's information as prior; ρ are
-the amplitudes of the shared structure; o are the per-log effects, whose prior is how much healthy
-logs differ; a are the amplitudes of the tested effect, which only diagnosed logs have. Everything
-but a is marginalised. What remains is quadratic in a, for all candidates at once:
+δθ is the change of the voltage model coefficients, with the model file's information as prior; ρ
+are the amplitudes of the shared structure; o are the per-log effects, whose prior is the spread
+between healthy logs; a are the amplitudes of the tested effect, which only diagnosed logs have. All
+but a are marginalised. The result is quadratic in a, for all candidates at once:
 
     ln p(residual | a) = g·a − ½ a·S·a + const.
 
@@ -34,8 +34,8 @@ PRIOR_SIGMAS = 2.0
 """Half the width of an amplitude's bounds in prior standard deviations."""
 
 STRUCTURE_STD = 0.1
-"""Standard deviation by which diagnosed logs may move the structure that the references show, in
-parts of its bounds. Unrestricted it would absorb a cause of its own kind."""
+"""Standard deviation by which diagnosed logs may change the structure of the references, in parts
+of its bounds. Without this limit, structure would absorb a cause of the same effect."""
 
 JITTER = 1e-10
 """Relative diagonal load: coefficients without information stay at their prior mean."""
@@ -46,7 +46,7 @@ class ErrorModel:
     """Error of the voltage model on healthy logs, and the prior scales that go with it."""
 
     scale_v2: tuple[float, ...]
-    """Error variance at each time scale (`time_scales.by_scale`) [V²]."""
+    """Error variance at each time scale (`inference.time_scales`) [V²]."""
     per_log_std: tuple[float, ...]
     """Standard deviation of the per-log amplitudes (`Hypotheses.per_log_prior_std`)."""
     rmse_v: float
@@ -329,8 +329,8 @@ def constrained_mode(
 ) -> tuple[FloatArray, list[FloatArray]]:
     """Return the most probable coefficients, structure and amplitudes within physical bounds.
 
-    One convex problem: the pseudo-OCV rises over the identified SoC, structure and effects keep
-    their bounds, and what a bound takes from one parameter is taken up by the others.
+    One convex problem: the pseudo-OCV rises over the identified SoC, and structure and effects keep
+    their bounds, to which the other parameters adapt.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""The diagnosis problem: what all verdicts of one diagnosis share.
+"""The diagnosis problem: everything that a verdict is computed from.
 
-Checks the logs, assigns the hypotheses, learns error model and structure from the references and
-linearises the diagnosed logs. Also decides where the references cover the diagnosed logs in
-temperature and SoC.
+Checks the logs, assigns the roles of the hypotheses, estimates error model and structure from the
+references, and linearises the diagnosed logs. Reference coverage, in temperature and SoC, limits
+the conclusions beyond the references' operating points.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from cangauge.diagnosis.linear_gaussian import (
     marginalize,
     normal_equations,
 )
-from cangauge.diagnosis.structure import learn, reference_equations, reference_matrices
+from cangauge.diagnosis.structure import learn_structure, reference_equations, reference_matrices
 from cangauge.errors import InputError
 from cangauge.inference.linearized import residual
 from cangauge.inference.rows import FitOptions, SampledLog, sample_log
@@ -48,13 +48,13 @@ COVERED_K, COVERED_PCT = 3.0, 3.0
 """References cover temperatures and SoC up to this far outside their own range [K, %]."""
 
 COLDER_PART, WARMER_PART = 0.2, 0.5
-"""References also cover temperatures below and above by these parts of their range, having shown
-the temperature dependence; less in the cold, where resistance rises ever faster. (On the trips of
-the check, winter is 0.3 below summer.)"""
+"""References also cover temperatures below and above their range by these parts of it, since they
+show the temperature dependence; less in the cold, where resistance rises more steeply. (On the
+trips of the check, winter is 0.3 below summer.)"""
 
 BEYOND_WEIGHT = 0.3
-"""Weight of a row at an SoC that only the model's own logs cover. Chosen on development cases,
-where such rows had not counted before; the only value that was run."""
+"""Weight of a row at an SoC that only the model's own logs cover. The only value tested, on
+development cases, against a weight of 0."""
 
 LEAST_REFERENCE_WEIGHT = 0.1
 """Weight of a reference at operating points that no other covers."""
@@ -82,7 +82,7 @@ TEMPERATURE_STRUCTURE = frozenset({"charge_transfer", "inner_temperature"})
 
 @dataclass(frozen=True, eq=False)
 class DiagnosisProblem:
-    """Common ground of all verdicts of one diagnosis."""
+    """Checked logs, hypotheses, error model and design matrices of one diagnosis."""
 
     model: ExtendedModel
     """Given model with the references' coefficients, without their structure; columns other than
@@ -108,12 +108,12 @@ class DiagnosisProblem:
     @cached_property
     def reference_errors_v(self) -> tuple[FloatArray, ...]:
         """Errors of the given model on each reference, shape (m,) [V]."""
-        return tuple(residual(matrix.prepared, self.given) for matrix in self.references)
+        return tuple(residual(matrix.sampled, self.given) for matrix in self.references)
 
     @cached_property
     def diagnosed_errors_v(self) -> tuple[FloatArray, ...]:
         """Errors of the given model on each diagnosed log, shape (m,) [V]."""
-        return tuple(residual(matrix.prepared, self.given) for matrix in self.diagnosed)
+        return tuple(residual(matrix.sampled, self.given) for matrix in self.diagnosed)
 
     @cached_property
     def reference_equations(self) -> tuple[NormalEquations, ...]:
@@ -133,10 +133,10 @@ class DiagnosisProblem:
         pseudo-OCV. Logs with too few covered rows are left out; if that leaves none, all rows
         count.
         """
-        references = [matrix.prepared for matrix in self.references]
+        references = [matrix.sampled for matrix in self.references]
         found = []
         for matrix, equations in zip(self.diagnosed, self.diagnosed_equations, strict=True):
-            weight = soc_weight(matrix.prepared, references, self.given.model.soc_range_pct)
+            weight = soc_weight(matrix.sampled, references, self.given.model.soc_range_pct)
             if np.all(weight == 1.0):
                 found.append(equations)
             elif np.mean(weight > 0.0) >= LEAST_COVERED:
@@ -225,7 +225,7 @@ def build_problem(
             error = error_from_references(hypotheses, equations, error, least_weight)
         expected = error if covered or not several else _error_beyond(error)
         _LOG.info("learning the structure from the references")
-        learned = learn(of_references, widened, hypotheses, equations, expected)
+        learned = learn_structure(of_references, widened, hypotheses, equations, expected)
         known, structured, hypotheses = learned.model, learned.structured, learned.hypotheses
         matrices = learned.matrices
         if several:
@@ -262,8 +262,8 @@ def build_problem(
 def with_wider_range(model: ExtendedModel, logs: Sequence[Log]) -> ExtendedModel:
     """Return the model with its temperature and current ranges widened to those of the logs.
 
-    Outside its range the model holds the temperature; inside, it can learn from the logs. The SoC
-    range stays, as the pseudo-OCV does not extrapolate.
+    Outside its range the model limits the temperature, so that logs there carry no information on
+    the temperature dependence. The SoC range stays, as the pseudo-OCV does not extrapolate.
     """
     low_c, high_c = model.model.temperature_range_c
     low_a, high_a = model.model.current_range_a
@@ -309,7 +309,7 @@ def _per_log_effects(
     by_effect: dict[str, dict[tuple[object, ...], int]] = {}
     for k, choice in enumerate(choices):
         if choice.effect.is_cause and choice.is_for_fit:
-            # The first candidate of a shape is linearised at a small effect; only a cause is large.
+            # The first candidate of a shape is linearised at a small effect, as per-log ones are.
             shapes = by_effect.setdefault(choice.effect.id, {})
             shapes.setdefault(tuple(choice.shape.items()), k)
     noise = model.noise
@@ -335,8 +335,8 @@ def _covered_equations(
     given: ExtendedModel,
 ) -> NormalEquations:
     """Return a reference's normal equations as if it were diagnosed with the others."""
-    others = [matrix.prepared for k, matrix in enumerate(matrices) if k != number]
-    weight = soc_weight(matrices[number].prepared, others, given.model.soc_range_pct)
+    others = [matrix.sampled for k, matrix in enumerate(matrices) if k != number]
+    weight = soc_weight(matrices[number].sampled, others, given.model.soc_range_pct)
     if np.all(weight == 1.0) or np.mean(weight > 0.0) < LEAST_COVERED:
         return equations[number]
     return normal_equations(matrices[number], hypotheses.column_scale, weight)
@@ -424,4 +424,4 @@ def _inside(
 
 
 def _mean_square_current(matrix: DesignMatrix) -> float:
-    return float(np.mean(matrix.prepared.rows.delayed_current_a[:, 0] ** 2))
+    return float(np.mean(matrix.sampled.rows.delayed_current_a[:, 0] ** 2))

@@ -1,12 +1,12 @@
-"""Structure that the references need beyond the voltage model, and the model that has it.
+"""Structure that the references need beyond the voltage model, and the model with it.
 
 The verdict marginalises over all structure. A model file has only the few pieces (candidates of the
 shared structure) that make the references more probable.
 
-Structure acts on what coefficients multiply: cells warmer than their sensor show as kt times the
-rise, so both cannot be solved for at once with columns of a model with another kt. Coefficients and
-structure are solved for repeatedly about the last solution (Gauss–Newton), until the references are
-no less probable than under the first one.
+Structure changes the factors of coefficients: cells warmer than their sensor change the voltage by
+kt times the rise, so the columns of a model with another kt cannot give both at once. Coefficients
+and structure are therefore solved for repeatedly about the last solution (Gauss–Newton), until the
+references are no less probable than under the first one.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class ReferenceModel:
     equations: tuple[NormalEquations, ...]
 
 
-def learn(
+def learn_structure(
     references: Sequence[SampledLog],
     model: ExtendedModel,
     hypotheses: Hypotheses,
@@ -81,8 +81,7 @@ def learn(
     error : ErrorModel
     """
     target, best = log_likelihood(hypotheses, equations, error) - MIN_LOG_GAIN, -np.inf
-    # Coefficients first: with too small a kt in the columns, a temperature rise comes out too
-    # large.
+    # Coefficients first: with too small a kt in the columns, a temperature rise is overestimated.
     start = ReferenceModel(model, None, hypotheses, (), tuple(equations))
     moved, about = _with_coefficients(start, error)
     matrices = reference_matrices(references, moved, about)
@@ -165,8 +164,8 @@ def select_structure(
 ) -> tuple[int, ...]:
     """Return the pieces of structure that the references need, most needed first.
 
-    Forward selection: each step adds the piece that makes the references most probable beside those
-    before it, with all amplitudes and coefficients marginalised.
+    Forward selection: each step adds the piece that makes the references most probable together
+    with the pieces selected before, with all amplitudes and coefficients marginalised.
     """
     whole = marginalize(hypotheses, references, [], error)
     right = whole.precision @ whole.mean

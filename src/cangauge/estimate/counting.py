@@ -5,11 +5,11 @@ their charge is uncertain by the whole recent current. Across a restart, the cur
 of the gap count for as long as a driver holds a current, and the mean of the last minute for the
 rest.
 
-Anything longer is an *unobserved interval*: the bus was asleep, or the service not running. No
-charge is counted, and two hypotheses describe the interval. *Parked*: small consumers only, so the
-SoC is what it was, within a little. *Moved*: the car was charged or driven, so the SoC may be
-anything that a fast charger can reach. The prior probability of *moved* grows with the length of
-the interval; afterwards the voltage decides (see `hypothesis_filter`).
+A longer step is an *unobserved interval*: the bus was asleep, or the service not running. No charge
+is counted, and there are two hypotheses. *Parked*: self-discharge and small consumers only, so the
+SoC has hardly changed. *Moved*: the car was charged or driven, by at most the rate of a fast
+charger. The prior probability of *moved* grows with the length of the interval; the voltages after
+it test both (see `hypothesis_filter`).
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ DRAIN_AT_MOST_PCT = 5.0
 """Self-discharge and consumers of a parked car [% per hour; %]: 1.2 % a day."""
 
 MOVED_AT_MOST = 0.3
-"""Prior probability that the car was charged or driven in a long unobserved interval: a guess, to
-which the result is insensitive once there are voltages."""
+"""Prior probability that the car was charged or driven in a long unobserved interval: an
+assumption, to which the result is insensitive after a few voltages."""
 
 MOVED_TIME_S = 1800.0
 """Time constant with which that probability grows [s]."""
@@ -140,8 +140,8 @@ class CoulombCounter:
         kept = math.exp(-seconds / MEAN_MEMORY_S)
         state.mean_a = kept * state.mean_a + (1.0 - kept) * current_a
         kept = math.exp(-seconds / MEAN_SQUARE_MEMORY_S)
-        # The mean square is slow to notice the start of a drive: the currents at the ends of the
-        # gap bound it from below.
+        # At the start of a drive the mean square lags: the currents at the ends of the gap bound it
+        # from below.
         mean_square_a2 = state.mean_square_a2
         state.mean_square_a2 = kept * state.mean_square_a2 + (1.0 - kept) * current_a**2
         if seconds > BRIDGE_S:
@@ -180,11 +180,11 @@ the last sample. Fewer are late or damaged samples, and refused."""
 EARLY_S = 5.0
 """Tolerance of the stamps against the known length of an interruption [s]."""
 
-SHORTEST_PAUSE_S = 1e-3
-LONGEST_PAUSE_S = 30.0 * 86400.0
+SHORTEST_INTERRUPTION_S = 1e-3
+LONGEST_INTERRUPTION_S = 30.0 * 86400.0
 """Bounds of an interruption's length [s]; a longer step may be a faulty clock."""
 
-UNKNOWN_PAUSE_S = 86400.0
+UNKNOWN_INTERRUPTION_S = 86400.0
 """Assumed length of an interruption that no clock measured [s]."""
 
 
@@ -215,14 +215,15 @@ class EstimatorClock:
         age_s, self.age_s = self.age_s, None
         if age_s is not None and not step_s >= _least_step_s(age_s):
             # The stamps restarted, or their clock was set back or stopped.
-            pause_s = UNKNOWN_PAUSE_S if math.isnan(age_s) else max(age_s, SHORTEST_PAUSE_S)
-            shift_s += pause_s - step_s
+            is_unknown = math.isnan(age_s)
+            least_s = UNKNOWN_INTERRUPTION_S if is_unknown else max(age_s, SHORTEST_INTERRUPTION_S)
+            shift_s += least_s - step_s
         elif step_s < SHORTEST_STEP_S:
             if not self._is_set_back(stamp_s, step_s):
                 return None
             shift_s += stamp_s - state.behind_s - step_s
-        elif step_s > LONGEST_PAUSE_S:
-            shift_s += LONGEST_PAUSE_S - step_s
+        elif step_s > LONGEST_INTERRUPTION_S:
+            shift_s += LONGEST_INTERRUPTION_S - step_s
         time_s = stamp_s + shift_s
         if time_s - state.last_s < SHORTEST_STEP_S:
             return None
@@ -259,4 +260,4 @@ class EstimatorClock:
 
 def _least_step_s(age_s: float) -> float:
     """Return the smallest step of the stamps that agrees with an age [s]."""
-    return max((UNKNOWN_PAUSE_S if math.isnan(age_s) else age_s) - EARLY_S, SHORTEST_STEP_S)
+    return max((UNKNOWN_INTERRUPTION_S if math.isnan(age_s) else age_s) - EARLY_S, SHORTEST_STEP_S)

@@ -72,13 +72,33 @@ LASTING_SPAN_PCT = 8.0
 with a constant bias the filter would slide along the curve until its shape fits."""
 
 LASTING_TIME_S = 7200.0
-"""Time constant of the lasting bias [s]; the logs that show it are seldom longer."""
+"""Time constant of the lasting bias [s]; the logs that it is identified on are seldom longer."""
 
 RESTED_BIAS = 0.6
 """The bias after a long rest, in units of its standard deviation while driving."""
 
 ROUNDING = 1e-6
 """Tolerance of a covariance's correlations."""
+
+
+def count_std_pct(
+    capacity_ah: float, start_var_pct2: float, hours: float, moved_pct: float
+) -> float:
+    """Return the standard deviation of the SoC by counting alone [%].
+
+    Parameters
+    ----------
+    capacity_ah : float
+        Charge from 100 to 0 % [Ah].
+    start_var_pct2 : float
+        Variance of the SoC that counting started from, and of gaps [%²].
+    hours, moved_pct : float
+        Time [h] and charge moved in either direction [%] since.
+    """
+    pct_per_as = 100.0 / (3600.0 * capacity_ah)
+    offset_pct = OFFSET_STD_PER_AH * capacity_ah * 3600.0 * hours * pct_per_as
+    capacity_pct2 = CAPACITY_STD**2 * CAPACITY_SPAN_PCT * moved_pct
+    return math.sqrt(start_var_pct2 + offset_pct**2 + capacity_pct2)
 
 
 class MeasurementNoise:
@@ -145,7 +165,7 @@ class MeasurementNoise:
 
         return std_v
 
-    def _filling_var_v2(self, settled_var_v2: float, filled_s: float) -> float:
+    def _filling_var_v2(self, filled_var_v2: float, filled_s: float) -> float:
         """Return the error's variance while the delay line fills [V²].
 
         Each sample gets the variance of all that share the unknown currents, so that together
@@ -157,11 +177,11 @@ class MeasurementNoise:
             for resistance, delay in zip(model.resistance_ohm, model.delay_s, strict=True)
             if delay > filled_s
         )
-        return (settled_var_v2 + (unknown_ohm * self._usual_a) ** 2) * self._shared_by
+        return (filled_var_v2 + (unknown_ohm * self._usual_a) ** 2) * self._shared_by
 
 
 class Measurement(NamedTuple):
-    """One voltage, with what is needed to predict it."""
+    """One measured voltage with the terms of its prediction."""
 
     voltage_v: float
     without_ocv_v: float
@@ -217,7 +237,7 @@ class SocEkf:
         self._ekf.P = np.diag(
             [soc_std_pct**2, self._offset_std_a**2, self._slow_var, self._lasting_var]
         )
-        self._forget_innovations()
+        self._reset_innovations()
 
     def predict(
         self,
@@ -276,7 +296,7 @@ class SocEkf:
             ekf.P = np.diag(
                 [UNKNOWN_SOC_STD_PCT**2, float(ekf.P[1, 1]), self._slow_var, self._lasting_var]
             )
-            self._forget_innovations()
+            self._reset_innovations()
             predicted_v = self._predicted_v(measurement, ocv_v)
         jacobian = np.array([[slope, -self._steady_ohm, 1.0, 1.0]])
         innovation = measurement.voltage_v - predicted_v
@@ -326,19 +346,19 @@ class SocEkf:
         Raises
         ------
         InputError
-            If its number of variables is another one.
+            If it has another number of variables.
         """
         ekf = self._ekf
         size = ekf.dim_x
         if [len(state.x), *map(len, state.p)] != [size] * (size + 1) or len(state.p) != size:
-            raise InputError(f"is not a filter of {size} states", field="filter.hypotheses")
+            raise InputError(f"not a filter of {size} states", field="filter.hypotheses")
         ekf.x = np.array(state.x).reshape(size, 1)
         ekf.P = np.array(state.p)
         self._mean_innovation_v = state.mean_innovation_v
         self._mean_seconds = state.mean_seconds
 
-    def is_sound(self) -> bool:
-        """Return whether state and covariance are finite and the covariance is still one."""
+    def is_valid(self) -> bool:
+        """Return whether state and covariance are finite, and the covariance semidefinite."""
         covariance = self._ekf.P
         variance = np.diag(covariance)
         if not (np.isfinite(covariance).all() and (variance >= 0.0).all()):
@@ -367,20 +387,6 @@ class SocEkf:
         std_pct = math.sqrt(max(float(self._ekf.P[0, 0]), 0.0))
         return float(x[0, 0]), std_pct, self._pct_per_as * counted_s * float(x[1, 0])
 
-    def count_std_pct(self, start_var_pct2: float, hours: float, moved_pct: float) -> float:
-        """Return the standard deviation of counting alone [%].
-
-        Parameters
-        ----------
-        start_var_pct2 : float
-            Variance of the SoC that counting started from, and of gaps [%²].
-        hours, moved_pct : float
-            Time [h] and charge moved in either direction [%] since.
-        """
-        offset_pct = self._offset_std_a * 3600.0 * hours * self._pct_per_as
-        capacity_pct2 = CAPACITY_STD**2 * CAPACITY_SPAN_PCT * moved_pct
-        return math.sqrt(start_var_pct2 + offset_pct**2 + capacity_pct2)
-
     def _predicted_v(self, measurement: Measurement, ocv_v: float) -> float:
         x = self._ekf.x
         volts = ocv_v + (measurement.without_ocv_v - self._steady_ohm * float(x[1, 0]))
@@ -398,7 +404,7 @@ class SocEkf:
         ekf = self._ekf
         if seconds > PERSISTENT_S:
             # After an interval without voltages, earlier innovations carry no information.
-            self._forget_innovations()
+            self._reset_innovations()
             return False
         bias_v = float(ekf.x[2, 0] + ekf.x[3, 0])
         unbiased_v = predicted_v - bias_v
@@ -414,7 +420,7 @@ class SocEkf:
         mean = self._mean_innovation_v / seen
         return mean**2 > PERSISTENT_SIGMAS**2 * mean_var
 
-    def _forget_innovations(self) -> None:
+    def _reset_innovations(self) -> None:
         self._mean_innovation_v = 0.0
         self._mean_seconds = 0.0
 

@@ -11,7 +11,13 @@ from dataclasses import replace
 
 from cangauge.errors import InputError
 from cangauge.estimate.counting import CoulombCounter, EstimatorClock
-from cangauge.estimate.ekf import UNKNOWN_SOC_STD_PCT, Measurement, MeasurementNoise, SocEkf
+from cangauge.estimate.ekf import (
+    UNKNOWN_SOC_STD_PCT,
+    Measurement,
+    MeasurementNoise,
+    SocEkf,
+    count_std_pct,
+)
 from cangauge.estimate.hypothesis_filter import HypothesisFilter
 from cangauge.estimate.settings import (
     EstimatorSettings,
@@ -115,7 +121,7 @@ class Estimator:
         self._implausible = Reason.NONE
         self._is_refused = False
         self._latest = Estimate.unknown(Reason.NO_INITIAL_SOC)
-        # Sample and stamp that the next estimate is to be made of; None: it is made.
+        # Sample and stamp of which the estimate is not computed yet; None: it is computed.
         self._pending: tuple[Sample, float] | None = None
         if self.settings.initial_soc_pct is not None:
             soc_pct = self._online.initial_soc_pct(self.settings.initial_soc_pct)
@@ -151,7 +157,7 @@ class Estimator:
         if time_s != stamp_s:
             sample = sample._replace(time_s=time_s)
         if self._has_effects:
-            self._evaluate()  # this sample may be held back, and the estimate stays that one
+            self._evaluate()  # effects may hold this sample back, which keeps the last estimate
         sample, self._implausible = drop_implausible(sample, self._nominal_v)
         memory = self._memory
         if memory.samples == 0:
@@ -177,8 +183,6 @@ class Estimator:
             return latest
         reasons = latest.reasons | Reason.IMPLAUSIBLE_INPUT
         return latest._replace(reasons=reasons, status=status_of(reasons))
-
-    # --- sample ---------------------------------------------------------------------------
 
     def _process(self, sample: Sample) -> None:
         """Count the charge of a corrected sample, and use its voltage where that is due."""
@@ -302,8 +306,6 @@ class Estimator:
         if self._is_filtering:
             self.filter.correct(reference.soc_pct, reference.soc_std_pct)
 
-    # --- estimate -------------------------------------------------------------------------
-
     def _evaluate(self) -> Estimate:
         """Return the estimate after the latest accepted sample."""
         if self._pending is None:
@@ -348,7 +350,7 @@ class Estimator:
         memory, counter = self._memory, self._counter.state
         hours = (counter.counted_s - memory.coulomb_counted_s) / 3600.0
         moved_pct = counter.moved_pct - memory.coulomb_moved_pct
-        return self.filter.count_std_pct(memory.coulomb_var_pct2, hours, moved_pct)
+        return count_std_pct(self.capacity_ah, memory.coulomb_var_pct2, hours, moved_pct)
 
     def _reasons(self, sample: Sample, soc_pct: float, std_pct: float) -> Reason:
         # Operations on flags are slow, and usually none is set. Comparisons with NaN are false.
@@ -374,8 +376,6 @@ class Estimator:
             reasons |= Reason.INNOVATION_LARGE
         outside = outside_model(self._voltage_model, soc_pct, sample)
         return reasons | outside if outside else reasons
-
-    # --- state ----------------------------------------------------------------------------
 
     def snapshot(self) -> EstimatorState:
         """Return a copy of everything needed to continue as if not interrupted."""
@@ -433,10 +433,9 @@ class Estimator:
     def take_over(self, before: Estimator) -> None:
         """Continue from another estimator, of another model or with other settings.
 
-        SoC and standard deviation are carried over, and so are the delay line, the last sample,
-        from which charge is counted on, and the marks of gaps. The current's offset, the model's
-        bias and the inner states of effects belong to the other model and are learned anew. An
-        unknown SoC stays unknown.
+        SoC and standard deviation, the delay line, the last sample (so that counting continues) and
+        the ends of gaps are carried over. The current's offset, the model's biases and the states
+        of effects belong to the other model and are estimated again. An unknown SoC stays unknown.
         """
         state = before.snapshot()
         self._resume(state, before._clock.age_s)
@@ -476,7 +475,7 @@ class Estimator:
         """Refuse a state whose filter or count contradicts its last estimate."""
         soc_pct, std_pct = self._soc_and_std_pct()
         kept_std_pct = state.soc_std_pct
-        # An estimator that had just taken over from another one started from no more than that.
+        # `take_over` limits the standard deviation that an estimator starts from.
         apart_pct = min(
             abs(std_pct - kept_std_pct), abs(std_pct - min(kept_std_pct, UNKNOWN_SOC_STD_PCT))
         )

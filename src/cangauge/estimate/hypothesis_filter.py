@@ -2,18 +2,18 @@
 
 There are two hypotheses in two cases:
 
-- After an unobserved interval (see `counting`): *parked* keeps the SoC to within a little, *moved*
-  hardly knows it.
+- After an unobserved interval (see `counting`): under *parked* the SoC has hardly changed, under
+  *moved* by an unknown amount.
 - After an initial SoC was given: the first hypothesis accepts it, the second rejects it and starts
   from the first voltage.
 
 Each hypothesis has its own filter. Both use every voltage, and the likelihoods of the voltages
 update the odds between them (static multiple-model estimator; Bar-Shalom, Li, Kirubarajan,
 Estimation with Applications to Tracking and Navigation, 2001, ch. 11.6). The output is the mean
-weighted by the odds; the spread between the hypotheses is part of its standard deviation. So the
-SoC approaches the voltage's as fast as the evidence grows, without a jump. Once the odds are clear
-the other hypothesis is dropped; if they stay unclear the two are merged. A given SoC that the
-voltages reject leaves no trace.
+weighted by the odds; the spread between the hypotheses is part of its standard deviation. The SoC
+therefore moves toward the likelier hypothesis as evidence grows, without a jump. Once the odds are
+clear the other hypothesis is dropped; if they stay unclear the two are merged. A rejected initial
+SoC has no influence on the result.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ CLEAR_LOG_ODDS = math.log(1000.0)
 LOG_ODDS_AT_MOST = 50.0
 
 WRONG_LOG_ODDS = -math.log(1000.0)
-"""Prior log odds that a given SoC is wrong, from another pack or day: a guess. It sets from which
-size an initial error is attributed to the given SoC and not to the voltage model."""
+"""Prior log odds that a given SoC is wrong, such as one of another pack or day: an assumption. It
+sets the size from which an initial error is attributed to the given SoC, not to the model."""
 
 OPEN_AT_MOST_S = 900.0
 """Time with voltages after which undecided hypotheses are merged [s]."""
@@ -124,7 +124,7 @@ class HypothesisFilter:
         self._open_s += since.seconds - since.away_s
         if is_contradicted != is_second_contradicted:
             return self._decide(int(is_contradicted))
-        # That a given SoC is wrong starts out so unlikely that this alone must not decide.
+        # The prior odds against a wrong initial SoC alone must not count as a clear decision.
         prior = 0.0 if self.verdict == "open" else WRONG_LOG_ODDS
         is_clear = self._log_odds > CLEAR_LOG_ODDS or self._log_odds < prior - CLEAR_LOG_ODDS
         if is_contradicted or is_clear:
@@ -145,11 +145,11 @@ class HypothesisFilter:
             each.shrink_bias()
 
     def is_lost(self) -> bool:
-        """Return whether the filter must be restarted: only outliers for long, or not sound."""
+        """Return whether the filter must be restarted: only outliers for long, or invalid."""
         if self._outlier_s > DIVERGED_S:
             return True
         for each in self._filters:  # noqa: SIM110 - called for every voltage
-            if not each.is_sound():
+            if not each.is_valid():
                 return True
         return False
 
@@ -183,10 +183,6 @@ class HypothesisFilter:
             return self._filters[0].offset_a
         return self._mean([each.offset_a for each in self._filters])
 
-    def count_std_pct(self, start_var_pct2: float, hours: float, moved_pct: float) -> float:
-        """Return the standard deviation of counting alone [%]; see `SocEkf.count_std_pct`."""
-        return self._filters[0].count_std_pct(start_var_pct2, hours, moved_pct)
-
     def snapshot(self) -> HypothesisFilterState:
         """Return a copy of the state."""
         return HypothesisFilterState(
@@ -204,11 +200,14 @@ class HypothesisFilter:
         Raises
         ------
         InputError
-            If a hypothesis is not a sound filter with a SoC within 0–100 %.
+            If a hypothesis is not a valid filter with a SoC within 0–100 %.
         """
         filters = [self._restored(each) for each in state.hypotheses]
-        if not all(each.is_sound() and 0.0 <= each.soc_pct <= 100.0 for each in filters):
-            raise InputError("holds no covariance, or no SoC", field="filter.hypotheses")
+        if not all(each.is_valid() and 0.0 <= each.soc_pct <= 100.0 for each in filters):
+            raise InputError(
+                "not a positive semidefinite covariance, or a SoC outside 0–100 %",
+                field="filter.hypotheses",
+            )
         self._filters = filters
         self._is_untested = state.is_untested
         self._log_odds = _bounded(state.log_odds)

@@ -1,4 +1,4 @@
-"""The estimator over a whole log, and its scores against a reference."""
+"""Run the estimator over a whole log, and score it against the log's reference SoC."""
 
 from __future__ import annotations
 

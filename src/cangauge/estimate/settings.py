@@ -22,8 +22,8 @@ VALID_STD_PCT = 1.5
 """Largest standard deviation of a valid SoC [%]: 19 of 20 such SoC lie within 3 %.
 
 On real trips of a vehicle with a fitted model (noise 1.4 V, a third of it lasting) the filter
-settles at 0.9–1.5 %. A limit of 1 % would call most undisturbed driving degraded; 2 % would accept
-a SoC found from the voltage a few minutes after the start.
+converges to 0.9–1.5 %. With a limit of 1 % most undisturbed driving would be degraded; 2 % would
+accept a SoC found from the voltage a few minutes after the start.
 """
 
 

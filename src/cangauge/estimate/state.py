@@ -1,8 +1,8 @@
 """State of an estimator: everything it needs to continue as if never interrupted.
 
 The parts are plain dataclasses that their owners update in place; `EstimatorState` collects copies
-of them and validates what is read from a file. NaN means "not known yet" and is null in JSON.
-Infinity is refused, and every number is bounded so that no arithmetic on it overflows.
+of them and validates the content of a file. NaN means "not known yet" and is null in JSON. Infinity
+is refused, and every number is bounded so that no arithmetic on it overflows.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PLAUSIBLE_A = 1e5
 """Upper bound of currents in a state [A]; effects may scale a sample's current."""
 
 DELAY_LINE_AT_MOST = 200_000
-"""Samples that a delay line may hold; 70 s thinned to 9 ms are 8,300."""
+"""Samples that a delay line may hold; 70 s at the least spacing of 9 ms are 8,300."""
 
 EFFECTS_AT_MOST = 64
 EFFECT_NUMBERS_AT_MOST = 50_000
@@ -48,20 +48,22 @@ def _check_not_negative(value: float) -> float:
     return value
 
 
-Finite = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-LARGEST, le=LARGEST)]
-NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0, le=LARGEST)]
-Current = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-PLAUSIBLE_A, le=PLAUSIBLE_A)]
-MeanSquare = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0, le=PLAUSIBLE_A**2)]
-MaybeNan = Annotated[
+_Finite = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-LARGEST, le=LARGEST)]
+_NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0, le=LARGEST)]
+_Current = Annotated[
+    float, Field(strict=True, allow_inf_nan=False, ge=-PLAUSIBLE_A, le=PLAUSIBLE_A)
+]
+_MeanSquare = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0, le=PLAUSIBLE_A**2)]
+_MaybeNan = Annotated[
     float,
     Field(strict=True),
     BeforeValidator(lambda value: math.nan if value is None else value),
     AfterValidator(_check_bound),
     PlainSerializer(lambda value: None if math.isnan(value) else value, when_used="json"),
 ]
-NotNegativeOrNan = Annotated[MaybeNan, AfterValidator(_check_not_negative)]
-Flag = Annotated[bool, Field(strict=True)]
-Count = Annotated[int, Field(strict=True, ge=0, le=1 << 62)]
+_NotNegativeOrNan = Annotated[_MaybeNan, AfterValidator(_check_not_negative)]
+_Flag = Annotated[bool, Field(strict=True)]
+_Count = Annotated[int, Field(strict=True, ge=0, le=1 << 62)]
 
 _NO_MORE: Any = ConfigDict(extra="forbid")
 
@@ -71,13 +73,13 @@ class ClockState:
     """State of an `EstimatorClock`."""
 
     __pydantic_config__: ClassVar[Any] = _NO_MORE
-    last_s: MaybeNan = math.nan
+    last_s: _MaybeNan = math.nan
     """Time of the last accepted sample [s]; NaN before the first."""
-    shift_s: Finite = 0.0
+    shift_s: _Finite = 0.0
     """Estimator time minus stamp [s]."""
-    behind: Count = 0
+    behind: _Count = 0
     """Consecutive samples stamped before the last accepted one."""
-    behind_s: MaybeNan = math.nan
+    behind_s: _MaybeNan = math.nan
     """Stamp of the latest of these [s]."""
 
 
@@ -86,19 +88,19 @@ class CounterState:
     """State of a `CoulombCounter`."""
 
     __pydantic_config__: ClassVar[Any] = _NO_MORE
-    time_s: MaybeNan = math.nan
+    time_s: _MaybeNan = math.nan
     """Time of the last sample [s]; NaN before the first."""
-    current_a: Current = 0.0
+    current_a: _Current = 0.0
     """Current of the last sample [A]."""
-    mean_square_a2: MeanSquare = 0.0
+    mean_square_a2: _MeanSquare = 0.0
     """Running mean square of the current [A²]."""
-    mean_a: Current = 0.0
+    mean_a: _Current = 0.0
     """Running mean of the current [A]."""
-    discharged_pct: Finite = 0.0
+    discharged_pct: _Finite = 0.0
     """Net charge taken out since the first sample [% of capacity]."""
-    moved_pct: NotNegative = 0.0
+    moved_pct: _NotNegative = 0.0
     """Charge moved in either direction since the first sample [% of capacity]."""
-    counted_s: NotNegative = 0.0
+    counted_s: _NotNegative = 0.0
     """Time since the first sample in which charge was counted [s]."""
 
 
@@ -107,9 +109,9 @@ class DelayLineState:
     """Content of a `DelayLine`: increasing times [s] and currents [A]."""
 
     __pydantic_config__: ClassVar[Any] = _NO_MORE
-    time_s: Annotated[list[Finite], Field(max_length=DELAY_LINE_AT_MOST)]
-    current_a: Annotated[list[Current], Field(max_length=DELAY_LINE_AT_MOST)]
-    since_s: Finite
+    time_s: Annotated[list[_Finite], Field(max_length=DELAY_LINE_AT_MOST)]
+    current_a: Annotated[list[_Current], Field(max_length=DELAY_LINE_AT_MOST)]
+    since_s: _Finite
     """Start of the gap-free stretch [s]."""
 
 
@@ -118,15 +120,15 @@ class EkfState:
     """State of a `SocEkf`."""
 
     __pydantic_config__: ClassVar[Any] = _NO_MORE
-    x: Annotated[list[Finite], Field(max_length=FILTER_STATES_AT_MOST)]
+    x: Annotated[list[_Finite], Field(max_length=FILTER_STATES_AT_MOST)]
     p: Annotated[
-        list[Annotated[list[Finite], Field(max_length=FILTER_STATES_AT_MOST)]],
+        list[Annotated[list[_Finite], Field(max_length=FILTER_STATES_AT_MOST)]],
         Field(max_length=FILTER_STATES_AT_MOST),
     ]
     """Covariance, by rows."""
-    mean_innovation_v: Finite
+    mean_innovation_v: _Finite
     """Running mean of the innovation [V]."""
-    mean_seconds: NotNegative
+    mean_seconds: _NotNegative
     """Time that it covers [s]."""
 
 
@@ -141,13 +143,13 @@ class HypothesisFilterState:
 
     __pydantic_config__: ClassVar[Any] = _NO_MORE
     hypotheses: Annotated[list[EkfState], Field(min_length=1, max_length=2)]
-    is_untested: Flag
-    """Whether a given initial SoC has not met a voltage yet."""
-    log_odds: Finite
+    is_untested: _Flag
+    """Whether no voltage has tested a given initial SoC yet."""
+    log_odds: _Finite
     """Log odds of the second hypothesis against the first."""
-    open_s: NotNegative
+    open_s: _NotNegative
     """Counted time for which two hypotheses have been open [s]."""
-    outlier_s: NotNegative
+    outlier_s: _NotNegative
     """Time for which every voltage has been an outlier [s]."""
     verdict: Verdict
 
@@ -157,14 +159,14 @@ class ChargeSinceUpdate:
     """Charge and time since the last voltage update."""
 
     __pydantic_config__: ClassVar[Any] = _NO_MORE
-    seconds: NotNegative = 0.0
-    away_s: NotNegative = 0.0
+    seconds: _NotNegative = 0.0
+    away_s: _NotNegative = 0.0
     """Part of it in unobserved intervals, in which no charge was counted [s]."""
-    discharged_pct: Finite = 0.0
-    moved_pct: NotNegative = 0.0
-    gap_var_pct2: NotNegative = 0.0
+    discharged_pct: _Finite = 0.0
+    moved_pct: _NotNegative = 0.0
+    gap_var_pct2: _NotNegative = 0.0
     """Variance of the charge counted across gaps [%²]."""
-    unseen_var_pct2: NotNegative = 0.0
+    unseen_var_pct2: _NotNegative = 0.0
     """Variance of the charge of unobserved intervals, if the car was parked [%²]."""
 
 
@@ -173,10 +175,10 @@ class ReferenceState:
     """State of a `SocReferenceDetector`."""
 
     __pydantic_config__: ClassVar[Any] = _NO_MORE
-    full_since_s: MaybeNan = math.nan
+    full_since_s: _MaybeNan = math.nan
     """Since when voltage and current have met the full-charge rule [s]; NaN: they do not."""
-    is_full: Flag = False
-    is_rested: Flag = False
+    is_full: _Flag = False
+    is_rested: _Flag = False
 
 
 @dataclass
@@ -184,33 +186,33 @@ class EstimatorMemory:
     """State of the `Estimator` itself; NaN: not known, or never."""
 
     __pydantic_config__: ClassVar[Any] = _NO_MORE
-    samples: Count = 0
+    samples: _Count = 0
     """Accepted samples."""
-    resets: Count = 0
+    resets: _Count = 0
     """How often the filter was lost and restarted."""
-    first_s: Finite = 0.0
+    first_s: _Finite = 0.0
     """Time of the first sample [s]."""
     tick: Annotated[int, Field(strict=True, ge=-1, le=1 << 62)] = -1
     """Last tick of the model's rate at which the voltage was used."""
-    temperature_c: MaybeNan = math.nan
+    temperature_c: _MaybeNan = math.nan
     """Last known temperature [°C]."""
-    newton_pct: MaybeNan = math.nan
+    newton_pct: _MaybeNan = math.nan
     """SoC by inverse of the voltage model [%]."""
-    newton_inside: Flag = True
+    newton_inside: _Flag = True
     """Whether the voltage lay within the model's range."""
-    newton_std_pct: NotNegativeOrNan = math.nan
-    coulomb_start_pct: MaybeNan = math.nan
+    newton_std_pct: _NotNegativeOrNan = math.nan
+    coulomb_start_pct: _MaybeNan = math.nan
     """SoC by counting, plus the charge counted so far [%]."""
-    coulomb_var_pct2: NotNegativeOrNan = math.nan
+    coulomb_var_pct2: _NotNegativeOrNan = math.nan
     """Variance of the SoC that counting started from, plus gaps [%²]."""
-    coulomb_counted_s: NotNegative = 0.0
-    coulomb_moved_pct: NotNegative = 0.0
+    coulomb_counted_s: _NotNegative = 0.0
+    coulomb_moved_pct: _NotNegative = 0.0
     """The counter's `counted_s` and `moved_pct` when that variance was last known."""
-    gap_until_s: MaybeNan = math.nan
+    gap_until_s: _MaybeNan = math.nan
     """Until when the last gap in the current degrades the estimate [s]."""
-    contradicted_until_s: MaybeNan = math.nan
+    contradicted_until_s: _MaybeNan = math.nan
     """Until when the last contradiction degrades the estimate [s]."""
-    rest_since_s: MaybeNan = math.nan
+    rest_since_s: _MaybeNan = math.nan
     """Since when the pack has rested [s]; NaN: it does not."""
 
 
@@ -220,19 +222,19 @@ class EstimatorState(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     method: Annotated[str, Field(strict=True)]
-    capacity_ah: NotNegative
+    capacity_ah: _NotNegative
     clock: ClockState
     counter: CounterState
     line: DelayLineState
     effects: Annotated[
-        list[Annotated[list[MaybeNan], Field(max_length=EFFECT_NUMBERS_AT_MOST)]],
+        list[Annotated[list[_MaybeNan], Field(max_length=EFFECT_NUMBERS_AT_MOST)]],
         Field(max_length=EFFECTS_AT_MOST),
     ]
     filter: HypothesisFilterState
     since: ChargeSinceUpdate
     references: ReferenceState
     memory: EstimatorMemory
-    estimate: Annotated[list[MaybeNan], Field(min_length=7, max_length=7)]
+    estimate: Annotated[list[_MaybeNan], Field(min_length=7, max_length=7)]
     """Numbers of the last `Estimate`, in its order, from `time_s` to `residual_v`."""
     reasons: Annotated[int, Field(strict=True, ge=0, le=0x1FFFF)]
 

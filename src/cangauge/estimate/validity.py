@@ -1,4 +1,4 @@
-"""Samples, estimates, and the conditions under which an estimate is not plainly valid."""
+"""Samples, estimates, and the conditions that make an estimate degraded or invalid."""
 
 from __future__ import annotations
 

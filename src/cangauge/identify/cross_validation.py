@@ -8,10 +8,11 @@ hard for both does not dominate the others.
 A model with one more effect is significantly better if the mean log ratio exceeds its standard
 error by the quantile of Student's t at probability `CHANCE`, divided by the number of the effect's
 amplitudes (2.2 standard errors for eleven logs, 4.3 for three), and if the pooled root mean square
-error falls by `GAIN_AT_LEAST`. One standard error would let in the best of ten useless effects too
-often, and first those with several amplitudes. Where whole logs are held out, half as many standard
-errors are also required of the error's variance within each log: errors that last as long as a log
-are easily explained by an effect of temperature, by chance, which nothing within the logs supports.
+error falls by `GAIN_AT_LEAST`. With one standard error, the best of ten useless effects would be
+accepted too often, in particular one with several amplitudes. Where whole logs are held out, half
+as many standard errors are also required of the error's variance within each log: an effect of
+temperature easily explains errors that last as long as a log, by chance and without support within
+the logs.
 """
 
 from __future__ import annotations

@@ -105,10 +105,10 @@ class _HeldOutError:
         self._folds: list[_Fold] = []
         for training, held_out in folds(rows):
             inside = (soc >= soc[training].min()) & (soc <= soc[training].max())
-            judged = held_out & inside
-            if judged.any():
-                factors = np.linalg.qr(table[training]).R, np.linalg.qr(table[judged]).R
-                self._folds.append(_Fold(*factors, int(judged.sum())))
+            tested = held_out & inside
+            if tested.any():
+                factors = np.linalg.qr(table[training]).R, np.linalg.qr(table[tested]).R
+                self._folds.append(_Fold(*factors, int(tested.sum())))
         if not self._folds:
             raise InputError(
                 "the logs are too short to hold rows out for a search over delays",

@@ -1,10 +1,10 @@
 """Selection of effects by forward selection and backward elimination, and their joint fit.
 
 Forward: every effect with every trial value of its shapes is screened by a linear step on the
-folds. The most promising are fitted jointly with the present model, on its own equations, and the
-better one is added if it is significantly better (`cross_validation`). Backward: the effect whose
-removal costs least is removed if the cost is not significant; otherwise each effect is compared
-with the best other one in its place.
+folds. The most promising are fitted jointly with the present model, through its own equations, and
+the better one is added if it is significantly better (`cross_validation`). Backward: the effect
+whose removal costs least is removed if the cost is not significant; otherwise each effect is
+compared with the best replacement.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.errors import CangaugeError, InputError
 from cangauge.identify.cross_validation import Comparison, CrossValidation, HeldOutErrors, compare
-from cangauge.inference.least_squares import BLOCK_S, Solution
+from cangauge.inference.least_squares import CLUSTER_S, Solution
 from cangauge.inference.linearized import (
     ROUGHLY_CONVERGED,
     Linearization,
@@ -75,7 +75,7 @@ FITTED_PER_ROUND = 2
 """Number of the most promising effects of a round that are fitted in full."""
 
 FEW_LOGS = 5
-"""With fewer whole logs the standard error of the mean gain is unreliable; a remark says so."""
+"""With fewer whole logs the standard error of the mean gain is unreliable: a remark is added."""
 
 AT_BOUND = 1e-6
 """Distance of a parameter from its bound, relative to their width, at which the bound is active."""
@@ -238,7 +238,7 @@ def fit_effects(
         errors = search.validation.errors(model)
     linear = linearize(model, logs)
     rows = [item.rows for item in logs]
-    whole = solution_at(linear, block_numbers(rows, BLOCK_S))
+    whole = solution_at(linear, block_numbers(rows, CLUSTER_S))
     n = model.model.coefficients.size
     ends = np.cumsum([len(item) for item in rows])[:-1]
     return FittedEffects(
@@ -339,7 +339,7 @@ class _Search:
     def backward(
         self, model: ExtendedModel, errors: HeldOutErrors
     ) -> tuple[ExtendedModel, HeldOutErrors]:
-        """Remove effects without a significant contribution; try others in place of the rest."""
+        """Remove effects without a significant contribution; try to replace the others."""
         for _ in range(EFFECTS_AT_MOST):
             if len(model.effects) < 2:
                 break
@@ -372,7 +372,7 @@ class _Search:
     ) -> _Trial | None:
         """Return the model with one effect replaced by a better one, or None.
 
-        An effect added early may have stood in for later ones and need not be the best with them.
+        An effect added early may have represented later ones and need not be the best with them.
         """
         for (removed, _), without in zip(model.effects, fewer, strict=True):
             pool = [LIBRARY[effect_id] for effect_id in SEARCHED if effect_id != removed.id]

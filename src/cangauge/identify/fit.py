@@ -53,7 +53,7 @@ from cangauge.model.voltage_model import BASIS_NAMES, VoltageModel
 _LOG = logging.getLogger(__name__)
 
 SHRINKAGE_REMARK = 0.8
-"""Shrinkage of kt by its prior below which a remark says so."""
+"""Shrinkage of kt by its prior below which a remark is added."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ class Identification:
     soc_newton_mae_pct: float
     remarks: tuple[str, ...] = ()
     effects: FittedEffects | None = None
-    """Effects, if any were asked for."""
+    """Fitted effects; None if none were requested."""
 
     def to_dict(self) -> dict[str, object]:
         """Return the object that `cangauge fit --json` prints."""
@@ -183,7 +183,7 @@ def fit(
     _LOG.debug("fitting %d rows of %d logs", sum(map(len, rows)), len(rows))
     found = None
     if effect_ids:
-        # With effects, held-out logs judge kt too, so its tight prior is not used.
+        # With effects, cross-validation tests kt too, so its tight prior is not used.
         plain, _ = fit_voltage_model(rows, options, with_kt_prior=False)
         sampled = [sample_log(log, options) for log in logs]
         found = fit_effects(ExtendedModel(plain, capacity_ah), sampled, effect_ids)
@@ -253,7 +253,7 @@ def _check_logs(logs: Sequence[Log]) -> None:
     for log in logs:
         if len(log) < 2:
             raise InputError(
-                "a single row identifies nothing",
+                "a single row cannot identify a model",
                 source=log.source or log.name,
                 cure="give a log of minutes or hours",
             )

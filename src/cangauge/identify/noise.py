@@ -1,8 +1,8 @@
-"""Voltage error of a model in time: a fast, a slow and a lasting part.
+"""Voltage error of a model by correlation time: a fast, a slow and a lasting part.
 
-The filter needs the difference. An error that is independent every second averages out; one that
-lasts as long as a trip does not, however many samples are taken. The parts are fitted to the
-autocovariance of held-out errors.
+The filter treats them differently: an error that is independent every second averages out, an error
+that lasts as long as a trip does not. The parts are fitted to the autocovariance of held-out
+errors.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cangauge.inference.rows import LOGS_AT_LEAST
 
 LAGS_S = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
 TIME_CONSTANTS_S = (3.0, 10.0, 30.0, 100.0, 300.0, 1e6)
-"""Time constants of the error's parts [s]; the last stands for the whole log. Those between 300 s
+"""Time constants of the error's parts [s]; the last represents the whole log. Those between 300 s
 and a log's length are not separable from it in trips of half an hour."""
 
 SLOW_UNSEEN_S = 300.0

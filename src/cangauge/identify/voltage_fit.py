@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.inference.least_squares import BLOCK_S, KtPrior, Solution, kt_prior, solve
+from cangauge.inference.least_squares import CLUSTER_S, KtPrior, Solution, kt_prior, solve
 from cangauge.inference.linearized import SLOPE_CHECKS
 from cangauge.inference.rows import (
     LOGS_AT_LEAST,
@@ -185,7 +185,7 @@ def stacked(
     """Return design matrix (n, 9 + delays), voltage [V] and block number (n,) of all logs."""
     columns = np.vstack([design_matrix(item, options.epsilon, options.t_ref_c) for item in rows])
     volts = np.concatenate([item.voltage_v for item in rows])
-    return columns, volts, block_numbers(rows, BLOCK_S)
+    return columns, volts, block_numbers(rows, CLUSTER_S)
 
 
 def _check_identifiable(

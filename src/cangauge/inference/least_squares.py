@@ -29,7 +29,7 @@ from cangauge.inference.time_scales import SCALES, haar_transform
 SINGULAR = 1e-11
 """Singular values below this, relative to the largest, are truncated."""
 
-BLOCK_S = 300.0
+CLUSTER_S = 300.0
 """Distance from which residuals count as independent in the standard errors [s]."""
 
 FEASIBLE = 1e-9
@@ -49,7 +49,7 @@ GROWTH_AT_MOST = np.log(4.0)
 """Growth of the log variance of errors from one scale to the next: that of a random walk."""
 
 GROWTH_SCALES = 3
-"""Number of the slowest well-observed scales from which the growth is read."""
+"""Number of the slowest well-observed scales from which the growth is estimated."""
 
 JITTER = 1e-9
 """Ridge on the information matrix, relative to its mean diagonal."""
@@ -62,7 +62,7 @@ class Solution:
     coefficients: FloatArray
     """Shape (p,), in the units of the columns."""
     std_error: FloatArray
-    """Shape (p,); robust against residuals correlated within `BLOCK_S`."""
+    """Shape (p,); robust against residuals correlated within `CLUSTER_S`."""
     condition_number: float
     """Of the scaled columns."""
     constrained: bool
@@ -203,7 +203,7 @@ class KtPrior:
     """Standard error of kt from the logs alone [V/K]."""
     prior_std_v_per_k: float
     """Prior standard deviation [V/K]."""
-    own_k: FloatArray
+    orthogonal_k: FloatArray
     """Part of the temperature column orthogonal to the other columns, shape (n,) [K]."""
     shift_per_kt: FloatArray
     """Change of the other coefficients with kt, shape (p,), 0 for kt itself."""
@@ -214,10 +214,11 @@ class KtPrior:
     def row_weight(self) -> float:
         """Weight of the row kt = 0 V/K that makes least squares shrink kt by `shrinkage` [K].
 
-        At least that for white errors: a temperature that never moves has no `own_k`, and nothing
-        else would bound its coefficient.
+        At least the weight for white errors, which bounds kt where the temperature is constant and
+        `orthogonal_k` is zero.
         """
-        weight = float(np.sqrt((1.0 / self.shrinkage - 1.0) * (self.own_k @ self.own_k)))
+        square_k2 = self.orthogonal_k @ self.orthogonal_k
+        weight = float(np.sqrt((1.0 / self.shrinkage - 1.0) * square_k2))
         return max(weight, self.residual_std_v / self.prior_std_v_per_k)
 
     @property
@@ -265,11 +266,11 @@ def kt_prior(
     total = np.asarray(information)
     total[np.diag_indices(len(total))] += JITTER * np.trace(total) / len(total)
     kt_variance = float(np.linalg.inv(total)[kt, kt])
-    own_k, shift_per_kt = _orthogonal_part(columns, kt)
+    orthogonal_k, shift_per_kt = _orthogonal_part(columns, kt)
     return KtPrior(
         data_std_v_per_k=float(np.sqrt(kt_variance)) / float(scale[kt]),
         prior_std_v_per_k=KT_PRIOR_PER_K * float(np.median(volts)),
-        own_k=own_k,
+        orthogonal_k=orthogonal_k,
         shift_per_kt=shift_per_kt,
         residual_std_v=float(np.sqrt(np.mean(residual_v**2))),
     )

@@ -22,15 +22,13 @@ from cangauge.errors import InputError
 from cangauge.inference.least_squares import Solution, solve
 from cangauge.inference.rows import Mask, SampledLog
 from cangauge.model.effects.base import PackState, Parameter
-from cangauge.model.effects.library import Candidate
+from cangauge.model.effects.library import STEP, Candidate
 from cangauge.model.extended import ExtendedModel, Prediction
 from cangauge.model.voltage_model import BASIS_NAMES, SLOPE_AT_LEAST, ocv_basis_slope
 
 SLOPE_CHECKS = 201
 """Points over the identified SoC at which the pseudo-OCV must rise."""
 
-STEP = 0.02
-"""Finite-difference step, relative to the width of an amplitude's bounds or to a shape."""
 
 SHAPE_STEP = (0.7, 1.4)
 """Factors by which one Gauss–Newton step may change a shape: the model is not linear in it."""
@@ -42,9 +40,9 @@ STEPS_AT_MOST, HALVINGS_AT_MOST = 12, 4
 CONVERGED, ROUGHLY_CONVERGED = 1e-5, 1e-3
 """Relative decrease of the sum of squares at which the iteration stops; roughly, in a search."""
 
-KT_PRIOR_PER_K = 2.5e-3
+WIDE_KT_PRIOR_PER_K = 2.5e-3
 """Wide prior standard deviation of kt, relative to the voltage [1/K]: 10 mV/K per cell, more than
-the published one. Held-out logs judge kt, but a constant temperature would leave it undefined."""
+the published one. Cross-validation tests kt; the prior only defines it at constant temperature."""
 
 
 def residual(log: SampledLog, model: ExtendedModel) -> FloatArray:
@@ -69,7 +67,7 @@ def pack_state(log: SampledLog, model: ExtendedModel) -> PackState:
 
 
 def with_modelled_voltage(log: SampledLog, model: ExtendedModel) -> SampledLog:
-    """Return the log with the model's voltage in place of the measured one.
+    """Return the log with the model's voltage instead of the measured one.
 
     The derivative by an effect in proportion to the voltage would otherwise contain its noise.
     """
@@ -152,7 +150,7 @@ class Linearization:
     residual_v: FloatArray
     """Shape (n,)."""
     kt_weight: float
-    """Weight of the prior row kt = 0 V/K [K]; see `KT_PRIOR_PER_K`."""
+    """Weight of the prior row kt = 0 V/K [K]; see `WIDE_KT_PRIOR_PER_K`."""
 
     @property
     def prior_row(self) -> FloatArray:
@@ -232,7 +230,7 @@ def linearize(
 def _kt_weight(model: ExtendedModel, at_model: Sequence[Prediction]) -> float:
     """Return the weight of the prior row kt = 0 V/K for white errors [K]."""
     residual_v = np.concatenate([item.residual_v for item in at_model])
-    return float(np.sqrt(np.mean(residual_v**2))) / (KT_PRIOR_PER_K * model.pack.voltage_v)
+    return float(np.sqrt(np.mean(residual_v**2))) / (WIDE_KT_PRIOR_PER_K * model.pack.voltage_v)
 
 
 def coefficient_columns(

@@ -10,7 +10,7 @@ A row passes these rules, in this order:
 
 Three logs or more: whole logs are held out in turn. One or two logs: interleaved blocks with a
 guard between them. The first and the last block of a log always belong to the training rows, since
-the 1/s⁴ terms explode beyond the SoC of the fit.
+the 1/s⁴ terms diverge beyond the SoC of the fit.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from cangauge.errors import InputError
 from cangauge.logs.log import Log
 from cangauge.logs.resample import dequantize
 from cangauge.model.charge import counted_soc_pct, discharged_ah
-from cangauge.model.delay_line import GAP_S, delayed_currents, settled
+from cangauge.model.delay_line import GAP_S, delayed_currents, filled_at
 from cangauge.model.effects.base import Signals
 
 DELAYS_S = (0.0, 10.0, 30.0, 70.0)
@@ -45,8 +45,13 @@ LOGS_AT_LEAST = 3
 """From this number of logs on, whole logs are held out."""
 
 FOLDS_AT_MOST = 12
+"""With more logs, several are held out together."""
+
 BLOCK_S, BLOCK_GUARD_S = 240.0, 60.0
+"""Length of a held-out block, and the guard at either end that is not evaluated [s]."""
+
 BLOCK_FOLDS = 5
+"""One block in this number is held out in turn."""
 
 Mask = NDArray[np.bool_]
 
@@ -146,7 +151,7 @@ def fit_rows(log: Log, options: FitOptions, *, gap_s: float = GAP_S) -> FitRows:
         )
     ticks = decimate(log.time_s, options.rate_hz)
     running = running_rows(log.time_s, log.voltage_v)[ticks]
-    full = settled(log.time_s, max(delay_s), log.time_s[ticks], usual_gap_s(log.time_s, gap_s))
+    full = filled_at(log.time_s, max(delay_s), log.time_s[ticks], usual_gap_s(log.time_s, gap_s))
     keep = ticks[running & full]
     if keep.size < 2:
         raise InputError(

@@ -15,7 +15,14 @@ from cangauge.errors import InputError
 from cangauge.logs.log import Log
 
 BRIDGE_S = 60.0
-"""Over a longer gap in the current no charge is counted [s]: the pack is assumed to rest."""
+"""No charge is counted over a longer gap in the current [s]: the pack is assumed to rest."""
+
+FULL_PCT, EMPTY_PCT = 98.0, 2.0
+"""Reference SoC at the start (at least) and end (at most) of a log with the whole capacity [%]."""
+
+KNEE_STEEPNESS = 5.0
+"""Ratio of the voltage's slope over charge at the end of a log to that in its middle, from which a
+log without reference SoC counts as discharged to empty."""
 
 
 def discharged_ah(time_s: FloatArray, current_a: FloatArray) -> FloatArray:
@@ -31,14 +38,6 @@ def discharged_ah(time_s: FloatArray, current_a: FloatArray) -> FloatArray:
     return np.concatenate(([0.0], np.cumsum(step_ah)))
 
 
-FULL_PCT, EMPTY_PCT = 98.0, 2.0
-"""Reference SoC at the start (at least) and end (at most) of a log with the whole capacity [%]."""
-
-KNEE_STEEPNESS = 5.0
-"""Ratio of the voltage's slope over charge at the end of a log to that in its middle, from which a
-log without reference SoC counts as discharged to empty."""
-
-
 def counted_soc_pct(log: Log, capacity_ah: float, initial_soc_pct: float | None) -> FloatArray:
     """Return the SoC counted from the log's current [%], shape (n,).
 
@@ -48,13 +47,19 @@ def counted_soc_pct(log: Log, capacity_ah: float, initial_soc_pct: float | None)
     capacity_ah : float
         Charge from 100 to 0 % [Ah].
     initial_soc_pct : float, optional
-        SoC at the first row [%]. By default the count is anchored at the first finite value of
-        the log's reference SoC; a log without reference starts at 100 %.
+        SoC at the first row [%]. By default the count starts from the first finite value of the
+        log's reference SoC; a log without reference starts at 100 %.
     """
     out = discharged_ah(log.time_s, log.current_a)
-    anchor = log.first_soc() if initial_soc_pct is None else (0, initial_soc_pct)
-    row, value = anchor if anchor is not None else (0, 100.0)
+    row, value = _start(log, initial_soc_pct)
     return np.asarray(value - 100.0 * (out - out[row]) / capacity_ah)
+
+
+def _start(log: Log, initial_soc_pct: float | None) -> tuple[int, float]:
+    """Return row and value of the SoC that counting starts from [%]; 100 % if it is unknown."""
+    if initial_soc_pct is not None:
+        return 0, initial_soc_pct
+    return log.first_soc() or (0, 100.0)
 
 
 def capacity_from_reference(logs: Sequence[Log]) -> float:
@@ -91,7 +96,7 @@ def capacity_from_full_discharge(logs: Sequence[Log], initial_soc_pct: float | N
     Raises
     ------
     InputError
-        If no log does.
+        If no log runs from full to empty.
     """
     for log in logs:
         capacity = _whole_capacity_ah(log, initial_soc_pct)
@@ -109,8 +114,7 @@ def capacity_from_full_discharge(logs: Sequence[Log], initial_soc_pct: float | N
 
 def _whole_capacity_ah(log: Log, initial_soc_pct: float | None) -> float | None:
     out = discharged_ah(log.time_s, log.current_a)
-    anchor = log.first_soc() if initial_soc_pct is None else (0, initial_soc_pct)
-    first_row, first = anchor if anchor is not None else (0, 100.0)
+    first_row, first = _start(log, initial_soc_pct)
     if first < FULL_PCT:
         return None
     if log.soc_pct is not None and np.isfinite(log.soc_pct).sum() > 1:

@@ -1,7 +1,7 @@
 """Delayed currents I(t − dj): over a whole log, and online from a ring buffer.
 
-Both interpolate linearly between time stamps, at any and irregular rates; before the first sample
-the current counts as that of the first sample. Tests hold the two forms together.
+Both interpolate linearly between time stamps, which may be irregular, and hold the current of the
+first sample before it. A test checks that the two forms agree.
 """
 
 from __future__ import annotations
@@ -36,12 +36,13 @@ def delayed_currents(
     return np.column_stack([np.interp(at - delay, time_s, current_a) for delay in delay_s])
 
 
-def settled(
+def filled_at(
     time_s: FloatArray, longest_delay_s: float, at_s: ArrayLike, gap_s: float = GAP_S
 ) -> NDArray[np.bool_]:
     """Return at which of the times `at_s` the delay line is full and free of gaps, shape (m,).
 
-    It is not in the first `longest_delay_s` of a log and as long after a gap longer than `gap_s`.
+    It is filling for `longest_delay_s` after the start of a log, and after each gap longer than
+    `gap_s`.
     """
     at = np.asarray(at_s, dtype=np.float64)
     after_gap = np.flatnonzero(np.diff(time_s) > gap_s) + 1

@@ -27,11 +27,11 @@ SLOPE_STEP_PCT = 0.05
 """Half step of the finite difference of the effects' voltage over SoC [%]."""
 
 STEADY_S, STEADY_STEP_S = 4.0 * 3600.0, 10.0
-"""Duration of a constant current until the voltage counts as settled, and its time step [s]."""
+"""Duration of a constant current until the voltage counts as steady, and its time step [s]."""
 
 STEADY_C_RATE = 1.0 / 3.0
 STEADY_CHANGE = 0.05
-"""Current at which the change of the settled voltage is taken, in both directions [1/h] (20 A at
+"""Current at which the change of the steady voltage is taken, in both directions [1/h] (20 A at
 60 Ah, as in driving), and the relative change of current."""
 
 _ORDER = {effect_id: number for number, effect_id in enumerate(LIBRARY)}
@@ -103,7 +103,7 @@ class ExtendedModel:
         initial_soc_pct: float,
         at_rows: NDArray[np.intp],
         *,
-        anchor_row: int = 0,
+        initial_row: int = 0,
     ) -> Prediction:
         """Predict voltage and SoC of a log.
 
@@ -112,14 +112,14 @@ class ExtendedModel:
         signals : Signals
             All measured rows, shape (n,).
         initial_soc_pct : float
-            SoC at `anchor_row` [%].
+            SoC at `initial_row` [%].
         at_rows : array of int, shape (m,)
             Rows at which to predict the voltage.
-        anchor_row : int
+        initial_row : int
             Row at which the initial SoC holds.
         """
         corrected = self.corrected(signals)
-        soc = self.counted_soc(corrected, initial_soc_pct, anchor_row=anchor_row)
+        soc = self.counted_soc(corrected, initial_soc_pct, initial_row=initial_row)
         state = self.state(corrected, soc) if self.effects else None
         if state is not None:
             delayed = state.history.delayed_a(self.model.delay_s)[at_rows]
@@ -145,7 +145,7 @@ class ExtendedModel:
         return counting
 
     def counted_soc(
-        self, corrected: Signals, initial_soc_pct: float, *, anchor_row: int = 0
+        self, corrected: Signals, initial_soc_pct: float, *, initial_row: int = 0
     ) -> FloatArray:
         """Return the SoC counted from corrected signals [%], shape (n,)."""
         counting = self.counting(initial_soc_pct)
@@ -154,7 +154,7 @@ class ExtendedModel:
             out = corrected.history.out_ah
         else:
             out = discharged_ah(corrected.time_s, counted)
-        moved = 100.0 * (out - out[anchor_row]) / counting.capacity_ah
+        moved = 100.0 * (out - out[initial_row]) / counting.capacity_ah
         return np.asarray(counting.initial_soc_pct - moved)
 
     def state(self, corrected: Signals, soc_pct: FloatArray) -> PackState:
@@ -190,14 +190,14 @@ class ExtendedModel:
             return ohm
         usual_a = STEADY_C_RATE * self.capacity_ah
         change_a = STEADY_CHANGE * usual_a
-        settled_v = [
-            self._settled_extra_v(sign * usual_a + change)
+        steady_v = [
+            self._steady_extra_v(sign * usual_a + change)
             for sign in (1.0, -1.0)
             for change in (change_a, -change_a)
         ]
-        return ohm + (settled_v[0] - settled_v[1] + settled_v[2] - settled_v[3]) / (4.0 * change_a)
+        return ohm + (steady_v[0] - steady_v[1] + steady_v[2] - steady_v[3]) / (4.0 * change_a)
 
-    def _settled_extra_v(self, current_a: float) -> float:
+    def _steady_extra_v(self, current_a: float) -> float:
         """Return the effects' voltage after a long constant current, at 50 % SoC [V]."""
         time_s = np.arange(0.0, STEADY_S, STEADY_STEP_S)
         constant = np.ones_like(time_s)
@@ -214,7 +214,7 @@ class ExtendedModel:
 class OnlineExtendedModel:
     """Sample-by-sample form of the extended model, for the estimator.
 
-    Call `correct`, then `advance` for each reading that comes out; `pseudo_ocv_at` then includes
+    Call `correct`, then `advance` for each reading it returns; `pseudo_ocv_at` then includes
     the effects' voltages.
 
     Parameters
@@ -227,7 +227,7 @@ class OnlineExtendedModel:
     def __init__(self, extended: ExtendedModel, capacity_ah: float | None = None) -> None:
         self.model = extended.model
         self._extended = extended
-        # Any SoC will do: capacity and efficiency do not depend on it.
+        # Capacity and efficiency do not depend on the SoC.
         self._counting = extended.counting(50.0)
         self.capacity_ah = capacity_ah or self._counting.capacity_ah
         """Capacity for the Coulomb counter [Ah]."""

@@ -269,8 +269,8 @@ class Model(_Strict):
         ----------
         log : Log
         initial_soc_pct : float, optional
-            SoC at the first row [%]; by default the first finite value of the log's reference SoC
-            anchors the count.
+            SoC at the first row [%]; by default the count starts from the first finite value of
+            the log's reference SoC.
 
         Returns
         -------
@@ -282,18 +282,18 @@ class Model(_Strict):
         InputError
             If the initial SoC is unknown.
         """
-        anchor = log.first_soc() if initial_soc_pct is None else (0, initial_soc_pct)
-        if anchor is None:
+        start = log.first_soc() if initial_soc_pct is None else (0, initial_soc_pct)
+        if start is None:
             raise InputError(
                 "unknown initial SoC",
                 source=log.source or log.name,
                 field="initial_soc_pct",
                 cure="give initial_soc_pct, or a log with soc_pct",
             )
-        row, soc_pct = anchor
+        row, soc_pct = start
         signals = Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
         rows = np.arange(len(log))
-        return self.extended_model().predict(signals, soc_pct, rows, anchor_row=row)
+        return self.extended_model().predict(signals, soc_pct, rows, initial_row=row)
 
 
 def resistance_names(number: int) -> list[str]:

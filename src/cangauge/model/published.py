@@ -13,9 +13,9 @@ CAPACITY_AH = 51.5
 MEAN_VOLTAGE_V = 370.0
 """Approximate mean pack voltage over the test [V]."""
 
+# Figures of the paper, to compare results with.
 VOLTAGE_MAE_PCT = 0.25
 SOC_NEWTON_MAE_PCT = 2.5
-SLOPE_OHM = 0.110
 DRIVEN_KWH = 21.3
 REGENERATED_KWH = 3.2
 NET_KWH = 18.1

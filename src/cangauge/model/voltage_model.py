@@ -6,7 +6,7 @@
 Published for a 2012 Nissan Leaf on a chassis dynamometer with delays of 0, 10, 30 and 70 s,
 ε = 0.05 and T_r = 20 °C. Positive current discharges, so the resistances Rj are negative.
 
-Outside the identified SoC the powers of 1/s explode, so the pseudo-OCV is extrapolated linearly;
+Outside the identified SoC the powers of 1/s diverge, so the pseudo-OCV is extrapolated linearly;
 the temperature is limited to the identified range ± `TEMPERATURE_MARGIN_K`.
 
 `soc_from_ocv` inverts the pseudo-OCV by Newton's method inside a bracket. It rises with SoC, so
@@ -49,14 +49,14 @@ EDGE = 0.25
 the very edge the fitted slope is mostly noise."""
 
 
-def scaled_soc(soc_pct: ArrayLike, epsilon: float) -> FloatArray:
+def _scaled_soc(soc_pct: ArrayLike, epsilon: float) -> FloatArray:
     """Return s, the SoC scaled into [ε, 1 − ε] so that ln s and ln(1 − s) are finite."""
     return np.asarray(soc_pct, dtype=np.float64) / 100.0 * (1.0 - 2.0 * epsilon) + epsilon
 
 
 def ocv_basis(soc_pct: ArrayLike, epsilon: float) -> FloatArray:
     """Return the pseudo-OCV's columns, shape (n, 8), for SoC [%] of shape (n,)."""
-    s = np.atleast_1d(scaled_soc(soc_pct, epsilon))
+    s = np.atleast_1d(_scaled_soc(soc_pct, epsilon))
     # Contiguous columns are several times as fast as contiguous rows.
     basis = np.empty((8, s.size))
     one, r, r2, r3, r4, linear, of_empty, of_full = basis
@@ -72,7 +72,7 @@ def ocv_basis(soc_pct: ArrayLike, epsilon: float) -> FloatArray:
 
 def ocv_basis_slope(soc_pct: ArrayLike, epsilon: float) -> FloatArray:
     """Return the derivative of `ocv_basis` by SoC [1/%], shape (n, 8)."""
-    s = np.atleast_1d(scaled_soc(soc_pct, epsilon))
+    s = np.atleast_1d(_scaled_soc(soc_pct, epsilon))
     gain = (1.0 - 2.0 * epsilon) / 100.0
     slope = np.empty((8, s.size))
     constant, r, r2, r3, r4, linear, of_empty, of_full = slope
@@ -321,7 +321,7 @@ def _check_shape(model: VoltageModel) -> None:
 
 def _defined(low_pct: float, high_pct: float, epsilon: float) -> bool:
     """Return whether ln s and ln(1 − s) exist from one SoC to another."""
-    ends = scaled_soc([low_pct, high_pct], epsilon)
+    ends = _scaled_soc([low_pct, high_pct], epsilon)
     return bool(np.all((ends > 0.0) & (ends < 1.0)))
 
 

@@ -2,5 +2,5 @@
 
 `fit.fit_page`, `estimate.estimate_page`, `diagnosis.gap_page` and `check.check_page` return a
 `page.Page`; `page.render` writes it as HTML, and its `figures` are bokeh figures for a notebook.
-Nothing is imported here: bokeh takes half a second.
+The package imports nothing, since importing bokeh takes half a second.
 """

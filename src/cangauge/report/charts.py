@@ -1,7 +1,8 @@
-"""Figures for the report pages, drawn with bokeh.
+"""Figures of the report pages, drawn with bokeh.
 
-`new_figure` gives an empty figure with units and tools; `TimeFigures` gives figures over one time
-axis that zoom together. Long series are reduced before drawing so that no peak is lost.
+`new_figure` returns an empty figure with units and tools, `TimeFigures` makes figures over one time
+axis that zoom together. Long series are reduced to the extremes of buckets, so that no peak is
+lost.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ def new_figure(
     x_range : bokeh range, optional
     hover_mode : {"mouse", "vline"}
     y_categories : sequence of str, optional
-        Names along the vertical axis, in place of numbers.
+        Names along the vertical axis instead of numbers.
     """
     x_label, y_label = (
         f"{quantity} [{unit}]" if unit else quantity
@@ -136,7 +137,7 @@ def add_line(plot: Plot, name: str, x: FloatArray, y: FloatArray, pen: Pen) -> N
 
 def add_cloud(plot: Plot, name: str, x: FloatArray, y: FloatArray, color: str) -> None:
     """Draw points, evenly sampled if there are many."""
-    sample = every(x.size)
+    sample = sampling_slice(x.size)
     cloud = plot.scatter(
         x="x",
         y="y",
@@ -192,7 +193,7 @@ def histogram(quantity: str, unit: str, parts: Sequence[tuple[str, FloatArray, s
     """
     known = [(name, values[np.isfinite(values)], color) for name, values, color in parts]
     everything = np.concatenate([values for _, values, _ in known])
-    # A few outliers must not squeeze the rest into one bar: the outermost bars collect them.
+    # The outermost bars include outliers, which would otherwise compress the rest into one bar.
     limit = float(np.quantile(np.abs(everything), 0.999)) if everything.size else 1.0
     edges = np.linspace(-limit, limit, 61) if limit > 0.0 else np.linspace(-1.0, 1.0, 61)
     plot = new_figure(
@@ -250,8 +251,6 @@ def bars(
     plot.ygrid.grid_line_color = None
     return plot
 
-
-# ------------------------------------------------------------------------- figures over time
 
 _LOG_SPACING: Final = 0.004
 """Free space between two logs on the time axis, relative to its length."""
@@ -467,8 +466,6 @@ class TimeFigures:
         )
 
 
-# ---------------------------------------------------------------- reduction of long series
-
 MAX_POINTS: Final = 4000
 """Points of a drawn line: no screen resolves more."""
 
@@ -522,7 +519,7 @@ def envelope(
     return rows[:, 0], np.where(known, lowest, np.nan), np.where(known, highest, np.nan)
 
 
-def every(n: int, max_points: int = MAX_POINTS) -> slice:
+def sampling_slice(n: int, max_points: int = MAX_POINTS) -> slice:
     """Return the slice that samples n points evenly, at most `max_points` of them."""
     return slice(None, None, max(1, -(-n // max_points)))
 

@@ -50,7 +50,7 @@ def check_page(result: Result) -> Page:
         Section(name, _protocol(items)) for name, items in sorted(result["protocols"].items())
     ]
     if result["later"]:
-        sections.append(Section("Extended models on further logs", _later(result["later"])))
+        sections.append(Section("Extended models on further logs", _held_out(result["later"])))
     sections.append(Section("Reliability of the probabilities", _reliability(result)))
     sections.append(Section("Method", _method(result)))
     targets = result["targets"]
@@ -121,9 +121,9 @@ def _protocol(items: Result) -> list[Block]:
     return blocks
 
 
-def _later(later: Result) -> list[Block]:
+def _held_out(groups: Result) -> list[Block]:
     blocks: list[Block] = []
-    for group, items in later.items():
+    for group, items in groups.items():
         rows = [
             [
                 row["log"],
@@ -158,7 +158,7 @@ def _method(result: Result) -> list[Block]:
     cost = result["cost"]
     lines = [
         f"SHA-256 of the sealed causes, published before the diagnosis: {result['labels_sha256']}.",
-        f"{result['jobs']} diagnosing processes, each with logs, model and request alone.",
+        f"{result['jobs']} diagnosing processes, whose only inputs are logs, model and request.",
         "A floor, the unit of a gap, is the error of a model of training and reference logs on"
         " unseen days without a fault.",
         "Intervals: Wilson's for shares, bootstrap for medians and the Brier score.",

@@ -69,8 +69,8 @@ from cangauge.report.summary import (
 )
 
 _SHOWN_CANDIDATES: Final = 8
-_MOMENT_POINTS: Final = 600
-"""Points of the current drawn around one moment."""
+_SEGMENT_POINTS: Final = 600
+"""Points of the current drawn for one segment."""
 _LONGEST_S: Final = 1e6
 """A time scale beyond this is shown as open-ended [s]."""
 _WHOLE_MINUTES_FROM_S: Final = 600.0
@@ -101,8 +101,8 @@ def gap_report(diagnosis: Diagnosis, model: InputFile | None = None) -> str:
 def gap_page(diagnosis: Diagnosis, model: InputFile | None = None) -> Page:
     """Return the report's content (see `gap_report`); `figures` holds the bokeh figures."""
     problem = diagnosis.problem
-    logs = [terms.prepared.log for terms in problem.diagnosed]
-    references = [terms.prepared.log for terms in problem.references]
+    logs = [matrix.sampled.log for matrix in problem.diagnosed]
+    references = [matrix.sampled.log for matrix in problem.references]
     errors = diagnosis.log_errors()
     extended = _extended_name(diagnosis)
     sections = [
@@ -113,7 +113,7 @@ def gap_page(diagnosis: Diagnosis, model: InputFile | None = None) -> Page:
         ),
         Section("Cause", _cause(diagnosis)),
         Section("How far the gap closes", [_closing(diagnosis), *_over_time(errors, extended)]),
-        Section("Worst moments", _moments(diagnosis.worst_segments, errors, extended)),
+        Section("Worst segments", _worst_segments(diagnosis.worst_segments, errors, extended)),
         Section("What these logs can show", [_observability(diagnosis)]),
         Section("Method", [Bullets(_method(diagnosis))]),
     ]
@@ -188,17 +188,15 @@ def _percent(fraction: float) -> str:
     return number(100.0 * fraction, 0, "%")
 
 
-# How large: in volts and in % SoC, against the two floors.
-
-
 def _size(diagnosis: Diagnosis, extended: str) -> list[Block]:
+    """Return the errors in volts and in % SoC, against the two floors."""
     problem = diagnosis.problem
-    soc = np.concatenate([terms.prepared.rows.soc_pct for terms in problem.diagnosed])
+    soc = np.concatenate([matrix.sampled.rows.soc_pct for matrix in problem.diagnosed])
     slope_v_per_pct = float(np.median(problem.given.model.pseudo_ocv_slope(soc)))
     floor = (
         ("floor: references", "the references, model as given: sensors and what does not repeat")
         if problem.references
-        else ("floor: model file", "the model file's own statement, in place of references")
+        else ("floor: model file", "stated in the model file, without references")
     )
     entries = [
         ("model as given", diagnosis.baseline_rmse_v, ORANGE,
@@ -249,12 +247,9 @@ def _size_caption(diagnosis: Diagnosis) -> str:
     )
 
 
-# Where: maps over SoC and a second quantity, and shares with their intervals.
-
-
 def _maps(errors: Sequence[LogErrors], extended: str) -> list[Block]:
     """Return the maps of the error, before and after in the same shades."""
-    rows = [item.prepared.rows for item in errors]
+    rows = [item.sampled.rows for item in errors]
     soc = np.concatenate([item.soc_pct for item in rows])
     axes = {
         "current": np.concatenate([item.delayed_current_a[:, 0] for item in rows]),
@@ -423,9 +418,6 @@ def _share_bars(places: Sequence[ErrorShare], digits: int) -> Plot:
     return plot
 
 
-# Cause: the probabilities and the candidates.
-
-
 def _cause(diagnosis: Diagnosis) -> list[Block]:
     verdict = diagnosis.verdict
     shown = diagnosis.candidates[:_SHOWN_CANDIDATES]
@@ -477,9 +469,6 @@ def _cause_text(diagnosis: Diagnosis) -> str:
     )
 
 
-# How far the gap closes: the error over time before and after, and by log.
-
-
 def _closing(diagnosis: Diagnosis) -> Paragraph:
     before = number(diagnosis.baseline_rmse_v, 2, "V")
     after = number(diagnosis.extended_rmse_v, 2, "V")
@@ -503,10 +492,10 @@ def _closing(diagnosis: Diagnosis) -> Paragraph:
 
 
 def _over_time(errors: Sequence[LogErrors], extended: str) -> list[Block]:
-    logs = [item.prepared.log for item in errors]
+    logs = [item.sampled.log for item in errors]
     time = TimeFigures(logs)
     plot = time.plot("measured − model", "V", height=300, names=True)
-    rows_s = [item.prepared.rows.time_s for item in errors]
+    rows_s = [item.sampled.rows.time_s for item in errors]
     for name, color, values in (
         ("model as given", ORANGE, [item.before_v for item in errors]),
         (extended, BLUE, [item.after_v for item in errors]),
@@ -532,11 +521,11 @@ def _over_time(errors: Sequence[LogErrors], extended: str) -> list[Block]:
 def _log_table(errors: Sequence[LogErrors]) -> Table:
     rows = []
     for item in errors:
-        seen = item.prepared.rows
+        seen = item.sampled.rows
         rows.append(
             [
-                item.prepared.log.name,
-                number(item.prepared.log.duration_s / 60.0, 1),
+                item.sampled.log.name,
+                number(item.sampled.log.duration_s / 60.0, 1),
                 span(float(seen.soc_pct.max()), float(seen.soc_pct.min()), 0),
                 span(float(seen.temperature_c.min()), float(seen.temperature_c.max()), 0),
                 number(rms(item.before_v), 2),
@@ -554,38 +543,36 @@ def _log_table(errors: Sequence[LogErrors]) -> Table:
     )  # fmt: skip
 
 
-# The worst moments as small multiples: error before and after, and current, a minute around.
-
-
-def _moments(
-    moments: Sequence[WorstSegment], errors: Sequence[LogErrors], extended: str
+def _worst_segments(
+    segments: Sequence[WorstSegment], errors: Sequence[LogErrors], extended: str
 ) -> list[Block]:
-    """Return a figure for each moment, all on the same scales, and their table."""
-    nearby = [segment_signals(moment, errors) for moment in moments]
+    """Return a figure of errors and current for each segment, on common scales, and their table."""
+    nearby = [segment_signals(segment, errors) for segment in segments]
     volts = _common_range([part for each in nearby for part in (each.before_v, each.after_v)])
     amperes = _common_range([each.current_a for each in nearby])
     figures, rows = [], []
-    for rank, (moment, each) in enumerate(zip(moments, nearby, strict=True), start=1):
+    for rank, (segment, each) in enumerate(zip(segments, nearby, strict=True), start=1):
         after_v = float(each.after_v[np.argmin(np.abs(each.time_s))])
         figures.append(
             Figure(
-                f"{rank}. {moment.log} at {number(moment.time_s, 0)} s",
-                _moment_plot(each, volts, amperes, extended),
-                f"{number(moment.residual_v, 2, 'V')} at {number(moment.soc_pct, 1, '%')} SoC,"
-                f" {number(moment.current_a, 1, 'A')} and {number(moment.temperature_c, 1, '°C')};"
+                f"{rank}. {segment.log} at {number(segment.time_s, 0)} s",
+                _segment_plot(each, volts, amperes, extended),
+                f"{number(segment.residual_v, 2, 'V')} at {number(segment.soc_pct, 1, '%')} SoC,"
+                f" {number(segment.current_a, 1, 'A')} and"
+                f" {number(segment.temperature_c, 1, '°C')};"
                 f" extended model {number(after_v, 2, 'V')}.",
             )
         )
         rows.append(
             [
                 str(rank),
-                moment.log,
-                number(moment.time_s, 0),
-                number(moment.residual_v, 2),
+                segment.log,
+                number(segment.time_s, 0),
+                number(segment.residual_v, 2),
                 number(after_v, 2),
-                number(moment.soc_pct, 1),
-                number(moment.current_a, 1),
-                number(moment.temperature_c, 1),
+                number(segment.soc_pct, 1),
+                number(segment.current_a, 1),
+                number(segment.temperature_c, 1),
             ]
         )
     return [
@@ -605,7 +592,7 @@ def _common_range(values: Sequence[FloatArray]) -> tuple[float, float]:
     return float(whole.min()) - margin, float(whole.max()) + margin
 
 
-def _moment_plot(
+def _segment_plot(
     each: SegmentSignals, volts: tuple[float, float], amperes: tuple[float, float], extended: str
 ) -> Plot:
     x_range = Range1d(-SEGMENT_S, SEGMENT_S)
@@ -619,10 +606,10 @@ def _moment_plot(
     error.y_range = Range1d(*volts)
     error.xaxis.visible = False
     current = new_figure(
-        ("time from the moment", "current"), "@y{0.0} A<br>at @x{0.0} s", units=("s", "A"),
+        ("time from the centre", "current"), "@y{0.0} A<br>at @x{0.0} s", units=("s", "A"),
         height=150, x_range=x_range,
     )  # fmt: skip
-    drawn = extremes(each.current_a, _MOMENT_POINTS)
+    drawn = extremes(each.current_a, _SEGMENT_POINTS)
     add_line(
         current, "current", each.current_time_s[drawn], each.current_a[drawn],
         Pen(GREY, width=1.4, in_legend=False),
@@ -642,9 +629,6 @@ def _moment_plot(
     )
 
 
-# What the logs can show, and the method.
-
-
 def _observability(diagnosis: Diagnosis) -> Table:
     rows = [
         [str(item["effect"]), _percent(float(str(item["visible"]))), str(item["needs"])]
@@ -661,8 +645,8 @@ def _observability(diagnosis: Diagnosis) -> Table:
 def _method(diagnosis: Diagnosis) -> list[str]:
     problem = diagnosis.problem
     error = problem.error
-    rows = sum(terms.residual_v.size for terms in problem.diagnosed)
-    names = ", ".join(terms.prepared.log.name for terms in problem.diagnosed)
+    rows = sum(matrix.residual_v.size for matrix in problem.diagnosed)
+    names = ", ".join(matrix.sampled.log.name for matrix in problem.diagnosed)
     remarks = [
         f"Diagnosed: {names} ({rows:,} rows); references: {len(problem.references)}.",
         f"Expected error without a fault: {error.rmse_v:.2f} V, weighted by time scale:"

@@ -57,7 +57,7 @@ _STATUS_COLORS: Final = {
     Status.INVALID: BLACK,
 }
 _MAX_BARS: Final = 500
-"""Gaps shorter than the time axis over this are closed: no screen shows them."""
+"""Gaps shorter than the time axis over this number are closed: no screen resolves them."""
 
 
 def estimate_report(estimate: RecordedEstimate, model_path: Path | None = None) -> str:

@@ -148,7 +148,7 @@ def _fit_figures(result: Identification, time: TimeFigures) -> list[Block]:
                     "Slope of the pseudo-OCV",
                     _slope_plot(result),
                     "A voltage error divided by this slope is the SoC error: where the slope is"
-                    " small, voltage says little about SoC.",
+                    " small, the voltage hardly determines the SoC.",
                 ),
             ]
         ),

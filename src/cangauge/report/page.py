@@ -1,7 +1,7 @@
 """A report page: tiles, tables and figures as one HTML file that needs no network.
 
-Scripts and styles are inline and the content security policy forbids any request, so a page reads
-the same in a workshop without network and in ten years.
+Scripts and styles are inline and the content security policy forbids any request, so a page needs
+no network and stays readable.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ _NUMBER: Final = re.compile(r"[−+-]?[\d.,]+([eE][+−-]?\d+)?( ?[%Ω])?|–|")
 
 @dataclass(frozen=True)
 class InputFile:
-    """A file that a page was made from.
+    """An input file of a page.
 
     Parameters
     ----------
@@ -193,9 +193,9 @@ class Page:
     lead : str
         The result in a sentence, above the subtitle.
     inputs : sequence of InputFile
-        What the page was made from.
+        Input files.
     banners : sequence of str
-        What to know before anything else, such as that a log is a reconstruction.
+        Warnings at the top of the page, such as that a log is a reconstruction.
     """
 
     title: str

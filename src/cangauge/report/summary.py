@@ -1,4 +1,4 @@
-"""Results in words and as table rows, shared by the terminal and the pages; imports no bokeh."""
+"""Results as sentences and table rows, shared by terminal and pages; imports no bokeh."""
 
 from __future__ import annotations
 

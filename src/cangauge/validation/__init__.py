@@ -1,16 +1,18 @@
 """Validation: simulated truth (`twin`) and the withheld check of the diagnosis.
 
-The check draws causes, withholds them, diagnoses in processes that get logs and model alone, then
+The check draws causes, withholds them, diagnoses in processes that get logs and model only, and
 scores the answers::
 
-    plan        protocols → planned cases, each with its seed
-    cases       a planned case → logs with a fault, in memory
-    recordings  recorded logs: healthy ones to put faults into, laboratory ones with a known cause
-    generation  cases → files for the diagnosis, labels for the scorer
-    check       draw, withhold, diagnose (`workers`, `worker`), reveal
-    score       labels and answers → figures; `tables` prints them
+    plan         protocols → planned cases, each with its seed
+    cases        a planned case → logs with a fault, in memory
+    recordings   recorded logs: healthy ones to inject faults into, laboratory ones with known cause
+    generation   cases → files for the diagnosis, labels for the scorer
+    worker       the diagnosing process; `worker_pool` runs several
+    check        draw, withhold, diagnose, evaluate
+    score        labels and answers → figures; `tables` prints them
+    final_seeds  seeds of the published figures
 
-The public names, those of the twin, are loaded when first used.
+The public names are those of the twin, loaded on first use.
 """
 
 from __future__ import annotations

@@ -74,7 +74,7 @@ class Scenario:
     ) -> tuple[Drive, ...]:
         """Draw drives within the ambient temperatures of the references.
 
-        Outside these, the temperature dependence of the healthy pack would open a gap.
+        At other temperatures the temperature dependence of the healthy pack would open a gap.
         """
         known = [float(drive.ambient_c[0]) for drive in self.reference_drives]
         low, high = (min(known), max(known)) if known else _AMBIENT_C[self.climate]

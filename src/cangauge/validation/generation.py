@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from cangauge._io import write_text_atomic
-from cangauge.identify.fit import Identification
+from cangauge.identify.fit import Identification, fit
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
@@ -32,7 +32,6 @@ from cangauge.validation.cases import (
 from cangauge.validation.plan import Group, PlannedCase
 from cangauge.validation.recordings import (
     LABORATORY_CAUSES,
-    fit_model,
     laboratory_case,
     model_rmse_v,
     recorded_set,
@@ -71,16 +70,16 @@ def draw_group(group: Group, folder: Path, withheld: Path, data: Path | None) ->
     ----------
     group : Group
     folder : Path
-        Gets a folder for each case.
+        Parent of the case folders.
     withheld : Path
-        Gets the held-out logs of laboratory cases.
+        Folder of the held-out logs of laboratory cases.
     data : Path, optional
         Folder of the recorded logs.
 
     Returns
     -------
     list of dict
-        Labels; of a case that cannot be drawn with the reason under `failed`.
+        Labels; a case that cannot be drawn has the reason under `failed`.
     """
     try:
         if group.protocol in _SIMULATED:
@@ -114,8 +113,8 @@ def _draw_simulated(group: Group, folder: Path) -> list[Label]:
     capacity_ah = scenario.pack.capacity_ah
     training = [recording.log for recording in scenario.training]
     references = [recording.log for recording in scenario.references]
-    model = fit_model(training, capacity_ah).model
-    known = fit_model([*training, *references], capacity_ah)
+    model = fit(training, capacity_ah=capacity_ah).model
+    known = fit([*training, *references], capacity_ah=capacity_ah)
     floor_v = model_rmse_v(known, _clean_logs(scenario, options))
     options = replace(options, floor_v=floor_v)
     writer = _CaseWriter(folder, training, references, model)
@@ -125,7 +124,7 @@ def _draw_simulated(group: Group, folder: Path) -> list[Label]:
             seed = case.seed + attempt * _NEXT_SEED
             drawn = draw_case(seed, case.effects, scenario, options)
             if not case.effects or drawn.gap_v >= LEAST_GAP * floor_v:
-                break  # else physics allows too small a gap on these drives
+                break  # otherwise the physical limits allow only a smaller gap on these drives
         writer.write(case.name, drawn.logs, capacity_ah)
         labels.append(_label(group.protocol, case, drawn, known))
     return labels
@@ -139,10 +138,10 @@ def _clean_logs(scenario: Scenario, options: CaseOptions) -> list[Log]:
 
 def _draw_recorded(group: Group, folder: Path, data: Path | None) -> list[Label]:
     recorded = recorded_set(group.protocol.removeprefix("real-"), data, group.scenario_seed)
-    model = fit_model(recorded.training, recorded.capacity_ah).model
+    model = fit(recorded.training, capacity_ah=recorded.capacity_ah).model
     own = {log.name for log in recorded.training}
     further = [log for log in recorded.references if log.name not in own]
-    known = fit_model([*recorded.training, *further], recorded.capacity_ah)
+    known = fit([*recorded.training, *further], capacity_ah=recorded.capacity_ah)
     floor_v = model_rmse_v(known, recorded.held_out)
     pack = recorded.fit_surrogate_pack()
     writer = _CaseWriter(folder, recorded.training, recorded.references, model)

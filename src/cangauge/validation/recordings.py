@@ -6,8 +6,8 @@ held-out ones; and laboratory cases, where the cause is what the laboratory chan
 - `cold-bmw_i3`: winter trips of a car against the model of its summer trips. Each trip is left out
   in turn; one more case has all of them.
 - `cold-lg_hg2`: drive cycles of a cell at 0 and 10 °C against 25 °C.
-- `hysteresis-a123_lfp`: slow discharge and charge of an LFP cell against drive cycles, which
-  discharge: the model fits the discharge as well as the drives, not the charge.
+- `hysteresis-a123_lfp`: slow discharge and charge of an LFP cell against drive cycles. The cycles
+  discharge the cell, so the model fits the slow discharge but not the slow charge.
 """
 
 from __future__ import annotations
@@ -233,7 +233,7 @@ def laboratory_case(protocol: str, number: int, data: Path | None) -> Laboratory
 def _winter(folder: Path, number: int) -> LaboratoryCase:
     training = summer_training(folder)
     capacity = capacity_from_reference(training)
-    known = fit_model(training, capacity)
+    known = fit(training, capacity_ah=capacity)
     trips = [read_log(folder / f"Trip{name}.csv.gz") for name in WINTER]
     left_out = trips[number : number + 1]
     clean = summer_held_out(folder)
@@ -252,7 +252,7 @@ def _cold_cell(folder: Path, number: int) -> LaboratoryCase:
         return [with_initial_soc(read_log(folder / f"{name}.parquet"), 100.0) for name in names]
 
     references = read(_LG_REFERENCES)
-    known = fit_model(read(_LG_TRAINED), LG_CAPACITY_AH)
+    known = fit(read(_LG_TRAINED), capacity_ah=LG_CAPACITY_AH)
     return LaboratoryCase(
         references,
         read(_LG_COLD[number]),
@@ -267,7 +267,7 @@ def _hysteresis(folder: Path, number: int) -> LaboratoryCase:
         return read_log(folder / f"A123_{name}.csv.gz")
 
     drives = [_middle(read(name), ends_full=False) for name in _A123_DRIVES]
-    known = fit_model(drives, _A123_CAPACITY_AH)
+    known = fit(drives, capacity_ah=_A123_CAPACITY_AH)
     at = _A123_SLOW[number]
     discharge = _middle(read(f"OCV_{at}_S1"), ends_full=False)
     charge = _middle(read(f"OCV_{at}_S3"), ends_full=True)
@@ -289,11 +289,6 @@ def _middle(log: Log, *, ends_full: bool) -> Log:
     inside = np.flatnonzero((soc >= low) & (soc <= high))
     rows = slice(int(inside[0]), int(inside[-1]) + 1)
     return with_initial_soc(log.rows(rows), float(soc[rows][0]))
-
-
-def fit_model(logs: Sequence[Log], capacity_ah: float) -> Identification:
-    """Identify the model of healthy logs, as `cangauge fit` does."""
-    return fit(logs, capacity_ah=capacity_ah)
 
 
 def model_rmse_v(known: Identification, logs: Sequence[Log]) -> float:

@@ -16,13 +16,13 @@ from scipy.stats import binomtest, bootstrap
 
 from cangauge.validation.plan import EFFECTS, is_outside
 from cangauge.validation.twin.faults import fault_kinds
-from cangauge.validation.workers import Task
+from cangauge.validation.worker_pool import Task
 
 NONE, UNKNOWN, CRASHED = "none", "unknown", "crashed"
 FAMILY: Final = {kind.id: kind.family for kind in fault_kinds()}
 
 LEAST_GAP: Final = 0.45
-"""Gaps below this multiple of the floor are out of range: physics allowed no larger one."""
+"""Gaps below this multiple of the floor are out of range: physical limits allow no larger one."""
 _CONFIDENT: Final = 0.5
 _GAP_EDGES: Final = (0.0, 0.5, 1.0, 2.0, 5.5)
 _PROBABILITY_BINS: Final = 10
@@ -48,7 +48,7 @@ def share(flags: Sequence[bool]) -> Figures:
     return proportion(sum(flags), len(flags))
 
 
-def estimate(values: Sequence[float], statistic: Callable[..., Any]) -> Figures:
+def bootstrapped(values: Sequence[float], statistic: Callable[..., Any]) -> Figures:
     """Return a statistic with its bootstrap percentile interval (fixed seed).
 
     Parameters
@@ -386,8 +386,8 @@ def _accuracy(items: Sequence[Outcome]) -> Figures:
         "correct_and_confident": share([i.probability >= _CONFIDENT for i in correct]),
         "closed": {
             floor: {
-                "all": estimate(_closed_share(items, floor), np.median),
-                "detected": estimate(
+                "all": bootstrapped(_closed_share(items, floor), np.median),
+                "detected": bootstrapped(
                     _closed_share((i for i in items if i.names_effect), floor), np.median
                 ),
             }
@@ -453,7 +453,7 @@ def _open_set(items: Sequence[Outcome]) -> Figures:
 def reliability(outcomes: Sequence[Outcome]) -> Figures:
     """Return the reliability diagram and the Brier score of the stated probabilities.
 
-    Without cases of two causes, which have no single correct verdict, and without crashes.
+    Cases of two causes, which have no single correct verdict, and crashes are excluded.
     """
     stated = [i for i in outcomes if len(i.truth) <= 1 and i.verdict != CRASHED and i.in_range]
     bins = []
@@ -472,7 +472,7 @@ def reliability(outcomes: Sequence[Outcome]) -> Figures:
             }
         )
     squares = [(i.probability - float(i.strict)) ** 2 for i in stated]
-    return {"brier": estimate(squares, np.mean), "bins": bins}
+    return {"brier": bootstrapped(squares, np.mean), "bins": bins}
 
 
 def confusion(items: Sequence[Outcome]) -> Figures:

@@ -84,7 +84,7 @@ TARGETS: Final = (
         low=0.85,
         high=0.98,
     ),
-    # Healthy, this plant obeys the published equation.
+    # A healthy plant of this kind obeys the published equation.
     Target("equation: top 1, pairs counted", _of("equation", "effects", "top1_pair"), low=0.95),
     Target("equation: top 1", _of("equation", "effects", "top1"), low=0.85),
     Target("equation: false alarms", _of("equation", "healthy", "false_alarms"), high=0.02),
@@ -260,8 +260,8 @@ def _print_protocol(name: str, items: Mapping[str, Any], console: Console) -> No
     console.print(table)
     if items.get("below_range"):
         console.print(
-            f"{items['below_range']} have a gap below {LEAST_GAP} floors: physics allows no larger"
-            " one on their drives. They are excluded from the shares of effects."
+            f"{items['below_range']} have a gap below {LEAST_GAP} floors, the largest that is"
+            " physical on their drives. They are excluded from the shares of effects."
         )
     if "by_gap" in items:
         table = _table(

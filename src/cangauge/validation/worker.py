@@ -1,4 +1,4 @@
-"""Diagnosing process: it gets logs, a model and requests, and nothing else.
+"""Diagnosing process: its only inputs are logs, a model and requests.
 
 `python -m cangauge.validation.worker` reads one request a line (JSON) from stdin and writes one
 answer a line to stdout:

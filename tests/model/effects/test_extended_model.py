@@ -67,7 +67,7 @@ def test_soc_may_be_anchored_at_any_row() -> None:
     signals = irregular_signals(500)
     extended = ExtendedModel(MODEL, CAPACITY_AH)
     first = extended.predict(signals, 80.0, np.array([0]))
-    again = extended.predict(signals, float(first.soc_pct[300]), np.array([0]), anchor_row=300)
+    again = extended.predict(signals, float(first.soc_pct[300]), np.array([0]), initial_row=300)
     np.testing.assert_allclose(again.soc_pct, first.soc_pct, atol=1e-10)
 
 

@@ -7,8 +7,8 @@ An effect acts in up to three places, in this order:
 2. `count`: how charge becomes SoC (capacity, initial_soc, coulombic_efficiency);
 3. `extra_voltage`: a voltage added to the voltage model's (resistances, dynamics, hysteresis …).
 
-Each effect is written twice in its file, over whole logs as arrays and one sample at a time; tests
-hold the two together. At its neutral values an effect changes nothing.
+Each effect has two forms in its file, over whole logs as arrays and one sample at a time; a test
+checks that they agree. At its neutral values an effect changes nothing.
 
 Parameters are of three kinds. *Amplitudes* have a neutral value and enter the voltage (nearly)
 linearly. *Shapes* (a time constant, a change point) have a grid of trial values and no meaning
@@ -175,8 +175,9 @@ MOST_LAGS = 64
 class CurrentHistory:
     """Delayed and lagged currents of one log, each computed once.
 
-    Effects and their shapes share them, and they are most of the work on a long log. `time_s` and
-    `current_a` have shape (n,), positive = discharge. The arrays returned must not be written to.
+    Effects and their shapes share them, since they dominate the computing time of a long log.
+    `time_s` and `current_a` have shape (n,), positive = discharge. Callers must not write to the
+    arrays returned.
     """
 
     time_s: FloatArray
@@ -199,7 +200,7 @@ class CurrentHistory:
     def _low_passed(self, tau_s: float, *, squared: bool) -> FloatArray:
         key = (tau_s, squared)
         if key not in self._lagged:
-            while len(self._lagged) >= MOST_LAGS:  # a fit asks for ever new ones
+            while len(self._lagged) >= MOST_LAGS:  # a fit varies the time constants
                 del self._lagged[next(iter(self._lagged))]
             values = self.current_a**2 if squared else self.current_a
             self._lagged[key] = low_passed(self.time_s, values, tau_s, 0.0, rest_s=BRIDGE_S)
@@ -222,7 +223,7 @@ class CurrentHistory:
 def _history_of(
     time_s: FloatArray, current_a: FloatArray, cached: CurrentHistory | None
 ) -> CurrentHistory:
-    """Return the cached history if it belongs to these very arrays, else a new one."""
+    """Return the cached history if it was made of the same array objects, else a new one."""
     if cached is not None and cached.current_a is current_a and cached.time_s is time_s:
         return cached
     return CurrentHistory(time_s, current_a)
@@ -312,7 +313,7 @@ def scaled_drop_at(drop_v: float, current_a: float, delayed: float, resistance_o
 
 
 class Reading(NamedTuple):
-    """One sample on its way through the corrections.
+    """One sample during its correction.
 
     Voltage and temperature may be NaN where that signal is missing; current never is.
     """
@@ -344,10 +345,10 @@ class OnlineEffect:
     lags: Sequence[LowPass] = ()
 
     def correct(self, reading: Reading) -> Sequence[Reading]:
-        """Return the readings that ideal sensors would have shown, as far as known by now.
+        """Return the corrected readings that are complete.
 
-        Usually one for each that comes in. `time_skew`, which needs a later current for a voltage,
-        delays readings: they come out in order with their own times, none added or dropped.
+        Usually one for each input. `time_skew`, which needs a later current for a voltage, delays
+        readings: it returns all of them in order with unchanged times.
         """
         return (reading,)
 
@@ -400,18 +401,18 @@ class Effect:
     family: ClassVar[Family]
     parameters: ClassVar[tuple[Parameter, ...]]
     signature: ClassVar[str]
-    """Its appearance in U_measured − U_model, in words."""
+    """Its signature in U_measured − U_model, in words."""
     equation: ClassVar[str]
     source: ClassVar[str]
     separated_by: ClassVar[str]
     """The test that separates it from effects that look alike."""
     is_cause: ClassVar[bool] = True
-    """Whether a diagnosis may name it; else it is structure that only reference logs teach."""
+    """Whether a diagnosis may name it; otherwise it is structure, learned from references only."""
     is_structure: ClassVar[bool] = False
-    """Whether a healthy pack may have it: then what the references show of it is no cause."""
+    """Whether a healthy pack may have it: the part that references show is then not a cause."""
     secant_points: ClassVar[tuple[float, ...]] = ()
-    """For an effect far from linear in its only amplitude: fractions of the widest bound at which
-    the diagnosis takes the change of the voltage, besides a small one."""
+    """For an effect that is strongly nonlinear in its only amplitude: fractions of the widest bound
+    at which the diagnosis takes the change of the voltage, besides a small one."""
 
     @property
     def amplitudes(self) -> tuple[Parameter, ...]:

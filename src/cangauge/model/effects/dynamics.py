@@ -86,19 +86,19 @@ class FastPolarization(Effect):
 ELEMENTS: Final = 5
 """RC elements of a spread: with the slowest at 2400 s the fastest has 9 s."""
 
-FASTER: Final = 4.0
+TAU_RATIO: Final = 4.0
 """Ratio of the time constants of neighbouring elements."""
 
-SMALLER: Final = 2.0
-"""Ratio of their resistances: that of diffusion goes with the square root of time."""
+RESISTANCE_RATIO: Final = 2.0
+"""Ratio of their resistances: that of diffusion scales with the square root of time."""
 
 MEAN_SLOPE_PCT: Final = (10.0, 90.0)
 """SoC between which the mean slope of the open-circuit voltage is taken [%]."""
 
-STEEPEST: Final = 5.0
+STEEPNESS_AT_MOST: Final = 5.0
 """Upper limit of the slope, relative to the mean."""
 
-FLATTEST: Final = 1e-6
+MEAN_SLOPE_AT_LEAST: Final = 1e-6
 """Lower limit of the mean slope [V per %], so that the ratio exists."""
 
 
@@ -148,7 +148,7 @@ class SlowDiffusion(Effect):
             total += _rc_voltage(state, ohm, tau_s, values["activation_k"])
         if values["by_slope"]:
             steepness = state.ocv_slope(model) / _mean_slope(model)
-            total *= 1.0 + values["by_slope"] * (np.clip(steepness, 0.0, STEEPEST) - 1.0)
+            total *= 1.0 + values["by_slope"] * (np.clip(steepness, 0.0, STEEPNESS_AT_MOST) - 1.0)
         return total
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
@@ -159,9 +159,9 @@ class SlowDiffusion(Effect):
 
 def _elements(values: Values) -> list[tuple[float, float]]:
     """Return resistance [Ω] and time constant [s] of each element, the slowest first."""
-    weights = [(values["spread"] / SMALLER) ** k for k in range(ELEMENTS)]
+    weights = [(values["spread"] / RESISTANCE_RATIO) ** k for k in range(ELEMENTS)]
     return [
-        (values["ohm"] * weight / sum(weights), values["tau_s"] / FASTER**k)
+        (values["ohm"] * weight / sum(weights), values["tau_s"] / TAU_RATIO**k)
         for k, weight in enumerate(weights)
         if weight > 0.0
     ]
@@ -171,7 +171,7 @@ def _mean_slope(model: VoltageModel) -> float:
     """Return the mean slope of the pseudo-OCV [V per % SoC], positive."""
     low, high = MEAN_SLOPE_PCT
     rise_v = model.pseudo_ocv_at(high)[0] - model.pseudo_ocv_at(low)[0]
-    return max(rise_v / (high - low), FLATTEST)
+    return max(rise_v / (high - low), MEAN_SLOPE_AT_LEAST)
 
 
 class _OnlineRcBySlope(_OnlineRc):
@@ -187,7 +187,7 @@ class _OnlineRcBySlope(_OnlineRc):
 
     def extra_voltage(self, soc_pct: float) -> float:
         steepness = self._model.pseudo_ocv_at(soc_pct)[1] / self._mean_slope
-        share = 1.0 + self._by_slope * (min(max(steepness, 0.0), STEEPEST) - 1.0)
+        share = 1.0 + self._by_slope * (min(max(steepness, 0.0), STEEPNESS_AT_MOST) - 1.0)
         return share * self.volts
 
 

@@ -22,7 +22,7 @@ NO_LAG_S = 1e-3
 """A time constant up to this is no lag: output = input [s]."""
 
 BLOCK_TIME_CONSTANTS = 300.0
-"""Time constants summed in one block: e³⁰⁰, times e⁵⁰ for a last step, is far from overflow."""
+"""Time constants summed in one block: e³⁰⁰, times e⁵⁰ for a last step, does not overflow."""
 
 FULL_DECAY = 50.0
 """Time constants after which a state has decayed completely (2·10⁻²²)."""
@@ -96,7 +96,7 @@ class LowPass:
     """
 
     STATE_SIZE = 3
-    """Numbers in `state` once a sample has come."""
+    """Number of values in `state` after the first sample."""
 
     def __init__(self, tau_s: float, start: float | None = None, rest_s: float = math.inf) -> None:
         self.is_lagging = tau_s > NO_LAG_S

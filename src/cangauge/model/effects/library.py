@@ -57,7 +57,7 @@ LARGEST = 1e30
 """Upper limit of any parameter in a model file, in any unit."""
 
 STEP = 0.02
-"""Finite-difference step of an amplitude, relative to the width of its bounds."""
+"""Finite-difference step, relative to the width of an amplitude's bounds or to a shape."""
 
 
 def effect_of(effect_id: object, field: str = "effects") -> Effect:

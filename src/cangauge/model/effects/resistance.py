@@ -31,24 +31,24 @@ REFERENCE_C: Final = 25.0
 """Temperature at which Arrhenius factors are 1 [°C]."""
 
 
-def inverse_k(temperature_c: FloatArray) -> FloatArray:
+def _inverse_k(temperature_c: FloatArray) -> FloatArray:
     """Return 1/T [1/K], shape (n,)."""
     return np.asarray(1.0 / (np.clip(temperature_c, COLDEST_C, HOTTEST_C) + ZERO_C_IN_K))
 
 
-def inverse_k_at(temperature_c: float) -> float:
+def _inverse_k_at(temperature_c: float) -> float:
     """Return 1/T [1/K] of one temperature."""
     return 1.0 / (min(max(temperature_c, COLDEST_C), HOTTEST_C) + ZERO_C_IN_K)
 
 
 def arrhenius(temperature_c: FloatArray, activation_k: float) -> FloatArray:
     """Return exp(B·(1/T − 1/T₂₅)), shape (n,): greater than 1 below 25 °C."""
-    return np.exp(activation_k * (inverse_k(temperature_c) - 1.0 / (REFERENCE_C + ZERO_C_IN_K)))
+    return np.exp(activation_k * (_inverse_k(temperature_c) - 1.0 / (REFERENCE_C + ZERO_C_IN_K)))
 
 
 def arrhenius_at(temperature_c: float, activation_k: float) -> float:
     """Return `arrhenius` of one temperature."""
-    inverse = inverse_k_at(temperature_c)
+    inverse = _inverse_k_at(temperature_c)
     return math.exp(activation_k * (inverse - 1.0 / (REFERENCE_C + ZERO_C_IN_K)))
 
 
@@ -87,8 +87,8 @@ class ResistanceTemperature(Effect):
         self, state: PackState, values: Values, model: VoltageModel, pack: Pack
     ) -> FloatArray:
         drop_v = state.scaled_drop_v(values["delayed"], pack)
-        colder = inverse_k(state.lagged_temperature_c(values["lag_s"]))
-        colder = colder - inverse_k_at(values["reference_c"])
+        colder = _inverse_k(state.lagged_temperature_c(values["lag_s"]))
+        colder = colder - _inverse_k_at(values["reference_c"])
         return values["share"] * drop_v * np.expm1(values["activation_k"] * colder)
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
@@ -101,12 +101,12 @@ class _ResistanceTemperatureOnline(OnlineInteriorEffect):
         self._share = values["share"]
         self._activation_k = values["activation_k"]
         self._delayed = values["delayed"]
-        self._reference_per_k = inverse_k_at(values["reference_c"])
+        self._reference_per_k = _inverse_k_at(values["reference_c"])
         self._resistance_ohm = resistance_ohm
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         scaled_v = scaled_drop_at(drop_v, current_a, self._delayed, self._resistance_ohm)
-        colder = inverse_k_at(self.interior.step(time_s, temperature_c)) - self._reference_per_k
+        colder = _inverse_k_at(self.interior.step(time_s, temperature_c)) - self._reference_per_k
         self.volts = self._share * scaled_v * math.expm1(self._activation_k * colder)
 
 

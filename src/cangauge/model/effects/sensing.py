@@ -73,7 +73,7 @@ class CurrentOffset(_LinearSensor):
 
 
 class CurrentGain(_LinearSensor):
-    """Gain error of the current sensor: it shows `gain_pct` too much of every current."""
+    """Gain error of the current sensor: every current reads `gain_pct` too high."""
 
     id = "current_gain"
     family = "current_sensing"
@@ -89,7 +89,7 @@ class CurrentGain(_LinearSensor):
 
 
 class VoltageOffset(_LinearSensor):
-    """Zero error of the voltage sensor: it shows `offset_v` too much."""
+    """Zero error of the voltage sensor: it reads `offset_v` too high."""
 
     id = "voltage_offset"
     family = "voltage_sensing"
@@ -105,7 +105,7 @@ class VoltageOffset(_LinearSensor):
 
 
 class VoltageGain(_LinearSensor):
-    """Gain error of the voltage sensor: it shows `gain_pct` too much of every voltage."""
+    """Gain error of the voltage sensor: every voltage reads `gain_pct` too high."""
 
     id = "voltage_gain"
     family = "voltage_sensing"

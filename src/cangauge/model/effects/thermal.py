@@ -68,12 +68,12 @@ class _TemperatureLagOnline(OnlineEffect):
 
 
 class CoreTemperature(Effect):
-    """Core temperature: surface plus low-passed Joule heat, used in place of the measured one.
+    """Core temperature: surface plus low-passed Joule heat, instead of the measured temperature.
 
-    The insulation that keeps the heat in delays changes from outside with the same time constant:
-    `late` is the fraction of them that the core follows with the lag (1: the whole cell is core).
-    Without a temperature coefficient in the model, or an effect that uses the temperature, it
-    changes nothing.
+    The thermal insulation also delays changes of the ambient temperature, with the same time
+    constant: `late` is the fraction of them that the core follows with the lag (1: the whole cell
+    is core). It has an effect only in a model with a temperature coefficient, or together with an
+    effect that uses the temperature.
     """
 
     id = "core_temperature"
@@ -134,7 +134,7 @@ class _CoreTemperatureOnline(OnlineEffect):
 class InnerTemperature(Effect):
     """Voltage and resistance of a cell interior that lags behind the measured temperature.
 
-    Every pack that is heated or cooled from outside shows it, the more the larger its cells: it is
+    Every pack that is heated or cooled from outside has it, and larger cells have more of it: it is
     structure, not a fault. The diagnosis learns it from reference logs and never names it.
     """
 

@@ -28,9 +28,9 @@ class TimeSkew(Effect):
     """The current that belongs to a voltage is found `skew_s` later in the log.
 
     The current is interpolated, never the voltage: averaging neighbouring voltages would reduce
-    their noise and look like an improvement. Online, with a positive skew, a voltage waits for its
-    current, so estimates are `skew_s` late. The last rows of a log, whose current never arrives,
-    use the last current offline and are withheld online.
+    their noise and look like an improvement. Online, with a positive skew, a voltage is held until
+    its current arrives, so estimates are `skew_s` late. The last rows of a log, whose current never
+    arrives, use the last current offline and are withheld online.
     """
 
     id = "time_skew"

@@ -28,9 +28,9 @@ from cangauge.validation.twin.condition import (
 from cangauge.validation.twin.pack import Pack
 
 OUTSIDE: Final = "outside"
-"""Family of the faults that the effects library has no counterpart of."""
+"""Family of the faults without a counterpart in the effects library."""
 GAP: Final = "gap_v"
-"""Parameter that replaces the size in a text: RMS gap that the fault is to open [V]."""
+"""Parameter that replaces the size in a text: RMS gap to open [V]."""
 
 _WARBURG_MODES: Final = 6
 _COLE_SPREAD: Final = (-1.6, -1.0, -0.5, 0.0, 0.5, 1.0, 1.6)
@@ -458,7 +458,7 @@ def parse_effect(
     ----------
     text : str
         For example `current_offset:offset_a=2` or `resistance_step:step_ohm=0.02,at_s=1200`.
-        `gap_v=` in place of the size gives the RMS gap to open.
+        `gap_v=` instead of the size gives the RMS gap to open.
     pack : Pack
         Sets the physical limits of the size.
     seed : int

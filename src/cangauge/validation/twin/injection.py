@@ -1,9 +1,9 @@
-"""Faults injected into recorded logs: the change that a fault makes is added to what was measured.
+"""Inject faults into recorded logs: the change that a fault causes is added to the signals.
 
-Faults of the pack add the difference that they make to a surrogate, a pack of the twin under the
-recorded current and temperature; faults of a sensor change the recorded signal itself. Only
-differences between two conditions of the surrogate count, so that its slope over the SoC and its
-resistance need to be right, not its voltage.
+For a fault of the pack, the change is the difference that it makes to a surrogate: a pack of the
+twin under the recorded current and temperature. A fault of a sensor changes the recorded signal
+itself. Only differences between two conditions of the surrogate are used, so its slope over SoC and
+its resistance must be accurate, not its voltage.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _MIN_DURATION_S: Final = 60.0
 
 
 def soc_of(log: Log, capacity_ah: float) -> FloatArray:
-    """Return the SoC of a log [-], shape (n,): its own if it has one, else counted from the first.
+    """Return the SoC of a log [-], shape (n,): its reference SoC, or counted from the first value.
 
     Raises
     ------
@@ -203,7 +203,7 @@ class Injected:
 
 
 def inject(log: Log, faults: Sequence[Fault], pack: Pack, *, seed: int = 0) -> Injected:
-    """Return a recorded log as the pack with faults would have written it.
+    """Return a recorded log as it would have been recorded with the faults.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
-"""Plants: models of a pack that answer a current with voltage, state of charge and heat.
+"""Plants: models of a pack that return voltage, state of charge and heat for a current.
 
 `TwinPlant` simulates the cells by tabulated open-circuit voltage, asymmetric Butler–Volmer
-kinetics, diffusion and cell spread. `EquationPlant` obeys the published voltage equation while it
-is healthy, so that a healthy log differs from the model by sensor errors and the core's temperature
-alone. Both share the thermal model and the faults around the cells.
+kinetics, diffusion and cell spread. A healthy `EquationPlant` obeys the published voltage equation,
+so that its logs differ from the model only by sensor errors and the temperature of the core. Both
+share the thermal model and the faults around the cells.
 """
 
 from __future__ import annotations
@@ -94,12 +94,7 @@ class Plant(Protocol):
 
 
 class TwinPlant:
-    """Cells with kinetics, diffusion and spread.
-
-    Parameters
-    ----------
-    pack : Pack
-    """
+    """Cells with kinetics, diffusion and spread."""
 
     name = "twin"
     temperature_tolerance_k = 0.05

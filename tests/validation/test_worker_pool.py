@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from cangauge.validation import workers
+from cangauge.validation import worker_pool
 from cangauge.validation.plan import EFFECTS
-from cangauge.validation.workers import Task, diagnose_all
+from cangauge.validation.worker_pool import Task, diagnose_all
 
 SPY = """
 import json, os, sys
@@ -57,7 +57,7 @@ def ask(
 ) -> Callable[..., dict[str, dict[str, Any]]]:
     spy = tmp_path / "spy.py"
     spy.write_text(SPY)
-    monkeypatch.setattr(workers, "COMMAND", (sys.executable, str(spy)))
+    monkeypatch.setattr(worker_pool, "COMMAND", (sys.executable, str(spy)))
     monkeypatch.setenv("GAP_TRUTH", "hysteresis")
 
     def run(*tasks: Task, jobs: int = 1) -> dict[str, dict[str, Any]]:
@@ -104,7 +104,7 @@ def test_crashed_process_is_replaced(
 def test_hanging_process_is_stopped(
     ask: Callable[..., dict[str, dict[str, Any]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(workers, "TIMEOUT_S", 1.0)
+    monkeypatch.setattr(worker_pool, "TIMEOUT_S", 1.0)
     found = ask(Task("a", "case_2", "simulated"), Task("b", "case_0", "simulated"))
     assert "ended" in found["a"]["error"]
     assert "received" in found["b"]

@@ -1,4 +1,4 @@
-"""Diagnosing processes: each gets copies of the open files of a case in an anonymous folder."""
+"""Pool of diagnosing processes; each gets copies of a case's open files in an anonymous folder."""
 
 from __future__ import annotations
 

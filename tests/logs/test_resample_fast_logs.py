@@ -1,4 +1,4 @@
-"""Resampling of fast logs keeps charge, pauses and times."""
+"""Resampling of fast logs keeps charge, gaps and times."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from cangauge.logs.resample import ENOUGH_HZ, resample
 from cangauge.model.charge import discharged_ah
 
 
-def drive(rate_hz: float, seconds: float = 120.0, pause_s: float = 0.0) -> Log:
+def drive(rate_hz: float, seconds: float = 120.0, gap_s: float = 0.0) -> Log:
     time_s = 1.7e9 + np.arange(0.0, seconds, 1.0 / rate_hz)
-    time_s[time_s.size // 2 :] += pause_s
+    time_s[time_s.size // 2 :] += gap_s
     current = 40.0 + 60.0 * np.sin((time_s - time_s[0]) / 3.0)
     voltage = 380.0 - 0.1 * current
     return Log(time_s, current, voltage, np.full_like(time_s, 25.0), 80.0 - current / 1e3)
@@ -28,7 +28,7 @@ def test_a_slow_log_is_unchanged(rate_hz: float) -> None:
 
 @pytest.mark.parametrize("rate_hz", [50.0, 100.0, 333.0])
 def test_a_fast_log_keeps_its_charge_and_alignment(rate_hz: float) -> None:
-    log = drive(rate_hz, pause_s=50.0)
+    log = drive(rate_hz, gap_s=50.0)
     few = resample(log)
     assert len(few) == pytest.approx(120.0 * ENOUGH_HZ, abs=2)
     assert np.all(np.diff(few.time_s) > 0.0)
