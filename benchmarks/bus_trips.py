@@ -36,8 +36,8 @@ from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from cangauge.replay.player import ReplaySettings, play
 from cangauge.replay.steps import LogSource, quantisation_bound
-from cangauge.service.capture_estimate import estimate_capture
 from cangauge.service.loop import LoopSettings, Outputs, serve
+from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
 from real_trips import DATA, JUDGED_S, TEST, TRAINING, identify, read_trips

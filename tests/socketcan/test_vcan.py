@@ -25,8 +25,8 @@ from cangauge.estimate.offline import run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.replay.player import ReplaySettings, play
 from cangauge.replay.steps import CaptureSource, LogSource, quantisation_bound
-from cangauge.service.capture_estimate import estimate_capture
 from cangauge.service.loop import LoopSettings
+from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
 from live import (

@@ -27,7 +27,8 @@ from cangauge.model.published import SOC_NEWTON_MAE_PCT, VOLTAGE_MAE_PCT
 from cangauge.replay.steps import quantisation_bound
 from cangauge.report.estimate import estimate_report
 from cangauge.report.fit import fit_report
-from cangauge.service.offline import RecordedEstimate, read_estimates
+from cangauge.service.estimate_table import read_estimates
+from cangauge.service.offline import RecordedEstimate
 
 TRAINED_ON = "leaf2012_reconstruction_white.parquet"
 PLAYED = "leaf2012_reconstruction_correlated.parquet"

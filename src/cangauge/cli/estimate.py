@@ -13,6 +13,9 @@ from rich.progress import Progress
 
 from cangauge._formatting import number
 from cangauge._io import atomic_path
+from cangauge.bus.captures.capture import Capture
+from cangauge.bus.recording import capture_without_vehicle, open_recording
+from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.options import (
     DbcOption,
     JsonOption,
@@ -34,14 +37,13 @@ from cangauge.errors import InputError
 from cangauge.estimate.settings import VALID_STD_PCT, EstimatorSettings, Method
 from cangauge.model.delay_line import GAP_S
 from cangauge.model.model_file import Model
+from cangauge.service.estimate_table import require_table_suffix, write_estimates
 from cangauge.service.offline import (
     RecordedEstimate,
     Recording,
     estimate_recorded_capture,
     estimate_recorded_log,
     require_same_pack,
-    require_table_suffix,
-    write_estimates,
 )
 
 AUTO = "auto"
@@ -133,11 +135,6 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     check_outputs([output, report], [log_path, model_path])
     model = Model.load(model_path)
     is_described = vehicle is not None or dbc is not None or map_file is not None
-    # python-can and cantools are slow to import.
-    from cangauge.bus.captures.capture import Capture  # noqa: PLC0415
-    from cangauge.bus.recording import capture_without_vehicle, open_recording  # noqa: PLC0415
-    from cangauge.bus.vehicle import Vehicle  # noqa: PLC0415
-
     if isinstance(open_recording(log_path), Capture):
         if not is_described:
             raise capture_without_vehicle(log_path)

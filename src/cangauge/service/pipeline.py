@@ -1,7 +1,7 @@
 """The pipeline: frames → samples → estimates → frames to publish.
 
 A live bus and a recorded capture share it. Pure: no bus, no files, no clock; the same frames with
-the same stamps give the same numbers. `loop` runs it on a bus, `capture_estimate` over a recording.
+the same stamps give the same numbers. `loop` runs it on a bus, `offline` over a capture.
 """
 
 from __future__ import annotations
