@@ -13,8 +13,8 @@ import os
 import secrets
 import stat
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final, cast
@@ -351,6 +351,14 @@ def write_text_atomic(path: str | PathLike[str], text: str) -> None:
     """Write `text` as UTF-8 to `path`, all or nothing (see `atomic_path`)."""
     with atomic_path(path) as part:
         part.write_text(text, encoding="utf-8", newline="\n")
+
+
+def write_texts_atomic(texts: Mapping[Path, str]) -> None:
+    """Write several files as UTF-8; a failure leaves all of them as they were."""
+    with ExitStack() as stack:
+        for path, text in texts.items():
+            part = stack.enter_context(atomic_path(path))
+            part.write_text(text, encoding="utf-8", newline="\n")
 
 
 def check_writable(path: str | PathLike[str]) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
+from can.typechecking import CanFilter
 from cantools.database.can import Message
 from numpy.typing import NDArray
 
@@ -279,7 +280,7 @@ class Vehicle:
         return tuple(dict.fromkeys(signal.arbitration_id for signal in self.signals))
 
     @property
-    def filters(self) -> list[dict[str, int | bool]]:
+    def filters(self) -> list[CanFilter]:
         """The wanted ids as filters of python-can (`bus.set_filters`)."""
         keys = dict.fromkeys(signal.key for signal in self.signals)
         return [

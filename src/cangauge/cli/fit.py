@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +9,7 @@ from typing import Annotated
 import typer
 
 from cangauge._formatting import number, significant, span
-from cangauge._io import atomic_path
+from cangauge._io import write_texts_atomic
 from cangauge.cli.options import (
     DbcOption,
     JsonOption,
@@ -165,7 +164,9 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
             from cangauge.report.fit import fit_report  # noqa: PLC0415
 
             page = fit_report(result)
-    _write({output: result.model.to_json()} | ({report: page} if report and page else {}))
+    write_texts_atomic(
+        {output: result.model.to_json()} | ({report: page} if report and page else {})
+    )
     if json_output:
         extra: dict[str, object] = {"model": str(output), "report": report and str(report)}
         if search is not None:
@@ -216,14 +217,6 @@ def _delays(given: str) -> tuple[float, ...]:
 
 def _best(search: DelaySearch) -> list[tuple[tuple[float, ...], float]]:
     return sorted(search.tried, key=lambda choice: choice[1])[:SHOWN_CHOICES]
-
-
-def _write(texts: dict[Path, str]) -> None:
-    """Write all files or none of them."""
-    with ExitStack() as stack:
-        for path, text in texts.items():
-            part = stack.enter_context(atomic_path(path))
-            part.write_text(text, encoding="utf-8", newline="\n")
 
 
 def _show(result: Identification, search: DelaySearch | None) -> None:

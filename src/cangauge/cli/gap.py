@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from cangauge._formatting import NONE_KNOWN, number
-from cangauge._io import atomic_path
+from cangauge._io import write_texts_atomic
 from cangauge.cli.options import (
     DbcOption,
     JsonOption,
@@ -108,17 +107,16 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     references = [read(path) for path in given]
     with progress_shown("cangauge.diagnosis"):
         found = diagnose(diagnosed, model_file, references, initial_soc_pct=initial_soc)
-    with ExitStack() as stack:
-        if extended is not None:
-            text = found.extended_model.to_json()
-            stack.enter_context(atomic_path(extended)).write_text(text)
-        if report is not None:
-            # bokeh takes half a second to import.
-            from cangauge.report.diagnosis import gap_report  # noqa: PLC0415
-            from cangauge.report.page import InputFile  # noqa: PLC0415
+    texts = {}
+    if extended is not None:
+        texts[extended] = found.extended_model.to_json()
+    if report is not None:
+        # bokeh takes half a second to import.
+        from cangauge.report.diagnosis import gap_report  # noqa: PLC0415
+        from cangauge.report.page import InputFile  # noqa: PLC0415
 
-            page = gap_report(found, InputFile.of_model(model_file, model))
-            stack.enter_context(atomic_path(report)).write_text(page, encoding="utf-8")
+        texts[report] = gap_report(found, InputFile.of_model(model_file, model))
+    write_texts_atomic(texts)
     if json_output:
         emit_json(found.to_dict(None if extended is None else str(extended)))
         return

@@ -312,7 +312,7 @@ class CaptureEstimate:
     soc_reference_pct : array of shape (n,)
         The vehicle's own state of charge [%]; NaN where there is none.
     counts : FrameCounts
-        What became of the frames.
+        Frames and values by outcome.
     time_source : {"receive", "replay-clock"}
         Source of bus time.
     seconds : float
