@@ -1,7 +1,7 @@
-"""Files: limits on what is read, opening what a user names, writing all or nothing.
+"""File access: size limits, safe opening of user-named paths, atomic writing.
 
-Limits stand far above what real files need and far below what hurts the machine. A file beyond
-one is refused by an `InputError` before the time or the memory is spent.
+Limits are far above real files and far below the memory of a small machine. A file beyond a limit
+raises `InputError` before it costs time or memory.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ MAX_LOG_ROWS: Final = 20_000_000
 """Rows of a log, samples of a capture: 23 days at 10 Hz, 0.8 GB as float64."""
 MAX_LOG_COLUMNS: Final = 10_000
 MAX_LOG_SPAN_S: Final = 366 * 86400.0
-"""First to last row [s]: a clock set within a log makes decades seem to pass."""
+"""First to last row [s]: setting the clock within a log can add decades."""
 MAX_HEADING: Final = 200
 """Longest column heading that is parsed [characters]."""
 MAX_ODD_ROWS: Final = 100
@@ -85,7 +85,7 @@ MAX_SPEED_TRACE_BYTES: Final = 64 * MIB
 # --- Reading
 
 _GZIP: Final = b"\x1f\x8b"
-# Opening these would block for ever, never end, or act on a machine.
+# Opening these could block, never end, or trigger a device.
 _NOT_FILES: Final = (
     (stat.S_ISFIFO, "this is a pipe (FIFO), not a file"),
     (stat.S_ISCHR, "this is a device, not a file"),
@@ -200,8 +200,8 @@ class _Bounded(io.RawIOBase):
         self._delivered += len(part)
         if self._delivered > self._limit:
             raise InputError(
-                f"unpacks to more than {_megabytes(self._limit)}, which no recording of its size"
-                " does",
+                f"unpacks to more than {_megabytes(self._limit)}, too much for a recording of its"
+                " size",
                 source=self._path,
                 cure="unpack it and check its content",
             )
@@ -286,7 +286,7 @@ def _unreadable(error: OSError | ValueError, path: str | PathLike[str]) -> Input
 # --- Writing
 
 FULL: Final = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
-"""Errors of a full or failing disk, which may pass."""
+"""Errors of a full or failing disk, which can be temporary."""
 _WRITE_ERRORS: Final[dict[int, tuple[str, str]]] = {
     errno.ENOENT: ("the folder of this file does not exist", "create it or name another one"),
     errno.ENOTDIR: ("a part of this path is a file, not a folder", "name another path"),
@@ -354,7 +354,7 @@ def write_text_atomic(path: str | PathLike[str], text: str) -> None:
 
 
 def write_texts_atomic(texts: Mapping[Path, str]) -> None:
-    """Write several files as UTF-8; a failure leaves all of them as they were."""
+    """Write several files as UTF-8, all or none (see `atomic_path`)."""
     with ExitStack() as stack:
         for path, text in texts.items():
             part = stack.enter_context(atomic_path(path))

@@ -28,8 +28,8 @@ from cangauge.cli.options import (
     known_temperature_source,
     load_log,
     note_not_a_capture,
+    refuse_inverted_current,
     refuse_single_row,
-    refuse_turned_current,
     within,
 )
 from cangauge.cli.output import console, emit_json, note, print_table
@@ -149,7 +149,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
             log_path,
             temperature_c=temperature,
             temperature_source=temperature_source,
-            refuse_turned=True,
+            refuse_inverted=True,
         )
         if is_described:
             note_not_a_capture(log_path)
@@ -214,14 +214,14 @@ def _progress(total: int | None) -> Iterator[Callable[[int], None]]:
 
 
 def _check_capture(done: RecordedEstimate, model: Model) -> None:
-    """Refuse a capture of one sample, of another pack, or with turned current."""
+    """Refuse a capture of one sample, of another pack, or with inverted current."""
     recorded = done.recorded
     refuse_single_row(recorded)
     for remark in recorded.remarks:
         note(f"{recorded.source}: {remark}")
     require_same_pack(recorded, model)
     if isinstance(recorded, Recording) and (log := recorded.as_log()) is not None:
-        refuse_turned_current(log, is_capture=True)
+        refuse_inverted_current(log, is_capture=True)
 
 
 def _show(done: RecordedEstimate) -> None:

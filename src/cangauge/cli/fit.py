@@ -34,7 +34,7 @@ from cangauge.report.summary import effect_rows, rounded, search_rows
 FROM_SOC = "from-soc"
 AUTO = "auto"
 SHOWN_CHOICES = 8
-"""Number of the best choices of delays to report."""
+"""Number of delay sets shown, the best first."""
 
 
 def fit_command(  # noqa: PLR0917 - typer passes options by name
@@ -43,7 +43,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         typer.Argument(metavar="LOG", help="Recorded logs or captures of one pack."),
     ],
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="MODEL", help="The model file (JSON).")
+        Path, typer.Option("-o", "--output", metavar="MODEL", help="Model file to write (JSON).")
     ],
     capacity_ah: Annotated[
         str | None,
@@ -95,7 +95,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Identify the voltage model of a pack from one or more recorded logs.
+    """Identify the voltage model of a pack from recorded logs.
 
     A log has time_s [s], current_a [A] (positive discharges), voltage_v [V], temperature_c [°C]
     and optionally soc_pct [%]; `cangauge inspect` shows what a file holds.
@@ -133,7 +133,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
                     map_file=map_file,
                     temperature_c=temperature,
                     temperature_source=temperature_source,
-                    refuse_turned=True,
+                    refuse_inverted=True,
                 )
             )
         if capacity_ah == FROM_SOC:
@@ -159,7 +159,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
             )
         page = None
         if report is not None:
-            status.update("drawing the report")
+            status.update("writing the report")
             # bokeh takes half a second to import.
             from cangauge.report.fit import fit_report  # noqa: PLC0415
 
@@ -204,7 +204,7 @@ def _delays(given: str) -> tuple[float, ...]:
             "not a list of seconds", field="--delays", value=given, cure=cure
         ) from error
     increasing = all(low < high for low, high in pairwise(delays))
-    # Without the current now, slope resistance and heat would lose their meaning.
+    # Slope resistance and heat are defined by the undelayed current.
     if not (delays[0] == 0.0 and increasing and delays[-1] <= 3600.0):
         raise InputError(
             "delays must begin with 0 and increase to 3600 s at most",

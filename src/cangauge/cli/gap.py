@@ -1,4 +1,4 @@
-"""`cangauge gap`: diagnose why a model does not explain logs."""
+"""`cangauge gap`: diagnose the gap between a model and logs."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ from cangauge.report.summary import headline, next_step, open_question, paramete
 
 SHOWN_CANDIDATES = 5
 SHORTEST_S = 300.0
-"""Shortest log to diagnose [s]: a shorter one shows only its start."""
+"""Shortest log to diagnose [s]; a shorter one is mostly transient."""
 
 
 def gap_command(  # noqa: PLR0917 - typer passes options by name
     logs: Annotated[
         list[Path],
-        typer.Argument(metavar="LOG", help="Logs to diagnose; they share one cause."),
+        typer.Argument(metavar="LOG", help="Logs to diagnose; one cause is sought for all."),
     ],
     model: Annotated[Path, typer.Option("-m", "--model", metavar="MODEL", help="Model file.")],
     reference: Annotated[
         list[Path] | None,
         typer.Option(
             metavar="LOG",
-            help="A log without a fault; repeat the option. It has soc_pct, at least at its start,"
-            " or starts full.",
+            help="Log without a fault; repeat the option. It needs soc_pct, at least at its start, or"
+            " starts full.",
         ),
     ] = None,
     initial_soc: Annotated[
@@ -59,7 +59,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     ] = None,
     extended: Annotated[
         Path | None,
-        typer.Option(metavar="MODEL", help="Write the model extended by the cause here."),
+        typer.Option(metavar="MODEL", help="Write the model, extended by the cause, to this file."),
     ] = None,
     vehicle: VehicleOption = None,
     dbc: DbcOption = None,
@@ -69,12 +69,12 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Diagnose why a model does not explain logs: how large the gap is, where, and its cause.
+    """Diagnose the gap between a model and logs: size, place, probable cause.
 
     The verdict is an effect, `none` (no significant gap) or `unknown` (a gap without a likely cause
     in the library), with its probability; the documentation states how often it is right. Give at
-    least three references, better more; without any, the error that the model file states is taken
-    as normal. A log needs 10 minutes, better an hour, with changing load and SoC. Positive current
+    least three references, better more; without any, the error stated in the model file counts as
+    normal. A log needs 10 minutes, better an hour, with changing load and SoC. Positive current
     discharges.
 
     Examples
@@ -100,7 +100,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
             map_file=map_file,
             temperature_c=temperature,
             temperature_source=temperature_source,
-            refuse_turned=True,
+            refuse_inverted=True,
         )
 
     diagnosed = [_long_enough(read(path)) for path in logs]
@@ -131,7 +131,7 @@ def _refuse_common(logs: list[Path], references: list[Path]) -> None:
     for path in logs:
         if path.resolve() in known:
             raise InputError(
-                "is both a LOG and a reference: a reference must be without the fault",
+                "is both a LOG and a reference, which must be without the fault",
                 source=path,
                 field="--reference",
                 cure="give it as one of them",
@@ -141,7 +141,7 @@ def _refuse_common(logs: list[Path], references: list[Path]) -> None:
 def _long_enough(log: Log) -> Log:
     if log.duration_s < SHORTEST_S:
         raise InputError(
-            f"{log.duration_s:.0f} s are too short: nothing can be concluded",
+            f"{log.duration_s:.0f} s are too short for a diagnosis",
             source=log.source or log.name,
             cure=f"give a log of at least {SHORTEST_S / 60.0:.0f} min, better half an hour with"
             " changing load and SoC",
@@ -173,7 +173,7 @@ def _show(found: Diagnosis) -> None:
     for answer in (UNKNOWN, NONE):
         probability = number(found.verdict.probabilities[answer], 2)
         rows.append([answer, probability, NONE_KNOWN, NONE_KNOWN, NONE_KNOWN])
-    headings = ["cause", "probability", "evidence", "left [V]", "closed"]
+    headings = ["cause", "probability", "evidence", "RMSE [V]", "closed"]
     print_table("Candidates, judged on held-out rows", headings, rows)
     for item in found.candidates:
         if item["effect"] in found.extension.cause:

@@ -92,8 +92,8 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
     (REPLAY_CLOCK, 0x5AF), so that `cangauge run --time-source replay-clock` counts the same charge
     at any speed.
 
-    For example:
-
+    Examples
+    --------
     `cangauge replay trip.parquet`
 
     `cangauge replay trip.parquet --speed max --vehicle leaf_aze0`

@@ -1,4 +1,4 @@
-"""`cangauge twin`: a simulated log whose truth is known."""
+"""`cangauge twin`: simulate a log whose truth is known."""
 
 from __future__ import annotations
 
@@ -102,8 +102,8 @@ def twin_command(  # noqa: PLR0917 - typer passes options by name
     open-circuit voltage, Butler–Volmer kinetics, diffusion, two thermal nodes, cell spread,
     quantized and jittered sensors. Positive current discharges.
 
-    For example:
-
+    Examples
+    --------
     `cangauge twin --seed 1 --discharge -o full.parquet`
 
     `cangauge twin --seed 1 --day 2 --effect current_offset:offset_a=1.5 -o trip.parquet`
