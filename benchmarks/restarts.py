@@ -372,7 +372,7 @@ class Player(threading.Thread):
 
     def restored(self) -> int:
         """Return the number of starts that restored a state, by the log of the service."""
-        return self._log.read_text(encoding="utf-8").count("going on from")
+        return self._log.read_text(encoding="utf-8").count("continuing from")
 
 
 def table_of(results: Result) -> Table:

@@ -13,7 +13,7 @@ from cangauge.bus.connection import BusConnection
 from cangauge.bus.open import bus_address, open_bus
 from cangauge.bus.publish import FrameIds
 from cangauge.bus.vehicle import Vehicle
-from cangauge.service.loop import RIVAL_AGAIN_S, DuplicateSenderDetector
+from cangauge.service.loop import DUPLICATE_WARN_EVERY_S, DuplicateSenderDetector
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from live import Service, leaf_model, virtual_service, waits
 
@@ -88,7 +88,7 @@ def test_single_frame_is_ignored_and_warning_repeats(
     assert not detector.handle(can.Message(arbitration_id=0x5A0, is_extended_id=True), 20.0)
     for number in range(20_000):
         detector.handle(frame(0x5A1), 30.0 + 0.1 * number)
-    assert len(caplog.messages) == 1 + 2000.0 // RIVAL_AGAIN_S
+    assert len(caplog.messages) == 1 + 2000.0 // DUPLICATE_WARN_EVERY_S
 
 
 def test_lost_echo_is_no_foreign_frame() -> None:

@@ -43,8 +43,8 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
         list[Path] | None,
         typer.Option(
             metavar="LOG",
-            help="Log without a fault; repeat the option. It needs soc_pct, at least at its start, or"
-            " starts full.",
+            help="Log without a fault; repeat the option. It needs soc_pct, at least at its start,"
+            " or starts full.",
         ),
     ] = None,
     initial_soc: Annotated[

@@ -1,4 +1,4 @@
-"""Configuration of the service: one model for the TOML file, the command line and the docs.
+"""Configuration of the service: one model for the TOML file, the command line and the reference.
 
 Each key is declared once, as a field of `RunConfig` with its type, bounds, default, unit and help.
 The TOML file has the same keys; `cangauge.cli.config_options` makes the options of the command
@@ -68,7 +68,7 @@ DEFAULT_VEHICLE: Final = "generic"
 
 @dataclass(frozen=True)
 class OptionInfo:
-    """What the command line and the reference need to know of a key.
+    """Data of a key for the command line and the reference.
 
     Parameters
     ----------

@@ -49,7 +49,7 @@ DOUBTFUL_COVER: Final = 0.5
 """Fractions of valid samples, and of reference SoC within ±2σ, below which to warn."""
 
 Origin = Literal["given", "log", "voltage"]
-"""Where the initial SoC comes from: an option, the log's soc_pct, the first voltages."""
+"""Source of the initial SoC: an option, the log's soc_pct, or the first voltages."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +112,7 @@ Recorded = Log | Recording
 
 @dataclass(frozen=True, eq=False)
 class RecordedEstimate:
-    """Estimates of a recording, with all that a table, a report and a JSON object need.
+    """Estimates of a recording, with the data for table, report and JSON.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ class RecordedEstimate:
         As used.
     origin : {"given", "log", "voltage"}
         Source of the initial SoC.
-    capture_facts : dict
+    capture_data : dict
         Time source and frame counts of a capture.
     """
 
@@ -136,7 +136,7 @@ class RecordedEstimate:
     model: Model
     settings: EstimatorSettings = field(default_factory=EstimatorSettings)
     origin: Origin = "voltage"
-    capture_facts: dict[str, Any] = field(default_factory=dict)
+    capture_data: dict[str, Any] = field(default_factory=dict)
 
     @property
     def reason_shares(self) -> dict[str, float]:
@@ -149,7 +149,7 @@ class RecordedEstimate:
 
     @property
     def warnings(self) -> list[str]:
-        """What makes the estimate doubtful as a whole, a sentence each."""
+        """Reasons to doubt the estimate as a whole, one sentence each."""
         scores, found = self.scores, []
         if scores.valid_fraction < DOUBTFUL_VALID:
             reasons = reason_names(int(np.bitwise_or.reduce(self.table.reasons)))
@@ -177,7 +177,7 @@ class RecordedEstimate:
             "capacity_ah": settings.capacity_ah or self.model.capacity_ah,
             "max_gap_s": settings.gap_s,
             "reasons": self.reason_shares,
-            **self.capture_facts,
+            **self.capture_data,
         }
 
 
@@ -233,8 +233,8 @@ def estimate_recorded_capture(
 ) -> RecordedEstimate:
     """Estimate a capture, bit for bit as the service does.
 
-    Like the service it begins from the first voltages unless `settings` holds an initial SoC; the
-    car's own SoC is only the reference to compare with.
+    Like the service it starts from the first voltages unless `settings` holds an initial SoC; the
+    car's own SoC is the reference to compare with only.
 
     Raises
     ------
@@ -258,17 +258,17 @@ def estimate_recorded_capture(
     return RecordedEstimate(
         recorded=recording,
         table=found.table,
-        # A recording has all that the scores need of a log.
+        # `score` needs only columns that a recording has.
         scores=score(found.table, cast("Log", recording), found.seconds),
         model=model,
         settings=settings,
         origin="voltage" if settings.initial_soc_pct is None else "given",
-        capture_facts={"time_source": found.time_source, "frames": asdict(found.counts)},
+        capture_data={"time_source": found.time_source, "frames": asdict(found.counts)},
     )
 
 
 def _unwrapped(time_s: FloatArray) -> FloatArray:
-    """Return time that continues where a second replay in the same capture began anew [s]."""
+    """Return time without the steps back of further replays in the same capture [s]."""
     step_s = np.diff(time_s)
     if not np.any(step_s < 0.0):
         return time_s

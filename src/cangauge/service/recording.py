@@ -5,7 +5,7 @@ also gzipped, Vector BLF and ASAM MF4. ASC and TRC shift or round time stamps.
 
 The receive loop only formats frames into memory; a thread writes. A killed service loses the
 frames of the last `HAND_OVER_S`, or the whole part of an .mf4, which is written at its end. A power
-cut may also lose what was written in the last `SYNC_EVERY_S`.
+cut can also lose the data written in the last `SYNC_EVERY_S`.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ class Recorder:
     Attributes
     ----------
     path : Path
-        What `estimate` and `replay` read: the file, or the name of this run.
+        Name for `estimate` and `replay`: the file, or this run.
     frames : int
         Frames recorded so far.
 
@@ -337,17 +337,17 @@ class _Disk:
     def close(self, within_s: float) -> bool:
         """Write the rest; return whether all was written in time [s]."""
         is_done = self.writer.flush(within_s)
-        # Written is enough for the end of the process; fsync is against power cuts, and may hang.
+        # Written data survive the end of the process; fsync, against power cuts, may hang.
         self.writer.submit(self._close_file)
         left = self.writer.close(0.0)
         self.lost_frames += sum(job.frames for job in left if isinstance(job, _Piece))
         return is_done
 
     def write(self, piece: _Piece) -> None:
-        """Write a piece; runs in the thread. What is written is cut off, so that it can retry."""
+        """Write a piece, in the thread; written bytes are removed from it, for a retry."""
         while piece.data and self._file is not None:
             place = self._end if piece.place is None else piece.place
-            if place != self._at:  # a pipe cannot seek, and need not
+            if place != self._at:  # not for a pipe, which cannot seek
                 self._at = self._file.seek(place)
             done = self._file.write(piece.data) or 0
             self._at += done
@@ -405,13 +405,13 @@ def _fsync(file: io.FileIO | None) -> None:
     try:
         os.fsync(file.fileno())
     except OSError as error:
-        # A pipe or a device cannot be synced, and need not.
+        # Pipes and devices cannot be synced.
         if error.errno not in _NOT_SYNCED:
             raise
 
 
 class RecordBuffer(io.RawIOBase):
-    """The file that python-can's writers see: in memory until it is handed over.
+    """File object for python-can's writers: keeps bytes in memory until they are handed over.
 
     Parameters
     ----------

@@ -120,7 +120,7 @@ class Service:
         """
         config, pipeline = self.config, self.pipeline
         with ExitStack() as stack:
-            # Signals first: the service may be stopped at any moment after its start.
+            # Signals first: the service may be stopped at any moment from now on.
             stop, hangup = self._stop.is_set, self._take_reload
             if threading.current_thread() is threading.main_thread():
                 signalled = stack.enter_context(stop_on_signals())
@@ -170,10 +170,10 @@ class Service:
         return summary_json(pipeline, port, summary) | {"state": config.state} | written
 
     def reconfigure(self) -> LoopSettings | None:
-        """Read the configuration again and apply it as a whole; the SoC continues.
+        """Reload the configuration and apply it as a whole; the SoC continues.
 
         Model, vehicle, method, capacity, gaps, time-outs and published ids change at once. The
-        initial SoC is ignored: the SoC is known by now. Other keys need a restart, which is logged.
+        initial SoC is ignored, since the SoC is known. Other keys need a restart, which is logged.
 
         Returns
         -------
@@ -269,7 +269,7 @@ def _check_output(output: Path, model: Path) -> None:
 
 
 def _vehicle_key(config: RunConfig, vehicle: Vehicle) -> tuple[object, ...]:
-    """Return what identifies a vehicle: its options, and its files by content."""
+    """Return the identity of a vehicle: its options, and the content of its files."""
     files = [*vehicle.dbc_files, *([config.map] if config.map is not None else [])]
     contents = tuple(hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in files)
     chosen = (config.messages, config.rules, config.checks)
@@ -303,7 +303,7 @@ def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None
         try:
             unix_path = default_path(monitor.latest.identity.bus)
         except InputError as error:
-            # Nobody asked for it: the service runs without.
+            # Not requested explicitly: the service runs without it.
             emit(_LOG, logging.WARNING, "status.unavailable", f"no status socket: {error}")
     http = config.http_address()
     if unix_path is None and http is None:

@@ -60,7 +60,7 @@ def fetch_status(endpoint: str, token_file: Path | None = None) -> dict[str, Any
     Raises
     ------
     InputError
-        If the endpoint is neither.
+        If the endpoint is neither of both.
     NotRunningError
         If no service answers.
     CangaugeError
