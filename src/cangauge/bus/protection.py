@@ -182,8 +182,8 @@ LEAF_RULE: Final = ProtectionRule("leaf", polynomial=0x85, counter_bits=2)
 GENERIC_RULE: Final = ProtectionRule(
     "generic", polynomial=0x1D, initial=0xFF, xor_out=0xFF, counter_bits=4, counter_shift=4
 )
-"""CRC-8 SAE J1850 in the last byte, counter in the high half of the byte before: what cangauge
-itself sends as the generic pack."""
+"""CRC-8 SAE J1850 in the last byte, counter in the high half of the byte before: the frames that
+`replay` sends as the generic pack."""
 
 CRC_ONLY_RULE: Final = ProtectionRule(
     "crc_only", polynomial=0x1D, initial=0xFF, xor_out=0xFF, counter_bits=0
@@ -269,7 +269,7 @@ class Profile(NamedTuple):
     id_bits: int
     """Width of the data id; 0: a list of 16 bytes."""
     modes: Mapping[str, int]
-    """How the data id can enter the CRC, where there is a choice."""
+    """Modes of the data id in the CRC, where there is a choice."""
     check: Callable[..., bool]
     protect: Callable[..., None]
 
@@ -308,7 +308,7 @@ class E2eRule:
     data_ids : bytes
         Profile 2: 16 data ids, one per counter value.
     data_id_mode : {"both", "alternating", "low", "nibble"}
-        How the data id enters the CRC: profile 1; profile 11 has "both" and "nibble" only.
+        Mode of the data id in the CRC: profile 1; profile 11 has "both" and "nibble" only.
     header_byte : int
         First byte of the header; 0 in profile 2.
     protected_bytes : int
@@ -377,7 +377,7 @@ class E2eRule:
     def is_whole(self, data: bytes | bytearray) -> bool:
         """Return whether header and CRC agree and the counter value is a possible one."""
         if isinstance(data, bytes):
-            data = bytearray(data)  # some checks of the library accept nothing else
+            data = bytearray(data)  # some checks of the library accept bytearray only
         return (
             self._profile.check(data, self.data_ids or self.data_id, **self._arguments)
             and self.counter(data) < self._profile.modulus

@@ -1,4 +1,4 @@
-"""Vehicles: signals of a map file bound to a DBC, ready to decode and encode; known vehicles.
+"""Vehicles: signals of a map file bound to a DBC, ready to decode and encode; presets.
 
 `Vehicle.load` gives a vehicle by the name of a preset, or by a DBC and a map file.
 """
@@ -417,7 +417,7 @@ class _Binder:
         return found
 
     def _message_key(self, name: str) -> int:
-        """Return the key of the message that a name or id in [messages] means."""
+        """Return the key of the message for a name or id in [messages]."""
         first: InputError | None = None
         for database, file in self._databases:
             try:
@@ -451,7 +451,7 @@ class Preset:
     about : str
         One line for help texts.
     periods_s : dict of int to float
-        Message periods that distinguish this vehicle from related ones in a capture [s].
+        Message periods that distinguish this vehicle from similar ones in a capture [s].
     """
 
     dbc: str
@@ -503,7 +503,7 @@ def _leaf(name: str, about: str, period_5bc_s: float, *, has_temperature: bool =
 PRESETS: Final[dict[str, Preset]] = {
     "generic": Preset(
         dbc="generic_pack.dbc",
-        about="a pack without a car: what replay sends by default",
+        about="a pack without a car: the default of replay",
         mapping=VehicleMap(
             name="generic pack",
             current=SignalMap(message="PACK_CURRENT", signal="current_a"),

@@ -34,7 +34,7 @@ from cangauge.replay.steps import Source, Step
 _LOG = logging.getLogger(__name__)
 
 AHEAD_S: Final = 0.0002
-"""Frames this close to their time are sent at once: sleeping is less precise [s]."""
+"""Frames due within this time are sent at once: sleeping is less precise [s]."""
 REST_AT_MOST_S: Final = 0.2
 """Longest uninterrupted wait, so that a stop is noticed [s]."""
 
@@ -43,14 +43,14 @@ WINDOW_SAMPLES: Final = 40
 WINDOW_FRAMES: Final = 160
 """Most frames under way: a default socket buffer of Linux holds about 270."""
 SAMPLES_AT_LEAST: Final = 2 * ACKNOWLEDGE_EVERY
-"""Samples that may always be under way; with fewer, no acknowledgement would become due."""
+"""Samples that may always be under way: fewer would not trigger an acknowledgement."""
 SLOW_S: Final = 0.5
-"""Wait for an acknowledgement that is worth a warning [s]."""
+"""Wait for an acknowledgement above which to warn [s]."""
 _POLL_S: Final = 0.05
 
 SHOW_EVERY_S: Final = 0.2
 LISTEN_S: Final = 0.001
-"""Time to listen at each display, in case there was no pause for it [s]."""
+"""Time to listen at each display update, for replays without pauses [s]."""
 LISTEN_AT_END_S: Final = 0.15
 """Time to listen for the estimate after the last frame [s]."""
 
@@ -61,7 +61,7 @@ _HINT = (
 
 @dataclass(frozen=True)
 class ReplaySettings:
-    """How to play.
+    """Settings of a replay.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ class ReplaySettings:
 
     @property
     def is_max(self) -> bool:
-        """Whether the receiver sets the pace."""
+        """Whether acknowledgements of the receiver set the speed."""
         return math.isinf(self.speed)
 
 
@@ -238,7 +238,7 @@ class _Player:
             )
 
     def _update(self, listen_s: float) -> None:
-        """Listen, bring the state up to date and show it."""
+        """Listen, update the state and show it."""
         state = self.state
         if self._first_us is not None:
             state.seconds = time.monotonic() - self._began_s
@@ -315,7 +315,7 @@ class _Receiver:
     def listen(self, within_s: float) -> None:
         """Receive for at most `within_s` [s]; return when the bus is quiet.
 
-        A timeout of 0 would not do: where Python filters, own frames must be skipped first.
+        Not with a timeout of 0: where Python filters, own frames must be skipped first.
         """
         until_s = time.monotonic() + within_s
         while (left_s := until_s - time.monotonic()) > 0.0 and self.take(left_s):

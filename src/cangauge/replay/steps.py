@@ -34,13 +34,13 @@ class Step(NamedTuple):
     """Log time [µs]; keeps increasing when the log is repeated."""
     frames: list[can.Message]
     samples: int
-    """Samples that a receiver has made after these frames, since the first step."""
+    """Samples that a receiver has completed after these frames, since the first step."""
     is_wanted: bool
     """Whether a receiver uses these frames, so that they need the clock."""
 
 
 class Source(Protocol):
-    """Something to replay."""
+    """A recording to replay."""
 
     name: str
 
@@ -172,7 +172,7 @@ class CaptureSource:
                 continue
             if clock.beginnings:
                 raise InputError(
-                    "holds several replays one after the other",
+                    "holds several consecutive replays",
                     source=self._path,
                     cure="cut it into one capture each",
                 )
@@ -187,7 +187,7 @@ class CaptureSource:
 
 
 class _SampleCounter:
-    """Counts the samples that a receiver makes, by decoding the frames."""
+    """Count the samples that a receiver makes, by decoding the frames."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._decoder = SampleDecoder(vehicle)

@@ -199,7 +199,7 @@ class RunConfig(_Strict):
     )
     wait_for_bus: StrictBool = _key(
         False,
-        "Start even if the bus is not there yet. A bus lost later is always reconnected.",
+        "Start even if the bus is not available yet. A bus lost later is always reconnected.",
         "",
         "--wait-for-bus/--need-bus",
         needs_restart=True,
