@@ -216,7 +216,7 @@ class Vehicle:
         """
         if temperature_c is not None and not -60.0 <= temperature_c <= 120.0:
             raise InputError(
-                "is no battery temperature in °C", field="--temperature", value=temperature_c
+                "is not a battery temperature in °C", field="--temperature", value=temperature_c
             )
         if preset is not None:
             if dbc is not None or map is not None:
