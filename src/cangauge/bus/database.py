@@ -204,7 +204,7 @@ class SignalCodec:
             cure="use a DBC with a wider signal",
         )
 
-    def quantise(self, values: FloatArray) -> FloatArray:
+    def quantize(self, values: FloatArray) -> FloatArray:
         """Return what `decode` gives after `encode_into`, for each value, without range check."""
         if self.float_format:
             kind = {"e": np.float16, "f": np.float32, "d": np.float64}[self.float_format]

@@ -107,9 +107,9 @@ class VehicleSignal:
         """
         self.codec.encode_into(payload, (value - self.offset) / self.gain)
 
-    def quantise(self, values: FloatArray) -> FloatArray:
+    def quantize(self, values: FloatArray) -> FloatArray:
         """Return what `decode` gives after `encode_into`, for each value."""
-        dbc_values = self.codec.quantise((np.asarray(values) - self.offset) / self.gain)
+        dbc_values = self.codec.quantize((np.asarray(values) - self.offset) / self.gain)
         return np.asarray(self.gain * dbc_values + self.offset)
 
     def fits(self, values: FloatArray) -> NDArray[np.bool_]:

@@ -24,7 +24,7 @@ from cangauge.estimate.settings import EstimatorSettings
 from cangauge.identify.fit import Identification, fit
 from cangauge.logs.read import read_log
 from cangauge.model.published import SOC_NEWTON_MAE_PCT, VOLTAGE_MAE_PCT
-from cangauge.replay.steps import quantisation_bound
+from cangauge.replay.steps import quantization_bound
 from cangauge.report.estimate import estimate_report
 from cangauge.report.fit import fit_report
 from cangauge.service.estimate_table import read_estimates
@@ -81,7 +81,7 @@ def demo_command(
     settings = EstimatorSettings(temperature_source=log.temperature_source)
     offline, _ = estimate_log(log, model, settings)
     difference = float(np.nanmax(np.abs(table.soc_pct - offline.soc_pct)))
-    bound = quantisation_bound(Vehicle.load("generic"), model, log).ekf_pct
+    bound = quantization_bound(Vehicle.load("generic"), model, log).ekf_pct
     note("4/4  write the pages")
     estimate = RecordedEstimate(log, table, live, model, settings)
     write_text_atomic(soc_page, estimate_report(estimate, model_path))

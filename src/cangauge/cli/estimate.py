@@ -125,12 +125,8 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
             initial_soc_std, 0.0, 100.0, option="--initial-soc-std", unit="%"
         ),
         valid_std_pct=within(valid_std, 0.01, 100.0, option="--valid-std", unit="%"),
-        capacity_ah=None
-        if capacity_ah is None
-        else within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah"),
-        gap_s=GAP_S
-        if max_gap_s is None
-        else within(max_gap_s, 1e-3, 3600.0, option="--max-gap-s", unit="s"),
+        capacity_ah=within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah"),
+        gap_s=within(max_gap_s, 1e-3, 3600.0, option="--max-gap-s", unit="s") or GAP_S,
     )
     check_outputs([output, report], [log_path, model_path])
     model = Model.load(model_path)

@@ -113,8 +113,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
     Model file and report are written together, or neither.
     """
     capacity = _capacity(capacity_ah)
-    if initial_soc is not None:
-        within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
+    within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
     within(rate_hz, 0.01, 1000.0, option="--rate-hz", unit="Hz")
     within(epsilon, 1e-4, 0.49, option="--epsilon", unit="")
     within(t_ref, -60.0, 120.0, option="--t-ref", unit="°C")

@@ -86,10 +86,9 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     _refuse_common(logs, given)
     check_outputs([report, extended], [*logs, *given, model])
     model_file = Model.load(model)
-    if initial_soc is not None:
-        within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
+    within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
+    within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
     if capacity_ah is not None:
-        within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
         model_file = model_file.model_copy(update={"capacity_ah": capacity_ah})
 
     def read(path: Path) -> Log:

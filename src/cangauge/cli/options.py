@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sized
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import typer
 
@@ -14,6 +14,8 @@ from cangauge.errors import InputError
 from cangauge.logs import units
 from cangauge.logs.log import Log
 from cangauge.logs.units import TEMPERATURE_SOURCES, TemperatureSource
+
+_Value = TypeVar("_Value", bound=float | None)
 
 VehicleOption = Annotated[
     str | None,
@@ -154,9 +156,9 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> Non
         check_writable(output)
 
 
-def within(value: float, low: float, high: float, *, option: str, unit: str) -> float:
-    """Return `value` if it lies within low … high (NaN does not); else raise InputError."""
-    if not low <= value <= high:
+def within(value: _Value, low: float, high: float, *, option: str, unit: str) -> _Value:
+    """Return `value` if it is None or within low … high; else (NaN too) raise InputError."""
+    if value is not None and not low <= value <= high:
         raise InputError(
             f"must lie within {low:g} … {high:g} {unit}".rstrip(), field=option, value=value
         )

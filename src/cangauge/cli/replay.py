@@ -219,7 +219,7 @@ def _as_json(state: ReplayState, bus: BusConnection, source: Source) -> dict[str
         "soc_std_pct": None if state.soc is None else state.soc.soc_std_pct,
     }
     if isinstance(source, LogSource):
-        result["quantisation"] = FrameEncoder(source.vehicle).quantisation()
+        result["quantisation"] = FrameEncoder(source.vehicle).quantization()
     if isinstance(source, CaptureSource):
         result["dropped"] = source.dropped
     return result

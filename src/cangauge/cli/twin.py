@@ -126,10 +126,10 @@ def twin_command(  # noqa: PLR0917 - typer passes options by name
             effect or (),
             seed=seed,
             drive=day,
-            hours=_within(hours, 0.05, 12.0, "--hours", "h"),
-            ambient_c=_within(ambient_c, -30.0, 50.0, "--ambient-c", "°C"),
-            start_soc_pct=_within(start_soc, 0.0, 100.0, "--start-soc", "%"),
-            end_soc_pct=_within(end_soc, 0.0, 100.0, "--end-soc", "%"),
+            hours=within(hours, 0.05, 12.0, option="--hours", unit="h"),
+            ambient_c=within(ambient_c, -30.0, 50.0, option="--ambient-c", unit="°C"),
+            start_soc_pct=within(start_soc, 0.0, 100.0, option="--start-soc", unit="%"),
+            end_soc_pct=within(end_soc, 0.0, 100.0, option="--end-soc", unit="%"),
             discharge=discharge,
             speed_ms=None if speed is None else read_speed(speed),
             pack=pack,
@@ -155,10 +155,6 @@ def twin_command(  # noqa: PLR0917 - typer passes options by name
         return
     _show(result)
     note(f"log: {output}")
-
-
-def _within(value: float | None, low: float, high: float, option: str, unit: str) -> float | None:
-    return value if value is None else within(value, low, high, option=option, unit=unit)
 
 
 def _show(result: dict[str, Any]) -> None:

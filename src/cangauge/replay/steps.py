@@ -200,7 +200,7 @@ class _SampleCounter:
 
 
 @dataclass(frozen=True)
-class QuantisationBound:
+class QuantizationBound:
     """Largest SoC error due to the quantization of frames [%], by method.
 
     Values in frames differ from the log's by at most half a step (δI, δU, δT; δt = 0.5 µs).
@@ -224,9 +224,9 @@ class QuantisationBound:
         return self.coulomb_pct + self.newton_pct
 
 
-def quantisation_bound(
+def quantization_bound(
     vehicle: Vehicle, model: Model, log: Log, capacity_ah: float | None = None
-) -> QuantisationBound:
+) -> QuantizationBound:
     """Return the bound for a log replayed as a vehicle's frames with REPLAY_CLOCK.
 
     Parameters
@@ -237,7 +237,7 @@ def quantisation_bound(
     capacity_ah : float, optional
         Instead of the model's [Ah].
     """
-    step = FrameEncoder(vehicle).quantisation()
+    step = FrameEncoder(vehicle).quantization()
     voltage_model = model.voltage_model()
     current_a = step["current_a"]
     rounded_s = np.rint(log.time_s * MICROSECONDS) / MICROSECONDS
@@ -252,4 +252,4 @@ def quantisation_bound(
     volts = step["voltage_v"] + abs(voltage_model.kt_v_per_k) * temperature_k
     volts += resistance * (current_a + time_s * slew)
     slope = min(voltage_model.pseudo_ocv_at(soc)[1] for soc in np.linspace(0.0, 100.0, 1001))
-    return QuantisationBound(coulomb, volts / slope)
+    return QuantizationBound(coulomb, volts / slope)

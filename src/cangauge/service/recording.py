@@ -110,7 +110,7 @@ class RecordLimits:
             )
 
     @property
-    def any(self) -> bool:
+    def in_parts(self) -> bool:
         """Whether the recording is in parts."""
         return self.part_bytes is not None or self.part_s is not None
 
@@ -151,12 +151,14 @@ class Recorder:
         path = Path(path)
         self._kind = record_format(path)
         self._limits = limits or RecordLimits()
-        if self._kind == ".mf4" and not self._limits.any:
+        if self._kind == ".mf4" and not self._limits.in_parts:
             self._limits = RecordLimits(part_s=MF4_PART_S)
         _check_writable(path)
         self._clock = clock
         self._base = path
-        self._in_parts = self._limits.any or self._kind in IN_PARTS_ONLY or _holds_something(path)
+        self._in_parts = (
+            self._limits.in_parts or self._kind in IN_PARTS_ONLY or _holds_something(path)
+        )
         self._run = max((each.run for each in all_parts(path)), default=0) + 1
         self._part = 0
         self.path = run_path(path, self._run) if self._in_parts else path
