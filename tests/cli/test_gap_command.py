@@ -89,4 +89,4 @@ def test_a_minute_of_data_concludes_nothing(run: Run, made: Path, tmp_path: Path
     write_log(log.rows(np.arange(60)), tmp_path / "stub.csv")
     ran = run("gap", tmp_path / "stub.csv", "-m", made / "model.json")
     assert ran.code == 2
-    assert "nothing can be concluded" in ran.err
+    assert "too short for a diagnosis" in ran.err

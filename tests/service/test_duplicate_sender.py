@@ -33,7 +33,7 @@ def test_two_services_warn_of_each_other_once() -> None:
         assert "0x5A" in service.warnings[0]
         assert "--soc-estimate-id" in service.warnings[0]
         assert service.summary is not None
-        assert service.summary.rival_frames >= 3
+        assert service.summary.foreign_frames >= 3
         assert service.pipeline.counts.frames == 0  # they are not input
 
 
@@ -42,7 +42,7 @@ def test_services_with_other_ids_do_not_warn() -> None:
         time.sleep(0.8)
     assert one.warnings == two.warnings == []
     assert one.summary is not None
-    assert one.summary.rival_frames == 0
+    assert one.summary.foreign_frames == 0
 
 
 def multicast_service(port: int) -> Service:

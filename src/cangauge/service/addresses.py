@@ -154,7 +154,7 @@ def _checked(content: str, source: str) -> str:
     return token
 
 
-# --- Unix sockets -------------------------------------------------------------------------------
+# --- Unix sockets
 
 SOCKET_MODE: Final = 0o660
 LONGEST_NAME: Final = 40

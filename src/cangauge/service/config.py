@@ -550,7 +550,7 @@ def _with_model(data: Mapping[str, Any]) -> dict[str, Any]:
     return {"model": "-", **data}
 
 
-# --- Reference ----------------------------------------------------------------------------------
+# --- Reference
 
 
 @dataclass(frozen=True)

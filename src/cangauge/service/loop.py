@@ -134,7 +134,7 @@ class RunSummary:
     step_p50_us: float | None
     """Median time from receiving a frame that completes a sample to having processed it [µs]; the
     mean counts for frames received together."""
-    rival_frames: int = 0
+    foreign_frames: int = 0
     """Frames with this service's ids from another sender."""
 
 
@@ -177,7 +177,7 @@ def serve(
         seconds=time.monotonic() - loop.began_s,
         cpu_seconds=time.process_time() - cpu,
         step_p50_us=1e6 * statistics.median(loop.step_s) if loop.step_s else None,
-        rival_frames=loop.duplicates.frames,
+        foreign_frames=loop.duplicates.frames,
     )
 
 

@@ -149,7 +149,7 @@ class Pipeline:
         self._latest = NOTHING_YET
         self._is_behind = False
 
-    # --- frames → estimates ---------------------------------------------------------------
+    # --- frames → estimates
 
     def handle(self, message: can.Message) -> bool:
         """Process one frame; return whether it completed a sample.
@@ -212,7 +212,7 @@ class Pipeline:
             untimed=self._untimed,
         )
 
-    # --- estimates → frames ---------------------------------------------------------------
+    # --- estimates → frames
 
     @property
     def filters(self) -> list[CanFilter]:
@@ -257,7 +257,7 @@ class Pipeline:
         period_s = self.decoder.health["current"].period_s
         return 0.0 if self._is_replay or math.isnan(period_s) else MISSED_AT_LEAST * period_s
 
-    # --- reload and restart ---------------------------------------------------------------
+    # --- reload and restart
 
     def reconfigure(
         self, vehicle: Vehicle | None, model: Model, settings: PipelineSettings

@@ -478,7 +478,7 @@ class RecordBuffer(io.RawIOBase):
         self._changes.clear()
 
 
-# --- Formats ------------------------------------------------------------------------------------
+# --- Formats
 
 EXACT_FORMATS: Final = (".log", ".csv", ".blf", ".mf4")
 PACKED: Final = ".gz"

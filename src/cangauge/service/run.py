@@ -342,7 +342,7 @@ def _bus_errors(port: ReconnectingBus, summary: RunSummary) -> str:
         "dropped in the receive queue": port.queue_drops,
         f"error frames ({kinds})": port.error_frames,
         "not sent": port.unsent,
-        "from another service with these ids": summary.rival_frames,
+        "from another service with these ids": summary.foreign_frames,
         f"bus losses ({port.away_s:.1f} s)": port.losses,
     }
     return "".join(f", {count} {what}" for what, count in found.items() if count)
@@ -377,7 +377,7 @@ def summary_json(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary)
         "unsent": port.unsent,
         "bus_losses": port.losses,
         "bus_away_s": port.away_s,
-        "rival_frames": summary.rival_frames,
+        "rival_frames": summary.foreign_frames,
         "stamps": port.capabilities.stamps,
         "step_p50_us": summary.step_p50_us,
         "estimate": {

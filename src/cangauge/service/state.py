@@ -281,7 +281,7 @@ class StateKeeper:
         emit(_LOG, logging.WARNING, "state.failed", f"state not written: {text}")
 
 
-# --- The file -----------------------------------------------------------------------------------
+# --- The file
 
 
 class StateContent(BaseModel):
