@@ -226,7 +226,7 @@ class Vehicle:
                     value=preset,
                     cure="give one or the other",
                 )
-            found = find_preset(preset)
+            found = _find_preset(preset)
             if found.lacks_temperature and temperature_c is None:
                 raise InputError(
                     "no pack temperature is known on the bus of this car",
@@ -532,7 +532,7 @@ PRESETS: Final[dict[str, Preset]] = {
 """By the name that `--vehicle` takes."""
 
 
-def find_preset(name: str) -> Preset:
+def _find_preset(name: str) -> Preset:
     """Return the preset of that name; case does not matter, nor does `-` for `_`.
 
     Raises

@@ -126,15 +126,15 @@ def main() -> None:
     except CangaugeError as error:
         if not error.logged:
             note(f"error: {error}")
-        emit_failure(error.to_dict(), error.exit_code)
+        _emit_failure(error.to_dict(), error.exit_code)
         sys.exit(error.exit_code)
     except UsageError as error:
-        if line := usage_line(error):
+        if line := _usage_line(error):
             note(line)
-        emit_failure(usage_dict(error), 2)
+        _emit_failure(_usage_dict(error), 2)
         sys.exit(2)
     except Exception as error:  # a bug: Python prints the traceback and exits with 1
-        emit_failure(CangaugeError(f"{type(error).__name__}: {error}").to_dict(), 1)
+        _emit_failure(CangaugeError(f"{type(error).__name__}: {error}").to_dict(), 1)
         raise
     if code == 130:  # typer's code for Ctrl-C
         note("stopped")
@@ -145,7 +145,7 @@ def main() -> None:
 UsageError: Final[type[Any]] = typer.BadParameter.__mro__[1]
 
 
-def emit_failure(error: Mapping[str, Any], exit_code: int) -> None:
+def _emit_failure(error: Mapping[str, Any], exit_code: int) -> None:
     """Print `{"error": {…}, "exit_code": …}` on stdout if the command line asks for `--json`.
 
     Parameters
@@ -169,7 +169,7 @@ def emit_failure(error: Mapping[str, Any], exit_code: int) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def usage_line(error: Any) -> str:
+def _usage_line(error: Any) -> str:
     """Return a usage error in one line that names the help page; "" if help was shown.
 
     Parameters
@@ -194,7 +194,7 @@ def _did_you_mean(word: str, names: Iterable[str]) -> str:
     return f". Did you mean {near}?" if near else ""
 
 
-def usage_dict(error: Any) -> dict[str, Any]:
+def _usage_dict(error: Any) -> dict[str, Any]:
     """Return a usage error as `CangaugeError.to_dict` does; `field` is the option or argument.
 
     Parameters
@@ -207,4 +207,4 @@ def usage_dict(error: Any) -> dict[str, Any]:
         # The help page shows an argument by its metavar.
         is_option = parameter.param_type_name == "option"
         field = "/".join(parameter.opts) if is_option else parameter.metavar or parameter.name
-    return {**CangaugeError(usage_line(error).removeprefix("error: ")).to_dict(), "field": field}
+    return {**CangaugeError(_usage_line(error).removeprefix("error: ")).to_dict(), "field": field}

@@ -32,7 +32,7 @@ VOLTAGE_QUANTA: Final = 4.0
 """Of voltage, in quanta; a jump of current must move the voltage by as much."""
 VOLTAGE_SHARE: Final = 0.002
 """Of voltage, relative to its median [-]."""
-LISTED_STRETCHES: Final = 5
+LISTED_INTERVALS: Final = 5
 """Most stuck intervals of a channel to list in the warnings."""
 
 # Limits of the abilities.
@@ -215,9 +215,9 @@ def _stuck_warnings(name: str, channel: Channel) -> list[str]:
     found = [
         f"{name} stuck at {stretch.value:g} {channel.unit} for {stretch.duration_s:.0f} s"
         f" from {stretch.start_s:.1f} s: {stretch.why}"
-        for stretch in channel.stuck[:LISTED_STRETCHES]
+        for stretch in channel.stuck[:LISTED_INTERVALS]
     ]
-    more = len(channel.stuck) - LISTED_STRETCHES
+    more = len(channel.stuck) - LISTED_INTERVALS
     return [*found, f"{name}: {more} more stuck intervals"] if more > 0 else found
 
 

@@ -137,7 +137,7 @@ class Pipeline:
         self._earlier_counts = FrameCounts()
         self._untimed = 0
         self._beginnings = 0
-        self._pack = pack_of(model, self.settings.estimator.capacity_ah)
+        self._pack = _pack_of(model, self.settings.estimator.capacity_ah)
         self.decoder = SampleDecoder(vehicle, self._pack)
         self.estimator = Estimator(model, _with_source(self.settings.estimator, vehicle))
         self.samples = 0
@@ -290,7 +290,7 @@ class Pipeline:
             initial_soc_pct=started.initial_soc_pct,
             initial_soc_std_pct=started.initial_soc_std_pct,
         )
-        pack = pack_of(model, estimator_settings.capacity_ah)
+        pack = _pack_of(model, estimator_settings.capacity_ah)
         if (model, estimator_settings) != (self.model, started):
             before, self.estimator = self.estimator, Estimator(model, estimator_settings)
             self.estimator.take_over(before)
@@ -382,7 +382,7 @@ class Pipeline:
         self._estimated = None
 
 
-def pack_of(model: Model, capacity_ah: float | None = None) -> Pack:
+def _pack_of(model: Model, capacity_ah: float | None = None) -> Pack:
     """Return the pack's properties by which its signals are judged.
 
     Parameters

@@ -149,7 +149,7 @@ class Recorder:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         path = Path(path)
-        self._kind = record_format(path)
+        self._kind = _record_format(path)
         self._limits = limits or RecordLimits()
         if self._kind == ".mf4" and not self._limits.in_parts:
             self._limits = RecordLimits(part_s=MF4_PART_S)
@@ -168,7 +168,7 @@ class Recorder:
         self._part_until_s = float("inf")
         self._start_s = 0.0
         self._file: RecordBuffer | None = None
-        self._writer: FrameWriter | None = None
+        self._writer: _FrameWriter | None = None
         self._current = path
         self._disk = _Disk()
         if self._kind not in IN_PARTS_ONLY:
@@ -247,7 +247,7 @@ class Recorder:
             self._disk.writer.submit(self._remove_oldest)
         self._disk.begin(self._current)
         self._file = RecordBuffer(self._disk.append)
-        self._writer = frame_writer(self._kind, self._file, start_s)
+        self._writer = _frame_writer(self._kind, self._file, start_s)
         self._file.hand_over(0)
         if self._limits.part_s is not None:
             self._part_until_s = self._clock() + self._limits.part_s
@@ -488,7 +488,7 @@ IN_PARTS_ONLY: Final = (".blf", ".mf4")
 """Formats with stamps relative to the file's start: a clock that is set back needs a new part."""
 
 
-class FrameWriter(Protocol):
+class _FrameWriter(Protocol):
     """Formats frames into a `RecordBuffer`."""
 
     def write(self, message: can.Message) -> None:
@@ -501,7 +501,7 @@ class FrameWriter(Protocol):
         """Complete the file."""
 
 
-def record_format(path: Path) -> str:
+def _record_format(path: Path) -> str:
     """Return the format of a recording by its name, such as ".log", ".log.gz", ".blf".
 
     Raises
@@ -525,13 +525,13 @@ def record_format(path: Path) -> str:
     return kind + PACKED if packed else kind
 
 
-def frame_writer(kind: str, file: RecordBuffer, start_s: float) -> FrameWriter:
+def _frame_writer(kind: str, file: RecordBuffer, start_s: float) -> _FrameWriter:
     """Return a writer of a format.
 
     Parameters
     ----------
     kind : str
-        As `record_format` returns it.
+        As `_record_format` returns it.
     file : RecordBuffer
     start_s : float
         Stamp of the first frame [s].

@@ -150,7 +150,7 @@ class Service:
                 sent=monitor.sent,
             )
             summary = serve(port, pipeline, config.loop_settings(), outputs, stop)
-        emit(_LOG, logging.INFO, "service.stopped", summary_line(pipeline, port, summary))
+        emit(_LOG, logging.INFO, "service.stopped", _summary_line(pipeline, port, summary))
         if not pipeline.counts.frames:
             emit(
                 _LOG,
@@ -167,7 +167,7 @@ class Service:
         }
         for path in filter(None, written.values()):
             emit(_LOG, logging.INFO, "file.written", f"written: {path}", limit=path, path=path)
-        return summary_json(pipeline, port, summary) | {"state": config.state} | written
+        return _summary_json(pipeline, port, summary) | {"state": config.state} | written
 
     def reconfigure(self) -> LoopSettings | None:
         """Reload the configuration and apply it as a whole; the SoC continues.
@@ -323,7 +323,7 @@ def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None
         )
 
 
-def summary_line(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary) -> str:
+def _summary_line(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary) -> str:
     """Return a run's frames, losses and last SoC in one line."""
     counts, latest = pipeline.counts, pipeline.latest
     soc = f"{number(latest.soc_pct, 2)} ± {number(latest.soc_std_pct, 2, '%')}"
@@ -348,7 +348,7 @@ def _bus_errors(port: ReconnectingBus, summary: RunSummary) -> str:
     return "".join(f", {count} {what}" for what, count in found.items() if count)
 
 
-def summary_json(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary) -> dict[str, Any]:
+def _summary_json(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary) -> dict[str, Any]:
     """Return the summary that `--json` prints."""
     counts, latest = pipeline.counts, pipeline.latest
     return {

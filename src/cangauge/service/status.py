@@ -379,7 +379,7 @@ class Monitor:
         try:
             yield
         finally:
-            self._notifier.ready(status_line(self.latest))
+            self._notifier.ready(_status_line(self.latest))
 
     def turn(self, now_s: float) -> bool:
         """Record a turn of the loop (monotonic time [s]); return whether `latest` is new."""
@@ -394,7 +394,7 @@ class Monitor:
             self._notifier.ping()
         if self._notifier.active and now_s >= self._notify_s:
             self._notify_s = now_s + NOTIFY_EVERY_S
-            self._notifier.status(status_line(snapshot))
+            self._notifier.status(_status_line(snapshot))
         return True
 
     def _snapshot(self, now_s: float) -> Snapshot:
@@ -438,7 +438,7 @@ class Monitor:
             _LOG,
             logging.WARNING if is_worse else logging.INFO,
             "status.changed",
-            status_line(snapshot),
+            _status_line(snapshot),
             status=estimate.status.name.lower(),
             before=None if before is None else before.name.lower(),
             reasons=reason_ids(estimate.reasons),
@@ -447,7 +447,7 @@ class Monitor:
         )
 
 
-def status_line(snapshot: Snapshot) -> str:
+def _status_line(snapshot: Snapshot) -> str:
     """Return a snapshot in one line, such as "SoC 71.2 ± 0.8 %, valid, 10.0 samples/s"."""
     estimate = snapshot.estimate
     soc = f"SoC {number(estimate.soc_pct, 1)} ± {number(estimate.soc_std_pct, 1, '%')}"

@@ -41,7 +41,7 @@ _WINDOW: Final = 8
 """The signature of an object ends at most this many bytes after the object before."""
 
 
-class CheckedBlf:
+class _CheckedBlf:
     """A BLF file for python-can's reader, with checked sizes and unpacked containers.
 
     Parameters
@@ -268,7 +268,7 @@ def library_messages(kind: LibraryFormat, path: Path) -> Iterator[can.Message]:
         yield from mf4_messages(path)
         return
     with open_bytes(path) as raw:
-        file: Any = _Lines(raw) if kind.is_text else CheckedBlf(raw)
+        file: Any = _Lines(raw) if kind.is_text else _CheckedBlf(raw)
         yield from kind.reader(file)
 
 
