@@ -302,7 +302,7 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside `path` and rename it to `path` when the block succeeds.
 
     The temporary file exists (empty), is on the same file system and keeps the suffix. If the
-    block raises, it is removed and `path` stays as it was. The content is synced to disk before
+    block raises, it is removed and `path` is unchanged. The content is synced to disk before
     the rename: a power cut leaves the old file or the new one. A device or pipe (`/dev/stdout`)
     cannot be replaced and is yielded itself.
 

@@ -159,7 +159,7 @@ class SignalCodec:
         return decode_integer if sign_bit or not_available else decode_plain
 
     def is_in(self, payload: bytes | bytearray) -> bool:
-        """Return whether the signal is present, according to the multiplexers if any."""
+        """Return whether the signal is present, according to its multiplexers, if any."""
         return all(each.field.get(payload) in each.values for each in self.conditions)
 
     def encode_into(self, payload: bytearray, value: float) -> None:
@@ -562,7 +562,7 @@ def _signal_cure(database: Database, owner: Message, signal: str) -> str:
     if near:
         return f"did you mean {near}?"
     shown = ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
-    return f"it has {shown}" if shown else "it has no signals at all"
+    return f"it has {shown}" if shown else "it has no signals"
 
 
 def _first_line(error: Exception) -> str:

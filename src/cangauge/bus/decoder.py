@@ -115,7 +115,7 @@ class Pairing:
     )
 
     def __init__(self, within_s: float, statistics: FrameStatistics | None = None) -> None:
-        # Slightly more than stated: stamps 20 ms apart must pair whatever their rounding.
+        # Slightly more than stated: stamps 20 ms apart must pair in spite of rounding.
         self._within_s = within_s + 1e-6
         self.statistics = statistics or FrameStatistics()
         self._current_s = self._voltage_s = math.nan  # NaN: no value waits

@@ -147,7 +147,7 @@ class ProtectionRule:
         return all(0 <= place < length for place in found) and len(found) == len(places)
 
     def crc(self, data: bytes | bytearray) -> int:
-        """Return the CRC of a payload, whatever its CRC byte holds."""
+        """Return the CRC of a payload, independent of its CRC byte."""
         table, crc = self._table, self.initial
         if self.crc_byte == -1:
             covered = data[:-1]

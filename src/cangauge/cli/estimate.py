@@ -27,7 +27,6 @@ from cangauge.cli.options import (
     check_outputs,
     known_temperature_source,
     load_log,
-    note_not_a_capture,
     refuse_inverted_current,
     refuse_single_row,
     within,
@@ -130,9 +129,8 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     )
     check_outputs([output, report], [log_path, model_path])
     model = Model.load(model_path)
-    is_described = vehicle is not None or dbc is not None or map_file is not None
     if isinstance(open_recording(log_path), Capture):
-        if not is_described:
+        if (vehicle, dbc, map_file) == (None, None, None):
             raise capture_without_vehicle(log_path)
         car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature)
         source = known_temperature_source(temperature_source) or "unknown"
@@ -143,12 +141,13 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     else:
         log = load_log(
             log_path,
+            vehicle=vehicle,
+            dbc=dbc,
+            map_file=map_file,
             temperature_c=temperature,
             temperature_source=temperature_source,
             refuse_inverted=True,
         )
-        if is_described:
-            note_not_a_capture(log_path)
         with _progress(len(log)) as progress:
             done = estimate_recorded_log(
                 log,

@@ -114,7 +114,7 @@ def load_log(
         if is_capture:
             car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature_c)
         else:
-            note_not_a_capture(path)
+            note(f"{path}: a log, not a capture: --vehicle, --dbc and --map do not apply to it")
     log = log_of(recording, car, temperature_c=temperature_c, temperature_source=source)
     if refuse_inverted:
         refuse_single_row(log)
@@ -190,11 +190,6 @@ def refuse_inverted_current(log: Log, *, is_capture: bool) -> None:
         raise InputError(
             error.problem, source=error.source, field=error.field, cure=cure
         ) from error
-
-
-def note_not_a_capture(path: Path) -> None:
-    """Note on stderr that the options for captures are ignored."""
-    note(f"{path}: a log, not a capture: --vehicle, --dbc and --map do not apply to it")
 
 
 def known_temperature_source(given: str | None) -> TemperatureSource | None:

@@ -107,7 +107,7 @@ class LogSource:
 class CaptureSource:
     """The frames of a capture, as recorded.
 
-    Frames of cangauge itself are left out. If REPLAY_CLOCK is among them, log time is that of the
+    Frames of cangauge itself are dropped. If REPLAY_CLOCK is among them, log time is that of the
     replayed log, else the recorded stamps.
 
     Parameters
@@ -128,7 +128,7 @@ class CaptureSource:
         self._ids = ids or FrameIds()
         self.name = self._path.name
         self.dropped = 0
-        """Frames left out in the latest pass: those of cangauge itself, and error frames."""
+        """Frames dropped in the latest pass: those of cangauge itself, and error frames."""
 
     @property
     def counts_samples(self) -> bool:

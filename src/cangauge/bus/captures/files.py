@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
 
 Stamps = Literal["us", "ms", "none"]
-"""Resolution of time stamps: microseconds or finer, whole milliseconds, or no stamps at all."""
+"""Resolution of time stamps: microseconds or finer, whole milliseconds, or no stamps."""
 
 _HEAD_BYTES: Final = 64 * 1024
 
@@ -123,7 +123,7 @@ def _split(path: Path) -> tuple[str, str]:
 
 
 def open_bytes(path: Path) -> io.BufferedReader:
-    """Open a capture file, unpacking gzip whatever its name; see `open_unpacked`."""
+    """Open a capture file, unpacking gzip, recognised by content; see `open_unpacked`."""
     return open_unpacked(path, MAX_CAPTURE_BYTES)
 
 
