@@ -38,8 +38,8 @@ from cangauge.model.delay_line import GAP_S
 from cangauge.model.model_file import Model
 from cangauge.service.estimate_table import require_table_suffix, write_estimates
 from cangauge.service.offline import (
+    RecordedCapture,
     RecordedEstimate,
-    Recording,
     estimate_recorded_capture,
     estimate_recorded_log,
     require_same_pack,
@@ -215,7 +215,7 @@ def _check_capture(done: RecordedEstimate, model: Model) -> None:
     for remark in recorded.remarks:
         note(f"{recorded.source}: {remark}")
     require_same_pack(recorded, model)
-    if isinstance(recorded, Recording) and (log := recorded.as_log()) is not None:
+    if isinstance(recorded, RecordedCapture) and (log := recorded.as_log()) is not None:
         refuse_inverted_current(log, is_capture=True)
 
 

@@ -53,7 +53,7 @@ Origin = Literal["given", "log", "voltage"]
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class RecordedCapture:
     """Samples of a capture: unlike a log's rows, they may lack voltage and temperature.
 
     Parameters
@@ -107,7 +107,7 @@ class Recording:
         )
 
 
-Recorded = Log | Recording
+Recorded = Log | RecordedCapture
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +244,7 @@ def estimate_recorded_capture(
     if settings.temperature_source == "unknown":
         settings = replace(settings, temperature_source=vehicle.temperature_source)
     found = estimate_capture(path, vehicle, model, settings, progress=progress)
-    recording = Recording(
+    recording = RecordedCapture(
         time_s=_unwrapped(found.time_s),
         current_a=found.current_a,
         voltage_v=found.voltage_v,
