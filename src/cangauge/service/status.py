@@ -25,10 +25,10 @@ from cangauge.estimate.validity import Estimate, Reason, Sample, Status, reason_
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.recording import Recorder, RecordState
+from cangauge.service.status_client import SCHEMA
 
 _LOG = logging.getLogger(__name__)
 
-SCHEMA: Final = 1
 STUCK_S: Final = 2.0
 """Age of a snapshot above which the receive loop counts as stuck, and its SoC as stale [s]."""
 SHOW_EVERY_S: Final = 0.25
