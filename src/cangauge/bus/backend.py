@@ -163,7 +163,7 @@ class NoPendingFrameError(Exception):
 
 
 class PendingFrames(Protocol):
-    """Reads the frames that are pending in the socket of a bus."""
+    """Read the frames that are pending in the socket of a bus."""
 
     def next(self) -> can.Message | None:
         """Return the next pending frame; None for one that does not pass the filters.

@@ -85,7 +85,7 @@ class FrameStatistics:
 
 
 class Pairing:
-    """Pairs currents and voltages into samples.
+    """Pair currents and voltages into samples.
 
     - A current and a voltage at most `within_s` apart make a sample, stamped with the current's
       time, when the later of the two arrives. Each value is used once.

@@ -37,7 +37,7 @@ class _Outgoing:
 
 
 class FrameEncoder:
-    """Makes frames of samples; the inverse of `SampleDecoder`.
+    """Encode samples as frames; the inverse of `SampleDecoder`.
 
     Slow signals (temperature, SoC) come first, so that they apply to their own sample; then
     current; then voltage. Slow ones are sent when their quantized value changes, and every

@@ -198,7 +198,7 @@ class MessageStatistics:
 
 
 class SignalHealth:
-    """Checks the values of one signal in order of time.
+    """Check the values of one signal in order of time.
 
     Parameters
     ----------
@@ -378,7 +378,7 @@ UNKNOWN_STEP: Final = 0.0025
 
 
 class StuckDetector:
-    """Detects that a signal is constant while its partner swings.
+    """Detect a signal that is constant while its partner swings.
 
     Made by `stuck_detectors`.
 
@@ -515,10 +515,10 @@ def stuck_detectors(
 
 
 class ConstantDetector:
-    """Detects that a signal has been constant for a stated time.
+    """Detect a signal that has been constant for a stated time.
 
     For a temperature: slow, coarse and without a partner, it is constant for hours in a healthy
-    car. Hence only where the user states a time.
+    car. Used only where the user states a time.
 
     Parameters
     ----------

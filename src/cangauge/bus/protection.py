@@ -417,7 +417,7 @@ sooner, the sender restarted or frames came out of order: no loss is proven."""
 
 
 class FrameChecker:
-    """Checks the frames of one message in order of time.
+    """Check the frames of one message in order of time.
 
     A repeated counter is no new frame, unless enough time has passed for the counter to wrap: on a
     lossy bus one in `modulus` of the surviving frames looks like a repetition.

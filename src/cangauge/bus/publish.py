@@ -144,7 +144,7 @@ def _layouts() -> tuple[_Layout, _Layout]:
 
 
 class SocPublisher:
-    """Makes the frames of estimates.
+    """Encode estimates as SOC_ESTIMATE and SOC_DETAIL frames.
 
     Parameters
     ----------
@@ -228,7 +228,7 @@ class SocPublisher:
 
 
 class SocReader:
-    """Reads the frames of a `SocPublisher`.
+    """Decode the frames of a `SocPublisher`.
 
     Parameters
     ----------

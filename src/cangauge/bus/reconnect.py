@@ -202,7 +202,7 @@ class ReconnectingBus(BusConnection):
         self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
 
     def _reconnect(self, timeout_s: float) -> None:
-        """Start an attempt when it is due, or wait for the one under way."""
+        """Start an attempt when it is due, or wait for the current one."""
         if self._attempt is None:
             left_s = self._retry_at_s - time.monotonic()
             if left_s > 0.0:

@@ -33,7 +33,7 @@ def whole_us(time_s: float) -> int:
 
 
 class TimeSource(Protocol):
-    """Gives each frame its bus time."""
+    """Source of the bus time of each frame."""
 
     beginnings: int
     """Number of new logs so far, after the first."""
@@ -131,7 +131,7 @@ def is_clock(message: can.Message, clock_id: int = REPLAY_CLOCK_ID) -> bool:
 
 
 class ClockFrames:
-    """Makes REPLAY_CLOCK frames.
+    """Encode log times as REPLAY_CLOCK frames.
 
     Parameters
     ----------

@@ -294,7 +294,7 @@ class Vehicle:
 
 
 class _Binder:
-    """Finds the signals of a map file in its DBC files.
+    """Find the signals of a map file in its DBC files.
 
     Parameters
     ----------

@@ -251,7 +251,7 @@ class _Player:
 
 
 class Pacer:
-    """Waits for moments of log time.
+    """Wait for moments of log time.
 
     All moments are counted from the first, on the monotonic clock: errors do not accumulate, and a
     late frame does not delay the rest.

@@ -155,7 +155,7 @@ class FullChargeConfig(_Strict):
     """Condition of a full pack; see `FullCharge`."""
 
     voltage_v: FiniteFloat = _key(..., "Least voltage.", unit="V", gt=0.0, le=1e4)
-    current_a: FiniteFloat = _key(..., "Largest current, either way.", unit="A", ge=0.0, le=5e3)
+    current_a: FiniteFloat = _key(..., "Largest absolute current.", unit="A", ge=0.0, le=5e3)
     hold_s: FiniteFloat = _key(60.0, "Duration of both.", unit="s", ge=0.0, le=86400.0)
     soc_pct: FiniteFloat = _key(100.0, "SoC then.", unit="%", ge=0.0, le=100.0)
     soc_std_pct: FiniteFloat = _key(0.5, "Its standard deviation.", unit="%", ge=0.01, le=100.0)

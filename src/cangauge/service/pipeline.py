@@ -85,7 +85,7 @@ class PipelineSettings:
 
 
 class Pipeline:
-    """Estimates the SoC from a vehicle's frames, and makes the frames to publish.
+    """Estimate the SoC from a vehicle's frames, and make the frames to publish.
 
     When the replay clock jumps back a new log has begun: decoder and estimator restart.
 

@@ -77,7 +77,7 @@ class RecordState:
 
 @dataclass(frozen=True)
 class RecordLimits:
-    """Size and duration of a recording's parts, and how much of it is kept.
+    """Limits of a recording: size and duration of its parts, and its total size.
 
     Without limits it is one file. If that exists already (a restarted service must not overwrite
     its predecessor's recording), or with any limit, runs and parts are numbered.
@@ -156,9 +156,7 @@ class Recorder:
         _check_writable(path)
         self._clock = clock
         self._base = path
-        self._in_parts = (
-            self._limits.in_parts or self._kind in IN_PARTS_ONLY or _holds_something(path)
-        )
+        self._in_parts = self._limits.in_parts or self._kind in IN_PARTS_ONLY or _is_not_empty(path)
         self._run = max((each.run for each in all_parts(path)), default=0) + 1
         self._part = 0
         self.path = run_path(path, self._run) if self._in_parts else path
@@ -284,7 +282,7 @@ class Recorder:
             emit(_LOG, logging.INFO, "record.removed", f"removed the oldest part: {path}")
 
 
-def _holds_something(path: Path) -> bool:
+def _is_not_empty(path: Path) -> bool:
     return path.is_file() and path.stat().st_size > 0
 
 
@@ -333,7 +331,7 @@ class _Disk:
             self.lost_frames += frames
 
     def sync(self) -> None:
-        """Force what was written onto the disk."""
+        """Flush written data to the disk."""
         self.writer.submit(lambda: _fsync(self._file))
 
     def close(self, within_s: float) -> bool:
@@ -489,7 +487,7 @@ IN_PARTS_ONLY: Final = (".blf", ".mf4")
 
 
 class _FrameWriter(Protocol):
-    """Formats frames into a `RecordBuffer`."""
+    """Format frames into a `RecordBuffer`."""
 
     def write(self, message: can.Message) -> None:
         """Write one frame."""

@@ -287,7 +287,7 @@ def _log_changes(old: RunConfig, new: RunConfig) -> None:
         if key.info.needs_restart and _value(before, key.name) != _value(after, key.name)
     ]
     if late:
-        text = f"{', '.join(late)}: takes effect when the service is restarted"
+        text = f"{', '.join(late)}: takes effect after a restart of the service"
         emit(_LOG, logging.WARNING, "config.needs_restart", text)
 
 

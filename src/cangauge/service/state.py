@@ -132,7 +132,7 @@ class StateKeeper:
         """True if the estimator continued from the file."""
 
     def __enter__(self) -> Self:
-        self._sweep()
+        self._remove_temporary()
         self._restore()
         return self
 
@@ -149,7 +149,7 @@ class StateKeeper:
 
     def checkpoint(self) -> None:
         """Start saving the state if it has new samples; return at once."""
-        self._log_verdict()
+        self._log_decision()
         if self._pipeline.samples == self._samples_kept:
             return
         state = self._pipeline.snapshot()
@@ -248,7 +248,7 @@ class StateKeeper:
         text = f"state refused: {error}{kept}; starting {how}"
         emit(_LOG, logging.WARNING, "state.refused", text)
 
-    def _sweep(self) -> None:
+    def _remove_temporary(self) -> None:
         """Remove temporary files of a process that was killed while writing."""
         path = Path(os.path.realpath(self.settings.path))
         left = re.compile(rf"\.{re.escape(path.stem[:200])}\.[0-9a-f]{{8}}{re.escape(path.suffix)}")
@@ -260,7 +260,7 @@ class StateKeeper:
     def _write(self, content: StateContent) -> None:
         write_text_atomic(self.settings.path, state_text(content))
 
-    def _log_verdict(self) -> None:
+    def _log_decision(self) -> None:
         verdict = self._pipeline.estimator.filter.verdict
         if self._restored_pct is None or verdict in {"", "open"}:
             return
