@@ -35,9 +35,9 @@ from cangauge.estimate.validity import Estimate
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from cangauge.replay.player import ReplaySettings, play
-from cangauge.replay.steps import LogSource, quantisation_bound
-from cangauge.service.capture_estimate import estimate_capture
+from cangauge.replay.steps import LogSource, quantization_bound
 from cangauge.service.loop import LoopSettings, Outputs, serve
+from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
 from real_trips import DATA, JUDGED_S, TEST, TRAINING, identify, read_trips
@@ -96,7 +96,7 @@ def compare(log: Log, vehicle: Vehicle, model: Model, address: BusAddress) -> Co
     settings = EstimatorSettings(temperature_source=vehicle.temperature_source)
     offline = run_estimator(samples_of(log), model, settings)
     live = {name: np.array([getattr(each, name) for each in rows]) for name in NUMBERS}
-    bound = quantisation_bound(vehicle, model, log)
+    bound = quantization_bound(vehicle, model, log)
 
     def largest(name: str) -> float:
         return float(np.nanmax(np.abs(live[name] - getattr(offline, name))))

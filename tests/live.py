@@ -45,7 +45,7 @@ def leaf_model() -> Model:
 
 
 def short_log(seconds: float = 100.0, rate_hz: float = 10.0, *, noise_v: float = 0.3) -> Log:
-    """Return a drive from 80 %, in values with many digits, so that quantisation shows."""
+    """Return a drive from 80 %, in values with many digits, so that quantization shows."""
     return synthetic_log(
         hours=seconds / 3600.0,
         rate_hz=rate_hz,

@@ -15,7 +15,7 @@ Positive current discharges, everywhere.
 `CangaugeError`, `InputError`             failures; wrong input, with field, value and cure
 ========================================  ==========================================================
 
-A name is loaded when it is first used: `import cangauge` alone costs next to nothing.
+Names are loaded on first use: `import cangauge` alone imports nothing else.
 
 Examples
 --------

@@ -16,8 +16,8 @@ from cangauge.errors import InputError, closest
 _KEY_PART: Final = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+"""
 _LONG_KEY: Final = re.compile(rf"(?<![\w-])(?:{_KEY_PART}){{{MAX_TOML_KEY}}}")
 _UNION_TAGS: Final = {"bool", "int", "float", "str", "constrained-int", "constrained-float"}
-# pydantic's words where ours are shorter.
-_WORDS: Final = (
+# Wording of pydantic, and the shorter one of our messages.
+_WORDING: Final = (
     ("Value error, ", ""),
     ("Input should be", "must be"),
     ("greater than or equal to", "at least"),
@@ -41,14 +41,14 @@ def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
         if _LONG_KEY.search(text):
             raise ValueError(f"a key of more than {MAX_TOML_KEY} parts")  # noqa: TRY301 - as tomllib
         return tomllib.loads(text)
-    except ValueError as error:  # TOMLDecodeError; what is not UTF-8; numbers of 5,000 digits
+    except ValueError as error:  # TOMLDecodeError; not UTF-8; an integer of 5,000 digits
         raise InputError(f"not TOML: {error}", source=path) from error
     except RecursionError as error:
         raise InputError("not TOML: nested too deeply", source=path) from error
 
 
 def validated(model: type[Model], data: object, source: str | PathLike[str]) -> Model:
-    """Return `data` as a model; raise InputError for the first error (see `schema_error`)."""
+    """Check `data` against a model; raise InputError for the first error (see `schema_error`)."""
     try:
         return model.model_validate(data)
     except ValidationError as error:
@@ -89,7 +89,7 @@ def schema_error(
     elif first["type"] in {"model_type", "model_attributes_type", "dict_type"}:
         problem = "must be a table"
     else:
-        for theirs, ours in _WORDS:
+        for theirs, ours in _WORDING:
             problem = problem.replace(theirs, ours, 1)
         problem = problem[0].lower() + problem[1:]
     return InputError(

@@ -1,4 +1,4 @@
-"""Export of tables to data frames: pandas, polars, and whatever reads the Arrow interface."""
+"""Export of tables to pandas, polars and any library that reads the Arrow C interface."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from cangauge.errors import InputError
 
 
 class ArrowExport:
-    """Data frames of anything with columns that can be an Arrow table.
+    """Base of tables that convert to data frames through Arrow.
 
-    pandas and polars are imported when asked for; neither is a dependency.
+    pandas and polars are optional: each is imported by its own method.
     """
 
     __slots__ = ()

@@ -6,9 +6,9 @@ import math
 from typing import Final
 
 NONE_KNOWN: Final = "–"
-"""Stands for a number that is not known."""
+"""Shown in place of an unknown number."""
 LONGEST_WHOLE: Final = 1e6
-"""Larger numbers are written with a power of ten."""
+"""Numbers from here on are written with a power of ten."""
 
 
 def number(value: float | None, digits: int = 3, unit: str = "") -> str:

@@ -1,7 +1,7 @@
-"""Files: limits on what is read, opening what a user names, writing all or nothing.
+"""File access: size limits, safe opening of user-named paths, atomic writing.
 
-Limits stand far above what real files need and far below what hurts the machine. A file beyond
-one is refused by an `InputError` before the time or the memory is spent.
+Limits are far above real files and far below the memory of a small machine. A file beyond a limit
+raises `InputError` before it costs time or memory.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import os
 import secrets
 import stat
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final, cast
@@ -39,7 +39,7 @@ MAX_LOG_ROWS: Final = 20_000_000
 """Rows of a log, samples of a capture: 23 days at 10 Hz, 0.8 GB as float64."""
 MAX_LOG_COLUMNS: Final = 10_000
 MAX_LOG_SPAN_S: Final = 366 * 86400.0
-"""First to last row [s]: a clock set within a log makes decades seem to pass."""
+"""First to last row [s]: setting the clock within a log can add decades."""
 MAX_HEADING: Final = 200
 """Longest column heading that is parsed [characters]."""
 MAX_ODD_ROWS: Final = 100
@@ -85,7 +85,7 @@ MAX_SPEED_TRACE_BYTES: Final = 64 * MIB
 # --- Reading
 
 _GZIP: Final = b"\x1f\x8b"
-# Opening these would block for ever, never end, or act on a machine.
+# Opening these could block, never end, or trigger a device.
 _NOT_FILES: Final = (
     (stat.S_ISFIFO, "this is a pipe (FIFO), not a file"),
     (stat.S_ISCHR, "this is a device, not a file"),
@@ -200,8 +200,8 @@ class _Bounded(io.RawIOBase):
         self._delivered += len(part)
         if self._delivered > self._limit:
             raise InputError(
-                f"unpacks to more than {_megabytes(self._limit)}, which no recording of its size"
-                " does",
+                f"unpacks to more than {_megabytes(self._limit)}, too much for a recording of its"
+                " size",
                 source=self._path,
                 cure="unpack it and check its content",
             )
@@ -286,7 +286,7 @@ def _unreadable(error: OSError | ValueError, path: str | PathLike[str]) -> Input
 # --- Writing
 
 FULL: Final = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
-"""Errors of a full or failing disk, which may pass."""
+"""Errors of a full or failing disk, which can be temporary."""
 _WRITE_ERRORS: Final[dict[int, tuple[str, str]]] = {
     errno.ENOENT: ("the folder of this file does not exist", "create it or name another one"),
     errno.ENOTDIR: ("a part of this path is a file, not a folder", "name another path"),
@@ -302,7 +302,7 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside `path` and rename it to `path` when the block succeeds.
 
     The temporary file exists (empty), is on the same file system and keeps the suffix. If the
-    block raises, it is removed and `path` stays as it was. The content is synced to disk before
+    block raises, it is removed and `path` is unchanged. The content is synced to disk before
     the rename: a power cut leaves the old file or the new one. A device or pipe (`/dev/stdout`)
     cannot be replaced and is yielded itself.
 
@@ -351,6 +351,14 @@ def write_text_atomic(path: str | PathLike[str], text: str) -> None:
     """Write `text` as UTF-8 to `path`, all or nothing (see `atomic_path`)."""
     with atomic_path(path) as part:
         part.write_text(text, encoding="utf-8", newline="\n")
+
+
+def write_texts_atomic(texts: Mapping[Path, str]) -> None:
+    """Write several files as UTF-8, all or none (see `atomic_path`)."""
+    with ExitStack() as stack:
+        for path, text in texts.items():
+            part = stack.enter_context(atomic_path(path))
+            part.write_text(text, encoding="utf-8", newline="\n")
 
 
 def check_writable(path: str | PathLike[str]) -> None:

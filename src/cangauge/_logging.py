@@ -6,7 +6,7 @@ Modules log through the standard library and name their event::
     emit(_LOG, logging.WARNING, "bus.lost", "socketcan can0 is down", retry_s=1.0)
 
 Event names (`area.what_happened`) are stable, so that logs can be searched and counted; texts may
-change. `RateLimitFilter` is the only rate limiter: whoever logs need not keep count.
+change. `RateLimitFilter` limits the rate of all events: callers log every occurrence.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ FIRST_INTERVAL_S: Final = 1.0
 LONGEST_INTERVAL_S: Final = 60.0
 """… up to this [s]. An event that was quiet for longer starts again at the first interval."""
 EVENTS_KEPT: Final = 256
-"""Number of different events whose repetitions are tracked: bounds the memory."""
+"""Most events whose repetitions are tracked, to bound the memory."""
 
 _UNNAMED: Final = "log"
-"""Event of a record without one: those of other libraries."""
+"""Event name of records from other libraries."""
 
 
 def emit(
@@ -112,7 +112,7 @@ class _Handler(logging.StreamHandler[TextIO]):
             self.release()
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
-        """Ignore it: a closed stderr must not end the service, and cannot be reported."""
+        """Ignore errors: a closed stderr must not end the service, and cannot be reported."""
 
 
 class TextFormatter(logging.Formatter):
@@ -129,7 +129,7 @@ class TextFormatter(logging.Formatter):
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object a line: `time`, `level`, `event`, `message`, `logger` and the fields."""
+    """One JSON object per line: `time`, `level`, `event`, `message`, `logger` and the fields."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""

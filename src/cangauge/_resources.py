@@ -49,8 +49,8 @@ def shared_file(folder: str, name: str) -> Path:
 def one_thread(environment: MutableMapping[str, str]) -> None:
     """Limit BLAS to one thread where the user has not set it; before numpy is imported.
 
-    cangauge solves thousands of small systems, which threads do not make faster. On a busy core
-    they wait for each other, and a diagnosis takes many times as long.
+    cangauge solves thousands of small systems, which gain nothing from threads. On busy cores,
+    threads that wait for each other slow a diagnosis down many times.
     """
     for name in THREADS:
         environment.setdefault(name, "1")

@@ -1,4 +1,4 @@
-"""Exceptions that cangauge raises on purpose, with exit codes; suggestions for misspelt names."""
+"""Exceptions of cangauge with their exit codes; suggestions for misspelt names."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def _shown(value: object) -> str:
 
 
 def _plain(value: object) -> bool | float | str | None:
-    """Return a number or text as it is, anything else as the message quotes it."""
+    """Return numbers and text unchanged, anything else as quoted in the message."""
     if hasattr(value, "tolist"):  # numpy's
         value = value.tolist()
     if value is None or isinstance(value, bool | float):

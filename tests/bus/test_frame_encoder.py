@@ -65,16 +65,16 @@ def rows_of(log: Log) -> list[Sample]:
 @pytest.mark.parametrize("name", list(VEHICLES))
 @settings(max_examples=60, deadline=None)
 @given(log=logs)
-def test_the_decoder_gives_the_quantised_log_bit_for_bit(name: str, log: Log) -> None:
+def test_the_decoder_gives_the_quantized_log_bit_for_bit(name: str, log: Log) -> None:
     vehicle = VEHICLES[name]
     encoder = FrameEncoder(vehicle)
     encoder.check_range(log)
     # Time goes through REPLAY_CLOCK, which is not part of these frames.
-    quantised = encoder.quantise(log)
+    quantized = encoder.quantize(log)
     samples, references = through_frames(vehicle, log)
-    assert [each[1:] for each in samples] == [each[1:] for each in rows_of(quantised)]
-    assert quantised.soc_pct is not None
-    for got, wanted in zip(references, quantised.soc_pct.tolist(), strict=True):
+    assert [each[1:] for each in samples] == [each[1:] for each in rows_of(quantized)]
+    assert quantized.soc_pct is not None
+    for got, wanted in zip(references, quantized.soc_pct.tolist(), strict=True):
         if not math.isnan(wanted):
             assert got == wanted
 
@@ -84,16 +84,16 @@ def test_the_decoder_gives_the_quantised_log_bit_for_bit(name: str, log: Log) ->
 @given(log=logs)
 def test_quantization_stays_within_the_bound(name: str, log: Log) -> None:
     encoder = FrameEncoder(VEHICLES[name])
-    bound, quantised = encoder.quantisation(), encoder.quantise(log)
+    bound, quantized = encoder.quantization(), encoder.quantize(log)
     for field in ("time_s", "current_a", "voltage_v", "temperature_c", "soc_pct"):
         if field not in bound:
             continue  # a fixed temperature
-        error = np.abs(getattr(quantised, field) - getattr(log, field))
+        error = np.abs(getattr(quantized, field) - getattr(log, field))
         assert np.nanmax(error, initial=0.0) <= bound[field] * (1 + 1e-6)
 
 
 def test_the_bounds_are_those_of_the_dbc() -> None:
-    generic = FrameEncoder(VEHICLES["generic"]).quantisation()
+    generic = FrameEncoder(VEHICLES["generic"]).quantization()
     assert generic == {
         "current_a": 0.00005,
         "voltage_v": 0.00005,
@@ -101,7 +101,7 @@ def test_the_bounds_are_those_of_the_dbc() -> None:
         "soc_pct": 0.0025,
         "time_s": 0.5e-6,
     }
-    leaf = FrameEncoder(VEHICLES["leaf_ze1"]).quantisation()
+    leaf = FrameEncoder(VEHICLES["leaf_ze1"]).quantization()
     assert leaf == {"current_a": 0.25, "voltage_v": 0.25, "soc_pct": 0.05, "time_s": 0.5e-6}
 
 

@@ -148,7 +148,7 @@ def test_other_protected_ids_are_found(
 
 def test_jumps_with_valid_crcs_are_losses_not_refusals(folder: Path) -> None:
     samples = capture_samples(folder / LOSSY, vehicle_of(LOSSY))
-    fate = samples.counters.messages[0x1DB]
+    fate = samples.statistics.messages[0x1DB]
     assert (fate.wanted, fate.crc_errors, fate.counter_repeats) == (1911, 0, 0)
     assert fate.counter_jumps == 488
     # 89 counters repeat after 4 periods or more: 3 or more frames are missing there.
@@ -158,7 +158,7 @@ def test_jumps_with_valid_crcs_are_losses_not_refusals(folder: Path) -> None:
 
 @pytest.mark.parametrize("name", [name for name in CAPTURES if name != LOSSY])
 def test_the_other_captures_lost_nothing(folder: Path, name: str) -> None:
-    counters = capture_samples(folder / name, vehicle_of(name)).counters
+    counters = capture_samples(folder / name, vehicle_of(name)).statistics
     assert (counters.counter_jumps, counters.counter_repeats, counters.crc_errors) == (0, 0, 0)
 
 
@@ -166,7 +166,7 @@ def test_the_other_captures_lost_nothing(folder: Path, name: str) -> None:
 def test_codes_of_wake_up_never_become_values(folder: Path, name: str) -> None:
     currents, voltages = WAKE_UP.get(name, (0, 0))
     samples = capture_samples(folder / name, vehicle_of(name))
-    fate = samples.counters.messages[0x1DB]
+    fate = samples.statistics.messages[0x1DB]
     assert fate.not_available == currents + voltages
     assert len(samples) == CAPTURES[name][3] - currents
     assert np.count_nonzero(np.isnan(samples.voltage_v)) == voltages - currents

@@ -189,7 +189,7 @@ def test_a_bus_that_is_missing_at_the_start(log: BusLog) -> None:
     assert (port.losses, port.unsent, port.trouble) == (0, 1, "")
     assert log.events == ["bus.missing", "bus.back"]
     assert "waiting for it" in log.lines[0]
-    assert "there after" in log.lines[1]
+    assert "available after" in log.lines[1]
     port.close()
 
 

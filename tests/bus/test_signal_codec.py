@@ -75,7 +75,7 @@ def test_rounds_to_the_nearest_step(value: float, factor: float) -> None:
     found.encode_into(payload, value)
     decoded = found.decode(payload)
     assert abs(decoded - value) <= found.half_step * (1 + 1e-9)
-    assert float(found.quantise(np.array([value]))[0]) == decoded
+    assert float(found.quantize(np.array([value]))[0]) == decoded
 
 
 @pytest.mark.parametrize(("width", "kind"), [(32, 1), (64, 2)])
@@ -87,7 +87,7 @@ def test_floats_are_exact(width: int, kind: int) -> None:
     for value in (0.0, -12.375, 300.25):
         found.encode_into(payload, value)
         assert found.decode(payload) == value
-        assert float(found.quantise(np.array([value]))[0]) == value
+        assert float(found.quantize(np.array([value]))[0]) == value
     found.field.put(payload, (1 << width) - 1)  # a NaN
     assert math.isnan(found.decode(payload))
     assert found.half_step == 0.0

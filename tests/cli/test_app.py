@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from importlib import import_module
 
 import pytest
 import typer
@@ -21,6 +22,13 @@ def test_each_command_loads_and_has_help(name: str) -> None:
     command = typer.main.get_command(app).get_command(None, name)  # type: ignore[attr-defined, arg-type] # a group, which needs no context
     assert command.name == name
     assert command.help
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_listing_repeats_the_first_line_of_each_docstring(name: str) -> None:
+    module = name.replace("-", "_")
+    command = getattr(import_module(f"cangauge.cli.{module}"), f"{module}_command")
+    assert command.__doc__.partition("\n")[0] == COMMANDS[name]
 
 
 def test_run_imports_no_module_of_other_commands() -> None:

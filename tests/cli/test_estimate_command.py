@@ -21,8 +21,8 @@ from cangauge.estimate.settings import EstimatorSettings
 from cangauge.logs.canonical import write_log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
-from cangauge.service.capture_estimate import estimate_capture
-from cangauge.service.offline import read_estimates, write_estimates
+from cangauge.service.estimate_table import read_estimates, write_estimates
+from cangauge.service.offline import estimate_capture
 
 Run = Callable[..., object]
 

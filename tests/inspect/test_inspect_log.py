@@ -19,7 +19,7 @@ from cangauge.logs.read import read_log
 
 
 def drive(minutes: float = 30.0, *, rate_hz: float = 10.0, seed: int = 1) -> Log:
-    """A drive whose current changes every 4 s, 0.1 Ω, quantised to 0.5 A, 0.25 V and 1 °C."""
+    """A drive whose current changes every 4 s, 0.1 Ω, quantized to 0.5 A, 0.25 V and 1 °C."""
     rng = np.random.default_rng(seed)
     time = np.arange(round(minutes * 60 * rate_hz)) / rate_hz
     level = rng.normal(20.0, 50.0, int(time[-1] // 4) + 1)
@@ -182,7 +182,7 @@ def test_tiny_logs_do_not_break_it(rows: int) -> None:
     offset=st.floats(-500.0, 500.0),
     seed=st.integers(0, 1000),
 )
-def test_the_step_of_quantisation_is_found(
+def test_the_step_of_quantization_is_found(
     step: float, levels: int, offset: float, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)

@@ -102,7 +102,7 @@ def test_a_second_voltage_in_place_of_the_temperature(tmp_path: Path) -> None:
 
 def test_a_code_is_no_voltage(tmp_path: Path) -> None:
     log = replace(steady(3.7), temperature_c=np.full(len(steady(3.7)), 128.0))
-    assert refusal(log, tmp_path).problem == "this is no battery's temperature in °C"
+    assert refusal(log, tmp_path).problem == "this is not a battery's temperature in °C"
 
 
 def test_a_few_wrong_rows_do_not_decide() -> None:

@@ -50,7 +50,7 @@ def test_cells_and_packs_pass(voltage_v: float, peak_a: float, interval_s: float
         ("voltage_v", lambda v: -v, "median voltage is not positive", "polarity"),
         ("current_a", lambda v: v * 1000.0, "milliamperes", "1000"),
         ("temperature_c", lambda v: v + 273.15, "kelvin", "273.15"),
-        ("temperature_c", lambda v: v * 30.0, "no battery's temperature", "°C"),
+        ("temperature_c", lambda v: v * 30.0, "not a battery's temperature", "°C"),
         ("time_s", lambda v: v * 1000.0, "milliseconds", "1000"),
         ("time_s", lambda v: 1.7e12 + v * 1000.0, "milliseconds since 1970", "1000"),
         ("time_s", lambda v: v / 3600.0, "hours or days", "seconds"),
@@ -103,7 +103,7 @@ def test_a_cell_in_millivolts_and_a_pack_code_for_not_available() -> None:
         checked(values)
     values = drive()
     values["temperature_c"][7] = 215.0
-    with pytest.raises(InputError, match="row 8 is no battery's temperature"):
+    with pytest.raises(InputError, match="row 8 is not a battery's temperature"):
         checked(values)
     values = drive()
     values["current_a"][7] = 3276.7

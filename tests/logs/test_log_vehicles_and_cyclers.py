@@ -43,7 +43,7 @@ def test_i3_without_its_columns_is_refused(
 ) -> None:
     text = build_i3(["0;0;0;391.4;-2;21;22;86.9;100;90"]).replace(b"Battery Current", b"Amps")
     (tmp_path / "x.csv").write_bytes(text)
-    with pytest.raises(InputError, match=r"current_a: no column of this file gives it \(it has: "):
+    with pytest.raises(InputError, match=r"current_a: no column of this file holds it \(found: "):
         read_log(tmp_path / "x.csv")
 
 
@@ -67,7 +67,7 @@ def test_signs_of_the_cyclers(tmp_path: Path, every_format: dict[str, bytes]) ->
         log = read_log(tmp_path / name)
         assert log.current_a[0] == current
     assert log.temperature_c[0] == 22.5  # mean of two sensors
-    assert any("closing line left out: 'Total Number" in text for text in log.remarks)
+    assert any("closing line omitted: 'Total Number" in text for text in log.remarks)
 
 
 def test_rows_that_bitrode_excludes_are_dropped(

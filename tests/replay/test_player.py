@@ -25,7 +25,7 @@ from cangauge.errors import CangaugeError, InputError
 from cangauge.estimate.offline import run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.replay.player import ReplaySettings, ReplayState, play
-from cangauge.replay.steps import CaptureSource, LogSource, quantisation_bound
+from cangauge.replay.steps import CaptureSource, LogSource, quantization_bound
 from cangauge.service.pipeline import NOTHING_YET, PipelineSettings
 from cangauge.service.recording import Recorder
 from live import (
@@ -66,7 +66,7 @@ def test_replayed_soc_is_offline_soc_within_the_bound(preset: str, method: str) 
     assert service.pipeline.counts.lost == 0
     offline = run_estimator(samples_of(log), model, estimator).soc_pct
     live = np.array([estimate.soc_pct for _, estimate in service.rows])
-    bound = quantisation_bound(vehicle, model, log)
+    bound = quantization_bound(vehicle, model, log)
     limit = {"ekf": bound.ekf_pct, "newton": bound.newton_pct, "coulomb": bound.coulomb_pct}
     worst = float(np.max(np.abs(live - offline)))
     assert worst <= limit[method] + 1e-9
@@ -76,7 +76,7 @@ def test_replayed_soc_is_offline_soc_within_the_bound(preset: str, method: str) 
 
 def test_the_bound_follows_its_equation() -> None:
     log, model = short_log(200.0), leaf_model()
-    bound = quantisation_bound(Vehicle.load("leaf_aze0"), model, log)
+    bound = quantization_bound(Vehicle.load("leaf_aze0"), model, log)
     # 0.25 A over the log's length; no stamp of this log needs rounding.
     assert bound.coulomb_pct == pytest.approx(0.25 * log.duration_s / 36.0 / 51.5, rel=1e-6)
     resistance = 0.1032 + 0.01501 + 0.009697 + 0.004652
@@ -261,7 +261,7 @@ def test_the_estimate_does_not_depend_on_the_speed() -> None:
         assert waits(lambda: service.pipeline.samples == 400)
     assert state.seconds == pytest.approx(39.9 / 40.0, abs=0.1)
     assert state.acknowledged is None
-    sent = FrameEncoder(Vehicle.load("generic")).quantise(log)
+    sent = FrameEncoder(Vehicle.load("generic")).quantize(log)
     offline = run_estimator(samples_of(sent), model, EstimatorSettings()).soc_pct
     assert [estimate.soc_pct for _, estimate in service.rows] == offline.tolist()
 

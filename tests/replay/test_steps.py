@@ -91,7 +91,7 @@ def test_several_replays_in_one_capture_are_refused(tmp_path: Path) -> None:
         frames += [clock.at(time_us), frame(0.0)]
     for number, each in enumerate(frames):
         each.timestamp = 1.7e9 + number
-    with pytest.raises(InputError, match="several replays"):
+    with pytest.raises(InputError, match="several consecutive replays"):
         list(CaptureSource(write(tmp_path / "a.log", frames)).steps(loop=False))
 
 

@@ -24,7 +24,7 @@ from cangauge.report.charts import Timeline
 from cangauge.report.estimate import estimate_page, estimate_report
 from cangauge.report.fit import fit_page, fit_report
 from cangauge.report.page import Bullets, Figure, Page, Section, Table, Tile, joined, render
-from cangauge.service.offline import RecordedEstimate, Recording
+from cangauge.service.offline import RecordedCapture, RecordedEstimate
 from report_html import MAX_PAGE_BYTES, Html, excess_width_px, title_after_scripts
 from synthetic import synthetic_log
 
@@ -204,7 +204,7 @@ def test_samples_without_voltage_or_any_estimate(found: Identification, log: Log
     page = estimate_report(
         replace(
             estimate,
-            recorded=Recording(
+            recorded=RecordedCapture(
                 few.time_s, few.current_a, nothing, nothing, nothing, "parked", "", "pack"
             ),
             table=replace(estimate.table, **dict.fromkeys(numbers, nothing)),

@@ -18,7 +18,7 @@ from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.offline import samples_of
 from cangauge.logs.canonical import write_log
-from cangauge.service.capture_estimate import estimate_capture
+from cangauge.service.offline import estimate_capture
 from cangauge.service.recording import Recorder
 from live import Command, in_process, leaf_model, leaf_model_path, run_to_end, short_log
 

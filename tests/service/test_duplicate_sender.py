@@ -13,7 +13,7 @@ from cangauge.bus.connection import BusConnection
 from cangauge.bus.open import bus_address, open_bus
 from cangauge.bus.publish import FrameIds
 from cangauge.bus.vehicle import Vehicle
-from cangauge.service.loop import RIVAL_AGAIN_S, DuplicateSenderDetector
+from cangauge.service.loop import DUPLICATE_WARN_EVERY_S, DuplicateSenderDetector
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from live import Service, leaf_model, virtual_service, waits
 
@@ -33,7 +33,7 @@ def test_two_services_warn_of_each_other_once() -> None:
         assert "0x5A" in service.warnings[0]
         assert "--soc-estimate-id" in service.warnings[0]
         assert service.summary is not None
-        assert service.summary.rival_frames >= 3
+        assert service.summary.foreign_frames >= 3
         assert service.pipeline.counts.frames == 0  # they are not input
 
 
@@ -42,7 +42,7 @@ def test_services_with_other_ids_do_not_warn() -> None:
         time.sleep(0.8)
     assert one.warnings == two.warnings == []
     assert one.summary is not None
-    assert one.summary.rival_frames == 0
+    assert one.summary.foreign_frames == 0
 
 
 def multicast_service(port: int) -> Service:
@@ -88,7 +88,7 @@ def test_single_frame_is_ignored_and_warning_repeats(
     assert not detector.handle(can.Message(arbitration_id=0x5A0, is_extended_id=True), 20.0)
     for number in range(20_000):
         detector.handle(frame(0x5A1), 30.0 + 0.1 * number)
-    assert len(caplog.messages) == 1 + 2000.0 // RIVAL_AGAIN_S
+    assert len(caplog.messages) == 1 + 2000.0 // DUPLICATE_WARN_EVERY_S
 
 
 def test_lost_echo_is_no_foreign_frame() -> None:

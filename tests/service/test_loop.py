@@ -17,8 +17,8 @@ from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.validity import Reason, Status
-from cangauge.service.capture_estimate import estimate_capture
 from cangauge.service.loop import LoopSettings
+from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
 from live import (

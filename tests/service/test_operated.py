@@ -11,7 +11,7 @@ import pytest
 
 from cangauge.bus.vehicle import Vehicle
 from cangauge.logs.canonical import write_log
-from cangauge.service.capture_estimate import estimate_capture
+from cangauge.service.offline import estimate_capture
 from live import Command, in_process, leaf_model, leaf_model_path, run_to_end, short_log
 
 pytestmark = pytest.mark.slow

@@ -57,12 +57,12 @@ def estimates(pipeline: Pipeline, frames: list[can.Message]) -> list[Estimate]:
 
 @pytest.mark.parametrize("preset", ["generic", "leaf_aze0"])
 @pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
-def test_live_equals_offline_on_quantised_values(log: Log, preset: str, method: str) -> None:
+def test_live_equals_offline_on_quantized_values(log: Log, preset: str, method: str) -> None:
     vehicle = Vehicle.load(preset)
     settings = EstimatorSettings(method=method, initial_soc_pct=80.0)  # type: ignore[arg-type] # parametrised
     pipeline = Pipeline(vehicle, leaf_model(), PipelineSettings(settings, "replay-clock"))
     live = estimates(pipeline, with_clock(frames_of(log, vehicle)))
-    offline = run_estimator(samples_of(FrameEncoder(vehicle).quantise(log)), leaf_model(), settings)
+    offline = run_estimator(samples_of(FrameEncoder(vehicle).quantize(log)), leaf_model(), settings)
     assert len(live) == len(log)
     # To the last bit.
     assert [each.soc_pct for each in live] == offline.soc_pct.tolist()

@@ -25,7 +25,7 @@ from cangauge.errors import InputError
 from cangauge.estimate.offline import samples_of
 from cangauge.replay.steps import CaptureSource
 from cangauge.service import recording
-from cangauge.service.capture_estimate import estimate_capture
+from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.recording import RecordBuffer, Recorder, RecordLimits
 from live import in_process, leaf_model, leaf_model_path, short_log, waits

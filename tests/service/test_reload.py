@@ -207,6 +207,6 @@ def test_keys_that_need_a_restart_are_logged_and_unchanged(car: Car) -> None:
     assert car.pipeline.settings.time_source == "receive"
     assert car.pipeline.settings.ids.replay_clock == 0x5AF
     assert car.said[1] == (
-        "warning: channel, time_source, ids.replay_clock: takes effect when the service is"
-        " restarted"
+        "warning: channel, time_source, ids.replay_clock: takes effect after a restart of"
+        " the service"
     )

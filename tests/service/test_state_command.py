@@ -91,7 +91,7 @@ def test_stopped_killed_and_started_again(tmp_path: Path) -> None:
         assert waits(lambda: samples_kept(path) > 202)  # counted on, not anew
         service.process.send_signal(signal.SIGTERM)
         ended = service.end()
-    assert "going on from" in ended.err
+    assert "continuing from" in ended.err
     # The seconds that starting took are counted by the mean current before: 10 s at 60 A are 0.3 %.
     assert ended.json["estimate"]["soc_pct"] == pytest.approx(kept_pct, abs=1.0)
     assert [each.name for each in tmp_path.iterdir()] == ["state.json"]

@@ -171,7 +171,7 @@ def test_a_service_restarted_at_once_goes_on_bit_for_bit(machine: Machine) -> No
     first = kept(machine, 1003)
     service = machine.start()
     assert service.keeper.restored
-    assert "going on from" in machine.text
+    assert "continuing from" in machine.text
     again = service.drive(DRIVE[1003:])
     assert numbers(first + again) == numbers(whole)
     assert again[-1] == whole[-1]
@@ -546,7 +546,7 @@ def test_a_folder_and_a_file_without_rights(machine: Machine) -> None:
     try:
         service = machine.start()
         assert "cannot be read: Permission denied" in machine.text
-        assert "cannot be put aside" in machine.text
+        assert "cannot be renamed" in machine.text
         assert service.drive(DRIVE[:10])
         service.stop()
         assert "not writable" in machine.text
@@ -609,7 +609,7 @@ def test_a_refused_state_starts_by_voltage(machine: Machine, method: Any) -> Non
     first.stop()
     machine.path.write_bytes(b"")
     again = machine.start()
-    assert "starting by voltage, for the given SoC is of an earlier start" in machine.text
+    assert "starting from the voltage, since the given initial SoC is outdated" in machine.text
     found = again.drive(DRIVE[:1000])[-1]
     assert abs(found.soc_pct - 79.0) < 3.0 * found.soc_std_pct
     assert found.soc_pct == pytest.approx(79.0, abs=4.0)

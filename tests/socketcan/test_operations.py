@@ -16,10 +16,10 @@ from cangauge.bus.open import BusAddress, has_socketcan, open_bus
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimate.offline import samples_of
 from cangauge.service.addresses import http_address
-from cangauge.service.capture_estimate import estimate_capture
 from cangauge.service.http import Endpoint
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.loop import LoopSettings, Outputs, serve
+from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.recording import Recorder, RecordLimits
 from cangauge.service.status import Identity, Monitor

@@ -24,9 +24,9 @@ from cangauge.errors import InputError
 from cangauge.estimate.offline import run_estimator, samples_of
 from cangauge.estimate.settings import EstimatorSettings
 from cangauge.replay.player import ReplaySettings, play
-from cangauge.replay.steps import CaptureSource, LogSource, quantisation_bound
-from cangauge.service.capture_estimate import estimate_capture
+from cangauge.replay.steps import CaptureSource, LogSource, quantization_bound
 from cangauge.service.loop import LoopSettings
+from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
 from live import (
@@ -130,7 +130,7 @@ def test_a_log_at_full_speed_within_the_bound_and_bit_for_bit(
     residual = np.array([estimate.residual_v for _, estimate in live.rows])
     offline = run_estimator(samples_of(log), leaf_model(), estimator)
     worst = float(np.max(np.abs(soc - offline.soc_pct)))
-    assert 0.0 < worst <= quantisation_bound(vehicle, leaf_model(), log).ekf_pct
+    assert 0.0 < worst <= quantization_bound(vehicle, leaf_model(), log).ekf_pct
     recorded = estimate_capture(path, vehicle, leaf_model(), estimator)
     assert np.array_equal(recorded.table.soc_pct, soc)
     assert np.array_equal(recorded.table.residual_v, residual, equal_nan=True)

@@ -1,1 +1,1 @@
-"""Frames ↔ samples and estimates: DBC mapping, protection, captures, publishing."""
+"""Frames ↔ samples and estimates: buses, captures, DBC mapping, protection, publishing."""

@@ -1,4 +1,4 @@
-"""Differences between python-can's interfaces: capabilities, error frames, sockets.
+"""Backends of python-can: capabilities, kinds of error frames, fast reading of sockets.
 
 Pending frames of SocketCAN and UDP multicast are read from the socket until it is empty, one system
 call per frame. python-can's `recv` calls `select` before every frame, and on UDP builds a message
@@ -64,7 +64,7 @@ def backend_capabilities(address: BusAddress) -> BackendCapabilities:
     if address.interface == "socketcan":
         return BackendCapabilities("kernel", echoes=asked, has_error_classes=True)
     if address.interface == "udp_multicast":
-        # Elsewhere python-can takes the moment of reading.
+        # Elsewhere python-can stamps when it reads.
         stamps: Stamps = "kernel" if _LINUX else "driver"
         return BackendCapabilities(stamps, echoes=True, has_error_classes=False)
     stamps = "sender" if address.interface == "virtual" else "driver"
@@ -100,9 +100,8 @@ _CONTROLLER_STATES: Final = {
 def error_kinds(message: can.Message) -> list[str]:
     """Return the error classes of a SocketCAN error frame (linux/can/error.h).
 
-    The classes are bits of the id, of which python-can keeps the lower eleven: all that name a
-    kind. The controller's state is in byte 1. A frame may have several kinds; `UNSPECIFIED` if it
-    has none.
+    The classes are bits of the id; python-can keeps the lower eleven, which are all that name a
+    kind. The controller's state is in byte 1. A frame can have several kinds, or `UNSPECIFIED`.
     """
     classes = message.arbitration_id
     kinds = [name for bit, name in _CLASSES.items() if classes & bit]
@@ -152,10 +151,10 @@ def queue_drops(bus: can.BusABC) -> int | None:
 
 
 _PACKET_BYTES: Final = 4096
-"""As in python-can: a longer packet is cut off, and then is no frame."""
+"""As in python-can: a longer packet is truncated, and hence not a frame."""
 _STAMP: Final = struct.Struct("@ll")
 _IDS_KEPT: Final = 4096
-"""Most ids whose filter result is cached: anybody may send any id."""
+"""Most ids whose filter result is cached: multicast packets can have any id."""
 _DO_NOT_WAIT: Final = int(socket.MSG_DONTWAIT) if sys.platform == "linux" else 0
 
 
@@ -164,7 +163,7 @@ class NoPendingFrameError(Exception):
 
 
 class PendingFrames(Protocol):
-    """Reads the frames that are pending in the socket of a bus."""
+    """Read the frames that are pending in the socket of a bus."""
 
     def next(self) -> can.Message | None:
         """Return the next pending frame; None for one that does not pass the filters.
@@ -263,7 +262,7 @@ class _UdpFrames:
             fields["timestamp"] = seconds + nanoseconds * 1.0e-9
             message = can.Message(check=True, **fields)
         except Exception as error:
-            # As in python-can: any error here is due to this packet.
+            # As in python-can: every error here is caused by this packet.
             raise can.CanOperationError("could not unpack received message") from error
         if passes is None:
             if len(self._passes) >= _IDS_KEPT:

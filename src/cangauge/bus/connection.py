@@ -1,7 +1,7 @@
 """An open bus: receive, send, and classify the errors of drivers.
 
-A bad packet is counted and skipped; an error that means that the bus is gone becomes a `BusError`.
-No threads: the caller owns the loop. `reconnect.ReconnectingBus` opens a lost bus again.
+A bad packet is counted and skipped; an error that means a lost bus becomes a `BusError`. There are
+no threads: the caller runs the loop. `reconnect.ReconnectingBus` reopens a lost bus.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SEND_WITHIN_S: Final = 1.0
 """Longest wait for room in the transmit queue [s]."""
 
 AT_ONCE: Final = 64
-"""Most pending frames received in one call: the caller has more to do than receive."""
+"""Most pending frames received in one call, so that the caller gets its turn."""
 
 _RETRY_S: Final = 0.0005
 _POSTED_RETRY_S: Final = 0.005
@@ -60,7 +60,7 @@ class BusConnection:
     Attributes
     ----------
     garbled : int
-        Packets that were no CAN frames (on `udp_multicast`, where anybody may send).
+        Packets that were no CAN frames (on `udp_multicast`, which carries other packets too).
     error_frames : int
         Error frames of the controller.
     error_kinds : Counter of str
@@ -68,8 +68,7 @@ class BusConnection:
     is_off : bool
         Whether the controller reported bus-off, with no frame received since.
     unsent : int
-        Frames given up because the transmit queue stayed full (no other node?), or for want of a
-        bus.
+        Frames dropped because the transmit queue stayed full (no other node?), or without a bus.
     """
 
     def __init__(
@@ -155,7 +154,7 @@ class BusConnection:
         if self._failed is not None:
             raise self._failed
         try:
-            # After a full read, more frames are pending most likely: no need to wait.
+            # After a full read more frames are probably pending: do not wait.
             if self._is_empty and not self._pending.wait(timeout_s):
                 return []
         except Exception as error:  # noqa: BLE001 - as above
@@ -175,7 +174,7 @@ class BusConnection:
                 try:
                     self._classify(error)
                 except BusError as lost:
-                    # The frames read before are good; the driver may not repeat the error.
+                    # Return the frames read before; the driver may not repeat the error.
                     self._failed = lost
                     if found:
                         break
@@ -184,7 +183,7 @@ class BusConnection:
             if message is None:
                 continue
             if message.is_error_frame:
-                # Return here, so that a caller who checks `is_off` after each call sees it change.
+                # Return now: a caller that checks `is_off` after each call must see every change.
                 self.is_off = self.is_off and not found
                 self._count_error(message)
                 return found
@@ -215,7 +214,7 @@ class BusConnection:
         """Send a frame without waiting.
 
         While the transmit queue is full, posted frames are retried in order with every call that
-        receives, and given up after `within_s` [s].
+        receives, and dropped after `within_s` [s].
 
         Raises
         ------
@@ -260,7 +259,7 @@ class BusConnection:
         self._is_empty, self._failed = True, None
 
     def _detach(self) -> can.BusABC | None:
-        """Give up the bus, if there is one, without closing it."""
+        """Release the bus, if any, without closing it."""
         self._dropped_before = self.queue_drops
         bus, self._bus = self._bus, None
         if self._pending is not None:

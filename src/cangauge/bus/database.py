@@ -28,7 +28,7 @@ from cangauge.errors import InputError, closest
 
 Decode = Callable[[bytes | bytearray], float]
 
-# Names that value tables give to codes without a value.
+# Names in value tables for codes without a value.
 _NOT_A_VALUE = re.compile(
     r"^(sna|n/?a|no data|invalid|error|fault|fehler|undefined|unknown|init)$"
     r"|(not|un)[\s_-]?(available|avail|valid|def)|invalid",
@@ -159,7 +159,7 @@ class SignalCodec:
         return decode_integer if sign_bit or not_available else decode_plain
 
     def is_in(self, payload: bytes | bytearray) -> bool:
-        """Return whether the signal is present, according to the multiplexers if any."""
+        """Return whether the signal is present, according to its multiplexers, if any."""
         return all(each.field.get(payload) in each.values for each in self.conditions)
 
     def encode_into(self, payload: bytearray, value: float) -> None:
@@ -204,7 +204,7 @@ class SignalCodec:
             cure="use a DBC with a wider signal",
         )
 
-    def quantise(self, values: FloatArray) -> FloatArray:
+    def quantize(self, values: FloatArray) -> FloatArray:
         """Return what `decode` gives after `encode_into`, for each value, without range check."""
         if self.float_format:
             kind = {"e": np.float16, "f": np.float32, "d": np.float64}[self.float_format]
@@ -267,8 +267,8 @@ def signal_codec(
     source, field : object, str
         For error messages: the file, and the name of the entry in the map file.
     not_available : tuple of int
-        Raw codes without a value, besides those that the value table names so ("not available",
-        "SNA", "invalid", …).
+        Raw codes without a value, besides those that the value table names "not available",
+        "SNA", "invalid", ….
     when : dict of str to int, optional
         Further conditions: raw values of other signals of the message.
 
@@ -328,12 +328,12 @@ def _signal(message: Message, name: str) -> Signal | None:
 def _codes_of_no_value(signal: Signal) -> frozenset[int]:
     names: Mapping[int, object] = signal.conversion.choices or {}
     if 2 * len(names) > 1 << min(signal.length, 64):
-        return frozenset()  # an enumeration: most codes have a name, "invalid" is one of them
+        return frozenset()  # an enumeration, in which "invalid" is a state
     return frozenset(int(raw) for raw, name in names.items() if _NOT_A_VALUE.search(str(name)))
 
 
 def _bits(message: Message, signal: Signal, source: object, field: str) -> Field:
-    """Return the bits of a signal; refuse a layout or conversion that is impossible."""
+    """Return the bits of a signal; raise InputError for an impossible layout or conversion."""
     bits, conversion = Field.of(signal, message.length), signal.conversion
     problem = ""
     if signal.length < 1 or bits.shift < 0 or bits.shift + bits.width > 8 * message.length:
@@ -372,7 +372,7 @@ _CANTOOLS_ERRORS: Final = (
     AssertionError,  # a multiplexed signal without a multiplexer
 )
 
-# The statements as cantools reads them; possessive quantifiers keep the time linear for any text.
+# Statements as cantools reads them. Possessive quantifiers keep the time linear for any text.
 _STRING_OR_COMMENT = re.compile(r'"(\\"|[^"])*?"|//[^\n]*+\n')
 _MESSAGE = re.compile(r"(?<![A-Za-z_])BO_\s++[-+]?\d++\s*+\w++\s*+:\s*+([-+]?\d++)")
 _SIGNAL = re.compile(
@@ -397,7 +397,7 @@ def load_dbc(path: str | PathLike[str]) -> Database:
     """
     path = Path(path)
     text = _read_text(path)
-    _refuse_hostile(text, path)
+    _check_sizes(text, path)
     try:
         database = cantools.database.load_string(text, "dbc", strict=False)
     except RecursionError as error:
@@ -512,8 +512,8 @@ def _read_text(path: Path) -> str:
         return data.decode("cp1252", errors="replace")  # the encoding that most tools write
 
 
-def _refuse_hostile(text: str, path: Path) -> None:
-    """Refuse sizes that would make cantools exhaust the memory."""
+def _check_sizes(text: str, path: Path) -> None:
+    """Raise InputError for sizes with which cantools would exhaust the memory."""
     # Comments may stand between any two words, and strings may look like statements.
     text = _STRING_OR_COMMENT.sub(lambda match: '""' if match[0][0] == '"' else " ", text)
     messages = 0
@@ -562,7 +562,7 @@ def _signal_cure(database: Database, owner: Message, signal: str) -> str:
     if near:
         return f"did you mean {near}?"
     shown = ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
-    return f"it has {shown}" if shown else "it has no signals at all"
+    return f"it has {shown}" if shown else "it has no signals"
 
 
 def _first_line(error: Exception) -> str:

@@ -68,7 +68,7 @@ class FrameStatistics:
     current_unpaired: int = 0
     """Samples without a voltage (voltage NaN)."""
     voltage_unpaired: int = 0
-    """Voltages dropped for want of a current."""
+    """Voltages dropped without a current."""
     time_reversals: int = 0
     """Wanted frames stamped earlier than the frame before."""
 
@@ -85,7 +85,7 @@ class FrameStatistics:
 
 
 class Pairing:
-    """Pairs currents and voltages into samples.
+    """Pair currents and voltages into samples.
 
     - A current and a voltage at most `within_s` apart make a sample, stamped with the current's
       time, when the later of the two arrives. Each value is used once.
@@ -115,7 +115,7 @@ class Pairing:
     )
 
     def __init__(self, within_s: float, statistics: FrameStatistics | None = None) -> None:
-        # Slightly more than stated: stamps 20 ms apart must pair whatever their rounding.
+        # Slightly more than stated: stamps 20 ms apart must pair in spite of rounding.
         self._within_s = within_s + 1e-6
         self.statistics = statistics or FrameStatistics()
         self._current_s = self._voltage_s = math.nan  # NaN: no value waits
@@ -158,7 +158,7 @@ class Pairing:
 
 @dataclass(slots=True)
 class _Input:
-    """A signal of a message: how to read it, and its health."""
+    """A signal of a message: its decoder and its health."""
 
     decode: Callable[[bytes | bytearray], float]
     is_present: Callable[[bytes | bytearray], bool] | None
@@ -170,7 +170,7 @@ class _Input:
 
 @dataclass(slots=True)
 class _Route:
-    """A wanted message: how to accept its frames, and the signals in it."""
+    """A wanted message: its checks and its signals."""
 
     length: int
     checker: FrameChecker | None
@@ -182,11 +182,11 @@ class _Route:
 
 
 class SampleDecoder:
-    """Makes samples from a vehicle's frames; a pure function of frames and time stamps.
+    """Decode a vehicle's frames to samples; a pure function of frames and time stamps.
 
-    Refused are frames with a wrong CRC, a repeated alive counter or too few bytes, and values that
-    are not available or implausible (see `plausibility`). A jump of the alive counter counts as a
-    loss, and the frame is used. Error frames, remote frames and frames of the wrong id width are
+    Refused are: frames with a wrong CRC, a repeated alive counter or too few bytes; values that are
+    not available or implausible (see `plausibility`). A jump of the alive counter counts as a loss,
+    and the frame is used. Error frames, remote frames and frames of the wrong id width are
     ignored. The temperature of a sample is the latest value while it is usable, else NaN.
 
     Parameters
@@ -327,7 +327,7 @@ class SampleDecoder:
         return payload
 
     def flush(self) -> Sample | None:
-        """Return a current that still waits for a voltage, at the end, as a sample without one."""
+        """Return the last current, if it is unpaired, as a sample without voltage."""
         sample = self._pairing.flush()
         if sample is not None:
             self.statistics.samples += 1
@@ -355,7 +355,7 @@ class SampleDecoder:
         return math.nan if health is None else health.value_at(self.now_s)
 
     def _rewind(self, last_s: float, time_s: float) -> None:
-        """Handle time that runs backwards: a log that starts again, or a clock that was set."""
+        """Handle time that runs backwards: a restarted log, or a clock that was set."""
         self.statistics.time_reversals += 1
         if last_s - time_s > self.vehicle.pair_within_s:
             for health in self.health.values():

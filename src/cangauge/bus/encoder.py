@@ -37,7 +37,7 @@ class _Outgoing:
 
 
 class FrameEncoder:
-    """Makes frames of samples; the inverse of `SampleDecoder`.
+    """Encode samples as frames; the inverse of `SampleDecoder`.
 
     Slow signals (temperature, SoC) come first, so that they apply to their own sample; then
     current; then voltage. Slow ones are sent when their quantized value changes, and every
@@ -132,7 +132,7 @@ class FrameEncoder:
                     cure="replay it as another --vehicle",
                 )
 
-    def quantisation(self) -> dict[str, float]:
+    def quantization(self) -> dict[str, float]:
         """Return the largest quantization errors of frames: half a step.
 
         Returns
@@ -144,13 +144,13 @@ class FrameEncoder:
         steps = {LOG_COLUMNS[signal.role]: signal.half_step for signal in self.vehicle.signals}
         return {**steps, "time_s": 0.5 / MICROSECONDS}
 
-    def quantise(self, log: Log) -> Log:
+    def quantize(self, log: Log) -> Log:
         """Return the log as decoded from its frames with REPLAY_CLOCK, bit for bit.
 
         A vehicle without a temperature signal gives its fixed temperature, or the log's if it has
         none.
         """
-        sent = {field: signal.quantise(values) for signal, field, values in self._columns(log)}
+        sent = {field: signal.quantize(values) for signal, field, values in self._columns(log)}
         if not math.isnan(self.vehicle.fixed_temperature_c):
             sent["temperature_c"] = np.full(len(log), self.vehicle.fixed_temperature_c)
         return replace(

@@ -1,4 +1,4 @@
-"""The map file: which signals of a DBC are current, voltage, temperature, and how to read them.
+"""The map file: which signals of a DBC are current, voltage and temperature; their conversion.
 
 A map file in TOML, for any car with a DBC::
 
@@ -154,7 +154,7 @@ class SignalMap(CheckMap):
     when : dict of str to int
         Raw values that other signals of the frame must have (multiplexers missing in the DBC).
     not_available : tuple of int
-        Raw codes without a value, besides those that the DBC's value table names so.
+        Raw codes without a value, besides those named so in the DBC's value table.
     """
 
     message: str | int | None = None
@@ -229,7 +229,7 @@ class MessageMap(_Strict):
         Raises
         ------
         InputError
-            If the rule is unknown, does not fit, lacks a field or has one that is not its own.
+            If the rule is unknown, does not fit, lacks a field or has one of another protection.
         """
         try:
             rule = self._rule(message, rules)
@@ -308,7 +308,7 @@ class MessageMap(_Strict):
         )
 
     def _refuse_fields(self, names: tuple[str, ...], protection: str) -> None:
-        """Refuse fields that only another protection has: most likely a mistake."""
+        """Raise InputError for fields that belong to another protection only."""
         for name in names:
             if getattr(self, name) is not None:
                 raise InputError(
@@ -378,7 +378,7 @@ class VehicleMap(_Strict):
 class Overrides:
     """Protection and checks of a service configuration, which override the car's map file.
 
-    For a known car, or a bus with a quirk of its own. What describes the car for good belongs in
+    For one vehicle or bus that differs from its map file. Properties of the model of car belong in
     the map file, which `estimate` reads too::
 
         [messages.BATTERY_1DB]
@@ -393,7 +393,7 @@ class Overrides:
     source : str
         The file, for error messages.
     messages : mapping of str to MessageMap
-        By name or id; what one leaves out is taken from the map file.
+        By name or id; missing fields are taken from the map file.
     rules : mapping of str to RuleMap
     checks : mapping of str to CheckMap
         By role: "current", "voltage", "temperature", "soc_reference".

@@ -26,7 +26,7 @@ BusOption = str | int | float | bool
 
 SOCKETCAN_CHANNEL: Final = "vcan0"
 MULTICAST_CHANNEL: Final = "239.74.163.2"
-"""IPv4 group of python-can, whose default is an IPv6 group that some machines cannot reach."""
+"""IPv4 group of python-can; its default is an IPv6 group, which some machines cannot reach."""
 
 MULTICAST_HOPS: Final = 0
 """0: packets stay on this machine; 1 (`--bus-option hop_limit=1`): local network."""
@@ -45,8 +45,8 @@ _DEFAULT_CHANNELS: Final = {
 }
 _ON_SOCKETS: Final = {"socketcan", "udp_multicast"}
 
-# Drivers raise python-can's errors, the operating system's, and anything that a missing library or
-# a wrong option causes in their code (NameError: kvaser without canlib).
+# Errors of python-can, of the operating system, and those that a missing library or a wrong option
+# causes in a driver (NameError: kvaser without canlib).
 _DRIVER_ERRORS: Final = (
     can.CanError,
     OSError,
@@ -247,7 +247,7 @@ def _as_driver_channel(address: BusAddress) -> str | int:
 def _widen_receive_buffer(bus: can.BusABC) -> None:
     if sys.platform == "win32":
         return
-    # The driver's socket is private; a duplicate of the descriptor is the same socket. Best effort:
+    # The driver's socket is private; a duplicate descriptor refers to the same socket. Best effort:
     # the system may refuse, or cap the size silently.
     options = [socket.SO_RCVBUF]
     if sys.platform == "linux":
@@ -276,7 +276,7 @@ def _check_up(bus: can.BusABC, address: BusAddress) -> None:
 
 
 def _refusal(address: BusAddress, error: BaseException) -> InputError:
-    """Return the meaning of a driver's error, in one line with a cure."""
+    """Return a driver's error in one line with a cure."""
     cause = error
     while not isinstance(cause, OSError) and cause.__cause__ is not None:
         cause = cause.__cause__

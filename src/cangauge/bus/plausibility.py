@@ -34,7 +34,7 @@ STUCK_AFTER_S: Final = 10.0
 
 TEMPERATURE_JUMP_K: Final = 5.0
 TEMPERATURE_RATE_K_PER_S: Final = 1.0
-"""Coarse steps and alternating sensors stay below these; a pack's heat capacity allows no more.
+"""Above coarse quantization and alternating sensors, and above what a pack's heat capacity allows.
 Current and voltage have no default rate limit: contactors, fuses, short circuits."""
 
 MISSED_UNTIL_OLD: Final = 10.0
@@ -186,7 +186,7 @@ class MessageStatistics:
     frames_lost: int = 0
     """Frames missing according to the alive counter."""
     short: int = 0
-    """Frames refused: shorter than the DBC says."""
+    """Frames refused: shorter than in the DBC."""
     not_available: int = 0
     """Values refused: the code means "not available"."""
     implausible: int = 0
@@ -198,7 +198,7 @@ class MessageStatistics:
 
 
 class SignalHealth:
-    """Checks the values of one signal in order of time.
+    """Check the values of one signal in order of time.
 
     Parameters
     ----------
@@ -316,7 +316,7 @@ class SignalHealth:
         """Record a failed value or a refused frame; return NaN."""
         self.fault = fault
         self._failures += 1
-        if fault is not Fault.REPEATED:  # a repeated frame does not discredit the original
+        if fault is not Fault.REPEATED:  # a repeated frame does not invalidate the original
             self._passes = 0
         if self._failures >= self._checks.invalid_after and self.state is _VALID:
             self.state = _INVALID
@@ -378,7 +378,7 @@ UNKNOWN_STEP: Final = 0.0025
 
 
 class StuckDetector:
-    """Detects that a signal is constant while its partner swings.
+    """Detect a signal that is constant while its partner swings.
 
     Made by `stuck_detectors`.
 
@@ -483,7 +483,7 @@ def stuck_detectors(
     """Return coupled stuck detectors for current and voltage of one pack.
 
     A change of the current by ΔI changes the voltage by R·ΔI at once. A voltage whose code stays
-    constant while the current swings to and fro, by R·ΔI of several quantization steps, is stuck;
+    constant while the current swings, by R·ΔI of several quantization steps, is stuck;
     and vice versa. Turning points are counted, not drift, so that these are not called stuck: a
     pack at rest; a charge at constant current; a current of exactly 0 next to a noisy voltage (a
     swing must be a multiple of the model's voltage error).
@@ -515,10 +515,10 @@ def stuck_detectors(
 
 
 class ConstantDetector:
-    """Detects that a signal has been constant for a stated time.
+    """Detect a signal that has been constant for a stated time.
 
     For a temperature: slow, coarse and without a partner, it is constant for hours in a healthy
-    car. Hence only where the user states a time.
+    car. Used only where the user states a time.
 
     Parameters
     ----------

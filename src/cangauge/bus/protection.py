@@ -147,7 +147,7 @@ class ProtectionRule:
         return all(0 <= place < length for place in found) and len(found) == len(places)
 
     def crc(self, data: bytes | bytearray) -> int:
-        """Return the CRC of a payload, whatever its CRC byte holds."""
+        """Return the CRC of a payload, independent of its CRC byte."""
         table, crc = self._table, self.initial
         if self.crc_byte == -1:
             covered = data[:-1]
@@ -182,8 +182,8 @@ LEAF_RULE: Final = ProtectionRule("leaf", polynomial=0x85, counter_bits=2)
 GENERIC_RULE: Final = ProtectionRule(
     "generic", polynomial=0x1D, initial=0xFF, xor_out=0xFF, counter_bits=4, counter_shift=4
 )
-"""CRC-8 SAE J1850 in the last byte, counter in the high half of the byte before: what cangauge
-itself sends as the generic pack."""
+"""CRC-8 SAE J1850 in the last byte, counter in the high half of the byte before: the frames that
+`replay` sends as the generic pack."""
 
 CRC_ONLY_RULE: Final = ProtectionRule(
     "crc_only", polynomial=0x1D, initial=0xFF, xor_out=0xFF, counter_bits=0
@@ -269,7 +269,7 @@ class Profile(NamedTuple):
     id_bits: int
     """Width of the data id; 0: a list of 16 bytes."""
     modes: Mapping[str, int]
-    """How the data id can enter the CRC, where there is a choice."""
+    """Modes of the data id in the CRC, where there is a choice."""
     check: Callable[..., bool]
     protect: Callable[..., None]
 
@@ -308,7 +308,7 @@ class E2eRule:
     data_ids : bytes
         Profile 2: 16 data ids, one per counter value.
     data_id_mode : {"both", "alternating", "low", "nibble"}
-        How the data id enters the CRC: profile 1; profile 11 has "both" and "nibble" only.
+        Mode of the data id in the CRC: profile 1; profile 11 has "both" and "nibble" only.
     header_byte : int
         First byte of the header; 0 in profile 2.
     protected_bytes : int
@@ -377,7 +377,7 @@ class E2eRule:
     def is_whole(self, data: bytes | bytearray) -> bool:
         """Return whether header and CRC agree and the counter value is a possible one."""
         if isinstance(data, bytes):
-            data = bytearray(data)  # some checks of the library accept nothing else
+            data = bytearray(data)  # some checks of the library accept bytearray only
         return (
             self._profile.check(data, self.data_ids or self.data_id, **self._arguments)
             and self.counter(data) < self._profile.modulus
@@ -417,7 +417,7 @@ sooner, the sender restarted or frames came out of order: no loss is proven."""
 
 
 class FrameChecker:
-    """Checks the frames of one message in order of time.
+    """Check the frames of one message in order of time.
 
     A repeated counter is no new frame, unless enough time has passed for the counter to wrap: on a
     lossy bus one in `modulus` of the surviving frames looks like a repetition.

@@ -1,11 +1,11 @@
 """Published frames: SOC_ESTIMATE and SOC_DETAIL, made and read.
 
-Normally the clock of the loop sets the rate (`SocPublisher.beat`), with or without samples: each
-beat has a SOC_ESTIMATE, every tenth a SOC_DETAIL.
+Normally the clock of the loop sets the rate (`SocPublisher.beat`), with or without samples: a
+SOC_ESTIMATE at each beat, a SOC_DETAIL at every tenth.
 
 During a replay at another speed, log time sets the rate (`SocPublisher.publish`): SOC_ESTIMATE
 with the first sample of every 100 ms, SOC_DETAIL with the first of every second and, as an
-acknowledgement, at the latest after `acknowledge_every` samples. Beats then fill the silences.
+acknowledgement, at the latest after `acknowledge_every` samples. Beats continue in the silences.
 
 Counter and CRC are those of AUTOSAR E2E profile 2, with the data ids in the DBC.
 """
@@ -33,7 +33,7 @@ DETAIL_EVERY_S: Final = 1.0
 DETAIL_EVERY_BEATS: Final = 10
 """Periods of the frames: [s] of log time, and beats of `ESTIMATE_EVERY_S`."""
 EARLY_S: Final = 0.01
-"""A sample this much before its turn counts, so that jitter does not halve the rate [s]."""
+"""A sample may be this early for a frame that is due [s]: else jitter could halve the rate."""
 
 AGE_AT_MOST_S: Final = 30.0
 """Largest age in SOC_ESTIMATE [s]."""
@@ -85,7 +85,7 @@ class SocEstimate(NamedTuple):
     status: Status
     reasons: Reason
     age_s: float = math.nan
-    """Whole seconds since charge was last counted, at most 30 [s]; NaN: never yet."""
+    """Whole seconds since charge was last counted, at most 30 [s]; NaN: no sample yet."""
 
 
 class SocDetail(NamedTuple):
@@ -144,7 +144,7 @@ def _layouts() -> tuple[_Layout, _Layout]:
 
 
 class SocPublisher:
-    """Makes the frames of estimates.
+    """Encode estimates as SOC_ESTIMATE and SOC_DETAIL frames.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ class SocPublisher:
         return frames
 
     def restart(self) -> None:
-        """Forget the due times: a new log may begin earlier."""
+        """Reset the due times: a new log may begin earlier."""
         self._estimate_due_s = self._detail_due_s = -math.inf
 
     def estimate_frame(self, estimate: Estimate, age_s: float = 0.0) -> can.Message:
@@ -228,7 +228,7 @@ class SocPublisher:
 
 
 class SocReader:
-    """Reads the frames of a `SocPublisher`.
+    """Decode the frames of a `SocPublisher`.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""A bus that is reconnected when it is lost: interface down or removed, adapter unplugged.
+"""Reconnect a lost bus: interface down or removed, adapter unplugged.
 
-While the bus is away, receiving waits and returns nothing, frames to send are dropped and counted,
-and opening is retried with growing pauses, in a thread because some drivers take seconds for it.
+Without a bus, receiving waits and returns nothing, and frames to send are dropped and counted.
+Opening is retried with growing pauses, in a thread because some drivers take seconds for it.
 """
 
 from __future__ import annotations
@@ -25,11 +25,12 @@ from cangauge.errors import InputError
 
 FIRST_PAUSE_S: Final = 0.05
 LONGEST_PAUSE_S: Final = 1.0
-"""Pauses between attempts double from the first to the longest [s]. Frames that arrive after the
-bus is back but before the next attempt are lost."""
+"""Pauses between attempts double from the first to the longest [s]. Frames between the return of
+the bus and the next attempt are lost."""
 
 STEADY_S: Final = 5.0
-"""A bus lost after this time in use [s] is retried at once; one that flaps keeps its pause."""
+"""A bus lost after this time in use [s] is retried after the first pause; one that flaps keeps its
+pause."""
 
 REPORT_AFTER_S: Final = 1.0
 """Time without a bus after which failed attempts are logged [s]: a short outage needs one line."""
@@ -40,7 +41,7 @@ Opener = Callable[[BusAddress, Sequence[CanFilter] | None], can.BusABC]
 
 
 class ReconnectingBus(BusConnection):
-    """A bus in use that is opened again when it is lost. Never raises `BusError`.
+    """A bus in use that is reopened when it is lost. Never raises `BusError`.
 
     Logs the events bus.missing, bus.lost, bus.away, bus.back, bus.off and bus.on.
 
@@ -80,7 +81,7 @@ class ReconnectingBus(BusConnection):
         Parameters
         ----------
         wait : bool
-            If the bus is missing, return without it; receiving then goes on trying.
+            If the bus is missing, return without it; receiving retries.
 
         Raises
         ------
@@ -95,12 +96,14 @@ class ReconnectingBus(BusConnection):
             if not wait:
                 raise
             self._schedule_attempt(away_since_s=time.monotonic())
-            self._log("bus.missing", logging.WARNING, f"not there yet ({error}); waiting for it")
+            self._log(
+                "bus.missing", logging.WARNING, f"not available yet ({error}); waiting for it"
+            )
             return
         self._since_s = time.monotonic()
 
     def close(self) -> None:
-        """Close the bus, or give up the attempt to open it."""
+        """Close the bus, or abandon the attempt to open it."""
         if self._attempt is not None:
             self._attempt.abandon()
             self._attempt = None
@@ -154,7 +157,7 @@ class ReconnectingBus(BusConnection):
 
     @property
     def trouble(self) -> str:
-        """Present trouble with the bus, for people; empty without."""
+        """Present problem of the bus as a phrase; "" without one."""
         found = []
         if self.is_away:
             found.append(f"bus away for {time.monotonic() - self._since_s:.0f} s")
@@ -189,7 +192,7 @@ class ReconnectingBus(BusConnection):
         self._lost_bus = self._detach()
         self._was_off = False
         self._schedule_attempt(away_since_s=now_s)
-        emit(_LOG, logging.WARNING, "bus.lost", f"{error} Trying again until it is back")
+        emit(_LOG, logging.WARNING, "bus.lost", f"{error} Reconnecting")
 
     def _schedule_attempt(self, away_since_s: float | None = None) -> None:
         now_s = time.monotonic()
@@ -199,7 +202,7 @@ class ReconnectingBus(BusConnection):
         self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
 
     def _reconnect(self, timeout_s: float) -> None:
-        """Start an attempt when it is due, or wait for the one under way."""
+        """Start an attempt when it is due, or wait for the current one."""
         if self._attempt is None:
             left_s = self._retry_at_s - time.monotonic()
             if left_s > 0.0:
@@ -216,13 +219,13 @@ class ReconnectingBus(BusConnection):
         if isinstance(outcome, str):
             self._schedule_attempt()
             if away_s >= REPORT_AFTER_S:
-                text = f"away for {away_s:.0f} s ({outcome}); trying again"
+                text = f"away for {away_s:.0f} s ({outcome}); retrying"
                 self._log("bus.away", logging.WARNING, text)
             return
         self._attach(outcome)
         self._away_s += away_s
         self._since_s = now_s
-        text = f"{'back' if self.losses else 'there'} after {away_s:.1f} s"
+        text = f"{'back' if self.losses else 'available'} after {away_s:.1f} s"
         self._log("bus.back", logging.INFO, text)
         if filters != self._filters:
             self.set_filters(self._filters)
@@ -256,11 +259,11 @@ class _Attempt:
         self._outcome: queue.SimpleQueue[can.BusABC | str] = queue.SimpleQueue()
         self._lock = threading.Lock()
         self._is_abandoned = False
-        # A daemon: a driver that hangs must not keep the program from ending.
+        # A daemon: a hanging driver must not prevent the end of the program.
         threading.Thread(target=self._run, daemon=True).start()
 
     def wait(self, timeout_s: float) -> can.BusABC | str | None:
-        """Return the bus, or why there is none; None if neither is known in time [s]."""
+        """Return the bus or the error message; None if the attempt takes longer [s]."""
         try:
             return self._outcome.get(timeout=max(timeout_s, 0.0))
         except queue.Empty:

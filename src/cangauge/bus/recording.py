@@ -1,7 +1,7 @@
 """Read a recording: a log of any format, or a capture decoded by its vehicle.
 
-A capture becomes samples exactly as the live service makes them, and a log by filling the values
-that single samples lack.
+A capture is decoded to the samples of the live service; its log fills the values that single
+samples lack.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ def read_recording(
     temperature_c: float | None = None,
     temperature_source: TemperatureSource | None = None,
 ) -> Log:
-    """Read a log, or a CAN capture by its vehicle, whatever the file is called.
+    """Read a log, or a CAN capture by its vehicle; the format is recognised by content.
 
     Logs: canonical Parquet and CSV, ANL D3 tests, BMW i3 trips, exports of Arbin, Bitrode and
     VisuaLCN cyclers; plain, gzipped or in a zip. Captures: candump, CRTD, ASC, BLF, TRC, MF4, CSV;
-    plain or gzipped. `Log.remarks` lists all that was dropped, converted or assumed.
+    plain or gzipped. `Log.remarks` lists what was dropped, converted or assumed.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def read_recording(
     temperature_c : float, optional
         Constant temperature [°C], in place of the recording's own.
     temperature_source : {"cell", "pack", "coolant", "room", "unknown"}, optional
-        What the temperature was measured on, in place of the recording's own word.
+        Location of the temperature sensor, in place of the recording's own.
 
     Returns
     -------
@@ -129,7 +129,7 @@ def log_of(
 
 
 def open_recording(path: str | PathLike[str]) -> LogFile | Capture:
-    """Find out whether a file is a log or a capture, from its beginning.
+    """Open a file as a log or a capture, recognised by its beginning.
 
     Raises
     ------
@@ -177,7 +177,7 @@ class CaptureSamples:
         [V], [°C]; NaN where the sample has none.
     soc_pct : array of shape (n,)
         The car's own SoC when the sample was made [%]; NaN where there is none.
-    counters : FrameStatistics
+    statistics : FrameStatistics
         Of the frames of the chosen bus.
     info : CaptureInfo
         Of the file.
@@ -190,7 +190,7 @@ class CaptureSamples:
     voltage_v: FloatArray
     temperature_c: FloatArray
     soc_pct: FloatArray
-    counters: FrameStatistics
+    statistics: FrameStatistics
     info: CaptureInfo
     remarks: tuple[str, ...]
 
@@ -215,7 +215,7 @@ def open_vehicle_capture(path: str | PathLike[str], vehicle: Vehicle) -> Capture
 def capture_samples(
     path: str | PathLike[str], vehicle: Vehicle, *, source: TimeSourceName = "receive"
 ) -> CaptureSamples:
-    """Return the samples of a capture, bit for bit as the live service makes them of the frames.
+    """Return the samples of a capture, bit for bit those of the live service.
 
     Each bus in the capture has its own decoder; the bus with most samples is returned.
 
@@ -240,7 +240,7 @@ def capture_samples(
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(bus.values).reshape(-1, 5).T
     remarks = [*capture.info.remarks, *_losses(bus.decoder.statistics)]
     if sum(bool(other.values) for other in buses.values()) > 1:
-        remarks.append(f"several buses carry the frames: bus {channel} is used, which has most")
+        remarks.append(f"several buses carry the frames; bus {channel} is used: most samples")
     if clock.beginnings:
         remarks.append(f"the replay clock starts again {clock.beginnings} times")
     return CaptureSamples(
@@ -249,7 +249,7 @@ def capture_samples(
         voltage_v=voltage_v,
         temperature_c=temperature_c,
         soc_pct=soc_pct,
-        counters=bus.decoder.statistics,
+        statistics=bus.decoder.statistics,
         info=capture.info,
         remarks=tuple(remarks),
     )
@@ -287,11 +287,11 @@ def _decode(capture: Capture, vehicle: Vehicle, clock: TimeSource) -> dict[Chann
 
 def _no_samples(path: str | PathLike[str], vehicle: Vehicle, bus: _Bus | None) -> InputError:
     name = f"0x{vehicle.current.arbitration_id:X} ({vehicle.current.message})"
-    counters = None if bus is None else bus.decoder.statistics
-    if counters is None or not counters.messages[vehicle.current.key].wanted:
+    statistics = None if bus is None else bus.decoder.statistics
+    if statistics is None or not statistics.messages[vehicle.current.key].wanted:
         problem = f"the capture holds no frames of {name}, which carries the current"
     else:
-        problem = f"the frames of {name} give no current ({'; '.join(_losses(counters))})"
+        problem = f"the frames of {name} give no current ({'; '.join(_losses(statistics))})"
     return InputError(
         problem,
         source=path,
@@ -299,20 +299,21 @@ def _no_samples(path: str | PathLike[str], vehicle: Vehicle, bus: _Bus | None) -
     )
 
 
-def _losses(counters: FrameStatistics) -> list[str]:
+def _losses(statistics: FrameStatistics) -> list[str]:
     losses = [
         f"{count} {text}"
         for count, text in (
-            (counters.crc_errors, "frames refused: wrong CRC"),
-            (counters.counter_repeats, "frames refused: repeated counter"),
-            (counters.short, "frames refused: too short"),
-            (counters.not_available, "values refused: code for 'not available'"),
+            (statistics.crc_errors, "frames refused: wrong CRC"),
+            (statistics.counter_repeats, "frames refused: repeated counter"),
+            (statistics.short, "frames refused: too short"),
+            (statistics.not_available, "values refused: code for 'not available'"),
         )
         if count
     ]
-    if counters.counter_jumps:
+    if statistics.counter_jumps:
         losses.append(
-            f"{counters.counter_jumps} counter jumps: at least {counters.frames_lost} frames lost"
+            f"{statistics.counter_jumps} counter jumps:"
+            f" at least {statistics.frames_lost} frames lost"
         )
     return losses
 
@@ -337,7 +338,7 @@ def capture_to_log(
     ------
     InputError
         If the capture cannot be read, gives no sample, no voltage or no temperature, holds
-        several replays one after the other, or values that are no battery's.
+        several consecutive replays, or values that are not a battery's.
     """
     samples = capture_samples(path, vehicle, source=source)
     path = Path(path)

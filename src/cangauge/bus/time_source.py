@@ -1,8 +1,8 @@
 """Bus time of frames: the receive stamp, or the log time of a replay (REPLAY_CLOCK).
 
-`replay` sends the log time in REPLAY_CLOCK ahead of the frames that it belongs to, so that a replay
-at any speed gives the same charge and the same delays. Times are whole microseconds, the resolution
-of most capture formats, so that a live run and its recording see equal numbers.
+`replay` sends REPLAY_CLOCK ahead of the frames of each log time, so that a replay at any speed
+gives the same charge and the same delays. Times are whole microseconds, the resolution of most
+capture formats, so that a live run and its recording see equal numbers.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MICROSECONDS: Final = 1e6
 """Unit of REPLAY_CLOCK [1/s]."""
 
 STEP_BACK_S: Final = 1.0
-"""A larger step back in time means that the clock was set, or a new log begins [s]."""
+"""A larger step back in time [s] means a clock that was set, or a new log."""
 
 
 def whole_us(time_s: float) -> int:
@@ -33,7 +33,7 @@ def whole_us(time_s: float) -> int:
 
 
 class TimeSource(Protocol):
-    """Gives each frame its bus time."""
+    """Source of the bus time of each frame."""
 
     beginnings: int
     """Number of new logs so far, after the first."""
@@ -45,8 +45,8 @@ class TimeSource(Protocol):
 class ReceiveTime:
     """Receive stamps.
 
-    After a step back of more than `STEP_BACK_S` time runs on from where it was, so that a clock
-    that is set does not stop the estimate. A step forward looks like a gap.
+    After a step back of more than `STEP_BACK_S` time continues from the latest stamp, so that
+    setting the clock does not stop the estimate. A step forward is a gap.
 
     Attributes
     ----------
@@ -131,7 +131,7 @@ def is_clock(message: can.Message, clock_id: int = REPLAY_CLOCK_ID) -> bool:
 
 
 class ClockFrames:
-    """Makes REPLAY_CLOCK frames.
+    """Encode log times as REPLAY_CLOCK frames.
 
     Parameters
     ----------

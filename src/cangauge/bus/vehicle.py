@@ -1,4 +1,4 @@
-"""Vehicles: signals of a map file bound to a DBC, ready to decode and encode; known vehicles.
+"""Vehicles: signals of a map file bound to a DBC, ready to decode and encode; presets.
 
 `Vehicle.load` gives a vehicle by the name of a preset, or by a DBC and a map file.
 """
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
+from can.typechecking import CanFilter
 from cantools.database.can import Message
 from numpy.typing import NDArray
 
@@ -106,9 +107,9 @@ class VehicleSignal:
         """
         self.codec.encode_into(payload, (value - self.offset) / self.gain)
 
-    def quantise(self, values: FloatArray) -> FloatArray:
+    def quantize(self, values: FloatArray) -> FloatArray:
         """Return what `decode` gives after `encode_into`, for each value."""
-        dbc_values = self.codec.quantise((np.asarray(values) - self.offset) / self.gain)
+        dbc_values = self.codec.quantize((np.asarray(values) - self.offset) / self.gain)
         return np.asarray(self.gain * dbc_values + self.offset)
 
     def fits(self, values: FloatArray) -> NDArray[np.bool_]:
@@ -215,7 +216,7 @@ class Vehicle:
         """
         if temperature_c is not None and not -60.0 <= temperature_c <= 120.0:
             raise InputError(
-                "is no battery temperature in °C", field="--temperature", value=temperature_c
+                "is not a battery temperature in °C", field="--temperature", value=temperature_c
             )
         if preset is not None:
             if dbc is not None or map is not None:
@@ -225,7 +226,7 @@ class Vehicle:
                     value=preset,
                     cure="give one or the other",
                 )
-            found = find_preset(preset)
+            found = _find_preset(preset)
             if found.lacks_temperature and temperature_c is None:
                 raise InputError(
                     "no pack temperature is known on the bus of this car",
@@ -279,7 +280,7 @@ class Vehicle:
         return tuple(dict.fromkeys(signal.arbitration_id for signal in self.signals))
 
     @property
-    def filters(self) -> list[dict[str, int | bool]]:
+    def filters(self) -> list[CanFilter]:
         """The wanted ids as filters of python-can (`bus.set_filters`)."""
         keys = dict.fromkeys(signal.key for signal in self.signals)
         return [
@@ -293,7 +294,7 @@ class Vehicle:
 
 
 class _Binder:
-    """Finds the signals of a map file in its DBC files.
+    """Find the signals of a map file in its DBC files.
 
     Parameters
     ----------
@@ -416,7 +417,7 @@ class _Binder:
         return found
 
     def _message_key(self, name: str) -> int:
-        """Return the key of the message that a name or id in [messages] means."""
+        """Return the key of the message for a name or id in [messages]."""
         first: InputError | None = None
         for database, file in self._databases:
             try:
@@ -450,7 +451,7 @@ class Preset:
     about : str
         One line for help texts.
     periods_s : dict of int to float
-        Message periods that distinguish this vehicle from related ones in a capture [s].
+        Message periods that distinguish this vehicle from similar ones in a capture [s].
     """
 
     dbc: str
@@ -502,7 +503,7 @@ def _leaf(name: str, about: str, period_5bc_s: float, *, has_temperature: bool =
 PRESETS: Final[dict[str, Preset]] = {
     "generic": Preset(
         dbc="generic_pack.dbc",
-        about="a pack without a car: what replay sends by default",
+        about="a pack without a car: the default of replay",
         mapping=VehicleMap(
             name="generic pack",
             current=SignalMap(message="PACK_CURRENT", signal="current_a"),
@@ -531,7 +532,7 @@ PRESETS: Final[dict[str, Preset]] = {
 """By the name that `--vehicle` takes."""
 
 
-def find_preset(name: str) -> Preset:
+def _find_preset(name: str) -> Preset:
     """Return the preset of that name; case does not matter, nor does `-` for `_`.
 
     Raises

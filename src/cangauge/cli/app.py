@@ -1,6 +1,6 @@
-"""The `cangauge` command: its subcommands, and errors as exit codes.
+"""The `cangauge` command: subcommands, error messages and exit codes.
 
-Exit 0: done; 1: failed; 2: bad usage or input.
+Exit codes: 0 success, 1 failure, 2 bad usage or input, 130 stopped by Ctrl-C.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from cangauge.cli.output import emit_json, note
 from cangauge.errors import CangaugeError, closest
 
 COMMANDS: Final = {
-    "demo": "Run the main job end to end on the shipped log: fit, replay, live SoC, pages.",
+    "demo": "Fit a model, replay a log on a bus, estimate its SoC live, and report the errors.",
     "fit": "Identify the voltage model of a pack from recorded logs.",
-    "estimate": "Estimate the state of charge of a recorded log or capture.",
+    "estimate": "Estimate the state of charge of a recorded log or capture, offline.",
     "gap": "Diagnose the gap between a model and logs: size, place, probable cause.",
-    "gap-check": "Measure how often `gap` names the right cause, on withheld effects.",
+    "gap-check": "Measure how often `gap` finds the right cause, on withheld causes.",
     "run": "Estimate the state of charge from a bus, and publish it there.",
-    "status": "Show the state of a running service.",
+    "status": "Show the state of a running service: SoC ± standard deviation [%], frames, delays.",
     "replay": "Play a recorded log or capture on a bus.",
     "inspect": "Show what a log or capture holds, and the sign of its current.",
-    "twin": "Simulate a log whose truth is known: pack, drive, weather, sensors.",
+    "twin": "Simulate a pack, a drive, the weather and the sensors: a log whose truth is known.",
 }
-"""First help line of each command, `cangauge.cli.NAME.NAME_command`: listed without its import."""
+"""Help line of each command: the first of its docstring, so that listing needs no imports."""
 
 _CONTEXT: Final = {"help_option_names": ["-h", "--help"]}
 
 
 class LazyGroup(TyperGroup):
-    """Import a command only when it is used: the service needs no plots, nor does `--help`."""
+    """Import each command on use only: neither the service nor `--help` needs the plots."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Return the commands' names."""
@@ -46,12 +46,12 @@ class LazyGroup(TyperGroup):
         return list(COMMANDS)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command; None if there is none of that name."""
+        """Return a command, or None."""
         del ctx
         return _command(cmd_name) if cmd_name in COMMANDS else None
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the command that the arguments name; suggest one if they name none."""
+        """Return the command that the arguments name, or suggest the closest name."""
         if args[0] not in COMMANDS and not args[0].startswith("-"):
             near = closest(args[0], COMMANDS)
             raise UsageError(
@@ -70,7 +70,7 @@ class LazyGroup(TyperGroup):
 
 
 class _Listing(TyperGroup):
-    """The same group with stand-ins for its commands: name and help line."""
+    """The same group with placeholders for its commands: name and help line."""
 
     def __init__(self, group: LazyGroup) -> None:
         super().__init__(
@@ -126,28 +126,26 @@ def main() -> None:
     except CangaugeError as error:
         if not error.logged:
             note(f"error: {error}")
-        emit_failure(error.to_dict(), error.exit_code)
+        _emit_failure(error.to_dict(), error.exit_code)
         sys.exit(error.exit_code)
     except UsageError as error:
-        if line := usage_line(error):
+        if line := _usage_line(error):
             note(line)
-        emit_failure(usage_dict(error), 2)
+        _emit_failure(_usage_dict(error), 2)
         sys.exit(2)
     except Exception as error:  # a bug: Python prints the traceback and exits with 1
-        emit_failure(CangaugeError(f"{type(error).__name__}: {error}").to_dict(), 1)
+        _emit_failure(CangaugeError(f"{type(error).__name__}: {error}").to_dict(), 1)
         raise
     if code == 130:  # typer's code for Ctrl-C
         note("stopped")
     sys.exit(code or 0)
 
 
-# --- Errors -------------------------------------------------------------------------------------
-
-# typer vendors click: the base of its usage errors is reached through the one that it exports.
+# typer bundles click without exporting UsageError: take the base class of BadParameter.
 UsageError: Final[type[Any]] = typer.BadParameter.__mro__[1]
 
 
-def emit_failure(error: Mapping[str, Any], exit_code: int) -> None:
+def _emit_failure(error: Mapping[str, Any], exit_code: int) -> None:
     """Print `{"error": {…}, "exit_code": …}` on stdout if the command line asks for `--json`.
 
     Parameters
@@ -159,7 +157,7 @@ def emit_failure(error: Mapping[str, Any], exit_code: int) -> None:
     """
     arguments = sys.argv[1:]
     options = arguments[: arguments.index("--")] if "--" in arguments else arguments
-    # Searched by hand: the error may be one of parsing this command line.
+    # Not from the parser: the error may be one of parsing.
     wanted = any(word.partition("=")[0] == "--json" for word in options)
     if not wanted or sys.stdout is None:
         return
@@ -171,7 +169,7 @@ def emit_failure(error: Mapping[str, Any], exit_code: int) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def usage_line(error: Any) -> str:
+def _usage_line(error: Any) -> str:
     """Return a usage error in one line that names the help page; "" if help was shown.
 
     Parameters
@@ -196,7 +194,7 @@ def _did_you_mean(word: str, names: Iterable[str]) -> str:
     return f". Did you mean {near}?" if near else ""
 
 
-def usage_dict(error: Any) -> dict[str, Any]:
+def _usage_dict(error: Any) -> dict[str, Any]:
     """Return a usage error as `CangaugeError.to_dict` does; `field` is the option or argument.
 
     Parameters
@@ -209,4 +207,4 @@ def usage_dict(error: Any) -> dict[str, Any]:
         # The help page shows an argument by its metavar.
         is_option = parameter.param_type_name == "option"
         field = "/".join(parameter.opts) if is_option else parameter.metavar or parameter.name
-    return {**CangaugeError(usage_line(error).removeprefix("error: ")).to_dict(), "field": field}
+    return {**CangaugeError(_usage_line(error).removeprefix("error: ")).to_dict(), "field": field}

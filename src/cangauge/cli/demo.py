@@ -24,10 +24,11 @@ from cangauge.estimate.settings import EstimatorSettings
 from cangauge.identify.fit import Identification, fit
 from cangauge.logs.read import read_log
 from cangauge.model.published import SOC_NEWTON_MAE_PCT, VOLTAGE_MAE_PCT
-from cangauge.replay.steps import quantisation_bound
+from cangauge.replay.steps import quantization_bound
 from cangauge.report.estimate import estimate_report
 from cangauge.report.fit import fit_report
-from cangauge.service.offline import RecordedEstimate, read_estimates
+from cangauge.service.estimate_table import read_estimates
+from cangauge.service.offline import RecordedEstimate
 
 TRAINED_ON = "leaf2012_reconstruction_white.parquet"
 PLAYED = "leaf2012_reconstruction_correlated.parquet"
@@ -70,7 +71,7 @@ def demo_command(
     identification = fit([read_log(shared_file("replay", TRAINED_ON))])
     identification.model.save(model_path)
     write_text_atomic(fit_page, fit_report(identification))
-    note("2/4  replay another 2.6 h on the bus, as fast as the service acknowledges")
+    note("2/4  replay another 2.6 h on the bus at full speed, and estimate its SoC live")
     played = shared_file("replay", PLAYED)
     seconds = _play(model_path, played, live_path)
     note("3/4  compare live with offline and with the reference")
@@ -80,8 +81,8 @@ def demo_command(
     settings = EstimatorSettings(temperature_source=log.temperature_source)
     offline, _ = estimate_log(log, model, settings)
     difference = float(np.nanmax(np.abs(table.soc_pct - offline.soc_pct)))
-    bound = quantisation_bound(Vehicle.load("generic"), model, log).ekf_pct
-    note("4/4  draw the pages")
+    bound = quantization_bound(Vehicle.load("generic"), model, log).ekf_pct
+    note("4/4  write the pages")
     estimate = RecordedEstimate(log, table, live, model, settings)
     write_text_atomic(soc_page, estimate_report(estimate, model_path))
     result = _result(identification, live, difference, bound)

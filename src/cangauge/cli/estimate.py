@@ -13,6 +13,9 @@ from rich.progress import Progress
 
 from cangauge._formatting import number
 from cangauge._io import atomic_path
+from cangauge.bus.captures.capture import Capture
+from cangauge.bus.recording import capture_without_vehicle, open_recording
+from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.options import (
     DbcOption,
     JsonOption,
@@ -24,9 +27,8 @@ from cangauge.cli.options import (
     check_outputs,
     known_temperature_source,
     load_log,
-    note_not_a_capture,
+    refuse_inverted_current,
     refuse_single_row,
-    refuse_turned_current,
     within,
 )
 from cangauge.cli.output import console, emit_json, note, print_table
@@ -34,14 +36,13 @@ from cangauge.errors import InputError
 from cangauge.estimate.settings import VALID_STD_PCT, EstimatorSettings, Method
 from cangauge.model.delay_line import GAP_S
 from cangauge.model.model_file import Model
+from cangauge.service.estimate_table import require_table_suffix, write_estimates
 from cangauge.service.offline import (
+    RecordedCapture,
     RecordedEstimate,
-    Recording,
     estimate_recorded_capture,
     estimate_recorded_log,
     require_same_pack,
-    require_table_suffix,
-    write_estimates,
 )
 
 AUTO = "auto"
@@ -123,23 +124,13 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
             initial_soc_std, 0.0, 100.0, option="--initial-soc-std", unit="%"
         ),
         valid_std_pct=within(valid_std, 0.01, 100.0, option="--valid-std", unit="%"),
-        capacity_ah=None
-        if capacity_ah is None
-        else within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah"),
-        gap_s=GAP_S
-        if max_gap_s is None
-        else within(max_gap_s, 1e-3, 3600.0, option="--max-gap-s", unit="s"),
+        capacity_ah=within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah"),
+        gap_s=within(max_gap_s, 1e-3, 3600.0, option="--max-gap-s", unit="s") or GAP_S,
     )
     check_outputs([output, report], [log_path, model_path])
     model = Model.load(model_path)
-    is_described = vehicle is not None or dbc is not None or map_file is not None
-    # python-can and cantools are slow to import.
-    from cangauge.bus.captures.capture import Capture  # noqa: PLC0415
-    from cangauge.bus.recording import capture_without_vehicle, open_recording  # noqa: PLC0415
-    from cangauge.bus.vehicle import Vehicle  # noqa: PLC0415
-
     if isinstance(open_recording(log_path), Capture):
-        if not is_described:
+        if (vehicle, dbc, map_file) == (None, None, None):
             raise capture_without_vehicle(log_path)
         car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature)
         source = known_temperature_source(temperature_source) or "unknown"
@@ -150,12 +141,13 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     else:
         log = load_log(
             log_path,
+            vehicle=vehicle,
+            dbc=dbc,
+            map_file=map_file,
             temperature_c=temperature,
             temperature_source=temperature_source,
-            refuse_turned=True,
+            refuse_inverted=True,
         )
-        if is_described:
-            note_not_a_capture(log_path)
         with _progress(len(log)) as progress:
             done = estimate_recorded_log(
                 log,
@@ -217,14 +209,14 @@ def _progress(total: int | None) -> Iterator[Callable[[int], None]]:
 
 
 def _check_capture(done: RecordedEstimate, model: Model) -> None:
-    """Refuse a capture of one sample, of another pack, or with turned current."""
+    """Refuse a capture of one sample, of another pack, or with inverted current."""
     recorded = done.recorded
     refuse_single_row(recorded)
     for remark in recorded.remarks:
         note(f"{recorded.source}: {remark}")
     require_same_pack(recorded, model)
-    if isinstance(recorded, Recording) and (log := recorded.as_log()) is not None:
-        refuse_turned_current(log, is_capture=True)
+    if isinstance(recorded, RecordedCapture) and (log := recorded.as_log()) is not None:
+        refuse_inverted_current(log, is_capture=True)
 
 
 def _show(done: RecordedEstimate) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +9,7 @@ from typing import Annotated
 import typer
 
 from cangauge._formatting import number, significant, span
-from cangauge._io import atomic_path
+from cangauge._io import write_texts_atomic
 from cangauge.cli.options import (
     DbcOption,
     JsonOption,
@@ -35,7 +34,7 @@ from cangauge.report.summary import effect_rows, rounded, search_rows
 FROM_SOC = "from-soc"
 AUTO = "auto"
 SHOWN_CHOICES = 8
-"""Number of the best choices of delays to report."""
+"""Number of delay sets shown, the best first."""
 
 
 def fit_command(  # noqa: PLR0917 - typer passes options by name
@@ -44,7 +43,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         typer.Argument(metavar="LOG", help="Recorded logs or captures of one pack."),
     ],
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="MODEL", help="The model file (JSON).")
+        Path, typer.Option("-o", "--output", metavar="MODEL", help="Model file to write (JSON).")
     ],
     capacity_ah: Annotated[
         str | None,
@@ -96,7 +95,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Identify the voltage model of a pack from one or more recorded logs.
+    """Identify the voltage model of a pack from recorded logs.
 
     A log has time_s [s], current_a [A] (positive discharges), voltage_v [V], temperature_c [°C]
     and optionally soc_pct [%]; `cangauge inspect` shows what a file holds.
@@ -114,8 +113,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
     Model file and report are written together, or neither.
     """
     capacity = _capacity(capacity_ah)
-    if initial_soc is not None:
-        within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
+    within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
     within(rate_hz, 0.01, 1000.0, option="--rate-hz", unit="Hz")
     within(epsilon, 1e-4, 0.49, option="--epsilon", unit="")
     within(t_ref, -60.0, 120.0, option="--t-ref", unit="°C")
@@ -134,7 +132,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
                     map_file=map_file,
                     temperature_c=temperature,
                     temperature_source=temperature_source,
-                    refuse_turned=True,
+                    refuse_inverted=True,
                 )
             )
         if capacity_ah == FROM_SOC:
@@ -160,12 +158,14 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
             )
         page = None
         if report is not None:
-            status.update("drawing the report")
+            status.update("writing the report")
             # bokeh takes half a second to import.
             from cangauge.report.fit import fit_report  # noqa: PLC0415
 
             page = fit_report(result)
-    _write({output: result.model.to_json()} | ({report: page} if report and page else {}))
+    write_texts_atomic(
+        {output: result.model.to_json()} | ({report: page} if report and page else {})
+    )
     if json_output:
         extra: dict[str, object] = {"model": str(output), "report": report and str(report)}
         if search is not None:
@@ -203,7 +203,7 @@ def _delays(given: str) -> tuple[float, ...]:
             "not a list of seconds", field="--delays", value=given, cure=cure
         ) from error
     increasing = all(low < high for low, high in pairwise(delays))
-    # Without the current now, slope resistance and heat would lose their meaning.
+    # Slope resistance and heat are defined by the undelayed current.
     if not (delays[0] == 0.0 and increasing and delays[-1] <= 3600.0):
         raise InputError(
             "delays must begin with 0 and increase to 3600 s at most",
@@ -216,14 +216,6 @@ def _delays(given: str) -> tuple[float, ...]:
 
 def _best(search: DelaySearch) -> list[tuple[tuple[float, ...], float]]:
     return sorted(search.tried, key=lambda choice: choice[1])[:SHOWN_CHOICES]
-
-
-def _write(texts: dict[Path, str]) -> None:
-    """Write all files or none of them."""
-    with ExitStack() as stack:
-        for path, text in texts.items():
-            part = stack.enter_context(atomic_path(path))
-            part.write_text(text, encoding="utf-8", newline="\n")
 
 
 def _show(result: Identification, search: DelaySearch | None) -> None:

@@ -1,15 +1,14 @@
-"""`cangauge gap`: diagnose why a model does not explain logs."""
+"""`cangauge gap`: diagnose the gap between a model and logs."""
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from cangauge._formatting import NONE_KNOWN, number
-from cangauge._io import atomic_path
+from cangauge._io import write_texts_atomic
 from cangauge.cli.options import (
     DbcOption,
     JsonOption,
@@ -31,20 +30,20 @@ from cangauge.report.summary import headline, next_step, open_question, paramete
 
 SHOWN_CANDIDATES = 5
 SHORTEST_S = 300.0
-"""Shortest log to diagnose [s]: a shorter one shows only its start."""
+"""Shortest log to diagnose [s]; a shorter one is mostly transient."""
 
 
 def gap_command(  # noqa: PLR0917 - typer passes options by name
     logs: Annotated[
         list[Path],
-        typer.Argument(metavar="LOG", help="Logs to diagnose; they share one cause."),
+        typer.Argument(metavar="LOG", help="Logs to diagnose; one cause is sought for all."),
     ],
     model: Annotated[Path, typer.Option("-m", "--model", metavar="MODEL", help="Model file.")],
     reference: Annotated[
         list[Path] | None,
         typer.Option(
             metavar="LOG",
-            help="A log without a fault; repeat the option. It has soc_pct, at least at its start,"
+            help="Log without a fault; repeat the option. It needs soc_pct, at least at its start,"
             " or starts full.",
         ),
     ] = None,
@@ -60,7 +59,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     ] = None,
     extended: Annotated[
         Path | None,
-        typer.Option(metavar="MODEL", help="Write the model extended by the cause here."),
+        typer.Option(metavar="MODEL", help="Write the model, extended by the cause, to this file."),
     ] = None,
     vehicle: VehicleOption = None,
     dbc: DbcOption = None,
@@ -70,12 +69,12 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Diagnose why a model does not explain logs: how large the gap is, where, and its cause.
+    """Diagnose the gap between a model and logs: size, place, probable cause.
 
     The verdict is an effect, `none` (no significant gap) or `unknown` (a gap without a likely cause
     in the library), with its probability; the documentation states how often it is right. Give at
-    least three references, better more; without any, the error that the model file states is taken
-    as normal. A log needs 10 minutes, better an hour, with changing load and SoC. Positive current
+    least three references, better more; without any, the error stated in the model file counts as
+    normal. A log needs 10 minutes, better an hour, with changing load and SoC. Positive current
     discharges.
 
     Examples
@@ -87,10 +86,9 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     _refuse_common(logs, given)
     check_outputs([report, extended], [*logs, *given, model])
     model_file = Model.load(model)
-    if initial_soc is not None:
-        within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
+    within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
+    within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
     if capacity_ah is not None:
-        within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
         model_file = model_file.model_copy(update={"capacity_ah": capacity_ah})
 
     def read(path: Path) -> Log:
@@ -101,24 +99,23 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
             map_file=map_file,
             temperature_c=temperature,
             temperature_source=temperature_source,
-            refuse_turned=True,
+            refuse_inverted=True,
         )
 
     diagnosed = [_long_enough(read(path)) for path in logs]
     references = [read(path) for path in given]
     with progress_shown("cangauge.diagnosis"):
         found = diagnose(diagnosed, model_file, references, initial_soc_pct=initial_soc)
-    with ExitStack() as stack:
-        if extended is not None:
-            text = found.extended_model.to_json()
-            stack.enter_context(atomic_path(extended)).write_text(text)
-        if report is not None:
-            # bokeh takes half a second to import.
-            from cangauge.report.diagnosis import gap_report  # noqa: PLC0415
-            from cangauge.report.page import InputFile  # noqa: PLC0415
+    texts = {}
+    if extended is not None:
+        texts[extended] = found.extended_model.to_json()
+    if report is not None:
+        # bokeh takes half a second to import.
+        from cangauge.report.diagnosis import gap_report  # noqa: PLC0415
+        from cangauge.report.page import InputFile  # noqa: PLC0415
 
-            page = gap_report(found, InputFile.of_model(model_file, model))
-            stack.enter_context(atomic_path(report)).write_text(page, encoding="utf-8")
+        texts[report] = gap_report(found, InputFile.of_model(model_file, model))
+    write_texts_atomic(texts)
     if json_output:
         emit_json(found.to_dict(None if extended is None else str(extended)))
         return
@@ -133,7 +130,7 @@ def _refuse_common(logs: list[Path], references: list[Path]) -> None:
     for path in logs:
         if path.resolve() in known:
             raise InputError(
-                "is both a LOG and a reference: a reference must be without the fault",
+                "is both a LOG and a reference, which must be without the fault",
                 source=path,
                 field="--reference",
                 cure="give it as one of them",
@@ -143,7 +140,7 @@ def _refuse_common(logs: list[Path], references: list[Path]) -> None:
 def _long_enough(log: Log) -> Log:
     if log.duration_s < SHORTEST_S:
         raise InputError(
-            f"{log.duration_s:.0f} s are too short: nothing can be concluded",
+            f"{log.duration_s:.0f} s are too short for a diagnosis",
             source=log.source or log.name,
             cure=f"give a log of at least {SHORTEST_S / 60.0:.0f} min, better half an hour with"
             " changing load and SoC",
@@ -175,7 +172,7 @@ def _show(found: Diagnosis) -> None:
     for answer in (UNKNOWN, NONE):
         probability = number(found.verdict.probabilities[answer], 2)
         rows.append([answer, probability, NONE_KNOWN, NONE_KNOWN, NONE_KNOWN])
-    headings = ["cause", "probability", "evidence", "left [V]", "closed"]
+    headings = ["cause", "probability", "evidence", "RMSE [V]", "closed"]
     print_table("Candidates, judged on held-out rows", headings, rows)
     for item in found.candidates:
         if item["effect"] in found.extension.cause:

@@ -1,4 +1,4 @@
-"""`cangauge gap-check`: the diagnosis on drawn and withheld causes, scored."""
+"""`cangauge gap-check`: score the diagnosis on withheld causes."""
 
 from __future__ import annotations
 
@@ -113,20 +113,20 @@ def gap_check_command(  # noqa: PLR0917 - typer passes options by name
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Check the diagnosis on withheld causes.
+    """Measure how often `gap` finds the right cause, on withheld causes.
 
     Packs, drives, weather and faults are drawn at random and simulated by physics independent of
-    the effects library, or faults are injected into recorded logs. The causes go to a label file
-    whose hash is printed first; processes that get logs and model alone diagnose the cases; then
-    the answers are scored against the labels. Gaps are 0.5 to 5 times the error of a model on
-    healthy logs.
+    the effects library, or faults are injected into recorded logs. The causes are written to a
+    label file, whose hash is printed first; processes that see only logs and model diagnose the
+    cases; the answers are then scored against the labels. Gaps are 0.5 to 5 times the error of a
+    model on healthy logs.
 
     `simulated` packs fit the voltage equation only roughly. `equation` packs obey it while healthy,
     by a core temperature that the sensor does not measure; `published` packs report that
     temperature.
 
-    For example:
-
+    Examples
+    --------
     `cangauge gap-check --part small`
 
     `cangauge gap-check --data recorded --report check.html --json > check.json`
@@ -262,7 +262,7 @@ def _sizes(
     sizes = {}
     for name in table:
         if protocol is None and part == "small" and name in NEEDS_DATA:
-            continue  # quick, and the same without recorded logs
+            continue  # quick, and the same cases with and without recorded logs
         needed = name == "simulated" and _wants(protocol, OPEN_SET)
         if (_wants(protocol, name) or needed) and _can_run(name, data, required=bool(protocol)):
             usual = table[name]

@@ -1,4 +1,4 @@
-"""`cangauge inspect`: what a log or a capture holds."""
+"""`cangauge inspect`: the contents of a log or capture."""
 
 from __future__ import annotations
 
@@ -46,14 +46,15 @@ def inspect_command(  # noqa: PLR0917 - typer fills the arguments by name
     temperature: TemperatureOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Show what a log or capture holds, and find the sign of current from the data.
+    """Show what a log or capture holds, and the sign of its current.
 
     Rates, gaps longer than 2 s, ranges, quantization, stuck channels, charge moved [Ah], the
     capacity that the reference SoC implies [Ah per 100 %], resistance from steps of current [Ω],
-    and what the log can and cannot identify. For a capture also frames, CRC and counter errors.
+    and what the log can and cannot identify. The sign of current is found from the data. For a
+    capture also frames, CRC and counter errors.
 
-    For example:
-
+    Examples
+    --------
     `cangauge inspect drive.parquet`
 
     `cangauge inspect TripA01.csv.gz --json`

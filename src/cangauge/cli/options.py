@@ -1,10 +1,10 @@
-"""What the commands that take a LOG or a capture have in common: options, reading, guards."""
+"""Options, reading and input checks shared by the commands that take a log or a capture."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sized
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import typer
 
@@ -14,6 +14,8 @@ from cangauge.errors import InputError
 from cangauge.logs import units
 from cangauge.logs.log import Log
 from cangauge.logs.units import TEMPERATURE_SOURCES, TemperatureSource
+
+_Value = TypeVar("_Value", bound=float | None)
 
 VehicleOption = Annotated[
     str | None,
@@ -46,20 +48,18 @@ TemperatureSourceOption = Annotated[
     typer.Option(
         "--temperature-source",
         metavar="SOURCE",
-        help="What the temperature was measured on, where the input does not state it: "
+        help="Location of the temperature sensor, where the input does not state it: "
         f"{', '.join(TEMPERATURE_SOURCES)}.",
     ),
 ]
 JsonOption = Annotated[
     bool,
-    typer.Option(
-        "--json", help="Print one JSON object on stdout and nothing else there, also of an error."
-    ),
+    typer.Option("--json", help="Print exactly one JSON object on stdout, also for an error."),
 ]
 ReportOption = Annotated[
     Path | None,
     typer.Option(
-        "--report", metavar="FILE.html", help="Write a report: one page that needs no network."
+        "--report", metavar="FILE.html", help="Write a report as one self-contained page."
     ),
 ]
 
@@ -72,9 +72,9 @@ def load_log(
     map_file: Path | None = None,
     temperature_c: float | None = None,
     temperature_source: str | None = None,
-    refuse_turned: bool = False,
+    refuse_inverted: bool = False,
 ) -> Log:
-    """Read a log, or a capture by its vehicle, and print the reader's remarks on stderr.
+    """Read a log, or decode a capture by its vehicle; print the reader's remarks on stderr.
 
     Parameters
     ----------
@@ -86,22 +86,22 @@ def load_log(
     temperature_c : float, optional
         Constant temperature [°C].
     temperature_source : str, optional
-        What the temperature was measured on.
-    refuse_turned : bool
+        Location of the temperature sensor.
+    refuse_inverted : bool
         Refuse a single row, and a log whose data show clearly that positive current charges.
 
     Returns
     -------
     Log
-        Positive current discharges, as far as the format defines it.
+        Positive current discharges, where the format defines the sign.
 
     Raises
     ------
     InputError
-        If the input cannot be read, an option has an unknown value, or (with `refuse_turned`)
+        If the input cannot be read, an option has an unknown value, or (with `refuse_inverted`)
         the sign of current is inverted.
     """
-    # pyarrow and cantools are slow to import; the service has these options and needs no logs.
+    # Deferred: the service shares these options, but needs neither pyarrow nor the readers.
     from cangauge.bus.recording import log_of, open_recording  # noqa: PLC0415
     from cangauge.bus.vehicle import Vehicle  # noqa: PLC0415
     from cangauge.logs.read import LogFile  # noqa: PLC0415
@@ -114,11 +114,11 @@ def load_log(
         if is_capture:
             car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature_c)
         else:
-            note_not_a_capture(path)
+            note(f"{path}: a log, not a capture: --vehicle, --dbc and --map do not apply to it")
     log = log_of(recording, car, temperature_c=temperature_c, temperature_source=source)
-    if refuse_turned:
+    if refuse_inverted:
         refuse_single_row(log)
-        refuse_turned_current(log, is_capture=is_capture)
+        refuse_inverted_current(log, is_capture=is_capture)
     for remark in log.remarks:
         note(f"{log.source or log.name}: {remark}")
     return log
@@ -156,9 +156,9 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> Non
         check_writable(output)
 
 
-def within(value: float, low: float, high: float, *, option: str, unit: str) -> float:
-    """Return `value` if it lies within low … high (NaN does not); else raise InputError."""
-    if not low <= value <= high:
+def within(value: _Value, low: float, high: float, *, option: str, unit: str) -> _Value:
+    """Return `value` if it is None or within low … high; else (NaN too) raise InputError."""
+    if value is not None and not low <= value <= high:
         raise InputError(
             f"must lie within {low:g} … {high:g} {unit}".rstrip(), field=option, value=value
         )
@@ -175,7 +175,7 @@ def refuse_single_row(recorded: Sized) -> None:
         )
 
 
-def refuse_turned_current(log: Log, *, is_capture: bool) -> None:
+def refuse_inverted_current(log: Log, *, is_capture: bool) -> None:
     """Raise InputError if the data show clearly that positive current charges."""
     # Deferred as in `load_log`.
     from cangauge.logs.sign import require_discharge_positive  # noqa: PLC0415
@@ -186,19 +186,14 @@ def refuse_turned_current(log: Log, *, is_capture: bool) -> None:
         if not is_capture:
             raise
         # Recorded frames are never changed: the map inverts the sign.
-        cure = "take the preset of this car, or set sign = -1 under [current] of the map file"
+        cure = "use the preset of this car, or set sign = -1 under [current] of the map file"
         raise InputError(
             error.problem, source=error.source, field=error.field, cure=cure
         ) from error
 
 
-def note_not_a_capture(path: Path) -> None:
-    """Note on stderr that the options for captures were not needed."""
-    note(f"{path}: a log, not a capture: --vehicle, --dbc and --map do not apply to it")
-
-
 def known_temperature_source(given: str | None) -> TemperatureSource | None:
-    """Return the temperature source if one was given; raise InputError if it is not known."""
+    """Check the value of --temperature-source; raise InputError if it is not a known one."""
     if given is None:
         return None
     return units.known_temperature_source(given, field="--temperature-source")

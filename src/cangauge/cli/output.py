@@ -27,14 +27,14 @@ def note(text: str) -> None:
 
 @contextmanager
 def progress_shown(logger: str, show: Callable[[str], None] | None = None) -> Iterator[None]:
-    """Show what a long computation logs: decisions (INFO) as lines, every step by `show`.
+    """Show the log records of a long computation: decisions (INFO) as lines, each step by `show`.
 
     Parameters
     ----------
     logger : str
         Name of the logger, such as "cangauge.identify".
     show : callable, optional
-        Takes the text of each step, to show it in passing.
+        Takes the text of each step, for a status line.
     """
     own, handler = logging.getLogger(logger), _ProgressHandler(show)
     level = own.level

@@ -92,8 +92,8 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
     (REPLAY_CLOCK, 0x5AF), so that `cangauge run --time-source replay-clock` counts the same charge
     at any speed.
 
-    For example:
-
+    Examples
+    --------
     `cangauge replay trip.parquet`
 
     `cangauge replay trip.parquet --speed max --vehicle leaf_aze0`
@@ -219,7 +219,7 @@ def _as_json(state: ReplayState, bus: BusConnection, source: Source) -> dict[str
         "soc_std_pct": None if state.soc is None else state.soc.soc_std_pct,
     }
     if isinstance(source, LogSource):
-        result["quantisation"] = FrameEncoder(source.vehicle).quantisation()
+        result["quantisation"] = FrameEncoder(source.vehicle).quantization()
     if isinstance(source, CaptureSource):
         result["dropped"] = source.dropped
     return result

@@ -50,8 +50,8 @@ def run_command(
     SIGHUP reloads configuration, model and vehicle: the SoC continues, an invalid configuration
     is refused. Changes of the bus, the time source and output files need a restart.
 
-    For example:
-
+    Examples
+    --------
     `cangauge run -m leaf.json --vehicle leaf_aze0 --interface socketcan --channel can0`
 
     `cangauge run -m leaf.json --time-source replay-clock`  (and, beside it,
@@ -73,8 +73,8 @@ def run_command(
         service = Service(loaded, read=read)
         if console.is_terminal:
             service.on_status = stack.enter_context(LiveLine(console)).show
-        # What is loaded by now stays until the end. Excluded from garbage collection it costs no
-        # pauses, and no second for its destruction at the end.
+        # Everything loaded so far lives until exit. Garbage collection of it would pause the loop,
+        # and destroying it would delay the exit by a second.
         gc.freeze()
         result = service.run()
     if json_output:

@@ -13,7 +13,7 @@ from cangauge.cli.output import emit_json, print_table
 from cangauge.errors import CangaugeError
 from cangauge.service.status_client import NotRunningError, fetch_status, find_socket
 
-TRUSTED: Final = frozenset({"valid", "degraded"})
+USABLE: Final = frozenset({"valid", "degraded"})
 
 
 def status_command(
@@ -39,8 +39,8 @@ def status_command(
     Exit code 0: the SoC is valid or degraded. 1: it is invalid or unknown, or no service runs.
     2: bad usage. With `--json` the object is printed with exit codes 0 and 1.
 
-    For example:
-
+    Examples
+    --------
     `cangauge status`
 
     `cangauge status --endpoint /run/cangauge/can0/status.sock --json`
@@ -59,7 +59,7 @@ def status_command(
         emit_json(status)
     else:
         print_table(f"cangauge at {place}", ("", "<"), _rows(status))
-    if status.get("status") not in TRUSTED:
+    if status.get("status") not in USABLE:
         raise typer.Exit(1)
 
 
@@ -94,8 +94,8 @@ def _rows(status: dict[str, Any]) -> list[tuple[str, str]]:
                 )
             ),
         ),
-        ("receive to sent", _delay(status["latency"])),
-        ("estimate takes", _delay(status["step"])),
+        ("latency", _delay(status["latency"])),
+        ("processing time", _delay(status["step"])),
     ]
     if record is not None:
         problem = f"; FAILING: {record['problem']}" if record["problem"] else ""
@@ -108,7 +108,7 @@ def _rows(status: dict[str, Any]) -> list[tuple[str, str]]:
             )
         )
     if status["loop_stuck"]:
-        rows.insert(0, ("LOOP STUCK", "the receive loop does not run; restart the service"))
+        rows.insert(0, ("LOOP STUCK", "the receive loop hangs; restart the service"))
     return [
         *rows,
         ("vehicle", status["vehicle"]),
@@ -125,7 +125,7 @@ def _delay(durations: dict[str, Any]) -> str:
     if not durations["count"]:
         return NONE_KNOWN
     p50, p99 = (_times(durations[f"{name}_at_most_s"], 1e3) for name in ("p50", "p99"))
-    return f"half within {number(p50, 3, 'ms')}, 99 % within {number(p99, 3, 'ms')}"
+    return f"median at most {number(p50, 3, 'ms')}, 99 % within {number(p99, 3, 'ms')}"
 
 
 def _times(value: float | None, factor: float) -> float | None:

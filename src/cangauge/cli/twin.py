@@ -1,4 +1,4 @@
-"""`cangauge twin`: a simulated log whose truth is known."""
+"""`cangauge twin`: simulate a log whose truth is known."""
 
 from __future__ import annotations
 
@@ -102,8 +102,8 @@ def twin_command(  # noqa: PLR0917 - typer passes options by name
     open-circuit voltage, Butler–Volmer kinetics, diffusion, two thermal nodes, cell spread,
     quantized and jittered sensors. Positive current discharges.
 
-    For example:
-
+    Examples
+    --------
     `cangauge twin --seed 1 --discharge -o full.parquet`
 
     `cangauge twin --seed 1 --day 2 --effect current_offset:offset_a=1.5 -o trip.parquet`
@@ -126,10 +126,10 @@ def twin_command(  # noqa: PLR0917 - typer passes options by name
             effect or (),
             seed=seed,
             drive=day,
-            hours=_within(hours, 0.05, 12.0, "--hours", "h"),
-            ambient_c=_within(ambient_c, -30.0, 50.0, "--ambient-c", "°C"),
-            start_soc_pct=_within(start_soc, 0.0, 100.0, "--start-soc", "%"),
-            end_soc_pct=_within(end_soc, 0.0, 100.0, "--end-soc", "%"),
+            hours=within(hours, 0.05, 12.0, option="--hours", unit="h"),
+            ambient_c=within(ambient_c, -30.0, 50.0, option="--ambient-c", unit="°C"),
+            start_soc_pct=within(start_soc, 0.0, 100.0, option="--start-soc", unit="%"),
+            end_soc_pct=within(end_soc, 0.0, 100.0, option="--end-soc", unit="%"),
             discharge=discharge,
             speed_ms=None if speed is None else read_speed(speed),
             pack=pack,
@@ -155,10 +155,6 @@ def twin_command(  # noqa: PLR0917 - typer passes options by name
         return
     _show(result)
     note(f"log: {output}")
-
-
-def _within(value: float | None, low: float, high: float, option: str, unit: str) -> float | None:
-    return value if value is None else within(value, low, high, option=option, unit=unit)
 
 
 def _show(result: dict[str, Any]) -> None:

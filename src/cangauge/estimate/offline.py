@@ -30,6 +30,9 @@ from cangauge.model.model_file import Model
 PROGRESS_EVERY = 5000
 """Samples between two calls of the progress callback."""
 
+LONGEST_GAP_S = 3600.0
+"""Upper limit of a gap that follows from a slow log's step [s]."""
+
 NUMBERS = Estimate._fields[:7]
 """Columns of numbers, from `time_s` to `residual_v`."""
 
@@ -174,21 +177,38 @@ def estimate(
     (120, 80.0)
     """
     if initial_soc_pct is None and log.first_soc() is not None:
-        start = counted_soc_pct(log, capacity_ah or model.capacity_ah, None)[0]
-        initial_soc_pct = float(np.clip(start, 0.0, 100.0))
+        initial_soc_pct = initial_soc_of(log, capacity_ah or model.capacity_ah)
     settings = EstimatorSettings(
         method=method,
         initial_soc_pct=None if initial_soc_pct == "auto" else initial_soc_pct,
         initial_soc_std_pct=initial_soc_std_pct,
         valid_std_pct=valid_std_pct,
         capacity_ah=capacity_ah,
-        gap_s=min(usual_gap_s(log.time_s, GAP_S), 3600.0) if gap_s is None else gap_s,
+        gap_s=gap_of(log) if gap_s is None else gap_s,
         temperature_source=log.temperature_source,
         full_charge=full_charge,
         long_rest=long_rest,
     )
     table, scores = estimate_log(log, model, settings)
     return replace(table, scores=scores)
+
+
+def initial_soc_of(log: Log, capacity_ah: float) -> float:
+    """Return the log's first reference SoC, counted back to its first row [%].
+
+    Parameters
+    ----------
+    log : Log
+        With a reference SoC.
+    capacity_ah : float
+        Capacity [Ah].
+    """
+    return float(np.clip(counted_soc_pct(log, capacity_ah, None)[0], 0.0, 100.0))
+
+
+def gap_of(log: Log) -> float:
+    """Return the longest step that is no gap [s]: 2 s, or three usual steps of a slower log."""
+    return min(usual_gap_s(log.time_s, GAP_S), LONGEST_GAP_S)
 
 
 def estimate_log(

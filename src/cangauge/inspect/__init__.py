@@ -1,1 +1,1 @@
-"""What logs hold: signals, rates, gaps, sign of current, what they can identify; pure."""
+"""Contents of logs and captures: signals, rates, gaps, sign of current, identifiability."""

@@ -21,19 +21,19 @@ from cangauge.bus.vehicle import PRESETS, Vehicle
 from cangauge.inspect.log import LogInspection, inspect_log
 
 GAP_S: Final = 1.0
-"""Longest silence of a bus that is no gap [s]."""
+"""Longest silence of a bus that does not count as a gap [s]."""
 LISTED_GAPS: Final = 20
 MAX_IDS: Final = 4096
-"""Ids that are described, more than any car has; frames of others are only counted."""
+"""Most ids to describe, more than any car has; frames of others are only counted."""
 INTERVALS: Final = 2000
 """First intervals of an id whose median is its period."""
 LEARN_FRAMES: Final = 50
-"""First frames of an id, from which the period of its alive counter is learnt."""
+"""First frames of an id, from which the period of its alive counter is learned."""
 AGREEING: Final = 0.9
 """Least share of frames with a correct CRC for an id to be protected by a rule, …"""
 PAYLOADS: Final = 4
 """… which have at least this many different payloads: a constant one can agree by chance."""
-STANDING: Final = 0.02
+REPEATED_SHARE: Final = 0.02
 """Largest share of repeated counters; above it the counter is elsewhere, or there is none."""
 PERIOD_TOLERANCE: Final = 0.3
 """Largest difference of a period from a preset's [-]."""
@@ -131,7 +131,7 @@ class CaptureInspection:
         The first `LISTED_GAPS` silences longer than `GAP_S`.
     presets : tuple of PresetMatch
     log : LogInspection or None
-        With a vehicle: of the log that it makes of the capture.
+        With a vehicle: of the decoded log.
     """
 
     name: str
@@ -167,7 +167,7 @@ class CaptureInspection:
 
 
 def inspect_capture(path: str | PathLike[str], vehicle: Vehicle | None = None) -> CaptureInspection:
-    """Inspect a capture; with a vehicle, also the log that it makes of it.
+    """Inspect a capture; with a vehicle, also the decoded log.
 
     Raises
     ------
@@ -198,7 +198,7 @@ def inspect_capture(path: str | PathLike[str], vehicle: Vehicle | None = None) -
     )
 
 
-# --- Frames by id, without knowing the car
+# --- Frames by id, without a vehicle
 
 
 class _Survey:
@@ -320,8 +320,7 @@ class _IdRecord:
         self._try_rules(data, time_s)
 
     def _start_trials(self) -> None:
-        # Losses only lengthen intervals: at least a quarter of them is the period. Equal stamps
-        # show none.
+        # Lost frames lengthen intervals, so the lower quartile is the period; 0 for equal stamps.
         period_s = sorted(self.intervals)[len(self.intervals) // 4] if self.intervals else None
         for rule in (LEAF_RULE, GENERIC_RULE):
             self.trials[rule.name] = _Trial(FrameChecker(rule, period_s or None))
@@ -356,7 +355,7 @@ class _IdRecord:
     def summary(self, name: str, channel: Channel | None) -> IdSummary:
         rule, trial = self._protection()
         counter = trial
-        if trial is not None and trial.counter_repeats > STANDING * self.frames:
+        if trial is not None and trial.counter_repeats > REPEATED_SHARE * self.frames:
             counter = None  # the CRC is correct, but the counter is not where the rule expects it
         return IdSummary(
             id=name,
@@ -373,7 +372,7 @@ class _IdRecord:
         )
 
 
-# --- Presets tried on the frames
+# --- Match of the presets
 
 
 @dataclass(slots=True)
@@ -471,11 +470,11 @@ class _Attempts:
 
 def _problem(name: str, attempt: _Attempt, vehicle: Vehicle, survey: _Survey) -> str:
     """Return why a preset does not match, or ""."""
-    counters = attempt.decoder.statistics
+    statistics = attempt.decoder.statistics
     if not attempt.samples:
-        return "no current in its frames" if counters.wanted else "none of its frames"
-    if counters.crc_errors > 0.1 * counters.wanted:
-        return f"{counters.crc_errors} of {counters.wanted} CRCs are wrong"
+        return "no current in its frames" if statistics.wanted else "none of its frames"
+    if statistics.crc_errors > 0.1 * statistics.wanted:
+        return f"{statistics.crc_errors} of {statistics.wanted} CRCs are wrong"
     if attempt.voltage.ends is None:
         return "no voltage"
     long_enough = survey.last_s - survey.first_s >= LONG_ENOUGH_S

@@ -84,7 +84,7 @@ def describe_timing(time_s: FloatArray, gap_limit_s: float = GAP_S) -> Timing:
 # --- Channels
 
 STUCK_S: Final = 10.0
-"""Shortest stretch of one value that may be stuck [s], …"""
+"""Shortest interval of one value that may be stuck [s], …"""
 STUCK_ROWS: Final = 5
 """… its fewest rows, …"""
 STUCK_JUMPS: Final = 3
@@ -92,7 +92,7 @@ STUCK_JUMPS: Final = 3
 JUMP_LIMIT_S: Final = 5.0
 """Longest interval between rows for a jump [s]."""
 END_S: Final = 2.0
-"""Jumps this near to the ends of a stretch do not count [s]."""
+"""Jumps this close to the ends of an interval do not count [s]."""
 _FREQUENT: Final = (3, 6, 12, 50)
 """Numbers of most frequent values whose differences are candidates for the quantum."""
 _MIN_PLACES: Final = 4
@@ -107,7 +107,7 @@ _OFF_GRID: Final = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Stuck:
-    """A stretch in which a channel kept one value while the other one jumped.
+    """An interval in which a channel kept one value while the other one jumped.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ def _refined(offsets: FloatArray, place: FloatArray, weight: FloatArray) -> floa
 def find_stuck(
     log: Log, values: FloatArray, other: FloatArray, jump: float, unit: str
 ) -> tuple[Stuck, ...]:
-    """Return the stretches where a channel keeps one value while the other jumps.
+    """Return the intervals in which a channel keeps one value while the other jumps.
 
     Jumps are changes from one second to the next; several in both directions are needed, since in
     a constant-current or constant-voltage phase the other channel drifts but does not jump.
@@ -239,7 +239,7 @@ def find_stuck(
     found = []
     for first, last in _constant_runs(log.time_s, values):
         start, end = log.time_s[first], log.time_s[last - 1]
-        # A jump at either end starts or ends the stretch; jumps in one direction are relaxation.
+        # A jump at either end bounds the interval; jumps in one direction are relaxation.
         ends = (start + END_S, end - END_S)
         ups, downs = (int(np.diff(np.searchsorted(jumps, ends))[0]) for jumps in (up, down))
         count = ups + downs
@@ -267,7 +267,7 @@ def _constant_runs(time_s: FloatArray, values: FloatArray) -> list[tuple[int, in
 # --- Charge, reference SoC and resistance
 
 MIN_SOC_SPAN_PCT: Final = 5.0
-"""Least span of the reference SoC for a capacity [%]: its quantization weighs too much below."""
+"""Least span of the reference SoC for a capacity [%]: below, its quantization dominates."""
 MIN_STEPS: Final = 8
 """Fewest clear steps of current for a resistance."""
 

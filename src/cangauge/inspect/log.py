@@ -1,4 +1,4 @@
-"""Inspect a log: what it holds, its sign of current, and what it can identify."""
+"""Inspect a log: its channels, its sign of current, and what it can identify."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ VOLTAGE_QUANTA: Final = 4.0
 """Of voltage, in quanta; a jump of current must move the voltage by as much."""
 VOLTAGE_SHARE: Final = 0.002
 """Of voltage, relative to its median [-]."""
-LISTED_STRETCHES: Final = 5
-"""Stuck stretches of a channel that are listed in the warnings."""
+LISTED_INTERVALS: Final = 5
+"""Most stuck intervals of a channel to list in the warnings."""
 
 # Limits of the abilities.
 DELAYS_S: Final = (10.0, 30.0, 70.0)
@@ -115,7 +115,7 @@ class LogInspection:
 
 
 def inspect_log(log: Log) -> LogInspection:
-    """Inspect a log; its current may have either sign, which is one of the findings."""
+    """Inspect a log; the sign of its current is one of the findings."""
     timing = describe_timing(log.time_s)
     resistance = describe_resistance(log)
     channels = _channels(log, resistance)
@@ -215,10 +215,10 @@ def _stuck_warnings(name: str, channel: Channel) -> list[str]:
     found = [
         f"{name} stuck at {stretch.value:g} {channel.unit} for {stretch.duration_s:.0f} s"
         f" from {stretch.start_s:.1f} s: {stretch.why}"
-        for stretch in channel.stuck[:LISTED_STRETCHES]
+        for stretch in channel.stuck[:LISTED_INTERVALS]
     ]
-    more = len(channel.stuck) - LISTED_STRETCHES
-    return [*found, f"{name}: {more} more stuck stretches"] if more > 0 else found
+    more = len(channel.stuck) - LISTED_INTERVALS
+    return [*found, f"{name}: {more} more stuck intervals"] if more > 0 else found
 
 
 def _voltage_curve(charge: Charge, soc: Soc | None) -> Ability:
@@ -321,7 +321,7 @@ def _start(log: Log) -> Ability:
 
 
 def _rests(log: Log) -> Ability:
-    """Judge the rests: they show the rest voltage and an offset of the current sensor."""
+    """Assess the rests, which show the rest voltage and an offset of the current sensor."""
     topic = "rest voltage"
     peak = float(np.max(np.abs(log.current_a)))
     still = np.abs(log.current_a) <= REST_SHARE * peak

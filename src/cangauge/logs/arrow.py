@@ -1,8 +1,8 @@
 """The columns of a canonical log in an Arrow table or a text header: names, types, values.
 
 Names in any case: `time_s`, `current_a` (positive = discharge), `voltage_v`, `temperature_c`,
-optional `soc_pct`. `temperature_source`, which names what the temperature was measured on, is
-metadata of the schema or a column that repeats the word; it is left out when unknown.
+optional `soc_pct`. `temperature_source`, the location of the temperature sensor, is metadata of the
+schema or a column that repeats the word; it is omitted when unknown.
 """
 
 from __future__ import annotations
@@ -192,5 +192,5 @@ def _as_float64(column: Any, label: str, where: str) -> FloatArray:
 
 
 def _plain(column: Any) -> Any:
-    # polars' text: few compute functions of pyarrow take it.
+    # The text type of polars, which few compute functions of pyarrow accept.
     return column.cast(pa.string()) if str(column.type) == "string_view" else column

@@ -39,7 +39,7 @@ def read_parquet(content: FileContent) -> DraftLog:
     Raises
     ------
     InputError
-        If it is damaged, lacks a column or holds something else than numbers.
+        If it is damaged, lacks a column or holds anything but numbers.
     """
     source = str(content.path)
     data = pa.BufferReader(content.read())
@@ -52,10 +52,10 @@ def read_parquet(content: FileContent) -> DraftLog:
         check_types(schema, places, source)
         texts = [names[index] for index in places.values() if is_text(schema.field(index).type)]
         if texts:
-            # As dictionaries: one long text, repeated in millions of rows, takes no room in a file.
+            # As dictionaries: a long text repeated in millions of rows is small in the file only.
             file = _open_parquet(data, *texts)
         table = file.read(columns=[names[index] for index in places.values()])
-        table.validate(full=True)  # damage can point outside of a dictionary
+        table.validate(full=True)  # damaged indices may exceed a dictionary
     except (pa.ArrowException, OSError, ValueError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise InputError(
@@ -67,7 +67,7 @@ def read_parquet(content: FileContent) -> DraftLog:
 def _open_parquet(data: Any, *dictionaries: str) -> Any:
     return pq.ParquetFile(
         data,
-        # Our files have checksums; others are read without.
+        # Files of `write_log` have checksums; others are read without.
         page_checksum_verification=True,
         thrift_string_size_limit=MAX_PARQUET_NAMES,
         thrift_container_size_limit=MAX_PARQUET_NAMES,
@@ -76,7 +76,7 @@ def _open_parquet(data: Any, *dictionaries: str) -> Any:
 
 
 def _check_size(metadata: Any, source: str) -> None:
-    """Refuse a small file of huge content: runs of one value take no room in Parquet."""
+    """Raise InputError for a small file of huge content: Parquet compresses runs of one value."""
     for what, count, limit in (
         ("rows", metadata.num_rows, MAX_LOG_ROWS),
         ("columns", metadata.num_columns, MAX_LOG_COLUMNS),
@@ -103,7 +103,7 @@ def read_csv(content: FileContent) -> DraftLog:
     Raises
     ------
     InputError
-        If it lacks a column or holds something else than numbers.
+        If it lacks a column or holds anything but numbers.
     """
     line = content.first_line
     delimiter = delimiter_of(line) or ","

@@ -36,7 +36,7 @@ class Columns:
     decimal_comma : bool
         Whether `391,4` means 391.4.
     remarks : tuple of str
-        Lines that were left out.
+        Lines that were omitted.
     """
 
     text: dict[str, Any]
@@ -51,7 +51,7 @@ class Columns:
         Raises
         ------
         InputError
-            If a cell holds something else than a number.
+            If a cell holds anything but a number.
         """
         trimmed = pc.utf8_trim_whitespace(self.text[name])
         if self.decimal_comma:
@@ -89,7 +89,7 @@ def read_columns(
     """Read some columns of the lines after the first `skip_lines`.
 
     A line with another number of cells than the first row is an error, except at the end: a cut
-    last line and closing remarks of the exporter are left out, with a remark.
+    last line and closing remarks of the exporter are omitted, with a remark.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def read_columns(
     wanted : mapping of str to int
         Index of the column, from 0, by the name to give it.
     header : list of str
-        Headings, for messages and to check that the first row is complete.
+        Headings, for messages and for the number of cells.
     delimiter : str
         One character.
     skip_lines : int
@@ -121,7 +121,7 @@ def read_columns(
     try:
         table = pacsv.read_csv(
             pa.BufferReader(data),
-            # One thread: pyarrow numbers odd rows only then.
+            # One thread: otherwise pyarrow does not number odd rows.
             read_options=pacsv.ReadOptions(
                 use_threads=False, column_names=names, skip_rows=skip_lines
             ),
@@ -197,9 +197,9 @@ def _remarks_on_odd_rows(
     for row in odd:
         closing = row.actual_columns == 1 and not _is_number(row.text)
         if row.number > last - len(odd) and closing:
-            remarks.append(f"closing line left out: {row.text.strip()[:60]!r}")
+            remarks.append(f"closing line omitted: {row.text.strip()[:60]!r}")
         elif row.number == last and row.actual_columns < row.expected_columns:
-            remarks.append("the last line is cut off and was left out: the file may be incomplete")
+            remarks.append("the last line is cut off and was omitted: the file may be incomplete")
         else:
             raise _odd_row(row, skip_lines, content)
     return remarks

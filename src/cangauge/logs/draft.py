@@ -1,4 +1,4 @@
-"""What a reader found, before it is checked; the checks that make it a log."""
+"""Columns found by a reader, and the checks that turn them into a log."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cangauge.errors import InputError
 from cangauge.logs.units import REQUIRED, TemperatureSource, refuse_wrong_units
 
 MAX_INCOMPLETE: Final = 0.05
-"""Largest part of incomplete rows that is dropped, where dropping is the rule [-]."""
+"""Largest fraction of incomplete rows to drop, in formats that allow it [-]."""
 
 
 @dataclass(slots=True)
@@ -32,13 +32,13 @@ class DraftLog:
     labels : dict of str to str
         Heading in the file by field, for messages.
     temperature_source : str
-        What the temperature was measured on.
+        Location of the temperature sensor.
     drop_incomplete : bool
-        Drop rows that lack a required value (with a remark) instead of refusing them.
+        Drop rows that lack a required value, with a remark, instead of raising.
     sign_unknown : bool
         The format does not define the sign of current.
     remarks : list of str
-        What the reader changed or noticed.
+        Changes and findings of the reader.
     """
 
     name: str
@@ -57,7 +57,7 @@ class DraftLog:
                 shown = ", ".join(headings[:12]) + (", …" if len(headings) > 12 else "")
                 raise self._error(
                     name,
-                    f"no column of this file gives it (it has: {shown})",
+                    f"no column of this file holds it (found: {shown})",
                     cure="check the export, or convert it to a canonical log",
                 )
 
@@ -66,14 +66,14 @@ class DraftLog:
         self.values = {name: values[rows] for name, values in self.values.items()}
 
     def negate_current(self, because: str) -> None:
-        """Turn the sign of the stored current, with a remark."""
+        """Invert the sign of the stored current, with a remark."""
         self.values["current_a"] = 0.0 - self.values["current_a"]  # no -0.0
         self.remarks.append(f"current negated: {because}")
 
     def checked(self, temperature_c: float | None = None) -> dict[str, Any]:
         """Check all values and return the arguments of `Log`.
 
-        Rows whose time stamp equals the one before are dropped (the first stays), with a remark.
+        Rows that repeat the time stamp of the row before are dropped, with a remark.
 
         Parameters
         ----------

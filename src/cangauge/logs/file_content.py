@@ -1,4 +1,4 @@
-"""A log file's content: gzip and zip unpacked, text decoded, the beginning to recognise it by."""
+"""Content of a log file: gzip and zip unpacked, text decoded; its beginning for recognition."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _DELIMITERS: Final = ("\t", ";", ",")
 _HEAD_BYTES: Final = 64 * 1024
 _HEAD_LINES: Final = 60
 _D3_MEMBER: Final = "test data.txt"
-# An LZMA member chooses how much memory its reader needs; no exporter writes one.
+# An LZMA member sets the memory of its reader; no exporter writes one.
 _ZIP_METHODS: Final = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _DAMAGE: Final = (EOFError, OSError, zlib.error, zipfile.BadZipFile, struct.error, ValueError)
 
@@ -121,7 +121,7 @@ def delimiter_of(line: str) -> str | None:
 
 
 def split_cells(line: str, delimiter: str) -> list[str]:
-    """Split a line into cells without blanks and quotes around them."""
+    """Split a line into cells, without enclosing blanks and quotes."""
     reader = csv.reader([line], delimiter=delimiter, skipinitialspace=True)
     return [cell.strip() for cell in next(reader, [])]
 

@@ -1,4 +1,4 @@
-"""Logs of other makers: BMW i3 trips, Argonne D3 tests, exports of battery cyclers.
+"""Third-party logs: BMW i3 trips, Argonne D3 tests, exports of battery cyclers.
 
 Each format has a test of the file's beginning (`is_…`) and a reader (`read_…`).
 """
@@ -60,7 +60,7 @@ def read_bmw_i3(content: FileContent) -> DraftLog:
     Raises
     ------
     InputError
-        If a column is missing, or holds something else than numbers or missing values.
+        If a column is missing, or holds anything but numbers or missing values.
     """
     header = split_cells(content.head[0], ";")
     places: dict[str, int] = {}
@@ -88,7 +88,7 @@ def read_bmw_i3(content: FileContent) -> DraftLog:
 # --- Argonne's Downloadable Dynamometer Database (D3): 10 Hz, tab-separated text.
 # Headings differ between years; they are compared without unit (`[V]` or `__V`), spaces and
 # underscores, in any case. Positive current discharges; a copy from the car's CAN may have the
-# opposite sign, which is then found from the data. `Cell Temp` is the temperature of the test
+# opposite sign, which is then determined from the data. `Cell Temp` is the temperature of the test
 # room. Rows before time 0 (the wait before the test) and rows that lack a required value are
 # dropped, each with a remark.
 
@@ -146,7 +146,7 @@ def read_d3(content: FileContent) -> DraftLog:
     Raises
     ------
     InputError
-        If time, battery current or voltage is not there, or holds something else than numbers.
+        If time, battery current or voltage is missing, or holds anything but numbers.
     """
     headings = _d3_headings(content.head[0])
     texts = [heading.text for heading in headings]
@@ -316,7 +316,7 @@ def read_cycler(content: FileContent) -> DraftLog:
     Raises
     ------
     InputError
-        If a row is incomplete or holds something else than numbers.
+        If a row is incomplete or holds anything but numbers.
     """
     found = _find_cycler(content)
     if found is None:

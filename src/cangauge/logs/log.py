@@ -36,16 +36,16 @@ class Log(ArrowExport):
     temperature_c : array of shape (n,)
         Temperature [°C] from `temperature_source`.
     soc_pct : array of shape (n,), optional
-        Reference state of charge [%]. May be NaN anywhere: the first finite value is the assumed
-        SoC at that moment, finite values are the reference to compare with.
+        Reference state of charge [%], NaN where unknown. The first finite value is also the
+        assumed SoC at that time.
     name : str
         Short name for tables and plots.
     source : str
-        Path of the file that it was read from, or "".
+        Path of the file, or "".
     temperature_source : {"cell", "pack", "coolant", "room", "unknown"}
-        What the temperature was measured on.
+        Location of the temperature sensor.
     remarks : tuple of str
-        What the reader changed or noticed ("12 duplicated time stamps dropped").
+        Changes and findings of the reader ("12 duplicated time stamps dropped").
 
     Raises
     ------
@@ -59,8 +59,8 @@ class Log(ArrowExport):
 
     Notes
     -----
-    A log offers the Arrow PyCapsule interface: `polars.DataFrame(log)`, `pyarrow.table(log)` and
-    every other library that reads it take a log as a table.
+    A log exports the Arrow PyCapsule interface, so that `polars.DataFrame(log)`,
+    `pyarrow.table(log)` and other libraries accept it as a table.
 
     Examples
     --------
@@ -147,7 +147,7 @@ class Log(ArrowExport):
         temperature_c : float, optional
             Constant temperature [°C], in place of a column.
         temperature_source : {"cell", "pack", "coolant", "room", "unknown"}, optional
-            What the temperature was measured on, in place of the table's own word.
+            Location of the temperature sensor, in place of the table's own.
 
         Raises
         ------

@@ -31,13 +31,13 @@ _TEXT_FORMATS: Final[tuple[tuple[Callable[[FileContent], bool], _Reader], ...]] 
 
 @dataclass(frozen=True, slots=True)
 class LogFile:
-    """A file that may be a log; its beginning is read.
+    """A file that may be a log, recognised by its beginning.
 
     Parameters
     ----------
     content : FileContent
     reader : callable or None
-        Of its format; None where it is no log.
+        Of its format; None if it is not a log.
     """
 
     content: FileContent
@@ -68,7 +68,7 @@ class LogFile:
 
 
 def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
-    """Return the error for a file of no known format; it shows the first line of a text."""
+    """Return the error for a file of unknown format; it quotes the first line of a text."""
     shown = file.content.first_line.strip()
     is_text = bool(shown) and shown.isprintable()
     return InputError(
@@ -103,7 +103,7 @@ def read_log(
 ) -> Log:
     """Read a log of any known format, plain, gzipped or in a zip.
 
-    `Log.remarks` lists all that was dropped, converted or assumed.
+    `Log.remarks` lists what was dropped, converted or assumed.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def read_log(
     temperature_c : float, optional
         Constant temperature [°C], in place of the file's.
     temperature_source : {"cell", "pack", "coolant", "room", "unknown"}, optional
-        What the temperature was measured on, in place of the file's own word.
+        Location of the temperature sensor, in place of the file's own.
 
     Returns
     -------

@@ -1,6 +1,6 @@
-"""Prepare a log for a fit or diagnosis: undo the steps of its temperature, average fast rows.
+"""Prepare a log for a fit or diagnosis: dequantize its temperature, average fast rows.
 
-Both look ahead: they are for offline use, not for the service.
+Both are non-causal, hence for offline use only.
 """
 
 from __future__ import annotations
@@ -13,24 +13,24 @@ from cangauge._typing import FloatArray, IntArray
 from cangauge.logs.log import Log
 
 PLATEAU_S = 60.0
-"""A reported value that lasts this long [s] is taken as exact in the middle of its plateau; a
-shorter plateau is noise of a temperature between two steps."""
+"""A reported value that lasts this long [s] is assumed exact in the middle of its plateau; shorter
+plateaus are noise of a temperature between two steps."""
 STEPPED_SHARE = 0.5
-"""A temperature that changes at this part of the rows or more is not quantized [-]."""
+"""A temperature that changes at this fraction of the rows or more is not quantized [-]."""
 ENOUGH_HZ = 20.0
-"""Rate of an averaged log [Hz]. A log below twice this rate is returned as it is."""
+"""Rate of an averaged log [Hz]. A log below twice this rate is returned unchanged."""
 
 
 def dequantize(log: Log) -> Log:
     """Return a log whose quantized temperature is interpolated between its steps.
 
-    A sensor reports whole or quarter degrees while the temperature may move by less in an hour:
-    the report is wrong by up to half a step for as long. With a coefficient of tenths of a volt
-    per kelvin (0.74 V/K in the published model) that exceeds most effects. At a step, the
-    temperature is known: half-way.
+    A sensor reports whole or quarter degrees, while the temperature may change by less in an hour:
+    the error of up to half a step lasts as long. With a coefficient of tenths of a volt per kelvin
+    (0.74 V/K in the published model) it exceeds most effects. At a step the temperature is known:
+    half-way between the two values.
 
-    Lines run from step to step through the middle of long plateaus, never further from the report
-    than half of its usual step, so that a jump, as after an unobserved interval, stays one. A
+    Interpolation is linear between steps and the middles of long plateaus, and clipped to half a
+    usual step around the reported value, which preserves jumps, as after an unobserved interval. A
     temperature that never changes, or changes at most rows, is kept.
     """
     time_s, reported = log.time_s, log.temperature_c
@@ -63,11 +63,11 @@ def _midpoints(values: FloatArray, change: IntArray) -> FloatArray:
 def resample(log: Log, rate_hz: float = ENOUGH_HZ) -> Log:
     """Return a log averaged over bins of 1 / `rate_hz`.
 
-    A diagnosis tries hundreds of effects over all samples; none of them acts within less than a
-    few tenths of a second, while a car's bus brings a hundred samples a second.
+    A diagnosis evaluates hundreds of effects over all samples. The fastest act within a few tenths
+    of a second, while a car's bus gives a hundred samples per second.
 
-    Each row is the mean of all signals at the mean time of its bin: no signal is delayed against
-    another, charge and unobserved intervals are kept. The reference SoC is the first finite value
+    Each row holds the means of all signals at the mean time of its bin: relative delays, charge and
+    unobserved intervals are preserved. The reference SoC is the first finite value
     of each bin.
     """
     if len(log) < 2 or float(np.median(np.diff(log.time_s))) * 2.0 * rate_hz > 1.0:

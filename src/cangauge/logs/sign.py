@@ -1,4 +1,4 @@
-"""The sign of current, found from the data: positive should discharge.
+"""Determine the sign of current from the data: positive should discharge.
 
 Three kinds of evidence:
 
@@ -7,8 +7,8 @@ Three kinds of evidence:
 - **charge**: over hours, voltage follows the remaining charge.
 - **SoC**: a reference SoC falls as charge is taken out.
 
-The confidence adds the weights of the three, each a decade of odds per unit. It ranks findings and
-is not a measured frequency; weights are capped so that no kind decides alone against another.
+The confidence follows from the sum of the three weights, one unit per decade of odds. It ranks
+findings and is not a measured frequency; weights are capped, so that no kind overrules another.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ Kind = Literal["steps", "charge", "soc"]
 STEP_SPACING_S: Final = 1.0
 """Time between the rows whose difference is a step [s]."""
 STEP_LIMIT_S: Final = 90.0
-"""Rows further apart make no step [s]: the cycler's slowest logging is 60 s."""
+"""Longest interval of a step [s]: the slowest logging of cyclers is 60 s."""
 STEP_SHARE: Final = 0.05
-"""A step is at least this part of the range of current."""
+"""Smallest step, relative to the range of current [-]."""
 MAX_STEPS: Final = 400
 VOTES_PER_FREE_ONE: Final = 3.0
-"""Votes that count as one independent vote: no wrong sign in random windows of real logs."""
+"""Votes that count as one independent vote; no wrong sign in random windows of real logs."""
 CLEAR_SHARE: Final = 0.75
 """Least share of agreeing votes for steps to count [-]."""
 MOST_CONFIDENT: Final = 0.9999
@@ -115,10 +115,7 @@ class SignFinding:
 
 
 def sign_of_current(log: Log) -> SignFinding:
-    """Find from the data whether positive current discharges.
-
-    The log's current may have either sign.
-    """
+    """Determine from the data whether positive current discharges; either sign is accepted."""
     evidence = (_from_steps(log), _from_charge(log), _from_soc(log))
     weight = sum(item.weight for item in evidence)
     opposed = any(item.weight * weight < 0.0 and abs(item.weight) >= 1.0 for item in evidence)

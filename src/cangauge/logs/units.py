@@ -1,7 +1,7 @@
-"""Units of a log's quantities: conversion of stated ones, refusal of those that values contradict.
+"""Units of a log: conversion of stated units, and errors where the values contradict a unit.
 
-A voltage that is swapped with the temperature is refused too: its values look like kelvin. The
-voltage is the one whose steps follow those of the current.
+Voltage and temperature that are swapped are detected too: the voltage is the column whose steps
+follow those of the current.
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ MAX_HOURS_AT_PEAK: Final = 100.0
 """Largest charge, in hours of the largest current [h]."""
 _EPOCH_MS: Final = 1e11
 
-# Of the steps of current that decide whether a column follows it.
+# Test whether a column follows the current.
 LARGE_SHARE: Final = 0.25
-"""Part of the rows that is compared: those with the largest steps of current [-]."""
+"""Fraction of the rows to compare: those with the largest steps of current [-]."""
 LEAST_ROWS: Final = 20
 FOLLOWS: Final = 0.7
 """Agreement from which a column follows the current [-]. Real drives: voltages at least 0.89,
@@ -135,7 +135,7 @@ def refuse_wrong_units(
 ) -> tuple[str, ...]:
     """Raise InputError if the values cannot be in the canonical units.
 
-    Medians are judged first, so that a few odd rows do not decide, then single impossible values.
+    Medians are checked first, against a few odd rows, then single impossible values.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def refuse_wrong_units(
         )
 
     _check_time(values, refuse)
-    # Before the voltage: a temperature below 1 °C in its place looks like kilovolts or turned.
+    # Before the voltage: a temperature below 1 °C in its place looks like kilovolts or inverted.
     _check_swapped(values, labels.get("voltage_v", "voltage_v"), refuse)
     _check_voltage(values["voltage_v"], refuse)
     _check_current(values["current_a"], refuse)
@@ -168,8 +168,8 @@ def refuse_wrong_units(
 def follows_current(current_a: FloatArray, values: FloatArray) -> bool:
     """Return whether a column's steps have the sign of the current's, or all the opposite one.
 
-    Only signs count: neither a unit nor a few wrong rows matter. False where the current hardly
-    changes, as in a cycler's discharge.
+    Signs alone count, so that neither the unit nor a few wrong rows matter. False where the current
+    hardly changes, as in a cycler's discharge.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def _check_time(values: dict[str, FloatArray], refuse: _Refuse) -> None:
     if far.size:
         raise refuse(
             "time_s",
-            f"row {far[0] + 1} is no time in seconds",
+            f"row {far[0] + 1} is not a time in seconds",
             float(time[far[0]]),
             "correct or remove the row",
         )
@@ -231,7 +231,7 @@ def _check_time(values: dict[str, FloatArray], refuse: _Refuse) -> None:
 
 
 def _check_charge(time: FloatArray, current: FloatArray, interval: float, refuse: _Refuse) -> None:
-    """Refuse a fast log in milliseconds: it moves more charge than a battery holds."""
+    """Detect a fast log in milliseconds: it moves more charge than a battery holds."""
     peak = float(np.max(np.abs(current)))
     # A steady drain can last for weeks; a drive that varies this much cannot.
     varied = float(np.mean(np.abs(current))) < 0.5 * peak
@@ -333,13 +333,13 @@ def _check_temperature(values: dict[str, FloatArray], refuse: _Refuse) -> tuple[
             raise refuse("temperature_c", "temperature looks like kelvin", middle, cure)
     if not COLDEST_C <= middle <= HOTTEST_C:
         raise refuse(
-            "temperature_c", "this is no battery's temperature in °C", middle, "convert it to °C"
+            "temperature_c", "this is not a battery's temperature in °C", middle, "convert it to °C"
         )
     odd = np.flatnonzero((temperature < COLDEST_C) | (temperature > HOTTEST_C))
     if odd.size:
         raise refuse(
             "temperature_c",
-            f"row {odd[0] + 1} is no battery's temperature in °C",
+            f"row {odd[0] + 1} is not a battery's temperature in °C",
             float(temperature[odd[0]]),
             "remove the row: codes such as 255 mean 'not available'",
         )

@@ -2,7 +2,7 @@
 
 At full speed nothing may be lost, although socket buffers drop excess frames silently. The receiver
 (`cangauge run --time-source replay-clock`) reports its sample count in SOC_DETAIL every few
-samples, and again in the silence after them; the player limits the samples and frames under way.
+samples, and again in the silence after them; the player limits the samples and frames in flight.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ from cangauge.replay.steps import Source, Step
 _LOG = logging.getLogger(__name__)
 
 AHEAD_S: Final = 0.0002
-"""Frames this close to their time are sent at once: sleeping is less precise [s]."""
+"""Frames due within this time are sent at once: sleeping is less precise [s]."""
 REST_AT_MOST_S: Final = 0.2
 """Longest uninterrupted wait, so that a stop is noticed [s]."""
 
 WINDOW_SAMPLES: Final = 40
-"""Most samples under way."""
+"""Most samples in flight."""
 WINDOW_FRAMES: Final = 160
-"""Most frames under way: a default socket buffer of Linux holds about 270."""
+"""Most frames in flight: a default socket buffer of Linux holds about 270."""
 SAMPLES_AT_LEAST: Final = 2 * ACKNOWLEDGE_EVERY
-"""Samples that may always be under way; with fewer, no acknowledgement would become due."""
+"""Samples that may always be in flight: fewer would not trigger an acknowledgement."""
 SLOW_S: Final = 0.5
-"""Wait for an acknowledgement that is worth a warning [s]."""
+"""Wait for an acknowledgement above which to warn [s]."""
 _POLL_S: Final = 0.05
 
 SHOW_EVERY_S: Final = 0.2
 LISTEN_S: Final = 0.001
-"""Time to listen at each display, in case there was no pause for it [s]."""
+"""Time to listen at each display update, for replays without pauses [s]."""
 LISTEN_AT_END_S: Final = 0.15
 """Time to listen for the estimate after the last frame [s]."""
 
@@ -61,7 +61,7 @@ _HINT = (
 
 @dataclass(frozen=True)
 class ReplaySettings:
-    """How to play.
+    """Settings of a replay.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ class ReplaySettings:
 
     @property
     def is_max(self) -> bool:
-        """Whether the receiver sets the pace."""
+        """Whether acknowledgements of the receiver set the speed."""
         return math.isinf(self.speed)
 
 
@@ -238,7 +238,7 @@ class _Player:
             )
 
     def _update(self, listen_s: float) -> None:
-        """Listen, bring the state up to date and show it."""
+        """Listen, update the state and show it."""
         state = self.state
         if self._first_us is not None:
             state.seconds = time.monotonic() - self._began_s
@@ -251,7 +251,7 @@ class _Player:
 
 
 class Pacer:
-    """Waits for moments of log time.
+    """Wait for moments of log time.
 
     All moments are counted from the first, on the monotonic clock: errors do not accumulate, and a
     late frame does not delay the rest.
@@ -315,7 +315,7 @@ class _Receiver:
     def listen(self, within_s: float) -> None:
         """Receive for at most `within_s` [s]; return when the bus is quiet.
 
-        A timeout of 0 would not do: where Python filters, own frames must be skipped first.
+        Not with a timeout of 0: where Python filters, own frames must be skipped first.
         """
         until_s = time.monotonic() + within_s
         while (left_s := until_s - time.monotonic()) > 0.0 and self.take(left_s):
@@ -354,22 +354,22 @@ class _Receiver:
         if self._is_full():
             # Drain to half, so that both sides work in batches.
             self._wait(
-                within_s, lambda: self._under_way <= WINDOW_SAMPLES // 2 and not self._is_full()
+                within_s, lambda: self._in_flight <= WINDOW_SAMPLES // 2 and not self._is_full()
             )
 
     def wait_for_all(self, within_s: float) -> None:
         """Wait until all samples are acknowledged; raises like `wait_for_room`."""
-        self._wait(within_s, lambda: self._under_way == 0)
+        self._wait(within_s, lambda: self._in_flight == 0)
 
     @property
-    def _under_way(self) -> int:
+    def _in_flight(self) -> int:
         return self._sent - self.acknowledged
 
     def _is_full(self) -> bool:
-        if self._under_way < SAMPLES_AT_LEAST:
+        if self._in_flight < SAMPLES_AT_LEAST:
             return False
         frames = self._frames_sent - self._frames_acknowledged
-        return self._under_way >= WINDOW_SAMPLES or frames >= WINDOW_FRAMES
+        return self._in_flight >= WINDOW_SAMPLES or frames >= WINDOW_FRAMES
 
     def _wait(self, within_s: float, is_enough: Callable[[], bool]) -> None:
         began_s = last_s = time.monotonic()
@@ -409,10 +409,10 @@ class _Receiver:
         more = (count - self._count) % SAMPLES_MODULO
         if more == 0:
             return
-        if more > self._under_way:
+        if more > self._in_flight:
             raise CangaugeError(
                 f"{self._bus.name}: the receiver has processed {more} samples where"
-                f" {self._under_way} were under way: it was restarted, or another program sends or"
+                f" {self._in_flight} were in flight: it was restarted, or another program sends or"
                 " acknowledges on this bus too"
             )
         self._count = count

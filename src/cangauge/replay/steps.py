@@ -34,13 +34,13 @@ class Step(NamedTuple):
     """Log time [µs]; keeps increasing when the log is repeated."""
     frames: list[can.Message]
     samples: int
-    """Samples that a receiver has made after these frames, since the first step."""
+    """Samples that a receiver has completed after these frames, since the first step."""
     is_wanted: bool
     """Whether a receiver uses these frames, so that they need the clock."""
 
 
 class Source(Protocol):
-    """Something to replay."""
+    """A recording to replay."""
 
     name: str
 
@@ -107,7 +107,7 @@ class LogSource:
 class CaptureSource:
     """The frames of a capture, as recorded.
 
-    Frames of cangauge itself are left out. If REPLAY_CLOCK is among them, log time is that of the
+    Frames of cangauge itself are dropped. If REPLAY_CLOCK is among them, log time is that of the
     replayed log, else the recorded stamps.
 
     Parameters
@@ -128,7 +128,7 @@ class CaptureSource:
         self._ids = ids or FrameIds()
         self.name = self._path.name
         self.dropped = 0
-        """Frames left out in the latest pass: those of cangauge itself, and error frames."""
+        """Frames dropped in the latest pass: those of cangauge itself, and error frames."""
 
     @property
     def counts_samples(self) -> bool:
@@ -172,7 +172,7 @@ class CaptureSource:
                 continue
             if clock.beginnings:
                 raise InputError(
-                    "holds several replays one after the other",
+                    "holds several consecutive replays",
                     source=self._path,
                     cure="cut it into one capture each",
                 )
@@ -187,7 +187,7 @@ class CaptureSource:
 
 
 class _SampleCounter:
-    """Counts the samples that a receiver makes, by decoding the frames."""
+    """Count the samples that a receiver makes, by decoding the frames."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._decoder = SampleDecoder(vehicle)
@@ -200,7 +200,7 @@ class _SampleCounter:
 
 
 @dataclass(frozen=True)
-class QuantisationBound:
+class QuantizationBound:
     """Largest SoC error due to the quantization of frames [%], by method.
 
     Values in frames differ from the log's by at most half a step (δI, δU, δT; δt = 0.5 µs).
@@ -224,9 +224,9 @@ class QuantisationBound:
         return self.coulomb_pct + self.newton_pct
 
 
-def quantisation_bound(
+def quantization_bound(
     vehicle: Vehicle, model: Model, log: Log, capacity_ah: float | None = None
-) -> QuantisationBound:
+) -> QuantizationBound:
     """Return the bound for a log replayed as a vehicle's frames with REPLAY_CLOCK.
 
     Parameters
@@ -237,7 +237,7 @@ def quantisation_bound(
     capacity_ah : float, optional
         Instead of the model's [Ah].
     """
-    step = FrameEncoder(vehicle).quantisation()
+    step = FrameEncoder(vehicle).quantization()
     voltage_model = model.voltage_model()
     current_a = step["current_a"]
     rounded_s = np.rint(log.time_s * MICROSECONDS) / MICROSECONDS
@@ -252,4 +252,4 @@ def quantisation_bound(
     volts = step["voltage_v"] + abs(voltage_model.kt_v_per_k) * temperature_k
     volts += resistance * (current_a + time_s * slew)
     slope = min(voltage_model.pseudo_ocv_at(soc)[1] for soc in np.linspace(0.0, 100.0, 1001))
-    return QuantisationBound(coulomb, volts / slope)
+    return QuantizationBound(coulomb, volts / slope)

@@ -1,1 +1,1 @@
-"""The service that runs on a bus: configuration and loop."""
+"""The service on a CAN bus, and the same pipeline over recordings."""

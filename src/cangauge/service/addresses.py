@@ -1,4 +1,4 @@
-"""Where the status of a service is served: HTTP addresses with tokens, and unix sockets.
+"""Addresses that serve a service's status: HTTP with tokens, and unix sockets.
 
 HTTP beyond loopback requires a bearer token. The token comes from a file or the environment, never
 from the command line, which other users of the machine can read. Unix sockets are open to their
@@ -144,7 +144,7 @@ def read_token(path: str | PathLike[str] | None, environment: Mapping[str, str])
 def _checked(content: str, source: str) -> str:
     token = content.strip()
     if not SHORTEST_TOKEN <= len(token) <= LONGEST_TOKEN or not token.isascii() or " " in token:
-        # The value is not quoted: it may be somebody's secret.
+        # The value is not quoted: it may be a secret.
         raise InputError(
             f"a token is {SHORTEST_TOKEN} to {LONGEST_TOKEN} printable characters without spaces",
             source=source,
@@ -154,7 +154,7 @@ def _checked(content: str, source: str) -> str:
     return token
 
 
-# --- Unix sockets -------------------------------------------------------------------------------
+# --- Unix sockets
 
 SOCKET_MODE: Final = 0o660
 LONGEST_NAME: Final = 40

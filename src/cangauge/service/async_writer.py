@@ -1,4 +1,4 @@
-"""Write from a thread, so that a slow, full or broken disk never blocks the receive loop."""
+"""Write in a thread, so that a slow, full or broken disk never blocks the receive loop."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class AsyncWriter:
     retry_s : float, optional
         Repeat a failed job after this time [s] until it succeeds. By default it is dropped.
     max_waiting_bytes : int
-        Reject jobs while more than this waits [bytes].
+        Reject jobs while the waiting ones exceed this [bytes].
     on_error : callable, optional
         Takes the exception of a failed job; called in the thread.
     on_recovery : callable, optional
@@ -32,7 +32,7 @@ class AsyncWriter:
     Attributes
     ----------
     problem : str or None
-        Why the latest job failed; None if it succeeded.
+        Error of the latest job; None if it succeeded.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class AsyncWriter:
         Returns
         -------
         bool
-            False if it was rejected, since too much waits already.
+            False if it was rejected: the waiting jobs exceed the limit.
         """
         with self._turn:
             if size and self._waiting_bytes > self.max_waiting_bytes:
@@ -97,7 +97,7 @@ class AsyncWriter:
             return self._turn.wait_for(self._is_idle, timeout=within_s)
 
     def close(self, within_s: float) -> list[Job]:
-        """Do the waiting jobs and end the thread.
+        """Finish the waiting jobs and end the thread.
 
         Parameters
         ----------

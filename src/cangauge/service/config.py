@@ -1,4 +1,4 @@
-"""Configuration of the service: one model for the TOML file, the command line and the docs.
+"""Configuration of the service: one model for the TOML file, the command line and the reference.
 
 Each key is declared once, as a field of `RunConfig` with its type, bounds, default, unit and help.
 The TOML file has the same keys; `cangauge.cli.config_options` makes the options of the command
@@ -68,7 +68,7 @@ DEFAULT_VEHICLE: Final = "generic"
 
 @dataclass(frozen=True)
 class OptionInfo:
-    """What the command line and the reference need to know of a key.
+    """Data of a key for the command line and the reference.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ class FullChargeConfig(_Strict):
     """Condition of a full pack; see `FullCharge`."""
 
     voltage_v: FiniteFloat = _key(..., "Least voltage.", unit="V", gt=0.0, le=1e4)
-    current_a: FiniteFloat = _key(..., "Largest current, either way.", unit="A", ge=0.0, le=5e3)
+    current_a: FiniteFloat = _key(..., "Largest absolute current.", unit="A", ge=0.0, le=5e3)
     hold_s: FiniteFloat = _key(60.0, "Duration of both.", unit="s", ge=0.0, le=86400.0)
     soc_pct: FiniteFloat = _key(100.0, "SoC then.", unit="%", ge=0.0, le=100.0)
     soc_std_pct: FiniteFloat = _key(0.5, "Its standard deviation.", unit="%", ge=0.01, le=100.0)
@@ -199,7 +199,7 @@ class RunConfig(_Strict):
     )
     wait_for_bus: StrictBool = _key(
         False,
-        "Start even if the bus is not there yet. A bus lost later is always reconnected.",
+        "Start even if the bus is not available yet. A bus lost later is always reconnected.",
         "",
         "--wait-for-bus/--need-bus",
         needs_restart=True,
@@ -550,7 +550,7 @@ def _with_model(data: Mapping[str, Any]) -> dict[str, Any]:
     return {"model": "-", **data}
 
 
-# --- Reference ----------------------------------------------------------------------------------
+# --- Reference
 
 
 @dataclass(frozen=True)

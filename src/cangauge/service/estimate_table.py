@@ -1,45 +1,104 @@
-"""Write the table of estimates while the service runs, in bounded memory."""
+"""The table of estimates as a file: one row per sample, CSV or Parquet by the suffix.
+
+`write_estimates` writes a finished table, `EstimateWriter` row by row while the service runs, in
+bounded memory.
+"""
 
 from __future__ import annotations
 
 import logging
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, BinaryIO, Final, Self
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 
 from cangauge._io import atomic_path
 from cangauge._logging import emit
+from cangauge._typing import FloatArray
 from cangauge.errors import CangaugeError, InputError
-from cangauge.estimate.validity import Estimate, reason_names
+from cangauge.estimate.offline import NUMBERS, EstimateTable
+from cangauge.estimate.validity import Estimate, Reason, Status, reason_name, reason_names
 from cangauge.service.async_writer import AsyncWriter
 
-NUMBERS: Final = (
-    "soc_pct",
-    "soc_std_pct",
-    "soc_newton_pct",
-    "soc_coulomb_pct",
-    "voltage_model_v",
-    "residual_v",
-)
 _SCHEMA: Final = pa.schema(
     [
-        *((name, pa.float64()) for name in ("time_s", *NUMBERS)),
+        *((name, pa.float64()) for name in NUMBERS),
         ("status", pa.string()),
         ("reasons", pa.string()),
     ]
 )
+_PLAIN_CSV: Final = pacsv.WriteOptions(include_header=False, quoting_style="none")
+"""No cell needs quotes."""
 _BLOCK_ROWS: Final = 4096
 _ROW_BYTES: Final = 400
 """Memory of a row in Python objects [bytes], roughly."""
 _CLOSE_WITHIN_S: Final = 30.0
 _LOG = logging.getLogger(__name__)
+
+
+def require_table_suffix(output: Path) -> None:
+    """Raise InputError unless the file is named .csv or .parquet."""
+    if output.suffix.lower() not in {".csv", ".parquet"}:
+        raise InputError(
+            "the suffix is neither .csv nor .parquet",
+            source=output,
+            field="--output",
+            value=output.suffix,
+            cure="name it .csv or .parquet",
+        )
+
+
+def write_estimates(path: Path, time_s: FloatArray, table: EstimateTable) -> None:
+    """Write one row per sample, as CSV or Parquet by the suffix.
+
+    Parameters
+    ----------
+    path : Path
+        Ends in .csv or .parquet.
+    time_s : array of shape (n,)
+        The samples' own time [s]: a refused sample's estimate is the one before.
+    table : EstimateTable
+        n estimates; an unknown value becomes empty (CSV) or null (Parquet).
+    """
+    columns = replace(table, time_s=time_s).to_arrow()
+    if path.suffix.lower() == ".parquet":
+        pq.write_table(columns, path)
+        return
+    with path.open("wb") as file:
+        _write_header(file)
+        pacsv.write_csv(columns, file, _PLAIN_CSV)
+
+
+def read_estimates(path: Path) -> EstimateTable:
+    """Read a Parquet file of estimates, as `write_estimates` or the service wrote it."""
+    columns = pq.read_table(path).to_pydict()
+    numbers: dict[str, Any] = {
+        name: np.array([np.nan if value is None else value for value in columns[name]])
+        for name in NUMBERS
+    }
+    flags = {reason_name(reason): int(reason) for reason in Reason}
+    reasons = {
+        text: sum(flags[name] for name in text.split("; ") if name)
+        for text in set(columns["reasons"])
+    }
+    return EstimateTable(
+        **numbers,
+        status=np.array([Status[name.upper()] for name in columns["status"]], dtype=np.int64),
+        reasons=np.array([reasons[text] for text in columns["reasons"]], dtype=np.int64),
+    )
+
+
+def _write_header(file: BinaryIO) -> None:
+    # pyarrow would quote the names.
+    file.write((",".join(_SCHEMA.names) + "\n").encode())
 
 
 class EstimateWriter:
@@ -68,14 +127,7 @@ class EstimateWriter:
 
     def __init__(self, path: str | PathLike[str]) -> None:
         self._path = Path(path)
-        if self._path.suffix.lower() not in {".parquet", ".csv"}:
-            raise InputError(
-                "the suffix is neither .csv nor .parquet",
-                source=self._path,
-                field="--output",
-                value=self._path.suffix,
-                cure="name it .csv or .parquet",
-            )
+        require_table_suffix(self._path)
         self._block: list[tuple[Any, ...]] = []
         self._names: dict[int, str] = {}
         self._stack = ExitStack()
@@ -89,11 +141,9 @@ class EstimateWriter:
     def __enter__(self) -> Self:
         part = self._stack.enter_context(atomic_path(self._path))
         if self._path.suffix.lower() == ".csv":
-            # pyarrow always quotes the names of the header.
             file = self._stack.enter_context(part.open("wb"))
-            file.write((",".join(_SCHEMA.names) + "\n").encode())
-            options = pacsv.WriteOptions(include_header=False, quoting_style="none")
-            self._sink = pacsv.CSVWriter(file, _SCHEMA, write_options=options)
+            _write_header(file)
+            self._sink = pacsv.CSVWriter(file, _SCHEMA, write_options=_PLAIN_CSV)
         else:
             self._sink = pq.ParquetWriter(part, _SCHEMA)
         return self
@@ -126,8 +176,8 @@ class EstimateWriter:
         words = self._names.get(reasons)
         if words is None:
             words = self._names[reasons] = reason_names(reasons)
-        # The fields of an estimate are in the table's order, after its time.
-        numbers = estimate[1 : 1 + len(NUMBERS)]
+        # The fields of an estimate are in the table's order; its time is that of the sample.
+        numbers = estimate[1 : len(NUMBERS)]
         self._block.append((time_s, *numbers, estimate.status.name.lower(), words))
         self.rows += 1
         if len(self._block) >= _BLOCK_ROWS:

@@ -1,7 +1,7 @@
-"""Serve the status of a running service by a unix socket, and by HTTP on request.
+"""Serve the status of a running service on a unix socket, and by HTTP on request.
 
-`/status` (JSON), `/healthz` and, with the extra `metrics`, `/metrics`. All are read-only and run in
-a thread that reads the latest snapshot; the receive loop neither knows nor waits. There is no
+Pages: `/status` (JSON), `/healthz` and, with the extra `metrics`, `/metrics`. All are read-only. A
+thread serves them from the latest snapshot and never blocks the receive loop. There is no
 encryption: beyond a trusted network, put a TLS proxy in front.
 """
 
@@ -36,11 +36,11 @@ if TYPE_CHECKING:
 MAX_HEADER_BYTES: Final = 8192
 MAX_BODY_BYTES: Final = 1024
 MAX_CLIENTS: Final = 32
-"""Limit of simultaneous connections; more are closed, which keeps files free for the service."""
+"""Most simultaneous connections; further ones are closed, to save file descriptors."""
 REQUEST_WITHIN_S: Final = 3.0
 """Time limit for receiving a request [s]."""
 CLOSE_WITHIN_S: Final = 0.3
-"""Time limit of the thread at the end [s]; it is a daemon."""
+"""Time limit for the thread to end [s]; it is a daemon."""
 
 _LOG = logging.getLogger(__name__)
 _Latest = Callable[[], Snapshot]
@@ -87,7 +87,7 @@ class Endpoint:
         self._thread = threading.Thread(target=self._run, name="cangauge-status", daemon=True)
 
     def _add_http(self, latest: _Latest, http: HttpAddress) -> None:
-        # Imported on request only: an extra. If it is missing, the error shows here.
+        # An optional dependency: the import raises the error if it is missing.
         from cangauge.service.metrics import Exposition  # noqa: PLC0415
 
         sockets = _open_tcp(http)
@@ -140,7 +140,7 @@ class Endpoint:
     def _run(self) -> None:
         try:
             asyncio.run(self._serve())
-        except Exception as error:  # noqa: BLE001 - no error here may end the estimate
+        except Exception as error:  # noqa: BLE001 - an error here must not end the estimate
             emit(
                 _LOG,
                 logging.ERROR,

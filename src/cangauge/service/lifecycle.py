@@ -24,8 +24,8 @@ PINGS_PER_TIMEOUT: Final = 4
 def stop_on_signals() -> Iterator[Callable[[], bool]]:
     """Yield a function that returns whether SIGINT (Ctrl-C) or SIGTERM was received.
 
-    A second signal has its default effect, so that a process that hangs can still be ended. For
-    the main thread only.
+    A second signal has its default effect, so that a hanging process can be ended. For the main
+    thread only.
     """
     received: list[int] = []
     kinds = (signal.SIGINT, signal.SIGTERM)
@@ -49,8 +49,8 @@ def stop_on_signals() -> Iterator[Callable[[], bool]]:
 def note_hangups() -> Iterator[Callable[[], bool]]:
     """Yield a function that returns whether SIGHUP was received since its last call.
 
-    A terminal that closes sends SIGHUP too, but means the end: it becomes SIGTERM. For the main
-    thread only; without effect on Windows, which has no SIGHUP.
+    SIGHUP from a closing terminal is turned into SIGTERM. For the main thread only; without effect
+    on Windows, which has no SIGHUP.
     """
     if not hasattr(signal, "SIGHUP"):
         yield lambda: False
@@ -86,7 +86,7 @@ def _has_terminal() -> bool:
 
 
 class Notifier:
-    """Notify systemd; without effect if systemd did not ask for it.
+    """Notify systemd; without effect where NOTIFY_SOCKET is not set.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ class Notifier:
         self._send("WATCHDOG=1")
 
     def reloading(self) -> None:
-        """Report the begin of a reload; `ready` ends it."""
+        """Report the start of a reload; `ready` ends it."""
         self._send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
     def stopping(self, status: str = "stopping") -> None:
@@ -158,8 +158,8 @@ class Notifier:
         try:
             self._socket.sendto("\n".join(lines).encode(), self._address)
         except OSError:
-            # systemd restarts, or its queue is full: the next datagram will do. If not, the
-            # watchdog acts, as it should.
+            # systemd restarts, or its queue is full: later datagrams will arrive, or the watchdog
+            # acts.
             return
 
 

@@ -1,9 +1,8 @@
 """The service's loop: receive frames, hand them to the pipeline, send its frames.
 
-Only the loop has a clock, a monotonic one: for the rate of publishing and to notice silence.
-Beside the frames it saves checkpoints, reloads the configuration, reports frames lost in the
-receive queue, and notices another service that sends frames with the same ids; its readers would
-see a SoC that jumps between two values.
+Only the loop reads a clock, a monotonic one: to publish periodically and to detect stale input. It
+also saves checkpoints, reloads the configuration, reports frames lost in the receive queue, and
+detects another sender of the same ids, which would make the published SoC jump between two values.
 """
 
 from __future__ import annotations
@@ -31,41 +30,41 @@ from cangauge.service.pipeline import Pipeline
 _LOG = logging.getLogger(__name__)
 
 LATE_S: Final = 0.01
-"""How long a heartbeat may wait for a sample that is about to come [s]."""
+"""Longest delay of a heartbeat for a sample that is due [s]."""
 
-CHORES_EVERY_S: Final = 0.01
-"""Time between two looks at everything but frames while frames keep coming [s]."""
+HOUSEKEEPING_EVERY_S: Final = 0.01
+"""Shortest interval of housekeeping, under continuous traffic [s]."""
 
-LOOK_EVERY_S: Final = 0.1
-"""Longest wait for frames, and time between two rounds of housekeeping [s]."""
+LONGEST_WAIT_S: Final = 0.1
+"""Longest wait for frames, and longest interval of housekeeping [s]."""
 
 SEND_WITHIN_S: Final = 0.1
-"""How long a frame may wait for room in the transmit queue [s]: until the next one is due. The
-loop never waits: a full queue (no other node on the bus) costs frames, not the estimate."""
+"""Longest time that a frame waits for room in the transmit queue [s]: until the next one is due.
+The loop itself never waits: a full queue (no other node on the bus) costs frames, not the
+estimate."""
 
 STEPS_KEPT: Final = 4096
-"""Number of latest steps whose durations enter the median."""
+"""Latest steps whose durations enter the median."""
 
 CHECKPOINT_EVERY_S: Final = 10.0
-"""Time between two checkpoints [s]. A service that is killed and takes three seconds to restart
-misses less than half a minute of charge; writing 20 kB each time makes 0.2 GB a day."""
+"""Interval of checkpoints [s]. A service that is killed and restarts within three seconds misses
+less than half a minute of charge; 20 kB per checkpoint make 0.2 GB a day."""
 
 FIRST_CHECKPOINT_S: Final = 1.0
-"""Time of the first checkpoint [s]: early, so that a service that is killed repeatedly keeps its
-state."""
+"""Time of the first checkpoint [s]: early, for a service that is killed repeatedly."""
 
-RIVAL_FRAMES: Final = 3
-RIVAL_WITHIN_S: Final = 5.0
-"""This many foreign frames with own ids within this time [s] prove another sender."""
+DUPLICATE_FRAMES: Final = 3
+DUPLICATE_WITHIN_S: Final = 5.0
+"""Foreign frames with own ids within this time [s] that prove another sender."""
 
-RIVAL_AGAIN_S: Final = 600.0
-"""Time between two warnings about it [s]."""
+DUPLICATE_WARN_EVERY_S: Final = 600.0
+"""Shortest interval of warnings about it [s]."""
 
 _SENT_KEPT: Final = 64
 
 
 class FrameSink(Protocol):
-    """Takes the frames that were received."""
+    """Consumer of received frames."""
 
     def write(self, message: can.Message) -> None:
         """Take one frame."""
@@ -82,7 +81,7 @@ class LoopSettings:
     duration_s, until_idle_s : float, optional
         End after this time; end after a silence of this length that follows samples [s].
     checkpoint_every_s : float
-        Time between two checkpoints [s].
+        Interval of checkpoints [s].
     """
 
     timeout_s: float = 2.0
@@ -93,7 +92,7 @@ class LoopSettings:
 
 @dataclass(frozen=True)
 class Outputs:
-    """Receivers of what the loop produces besides the frames on the bus; all optional.
+    """Consumers of the loop's results besides the bus; all optional.
 
     Parameters
     ----------
@@ -108,12 +107,12 @@ class Outputs:
     sent : callable
         Called after frames were sent.
     show : callable
-        Called with the monotonic time [s] at least every `LOOK_EVERY_S`.
+        Called with the monotonic time [s] at least every `LONGEST_WAIT_S`.
     checkpoint : callable
         Saves the state, every `checkpoint_every_s` and at the end after the last estimate. Its
         OSError and CangaugeError are logged.
     reload : callable
-        Called at least every `LOOK_EVERY_S`; returns the loop's new settings once the pipeline
+        Called at least every `LONGEST_WAIT_S`; returns the loop's new settings once the pipeline
         has another configuration.
     """
 
@@ -135,7 +134,7 @@ class RunSummary:
     step_p50_us: float | None
     """Median time from receiving a frame that completes a sample to having processed it [µs]; the
     mean counts for frames received together."""
-    rival_frames: int = 0
+    foreign_frames: int = 0
     """Frames with this service's ids from another sender."""
 
 
@@ -155,7 +154,7 @@ def serve(
     settings : LoopSettings
     outputs : Outputs
     stop : callable
-        Called at least every `LOOK_EVERY_S`; True ends the loop.
+        Called at least every `LONGEST_WAIT_S`; True ends the loop.
 
     Returns
     -------
@@ -178,7 +177,7 @@ def serve(
         seconds=time.monotonic() - loop.began_s,
         cpu_seconds=time.process_time() - cpu,
         step_p50_us=1e6 * statistics.median(loop.step_s) if loop.step_s else None,
-        rival_frames=loop.duplicates.frames,
+        foreign_frames=loop.duplicates.frames,
     )
 
 
@@ -194,20 +193,19 @@ class _Loop:
             pipeline.settings.ids, echoes=port.capabilities.echoes
         )
         self.housekeeping = Housekeeping(port, outputs.checkpoint, settings.checkpoint_every_s)
-        # A replay's clock is not input where the receive stamps are; it is received until the
-        # first one, for a warning.
+        # With receive stamps REPLAY_CLOCK is no input; it is received once, for a warning.
         self._ignores_clock = pipeline.settings.time_source == "receive"
         self._expects_clock = self._ignores_clock
         self._stamps_are_wall_time = port.capabilities.stamps == "kernel"
-        self._no_input: frozenset[int] = frozenset()
+        self._foreign_ids: frozenset[int] = frozenset()
         self._set_filters()
         self.began_s = time.monotonic()
         self.step_s: deque[float] = deque(maxlen=STEPS_KEPT)
         self._now_s = self.began_s
         self._beat_s = self.began_s
-        self._chores_s = self.began_s
-        # When the latest sample was processed, and when it had come in. They differ while frames
-        # wait in the socket, after the process was suspended or under load.
+        self._housekeeping_s = self.began_s
+        # Times at which the latest sample was processed and received. They differ while frames wait
+        # in the socket, after the process was suspended or under load.
         self._sample_s = self.began_s
         self._came_s = self.began_s
 
@@ -222,10 +220,10 @@ class _Loop:
         )
 
     def turn(self) -> None:
-        """Receive once, process what came, and do what is due."""
+        """Receive once, process the frames, and do what is due."""
         left_s = self._beat_s + LATE_S - self._now_s
-        messages = self._port.receive_pending(min(max(left_s, 0.0), LOOK_EVERY_S))
-        # Reading the clock may be a system call: once a turn, and once more after samples.
+        messages = self._port.receive_pending(min(max(left_s, 0.0), LONGEST_WAIT_S))
+        # Reading the clock may be a system call: once per turn, and again after samples.
         self._now_s = time.monotonic()
         before = self._pipeline.samples
         if messages:
@@ -233,12 +231,12 @@ class _Loop:
         late_s = 0.0 if self._pipeline.samples != before else LATE_S
         if self._now_s >= self._beat_s + late_s:
             self._beat()
-        if self._now_s >= self._chores_s:
-            self._chores_s = self._now_s + CHORES_EVERY_S
-            self._do_chores()
+        if self._now_s >= self._housekeeping_s:
+            self._housekeeping_s = self._now_s + HOUSEKEEPING_EVERY_S
+            self._run_housekeeping()
 
     def finish(self) -> None:
-        """Use what the pipeline still holds, and publish the last estimate."""
+        """Flush the pipeline and publish the last estimate."""
         before = self._pipeline.samples
         frames = self._pipeline.finish()
         if self._pipeline.samples != before:
@@ -249,7 +247,7 @@ class _Loop:
         pipeline, record, table = self._pipeline, self._outputs.record, self._outputs.table
         before, stamp_s = pipeline.samples, math.nan
         for message in messages:
-            if message.arbitration_id in self._no_input and self._is_no_input(message):
+            if message.arbitration_id in self._foreign_ids and self._is_foreign(message):
                 continue
             if record is not None:
                 record.write(message)
@@ -265,8 +263,8 @@ class _Loop:
         if pipeline.samples != before:
             self._note_samples(pipeline.samples - before, stamp_s)
 
-    def _is_no_input(self, message: can.Message) -> bool:
-        """Handle a frame that is not the vehicle's; False if it is input after all."""
+    def _is_foreign(self, message: can.Message) -> bool:
+        """Handle a frame with an id that is not the vehicle's; return False if it is input."""
         if self.duplicates.handle(message, self._now_s):
             return True
         if self._ignores_clock and is_clock(message, self._pipeline.settings.ids.replay_clock):
@@ -302,7 +300,7 @@ class _Loop:
         silent_s = self._now_s - self._came_s
         is_stale = silent_s > max(self._settings.timeout_s, self._pipeline.least_timeout_s)
         self._send(self._pipeline.heartbeat(is_stale=is_stale, silent_s=silent_s))
-        # Stay on the clock's grid; beats missed while the process was suspended are left out.
+        # Stay on the clock's grid; skip beats missed while the process was suspended.
         missed = max(math.floor((self._now_s - self._beat_s) / ESTIMATE_EVERY_S), 0)
         self._beat_s += (missed + 1) * ESTIMATE_EVERY_S
 
@@ -313,7 +311,7 @@ class _Loop:
         if frames and self._outputs.sent is not None:
             self._outputs.sent()
 
-    def _do_chores(self) -> None:
+    def _run_housekeeping(self) -> None:
         self.housekeeping.run(self._now_s)
         if self._outputs.reload is not None and (settings := self._outputs.reload()) is not None:
             self._settings = settings
@@ -328,12 +326,12 @@ class _Loop:
         wanted = [*self._pipeline.filters, *self.duplicates.filters]
         if self._expects_clock:
             wanted.append(standard_filter(clock_id))
-        self._no_input = self.duplicates.ids | ({clock_id} if self._ignores_clock else set())
+        self._foreign_ids = self.duplicates.ids | ({clock_id} if self._ignores_clock else set())
         self._port.set_filters(wanted)
 
 
 class Housekeeping:
-    """Saves checkpoints and reports frames lost in the receive queue.
+    """Save checkpoints and report frames lost in the receive queue.
 
     Parameters
     ----------
@@ -341,7 +339,7 @@ class Housekeeping:
     checkpoint : callable, optional
         Saves the state; called after `FIRST_CHECKPOINT_S`, then every `every_s`.
     every_s : float
-        May be changed [s].
+        Interval of checkpoints [s]; may be changed.
     """
 
     def __init__(
@@ -358,10 +356,10 @@ class Housekeeping:
         self._drops = 0
 
     def run(self, now_s: float) -> None:
-        """Do what is due at a monotonic time [s]."""
+        """Do the tasks due at a monotonic time [s]."""
         if now_s < self._look_s:
             return
-        self._look_s = now_s + LOOK_EVERY_S
+        self._look_s = now_s + LONGEST_WAIT_S
         drops = self._port.queue_drops or 0
         if drops > self._drops:
             lost, self._drops = drops - self._drops, drops
@@ -389,7 +387,7 @@ class Housekeeping:
 
 
 class DuplicateSenderDetector:
-    """Recognises frames with this service's ids that another sender put on the bus.
+    """Detect frames with this service's ids from another sender.
 
     Parameters
     ----------
@@ -410,7 +408,7 @@ class DuplicateSenderDetector:
         self.frames = 0
         self._echoes = echoes
         self._sent: deque[tuple[int, bytes]] = deque(maxlen=_SENT_KEPT)
-        self._seen_s: deque[float] = deque(maxlen=RIVAL_FRAMES)
+        self._seen_s: deque[float] = deque(maxlen=DUPLICATE_FRAMES)
         self._quiet_until_s = -math.inf
         self.watch(ids)
 
@@ -424,7 +422,7 @@ class DuplicateSenderDetector:
         return [standard_filter(each) for each in sorted(self.ids)]
 
     def note_sent(self, message: can.Message) -> None:
-        """Remember an own frame, whose echo may come back."""
+        """Record an own frame, whose echo may be received."""
         if self._echoes:
             self._sent.append((message.arbitration_id, bytes(message.data)))
 
@@ -447,8 +445,8 @@ class DuplicateSenderDetector:
         frame = (message.arbitration_id, bytes(message.data))
         if frame not in self._sent:
             return False
-        # Echoes come once each and in order; earlier ones that did not come are lost. So another
-        # sender of identical frames is noticed as well: there is one echo too many.
+        # Each echo comes once and in order; skipped ones are lost. So identical frames of another
+        # sender are detected as well: as surplus echoes.
         while self._sent.popleft() != frame:
             pass
         return True
@@ -456,9 +454,11 @@ class DuplicateSenderDetector:
     def _count(self, frame_id: int, now_s: float) -> None:
         self.frames += 1
         self._seen_s.append(now_s)
-        is_proven = len(self._seen_s) == RIVAL_FRAMES and now_s - self._seen_s[0] <= RIVAL_WITHIN_S
+        is_proven = (
+            len(self._seen_s) == DUPLICATE_FRAMES and now_s - self._seen_s[0] <= DUPLICATE_WITHIN_S
+        )
         if is_proven and now_s >= self._quiet_until_s:
-            self._quiet_until_s = now_s + RIVAL_AGAIN_S
+            self._quiet_until_s = now_s + DUPLICATE_WARN_EVERY_S
             emit(
                 _LOG,
                 logging.WARNING,

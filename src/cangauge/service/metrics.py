@@ -1,4 +1,4 @@
-"""Prometheus metrics of a snapshot, by prometheus-client (extra `metrics`)."""
+"""Prometheus metrics of a snapshot, rendered by prometheus-client (extra `metrics`)."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _BUS_HELP: Final = {
 
 
 class Exposition:
-    """Render the latest snapshot; for any thread but the receive loop's.
+    """Render the latest snapshot; call it from any thread but the receive loop's.
 
     Parameters
     ----------

@@ -1,34 +1,45 @@
-"""Offline estimates of a recorded log or capture, and the table file that they go to."""
+"""Offline estimates of a recorded log or capture.
+
+A capture passes the same pipeline as the frames of the live service, so that the numbers are the
+same bit for bit.
+"""
 
 from __future__ import annotations
 
+import time
+from array import array
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
+from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, cast
+from typing import Any, Final, Literal, cast
 
+import can
 import numpy as np
-import pyarrow as pa
-import pyarrow.csv
-import pyarrow.parquet
+from can.typechecking import Channel
 
 from cangauge._typing import FloatArray
+from cangauge.bus.publish import FrameIds
+from cangauge.bus.recording import open_vehicle_capture
+from cangauge.bus.time_source import REPLAY_CLOCK_ID, TimeSourceName, is_clock
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.offline import EstimateTable, Scores, estimate_log, score
+from cangauge.estimate.offline import (
+    EstimateTable,
+    Scores,
+    estimate_log,
+    gap_of,
+    initial_soc_of,
+    score,
+)
 from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.validity import Reason, Status, reason_name, reason_names
-from cangauge.inference.rows import usual_gap_s
+from cangauge.estimate.validity import Estimate, Reason, reason_name, reason_names
 from cangauge.logs.log import Log
-from cangauge.model.charge import counted_soc_pct
-from cangauge.model.delay_line import GAP_S
 from cangauge.model.model_file import Model
-from cangauge.service.estimate_table import NUMBERS
+from cangauge.service.pipeline import FrameCounts, Pipeline, PipelineSettings
 
-if TYPE_CHECKING:
-    from cangauge.bus.vehicle import Vehicle
-
-LONGEST_GAP_S: Final = 3600.0
-"""Upper limit of a gap that follows from a slow log's step [s]."""
+PROGRESS_EVERY: Final = 50_000
+"""Frames between two calls of the progress callback."""
 
 PACK_VOLTAGE_MARGIN: Final = 0.2
 """Relative margin around the pseudo-OCV's range; a median voltage outside it is another pack's."""
@@ -38,11 +49,11 @@ DOUBTFUL_COVER: Final = 0.5
 """Fractions of valid samples, and of reference SoC within ±2σ, below which to warn."""
 
 Origin = Literal["given", "log", "voltage"]
-"""Where the initial SoC comes from: an option, the log's soc_pct, the first voltages."""
+"""Source of the initial SoC: an option, the log's soc_pct, or the first voltages."""
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class RecordedCapture:
     """Samples of a capture: unlike a log's rows, they may lack voltage and temperature.
 
     Parameters
@@ -96,12 +107,12 @@ class Recording:
         )
 
 
-Recorded = Log | Recording
+Recorded = Log | RecordedCapture
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedEstimate:
-    """Estimates of a recording, with all that a table, a report and a JSON object need.
+    """Estimates of a recording, with the data for table, report and JSON.
 
     Parameters
     ----------
@@ -115,7 +126,7 @@ class RecordedEstimate:
         As used.
     origin : {"given", "log", "voltage"}
         Source of the initial SoC.
-    capture_facts : dict
+    capture_data : dict
         Time source and frame counts of a capture.
     """
 
@@ -125,7 +136,7 @@ class RecordedEstimate:
     model: Model
     settings: EstimatorSettings = field(default_factory=EstimatorSettings)
     origin: Origin = "voltage"
-    capture_facts: dict[str, Any] = field(default_factory=dict)
+    capture_data: dict[str, Any] = field(default_factory=dict)
 
     @property
     def reason_shares(self) -> dict[str, float]:
@@ -138,7 +149,7 @@ class RecordedEstimate:
 
     @property
     def warnings(self) -> list[str]:
-        """What makes the estimate doubtful as a whole, a sentence each."""
+        """Reasons to doubt the estimate as a whole, one sentence each."""
         scores, found = self.scores, []
         if scores.valid_fraction < DOUBTFUL_VALID:
             reasons = reason_names(int(np.bitwise_or.reduce(self.table.reasons)))
@@ -166,7 +177,7 @@ class RecordedEstimate:
             "capacity_ah": settings.capacity_ah or self.model.capacity_ah,
             "max_gap_s": settings.gap_s,
             "reasons": self.reason_shares,
-            **self.capture_facts,
+            **self.capture_data,
         }
 
 
@@ -204,11 +215,10 @@ def estimate_recorded_log(
     settings = replace(settings, temperature_source=log.temperature_source)
     if soc_from_log and log.first_soc() is not None:
         origin = "log"
-        first_pct = counted_soc_pct(log, settings.capacity_ah or model.capacity_ah, None)[0]
-        settings = replace(settings, initial_soc_pct=float(np.clip(first_pct, 0.0, 100.0)))
+        start_pct = initial_soc_of(log, settings.capacity_ah or model.capacity_ah)
+        settings = replace(settings, initial_soc_pct=start_pct)
     if gap_from_log:
-        gap_s = min(usual_gap_s(log.time_s, GAP_S), LONGEST_GAP_S)
-        settings = replace(settings, gap_s=gap_s)
+        settings = replace(settings, gap_s=gap_of(log))
     table, scores = estimate_log(log, model, settings, progress)
     return RecordedEstimate(log, table, scores, model, settings, origin)
 
@@ -223,21 +233,18 @@ def estimate_recorded_capture(
 ) -> RecordedEstimate:
     """Estimate a capture, bit for bit as the service does.
 
-    Like the service it begins from the first voltages unless `settings` holds an initial SoC; the
-    car's own SoC is only the reference to compare with.
+    Like the service it starts from the first voltages unless `settings` holds an initial SoC; the
+    car's own SoC is the reference to compare with only.
 
     Raises
     ------
     InputError
         If the capture gives no sample.
     """
-    # python-can and cantools are slow to import; logs do without.
-    from cangauge.service.capture_estimate import estimate_capture  # noqa: PLC0415
-
     if settings.temperature_source == "unknown":
         settings = replace(settings, temperature_source=vehicle.temperature_source)
     found = estimate_capture(path, vehicle, model, settings, progress=progress)
-    recording = Recording(
+    recording = RecordedCapture(
         time_s=_unwrapped(found.time_s),
         current_a=found.current_a,
         voltage_v=found.voltage_v,
@@ -251,17 +258,17 @@ def estimate_recorded_capture(
     return RecordedEstimate(
         recorded=recording,
         table=found.table,
-        # A recording has all that the scores need of a log.
+        # `score` needs only columns that a recording has.
         scores=score(found.table, cast("Log", recording), found.seconds),
         model=model,
         settings=settings,
         origin="voltage" if settings.initial_soc_pct is None else "given",
-        capture_facts={"time_source": found.time_source, "frames": asdict(found.counts)},
+        capture_data={"time_source": found.time_source, "frames": asdict(found.counts)},
     )
 
 
 def _unwrapped(time_s: FloatArray) -> FloatArray:
-    """Return time that continues where a second replay in the same capture began anew [s]."""
+    """Return time without the steps back of further replays in the same capture [s]."""
     step_s = np.diff(time_s)
     if not np.any(step_s < 0.0):
         return time_s
@@ -291,59 +298,156 @@ def require_same_pack(recorded: Recorded, model: Model) -> None:
         )
 
 
-def require_table_suffix(output: Path) -> None:
-    """Raise InputError if the name of an estimate file ends in neither .csv nor .parquet."""
-    if output.suffix.lower() not in {".csv", ".parquet"}:
-        raise InputError(
-            "the suffix is neither .csv nor .parquet",
-            source=output,
-            field="--output",
-            value=output.suffix,
-            cure="name it .csv or .parquet",
-        )
-
-
-def write_estimates(path: Path, time_s: FloatArray, table: EstimateTable) -> None:
-    """Write one row per sample, as CSV or Parquet by the suffix.
+@dataclass(frozen=True, eq=False)
+class CaptureEstimate:
+    """Estimates of all n samples of a capture.
 
     Parameters
     ----------
-    path : Path
-        Ends in .csv or .parquet.
-    time_s : array of shape (n,)
-        The samples' own time [s]: a refused sample's estimate is the one before.
     table : EstimateTable
-        n estimates; an unknown value becomes empty (CSV) or null (Parquet).
+    time_s, current_a : array of shape (n,)
+        Bus time [s] and current [A], positive = discharge, of the samples.
+    voltage_v, temperature_c : array of shape (n,)
+        Measured voltage [V] and temperature [°C]; NaN where the sample has none.
+    soc_reference_pct : array of shape (n,)
+        The vehicle's own state of charge [%]; NaN where there is none.
+    counts : FrameCounts
+        Frames and values by outcome.
+    time_source : {"receive", "replay-clock"}
+        Source of bus time.
+    seconds : float
+        Computing time [s].
+    remarks : tuple of str
+        Notes for the user.
     """
-    columns: dict[str, Any] = {"time_s": pa.array(time_s)}
-    columns |= {name: pa.array(getattr(table, name), from_pandas=True) for name in NUMBERS}
-    columns["status"] = pa.array([Status(value).name.lower() for value in table.status.tolist()])
-    texts = {value: reason_names(value) for value in np.unique(table.reasons).tolist()}
-    columns["reasons"] = pa.array([texts[value] for value in table.reasons.tolist()])
-    if path.suffix.lower() == ".parquet":
-        pa.parquet.write_table(pa.table(columns), path)
-        return
-    with path.open("wb") as file:
-        # The header by hand: pyarrow always quotes names; no cell needs quotes.
-        file.write((",".join(columns) + "\n").encode())
-        plain = pa.csv.WriteOptions(include_header=False, quoting_style="none")
-        pa.csv.write_csv(pa.table(columns), file, plain)
+
+    table: EstimateTable
+    time_s: FloatArray
+    current_a: FloatArray
+    voltage_v: FloatArray
+    temperature_c: FloatArray
+    soc_reference_pct: FloatArray
+    counts: FrameCounts
+    time_source: TimeSourceName
+    seconds: float
+    remarks: tuple[str, ...]
 
 
-def read_estimates(path: Path) -> EstimateTable:
-    """Read a Parquet file of estimates, as `write_estimates` or the service wrote it."""
-    columns = pa.parquet.read_table(path).to_pydict()
-    numbers: dict[str, Any] = {
-        name: np.array([np.nan if value is None else value for value in columns[name]])
-        for name in ("time_s", *NUMBERS)
-    }
-    flags = {reason_name(reason): int(reason) for reason in Reason}
-    reasons = {
-        text: sum(flags[name] for name in text.split("; ") if name)
-        for text in set(columns["reasons"])
-    }
-    return EstimateTable(
-        **numbers,
-        status=np.array([Status[name.upper()] for name in columns["status"]], dtype=np.int64),
-        reasons=np.array([reasons[text] for text in columns["reasons"]], dtype=np.int64),
+def estimate_capture(
+    path: str | PathLike[str],
+    vehicle: Vehicle,
+    model: Model,
+    settings: EstimatorSettings | None = None,
+    *,
+    time_source: TimeSourceName | Literal["auto"] = "auto",
+    clock_id: int = REPLAY_CLOCK_ID,
+    progress: Callable[[int], None] | None = None,
+) -> CaptureEstimate:
+    """Estimate a capture, bit for bit as the service does with the same frames.
+
+    Parameters
+    ----------
+    path : path-like
+    vehicle : Vehicle
+    model : Model
+    settings : EstimatorSettings, optional
+    time_source : {"auto", "receive", "replay-clock"}
+        "auto": the replay clock if the capture holds one, else the receive stamps.
+    clock_id : int
+        REPLAY_CLOCK's id.
+    progress : callable, optional
+        Called with the number of frames read, every `PROGRESS_EVERY`.
+
+    Returns
+    -------
+    CaptureEstimate
+
+    Raises
+    ------
+    InputError
+        If the capture cannot be read, or gives no sample.
+    """
+    began = time.perf_counter()
+    is_undecided = time_source == "auto"
+    source: TimeSourceName = "receive" if time_source == "auto" else time_source
+    ids = FrameIds(replay_clock=clock_id)
+    buses: dict[Channel | None, _Bus] = {}
+    capture = open_vehicle_capture(path, vehicle)
+    for number, message in enumerate(capture, start=1):
+        if is_undecided and is_clock(message, clock_id):
+            # Earlier frames have no log time; a live run starts here as well.
+            is_undecided, source = False, "replay-clock"
+            buses.clear()
+        bus = buses.get(message.channel)
+        if bus is None:
+            chosen = PipelineSettings(settings or EstimatorSettings(), source, ids)
+            bus = buses[message.channel] = _Bus(Pipeline(vehicle, model, chosen, publishes=False))
+        bus.handle(message)
+        if progress is not None and number % PROGRESS_EVERY == 0:
+            progress(number)
+    for each in buses.values():
+        each.finish()
+    found = [bus for bus in buses.values() if bus.estimates]
+    if not found:
+        raise InputError(
+            "the capture gives no sample of current",
+            source=path,
+            field=vehicle.current.message,
+            cure=f"check that this is the bus of {vehicle.name} (see `cangauge inspect`)",
+        )
+    best = max(found, key=lambda bus: len(bus.estimates))
+    counts = best.pipeline.counts
+    time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(best.values).reshape(-1, 5).T
+    return CaptureEstimate(
+        table=EstimateTable.of(best.estimates),
+        time_s=time_s,
+        current_a=current_a,
+        voltage_v=voltage_v,
+        temperature_c=temperature_c,
+        soc_reference_pct=soc_pct,
+        counts=counts,
+        time_source=source,
+        seconds=time.perf_counter() - began,
+        remarks=(*capture.info.remarks, *_remarks(source, counts, len(found))),
     )
+
+
+@dataclass
+class _Bus:
+    """One of the buses in a capture; each has its own pipeline."""
+
+    pipeline: Pipeline
+    estimates: list[Estimate] = field(default_factory=list)
+    # Time, current, voltage, temperature and the vehicle's own SoC of every sample.
+    values: array[float] = field(default_factory=lambda: array("d"))
+
+    def handle(self, message: can.Message) -> None:
+        if self.pipeline.handle(message):
+            self._collect()
+
+    def finish(self) -> None:
+        before = self.pipeline.samples
+        self.pipeline.finish()
+        if self.pipeline.samples != before:
+            self._collect()
+
+    def _collect(self) -> None:
+        if self.pipeline.latest_sample is not None:
+            self.estimates.append(self.pipeline.latest)
+            self.values.extend(self.pipeline.latest_sample)
+            self.values.append(self.pipeline.decoder.reference_soc_pct)
+
+
+def _remarks(time_source: TimeSourceName, counts: FrameCounts, buses: int) -> list[str]:
+    remarks = []
+    if time_source == "replay-clock":
+        remarks.append("a recorded replay: time is its log's (REPLAY_CLOCK)")
+    if counts.beginnings:
+        remarks.append(f"{counts.beginnings + 1} logs were replayed; each is estimated separately")
+    if counts.crc_errors:
+        remarks.append(f"{counts.crc_errors} frames refused: wrong CRC")
+    if counts.lost:
+        remarks.append(f"{counts.lost} frames lost, by their alive counters")
+    if buses > 1:
+        remarks.append("several buses carry the frames; the one with most samples is used")
+    return remarks

@@ -1,7 +1,7 @@
 """The pipeline: frames → samples → estimates → frames to publish.
 
 A live bus and a recorded capture share it. Pure: no bus, no files, no clock; the same frames with
-the same stamps give the same numbers. `loop` runs it on a bus, `capture_estimate` over a recording.
+the same stamps give the same numbers. `loop` runs it on a bus, `offline` over a capture.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from can.typechecking import CanFilter
 
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.plausibility import MISSED_AT_LEAST, Pack
-from cangauge.bus.publish import FrameIds, SocPublisher, standard_filter
-from cangauge.bus.time_source import ReceiveTime, ReplayClock, TimeSourceName, is_clock
+from cangauge.bus.publish import ACKNOWLEDGE_EVERY, FrameIds, SocPublisher, standard_filter
+from cangauge.bus.time_source import ReplayClock, TimeSourceName, is_clock, time_source
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimate.estimator import Estimator
@@ -25,17 +25,13 @@ from cangauge.estimate.state import EstimatorState
 from cangauge.estimate.validity import Estimate, Reason, Sample, Status, status_of
 from cangauge.model.model_file import Model, effective_error_std_v
 
-ACKNOWLEDGE_EVERY: Final = 4
-"""Largest number of samples between two SOC_DETAIL under the replay clock: `replay` waits for
-them."""
-
 NOTHING_YET: Final = Estimate.unknown(Reason.NO_INITIAL_SOC | Reason.INPUT_STALE)
 """The estimate before the first sample."""
 
 
 @dataclass(frozen=True)
 class FrameCounts:
-    """What became of the frames, over all logs of a run."""
+    """Frames and values by outcome, over all logs of a run."""
 
     frames: int = 0
     """Frames handled, REPLAY_CLOCK excluded."""
@@ -56,11 +52,11 @@ class FrameCounts:
     stuck: int = 0
     """Values of a signal that was constant while it should change."""
     held_back: int = 0
-    """Good values withheld until enough of them follow a failure."""
+    """Good values not used yet, while their signal recovers from failures."""
     untimed: int = 0
     """Frames before the first REPLAY_CLOCK, where that is the time source."""
     beginnings: int = 0
-    """How often a new log began, and decoder and estimator restarted."""
+    """Number of new logs, each of which restarted decoder and estimator."""
 
     def __add__(self, other: FrameCounts) -> FrameCounts:
         """Return the sums."""
@@ -89,7 +85,7 @@ class PipelineSettings:
 
 
 class Pipeline:
-    """Estimates the SoC from a vehicle's frames, and makes the frames to publish.
+    """Estimate the SoC from a vehicle's frames, and make the frames to publish.
 
     When the replay clock jumps back a new log has begun: decoder and estimator restart.
 
@@ -137,23 +133,23 @@ class Pipeline:
         if publishes:
             _check_ids(vehicle, ids)
             self._publisher = SocPublisher(ids, ACKNOWLEDGE_EVERY if self._is_replay else None)
-        self._time = ReplayClock(ids.replay_clock) if self._is_replay else ReceiveTime()
+        self._time = time_source(self.settings.time_source, ids.replay_clock)
         self._earlier_counts = FrameCounts()
         self._untimed = 0
         self._beginnings = 0
-        self._pack = pack_of(model, self.settings.estimator.capacity_ah)
+        self._pack = _pack_of(model, self.settings.estimator.capacity_ah)
         self.decoder = SampleDecoder(vehicle, self._pack)
         self.estimator = Estimator(model, _with_source(self.settings.estimator, vehicle))
         self.samples = 0
         self.latest_sample: Sample | None = None
         self.published = NOTHING_YET
-        # The estimate of the latest sample from the estimator (None: there is none, or it was
-        # restored), and the same with signal health; both wait until they are read.
+        # Computed when read: the estimator's latest estimate (None before the first sample, or
+        # when restored), and the same with signal health.
         self._estimated: Estimate | None = None
         self._latest = NOTHING_YET
         self._is_behind = False
 
-    # --- frames → estimates ---------------------------------------------------------------
+    # --- frames → estimates
 
     def handle(self, message: can.Message) -> bool:
         """Process one frame; return whether it completed a sample.
@@ -175,7 +171,7 @@ class Pipeline:
         return True
 
     def finish(self) -> list[can.Message]:
-        """Use a last current that still waits for a voltage; return the frames for it, if any."""
+        """Release the last current if it is unpaired; return the frames of its sample, if any."""
         sample = self.decoder.flush()
         if sample is None:
             return []
@@ -200,7 +196,7 @@ class Pipeline:
 
     @property
     def counts(self) -> FrameCounts:
-        """What became of the frames so far, over all logs."""
+        """Frames and values by outcome so far, over all logs."""
         now = self.decoder.statistics
         return self._earlier_counts + FrameCounts(
             frames=now.frames,
@@ -216,22 +212,14 @@ class Pipeline:
             untimed=self._untimed,
         )
 
-    # --- estimates → frames ---------------------------------------------------------------
+    # --- estimates → frames
 
     @property
     def filters(self) -> list[CanFilter]:
         """Filters for the vehicle's frames, and for REPLAY_CLOCK where that is the time source."""
-        wanted = [
-            CanFilter(
-                can_id=int(each["can_id"]),
-                can_mask=int(each["can_mask"]),
-                extended=bool(each["extended"]),
-            )
-            for each in self.vehicle.filters
-        ]
-        if self._is_replay:
-            wanted.append(standard_filter(self.settings.ids.replay_clock))
-        return wanted
+        if not self._is_replay:
+            return self.vehicle.filters
+        return [*self.vehicle.filters, standard_filter(self.settings.ids.replay_clock)]
 
     def acknowledgement(self) -> list[can.Message]:
         """Return the frames due with the latest sample of a replay; none with receive stamps."""
@@ -269,15 +257,15 @@ class Pipeline:
         period_s = self.decoder.health["current"].period_s
         return 0.0 if self._is_replay or math.isnan(period_s) else MISSED_AT_LEAST * period_s
 
-    # --- another configuration, another process -------------------------------------------
+    # --- reload and restart
 
     def reconfigure(
         self, vehicle: Vehicle | None, model: Model, settings: PipelineSettings
     ) -> None:
         """Continue with another configuration, from the SoC known so far.
 
-        What stays the same is not touched, and its numbers continue bit for bit. Otherwise the
-        estimator is replaced, and the new one takes over SoC and delay line.
+        Unchanged parts keep their state bit for bit. A changed model or estimator setting makes
+        a new estimator, which takes over SoC and delay line.
 
         Parameters
         ----------
@@ -302,7 +290,7 @@ class Pipeline:
             initial_soc_pct=started.initial_soc_pct,
             initial_soc_std_pct=started.initial_soc_std_pct,
         )
-        pack = pack_of(model, estimator_settings.capacity_ah)
+        pack = _pack_of(model, estimator_settings.capacity_ah)
         if (model, estimator_settings) != (self.model, started):
             before, self.estimator = self.estimator, Estimator(model, estimator_settings)
             self.estimator.take_over(before)
@@ -351,8 +339,6 @@ class Pipeline:
         self.estimator = Estimator(self.model, settings)
         return True
 
-    # --- inside ---------------------------------------------------------------------------
-
     def _estimate(self, sample: Sample) -> None:
         self.samples += 1
         self.latest_sample = sample
@@ -396,7 +382,7 @@ class Pipeline:
         self._estimated = None
 
 
-def pack_of(model: Model, capacity_ah: float | None = None) -> Pack:
+def _pack_of(model: Model, capacity_ah: float | None = None) -> Pack:
     """Return the pack's properties by which its signals are judged.
 
     Parameters

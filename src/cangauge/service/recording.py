@@ -5,7 +5,7 @@ also gzipped, Vector BLF and ASAM MF4. ASC and TRC shift or round time stamps.
 
 The receive loop only formats frames into memory; a thread writes. A killed service loses the
 frames of the last `HAND_OVER_S`, or the whole part of an .mf4, which is written at its end. A power
-cut may also lose what was written in the last `SYNC_EVERY_S`.
+cut can also lose the data written in the last `SYNC_EVERY_S`.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class RecordState:
 
 @dataclass(frozen=True)
 class RecordLimits:
-    """Size and duration of a recording's parts, and how much of it is kept.
+    """Limits of a recording: size and duration of its parts, and its total size.
 
     Without limits it is one file. If that exists already (a restarted service must not overwrite
     its predecessor's recording), or with any limit, runs and parts are numbered.
@@ -110,7 +110,7 @@ class RecordLimits:
             )
 
     @property
-    def any(self) -> bool:
+    def in_parts(self) -> bool:
         """Whether the recording is in parts."""
         return self.part_bytes is not None or self.part_s is not None
 
@@ -132,7 +132,7 @@ class Recorder:
     Attributes
     ----------
     path : Path
-        What `estimate` and `replay` read: the file, or the name of this run.
+        Name for `estimate` and `replay`: the file, or this run.
     frames : int
         Frames recorded so far.
 
@@ -149,14 +149,14 @@ class Recorder:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         path = Path(path)
-        self._kind = record_format(path)
+        self._kind = _record_format(path)
         self._limits = limits or RecordLimits()
-        if self._kind == ".mf4" and not self._limits.any:
+        if self._kind == ".mf4" and not self._limits.in_parts:
             self._limits = RecordLimits(part_s=MF4_PART_S)
         _check_writable(path)
         self._clock = clock
         self._base = path
-        self._in_parts = self._limits.any or self._kind in IN_PARTS_ONLY or _holds_something(path)
+        self._in_parts = self._limits.in_parts or self._kind in IN_PARTS_ONLY or _is_not_empty(path)
         self._run = max((each.run for each in all_parts(path)), default=0) + 1
         self._part = 0
         self.path = run_path(path, self._run) if self._in_parts else path
@@ -166,7 +166,7 @@ class Recorder:
         self._part_until_s = float("inf")
         self._start_s = 0.0
         self._file: RecordBuffer | None = None
-        self._writer: FrameWriter | None = None
+        self._writer: _FrameWriter | None = None
         self._current = path
         self._disk = _Disk()
         if self._kind not in IN_PARTS_ONLY:
@@ -245,7 +245,7 @@ class Recorder:
             self._disk.writer.submit(self._remove_oldest)
         self._disk.begin(self._current)
         self._file = RecordBuffer(self._disk.append)
-        self._writer = frame_writer(self._kind, self._file, start_s)
+        self._writer = _frame_writer(self._kind, self._file, start_s)
         self._file.hand_over(0)
         if self._limits.part_s is not None:
             self._part_until_s = self._clock() + self._limits.part_s
@@ -282,7 +282,7 @@ class Recorder:
             emit(_LOG, logging.INFO, "record.removed", f"removed the oldest part: {path}")
 
 
-def _holds_something(path: Path) -> bool:
+def _is_not_empty(path: Path) -> bool:
     return path.is_file() and path.stat().st_size > 0
 
 
@@ -331,23 +331,23 @@ class _Disk:
             self.lost_frames += frames
 
     def sync(self) -> None:
-        """Force what was written onto the disk."""
+        """Flush written data to the disk."""
         self.writer.submit(lambda: _fsync(self._file))
 
     def close(self, within_s: float) -> bool:
         """Write the rest; return whether all was written in time [s]."""
         is_done = self.writer.flush(within_s)
-        # Written is enough for the end of the process; fsync is against power cuts, and may hang.
+        # Written data survive the end of the process; fsync, against power cuts, may hang.
         self.writer.submit(self._close_file)
         left = self.writer.close(0.0)
         self.lost_frames += sum(job.frames for job in left if isinstance(job, _Piece))
         return is_done
 
     def write(self, piece: _Piece) -> None:
-        """Write a piece; runs in the thread. What is written is cut off, so that it can retry."""
+        """Write a piece, in the thread; written bytes are removed from it, for a retry."""
         while piece.data and self._file is not None:
             place = self._end if piece.place is None else piece.place
-            if place != self._at:  # a pipe cannot seek, and need not
+            if place != self._at:  # not for a pipe, which cannot seek
                 self._at = self._file.seek(place)
             done = self._file.write(piece.data) or 0
             self._at += done
@@ -405,13 +405,13 @@ def _fsync(file: io.FileIO | None) -> None:
     try:
         os.fsync(file.fileno())
     except OSError as error:
-        # A pipe or a device cannot be synced, and need not.
+        # Pipes and devices cannot be synced.
         if error.errno not in _NOT_SYNCED:
             raise
 
 
 class RecordBuffer(io.RawIOBase):
-    """The file that python-can's writers see: in memory until it is handed over.
+    """File object for python-can's writers: keeps bytes in memory until they are handed over.
 
     Parameters
     ----------
@@ -476,7 +476,7 @@ class RecordBuffer(io.RawIOBase):
         self._changes.clear()
 
 
-# --- Formats ------------------------------------------------------------------------------------
+# --- Formats
 
 EXACT_FORMATS: Final = (".log", ".csv", ".blf", ".mf4")
 PACKED: Final = ".gz"
@@ -486,8 +486,8 @@ IN_PARTS_ONLY: Final = (".blf", ".mf4")
 """Formats with stamps relative to the file's start: a clock that is set back needs a new part."""
 
 
-class FrameWriter(Protocol):
-    """Formats frames into a `RecordBuffer`."""
+class _FrameWriter(Protocol):
+    """Format frames into a `RecordBuffer`."""
 
     def write(self, message: can.Message) -> None:
         """Write one frame."""
@@ -499,7 +499,7 @@ class FrameWriter(Protocol):
         """Complete the file."""
 
 
-def record_format(path: Path) -> str:
+def _record_format(path: Path) -> str:
     """Return the format of a recording by its name, such as ".log", ".log.gz", ".blf".
 
     Raises
@@ -523,13 +523,13 @@ def record_format(path: Path) -> str:
     return kind + PACKED if packed else kind
 
 
-def frame_writer(kind: str, file: RecordBuffer, start_s: float) -> FrameWriter:
+def _frame_writer(kind: str, file: RecordBuffer, start_s: float) -> _FrameWriter:
     """Return a writer of a format.
 
     Parameters
     ----------
     kind : str
-        As `record_format` returns it.
+        As `_record_format` returns it.
     file : RecordBuffer
     start_s : float
         Stamp of the first frame [s].

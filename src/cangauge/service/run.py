@@ -120,7 +120,7 @@ class Service:
         """
         config, pipeline = self.config, self.pipeline
         with ExitStack() as stack:
-            # Signals first: the service may be stopped at any moment after its start.
+            # Signals first: the service may be stopped at any moment from now on.
             stop, hangup = self._stop.is_set, self._take_reload
             if threading.current_thread() is threading.main_thread():
                 signalled = stack.enter_context(stop_on_signals())
@@ -150,7 +150,7 @@ class Service:
                 sent=monitor.sent,
             )
             summary = serve(port, pipeline, config.loop_settings(), outputs, stop)
-        emit(_LOG, logging.INFO, "service.stopped", summary_line(pipeline, port, summary))
+        emit(_LOG, logging.INFO, "service.stopped", _summary_line(pipeline, port, summary))
         if not pipeline.counts.frames:
             emit(
                 _LOG,
@@ -167,13 +167,13 @@ class Service:
         }
         for path in filter(None, written.values()):
             emit(_LOG, logging.INFO, "file.written", f"written: {path}", limit=path, path=path)
-        return summary_json(pipeline, port, summary) | {"state": config.state} | written
+        return _summary_json(pipeline, port, summary) | {"state": config.state} | written
 
     def reconfigure(self) -> LoopSettings | None:
-        """Read the configuration again and apply it as a whole; the SoC continues.
+        """Reload the configuration and apply it as a whole; the SoC continues.
 
         Model, vehicle, method, capacity, gaps, time-outs and published ids change at once. The
-        initial SoC is ignored: the SoC is known by now. Other keys need a restart, which is logged.
+        initial SoC is ignored, since the SoC is known. Other keys need a restart, which is logged.
 
         Returns
         -------
@@ -269,7 +269,7 @@ def _check_output(output: Path, model: Path) -> None:
 
 
 def _vehicle_key(config: RunConfig, vehicle: Vehicle) -> tuple[object, ...]:
-    """Return what identifies a vehicle: its options, and its files by content."""
+    """Return the identity of a vehicle: its options, and the content of its files."""
     files = [*vehicle.dbc_files, *([config.map] if config.map is not None else [])]
     contents = tuple(hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in files)
     chosen = (config.messages, config.rules, config.checks)
@@ -287,7 +287,7 @@ def _log_changes(old: RunConfig, new: RunConfig) -> None:
         if key.info.needs_restart and _value(before, key.name) != _value(after, key.name)
     ]
     if late:
-        text = f"{', '.join(late)}: takes effect when the service is restarted"
+        text = f"{', '.join(late)}: takes effect after a restart of the service"
         emit(_LOG, logging.WARNING, "config.needs_restart", text)
 
 
@@ -303,7 +303,7 @@ def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None
         try:
             unix_path = default_path(monitor.latest.identity.bus)
         except InputError as error:
-            # Nobody asked for it: the service runs without.
+            # Not requested explicitly: the service runs without it.
             emit(_LOG, logging.WARNING, "status.unavailable", f"no status socket: {error}")
     http = config.http_address()
     if unix_path is None and http is None:
@@ -323,7 +323,7 @@ def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None
         )
 
 
-def summary_line(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary) -> str:
+def _summary_line(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary) -> str:
     """Return a run's frames, losses and last SoC in one line."""
     counts, latest = pipeline.counts, pipeline.latest
     soc = f"{number(latest.soc_pct, 2)} ± {number(latest.soc_std_pct, 2, '%')}"
@@ -342,13 +342,13 @@ def _bus_errors(port: ReconnectingBus, summary: RunSummary) -> str:
         "dropped in the receive queue": port.queue_drops,
         f"error frames ({kinds})": port.error_frames,
         "not sent": port.unsent,
-        "from another service with these ids": summary.rival_frames,
+        "from another service with these ids": summary.foreign_frames,
         f"bus losses ({port.away_s:.1f} s)": port.losses,
     }
     return "".join(f", {count} {what}" for what, count in found.items() if count)
 
 
-def summary_json(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary) -> dict[str, Any]:
+def _summary_json(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary) -> dict[str, Any]:
     """Return the summary that `--json` prints."""
     counts, latest = pipeline.counts, pipeline.latest
     return {
@@ -377,7 +377,7 @@ def summary_json(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary)
         "unsent": port.unsent,
         "bus_losses": port.losses,
         "bus_away_s": port.away_s,
-        "rival_frames": summary.rival_frames,
+        "rival_frames": summary.foreign_frames,
         "stamps": port.capabilities.stamps,
         "step_p50_us": summary.step_p50_us,
         "estimate": {

@@ -1,10 +1,10 @@
-"""The service's state over restarts: read and checked at the start, written while it runs.
+"""The service's state across restarts: restored at the start, saved while it runs.
 
     {"format": "cangauge-state", "version": 1, "sha256": "…", "content": {…}}
 
 The hash is that of the content, written without spaces and with sorted keys. Everything is checked
 before use: size, JSON, format, version, hash, then the type and range of every field. A file that
-cannot be read or written never stops the estimator: it is logged, and the service runs without.
+cannot be read or written never stops the estimator: the error is logged and the service goes on.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from cangauge.service.pipeline import Pipeline
 
 STATE_FORMAT: Final = "cangauge-state"
 STATE_VERSION: Final = 1
-"""Increase it with every change of the estimator's state."""
+"""To be increased with every change of the estimator's state."""
 
 LARGEST_BYTES: Final = 8 << 20
 """Largest state file that is read [bytes]; a full delay line takes 0.3 MB."""
@@ -54,7 +54,7 @@ REBOOT_S: Final = 600.0
 """Least duration of a pause over a reboot [s]: the clock may have stopped with the machine."""
 
 FUTURE_S: Final = 60.0
-"""A state further in the future than this [s] was written under another clock: age unknown."""
+"""A state further in the future than this [s] has another clock: its age is unknown."""
 
 REFUSED_SUFFIX: Final = ".refused"
 
@@ -132,7 +132,7 @@ class StateKeeper:
         """True if the estimator continued from the file."""
 
     def __enter__(self) -> Self:
-        self._sweep()
+        self._remove_temporary()
         self._restore()
         return self
 
@@ -148,8 +148,8 @@ class StateKeeper:
             emit(_LOG, logging.WARNING, "state.failed", text)
 
     def checkpoint(self) -> None:
-        """Start writing the state, if a sample came since the last time; return at once."""
-        self._log_verdict()
+        """Start saving the state if it has new samples; return at once."""
+        self._log_decision()
         if self._pipeline.samples == self._samples_kept:
             return
         state = self._pipeline.snapshot()
@@ -157,7 +157,7 @@ class StateKeeper:
             return
         self._samples_kept = self._pipeline.samples
         if self._pipeline.model is not self._model:
-            # The configuration was read again.
+            # The configuration was reloaded.
             self._model = self._pipeline.model
             self._fingerprint = model_fingerprint(self._model)
         content = StateContent.model_construct(
@@ -181,16 +181,21 @@ class StateKeeper:
             age_s = self._checked_age(content)
             latest = self._pipeline.restore(content.estimator, age_s)
         except FileNotFoundError:
-            emit(_LOG, logging.INFO, "state.none", f"{path}: no state yet; starting without")
+            emit(_LOG, logging.INFO, "state.none", f"{path}: no saved state; starting without one")
             return
         except InputError as error:
             self._refuse(error)
             return
         self.restored = True
         self._restored_pct = latest.soc_pct
-        ago = "some time ago" if math.isnan(age_s) else f"{duration(age_s)} ago"
+        ago = "of unknown age" if math.isnan(age_s) else f"saved {duration(age_s)} ago"
         soc = f"{number(latest.soc_pct, 2)} ± {number(latest.soc_std_pct, 2, '%')}"
-        emit(_LOG, logging.INFO, "state.restored", f"{path}: going on from {ago}: SoC {soc}")
+        emit(
+            _LOG,
+            logging.INFO,
+            "state.restored",
+            f"{path}: continuing from a state {ago}: SoC {soc}",
+        )
 
     def _checked_age(self, content: StateContent) -> float:
         """Return the least age of the state [s]; NaN if it is unknown."""
@@ -231,19 +236,19 @@ class StateKeeper:
             path.replace(aside)
             kept = f"; kept as {aside.name}"
         except OSError as problem:
-            kept = f" (and cannot be put aside: {problem.strerror})"
-        # A configured initial SoC belongs to an earlier start: there is a state, so the car has
-        # been used since. With a wide deviation it would add nothing to the voltage, and Coulomb
-        # counting alone would never correct it.
+            kept = f" (and cannot be renamed: {problem.strerror})"
+        # A state exists, so the car has been used since the configured initial SoC was true. With
+        # a wide standard deviation that SoC would add nothing to the voltage, and Coulomb counting
+        # would never correct it.
         how = (
-            "by voltage, for the given SoC is of an earlier start"
+            "from the voltage, since the given initial SoC is outdated"
             if self._pipeline.discard_initial_soc()
-            else "without"
+            else "without one"
         )
         text = f"state refused: {error}{kept}; starting {how}"
         emit(_LOG, logging.WARNING, "state.refused", text)
 
-    def _sweep(self) -> None:
+    def _remove_temporary(self) -> None:
         """Remove temporary files of a process that was killed while writing."""
         path = Path(os.path.realpath(self.settings.path))
         left = re.compile(rf"\.{re.escape(path.stem[:200])}\.[0-9a-f]{{8}}{re.escape(path.suffix)}")
@@ -255,7 +260,7 @@ class StateKeeper:
     def _write(self, content: StateContent) -> None:
         write_text_atomic(self.settings.path, state_text(content))
 
-    def _log_verdict(self) -> None:
+    def _log_decision(self) -> None:
         verdict = self._pipeline.estimator.filter.verdict
         if self._restored_pct is None or verdict in {"", "open"}:
             return
@@ -264,7 +269,7 @@ class StateKeeper:
         soc = f"{number(latest.soc_pct, 1)} ± {number(latest.soc_std_pct, 1, '%')}"
         words = {
             "parked": f"the voltage confirms the restored SoC; now {soc}",
-            "moved": f"the voltage refutes the restored SoC of {before:.1f} %; by it {soc}",
+            "moved": f"the voltage refutes the restored SoC of {before:.1f} %; now {soc}",
         }
         text = words.get(verdict, f"restored SoC and voltage are combined; now {soc}")
         emit(_LOG, logging.INFO, "state.judged", text)
@@ -276,7 +281,7 @@ class StateKeeper:
         emit(_LOG, logging.WARNING, "state.failed", f"state not written: {text}")
 
 
-# --- The file -----------------------------------------------------------------------------------
+# --- The file
 
 
 class StateContent(BaseModel):
@@ -352,7 +357,7 @@ def boot_id() -> str | None:
 
 def _bytes(path: Path) -> bytes:
     try:
-        # A pipe or device could block for ever.
+        # A pipe or device could block.
         if not stat.S_ISREG(path.stat().st_mode):
             raise InputError("not a regular file", source=path)
         with path.open("rb") as file:
@@ -367,7 +372,7 @@ def _bytes(path: Path) -> bytes:
 
 def _parsed(raw: bytes, path: Path) -> object:
     try:
-        # Decoded here: of bytes, `json` would also accept UTF-16 and UTF-32.
+        # Decoded here: from bytes, `json` would accept UTF-16 and UTF-32 too.
         return json.loads(raw.decode("utf-8"), parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
         reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)[:200]

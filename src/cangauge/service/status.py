@@ -25,15 +25,15 @@ from cangauge.estimate.validity import Estimate, Reason, Sample, Status, reason_
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.recording import Recorder, RecordState
+from cangauge.service.status_client import SCHEMA
 
 _LOG = logging.getLogger(__name__)
 
-SCHEMA: Final = 1
 STUCK_S: Final = 2.0
 """Age of a snapshot above which the receive loop counts as stuck, and its SoC as stale [s]."""
 SHOW_EVERY_S: Final = 0.25
 """Interval of the snapshots [s]."""
-TELL_EVERY_S: Final = 1.0
+NOTIFY_EVERY_S: Final = 1.0
 """Interval of status lines to systemd [s]."""
 RATE_OVER_S: Final = 2.0
 """Averaging time of the sample rate [s]."""
@@ -41,11 +41,11 @@ CLOCKS_APART_S: Final = 60.0
 """A receive stamp further than this from the wall clock belongs to another clock [s]."""
 
 BUS_COUNTS: Final = ("garbled", "error_frames", "unsent", "queue_drops", "losses")
-"""Counts of a bus that are shown, if it has them."""
+"""Counts of a bus to report, where it has them."""
 
 _NO_REJECTS: Final = frozenset({"wanted", "counter_jumps", "frames_lost"})
 _OF_VALUES: Final = frozenset({"not_available", "implausible", "stuck", "held_back"})
-"""Rejected values of frames that were not rejected."""
+"""Reasons that concern values, not whole frames."""
 _REJECTS: Final = tuple(
     each.name for each in fields(MessageStatistics) if each.name not in _NO_REJECTS
 )
@@ -158,7 +158,7 @@ class Snapshot:
     bus_up : bool
         False while the bus is lost or its controller is bus-off.
     bus_trouble : str
-        Problem of the bus in words; empty without one.
+        Problem of the bus as a phrase; "" without one.
     latency, step : HistogramCounts
         Time from receive stamp to published SoC; processing time of the frame that completes a
         sample.
@@ -314,9 +314,9 @@ class Monitor:
     Attributes
     ----------
     identity : Identity
-        Replace it when the configuration changes.
+        Replaced when the configuration changes.
     latest : Snapshot
-        For any thread: replaced, never changed.
+        Immutable, hence readable from any thread.
     """
 
     def __init__(
@@ -337,7 +337,7 @@ class Monitor:
         self._began_s = now_s = clock()
         self._latency = Histogram()
         self._step = Histogram()
-        self._due_s = self._tell_s = now_s
+        self._due_s = self._notify_s = now_s
         self._ping_s = now_s
         self._sample_s = -math.inf
         self._unsent_stamp_s: float | None = None
@@ -368,7 +368,7 @@ class Monitor:
         if stamp_s is None:
             return
         latency_s = time.time() - stamp_s
-        # Not with stamps of another clock, or after the clock was set.
+        # Skip stamps of another clock, and those before the clock was set.
         if 0.0 <= latency_s < CLOCKS_APART_S:
             self._latency.add(latency_s)
 
@@ -379,10 +379,10 @@ class Monitor:
         try:
             yield
         finally:
-            self._notifier.ready(status_line(self.latest))
+            self._notifier.ready(_status_line(self.latest))
 
     def turn(self, now_s: float) -> bool:
-        """Note a turn of the loop (monotonic time [s]); return whether `latest` is new."""
+        """Record a turn of the loop (monotonic time [s]); return whether `latest` is new."""
         if now_s < self._due_s:
             return False
         self._due_s = now_s + SHOW_EVERY_S
@@ -392,9 +392,9 @@ class Monitor:
         if ping_every_s is not None and now_s >= self._ping_s:
             self._ping_s = now_s + ping_every_s - SHOW_EVERY_S
             self._notifier.ping()
-        if self._notifier.active and now_s >= self._tell_s:
-            self._tell_s = now_s + TELL_EVERY_S
-            self._notifier.status(status_line(snapshot))
+        if self._notifier.active and now_s >= self._notify_s:
+            self._notify_s = now_s + NOTIFY_EVERY_S
+            self._notifier.status(_status_line(snapshot))
         return True
 
     def _snapshot(self, now_s: float) -> Snapshot:
@@ -404,8 +404,8 @@ class Monitor:
         if now_s - since_s >= RATE_OVER_S:
             self._rate = (samples - before) / (now_s - since_s)
             self._rate_from = (now_s, samples)
-        counters = pipeline.decoder.statistics
-        rejects = _rejects(counters)
+        statistics = pipeline.decoder.statistics
+        rejects = _rejects(statistics)
         return Snapshot(
             identity=self.identity,
             made_s=now_s,
@@ -415,10 +415,10 @@ class Monitor:
             sample_age_s=now_s - self._sample_s,
             samples=samples,
             samples_per_s=self._rate,
-            frames=counters.frames,
-            wanted=counters.wanted,
+            frames=statistics.frames,
+            wanted=statistics.wanted,
             rejected=sum(count for name, count in rejects.items() if name not in _OF_VALUES),
-            lost=counters.frames_lost,
+            lost=statistics.frames_lost,
             rejects=rejects,
             bus=_bus_counts(self._port),
             bus_up=not any(getattr(self._port, name, False) for name in ("is_away", "is_off")),
@@ -438,7 +438,7 @@ class Monitor:
             _LOG,
             logging.WARNING if is_worse else logging.INFO,
             "status.changed",
-            status_line(snapshot),
+            _status_line(snapshot),
             status=estimate.status.name.lower(),
             before=None if before is None else before.name.lower(),
             reasons=reason_ids(estimate.reasons),
@@ -447,7 +447,7 @@ class Monitor:
         )
 
 
-def status_line(snapshot: Snapshot) -> str:
+def _status_line(snapshot: Snapshot) -> str:
     """Return a snapshot in one line, such as "SoC 71.2 ± 0.8 %, valid, 10.0 samples/s"."""
     estimate = snapshot.estimate
     soc = f"SoC {number(estimate.soc_pct, 1)} ± {number(estimate.soc_std_pct, 1, '%')}"
@@ -456,9 +456,9 @@ def status_line(snapshot: Snapshot) -> str:
     return f"{soc}, {status}, {snapshot.samples_per_s:.1f} samples/s"
 
 
-def _rejects(counters: FrameStatistics) -> dict[str, int]:
+def _rejects(statistics: FrameStatistics) -> dict[str, int]:
     return {
-        name: sum(int(getattr(each, name)) for each in counters.messages.values())
+        name: sum(int(getattr(each, name)) for each in statistics.messages.values())
         for name in _REJECTS
     }
 

@@ -12,8 +12,10 @@ from urllib.parse import urlsplit
 
 from cangauge.errors import CangaugeError, InputError
 from cangauge.service.addresses import read_token, served_sockets
-from cangauge.service.status import SCHEMA
 
+SCHEMA: Final = 1
+"""Version of the JSON object of `/status`. Defined here, so that a client need not import the
+estimator."""
 ANSWER_WITHIN_S: Final = 3.0
 LARGEST_ANSWER: Final = 1 << 20
 
@@ -60,7 +62,7 @@ def fetch_status(endpoint: str, token_file: Path | None = None) -> dict[str, Any
     Raises
     ------
     InputError
-        If the endpoint is neither.
+        If the endpoint is neither of both.
     NotRunningError
         If no service answers.
     CangaugeError

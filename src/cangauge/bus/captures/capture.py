@@ -85,7 +85,7 @@ class Capture:
 
     @property
     def info(self) -> CaptureInfo:
-        """What the latest iteration has shown so far; complete after its end."""
+        """Findings of the latest iteration; complete after its end."""
         return CaptureInfo(
             format=self._kind.name,
             stamps=self.stamps,
@@ -191,7 +191,7 @@ class Capture:
                 yield message
         except DAMAGE as error:
             self._cut_off = True
-            # An empty last part, begun just before power was lost, does not spoil the others.
+            # An empty last part, begun just before a power cut, does not invalidate the others.
             if not self._frames and path == self._parts[-1]:
                 raise InputError(
                     f"the {kind.name} file is damaged ({type(error).__name__}: {error})",
@@ -290,7 +290,7 @@ def read_capture(path: str | PathLike[str]) -> Iterator[can.Message]:
 
 
 def is_capture(path: str | PathLike[str]) -> bool:
-    """Return whether a file is a capture of a known kind; False also if it cannot be read."""
+    """Return whether a file is a readable capture of a known kind."""
     try:
         return find_capture(path) is not None
     except InputError:

@@ -1,4 +1,4 @@
-"""Capture files: what reading them showed, recordings in parts, lines of damaged files."""
+"""Capture files: findings of reading, recordings in parts, lines of damaged files."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
 
 Stamps = Literal["us", "ms", "none"]
-"""Resolution of time stamps: microseconds or finer, whole milliseconds, or no stamps at all."""
+"""Resolution of time stamps: microseconds or finer, whole milliseconds, or no stamps."""
 
 _HEAD_BYTES: Final = 64 * 1024
 
 
 @dataclass(frozen=True, slots=True)
 class CaptureInfo:
-    """What reading a capture has shown so far.
+    """Findings of reading a capture.
 
     Parameters
     ----------
@@ -51,9 +51,9 @@ class CaptureInfo:
     remarks: tuple[str, ...] = ()
 
 
-# --- Recordings in parts. `cangauge run` starts a new file now and then and numbers its runs, so
-# that no recording is overwritten. `drive-0003-000001.log`, `drive-0003-000002.log`, … are the
-# parts of run 3 of `drive.log`, and `drive-0003.log` stands for all of them: one capture.
+# --- Recordings in parts. `cangauge run` numbers its runs, so that no recording is overwritten, and
+# can split a run into parts. `drive-0003-000001.log`, `drive-0003-000002.log`, … are the parts of
+# run 3 of `drive.log`; `drive-0003.log` names all of them as one capture.
 
 _RUN: Final = r"(?P<run>\d{4,9})"
 _PART: Final = r"(?P<part>\d{6,9})"
@@ -74,7 +74,7 @@ def part_path(path: Path, run: int, part: int) -> Path:
 
 
 def run_path(path: Path, run: int) -> Path:
-    """Return the name that stands for all parts of a run."""
+    """Return the name for all parts of a run."""
     stem, suffix = _split(path)
     return path.with_name(f"{stem}-{run:04d}{suffix}")
 
@@ -96,9 +96,9 @@ def all_parts(path: Path) -> list[Part]:
 
 
 def parts_of_run(path: Path) -> list[Path]:
-    """Return the files for which the name of a run (see `run_path`) stands.
+    """Return the parts of a run, by its name (see `run_path`).
 
-    Empty where a file has that name, or where it is no run's name.
+    Empty if a file has that name, or if it is not the name of a run.
     """
     stem, suffix = _split(path)
     match = re.fullmatch(f"(?P<stem>.*)-{_RUN}", stem)
@@ -123,7 +123,7 @@ def _split(path: Path) -> tuple[str, str]:
 
 
 def open_bytes(path: Path) -> io.BufferedReader:
-    """Open a capture file, unpacking gzip whatever its name; see `open_unpacked`."""
+    """Open a capture file, unpacking gzip, recognised by content; see `open_unpacked`."""
     return open_unpacked(path, MAX_CAPTURE_BYTES)
 
 
@@ -160,7 +160,7 @@ class LineStream:
 
 
 class _Salvage(io.RawIOBase):
-    """A stream that ends, instead of raising, where the file below breaks off."""
+    """A stream that ends, instead of raising, where the underlying file breaks off."""
 
     def __init__(self, raw: io.BufferedIOBase, owner: LineStream) -> None:
         self._raw = raw

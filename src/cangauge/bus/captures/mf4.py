@@ -1,8 +1,8 @@
 """ASAM MF4, read in a child process with bounded memory and time.
 
 The blocks of an MF4 file point at one another, and asammdf follows the pointers of a damaged file
-for ever, into gigabytes, or into errors of every kind. The child sends frames through a pipe and is
-killed if it sends nothing for too long.
+in endless loops, into gigabytes of memory, or into errors of any kind. The child sends frames
+through a pipe and is killed if it is silent for too long.
 """
 
 from __future__ import annotations

@@ -23,9 +23,9 @@ from cangauge._io import MAX_BLF_OBJECT, MAX_LINE
 from cangauge.bus.captures.files import Stamps, open_bytes
 from cangauge.bus.captures.mf4 import mf4_messages
 
-# --- Vector BLF, checked before python-can reads it. A BLF file is a row of objects, most of them
-# containers of more objects, packed by zlib. python-can trusts every size in it: an object of no
-# length makes it loop for ever, and a container unpacks to any size.
+# --- Vector BLF, checked before python-can reads it. A BLF file is a sequence of objects, most of
+# them containers of further objects, compressed by zlib. python-can trusts every size in it: an
+# object of length 0 makes it loop endlessly, and a container unpacks to any size.
 
 _OBJECT: Final = struct.Struct("<4sHHLL")
 """Signature, length of the header, its version, length of the object, type."""
@@ -41,7 +41,7 @@ _WINDOW: Final = 8
 """The signature of an object ends at most this many bytes after the object before."""
 
 
-class CheckedBlf:
+class _CheckedBlf:
     """A BLF file for python-can's reader, with checked sizes and unpacked containers.
 
     Parameters
@@ -164,7 +164,7 @@ def _unpacked(body: bytes) -> bytes:
 
 # --- Formats that python-can reads
 
-# Its readers log a line for every unknown object: a hostile file has millions.
+# Its readers log a line for every unknown object, of which a hostile file can have millions.
 logging.getLogger("can").addHandler(logging.NullHandler())
 
 # Errors of python-can's readers on damaged files.
@@ -268,7 +268,7 @@ def library_messages(kind: LibraryFormat, path: Path) -> Iterator[can.Message]:
         yield from mf4_messages(path)
         return
     with open_bytes(path) as raw:
-        file: Any = _Lines(raw) if kind.is_text else CheckedBlf(raw)
+        file: Any = _Lines(raw) if kind.is_text else _CheckedBlf(raw)
         yield from kind.reader(file)
 
 
@@ -477,4 +477,4 @@ TEXT_FORMATS: Final = (
     TextFormat("candump with stamps", "us", True, parser=_candump(with_stamps=True)),
     TextFormat("candump without stamps", "none", True, parser=_candump(with_stamps=False)),
 )
-"""The one with most frames in the beginning of a file is taken, the first of equals."""
+"""The format with most frames in the beginning of a file is chosen, the first of equals."""

@@ -15,7 +15,7 @@ from cangauge.errors import InputError
 from cangauge.estimate.offline import samples_of
 from cangauge.estimate.validity import Estimate
 from cangauge.service import recording as record
-from cangauge.service.capture_estimate import estimate_capture
+from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
 from live import leaf_model, short_log
