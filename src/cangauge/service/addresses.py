@@ -175,7 +175,8 @@ def open_unix(path: Path) -> socket.socket:
     Raises
     ------
     InputError
-        If another service uses it, a file has this name, or it cannot be created.
+        If another service uses it, a file or another user's socket has this name, or it cannot be
+        created.
     """
     if not has_unix_sockets():
         raise _bad(path, "this system has no unix sockets in Python", "use --http, or off")
@@ -183,6 +184,8 @@ def open_unix(path: Path) -> socket.socket:
         raise _bad(path, "another service uses this socket", "name another one")
     try:
         if path.is_socket():
+            if path.lstat().st_uid != os.geteuid():
+                raise _bad(path, "this socket belongs to another user", "name another one")
             path.unlink()
         server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
@@ -228,7 +231,7 @@ def default_path(bus: str) -> Path:
     """
     folder = _own_folder()
     for left in folder.glob("*.sock"):
-        if not is_served(left):
+        if left.is_socket() and not is_served(left):
             left.unlink(missing_ok=True)
     name = re.sub(r"[^A-Za-z0-9.]+", "-", bus).strip("-.")[:LONGEST_NAME]
     return folder / f"{name or 'bus'}-{os.getpid()}.sock"
