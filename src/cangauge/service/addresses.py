@@ -238,8 +238,28 @@ def default_path(bus: str) -> Path:
 
 
 def served_sockets() -> list[Path]:
-    """Return the sockets of running services that this user can see."""
-    return [path for path in _candidates() if is_served(path)]
+    """Return the sockets of running services that this user can see.
+
+    In a folder that anybody could have made (in `/tmp`), only those of this user or root.
+    """
+    return [path for path in _candidates() if _is_trusted(path) and is_served(path)]
+
+
+def _is_trusted(path: Path) -> bool:
+    """Return whether a socket is of this user or root, unless only they could have made it."""
+    folder = path.parent
+    try:
+        if not folder.parent.stat().st_mode & stat.S_IWOTH:
+            return True
+        return all(
+            each.st_uid in {os.getuid(), 0} and not each.st_mode & unwanted
+            for each, unwanted in (
+                (folder.lstat(), stat.S_IWGRP | stat.S_IWOTH),
+                (path.lstat(), stat.S_IWOTH),
+            )
+        ) and stat.S_ISDIR(folder.lstat().st_mode)
+    except OSError:  # gone, or in a folder that this user may not read
+        return False
 
 
 def _candidates() -> Iterator[Path]:
