@@ -15,6 +15,8 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Final, Self
 
+from cangauge._formatting import printable
+
 NOTIFY_SOCKET: Final = "NOTIFY_SOCKET"
 PINGS_PER_TIMEOUT: Final = 4
 """Watchdog pings per time-out of systemd."""
@@ -182,4 +184,4 @@ class Notifier:
 
 
 def _line(text: str) -> str:
-    return " ".join(text.split())
+    return printable(" ".join(text.split()))
