@@ -373,13 +373,13 @@ def refuse_foreign(path: str | PathLike[str]) -> None:
     if not hasattr(os, "geteuid"):  # Windows
         return
     rest = list(Path(path).parts)
-    place = Path.cwd()
+    place = Path("/" if Path(path).is_absolute() else ".")
     for _ in range(_MOST_PARTS):
         if not rest:
             return
         name = rest.pop(0)
         if name == "..":
-            place = place.parent
+            place = place / ".." if place.name in {"", ".."} else place.parent
             continue
         found = place / name  # an absolute path begins with its root
         try:

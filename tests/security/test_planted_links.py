@@ -98,3 +98,15 @@ def test_an_output_that_is_a_socket_is_refused(tmp_path: Path) -> None:
         server.bind(str(tmp_path / "x.csv"))
     with pytest.raises(InputError, match="this is a socket"):
         check_writable(tmp_path / "x.csv")
+
+
+@needs_root
+def test_planted_links_of_relative_paths(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    planted(shared / "x.csv", shared.parent / "victim")
+    inner = shared / "inner"
+    inner.mkdir()
+    monkeypatch.chdir(inner)
+    for path in ("../x.csv", "./../inner/../x.csv", "../../shared/x.csv"):
+        with pytest.raises(InputError, match="another user placed"):
+            check_writable(path)
+    check_writable("../y.csv")
