@@ -33,7 +33,7 @@ from cangauge.service.loop import LoopSettings, Outputs, RunSummary, serve
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from synthetic import synthetic_log
 
-COMMAND = "import sys; from cangauge.cli.app import main; main()"
+COMMAND = "from cangauge.__main__ import main; main()"
 
 
 def leaf_model_path() -> Path:

@@ -15,6 +15,7 @@ from random import Random
 from typing import Any, Final
 
 from cangauge._resources import shared_file
+from cangauge.service.state import FILE_NAME
 from faults.frames import Profile, initial_soc_pct
 from faults.line import BusLine
 from faults.process import Process, Target, cangauge
@@ -98,7 +99,7 @@ class Bench:
         self.folder = folder
         self.rng = rng
         self.config_path = folder / "run.toml"
-        self.state_path = folder / "state" / "soc.state"
+        self.state_path = folder / "state" / FILE_NAME
         self.state_path.parent.mkdir()
         self.expected_silence_s: list[tuple[float, float]] = []
         self.incidents: list[str] = []

@@ -8,7 +8,6 @@ service, the bus or the machine, see `actions`).
 from __future__ import annotations
 
 import math
-import os
 import signal
 import struct
 from collections.abc import Callable
@@ -265,7 +264,6 @@ _STATE_DAMAGE: list[tuple[str, str, Callable[[Bench], None]]] = [
     ("UTF-16", "another encoding",
      do.spoil(lambda data, _r: data.decode("utf-8", "replace").encode("utf-16"))),
     ("folder", "a folder instead", do.instead(Path.mkdir)),
-    ("pipe", "a pipe without a writer instead", do.instead(os.mkfifo)),
     ("loop", "a link to itself", do.instead(lambda path: path.symlink_to(path))),
     ("gone", "removed", do.instead(lambda _path: None)),
 ]  # fmt: skip

@@ -30,7 +30,7 @@ PRELOAD: Final = [
     "can.interfaces.udp_multicast",
     "can.interfaces.socketcan",
 ]
-_COLD: Final = "import sys; from cangauge.cli.app import main; main()"
+_COLD: Final = "from cangauge.__main__ import main; main()"
 _STARTING: Final = threading.Lock()
 
 

@@ -1,4 +1,4 @@
-"""Numbers as text, the same in every message, report and table."""
+"""Numbers and foreign text, the same in every message, report and table."""
 
 from __future__ import annotations
 
@@ -39,6 +39,25 @@ def duration(seconds: float) -> str:
     if seconds < 120.0:
         return f"{seconds:.0f} s"
     return f"{seconds / 60.0:.1f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.2f} h"
+
+
+_NOT_FOR_TERMINALS: Final = frozenset((*range(0x20), *range(0x7F, 0xA0))) - {0x09, 0x0A}
+"""Code points by which text controls a terminal: C0 without tab and newline, DEL, C1."""
+_AS_TEXT: Final = {code: f"\\x{code:02x}" for code in _NOT_FOR_TERMINALS}
+_AS_JSON: Final = {code: f"\\u{code:04x}" for code in _NOT_FOR_TERMINALS}
+
+
+def printable(text: str) -> str:
+    r"""Return text whose control characters are written out ("\x1b"), for terminals and journals.
+
+    Names of files and signals, and what a server answers, may hold anything.
+    """
+    return text.translate(_AS_TEXT)
+
+
+def printable_json(text: str) -> str:
+    r"""Return JSON whose control characters are escaped ("\u009b"), those beyond ASCII as well."""
+    return text.translate(_AS_JSON)
 
 
 def _with_unit(text: str, unit: str) -> str:

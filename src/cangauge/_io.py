@@ -309,7 +309,7 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
     Parameters
     ----------
     path : path-like
-        The file to write; a symbolic link is followed.
+        The file to write; a symbolic link is followed (see `refuse_foreign`).
 
     Yields
     ------
@@ -319,10 +319,11 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
     Raises
     ------
     InputError
-        If the folder does not exist or is not writable, or `path` is a folder.
+        If the folder does not exist or is not writable, or `path` is a folder or foreign.
     CangaugeError
         If the disk is full or fails while writing.
     """
+    refuse_foreign(path)
     target = Path(path)
     if _is_device(target):
         yield target
@@ -363,8 +364,63 @@ def write_texts_atomic(texts: Mapping[Path, str]) -> None:
 
 def check_writable(path: str | PathLike[str]) -> None:
     """Raise the InputError that writing `path` would raise, before any long work is done."""
+    refuse_foreign(path)
     if not _is_device(Path(path)):
         _create_beside(Path(os.path.realpath(path)), shown=path).unlink()
+
+
+def refuse_foreign(path: str | PathLike[str]) -> None:
+    """Raise InputError if writing `path` would write what somebody else chose.
+
+    In a folder such as `/tmp` (sticky, writable by all) anybody can place a link or pipe under a
+    name that is written later. As Linux does for opening a file (`fs.protected_symlinks`,
+    `fs.protected_fifos`), a link is followed and a pipe written there only if it belongs to this
+    user or to the folder's owner. A file that is renamed into place never meets those checks.
+    Disks and sockets, which no file can replace, are refused everywhere.
+    """
+    if not hasattr(os, "geteuid"):  # Windows
+        return
+    rest = list(Path(path).parts)
+    place = Path("/" if Path(path).is_absolute() else ".")
+    for _ in range(_MOST_PARTS):
+        if not rest:
+            return
+        name = rest.pop(0)
+        if name == "..":
+            place = place / ".." if place.name in {"", ".."} else place.parent
+            continue
+        found = place / name  # an absolute path begins with its root
+        try:
+            state, folder = found.lstat(), place.lstat()
+            target = found.readlink() if stat.S_ISLNK(state.st_mode) else None
+        except (OSError, ValueError):
+            return  # absent, or impossible: creating it reports which
+        if target is not None:
+            _refuse_planted(state, folder, "a symbolic link", path)
+            rest = [*target.parts, *rest]
+            continue
+        if not rest and stat.S_ISFIFO(state.st_mode):
+            _refuse_planted(state, folder, "a pipe (FIFO)", path)
+        if not rest and (stat.S_ISBLK(state.st_mode) or stat.S_ISSOCK(state.st_mode)):
+            kind = "a disk" if stat.S_ISBLK(state.st_mode) else "a socket"
+            raise InputError(f"this is {kind}, not a file", source=path, cure="name a file")
+        place = found
+
+
+_MOST_PARTS: Final = 4096
+"""Most parts of a path, with those of the links in it: a circle of links ends here."""
+
+
+def _refuse_planted(
+    state: os.stat_result, folder: os.stat_result, kind: str, path: str | PathLike[str]
+) -> None:
+    shared = stat.S_ISVTX | stat.S_IWOTH
+    if folder.st_mode & shared == shared and state.st_uid not in {os.geteuid(), folder.st_uid}:
+        raise InputError(
+            f"leads over {kind} that another user placed in a shared folder",
+            source=path,
+            cure="remove it, or name a file in a folder of your own",
+        )
 
 
 def _is_device(path: Path) -> bool:

@@ -23,6 +23,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Final, Literal, TextIO
 
+from cangauge._formatting import printable, printable_json
+
 LogFormat = Literal["text", "json"]
 LogLevel = Literal["debug", "info", "warning", "error"]
 
@@ -125,7 +127,7 @@ class TextFormatter(logging.Formatter):
             for name, value in _fields(record).items()
         )
         line = f"{_time(record)} {record.levelname} {_event(record)}: {_message(record)}"
-        return " ".join((f"{line} ({pairs})" if pairs else line).splitlines())
+        return printable(" ".join((f"{line} ({pairs})" if pairs else line).splitlines()))
 
 
 class JsonFormatter(logging.Formatter):
@@ -140,7 +142,7 @@ class JsonFormatter(logging.Formatter):
             "message": _message(record),
             "logger": record.name,
         }
-        return json.dumps(content, ensure_ascii=False)
+        return printable_json(json.dumps(content, ensure_ascii=False))
 
 
 @dataclass(slots=True)

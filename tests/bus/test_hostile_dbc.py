@@ -92,6 +92,49 @@ def test_a_circle_of_multiplexers_is_refused(tmp_path: Path) -> None:
         Vehicle.load(map=tmp_path / "x.toml")
 
 
+def nested(levels: int, values: int, copies: int = 1) -> str:
+    """A chain of multiplexers, each switching the next by every one of its values."""
+    signals, ranges = [], []
+    for level in range(levels):
+        mark = "m0M" if level else "M"
+        signals += copies * [f' SG_ s{level} {mark} : {8 * level}|8@1+ (1,0) [0|0] "A" X']
+        if level:
+            ranges.append(f"SG_MUL_VAL_ 256 s{level} s{level - 1} 0-{values - 1};")
+    return "\n".join(["BO_ 256 Nested: 64 X", *signals, "", *ranges, ""])
+
+
+def flat(signals: int) -> str:
+    multiplexed = (f' SG_ s{n} m{n} : 16|8@1+ (1,0) [0|0] "" X\n' for n in range(signals))
+    return 'BO_ 256 Flat: 8 X\n SG_ M M : 0|16@1+ (1,0) [0|0] "" X\n' + "".join(multiplexed)
+
+
+MULTIPLYING = {
+    "12 levels of 4 values": nested(12, 4),
+    "24 levels of 2 values": nested(24, 2),
+    "3 levels of 400 values": nested(3, 400),
+    "40 levels": nested(40, 8),
+    "signals of one name": nested(24, 1, copies=2),
+    "named values": nested(2, 200) + "".join(
+        f"VAL_ 256 s{level} " + " ".join(f'{n} "x{n}"' for n in range(900)) + " ;\n"
+        for level in range(2)
+    ),
+    "a signal for each value": flat(20_000),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MULTIPLYING)
+def test_multiplexers_that_multiply_are_refused_at_once(tmp_path: Path, name: str) -> None:
+    began_s = time.process_time()
+    with pytest.raises(InputError, match="multiplex"):
+        load(tmp_path, MULTIPLYING[name].encode())
+    assert time.process_time() - began_s < 2.0
+
+
+@pytest.mark.parametrize("text", [nested(3, 3), nested(6, 4), nested(2, 256), flat(1000)])
+def test_modest_multiplexing_is_read(tmp_path: Path, text: str) -> None:
+    load(tmp_path, text.encode())
+
+
 def test_windows_umlauts_and_byte_order_marks_are_read(tmp_path: Path) -> None:
     load(tmp_path, (GOOD + 'CM_ "Größe in °C";\n').encode("cp1252"))
     load(tmp_path, b"\xef\xbb\xbf" + GOOD.encode())

@@ -334,7 +334,7 @@ def check_refused(machine: Machine, reason: str) -> None:
     assert "state refused" in machine.text
     assert reason in machine.text
     assert "\n" not in machine.said[0]
-    aside = machine.path.with_name("state.json.refused")
+    aside = machine.path.with_name(machine.path.name + ".refused")
     assert aside.exists()
     assert not machine.path.exists()
     found = service.drive(DRIVE[:1000])
@@ -433,6 +433,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
 @pytest.mark.parametrize("name", DAMAGE)
 def test_a_damaged_file_is_refused_put_aside_and_replaced(machine: Machine, name: str) -> None:
     act, reason = DAMAGE[name]
+    machine.path = machine.path.with_name(FILE_NAME)  # by another name, no state is not touched
     kept(machine, 300)
     act(machine.path)
     began = time.process_time()
@@ -466,11 +467,25 @@ def test_flipped_bits_are_noticed(tmp_path: Path) -> None:
             continue
 
 
-def test_pipes_and_devices_do_not_hold_it_up(machine: Machine) -> None:
+def test_a_pipe_is_neither_read_nor_moved(machine: Machine) -> None:
     os.mkfifo(machine.path)
-    service = machine.start()
-    assert "not a regular file" in machine.text
-    assert service.drive(DRIVE[:10])
+    with pytest.raises(state_keeper.InputError, match="FIFO"):
+        machine.start()
+    assert machine.path.is_fifo()
+
+
+def test_a_refused_state_replaces_only_an_earlier_one(machine: Machine) -> None:
+    foreign = machine.path.with_name("state.json.refused")
+    foreign.write_text("somebody's")
+    for _ in range(2):
+        kept(machine, 3)
+        overwrite(version=2)(machine.path)
+        machine.start()
+    assert foreign.read_text() == "somebody's"
+    assert sorted(each.name for each in machine.path.parent.iterdir()) == [
+        "state.json.refused",
+        "state.json.refused2",
+    ]
 
 
 # --- what the disk can do ---------------------------------------------------------------------
@@ -540,6 +555,7 @@ def test_a_folder_that_is_not_there(machine: Machine) -> None:
 
 @pytest.mark.skipif(is_root(), reason="root may write anywhere")
 def test_a_folder_and_a_file_without_rights(machine: Machine) -> None:
+    machine.path = machine.path.with_name(FILE_NAME)
     kept(machine)
     machine.path.chmod(0)
     machine.path.parent.chmod(0o500)

@@ -19,15 +19,10 @@ from typing import Any, Final, Literal, Protocol, cast
 import can
 from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.socketcan.socketcan import capture_message
-from can.interfaces.udp_multicast import UdpMulticastBus
 from can.interfaces.udp_multicast.bus import SO_TIMESTAMPNS
 
 from cangauge.bus.open import BusAddress
-
-try:
-    import msgpack
-except ImportError:  # then there is no UDP bus either
-    msgpack = None
+from cangauge.bus.udp import CheckedUdpBus, as_message, unpack_fields
 
 Stamps = Literal["kernel", "sender", "driver"]
 
@@ -191,7 +186,7 @@ def pending_frames(bus: can.BusABC) -> PendingFrames | None:
         return None
     if isinstance(bus, SocketcanBus):
         return _SocketcanFrames(bus)
-    if isinstance(bus, UdpMulticastBus):
+    if isinstance(bus, CheckedUdpBus):
         own = _duplicate_socket(bus)
         if own.getsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS):
             return _UdpFrames(bus, own)
@@ -238,7 +233,7 @@ class _NonBlockingSocket:
 class _UdpFrames:
     """Pending frames of UDP multicast; no message is built of a frame with an unwanted id."""
 
-    def __init__(self, bus: UdpMulticastBus, own: socket.socket) -> None:
+    def __init__(self, bus: CheckedUdpBus, own: socket.socket) -> None:
         self._bus = bus
         self._socket = own
         self._stamp_space = socket.CMSG_SPACE(_STAMP.size)
@@ -247,23 +242,20 @@ class _UdpFrames:
 
     def next(self) -> can.Message | None:
         try:
-            packet, ((_, _, stamp),), _, _ = self._socket.recvmsg(
+            packet, ((_, _, stamp),), _, sender = self._socket.recvmsg(
                 _PACKET_BYTES, self._stamp_space, _DO_NOT_WAIT
             )
         except BlockingIOError:
             raise NoPendingFrameError from None
+        if not self._bus.is_accepted(sender):
+            return None
+        fields = unpack_fields(packet)
+        key = fields.get("arbitration_id"), fields.get("is_extended_id")
+        passes = self._passes.get(key)
+        if passes is False:
+            return None
         seconds, nanoseconds = _STAMP.unpack(stamp)
-        try:
-            fields = msgpack.unpackb(packet, raw=False)
-            key = fields.get("arbitration_id"), fields.get("is_extended_id")
-            passes = self._passes.get(key)
-            if passes is False:
-                return None
-            fields["timestamp"] = seconds + nanoseconds * 1.0e-9
-            message = can.Message(check=True, **fields)
-        except Exception as error:
-            # As in python-can: every error here is caused by this packet.
-            raise can.CanOperationError("could not unpack received message") from error
+        message = as_message(fields, seconds + nanoseconds * 1.0e-9)
         if passes is None:
             if len(self._passes) >= _IDS_KEPT:
                 self._passes.clear()

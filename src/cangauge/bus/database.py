@@ -361,6 +361,11 @@ MAX_MESSAGE_BYTES: Final = 1785
 MAX_MULTIPLEXER_VALUE: Final = (1 << 32) - 1
 MAX_MULTIPLEXER_VALUES: Final = 65_536
 """cantools expands each range of multiplexer values into a list."""
+MAX_MULTIPLEXER_LEVELS: Final = 32
+MAX_MULTIPLEXER_WORK: Final = 20_000_000
+"""Largest number of steps in which cantools lays out the multiplexed signals: about 2 s."""
+_STEPS_PER_LAYOUT: Final = 200
+"""Steps that an empty layout takes, in units of one signal of it."""
 
 _CANTOOLS_ERRORS: Final = (
     cantools.Error,
@@ -379,6 +384,13 @@ _SIGNAL = re.compile(
     r"(?<![A-Za-z_])SG_\s++\w++\s*+(?:\w++\s*+)?:\s*+([-+]?\d++)\s*+\|\s*+([-+]?\d++)\s*+@"
 )
 _MULTIPLEXER_VALUES = re.compile(r"(?<![A-Za-z_])SG_MUL_VAL_\s[^;]*+")
+_MULTIPLEXED = re.compile(
+    r"(?<![A-Za-z_])(?:BO_\s++([-+]?\d++)\s*+\w++\s*+:|SG_\s++(\w++)\s*+(?:(\w++)\s*+)?:)"
+)
+_EXTENDED_MULTIPLEXING = re.compile(
+    r"(?<![A-Za-z_])SG_MUL_VAL_\s*+([-+]?\d++)\s*+(\w++)\s++(\w++)([^;]*+)"
+)
+_NAMED_VALUES = re.compile(r"(?<![A-Za-z_])VAL_\s++([-+]?\d++)\s*+(\w++)([^;]*+)")
 _RANGE = re.compile(r"(?<!\d)(\d++)\s*+-\s*+(\d++)")
 
 # cantools warns on stderr of messages defined twice; `find_message` reports the wanted ones.
@@ -537,6 +549,117 @@ def _check_sizes(text: str, path: Path) -> None:
             values += max(int(high) - int(low[-12:]) + 1, 0)
     if values > MAX_MULTIPLEXER_VALUES:
         raise InputError("the DBC lists too many multiplexer values", source=path, value=values)
+    _refuse_nesting(text, path)
+
+
+@dataclass(slots=True)
+class _Multiplexer:
+    """What the signals of one name in a message multiply."""
+
+    parent: str | None = None
+    times: int = 0
+    """Values of the parent with which they are present, summed over the signals of this name."""
+    children: int = 0
+    values: set[int] = dataclasses.field(default_factory=set)
+    named: int = 0
+
+
+def _refuse_nesting(text: str, path: Path) -> None:
+    """Refuse multiplexers whose layouts multiply along a chain.
+
+    cantools lays out a message once for each combination of values along a chain of multiplexers,
+    and looks at all signals of a multiplexer for each of its values.
+    """
+    ranges: dict[tuple[int, str], dict[str, set[int]]] = {}
+    for message, name, parent, listed in _EXTENDED_MULTIPLEXING.findall(text):
+        values: set[int] = set()
+        for low, high in _RANGE.findall(listed):
+            values.update(range(int(low), int(high) + 1))
+        ranges.setdefault((int(message[:20]), name), {})[parent] = values
+    named = {
+        (int(message[:20]), name): listed.count('""')
+        for message, name, listed in _NAMED_VALUES.findall(text)
+    }
+    work = 0
+    message, marked = 0, list[tuple[str, str]]()
+    for match in (*_MULTIPLEXED.finditer(text), None):
+        if match is not None and match[1] is None:
+            if match[3] is not None:
+                marked.append((match[2], match[3]))
+            continue
+        if marked:
+            work += _layout_steps(_multiplexers(message, marked, ranges, named), path)
+            marked = []
+        if match is not None:
+            message = int(match[1][:20])
+    if work > MAX_MULTIPLEXER_WORK:
+        raise InputError(
+            "the DBC nests multiplexers so that their values multiply beyond reason",
+            source=path,
+            cure="remove the multiplexed messages that you do not need",
+        )
+
+
+def _multiplexers(
+    message: int,
+    marked: list[tuple[str, str]],
+    ranges: Mapping[tuple[int, str], Mapping[str, set[int]]],
+    named: Mapping[tuple[int, str], int],
+) -> dict[str, _Multiplexer]:
+    """Return the multiplexers of a message as cantools relates them, by name.
+
+    Parameters
+    ----------
+    message : int
+        Its id.
+    marked : list of (str, str)
+        Names and marks ("M", "m1", "m1M") of its signals.
+    ranges : mapping
+        Values by message and signal, then by multiplexer (SG_MUL_VAL_).
+    named : mapping
+        Number of named values by message and signal (VAL_).
+    """
+    found = {name: _Multiplexer() for name, mark in marked if mark.endswith("M")}
+    only = next(iter(found)) if sum(mark.endswith("M") for _, mark in marked) == 1 else None
+    for name, mark in marked:
+        listed = ranges.get((message, name), {})
+        parent = only if only is not None else next(reversed(list(listed)), None)
+        values: set[int] = set()
+        if parent is None or (only is not None and name == only):
+            parent = None
+        else:
+            values = set(listed.get(parent, ()))
+            if only is not None and mark[1:].isdecimal():
+                values.add(int(mark[1:20]))
+        if name in found:
+            found[name].parent = parent
+            found[name].times += len(values) if parent is not None else 1
+            found[name].named = named.get((message, name), 0)
+        if parent in found:
+            found[parent].children += 1
+            found[parent].values |= values
+    return found
+
+
+def _layout_steps(multiplexers: Mapping[str, _Multiplexer], path: Path) -> int:
+    steps = 0
+    for each in multiplexers.values():
+        times, above = each.times, each.parent
+        for _ in range(MAX_MULTIPLEXER_LEVELS):
+            if above is None or above not in multiplexers:
+                break
+            times *= multiplexers[above].times
+            above = multiplexers[above].parent
+        else:
+            raise InputError(
+                "signals are multiplexed in a circle, or in more than"
+                f" {MAX_MULTIPLEXER_LEVELS} levels",
+                source=path,
+                cure="correct the DBC",
+            )
+        layouts = len(each.values) + each.named
+        steps += times * layouts * (_STEPS_PER_LAYOUT + each.children)
+    return steps
 
 
 def _bounded(figure: str, limit: int, what: str, path: Path) -> None:

@@ -1,7 +1,9 @@
 """Open a bus: any interface of python-can, with a one-line error and its cure on failure.
 
 The default is SocketCAN's vcan0 where it exists, else `udp_multicast`, which needs no driver and
-connects the programs of this machine (its packets do not leave it).
+connects the programs of this machine: its packets do not leave it, and on the default bus packets
+from elsewhere are dropped. Where interface or channel are named, anybody who reaches the port may
+send.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from typing import Any, Final
 import can
 from can.typechecking import CanFilter
 
+from cangauge.bus.udp import CheckedUdpBus
 from cangauge.errors import InputError
 
 BusOption = str | int | float | bool
@@ -29,7 +32,7 @@ MULTICAST_CHANNEL: Final = "239.74.163.2"
 """IPv4 group of python-can; its default is an IPv6 group, which some machines cannot reach."""
 
 MULTICAST_HOPS: Final = 0
-"""0: packets stay on this machine; 1 (`--bus-option hop_limit=1`): local network."""
+"""0: packets sent stay on this machine; 1 (`--bus-option hop_limit=1`): local network."""
 
 RECEIVE_BUFFER_BYTES: Final = 16 << 20
 """Requested receive buffer of sockets, for pauses: Linux's default holds about 270 frames. Without
@@ -77,11 +80,14 @@ class BusAddress:
     channel : str
     options : mapping of str to (str, int, float or bool)
         Further arguments of the driver, such as `bitrate`.
+    local_only : bool
+        Drop packets that other machines send; for `udp_multicast`.
     """
 
     interface: str
     channel: str
     options: Mapping[str, BusOption] = field(default_factory=dict)
+    local_only: bool = False
 
     def __str__(self) -> str:
         return f"{self.interface} {self.channel}"
@@ -94,7 +100,8 @@ def bus_address(
 ) -> BusAddress:
     """Complete a partial address.
 
-    Default interface: SocketCAN if it has that channel (default vcan0), else `udp_multicast`.
+    Default interface: SocketCAN if it has that channel (default vcan0), else `udp_multicast`, which
+    is `local_only` if neither a channel nor `hop_limit` is given.
 
     Parameters
     ----------
@@ -107,6 +114,7 @@ def bus_address(
         If the interface is unknown or needs a channel, or no default interface has the channel.
     """
     options = dict(options or {})
+    local_only = interface is None and channel is None and "hop_limit" not in options
     if interface is None:
         interface = _guess_interface(channel)
     if interface not in can.VALID_INTERFACES:
@@ -129,6 +137,7 @@ def bus_address(
                 cure=f"use one such as {MULTICAST_CHANNEL}",
             )
         options.setdefault("hop_limit", MULTICAST_HOPS)
+        return BusAddress(interface, channel, options, local_only)
     return BusAddress(interface, channel, options)
 
 
@@ -156,12 +165,16 @@ def open_bus(address: BusAddress, filters: Sequence[CanFilter] | None = None) ->
     if filters is not None:
         arguments["can_filters"] = list(filters)
     try:
-        bus = can.Bus(
-            channel=_as_driver_channel(address),
-            interface=address.interface,
-            ignore_config=True,
-            **arguments,
-        )
+        bus: can.BusABC
+        if address.interface == "udp_multicast":
+            bus = CheckedUdpBus(address.channel, local_only=address.local_only, **arguments)
+        else:
+            bus = can.Bus(
+                channel=_as_driver_channel(address),
+                interface=address.interface,
+                ignore_config=True,
+                **arguments,
+            )
     except _DRIVER_ERRORS as error:
         raise _refusal(address, error) from error
     if address.interface in _ON_SOCKETS:

@@ -102,7 +102,7 @@ def _play(model: Path, log: Path, live: Path) -> float:
     """Replay a log to the service, each in its own process; return the duration [s]."""
     bus = ["--interface", "socketcan", "--channel", "vcan0"]
     if not has_socketcan("vcan0"):
-        bus = ["--interface", "udp_multicast"]
+        bus = []  # the default, which takes nothing from other machines
     cangauge = [sys.executable, "-m", "cangauge"]
     service = [
         *cangauge, "run", *bus, "-m", str(model), "--time-source", "replay-clock",

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cangauge._formatting import NONE_KNOWN, number
+from cangauge._formatting import NONE_KNOWN, number, printable
 from cangauge._io import write_texts_atomic
 from cangauge.cli.options import (
     DbcOption,
@@ -156,7 +156,7 @@ def _show(found: Diagnosis) -> None:
         next_step(found),
     ):
         if sentence:
-            typer.echo(sentence)
+            typer.echo(printable(sentence))
     rows = []
     for item in found.candidates[:SHOWN_CANDIDATES]:
         closed = item["closed_fraction"]
@@ -180,4 +180,4 @@ def _show(found: Diagnosis) -> None:
     if found.caveats:
         typer.echo("What these logs cannot show:")
     for sentence in found.caveats:
-        typer.echo(f"- {sentence}")
+        typer.echo(printable(f"- {sentence}"))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from cangauge.cli.options import (
@@ -17,7 +18,7 @@ from cangauge.cli.options import (
     TemperatureOption,
     VehicleOption,
 )
-from cangauge.cli.output import emit_json
+from cangauge.cli.output import PlainConsole, emit_json
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -92,9 +93,9 @@ def inspect_command(  # noqa: PLR0917 - typer fills the arguments by name
     if json_output:
         emit_json(found.to_dict())
         return
-    console = Console(highlight=False)
+    console = PlainConsole(highlight=False)
     if not console.is_terminal:
-        console = Console(highlight=False, width=PIPED_WIDTH)
+        console = PlainConsole(highlight=False, width=PIPED_WIDTH)
     if isinstance(found, LogInspection):
         _show_log(console, found)
     else:
@@ -107,7 +108,7 @@ def _show_log(console: Console, found: LogInspection) -> None:
     timing, charge, soc = found.timing, found.charge, found.soc
     rate = f"{timing.rate_hz:.4g} Hz" if timing.rate_hz else "one row"
     console.print(
-        f"[bold]{found.name}[/]: {found.rows} rows, {timing.duration_s / 60.0:.1f} min,"
+        f"[bold]{escape(found.name)}[/]: {found.rows} rows, {timing.duration_s / 60.0:.1f} min,"
         f" {rate} ({'regular' if timing.regular else 'irregular'}),"
         f" temperature of: {found.temperature_source}"
     )
@@ -116,11 +117,11 @@ def _show_log(console: Console, found: LogInspection) -> None:
         table.add_column(heading, justify="left" if heading in {"channel", "unit"} else "right")
     for name, channel in found.channels.items():
         table.add_row(
-            name,
+            escape(name),
             f"{channel.minimum:.5g}",
             f"{channel.median:.5g}",
             f"{channel.maximum:.5g}",
-            channel.unit,
+            escape(channel.unit),
             "constant" if channel.levels == 1 else _number(channel.quantum),
             str(channel.missing or ""),
         )
@@ -174,7 +175,7 @@ def _show_rows(console: Console, title: str, rows: Sequence[Mapping[str, Any]]) 
     for heading in headings:
         table.add_column(heading.replace("_", " "))
     for row in rows:
-        table.add_row(*(_shown(row.get(heading)) for heading in headings))
+        table.add_row(*(escape(_shown(row.get(heading))) for heading in headings))
     console.print(table)
 
 

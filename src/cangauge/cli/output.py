@@ -11,17 +11,32 @@ from contextlib import contextmanager
 from typing import Any
 
 from rich import box
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
-console = Console(stderr=True, highlight=False)
+from cangauge._formatting import printable, printable_json
+
+
+class PlainConsole(Console):
+    """A console on which text cannot control the terminal: rich itself passes escapes on."""
+
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterator[Segment]:
+        """Yield the segments of a renderable, their control characters written out."""
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else segment._replace(text=printable(segment.text))
+
+
+console = PlainConsole(stderr=True, highlight=False)
 """Console for progress and notes: stderr, since stdout is for results."""
 
 
 def note(text: str) -> None:
     """Print one line on stderr."""
-    sys.stderr.write(text.rstrip() + "\n")
+    sys.stderr.write(printable(text.rstrip()) + "\n")
     sys.stderr.flush()
 
 
@@ -63,7 +78,7 @@ class _ProgressHandler(logging.Handler):
 def emit_json(result: Mapping[str, Any]) -> None:
     """Print exactly one JSON object on stdout; NaN and infinities become null."""
     plain = _plain(result)
-    text = json.dumps(plain, ensure_ascii=False)
+    text = printable_json(json.dumps(plain, ensure_ascii=False))
     try:
         text.encode(sys.stdout.encoding or "utf-8")
     except UnicodeEncodeError:  # a terminal without these characters, or an undecodable file name
@@ -94,11 +109,13 @@ def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) 
         Headings; a leading "<" (not shown) left-aligns the column.
     rows : sequence of sequences of str
     """
-    table = Table(title=Text(title), title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
+    table = Table(
+        title=Text(printable(title)), title_justify="left", title_style="bold", box=box.SIMPLE_HEAD
+    )
     for number, heading in enumerate(head):
         left = number == 0 or heading.startswith("<")
         table.add_column(Text(heading.removeprefix("<")), justify="left" if left else "right")
     for row in rows:
         # Text: brackets in names are not markup.
-        table.add_row(*map(Text, row))
-    Console(highlight=False).print(table)
+        table.add_row(*(Text(printable(cell)) for cell in row))
+    PlainConsole(highlight=False).print(table)

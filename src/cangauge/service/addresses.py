@@ -175,7 +175,8 @@ def open_unix(path: Path) -> socket.socket:
     Raises
     ------
     InputError
-        If another service uses it, a file has this name, or it cannot be created.
+        If another service uses it, a file or another user's socket has this name, or it cannot be
+        created.
     """
     if not has_unix_sockets():
         raise _bad(path, "this system has no unix sockets in Python", "use --http, or off")
@@ -183,6 +184,8 @@ def open_unix(path: Path) -> socket.socket:
         raise _bad(path, "another service uses this socket", "name another one")
     try:
         if path.is_socket():
+            if path.lstat().st_uid != os.geteuid():
+                raise _bad(path, "this socket belongs to another user", "name another one")
             path.unlink()
         server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
@@ -228,15 +231,35 @@ def default_path(bus: str) -> Path:
     """
     folder = _own_folder()
     for left in folder.glob("*.sock"):
-        if not is_served(left):
+        if left.is_socket() and not is_served(left):
             left.unlink(missing_ok=True)
     name = re.sub(r"[^A-Za-z0-9.]+", "-", bus).strip("-.")[:LONGEST_NAME]
     return folder / f"{name or 'bus'}-{os.getpid()}.sock"
 
 
 def served_sockets() -> list[Path]:
-    """Return the sockets of running services that this user can see."""
-    return [path for path in _candidates() if is_served(path)]
+    """Return the sockets of running services that this user can see.
+
+    In a folder that anybody could have made (in `/tmp`), only those of this user or root.
+    """
+    return [path for path in _candidates() if _is_trusted(path) and is_served(path)]
+
+
+def _is_trusted(path: Path) -> bool:
+    """Return whether a socket is of this user or root, unless only they could have made it."""
+    folder = path.parent
+    try:
+        if not folder.parent.stat().st_mode & stat.S_IWOTH:
+            return True
+        return all(
+            each.st_uid in {os.getuid(), 0} and not each.st_mode & unwanted
+            for each, unwanted in (
+                (folder.lstat(), stat.S_IWGRP | stat.S_IWOTH),
+                (path.lstat(), stat.S_IWOTH),
+            )
+        ) and stat.S_ISDIR(folder.lstat().st_mode)
+    except OSError:  # gone, or in a folder that this user may not read
+        return False
 
 
 def _candidates() -> Iterator[Path]:

@@ -178,7 +178,8 @@ class RunConfig(_Strict):
     model: str = _key(..., "Model file of `cangauge fit`.", "MODEL", "-m", "--model", is_path=True)
     interface: str | None = _key(
         None,
-        "python-can interface: socketcan, udp_multicast, pcan, slcan and others.",
+        "python-can interface: socketcan, udp_multicast, pcan, slcan and others. On udp_multicast"
+        " whoever reaches its port may send; only the default bus drops what other machines send.",
         "I",
         default_text="socketcan if there is a vcan0, else udp_multicast on this machine",
         needs_restart=True,

@@ -15,6 +15,8 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Final, Self
 
+from cangauge._formatting import printable
+
 NOTIFY_SOCKET: Final = "NOTIFY_SOCKET"
 PINGS_PER_TIMEOUT: Final = 4
 """Watchdog pings per time-out of systemd."""
@@ -45,34 +47,51 @@ def stop_on_signals() -> Iterator[Callable[[], bool]]:
             signal.signal(kind, before[kind])
 
 
+class _Hangups:
+    """Handler of SIGHUP that remembers it."""
+
+    def __init__(self) -> None:
+        self._received = False
+        self._had_terminal = _has_terminal()
+
+    def note(self, number: int, frame: FrameType | None) -> None:
+        del number, frame
+        if self._had_terminal and not _has_terminal():
+            signal.raise_signal(signal.SIGTERM)
+        else:
+            self._received = True
+
+    def take(self) -> bool:
+        received, self._received = self._received, False
+        return received
+
+
+def hold_hangups() -> None:
+    """Remember SIGHUP for `note_hangups` from now until the process ends.
+
+    By default the signal would end a service that still loads, or just ends. For the main thread
+    only.
+    """
+    if hasattr(signal, "SIGHUP"):
+        signal.signal(signal.SIGHUP, _Hangups().note)
+
+
 @contextmanager
 def note_hangups() -> Iterator[Callable[[], bool]]:
     """Yield a function that returns whether SIGHUP was received since its last call.
 
-    SIGHUP from a closing terminal is turned into SIGTERM. For the main thread only; without effect
-    on Windows, which has no SIGHUP.
+    One that `hold_hangups` remembered counts. SIGHUP from a closing terminal is turned into
+    SIGTERM. For the main thread only; without effect on Windows, which has no SIGHUP.
     """
     if not hasattr(signal, "SIGHUP"):
         yield lambda: False
         return
-    received: list[int] = []
-    had_terminal = _has_terminal()
-
-    def note(number: int, _frame: FrameType | None) -> None:
-        if had_terminal and not _has_terminal():
-            signal.raise_signal(signal.SIGTERM)
-        else:
-            received.append(number)
-
-    def take() -> bool:
-        if not received:
-            return False
-        received.clear()
-        return True
-
-    before = signal.signal(signal.SIGHUP, note)
+    before = signal.getsignal(signal.SIGHUP)
+    held = getattr(before, "__self__", None)
+    hangups = held if isinstance(held, _Hangups) else _Hangups()
+    signal.signal(signal.SIGHUP, hangups.note)
     try:
-        yield take
+        yield hangups.take
     finally:
         signal.signal(signal.SIGHUP, before)
 
@@ -164,4 +183,4 @@ class Notifier:
 
 
 def _line(text: str) -> str:
-    return " ".join(text.split())
+    return printable(" ".join(text.split()))

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, Self, cast
 
 import can
 
-from cangauge._io import FULL, check_writable
+from cangauge._io import FULL, check_writable, refuse_foreign
 from cangauge._logging import emit
 from cangauge.bus.captures.files import all_parts, part_path, run_path
 from cangauge.bus.time_source import whole_us
@@ -317,6 +317,7 @@ class _Disk:
 
         def begin() -> None:
             self._close_file()
+            refuse_foreign(path)  # the names of parts are known before they begin
             self._file = io.FileIO(path, "w")
             self._end = self._at = 0
 

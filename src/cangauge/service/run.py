@@ -29,7 +29,7 @@ from cangauge.service.lifecycle import Notifier, note_hangups, stop_on_signals
 from cangauge.service.loop import LoopSettings, Outputs, RunSummary, serve
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.recording import Recorder
-from cangauge.service.state import StateKeeper
+from cangauge.service.state import StateKeeper, check_state_path
 from cangauge.service.status import Identity, Monitor, Snapshot
 
 _LOG = logging.getLogger(__name__)
@@ -87,6 +87,8 @@ class Service:
         if loaded.output is not None:
             _check_output(Path(loaded.output), Path(loaded.model))
         self._state = loaded.state_settings(os.environ)
+        if self._state is not None:
+            check_state_path(self._state.path)
         vehicle = loaded.load_vehicle()
         self._vehicle_key = _vehicle_key(loaded, vehicle)
         self.pipeline = Pipeline(vehicle, Model.load(loaded.model), loaded.pipeline_settings())

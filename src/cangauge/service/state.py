@@ -28,7 +28,7 @@ from typing import Annotated, Any, Final, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from cangauge._formatting import duration, number
-from cangauge._io import write_text_atomic
+from cangauge._io import open_regular, refuse_foreign, write_text_atomic
 from cangauge._logging import emit
 from cangauge.errors import CangaugeError, InputError
 from cangauge.estimate.state import EstimatorState
@@ -57,6 +57,11 @@ FUTURE_S: Final = 60.0
 """A state further in the future than this [s] has another clock: its age is unknown."""
 
 REFUSED_SUFFIX: Final = ".refused"
+
+_OWN_NAMES: Final = frozenset({FILE_NAME, FILE_NAME + REFUSED_SUFFIX})
+_BEGINNING_BYTES: Final = 64
+_BEGINNING: Final = re.compile(rb'\s*\{\s*"format"\s*:\s*"' + STATE_FORMAT.encode() + rb'"')
+"""Beginning of every state file, of any version; the rest may be damaged."""
 
 _LOG = logging.getLogger(__name__)
 Hash = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
@@ -99,6 +104,46 @@ def state_path(given: str | None, environment: Mapping[str, str]) -> Path | None
             value=f"{str(path)[:40]}…",
             cure="give a shorter one",
         ) from error
+
+
+def check_state_path(path: Path) -> None:
+    """Raise InputError if the state cannot be kept at `path`, before anything is changed.
+
+    A state that is damaged or of another release, model or age is set aside later. What is no
+    state at all was named by mistake: it is neither moved nor replaced.
+    """
+    refuse_foreign(path)
+    if not path.parent.is_dir():
+        raise InputError(
+            "the folder of this file does not exist",
+            source=path,
+            field="state",
+            cure="create it or name another one",
+        )
+    _refuse_no_state(path)
+
+
+def _refuse_no_state(path: Path) -> None:
+    """Raise InputError for anything but a state, an empty file, or nothing at all."""
+    try:
+        if not path.exists() or (path.name in _OWN_NAMES and path.is_file()):
+            return
+        with open_regular(path) as file:
+            beginning = file.read(_BEGINNING_BYTES)
+    except OSError as error:
+        raise InputError(
+            f"cannot be read: {error.strerror}",
+            source=path,
+            field="state",
+            cure="change its rights",
+        ) from error
+    if beginning and not _BEGINNING.match(beginning):
+        raise InputError(
+            "not a cangauge state file, so it is not replaced",
+            source=path,
+            field="state",
+            cure="name a new file, or a folder",
+        )
 
 
 class StateKeeper:
@@ -231,7 +276,8 @@ class StateKeeper:
 
     def _refuse(self, error: InputError) -> None:
         path = self.settings.path
-        aside = path.with_name(path.name + REFUSED_SUFFIX)
+        _refuse_no_state(path)
+        aside = _free_name(path)
         try:
             path.replace(aside)
             kept = f"; kept as {aside.name}"
@@ -279,6 +325,19 @@ class StateKeeper:
         if not isinstance(error, CangaugeError):
             text = f"{self.settings.path}: {error!r}"
         emit(_LOG, logging.WARNING, "state.failed", f"state not written: {text}")
+
+
+def _free_name(path: Path) -> Path:
+    """Return the name under which a refused state is set aside: it replaces only an earlier one."""
+    for count in range(1, 100):
+        aside = path.with_name(f"{path.name}{REFUSED_SUFFIX}{count if count > 1 else ''}")
+        try:
+            if not aside.is_symlink():
+                _refuse_no_state(aside)
+                break
+        except InputError:
+            continue
+    return aside
 
 
 # --- The file

@@ -57,7 +57,7 @@ def fetch_status(endpoint: str, token_file: Path | None = None) -> dict[str, Any
     endpoint : str
         Path of a unix socket, or "http://host:port".
     token_file : Path, optional
-        File with the token; by default the environment's.
+        File with the token for HTTP; by default the environment's. A unix socket needs none.
 
     Raises
     ------
@@ -68,10 +68,16 @@ def fetch_status(endpoint: str, token_file: Path | None = None) -> dict[str, Any
     CangaugeError
         If the request is refused, or the answer is not a status.
     """
-    token = read_token(token_file, os.environ)
-    connection = _http(endpoint) if "://" in endpoint else _UnixConnection(endpoint)
+    headers = {}
+    connection: http.client.HTTPConnection
+    if "://" in endpoint:
+        connection = _http(endpoint)
+        token = read_token(token_file, os.environ)
+        if token is not None:
+            headers["Authorization"] = f"Bearer {token}"
+    else:
+        connection = _UnixConnection(endpoint)
     try:
-        headers = {} if token is None else {"Authorization": f"Bearer {token}"}
         connection.request("GET", "/status", headers=headers)
         response = connection.getresponse()
         body = response.read(LARGEST_ANSWER)
