@@ -38,9 +38,9 @@ from cangauge._resources import shared_file
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimate.offline import estimate_log
-from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.validity import Sample
+from cangauge.estimation.offline import estimate_log
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.validity import Sample
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model

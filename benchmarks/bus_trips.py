@@ -29,9 +29,9 @@ from cangauge.bus.connection import BusConnection
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.publish import standard_filter
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimate.offline import run_estimator, samples_of
-from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.validity import Estimate
+from cangauge.estimation.offline import run_estimator, samples_of
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.validity import Estimate
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from cangauge.replay.player import ReplaySettings, play

@@ -21,9 +21,9 @@ from rich.table import Table
 
 from cangauge.bus.recording import capture_to_log
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimate.offline import estimate_log
-from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.validity import Reason
+from cangauge.estimation.offline import estimate_log
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.validity import Reason
 from cangauge.model.published import leaf_2012_model_file
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "leaf_can"

@@ -12,8 +12,8 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
-from cangauge.estimate.offline import run_estimator
-from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimation.offline import run_estimator
+from cangauge.estimation.settings import EstimatorSettings
 from real_trips import DATA, JUDGED_S, OFFSET_A, TEST, TRAINING, chain, identify, read_trips
 
 mpl.use("Agg")

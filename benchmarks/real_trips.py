@@ -27,9 +27,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from cangauge.estimate.offline import EstimateTable, run_estimator, samples_of
-from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.validity import Sample
+from cangauge.estimation.offline import EstimateTable, run_estimator, samples_of
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.validity import Sample
 from cangauge.identify.evaluate import LogFit, evaluate, evaluate_extended
 from cangauge.identify.fit import Identification, fit
 from cangauge.inference.rows import FitOptions, fit_rows, sample_log

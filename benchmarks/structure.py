@@ -246,7 +246,7 @@ def run_command(*arguments: object) -> None:
 
 def trace_frames(root: Path, data: Path, entry: str) -> Trace:
     """Trace every frame of a Leaf capture through the offline path of the service."""
-    trace = Trace(root / "src/cangauge", entry, needs="estimate/estimator.py")
+    trace = Trace(root / "src/cangauge", entry, needs="estimation/estimator.py")
     model = root / "replay/leaf2012_published_model.json"
     with tempfile.TemporaryDirectory() as folder:
         arguments = ("-m", model, "-o", Path(folder) / "soc.csv", "--vehicle", "leaf_ze0")

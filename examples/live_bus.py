@@ -13,7 +13,7 @@ import can
 import cangauge
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.publish import SocEstimate, SocReader
-from cangauge.estimate.offline import samples_of
+from cangauge.estimation.offline import samples_of
 
 BUS = {"interface": "virtual", "channel": "example"}
 

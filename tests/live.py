@@ -26,7 +26,7 @@ from cangauge.bus.connection import BusConnection
 from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.app import main
-from cangauge.estimate.validity import Estimate
+from cangauge.estimation.validity import Estimate
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from cangauge.service.loop import LoopSettings, Outputs, RunSummary, serve

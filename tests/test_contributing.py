@@ -13,7 +13,7 @@ from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.mapping import SignalMap, TemperatureMap, VehicleMap
 from cangauge.bus.vehicle import PRESETS, Preset, Vehicle
-from cangauge.estimate.validity import Sample
+from cangauge.estimation.validity import Sample
 from cangauge.logs import read
 from cangauge.logs.draft import DraftLog
 from cangauge.logs.file_content import FileContent

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from cangauge._formatting import duration, number, significant, span
-from cangauge.estimate.validity import REASON_WORDS, Reason, reason_names
+from cangauge.estimation.validity import REASON_WORDS, Reason, reason_names
 
 
 @pytest.mark.parametrize(

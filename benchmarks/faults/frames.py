@@ -19,8 +19,8 @@ from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import ProtectionRule
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimate.offline import samples_of
-from cangauge.estimate.validity import Sample
+from cangauge.estimation.offline import samples_of
+from cangauge.estimation.validity import Sample
 from cangauge.logs.read import read_log
 
 LOG: Final = "leaf2012_reconstruction_10min.parquet"

@@ -26,7 +26,7 @@ PRELOAD: Final = [
     "faults.process",
     "cangauge.cli.app",
     "cangauge.cli.run",
-    "cangauge.estimate.ekf",
+    "cangauge.estimation.ekf",
     "can.interfaces.udp_multicast",
     "can.interfaces.socketcan",
 ]

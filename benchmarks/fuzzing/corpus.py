@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from cangauge._resources import shared_file
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimate.validity import Sample
+from cangauge.estimation.validity import Sample
 from cangauge.model.effects.base import Pack, Parameter
 from cangauge.model.effects.library import LIBRARY, effect_entries
 from cangauge.model.model_file import Model

@@ -26,10 +26,10 @@ from cangauge.bus.publish import SocPublisher, SocReader
 from cangauge.bus.recording import capture_to_log
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimate.estimator import Estimator
-from cangauge.estimate.offline import estimate_log
-from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.validity import Estimate, Sample
+from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.offline import estimate_log
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.validity import Estimate, Sample
 from cangauge.inspect.capture import inspect_capture
 from cangauge.inspect.log import inspect_log
 from cangauge.logs.log import Log

@@ -37,9 +37,9 @@ if TYPE_CHECKING:
     from cangauge.bus.vehicle import Vehicle
     from cangauge.diagnosis import Diagnosis, diagnose
     from cangauge.errors import CangaugeError, InputError
-    from cangauge.estimate.estimator import Estimator
-    from cangauge.estimate.offline import EstimateTable, estimate
-    from cangauge.estimate.validity import Estimate, Sample
+    from cangauge.estimation.estimator import Estimator
+    from cangauge.estimation.offline import EstimateTable, estimate
+    from cangauge.estimation.validity import Estimate, Sample
     from cangauge.identify.fit import Identification, fit
     from cangauge.logs.log import Log
     from cangauge.model.model_file import Model
@@ -71,19 +71,19 @@ __all__ = [
 _PLACES: Final = {
     "CangaugeError": "errors",
     "Diagnosis": "diagnosis",
-    "Estimate": "estimate.validity",
-    "EstimateTable": "estimate.offline",
-    "Estimator": "estimate.estimator",
+    "Estimate": "estimation.validity",
+    "EstimateTable": "estimation.offline",
+    "Estimator": "estimation.estimator",
     "Identification": "identify.fit",
     "InputError": "errors",
     "Log": "logs.log",
     "Model": "model.model_file",
-    "Sample": "estimate.validity",
+    "Sample": "estimation.validity",
     "Service": "service.run",
     "Simulation": "validation",
     "Vehicle": "bus.vehicle",
     "diagnose": "diagnosis",
-    "estimate": "estimate.offline",
+    "estimate": "estimation.offline",
     "fit": "identify.fit",
     "read_log": "bus.recording:read_recording",
     "simulate": "validation",

@@ -14,7 +14,7 @@ from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.validity import Sample
+from cangauge.estimation.validity import Sample
 from cangauge.logs.log import Log
 
 VEHICLES = {

@@ -22,7 +22,7 @@ from cangauge.bus.recording import (
 from cangauge.bus.time_source import ClockFrames, ReceiveTime
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.validity import Sample
+from cangauge.estimation.validity import Sample
 from cangauge.inspect.capture import inspect_capture
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log

@@ -16,8 +16,8 @@ import pytest
 
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimate.offline import estimate_log, samples_of
-from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimation.offline import estimate_log, samples_of
+from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.canonical import write_log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model

@@ -16,8 +16,8 @@ from cangauge.diagnosis.cross_validation import soc_mae_pct
 from cangauge.diagnosis.extended_model import extended_model_file
 from cangauge.diagnosis.problem import build_problem
 from cangauge.errors import InputError
-from cangauge.estimate.offline import estimate_log
-from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimation.offline import estimate_log
+from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from cangauge.report.diagnosis import gap_report

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.estimate.offline import estimate_log
-from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimation.offline import estimate_log
+from cangauge.estimation.settings import EstimatorSettings
 from cangauge.identify.cross_validation import CrossValidation, HeldOutErrors, compare
 from cangauge.identify.effect_search import NOT_IDENTIFIABLE, SEARCHED, parse_effect_ids
 from cangauge.identify.fit import Identification, fit

@@ -12,9 +12,9 @@ import pytest
 from markupsafe import escape
 
 from cangauge._version import __version__
-from cangauge.estimate.offline import estimate_log
-from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.validity import REASON_WORDS, Reason
+from cangauge.estimation.offline import estimate_log
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.validity import REASON_WORDS, Reason
 from cangauge.identify.fit import Identification, fit
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log

@@ -16,7 +16,7 @@ import pytest
 
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimate.offline import samples_of
+from cangauge.estimation.offline import samples_of
 from cangauge.logs.canonical import write_log
 from cangauge.service.offline import estimate_capture
 from cangauge.service.recording import Recorder

@@ -218,3 +218,8 @@ def test_an_error_of_an_option_names_it_as_it_is_written() -> None:
     with pytest.raises(InputError) as caught:
         load_config(None, {"model": "m", "until_idle_s": -1.0})
     assert caught.value.field == "--until-idle"
+
+
+def test_the_reference_page_is_generated_from_the_model(project: Path) -> None:
+    page = (project / "docs/configuration.md").read_text(encoding="utf-8")
+    assert page.endswith(reference() + "\n"), "python -m cangauge.service.config prints it"

@@ -13,8 +13,8 @@ from cangauge.bus.backend import UNKNOWN_INTERFACE, BackendCapabilities, Stamps
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.publish import SocDetail, SocEstimate, SocReader
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.validity import Reason, Sample, Status
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.validity import Reason, Sample, Status
 from cangauge.service import loop
 from cangauge.service.loop import LoopSettings, Outputs, serve
 from cangauge.service.pipeline import Pipeline, PipelineSettings

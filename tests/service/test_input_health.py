@@ -14,9 +14,9 @@ from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import GENERIC_RULE
 from cangauge.bus.publish import SocEstimate, SocReader
 from cangauge.bus.vehicle import Vehicle, VehicleSignal
-from cangauge.estimate.offline import samples_of
-from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.validity import Estimate, Reason, Sample, Status
+from cangauge.estimation.offline import samples_of
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.validity import Estimate, Reason, Sample, Status
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from live import leaf_model, short_log
 

@@ -15,8 +15,8 @@ from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.publish import SocDetail, SocEstimate, SocReader
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimate.offline import samples_of
-from cangauge.estimate.validity import Reason, Status
+from cangauge.estimation.offline import samples_of
+from cangauge.estimation.validity import Reason, Status
 from cangauge.service.loop import LoopSettings
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings

@@ -11,7 +11,7 @@ import pytest
 from watched import StandInPort, Watched
 
 from cangauge._logging import RateLimitFilter
-from cangauge.estimate.validity import Reason, Status
+from cangauge.estimation.validity import Reason, Status
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.status import BOUNDS_S, Histogram, as_json
 

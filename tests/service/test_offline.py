@@ -12,8 +12,8 @@ from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.offline import samples_of
-from cangauge.estimate.validity import Estimate
+from cangauge.estimation.offline import samples_of
+from cangauge.estimation.validity import Estimate
 from cangauge.service import recording as record
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings

@@ -12,9 +12,9 @@ from cangauge.bus.publish import FrameIds, SocDetail, SocEstimate, SocReader
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.offline import run_estimator, samples_of
-from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.validity import Estimate, Reason, Status
+from cangauge.estimation.offline import run_estimator, samples_of
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.validity import Estimate, Reason, Status
 from cangauge.logs.log import Log
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from live import leaf_model, short_log

@@ -14,9 +14,9 @@ from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import LEAF_RULE
 from cangauge.bus.recording import open_vehicle_capture
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimate.offline import run_estimator, samples_of
-from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.validity import Estimate, Reason, Status
+from cangauge.estimation.offline import run_estimator, samples_of
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.validity import Estimate, Reason, Status
 from cangauge.logs.read import read_log
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from live import leaf_model

@@ -22,7 +22,7 @@ from cangauge.bus.captures.files import all_parts, part_path, parts_of_run, run_
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.offline import samples_of
+from cangauge.estimation.offline import samples_of
 from cangauge.replay.steps import CaptureSource
 from cangauge.service import recording
 from cangauge.service.offline import estimate_capture

@@ -14,8 +14,8 @@ from cangauge._resources import shared_file
 from cangauge.bus.database import load_dbc
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimate.offline import samples_of
-from cangauge.estimate.validity import Reason
+from cangauge.estimation.offline import samples_of
+from cangauge.estimation.validity import Reason
 from cangauge.service.loop import LoopSettings
 from cangauge.service.run import Service
 from live import LoggedLines, leaf_model_path, short_log, waits

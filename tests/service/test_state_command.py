@@ -14,8 +14,8 @@ from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.publish import SocEstimate, SocReader, standard_filter
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimate.offline import samples_of
-from cangauge.estimate.validity import Reason, Status
+from cangauge.estimation.offline import samples_of
+from cangauge.estimation.validity import Reason, Status
 from cangauge.service.loop import LoopSettings
 from cangauge.service.state import read_state
 from live import (

@@ -22,9 +22,9 @@ from cangauge._logging import RateLimitFilter
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimate.offline import samples_of
-from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.validity import Estimate, Reason, Sample, Status
+from cangauge.estimation.offline import samples_of
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.validity import Estimate, Reason, Sample, Status
 from cangauge.model.model_file import Model
 from cangauge.service import state as state_keeper
 from cangauge.service.pipeline import Pipeline, PipelineSettings

@@ -16,7 +16,7 @@ from watched import Watched
 
 from cangauge.cli.run import LiveLine, live_text
 from cangauge.errors import InputError
-from cangauge.estimate.validity import Estimate, Reason, Status
+from cangauge.estimation.validity import Estimate, Reason, Status
 from cangauge.service.estimate_table import EstimateWriter
 from live import LoggedLines
 

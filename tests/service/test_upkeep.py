@@ -11,7 +11,7 @@ from cangauge.bus.connection import BusConnection, BusError
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import CangaugeError
-from cangauge.estimate.offline import samples_of
+from cangauge.estimation.offline import samples_of
 from cangauge.service.loop import Housekeeping, LoopSettings, Outputs, serve
 from live import BrokenBus, LoggedLines, network_down, short_log, virtual_port, virtual_service
 

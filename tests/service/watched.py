@@ -7,8 +7,8 @@ from typing import Any
 
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimate.offline import samples_of
-from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimation.offline import samples_of
+from cangauge.estimation.settings import EstimatorSettings
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.status import Identity, Monitor

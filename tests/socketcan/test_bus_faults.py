@@ -26,9 +26,9 @@ from cangauge.bus.publish import SocDetail, SocEstimate, SocReader, standard_fil
 from cangauge.bus.reconnect import LONGEST_PAUSE_S, ReconnectingBus
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.offline import samples_of
-from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.validity import Reason, Status
+from cangauge.estimation.offline import samples_of
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.validity import Reason, Status
 from cangauge.service.loop import LoopSettings
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from live import Command, Service, leaf_model, leaf_model_path, short_log, waits

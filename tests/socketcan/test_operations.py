@@ -14,7 +14,7 @@ from cangauge.bus.connection import BusConnection
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, has_socketcan, open_bus
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimate.offline import samples_of
+from cangauge.estimation.offline import samples_of
 from cangauge.service.addresses import http_address
 from cangauge.service.http import Endpoint
 from cangauge.service.lifecycle import Notifier

@@ -21,8 +21,8 @@ from cangauge.bus.open import BusAddress, bus_address, has_socketcan, open_bus
 from cangauge.bus.publish import FrameIds, SocEstimate, SocReader, standard_filter
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.offline import run_estimator, samples_of
-from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimation.offline import run_estimator, samples_of
+from cangauge.estimation.settings import EstimatorSettings
 from cangauge.replay.player import ReplaySettings, play
 from cangauge.replay.steps import CaptureSource, LogSource, quantization_bound
 from cangauge.service.loop import LoopSettings

@@ -11,7 +11,7 @@ import pytest
 
 import cangauge.diagnosis
 
-UNDER_TEST = ("cangauge.model", "cangauge.diagnosis", "cangauge.identify", "cangauge.estimate")
+UNDER_TEST = ("cangauge.model", "cangauge.diagnosis", "cangauge.identify", "cangauge.estimation")
 FACE = {f"cangauge.diagnosis.{name}" for name in cangauge.diagnosis.__all__}
 """Public names of the diagnosis."""
 

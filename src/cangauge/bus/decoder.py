@@ -19,7 +19,7 @@ from cangauge.bus.plausibility import (
 )
 from cangauge.bus.protection import FrameChecker, Verdict
 from cangauge.bus.vehicle import EXTENDED, Vehicle, VehicleSignal
-from cangauge.estimate.validity import Reason, Sample
+from cangauge.estimation.validity import Reason, Sample
 
 _MISSING: Final = {
     "current": Reason.CURRENT_MISSING,

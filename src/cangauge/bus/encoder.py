@@ -16,7 +16,7 @@ from cangauge.bus.protection import Protection
 from cangauge.bus.time_source import MICROSECONDS
 from cangauge.bus.vehicle import LOG_COLUMNS, Vehicle, VehicleSignal
 from cangauge.errors import InputError
-from cangauge.estimate.validity import Sample
+from cangauge.estimation.validity import Sample
 from cangauge.logs.log import Log
 
 SLOW_EVERY_S: Final = 1.0

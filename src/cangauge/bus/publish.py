@@ -26,7 +26,7 @@ from cangauge.bus.database import SignalCodec, load_dbc, signal_codec
 from cangauge.bus.protection import E2eRule
 from cangauge.bus.time_source import REPLAY_CLOCK_ID
 from cangauge.errors import InputError
-from cangauge.estimate.validity import Estimate, Reason, Status
+from cangauge.estimation.validity import Estimate, Reason, Status
 
 ESTIMATE_EVERY_S: Final = 0.1
 DETAIL_EVERY_S: Final = 1.0

@@ -30,7 +30,7 @@ from cangauge.bus.decoder import FrameStatistics, SampleDecoder
 from cangauge.bus.time_source import TimeSource, TimeSourceName, time_source
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.validity import Sample
+from cangauge.estimation.validity import Sample
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.read import KNOWN_LOGS, LogFile, not_recognised, open_log
 from cangauge.logs.sign import resolve_sign

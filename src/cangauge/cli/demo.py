@@ -19,8 +19,8 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.options import JsonOption
 from cangauge.cli.output import emit_json, note, print_table
 from cangauge.errors import CangaugeError, InputError
-from cangauge.estimate.offline import Scores, estimate_log, score
-from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimation.offline import Scores, estimate_log, score
+from cangauge.estimation.settings import EstimatorSettings
 from cangauge.identify.fit import Identification, fit
 from cangauge.logs.read import read_log
 from cangauge.model.published import SOC_NEWTON_MAE_PCT, VOLTAGE_MAE_PCT

@@ -33,7 +33,7 @@ from cangauge.cli.options import (
 )
 from cangauge.cli.output import console, emit_json, note, print_table
 from cangauge.errors import InputError
-from cangauge.estimate.settings import VALID_STD_PCT, EstimatorSettings, Method
+from cangauge.estimation.settings import VALID_STD_PCT, EstimatorSettings, Method
 from cangauge.model.delay_line import GAP_S
 from cangauge.model.model_file import Model
 from cangauge.service.estimate_table import require_table_suffix, write_estimates

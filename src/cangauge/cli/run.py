@@ -20,7 +20,7 @@ from cangauge.cli.config_options import config_options, config_values
 from cangauge.cli.options import JsonOption
 from cangauge.cli.output import console, emit_json
 from cangauge.errors import CangaugeError
-from cangauge.estimate.validity import Status, reason_names
+from cangauge.estimation.validity import Status, reason_names
 from cangauge.service.config import RunConfig, load_config
 from cangauge.service.run import Service
 from cangauge.service.status import Snapshot

@@ -17,8 +17,8 @@ from cangauge._typing import FloatArray
 from cangauge.diagnosis.bayes_factors import scores
 from cangauge.diagnosis.linear_gaussian import NormalEquations, Posterior, marginalize
 from cangauge.diagnosis.problem import DiagnosisProblem
-from cangauge.estimate.offline import run_estimator, samples_of
-from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimation.offline import run_estimator, samples_of
+from cangauge.estimation.settings import EstimatorSettings
 from cangauge.inference.rows import BLOCK_GUARD_S, BLOCK_S
 from cangauge.logs.log import Log
 from cangauge.logs.resample import resample

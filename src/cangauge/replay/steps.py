@@ -19,7 +19,7 @@ from cangauge.bus.recording import open_vehicle_capture
 from cangauge.bus.time_source import MICROSECONDS, ReceiveTime, ReplayClock, is_clock, whole_us
 from cangauge.bus.vehicle import EXTENDED, Vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.validity import Sample
+from cangauge.estimation.validity import Sample
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 

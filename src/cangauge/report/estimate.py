@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from cangauge._formatting import duration, number, span
 from cangauge._typing import FloatArray
-from cangauge.estimate.offline import EstimateTable
-from cangauge.estimate.validity import REASON_WORDS, Reason, Status, reason_name
+from cangauge.estimation.offline import EstimateTable
+from cangauge.estimation.validity import REASON_WORDS, Reason, Status, reason_name
 from cangauge.inference.rows import running_rows
 from cangauge.report.charts import (
     AMBER,

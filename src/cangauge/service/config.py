@@ -47,7 +47,7 @@ from cangauge.bus.publish import FrameIds
 from cangauge.bus.time_source import TimeSourceName
 from cangauge.bus.vehicle import PRESETS, Vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.settings import (
+from cangauge.estimation.settings import (
     VALID_STD_PCT,
     EstimatorSettings,
     FullCharge,

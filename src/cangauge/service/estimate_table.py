@@ -24,8 +24,8 @@ from cangauge._io import atomic_path
 from cangauge._logging import emit
 from cangauge._typing import FloatArray
 from cangauge.errors import CangaugeError, InputError
-from cangauge.estimate.offline import NUMBERS, EstimateTable
-from cangauge.estimate.validity import Estimate, Reason, Status, reason_name, reason_names
+from cangauge.estimation.offline import NUMBERS, EstimateTable
+from cangauge.estimation.validity import Estimate, Reason, Status, reason_name, reason_names
 from cangauge.service.async_writer import AsyncWriter
 
 _SCHEMA: Final = pa.schema(

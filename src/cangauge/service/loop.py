@@ -24,7 +24,7 @@ from cangauge.bus.connection import BusConnection
 from cangauge.bus.publish import ESTIMATE_EVERY_S, FrameIds, standard_filter
 from cangauge.bus.time_source import is_clock
 from cangauge.errors import CangaugeError
-from cangauge.estimate.validity import Estimate
+from cangauge.estimation.validity import Estimate
 from cangauge.service.pipeline import Pipeline
 
 _LOG = logging.getLogger(__name__)

@@ -10,7 +10,7 @@ from typing import Final
 
 from cangauge._version import __version__
 from cangauge.errors import InputError
-from cangauge.estimate.validity import Reason, Status
+from cangauge.estimation.validity import Reason, Status
 from cangauge.service.status import BOUNDS_S, HistogramCounts, Snapshot, reason_ids
 
 try:

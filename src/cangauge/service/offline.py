@@ -24,7 +24,7 @@ from cangauge.bus.recording import open_vehicle_capture
 from cangauge.bus.time_source import REPLAY_CLOCK_ID, TimeSourceName, is_clock
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.offline import (
+from cangauge.estimation.offline import (
     EstimateTable,
     Scores,
     estimate_log,
@@ -32,8 +32,8 @@ from cangauge.estimate.offline import (
     initial_soc_of,
     score,
 )
-from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.validity import Estimate, Reason, reason_name, reason_names
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.validity import Estimate, Reason, reason_name, reason_names
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from cangauge.service.pipeline import FrameCounts, Pipeline, PipelineSettings

@@ -19,10 +19,10 @@ from cangauge.bus.publish import ACKNOWLEDGE_EVERY, FrameIds, SocPublisher, stan
 from cangauge.bus.time_source import ReplayClock, TimeSourceName, is_clock, time_source
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.estimator import Estimator
-from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.state import EstimatorState
-from cangauge.estimate.validity import Estimate, Reason, Sample, Status, status_of
+from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.state import EstimatorState
+from cangauge.estimation.validity import Estimate, Reason, Sample, Status, status_of
 from cangauge.model.model_file import Model, effective_error_std_v
 
 NOTHING_YET: Final = Estimate.unknown(Reason.NO_INITIAL_SOC | Reason.INPUT_STALE)

@@ -20,7 +20,7 @@ from cangauge._logging import emit
 from cangauge.bus.reconnect import ReconnectingBus
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimate.validity import reason_names
+from cangauge.estimation.validity import reason_names
 from cangauge.model.model_file import Model
 from cangauge.service.addresses import default_path, has_unix_sockets
 from cangauge.service.config import RunConfig, config_keys, load_config

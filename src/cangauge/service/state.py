@@ -31,7 +31,7 @@ from cangauge._formatting import duration, number
 from cangauge._io import open_regular, refuse_foreign, write_text_atomic
 from cangauge._logging import emit
 from cangauge.errors import CangaugeError, InputError
-from cangauge.estimate.state import EstimatorState
+from cangauge.estimation.state import EstimatorState
 from cangauge.model.model_file import Model
 from cangauge.service.async_writer import AsyncWriter
 from cangauge.service.loop import CHECKPOINT_EVERY_S

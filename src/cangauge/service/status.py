@@ -21,7 +21,7 @@ from cangauge._version import __version__
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.decoder import FrameStatistics
 from cangauge.bus.plausibility import MessageStatistics
-from cangauge.estimate.validity import Estimate, Reason, Sample, Status, reason_name, reason_names
+from cangauge.estimation.validity import Estimate, Reason, Sample, Status, reason_name, reason_names
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.recording import Recorder, RecordState

@@ -24,8 +24,8 @@ import numpy as np
 from cangauge._io import write_text_atomic
 from cangauge._resources import THREADS
 from cangauge.errors import InputError
-from cangauge.estimate.offline import run_estimator, samples_of
-from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimation.offline import run_estimator, samples_of
+from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model

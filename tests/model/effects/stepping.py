@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cangauge.estimate.counting import CoulombCounter
+from cangauge.estimation.counting import CoulombCounter
 from cangauge.model.delay_line import DelayLine
 from cangauge.model.effects.base import Effect, Pack, Parameter, Reading, Signals
 from cangauge.model.effects.library import LIBRARY

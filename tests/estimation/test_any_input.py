@@ -7,17 +7,17 @@ import sys
 from typing import Any
 
 import pytest
+from estimate.test_snapshot import extended_by
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from cangauge.estimate.estimator import Estimator
-from cangauge.estimate.settings import EstimatorSettings, FullCharge, LongRest
-from cangauge.estimate.state import EstimatorState
-from cangauge.estimate.validity import Estimate, Reason, Sample, Status
+from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.settings import EstimatorSettings, FullCharge, LongRest
+from cangauge.estimation.state import EstimatorState
+from cangauge.estimation.validity import Estimate, Reason, Sample, Status
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
-from estimate.test_snapshot import extended_by
 
 PLAIN = leaf_2012_model_file()
 TOGETHER = [

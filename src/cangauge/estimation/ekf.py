@@ -25,7 +25,7 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
 from cangauge.errors import InputError
-from cangauge.estimate.state import EkfState
+from cangauge.estimation.state import EkfState
 from cangauge.model.delay_line import DelayLine
 from cangauge.model.model_file import Model, ModelNoise, effective_error_std_v
 from cangauge.model.voltage_model import Curve, VoltageModel

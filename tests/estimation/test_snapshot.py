@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cangauge.errors import InputError
-from cangauge.estimate.estimator import Estimator
-from cangauge.estimate.offline import samples_of
-from cangauge.estimate.settings import EstimatorSettings, FullCharge, LongRest
-from cangauge.estimate.state import EstimatorState
-from cangauge.estimate.validity import Estimate, Reason, Sample
+from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.offline import samples_of
+from cangauge.estimation.settings import EstimatorSettings, FullCharge, LongRest
+from cangauge.estimation.state import EstimatorState
+from cangauge.estimation.validity import Estimate, Reason, Sample
 from cangauge.model.effects.base import Pack
 from cangauge.model.effects.library import LIBRARY, effect_entries
 from cangauge.model.model_file import Model

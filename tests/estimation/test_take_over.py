@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from cangauge.estimate.estimator import Estimator
-from cangauge.estimate.offline import samples_of
-from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.validity import Estimate, Reason, Sample
+from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.offline import samples_of
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.validity import Estimate, Reason, Sample
 from cangauge.model.model_file import Model
 from live import leaf_model, short_log
 

@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 
 from cangauge._dataframes import ArrowExport
 from cangauge._typing import FloatArray
-from cangauge.estimate.estimator import Estimator
-from cangauge.estimate.settings import (
+from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.settings import (
     VALID_STD_PCT,
     EstimatorSettings,
     FullCharge,
     LongRest,
     Method,
 )
-from cangauge.estimate.validity import Estimate, Sample, Status, reason_names
+from cangauge.estimation.validity import Estimate, Sample, Status, reason_names
 from cangauge.inference.rows import usual_gap_s
 from cangauge.logs.log import Log
 from cangauge.model.charge import counted_soc_pct
@@ -167,7 +167,7 @@ def estimate(
     Examples
     --------
     >>> import numpy as np
-    >>> from cangauge.estimate.offline import estimate
+    >>> from cangauge.estimation.offline import estimate
     >>> from cangauge.logs.log import Log
     >>> from cangauge.model.published import leaf_2012_model_file
     >>> rest = np.ones(120)

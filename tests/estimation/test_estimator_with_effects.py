@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cangauge.estimate.offline import estimate_log
-from cangauge.estimate.settings import EstimatorSettings
+from cangauge.estimation.offline import estimate_log
+from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.log import Log
 from cangauge.model.effects.base import Effect, Pack, Signals
 from cangauge.model.effects.library import LIBRARY, effect_entries

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 from cangauge.errors import InputError
-from cangauge.estimate.state import ReferenceState
-from cangauge.estimate.validity import Sample
+from cangauge.estimation.state import ReferenceState
+from cangauge.estimation.validity import Sample
 from cangauge.logs.log import TemperatureSource
 from cangauge.model.delay_line import GAP_S
 

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.estimate.counting import SET_BACK_SAMPLES, moved_log_odds
-from cangauge.estimate.estimator import Estimator
-from cangauge.estimate.offline import samples_of
-from cangauge.estimate.settings import EstimatorSettings, FullCharge, LongRest
-from cangauge.estimate.validity import Estimate, Reason, Sample
+from cangauge.estimation.counting import SET_BACK_SAMPLES, moved_log_odds
+from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.offline import samples_of
+from cangauge.estimation.settings import EstimatorSettings, FullCharge, LongRest
+from cangauge.estimation.validity import Estimate, Reason, Sample
 from cangauge.model.published import leaf_2012_model, leaf_2012_model_file
 from synthetic import synthetic_log
 

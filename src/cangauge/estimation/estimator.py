@@ -10,27 +10,27 @@ import math
 from dataclasses import replace
 
 from cangauge.errors import InputError
-from cangauge.estimate.counting import CoulombCounter, EstimatorClock
-from cangauge.estimate.ekf import (
+from cangauge.estimation.counting import CoulombCounter, EstimatorClock
+from cangauge.estimation.ekf import (
     UNKNOWN_SOC_STD_PCT,
     Measurement,
     MeasurementNoise,
     SocEkf,
     count_std_pct,
 )
-from cangauge.estimate.hypothesis_filter import HypothesisFilter
-from cangauge.estimate.settings import (
+from cangauge.estimation.hypothesis_filter import HypothesisFilter
+from cangauge.estimation.settings import (
     EstimatorSettings,
     SocReference,
     SocReferenceDetector,
 )
-from cangauge.estimate.state import (
+from cangauge.estimation.state import (
     ChargeSinceUpdate,
     DelayLineState,
     EstimatorMemory,
     EstimatorState,
 )
-from cangauge.estimate.validity import (
+from cangauge.estimation.validity import (
     CURRENT_AT_MOST_A,
     Estimate,
     Reason,
@@ -79,8 +79,8 @@ class Estimator:
 
     Examples
     --------
-    >>> from cangauge.estimate.estimator import Estimator, EstimatorSettings
-    >>> from cangauge.estimate.validity import Sample
+    >>> from cangauge.estimation.estimator import Estimator, EstimatorSettings
+    >>> from cangauge.estimation.validity import Sample
     >>> from cangauge.model.published import leaf_2012_model_file
     >>> estimator = Estimator(leaf_2012_model_file(), EstimatorSettings(initial_soc_pct=80.0))
     >>> estimate = estimator.step(

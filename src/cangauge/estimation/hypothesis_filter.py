@@ -25,9 +25,9 @@ from dataclasses import replace
 import numpy as np
 
 from cangauge.errors import InputError
-from cangauge.estimate.counting import moved_log_odds, moved_std_pct
-from cangauge.estimate.ekf import UNKNOWN_SOC_STD_PCT, Measurement, SocEkf
-from cangauge.estimate.state import ChargeSinceUpdate, EkfState, HypothesisFilterState, Verdict
+from cangauge.estimation.counting import moved_log_odds, moved_std_pct
+from cangauge.estimation.ekf import UNKNOWN_SOC_STD_PCT, Measurement, SocEkf
+from cangauge.estimation.state import ChargeSinceUpdate, EkfState, HypothesisFilterState, Verdict
 
 CLEAR_LOG_ODDS = math.log(1000.0)
 """Beyond this the less likely hypothesis is dropped."""

@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cangauge.errors import InputError
-from cangauge.estimate.counting import CoulombCounter
-from cangauge.estimate.estimator import Estimator
-from cangauge.estimate.offline import estimate, estimate_log, run_estimator, samples_of
-from cangauge.estimate.settings import EstimatorSettings
-from cangauge.estimate.validity import Reason, Sample, Status
+from cangauge.estimation.counting import CoulombCounter
+from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.offline import estimate, estimate_log, run_estimator, samples_of
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.validity import Reason, Sample, Status
 from cangauge.identify.fit import fit
 from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from cangauge.estimate.state import ClockState, CounterState
+from cangauge.estimation.state import ClockState, CounterState
 from cangauge.model.charge import BRIDGE_S
 
 USE_S = 120.0
