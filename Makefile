@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 # Where SocketCAN is not to be had directly, a command that provides it (as in .ci/run).
 SOCKETCAN ?= $(wildcard ../shared/tools/with-socketcan)
 
-.PHONY: help demo test lint coverage check faults trips clean
+.PHONY: help demo test lint coverage check faults trips lowest clean
 
 help:
 	@echo "make demo      the whole job on the shipped log: fit, bus, service, report"
@@ -14,7 +14,8 @@ help:
 	@echo "make lint      ruff and mypy"
 	@echo "make coverage  the test suite with coverage"
 	@echo "make check     a small part of the withheld check of the diagnosis"
-	@echo "make faults    the table of faults on a live bus; says how long it takes before it starts"
+	@echo "make faults    the table of faults on a live bus (prints the expected time first)"
+	@echo "make lowest    the lowest versions that pyproject.toml allows, and tests where they matter"
 	@echo "make trips     the table on the real BMW i3 trips (see README for the data)"
 
 $(VENV)/installed: pyproject.toml
@@ -54,5 +55,8 @@ trips: $(VENV)/installed
 faults: $(VENV)/installed
 	PYTHONPATH=benchmarks $(BIN)/python -m faults $(if $(SOCKETCAN),--socketcan "$(SOCKETCAN) -t 3600 -m 2G")
 
+lowest:
+	.ci/lowest $(PYTHON)
+
 clean:
-	rm -rf $(VENV) out
+	rm -rf $(VENV) .venv-lowest out
