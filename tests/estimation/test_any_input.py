@@ -7,7 +7,6 @@ import sys
 from typing import Any
 
 import pytest
-from estimate.test_snapshot import extended_by
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -18,6 +17,7 @@ from cangauge.estimation.validity import Estimate, Reason, Sample, Status
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
+from estimation.test_snapshot import extended_by
 
 PLAIN = leaf_2012_model_file()
 TOGETHER = [

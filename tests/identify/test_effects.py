@@ -247,7 +247,7 @@ def test_kt_stays_physical_at_constant_temperature() -> None:
 
 def test_held_out_errors_come_from_fits_without_the_row(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without effects the model is linear, so the one-step folds equal full fits."""
-    monkeypatch.setattr("cangauge.inference.linearized.KT_PRIOR_PER_K", math.inf)
+    monkeypatch.setattr("cangauge.inference.linearized.WIDE_KT_PRIOR_PER_K", math.inf)
     logs = sampled_trips("dynamics")
     validation = CrossValidation(logs)
     seen = np.zeros(validation.unit.size, dtype=int)

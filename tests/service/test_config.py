@@ -222,4 +222,6 @@ def test_an_error_of_an_option_names_it_as_it_is_written() -> None:
 
 def test_the_reference_page_is_generated_from_the_model(project: Path) -> None:
     page = (project / "docs/configuration.md").read_text(encoding="utf-8")
-    assert page.endswith(reference() + "\n"), "python -m cangauge.service.config prints it"
+    assert page.rstrip().endswith(reference().rstrip()), (
+        "python -m cangauge.service.config prints it"
+    )
