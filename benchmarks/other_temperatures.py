@@ -22,7 +22,7 @@ from cangauge.identify.voltage_fit import fit_voltage_model
 from cangauge.inference.rows import FitOptions, fit_rows
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
-from cangauge.model.charge import capacity_from_reference
+from cangauge.model.coulomb_counting import capacity_from_reference
 from cangauge.model.voltage_model import VoltageModel
 from cangauge.validation.recordings import (
     LG_25C,

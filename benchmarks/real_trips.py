@@ -35,7 +35,7 @@ from cangauge.identify.fit import Identification, fit
 from cangauge.inference.rows import FitOptions, fit_rows, sample_log
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
-from cangauge.model.charge import capacity_from_reference
+from cangauge.model.coulomb_counting import capacity_from_reference
 from cangauge.model.model_file import Model
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "bmw_i3"

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from cangauge._io import atomic_path
 from cangauge._typing import FloatArray
 from cangauge.errors import CangaugeError, InputError
-from cangauge.model.charge import discharged_ah
+from cangauge.model.coulomb_counting import discharged_ah
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.published import CAPACITY_AH, VOLTAGE_MAE_PCT, leaf_2012_model
 

@@ -14,7 +14,7 @@ from cangauge.identify.noise import describe_noise
 from cangauge.inference.least_squares import solve
 from cangauge.inference.rows import FitOptions
 from cangauge.logs.log import Log
-from cangauge.model.charge import (
+from cangauge.model.coulomb_counting import (
     capacity_from_full_discharge,
     capacity_from_reference,
     discharged_ah,

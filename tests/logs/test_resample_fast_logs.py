@@ -9,7 +9,7 @@ import pytest
 
 from cangauge.logs.log import Log
 from cangauge.logs.resample import ENOUGH_HZ, resample
-from cangauge.model.charge import discharged_ah
+from cangauge.model.coulomb_counting import discharged_ah
 
 
 def drive(rate_hz: float, seconds: float = 120.0, gap_s: float = 0.0) -> Log:

@@ -17,7 +17,7 @@ from cangauge.inference.rows import FitOptions, FitRows, decimate, fit_rows
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model import published
-from cangauge.model.charge import discharged_ah
+from cangauge.model.coulomb_counting import discharged_ah
 
 VARIANTS = ("white", "correlated")
 FILES = tuple(f"leaf2012_reconstruction_{name}.parquet" for name in (*VARIANTS, "10min"))

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from cangauge.cli.twin import twin_command
 from cangauge.errors import InputError
 from cangauge.logs.read import read_log
-from cangauge.model.charge import capacity_from_full_discharge
+from cangauge.model.coulomb_counting import capacity_from_full_discharge
 from cangauge.validation import simulate
 from cangauge.validation.twin import simulation
 from cangauge.validation.twin.drive import read_speed

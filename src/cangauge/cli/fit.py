@@ -28,7 +28,7 @@ from cangauge.identify.delays import DelaySearch, search_delays
 from cangauge.identify.effect_search import parse_effect_ids
 from cangauge.identify.fit import Identification, fit
 from cangauge.inference.rows import DELAYS_S, FitOptions
-from cangauge.model.charge import capacity_from_full_discharge, capacity_from_reference
+from cangauge.model.coulomb_counting import capacity_from_full_discharge, capacity_from_reference
 from cangauge.report.summary import effect_rows, rounded, search_rows
 
 FROM_SOC = "from-soc"

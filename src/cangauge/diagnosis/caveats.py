@@ -10,7 +10,7 @@ from cangauge.diagnosis.error_breakdown import REST_C_RATE
 from cangauge.diagnosis.problem import COVERED_K, COVERED_PCT
 from cangauge.inference.rows import SampledLog
 from cangauge.logs.log import TemperatureSource
-from cangauge.model.charge import BRIDGE_S
+from cangauge.model.coulomb_counting import BRIDGE_S
 
 SHORT_S = 600.0
 """Duration below which slow effects hardly develop [s]."""

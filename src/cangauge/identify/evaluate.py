@@ -10,7 +10,7 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.inference.rows import FitRows, SampledLog
 from cangauge.logs.log import Log
-from cangauge.model.charge import BRIDGE_S
+from cangauge.model.coulomb_counting import BRIDGE_S
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.extended import ExtendedModel, Prediction
 from cangauge.model.voltage_model import VoltageModel, soc_from_ocv

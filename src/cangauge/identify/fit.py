@@ -35,7 +35,7 @@ from cangauge.inference.rows import (
     sample_log,
 )
 from cangauge.logs.log import Log
-from cangauge.model.charge import capacity_from_full_discharge
+from cangauge.model.coulomb_counting import capacity_from_full_discharge
 from cangauge.model.effects.library import effect_entries
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import (

@@ -25,7 +25,7 @@ from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
 from cangauge.logs.resample import dequantize
-from cangauge.model.charge import counted_soc_pct, discharged_ah
+from cangauge.model.coulomb_counting import counted_soc_pct, discharged_ah
 from cangauge.model.delay_line import GAP_S, delayed_currents, filled_at
 from cangauge.model.effects.base import Signals
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.model.charge import discharged_ah
+from cangauge.model.coulomb_counting import discharged_ah
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.effects.base import Counting, Effect, Pack, PackState, Reading, Signals, Values
 from cangauge.model.effects.library import LIBRARY

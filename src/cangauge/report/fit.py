@@ -14,7 +14,7 @@ from cangauge._typing import FloatArray
 from cangauge.identify.evaluate import LogFit
 from cangauge.identify.fit import Identification
 from cangauge.inference.rows import running_rows
-from cangauge.model.charge import discharged_ah
+from cangauge.model.coulomb_counting import discharged_ah
 from cangauge.model.effects.library import LIBRARY
 from cangauge.report.charts import (
     BLACK,

@@ -25,7 +25,7 @@ from cangauge.identify.fit import Identification, fit
 from cangauge.inference.rows import FitOptions, fit_rows
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
-from cangauge.model.charge import capacity_from_reference
+from cangauge.model.coulomb_counting import capacity_from_reference
 from cangauge.model.model_file import Model
 from cangauge.validation.twin.injection import (
     fit_surrogate_pack,

@@ -28,7 +28,7 @@ from typing import ClassVar, Final, Literal, NamedTuple
 import numpy as np
 
 from cangauge._typing import FloatArray
-from cangauge.model.charge import BRIDGE_S, discharged_ah
+from cangauge.model.coulomb_counting import BRIDGE_S, discharged_ah
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.effects.first_order import LowPass, low_passed
 from cangauge.model.voltage_model import VoltageModel

@@ -9,7 +9,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from cangauge._typing import FloatArray
-from cangauge.model.charge import BRIDGE_S
+from cangauge.model.coulomb_counting import BRIDGE_S
 from cangauge.model.effects.base import Effect, OnlineEffect, Pack, PackState, Parameter, Values
 from cangauge.model.effects.first_order import LowPass
 from cangauge.model.effects.resistance import arrhenius, arrhenius_at

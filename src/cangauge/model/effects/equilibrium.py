@@ -9,7 +9,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from cangauge._typing import FloatArray
-from cangauge.model.charge import BRIDGE_S
+from cangauge.model.coulomb_counting import BRIDGE_S
 from cangauge.model.effects.base import (
     LAG,
     WITHIN_C,

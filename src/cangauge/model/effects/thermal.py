@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import ClassVar
 
 from cangauge._typing import FloatArray
-from cangauge.model.charge import BRIDGE_S
+from cangauge.model.coulomb_counting import BRIDGE_S
 from cangauge.model.effects.base import (
     Effect,
     OnlineEffect,
