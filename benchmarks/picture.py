@@ -1,4 +1,4 @@
-"""Draw the README's picture: chained real trips with a current sensor offset of 3 A.
+"""Draw the picture of docs/results.md: chained real trips with a current sensor offset of 3 A.
 
 python benchmarks/picture.py --data FOLDER -o docs/chain.png
 """
