@@ -85,10 +85,10 @@ def test_status_and_reasons_agree_with_the_estimator() -> None:
     status = message.get_signal_by_name("status").choices
     assert status == {int(each): each.name.lower() for each in Status}
     reason = message.get_signal_by_name("reason")
-    assert reason.length == 17
-    for bit in range(17):
+    assert reason.length == 20
+    for bit in range(20):
         assert f" {bit}: " in str(reason.comment)
-    assert max(Reason).bit_length() == 17
+    assert max(Reason).bit_length() == 20
     assert (message.frame_id, message.cycle_time) == (0x5A0, 100)
     detail = soc.get_message_by_name("SOC_DETAIL")
     assert (detail.frame_id, detail.cycle_time) == (0x5A1, 1000)

@@ -58,7 +58,7 @@ def test_a_log_at_full_speed_from_one_process_to_the_other(
     result = ended.json
     assert result["samples"] == 1200
     assert result["lost"] == result["crc_errors"] == result["untimed"] == 0
-    assert result["estimate"]["soc_pct"] == pytest.approx(replayed.json["soc_pct"], abs=0.002)
+    assert result["estimate"]["soc_pct"] == pytest.approx(replayed.json["soc_pct"], abs=0.01)
     # Bit for bit: the recording, offline.
     offline = estimate_capture(record, Vehicle.load("generic"), leaf_model()).table
     read = pyarrow.csv.read_csv if suffix == ".csv" else pyarrow.parquet.read_table

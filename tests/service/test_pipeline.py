@@ -111,7 +111,7 @@ def test_silence_is_invalid_with_the_last_soc(log: Log) -> None:
     assert not fresh.reasons & Reason.INPUT_STALE
     assert stale.status is Status.INVALID
     assert stale.reasons & Reason.INPUT_STALE
-    assert stale.soc_pct == fresh.soc_pct == pytest.approx(pipeline.latest.soc_pct, abs=0.001)
+    assert stale.soc_pct == fresh.soc_pct == pytest.approx(pipeline.latest.soc_pct, abs=0.005)
     assert (fresh.age_s, stale.age_s) == (0.0, 7.0)
     # The estimate recovers with the next frames.
     again = frames_of(log.rows(slice(0, 2)), vehicle, shift_s=log.time_s[-1] + 0.1)

@@ -84,7 +84,7 @@ def test_stopped_killed_and_started_again(tmp_path: Path) -> None:
         contents = [SocReader().read(frame) for frame in collect(port, 0.5)]
         told = [each for each in contents if isinstance(each, SocEstimate)]
         assert told
-        assert told[-1].soc_pct == pytest.approx(kept_pct, abs=0.002)
+        assert told[-1].soc_pct == pytest.approx(kept_pct, abs=0.01)
         assert told[-1].status is Status.INVALID
         assert told[-1].reasons & Reason.INPUT_STALE
         drive(port, 202, 210)

@@ -212,7 +212,7 @@ def test_others_can_read_the_published_frames(replay_port: BusConnection) -> Non
     published = [each for each in map(reader.read, frames) if isinstance(each, SocEstimate)]
     assert reader.refused == 0
     assert len(published) >= len(log)  # every 100 ms of bus time
-    assert published[-1].soc_pct == pytest.approx(live.rows[-1][1].soc_pct, abs=0.001)
+    assert published[-1].soc_pct == pytest.approx(live.rows[-1][1].soc_pct, abs=0.005)
 
 
 def test_a_bus_that_does_not_exist(tmp_path: Path) -> None:

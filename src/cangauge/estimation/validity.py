@@ -73,6 +73,9 @@ class Reason(enum.IntFlag):
     SIGNAL_STUCK = 1 << 14
     CURRENT_MISSING = 1 << 15
     SOC_UNCERTAIN = 1 << 16
+    DUPLICATE_SENDER = 1 << 17
+    MODEL_MISMATCH = 1 << 18
+    TIME_UNCERTAIN = 1 << 19
 
 
 REASON_WORDS: Final = {
@@ -93,6 +96,9 @@ REASON_WORDS: Final = {
     Reason.SIGNAL_STUCK: "a signal is constant while another proves that it should change",
     Reason.CURRENT_MISSING: "no plausible current within its time-out: charge is not counted",
     Reason.SOC_UNCERTAIN: "the standard deviation exceeds the limit of a valid SoC",
+    Reason.DUPLICATE_SENDER: "another node sends frames with an id that is read or published here",
+    Reason.MODEL_MISMATCH: "the voltages contradict the model: wrong pack, capacity or sensor",
+    Reason.TIME_UNCERTAIN: "time stamps and the monotonic clock disagree",
 }
 """Description of each reason, for pages and messages."""
 
