@@ -20,6 +20,7 @@ from mkdocs.structure.files import File, Files
 from typer.main import get_command
 
 from cangauge.cli.app import COMMANDS, LazyGroup, app
+from cangauge.estimation.validity import REASON_WORDS, reason_name
 from cangauge.model.effects.library import LIBRARY
 from cangauge.validation import simulate
 
@@ -63,7 +64,8 @@ def commands_page() -> str:
     ]
     for name in COMMANDS:
         command = group.get_command(None, name)
-        parts += [f"## cangauge {name}", inspect.cleandoc(command.help or "")]
+        text = re.sub(r"^#+ (.+)$", r"**\1**", inspect.cleandoc(command.help or ""), flags=re.MULTILINE)
+        parts += [f"## cangauge {name}", text]
         rows = ["| Option | Value | Default | Meaning |", "| --- | --- | --- | --- |"]
         context = typer.Context(command, info_name=name)
         rows.extend(_option_row(parameter) for parameter in command.get_params(context))
@@ -106,13 +108,20 @@ def frames_page() -> str:
             "| --- | --- | --- | --- | --- | --- | --- |",
         ]
         for signal in message.signals:
-            limits = f"{signal.minimum:g} … {signal.maximum:g}"
+            limits = f"{signal.minimum:.9g} … {signal.maximum:.9g}"
             cells = (
                 f"`{signal.name}`", f"{signal.start}", f"{signal.length}", f"{signal.scale:g}",
-                limits, signal.unit or "", str(signal.comment or ""),
+                limits, signal.unit or "",
+                "Bits, see below." if signal.name == "reason" else str(signal.comment or ""),
             )  # fmt: skip
             rows.append("| " + " | ".join(_cell(cell) for cell in cells) + " |")
         parts.append("\n".join(rows))
+    rows = ["| Bit | Reason | Meaning |", "| --- | --- | --- |"]
+    rows += [
+        f"| {int(reason).bit_length() - 1} | {reason_name(reason)} | {_cell(words)} |"
+        for reason, words in REASON_WORDS.items()
+    ]
+    parts += ["## Reasons", "A bit is set while its reason applies.", "\n".join(rows)]
     return "\n\n".join(parts) + "\n"
 
 
