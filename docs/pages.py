@@ -64,7 +64,8 @@ def commands_page() -> str:
     ]
     for name in COMMANDS:
         command = group.get_command(None, name)
-        text = re.sub(r"^#+ (.+)$", r"**\1**", inspect.cleandoc(command.help or ""), flags=re.MULTILINE)
+        text = inspect.cleandoc(command.help or "")
+        text = re.sub(r"^#+ (.+)$", r"**\1**", text, flags=re.MULTILINE)
         parts += [f"## cangauge {name}", text]
         rows = ["| Option | Value | Default | Meaning |", "| --- | --- | --- | --- |"]
         context = typer.Context(command, info_name=name)
