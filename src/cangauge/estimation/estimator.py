@@ -176,6 +176,15 @@ class Estimator:
             self._latest = self._latest._replace(time_s=stamp_s, samples=memory.samples)
 
     @property
+    def is_refused(self) -> bool:
+        """Whether the latest sample was refused: without a plausible current, or not later."""
+        return self._is_refused
+
+    def uncounted_std_pct(self, seconds: float) -> float:
+        """Return what the SoC's standard deviation lacks [%] when no sample came for a time [s]."""
+        return self._counter.uncounted_std_pct(seconds)
+
+    @property
     def estimate(self) -> Estimate:
         """The estimate after the latest sample; SoC and voltages are NaN until they are known."""
         latest = self._evaluate()
