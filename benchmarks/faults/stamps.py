@@ -62,9 +62,9 @@ def fast(arguments: list[str]) -> None:
     _run(lambda stamp_s, begin_s, _rng: begin_s + 10.0 * (stamp_s - begin_s), arguments)
 
 
-def no_number(arguments: list[str]) -> None:
-    """Run with stamps that are no numbers."""
-    _run(lambda _stamp_s, _b, _rng: math.nan, arguments)
+def zero(arguments: list[str]) -> None:
+    """Run without stamps, as with some drivers."""
+    _run(lambda _stamp_s, _b, _rng: 0.0, arguments)
 
 
 def forward(arguments: list[str]) -> None:

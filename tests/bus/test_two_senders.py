@@ -100,6 +100,31 @@ def test_few_forged_frames_are_found_too(vehicle: Vehicle, ahead: int, later: fl
     assert FROM <= first <= FROM + 200
 
 
+def test_forged_frames_that_fill_the_counter_are_too_many() -> None:
+    # Four forged frames, and the counter is again where the true sender goes on.
+    out = []
+    for number, frame in enumerate(true_frames(LEAF, 2000)):
+        out.append(frame)
+        if number > 600 and frame.arbitration_id == LEAF.current.arbitration_id:
+            out += [forged(frame, rule_of(LEAF), n, 0.002 * n) for n in range(1, 5)]
+    decoder, first = decoded(LEAF, sorted(out, key=lambda each: each.timestamp))
+    assert decoder.statistics.messages[LEAF.current.key].counter_jumps == 0
+    assert first <= 600 + 400
+
+
+def test_damaged_frames_with_its_id_do_not_stop_a_message() -> None:
+    rng, out = Random(1), []  # noqa: S311 - must be repeatable
+    for frame in true_frames(LEAF, 3000):
+        noise = can.Message(
+            arbitration_id=frame.arbitration_id, is_extended_id=False, data=rng.randbytes(8),
+            timestamp=frame.timestamp + 0.003,
+        )  # fmt: skip
+        out += [frame, noise, noise]
+    decoder, _ = decoded(LEAF, out)
+    assert decoder.statistics.two_senders == 0
+    assert not math.isnan(decoder.health["current"].value_at(decoder.now_s))
+
+
 def test_second_sender_from_the_start_is_found() -> None:
     for vehicle in (LEAF, GENERIC):
         _, first = decoded(vehicle, attacked(vehicle, 2, 0.3, first=0))

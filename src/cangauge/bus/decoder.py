@@ -212,43 +212,55 @@ class _RateCheck:
         Stated [s].
     """
 
-    __slots__ = ("_before", "_kept", "_most", "_period_s", "_seen_s", "_since_s", "_spare_s")
+    __slots__ = ("_before", "_frames", "_kept", "_most", "_period_s", "_seen_s", "_since_s",
+                 "_spare_s")  # fmt: skip
 
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
         self._seen_s = self._since_s = -math.inf
-        self._kept = 0
+        self._frames = self._kept = 0
         self._spare_s = 0.0
         # Frames beyond those due: largest number so far in this interval of `HELD_UP_S`, and in
         # the one before.
         self._most = self._before = math.inf
 
-    def is_exceeded(self, time_s: float, frames: int) -> bool:
+    def is_exceeded(self, time_s: float, statistics: MessageStatistics) -> bool:
         """Return whether a lasting surplus proves two senders; called every `COUNTED` frames.
 
         A message is judged once it has kept its period for a while: the stated one may be wrong.
         """
-        surplus, usual_s = frames - time_s / self._period_s, COUNTED * self._period_s
+        surplus = self._surplus(time_s, statistics)
+        # A repeated frame is refused anyway; CAN itself repeats some after an error.
+        frames = _whole(statistics) - statistics.counter_repeats
+        due_s, self._frames = (frames - self._frames) * self._period_s, frames
         took_s, self._seen_s = time_s - self._seen_s, time_s
-        if took_s > HELD_UP_S + usual_s:
+        if took_s > HELD_UP_S + due_s:
             self._since_s, self._most, self._before = time_s, surplus, surplus
             return False
         if time_s - self._since_s >= HELD_UP_S:
             self._since_s, self._most, self._before = time_s, surplus, self._most
         self._most = max(self._most, surplus)
         if self._kept < KEPT:
-            is_kept = usual_s / TOO_MANY <= took_s <= TOO_MANY * usual_s
+            is_kept = due_s / TOO_MANY <= took_s <= TOO_MANY * due_s
             self._kept = self._kept + 1 if is_kept else 0
             return False
-        self._spare_s = min(max(self._spare_s + TOO_MANY * took_s - usual_s, -SURPLUS_S), 0.0)
+        self._spare_s = min(max(self._spare_s + TOO_MANY * took_s - due_s, -SURPLUS_S), 0.0)
         return self._spare_s <= -SURPLUS_S
 
-    def has_surplus(self, time_s: float, frames: int) -> bool:
+    def has_surplus(self, time_s: float, statistics: MessageStatistics) -> bool:
         """Return whether frames came that were not due; False while that is not known.
 
         Frames that were lost, and delivered in bursts, can look like those of two senders.
         """
-        return frames - time_s / self._period_s - self._before >= SUSPECTED_AT / 2
+        return self._surplus(time_s, statistics) - self._before >= SUSPECTED_AT / 2
+
+    def _surplus(self, time_s: float, statistics: MessageStatistics) -> float:
+        return _whole(statistics) - time_s / self._period_s
+
+
+def _whole(statistics: MessageStatistics) -> int:
+    """Return the number of frames that were neither damaged nor too short."""
+    return statistics.wanted - statistics.crc_errors - statistics.short
 
 
 class SampleDecoder:
@@ -389,8 +401,7 @@ class SampleDecoder:
         if (
             not statistics.wanted % COUNTED
             and route.rate is not None
-            and route.rate.is_exceeded(time_s, statistics.wanted)
-            and (route.checker is None or not route.checker.has_counter)
+            and route.rate.is_exceeded(time_s, statistics)
         ):
             self._suspect(route, time_s)
         if len(payload) != route.length:
@@ -406,7 +417,7 @@ class SampleDecoder:
                     statistics.crc_errors += 1
                     return _refuse(route, Fault.PROTECTION)
                 if checker.suspects_second_sender and (
-                    route.rate is None or route.rate.has_surplus(time_s, statistics.wanted)
+                    route.rate is None or route.rate.has_surplus(time_s, statistics)
                 ):
                     self._suspect(route, time_s)
                 if verdict is Verdict.REPEATED:

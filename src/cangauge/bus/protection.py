@@ -493,11 +493,6 @@ class FrameChecker:
         self._was_repeated = False
 
     @property
-    def has_counter(self) -> bool:
-        """Whether the message has an alive counter."""
-        return self._modulus > 0
-
-    @property
     def suspects_second_sender(self) -> bool:
         """Whether the latest frames came from two senders."""
         return self.inserted >= SUSPECTED_AT

@@ -160,6 +160,8 @@ class StampLimiter:
 
     Attributes
     ----------
+    offset_s : float
+        Bus time minus monotonic time [s].
     shift_s : float
         Added to the stamps at present [s].
     limited : int
@@ -168,7 +170,7 @@ class StampLimiter:
 
     def __init__(self, tolerance_s: float, offset_s: float = math.nan) -> None:
         self._tolerance_s = tolerance_s
-        self._offset_s = offset_s
+        self.offset_s = offset_s
         self.shift_s = 0.0
         self.limited = 0
         # Replaced stamps in a row: their number, since when, and how far they were off.
@@ -194,13 +196,13 @@ class StampLimiter:
         stamp_s = math.nan
         for message in messages:
             stamp_s = message.timestamp + self.shift_s
-            early_s = since_s + self._offset_s - self._tolerance_s
-            if early_s <= stamp_s <= now_s + self._offset_s + self._tolerance_s:
+            early_s = since_s + self.offset_s - self._tolerance_s
+            if early_s <= stamp_s <= now_s + self.offset_s + self._tolerance_s:
                 self._run = 0
             else:
                 stamp_s = self._replaced(stamp_s, since_s, now_s)
             message.timestamp = stamp_s
-        return min(stamp_s - self._offset_s, now_s)
+        return min(stamp_s - self.offset_s, now_s)
 
     def is_uncertain(self, now_s: float) -> bool:
         """Return whether the stamps are unusable at a monotonic time [s]."""
@@ -211,16 +213,16 @@ class StampLimiter:
 
     def _replaced(self, stamp_s: float, since_s: float, now_s: float) -> float:
         """Return the time for a stamp outside the interval [s]."""
-        if math.isnan(self._offset_s):
+        if math.isnan(self.offset_s):
             if not abs(stamp_s) <= LATEST_S:  # NaN too
                 stamp_s = 0.0
-            self._offset_s = stamp_s - now_s
+            self.offset_s = stamp_s - now_s
             return stamp_s
         self.limited += 1
         if now_s - self._unusable_s >= CERTAIN_AFTER_S:
             self._unusable_since_s = now_s
         self._unusable_s = now_s
-        off_s = stamp_s - now_s - self._offset_s
+        off_s = stamp_s - now_s - self.offset_s
         low_s, high_s = min(self._low_s, off_s), max(self._high_s, off_s)
         if self._run == 0 or not high_s - low_s <= self._tolerance_s:
             self._run, self._run_since_s = 0, now_s
@@ -231,8 +233,8 @@ class StampLimiter:
             self.shift_s -= high_s
             self._run, self._unusable_since_s = 0, now_s
             stamp_s -= high_s
-        received_s = now_s + self._offset_s
-        return stamp_s if since_s + self._offset_s <= stamp_s <= received_s else received_s
+        received_s = now_s + self.offset_s
+        return stamp_s if since_s + self.offset_s <= stamp_s <= received_s else received_s
 
 
 def steady_s() -> float:
