@@ -1,9 +1,9 @@
 """The service's loop: receive frames, hand them to the pipeline, send its frames.
 
-Only the loop reads a clock, a monotonic one: to publish periodically, to detect stale input and
-time stamps that cannot be true. It
-also saves checkpoints, reloads the configuration, reports frames lost in the receive queue, and
-detects another sender of the same ids, which would make the published SoC jump between two values.
+Only the loop reads a clock, a monotonic one: to publish periodically, to detect stale input, and
+to replace time stamps that cannot be true. It also saves checkpoints, reloads the configuration,
+reports frames lost in the receive queue, and detects another sender of the same ids, which would
+make the published SoC jump between two values.
 """
 
 from __future__ import annotations
@@ -209,7 +209,9 @@ class _Loop:
         self._expects_clock = self._ignores_clock
         self._stamps = _limiter(port)
         self._stamps_are_arrival = port.capabilities.stamps != "driver"
-        self._drained_s = steady_s()
+        # The receive queue was empty at some time after the first; the latest turn received at the
+        # second.
+        self._drained_s = self._received_s = steady_s()
         self._shift_s = 0.0
         self._reported: set[str] = set()
         self._foreign_ids: frozenset[int] = frozenset()
@@ -241,10 +243,12 @@ class _Loop:
         # Reading the clock may be a system call: once per turn, and again after samples.
         self._now_s = time.monotonic()
         before = self._pipeline.samples
+        received_s = steady_s()
         if messages:
-            self._process(messages)
-        elif self._port.is_drained:
-            self._drained_s = steady_s()
+            self._process(messages, received_s)
+        if self._port.is_drained:
+            self._drained_s = self._received_s
+        self._received_s = received_s
         late_s = 0.0 if self._pipeline.samples != before else LATE_S
         if self._now_s >= self._beat_s + late_s:
             self._beat()
@@ -260,11 +264,11 @@ class _Loop:
             self._write_row()
             self._send(frames)
 
-    def _process(self, messages: list[can.Message]) -> None:
+    def _process(self, messages: list[can.Message], now_s: float) -> None:
         pipeline, record, table = self._pipeline, self._outputs.record, self._outputs.table
         before, taken, stamp_s = pipeline.samples, pipeline.taken, math.nan
         stamps = [message.timestamp for message in messages]
-        lag_s = self._limit_stamps(messages)
+        lag_s = now_s - self._stamps.limit(messages, self._drained_s, now_s)
         for message, received_s in zip(messages, stamps, strict=True):
             if message.arbitration_id in self._foreign_ids and self._is_foreign(message):
                 continue
@@ -282,14 +286,6 @@ class _Loop:
             self._sample_s = self._now_s
         if pipeline.taken != taken:
             self._note_samples(pipeline.taken - taken, stamp_s, lag_s)
-
-    def _limit_stamps(self, messages: list[can.Message]) -> float:
-        """Make bus time of the stamps; return how long ago the last frame arrived [s]."""
-        now_s = steady_s()
-        came_s = self._stamps.limit(messages, self._drained_s, now_s)
-        if self._port.is_drained:
-            self._drained_s = now_s
-        return now_s - came_s if self._stamps_are_arrival else 0.0
 
     def _is_foreign(self, message: can.Message) -> bool:
         """Handle a frame with an id that is not the vehicle's; return False if it is input."""
@@ -314,7 +310,7 @@ class _Loop:
     def _note_samples(self, samples: int, stamp_s: float, lag_s: float) -> None:
         before_s, self._now_s = self._now_s, time.monotonic()
         step_s = (self._now_s - before_s) / samples
-        self._came_s = before_s - lag_s
+        self._came_s = before_s - lag_s if self._stamps_are_arrival else before_s
         self.step_s.append(step_s)
         if self._outputs.stepped is not None:
             self._outputs.stepped(stamp_s, step_s, self._came_s)
