@@ -194,7 +194,7 @@ class _Route:
     length: int
     checker: FrameChecker | None
     statistics: MessageStatistics
-    rate: _RateCheck | None
+    rate: _RateCheck
     inputs: list[_Input] = field(default_factory=list)
     has_both: bool = False
     """Current and voltage: each frame is a sample by itself."""
@@ -204,31 +204,54 @@ class _Route:
 
 
 class _RateCheck:
-    """Detect more frames of a message than its stated period allows.
+    """Detect more frames of a message than its stated period allows; learn one that is not stated.
 
     Parameters
     ----------
-    period_s : float
-        Stated [s].
+    stated_s : float, optional
+        Stated period [s].
+
+    Attributes
+    ----------
+    learned_s : float
+        Longest period of the last `HELD_UP_S` to twice that [s], so that a second sender does not
+        shorten it soon; NaN while it is not known, or where one is stated.
+    held_until_s : float
+        Nothing is learned until then [s].
     """
 
-    __slots__ = ("_before", "_frames", "_kept", "_most", "_period_s", "_seen_s", "_since_s",
-                 "_spare_s")  # fmt: skip
+    __slots__ = ("_before", "_frames", "_is_stated", "_kept", "_most", "_period_s", "_seen_s",
+                 "_since_s", "_spare_s", "held_until_s", "learned_s")  # fmt: skip
 
-    def __init__(self, period_s: float) -> None:
-        self._period_s = period_s
+    def __init__(self, stated_s: float | None) -> None:
+        self._is_stated = stated_s is not None
+        self._period_s = math.nan if stated_s is None else stated_s
         self._seen_s = self._since_s = -math.inf
         self._frames = self._kept = 0
         self._spare_s = 0.0
-        # Frames beyond those due: largest number so far in this interval of `HELD_UP_S`, and in
-        # the one before.
-        self._most = self._before = math.inf
+        # Frames beyond those due, or periods [s]: largest number so far in this interval of
+        # `HELD_UP_S`, and in the one before.
+        self._most = self._before = math.inf if self._is_stated else 0.0
+        self.learned_s = math.nan
+        self.held_until_s = -math.inf
+
+    def _learn(self, time_s: float) -> None:
+        took_s, self._seen_s = time_s - self._seen_s, time_s
+        if not 0.0 < took_s < math.inf or time_s < self.held_until_s:
+            return
+        if time_s - self._since_s >= HELD_UP_S:
+            self._since_s, self._most, self._before = time_s, 0.0, self._most
+        self._most = max(self._most, took_s / COUNTED)
+        self.learned_s = max(self._most, self._before)
 
     def is_exceeded(self, time_s: float, statistics: MessageStatistics) -> bool:
         """Return whether a lasting surplus proves two senders; called every `COUNTED` frames.
 
         A message is judged once it has kept its period for a while: the stated one may be wrong.
         """
+        if not self._is_stated:
+            self._learn(time_s)
+            return False
         surplus = self._surplus(time_s, statistics)
         # A repeated frame is refused anyway; CAN itself repeats some after an error.
         frames = _whole(statistics) - statistics.counter_repeats
@@ -252,6 +275,8 @@ class _RateCheck:
 
         Frames that were lost, and delivered in bursts, can look like those of two senders.
         """
+        if not self._is_stated:
+            return True
         return self._surplus(time_s, statistics) - self._before >= SUSPECTED_AT / 2
 
     def _surplus(self, time_s: float, statistics: MessageStatistics) -> float:
@@ -316,9 +341,8 @@ class SampleDecoder:
         if route is None:
             statistics = self.statistics.messages[signal.key] = MessageStatistics()
             checker = None if message.rule is None else FrameChecker(message.rule, message.period_s)
-            rate = None if message.period_s is None else _RateCheck(message.period_s)
             route = self._routes[signal.key] = _Route(
-                signal.message, signal.length, checker, statistics, rate
+                signal.message, signal.length, checker, statistics, _RateCheck(message.period_s)
             )
         is_fast = signal.role in {"current", "voltage"}
         is_multiplexed = bool(signal.codec.conditions)
@@ -331,7 +355,10 @@ class SampleDecoder:
             statistics=route.statistics,
         )
         if route.checker is not None and not is_multiplexed:
-            route.checker.learned_period_s = lambda: health.period_s
+            rate = route.rate
+            route.checker.learned_period_s = lambda: (
+                health.period_s if math.isnan(rate.learned_s) else rate.learned_s
+            )
         route.inputs.append(
             _Input(
                 signal.decode,
@@ -398,11 +425,7 @@ class SampleDecoder:
         if time_s < route.last_s:
             self._rewind(route.last_s, time_s)
         self.now_s = time_s
-        if (
-            not statistics.wanted % COUNTED
-            and route.rate is not None
-            and route.rate.is_exceeded(time_s, statistics)
-        ):
+        if not statistics.wanted % COUNTED and route.rate.is_exceeded(time_s, statistics):
             self._suspect(route, time_s)
         if len(payload) != route.length:
             if len(payload) < route.length:
@@ -416,9 +439,7 @@ class SampleDecoder:
                 if verdict is Verdict.CRC_WRONG:
                     statistics.crc_errors += 1
                     return _refuse(route, Fault.PROTECTION)
-                if checker.suspects_second_sender and (
-                    route.rate is None or route.rate.has_surplus(time_s, statistics)
-                ):
+                if checker.suspects_second_sender and route.rate.has_surplus(time_s, statistics):
                     self._suspect(route, time_s)
                 if verdict is Verdict.REPEATED:
                     statistics.counter_repeats += 1
@@ -434,6 +455,7 @@ class SampleDecoder:
     def _suspect(self, route: _Route, time_s: float) -> None:
         """Refuse a message for a while: its frames may be of two senders."""
         route.suspected_until_s = self._suspected_until_s = time_s + SUSPECTED_FOR_S
+        route.rate.held_until_s = route.suspected_until_s
 
     @property
     def two_sender_messages(self) -> tuple[str, ...]:
