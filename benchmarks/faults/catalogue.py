@@ -195,9 +195,9 @@ DISK = [
 
 MACHINE_CLOCK = [
     Fault("machine's clock back", "set back by an hour", REAL, plan=do.clock_set(-3600.0),
-          needs=frozenset({"vcan", "root", "alone"})),
+          needs=frozenset({"vcan", "root", "alone"}), recovers=True),
     Fault("machine's clock forward", "set forward by an hour", REAL, plan=do.clock_set(3600.0),
-          needs=frozenset({"vcan", "root", "alone"})),
+          needs=frozenset({"vcan", "root", "alone"}), recovers=True),
 ]  # fmt: skip
 
 RESTARTS = [

@@ -16,6 +16,7 @@ from cangauge.bus.connection import BusConnection
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.publish import SocEstimate, SocReader
+from cangauge.bus.recording import capture_samples
 from cangauge.bus.time_source import ClockFrames, ReceiveTime
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
@@ -156,6 +157,24 @@ def test_samples_that_are_refused_do_not_make_it_fresh() -> None:
     assert found[-1].age_s >= 1.0
 
 
+def test_uncertainty_grows_while_no_charge_is_counted() -> None:
+    pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
+    encoder = FrameEncoder(Vehicle.load("generic"))
+    for sample in samples_of(short_log(100.0)):
+        for each in encoder.encode(sample):
+            pipeline.handle(each)
+    published = []
+    for silent_s in (0.0, 1.0, 10.0, 60.0):
+        pipeline.heartbeat(is_stale=silent_s > 0.5, silent_s=silent_s)
+        published.append(pipeline.published.soc_std_pct)
+    assert published[0] == pipeline.latest.soc_std_pct
+    assert published == sorted(published)
+    # A minute of the drive's mean square current.
+    assert published[-1] > published[0] + 0.1
+    pipeline.heartbeat(is_stale=False)
+    assert pipeline.published.soc_std_pct == published[0]
+
+
 def frame(time_s: float) -> can.Message:
     return can.Message(timestamp=time_s, arbitration_id=0x401, is_extended_id=False)
 
@@ -169,6 +188,39 @@ def test_irregular_stamps_of_a_capture_do_not_speed_time_up() -> None:
         times.append(time_s)
     assert max(times) - min(times) == pytest.approx(600.0, abs=3.0)
     assert source.is_uncertain
+
+
+def capture_of(path: Path, buses: dict[str, Callable[[float], float]]) -> Path:
+    """Write a minute of a drive as received on several buses, each with its own stamps."""
+    encoder, lines = FrameEncoder(Vehicle.load("generic")), []
+    for sample in samples_of(short_log(60.0)):
+        for each in encoder.encode(sample):
+            for bus, stamp in buses.items():
+                time_s, data = 1e9 + stamp(sample.time_s), each.data.hex().upper()
+                lines.append(f"({time_s:.6f}) {bus} {each.arbitration_id:03X}#{data}\n")
+    path.write_text("".join(lines))
+    return path
+
+
+def test_two_adapters_in_a_capture_are_no_irregularity(tmp_path: Path) -> None:
+    buses = {"can0": lambda time_s: time_s, "can1": lambda time_s: time_s - 3.0}
+    path = capture_of(tmp_path / "two.log", buses)
+    found = estimate_capture(path, Vehicle.load("generic"), leaf_model())
+    assert not (found.table.reasons & Reason.TIME_UNCERTAIN).any()
+    assert found.time_s[-1] - found.time_s[0] == pytest.approx(59.9)
+    read = capture_samples(path, Vehicle.load("generic"))
+    assert not any("irregular" in each for each in read.remarks)
+    assert read.time_s[-1] - read.time_s[0] == pytest.approx(59.9)
+
+
+def test_irregular_stamps_of_a_capture_are_named(tmp_path: Path) -> None:
+    rng = Random(1)  # noqa: S311 - must be repeatable
+    path = capture_of(tmp_path / "one.log", {"can0": lambda s: s + rng.uniform(-0.9, 0.9)})
+    found = estimate_capture(path, Vehicle.load("generic"), leaf_model())
+    assert found.table.reasons[-1] & Reason.TIME_UNCERTAIN
+    assert found.time_s[-1] - found.time_s[0] == pytest.approx(60.0, abs=2.0)
+    remarks = capture_samples(path, Vehicle.load("generic")).remarks
+    assert any("irregular" in each for each in remarks)
 
 
 def test_one_set_clock_in_a_capture_is_no_irregularity() -> None:

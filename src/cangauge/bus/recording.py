@@ -241,6 +241,8 @@ def capture_samples(
     remarks = [*capture.info.remarks, *_losses(bus.decoder.statistics)]
     if sum(bool(other.values) for other in buses.values()) > 1:
         remarks.append(f"several buses carry the frames; bus {channel} is used: most samples")
+    if isinstance(bus.clock, ReceiveTime) and bus.clock.irregular:
+        remarks.append(f"{bus.clock.irregular} time stamps step back: they are irregular")
     if clock.beginnings:
         remarks.append(f"the replay clock starts again {clock.beginnings} times")
     return CaptureSamples(

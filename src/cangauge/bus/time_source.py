@@ -73,11 +73,14 @@ class ReceiveTime:
     ----------
     steps_back : int
         Number of such steps.
+    irregular : int
+        Number of steps back that were not taken for one.
     """
 
     def __init__(self) -> None:
         self.beginnings = 0
         self.steps_back = 0
+        self.irregular = 0
         self._latest_us: int | None = None
         self._previous_us = 0
         self._shift_us = 0
@@ -119,6 +122,7 @@ class ReceiveTime:
                 now_us -= self._shift_us - reversals[0][1]
                 self._shift_us = reversals[0][1]
             self._irregular_until_us = latest_us + whole_us(IRREGULAR_FOR_S)
+            self.irregular += 1
             return max(now_us, latest_us - whole_us(REVERSAL_S))
         if is_far:
             self.steps_back += 1
