@@ -355,7 +355,8 @@ class _Loop:
         for name in self._pipeline.decoder.two_sender_messages:
             found[f"bus.two_senders {name}"] = (
                 f"two senders use the id of {name}: its frames are refused until one of them"
-                " stops; is somebody else on the bus?"
+                " stops; is somebody else on the bus? (If one sender sends it more often than"
+                " the DBC states, give its shortest period_s in the map file)"
             )
         for event in found.keys() - self._reported:
             emit(_LOG, logging.WARNING, event.split()[0], found[event], limit=event)
