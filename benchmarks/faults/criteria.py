@@ -45,7 +45,7 @@ TIMEOUT_S: Final = {"current": 2.0, "voltage": 2.0, "temperature": 10.0}
 """Time-outs of the values: documented defaults of the service [s]."""
 
 REPORTED_S: Final = 5.0
-"""Time from the start of a fault to its reason [s]: half of what a drive's SoC changes by 0.1 %."""
+"""Longest time from the start of a fault to its reason [s]: the SoC of a drive changes by 0.1 %."""
 
 INITIALISING, VALID, DEGRADED, INVALID = range(4)
 STATUS: Final = ("initialising", "valid", "degraded", "invalid")
