@@ -24,6 +24,7 @@ Target = Callable[[list[str]], None]
 CONTEXT: Final = multiprocessing.get_context("forkserver")
 PRELOAD: Final = [
     "faults.process",
+    "faults.stamps",
     "cangauge.cli.app",
     "cangauge.cli.run",
     "cangauge.estimation.ekf",

@@ -27,7 +27,7 @@ from cangauge.bus.captures.capture import (
 )
 from cangauge.bus.captures.files import CaptureInfo, parts_of_run
 from cangauge.bus.decoder import FrameStatistics, SampleDecoder
-from cangauge.bus.time_source import TimeSource, TimeSourceName, time_source
+from cangauge.bus.time_source import ReceiveTime, TimeSource, TimeSourceName, time_source
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.validity import Sample
@@ -241,6 +241,8 @@ def capture_samples(
     remarks = [*capture.info.remarks, *_losses(bus.decoder.statistics)]
     if sum(bool(other.values) for other in buses.values()) > 1:
         remarks.append(f"several buses carry the frames; bus {channel} is used: most samples")
+    if isinstance(bus.clock, ReceiveTime) and bus.clock.irregular:
+        remarks.append(f"{bus.clock.irregular} time stamps step back: they are irregular")
     if clock.beginnings:
         remarks.append(f"the replay clock starts again {clock.beginnings} times")
     return CaptureSamples(
@@ -256,9 +258,10 @@ def capture_samples(
 
 
 class _Bus:
-    """One bus of a capture: its decoder and the decoded values."""
+    """One bus of a capture: its time, its decoder and the decoded values."""
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle: Vehicle, clock: TimeSource) -> None:
+        self.clock = clock
         self.decoder = SampleDecoder(vehicle)
         # Time, current, voltage, temperature and the car's SoC of each sample in turn.
         self.values = array("d")
@@ -272,13 +275,15 @@ class _Bus:
 def _decode(capture: Capture, vehicle: Vehicle, clock: TimeSource) -> dict[Channel | None, _Bus]:
     buses: dict[Channel | None, _Bus] = {}
     for message in capture:
-        time_s = clock.time_of(message)
+        bus = buses.get(message.channel)
+        if bus is None:
+            # The stamps of two buses can be of two adapters.
+            own = ReceiveTime() if isinstance(clock, ReceiveTime) else clock
+            bus = buses[message.channel] = _Bus(vehicle, own)
+        time_s = bus.clock.time_of(message)
         if time_s is None:
             continue
         message.timestamp = time_s
-        bus = buses.get(message.channel)
-        if bus is None:
-            bus = buses[message.channel] = _Bus(vehicle)
         bus.add(bus.decoder.handle(message))
     for bus in buses.values():
         bus.add(bus.decoder.flush())
@@ -306,6 +311,7 @@ def _losses(statistics: FrameStatistics) -> list[str]:
             (statistics.crc_errors, "frames refused: wrong CRC"),
             (statistics.counter_repeats, "frames refused: repeated counter"),
             (statistics.short, "frames refused: too short"),
+            (statistics.two_senders, "frames refused: two senders use their id"),
             (statistics.not_available, "values refused: code for 'not available'"),
         )
         if count

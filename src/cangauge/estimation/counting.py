@@ -158,6 +158,14 @@ class CoulombCounter:
         rms_a = math.sqrt(max(mean_square_a2, 0.5 * (current_a**2 + last_a**2)))
         return ChargeStep(seconds, out_pct, rms_a * seconds * self._pct_per_as)
 
+    def uncounted_std_pct(self, seconds: float) -> float:
+        """Return the standard deviation of the charge since the last sample [%]."""
+        state = self.state
+        if math.isnan(state.time_s):
+            return 0.0
+        rms_a = math.sqrt(max(state.mean_square_a2, state.current_a**2))
+        return min(rms_a * seconds * self._pct_per_as, MOVED_STD_AT_MOST_PCT)
+
     def restore(self, state: CounterState) -> None:
         """Continue from a state after a restart; the counter works on it."""
         self.state = state

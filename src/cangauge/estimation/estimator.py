@@ -76,6 +76,8 @@ class Estimator:
         Charge from 100 to 0 % [Ah].
     filter : HypothesisFilter
         Offset of the current sensor, and the verdict on the last unobserved interval.
+    is_refused : bool
+        Whether the latest sample was refused: without a plausible current, or not later.
 
     Examples
     --------
@@ -119,7 +121,7 @@ class Estimator:
         # Voltage less the pseudo-OCV at the latest sample [V]; NaN until it is needed.
         self._without_ocv_v = math.nan
         self._implausible = Reason.NONE
-        self._is_refused = False
+        self.is_refused = False
         self._latest = Estimate.unknown(Reason.NO_INITIAL_SOC)
         # Sample and stamp of which the estimate is not computed yet; None: it is computed.
         self._pending: tuple[Sample, float] | None = None
@@ -150,7 +152,7 @@ class Estimator:
         time_s = None
         if abs(sample.current_a) <= CURRENT_AT_MOST_A:  # false for NaN
             time_s = self._clock.time_of(sample.time_s)
-        self._is_refused = time_s is None
+        self.is_refused = time_s is None
         if time_s is None:
             return
         stamp_s = sample.time_s
@@ -175,11 +177,15 @@ class Estimator:
         else:
             self._latest = self._latest._replace(time_s=stamp_s, samples=memory.samples)
 
+    def uncounted_std_pct(self, seconds: float) -> float:
+        """Return what the SoC's standard deviation lacks [%] when no sample came for a time [s]."""
+        return self._counter.uncounted_std_pct(seconds)
+
     @property
     def estimate(self) -> Estimate:
         """The estimate after the latest sample; SoC and voltages are NaN until they are known."""
         latest = self._evaluate()
-        if not self._is_refused:
+        if not self.is_refused:
             return latest
         reasons = latest.reasons | Reason.IMPLAUSIBLE_INPUT
         return latest._replace(reasons=reasons, status=status_of(reasons))
@@ -457,7 +463,7 @@ class Estimator:
         self._latest = Estimate._make(
             [*state.estimate, status_of(reasons), reasons, state.memory.samples]
         )
-        self._pending, self._is_refused = None, False
+        self._pending, self.is_refused = None, False
         self._is_filtering = False
 
     def _start_from(self, state: EstimatorState) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import NamedTuple, Protocol
 
 import can
 import numpy as np
+from can.typechecking import Channel
 
 from cangauge.bus.captures.capture import open_capture
 from cangauge.bus.decoder import SampleDecoder
@@ -160,17 +162,19 @@ class CaptureSource:
         """Yield the frames to send, stamped with log time."""
         self.dropped = 0
         ids = self._ids
-        clock: ReceiveTime | ReplayClock = ReceiveTime()
+        clock: ReplayClock | None = None
         if any(is_clock(message, ids.replay_clock) for message in self._messages()):
             clock = ReplayClock(ids.replay_clock)
+        # The stamps of two buses can be of two adapters.
+        stamps: defaultdict[Channel | None, ReceiveTime] = defaultdict(ReceiveTime)
         own = {ids.soc_estimate, ids.soc_detail, ids.replay_clock}
         for message in self._messages():
-            time_s = clock.time_of(message)
+            time_s = (clock or stamps[message.channel]).time_of(message)
             is_own = message.arbitration_id in own and not message.is_extended_id
             if time_s is None or is_own or message.is_error_frame:
                 self.dropped += 1
                 continue
-            if clock.beginnings:
+            if clock is not None and clock.beginnings:
                 raise InputError(
                     "holds several consecutive replays",
                     source=self._path,

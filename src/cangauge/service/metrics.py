@@ -36,6 +36,7 @@ _BUS_HELP: Final = {
     "unsent": "Frames dropped since the transmit queue stayed full.",
     "queue_drops": "Frames that the kernel dropped since the receive queue was full.",
     "losses": "Losses of the bus; each is followed by reconnecting.",
+    "foreign": "Frames from another sender with ids that this service sends.",
 }
 
 

@@ -14,7 +14,7 @@ import can
 from can.typechecking import CanFilter
 
 from cangauge.bus.decoder import SampleDecoder
-from cangauge.bus.plausibility import MISSED_AT_LEAST, Pack
+from cangauge.bus.plausibility import MISSED_AT_LEAST, MISSED_UNTIL_OLD, Pack
 from cangauge.bus.publish import ACKNOWLEDGE_EVERY, FrameIds, SocPublisher, standard_filter
 from cangauge.bus.time_source import ReplayClock, TimeSourceName, is_clock, time_source
 from cangauge.bus.vehicle import Vehicle
@@ -106,6 +106,10 @@ class Pipeline:
     estimator : Estimator
     samples : int
         Samples handed to the estimator, refused ones included, over all logs.
+    taken : int
+        Samples that the estimator took: only these make an estimate fresh.
+    stamp_shift_s : float
+        Part of the frames' stamps that their clock does not have, since it was set [s].
     latest_sample : Sample or None
     published : Estimate
         The estimate in the frames made last.
@@ -140,7 +144,9 @@ class Pipeline:
         self._pack = _pack_of(model, self.settings.estimator.capacity_ah)
         self.decoder = SampleDecoder(vehicle, self._pack)
         self.estimator = Estimator(model, _with_source(self.settings.estimator, vehicle))
-        self.samples = 0
+        self.samples = self.taken = 0
+        self._refused = 0  # in a row
+        self.stamp_shift_s = 0.0
         self.latest_sample: Sample | None = None
         self.published = NOTHING_YET
         # Computed when read: the estimator's latest estimate (None before the first sample, or
@@ -228,7 +234,9 @@ class Pipeline:
         self.published = self.latest
         return self._publisher.publish(self.published, self.samples)
 
-    def heartbeat(self, *, is_stale: bool, silent_s: float = 0.0) -> list[can.Message]:
+    def heartbeat(
+        self, *, is_stale: bool, silent_s: float = 0.0, reasons: Reason = Reason.NONE
+    ) -> list[can.Message]:
         """Return the frames due every `publish.ESTIMATE_EVERY_S`.
 
         Parameters
@@ -236,8 +244,11 @@ class Pipeline:
         is_stale : bool
             No sample within the service's time-out: the latest estimate becomes invalid.
         silent_s : float
-            Time since the latest sample came in, by the loop's monotonic clock [s]. With receive
-            stamps, a silence longer than the current's own time-out is stale as well.
+            Time since the latest sample that the estimator took came in, by the loop's monotonic
+            clock [s]. With receive stamps, a silence longer than the current's own time-out is
+            stale as well.
+        reasons : Reason
+            Findings of the loop itself, about time and other senders.
         """
         if self._publisher is None:
             return []
@@ -245,8 +256,15 @@ class Pipeline:
         if not self._is_replay:
             is_stale = is_stale or silent_s > self.decoder.health["current"].timeout_s
         if is_stale and self.samples:
-            reasons = estimate.reasons | Reason.INPUT_STALE
+            reasons |= Reason.INPUT_STALE
+        if reasons:
+            reasons |= estimate.reasons
             estimate = estimate._replace(status=status_of(reasons), reasons=reasons)
+        if estimate.status is Status.INVALID:
+            # No charge is counted; the last estimate grows old.
+            missing_pct = self.estimator.uncounted_std_pct(silent_s)
+            std_pct = math.hypot(estimate.soc_std_pct, missing_pct)
+            estimate = estimate._replace(soc_std_pct=std_pct)
         self.published = estimate
         age_s = silent_s if self.samples else math.nan
         return self._publisher.beat(estimate, self.samples, age_s)
@@ -305,8 +323,15 @@ class Pipeline:
             self._publisher.ids = settings.ids
 
     def snapshot(self) -> EstimatorState | None:
-        """Return the estimator's state; None while no SoC is known."""
-        return self.estimator.snapshot() if math.isfinite(self.latest.soc_pct) else None
+        """Return the estimator's state; None while no SoC is known.
+
+        It refers to the stamps as their clock makes them now: after a restart they come so.
+        """
+        if not math.isfinite(self.latest.soc_pct):
+            return None
+        state = self.estimator.snapshot()
+        state.clock.shift_s += self.stamp_shift_s
+        return state
 
     def restore(self, state: EstimatorState, age_s: float = 0.0) -> Estimate:
         """Continue from a state (see `Estimator.restore`); it is stale until a sample comes.
@@ -342,7 +367,13 @@ class Pipeline:
     def _estimate(self, sample: Sample) -> None:
         self.samples += 1
         self.latest_sample = sample
-        self.estimator.update(sample)
+        estimator = self.estimator
+        estimator.update(sample)
+        if estimator.is_refused:
+            self._refused += 1
+        else:
+            self.taken += 1
+            self._refused = 0
         self._is_behind = True
 
     def _evaluate(self) -> Estimate:
@@ -357,7 +388,8 @@ class Pipeline:
         """Return the latest estimate, marked by the health of the signals at bus time `now_s`.
 
         A single voltage that failed or has not come yet is not missing; several consecutive ones
-        are, or one that is too old.
+        are, or one that is too old. Samples that are refused one after the other do not make an
+        estimate fresh.
         """
         estimate = self._latest if self._estimated is None else self._estimated
         reasons = estimate.reasons
@@ -365,6 +397,10 @@ class Pipeline:
             reasons &= ~Reason.VOLTAGE_MISSING
         if missing := self.decoder.reasons(now_s):
             reasons |= missing
+        if self._time.is_uncertain:
+            reasons |= Reason.TIME_UNCERTAIN
+        if self._refused >= MISSED_UNTIL_OLD:
+            reasons |= Reason.INPUT_STALE
         if reasons == estimate.reasons:
             return estimate
         return estimate._replace(reasons=reasons, status=status_of(reasons))

@@ -40,7 +40,7 @@ RATE_OVER_S: Final = 2.0
 CLOCKS_APART_S: Final = 60.0
 """A receive stamp further than this from the wall clock belongs to another clock [s]."""
 
-BUS_COUNTS: Final = ("garbled", "error_frames", "unsent", "queue_drops", "losses")
+BUS_COUNTS: Final = ("garbled", "error_frames", "unsent", "queue_drops", "losses", "foreign")
 """Counts of a bus to report, where it has them."""
 
 _NO_REJECTS: Final = frozenset({"wanted", "counter_jumps", "frames_lost"})
