@@ -28,7 +28,7 @@ from typing import Annotated, Any, Final, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from cangauge._formatting import duration, number
-from cangauge._io import open_regular, refuse_foreign, write_text_atomic
+from cangauge._io import PRIVATE, open_regular, refuse_foreign, write_text_atomic
 from cangauge._logging import emit
 from cangauge.errors import CangaugeError, InputError
 from cangauge.estimation.state import EstimatorState
@@ -304,7 +304,7 @@ class StateKeeper:
                     each.unlink()
 
     def _write(self, content: StateContent) -> None:
-        write_text_atomic(self.settings.path, state_text(content))
+        write_text_atomic(self.settings.path, state_text(content), PRIVATE)
 
     def _log_decision(self) -> None:
         verdict = self._pipeline.estimator.filter.verdict
