@@ -134,7 +134,7 @@ class Service:
             port.open(wait=config.wait_for_bus)
             recorder = table = keeper = None
             if self._state is not None:
-                keeper = stack.enter_context(StateKeeper(self._state, pipeline))
+                keeper = stack.enter_context(StateKeeper(self._state, pipeline, port.name))
             if config.record is not None:
                 recorder = stack.enter_context(Recorder(config.record, config.record_limits()))
             if config.output is not None:
