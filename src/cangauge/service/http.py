@@ -204,7 +204,6 @@ class _Door:
         self._server = server
         self._listening = listening
         self._loop = asyncio.get_running_loop()
-        self._is_exhausted = False
 
     def open(self) -> None:
         self._loop.add_reader(self._listening, self._accept)
@@ -220,26 +219,16 @@ class _Door:
                 return
             except OSError as error:
                 if error.errno in _EXHAUSTED:
-                    self._note_exhaustion(error)
+                    text = f"no connection can be accepted: {error.strerror}"
+                    emit(_LOG, logging.WARNING, "http.exhausted", f"{text}; the estimate continues")
                     if self._server.drop_slowest():
                         continue
                     self.close()
                     self._loop.call_later(EXHAUSTED_S, self.open)
                 return  # or the client went away
-            self._is_exhausted = False
             connection.setblocking(False)
             stream = IOStream(connection, max_buffer_size=self._server.max_buffer_size)
             self._server.handle_stream(stream, address)
-
-    def _note_exhaustion(self, error: OSError) -> None:
-        if not self._is_exhausted:
-            self._is_exhausted = True
-            emit(
-                _LOG,
-                logging.WARNING,
-                "http.exhausted",
-                f"no connection can be accepted: {error.strerror}; the estimate continues",
-            )
 
 
 def _open_tcp(http: HttpAddress) -> list[socket.socket]:
