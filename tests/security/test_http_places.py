@@ -33,10 +33,10 @@ def test_few_descriptors_leave_the_processor_to_the_estimate() -> None:
         "--bus-option", f"port={port}", "--http", f"127.0.0.1:{http}", "--status-socket", "off",
     ]  # fmt: skip
 
+    limited = ["/bin/sh", "-c", 'ulimit -n 30; exec "$@"', ""]
     with can.Bus(interface="udp_multicast", channel=GROUP, port=port) as watcher:
         service = subprocess.Popen(
-            ["/bin/sh", "-c", 'ulimit -n 30; exec "$@"', "", sys.executable, "-c", COMMAND]
-            + arguments,
+            [*limited, sys.executable, "-c", COMMAND, *arguments],
             stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         assert waits(lambda: watcher.recv(0.1) is not None, 30.0)
