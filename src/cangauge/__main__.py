@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 
@@ -9,6 +10,9 @@ import sys
 def main() -> None:
     """Run the command line; a service holds SIGHUP before its imports, which take a second."""
     _open_missing_streams()
+    if isinstance(sys.stdout, io.TextIOWrapper):  # not what a test or a notebook has in its place
+        # In a locale without "±" or "°C" the text is legible; otherwise it would be an error.
+        sys.stdout.reconfigure(errors="backslashreplace")
     if sys.argv[1:2] == ["run"]:
         from cangauge.service.lifecycle import hold_hangups  # noqa: PLC0415 - as above
 

@@ -26,6 +26,7 @@ PINGS_PER_TIMEOUT: Final = 4
 END_WITHIN_S: Final = 6.0
 """Longest time from SIGTERM to the end [s]: what is written at the end has 5 s, and the systemd
 unit kills after 10 s."""
+_MOST_DIGITS: Final = 20
 _LAST_LINE_S: Final = 0.2
 _LOG = logging.getLogger(__name__)
 
@@ -184,7 +185,8 @@ class Notifier:
             return cls()
         for_us = given.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         microseconds = given.get("WATCHDOG_USEC", "")
-        watched = for_us and microseconds.isdecimal() and int(microseconds) > 0
+        is_number = microseconds.isdecimal() and len(microseconds) < _MOST_DIGITS
+        watched = for_us and is_number and int(microseconds) > 0
         return cls(address, int(microseconds) / 1e6 if watched else None)
 
     @property

@@ -330,7 +330,14 @@ def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None
     http = config.http_address()
     if unix_path is None and http is None:
         return
-    endpoint = Endpoint(lambda: monitor.latest, unix_path=unix_path, http=http)
+    try:
+        endpoint = Endpoint(lambda: monitor.latest, unix_path=unix_path, http=http)
+    except InputError as error:
+        if config.status_socket != "auto" or error.field != "status_socket":
+            raise
+        emit(_LOG, logging.WARNING, "status.unavailable", f"no status socket: {error}")
+        unix_path = None
+        endpoint = Endpoint(lambda: monitor.latest, http=http)
     stack.enter_context(endpoint)
     if unix_path is not None:
         emit(_LOG, logging.DEBUG, "status.listening", f"status at {unix_path}", path=str(unix_path))
