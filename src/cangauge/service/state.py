@@ -314,6 +314,7 @@ class StateKeeper:
                     each.unlink()
 
     def _write(self, content: StateContent) -> None:
+        _refuse_no_state(self.settings.path)  # it may have been swapped: a pipe would never end
         write_text_atomic(self.settings.path, state_text(content), PRIVATE)
 
     def _log_decision(self) -> None:
