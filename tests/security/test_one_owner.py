@@ -123,3 +123,24 @@ def test_a_token_that_others_can_read_is_reported(tmp_path: Path, rights: int) -
     )
     assert ended.code == 0
     assert ("http.token_exposed" in ended.err) == (rights != 0o600)
+
+
+def test_of_many_that_start_at_once_one_writes(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", HOLD, str(tmp_path / "x.log")]
+    pipe, crowd = subprocess.PIPE, list[subprocess.Popen[bytes]]()
+    for _ in range(6):
+        crowd.append(subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL))
+    lines = [each.stdout.readline() for each in crowd if each.stdout is not None]
+    assert sorted(lines) == [b""] * 5 + [b"held\n"]
+    for each in crowd:
+        each.communicate()
+
+
+def test_a_lock_file_with_any_content_is_quoted_safely(tmp_path: Path) -> None:
+    first = holder(tmp_path / "x.log")
+    (tmp_path / ".x.log.lock").write_bytes(b"\x1b[2J\xff\n" + b"9" * 100_000)
+    with pytest.raises(InputError) as caught, sole_writer(tmp_path / "x.log"):
+        raise AssertionError
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 1000
+    first.communicate()
