@@ -87,7 +87,9 @@ MAX_MODEL_BYTES: Final = 4 * MIB
 MAX_MODEL_COLUMNS: Final = 256
 """Columns of the information matrix in a model file."""
 MAX_MODEL_ITEMS: Final = 4096
-"""Effects, source logs and coefficients in a model file, each."""
+"""Source logs, options and coefficients in a model file, each."""
+MAX_MODEL_EFFECTS: Final = 32
+"""Effects in a model file: each costs time at every sample, and the library has 22 kinds."""
 MAX_SPEED_TRACE_BYTES: Final = 64 * MIB
 READ_WITHIN_S: Final = 120.0
 """Time for reading a configuration with its model, map and DBC [s]: the largest DBC takes up to

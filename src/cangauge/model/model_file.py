@@ -22,8 +22,10 @@ from cangauge._config import schema_error
 from cangauge._io import (
     MAX_MODEL_BYTES,
     MAX_MODEL_COLUMNS,
+    MAX_MODEL_EFFECTS,
     MAX_MODEL_ITEMS,
     read_bounded,
+    time_limit,
     write_text_atomic,
 )
 from cangauge.errors import InputError
@@ -144,7 +146,7 @@ class Model(_Strict):
     delays_s: Annotated[list[_Delay], Field(min_length=1, max_length=64)]
     rate_hz: Annotated[float, Field(ge=1e-3, le=1e4)]
     capacity_ah: Annotated[float, Field(ge=1e-3, le=1e5)]
-    effects: Annotated[list[dict[str, object]], _Items] = []
+    effects: Annotated[list[dict[str, object]], Field(max_length=MAX_MODEL_EFFECTS)] = []
     temperature_source: TemperatureSource
     range: Ranges
     noise: ModelNoise
@@ -238,6 +240,11 @@ class Model(_Strict):
             If the file cannot be read or does not describe a usable model; names the field.
         """
         path = Path(path)
+        with time_limit(path):
+            return cls._load(path)
+
+    @classmethod
+    def _load(cls, path: Path) -> Model:
         data = read_bounded(path, MAX_MODEL_BYTES, "a model file")
         try:
             raw = json.loads(data, parse_constant=_refuse_constant)

@@ -10,6 +10,7 @@ import logging
 import os
 import signal
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -68,6 +69,9 @@ def deadline_after_signal(within_s: float = END_WITHIN_S) -> Iterator[None]:
     within_s : float
         Time from the signal to that end [s].
     """
+    if sys.platform == "win32":  # it has no wake-up by a pipe
+        yield
+        return
     signals, wakeup = os.pipe()
     os.set_blocking(wakeup, False)
     before = signal.set_wakeup_fd(wakeup, warn_on_full_buffer=False)
