@@ -359,8 +359,9 @@ def _check_coefficients(model: VoltageModel, capacity_ah: float) -> None:
                 value=value,
                 cure="check the value and its unit, or the capacity",
             )
-    total = sum(model.resistance_ohm)
-    if total > RESISTANCE_AT_LEAST * pack.voltage_v / capacity_ah:
+    # A log of constant current leaves the sign open, and there the resistances cancel.
+    (low_a, high_a), total = model.current_range_a, sum(model.resistance_ohm)
+    if total * (high_a - low_a) > RESISTANCE_AT_LEAST * pack.voltage_v:
         raise InputError(
             "the sum of the resistances is positive, so that discharging would raise the voltage",
             field="coefficients",
