@@ -23,6 +23,8 @@ DISK_KB: Final = 256
 """Size of the small disk; fits several state files [kB]."""
 LARGE_DBC_MB: Final = 3.9
 """Just below the largest that is read [MB]."""
+RELOAD_S: Final = 8.0
+"""Time in which a small configuration is read, on a busy machine [s]."""
 REFUSED: Final = 2
 """Exit status of a command with bad input."""
 
@@ -164,7 +166,7 @@ def large_dbc(bench: Bench) -> None:
 
 
 def impossible_model(change: Callable[[dict[str, Any]], None]) -> Callable[[Bench], None]:
-    """Reload with a model that no pack has."""
+    """Reload with a model that no pack has; it must be refused."""
 
     def do(bench: Bench) -> None:
         content = json.loads(Path(bench.config["model"]).read_text())
@@ -173,6 +175,9 @@ def impossible_model(change: Callable[[dict[str, Any]], None]) -> Callable[[Benc
         model.write_text(json.dumps(content))
         bench.write_config(model=str(model))
         bench.reload()
+        bench.wait(RELOAD_S)
+        if "config.refused" not in bench.service.output():
+            bench.incidents.append("an impossible model was taken")
 
     return do
 
