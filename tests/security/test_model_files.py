@@ -19,7 +19,7 @@ from cangauge.estimation.settings import EstimatorSettings
 from cangauge.model.model_file import Model
 from live import leaf_model_path, short_log
 
-DRIVE = list(samples_of(short_log(90.0, 2.0)))
+DRIVE = list(samples_of(short_log(80.0, 1.0)))
 KNOWN = EstimatorSettings(initial_soc_pct=80.0)
 
 
@@ -123,7 +123,7 @@ CHANGES = st.one_of(
 
 
 @settings(
-    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(changes=st.lists(st.tuples(st.sampled_from(PLACES), CHANGES), min_size=1, max_size=3))
 def test_a_changed_model_is_refused_or_gives_bounded_estimates(

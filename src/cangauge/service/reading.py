@@ -28,7 +28,7 @@ from cangauge.service.config import RunConfig
 
 ReadConfig = Callable[[], RunConfig]
 
-_START_S: Final = 10.0
+START_S: Final = 10.0
 """Time for the other process to start and to end, beside its limit for reading [s]."""
 
 
@@ -149,7 +149,7 @@ class BackgroundReader:
         with self._child as child:
             try:
                 answer, _ = child.communicate(
-                    pickle.dumps((self._read, within_s)), within_s + _START_S
+                    pickle.dumps((self._read, within_s)), within_s + START_S
                 )
             except subprocess.TimeoutExpired:
                 raise InputError(

@@ -26,7 +26,7 @@ from cangauge.service.http import Endpoint
 from cangauge.service.lifecycle import Notifier, note_hangups, stop_on_signals
 from cangauge.service.loop import LoopSettings, Outputs, RunSummary, serve
 from cangauge.service.pipeline import Pipeline
-from cangauge.service.reading import BackgroundReader, Reading
+from cangauge.service.reading import START_S, BackgroundReader, Reading
 from cangauge.service.recording import Recorder
 from cangauge.service.state import StateKeeper, check_state_path
 from cangauge.service.status import Identity, Monitor, Snapshot
@@ -219,26 +219,27 @@ class Service:
         """Begin to read on request; apply what was read since the last call."""
         if wanted:
             self._reader.request()
-            monitor.reload_begins(READ_WITHIN_S)
+            monitor.reload_begins(READ_WITHIN_S + START_S)
         result = self._reader.poll()
         if result is None:
             return None
-        settings, problem = None, ""
-        try:
-            if isinstance(result, InputError):
-                raise result
-            settings = self._apply(result)
+        settings = None
+        if isinstance(result, Reading):
+            try:
+                settings = self._apply(result)
+            except InputError as error:
+                result = error
+        if isinstance(result, InputError):
+            _log_refusal(result)
+        else:
             monitor.identity = replace(
                 monitor.identity,
                 vehicle=self.pipeline.vehicle.name,
                 model=self.config.model,
                 method=self.pipeline.settings.estimator.method,
             )
-        except InputError as error:
-            _log_refusal(error)
-            problem = str(error)
         if not self._reader.is_reading:
-            monitor.reload_ends(problem)
+            monitor.reload_ends(str(result) if isinstance(result, InputError) else "")
         return settings
 
     def _each_turn(self, monitor: Monitor, recorder: Recorder | None) -> Callable[[float], None]:
@@ -336,6 +337,8 @@ def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None
         if config.status_socket != "auto" or error.field != "status_socket":
             raise
         emit(_LOG, logging.WARNING, "status.unavailable", f"no status socket: {error}")
+        if http is None:
+            return
         unix_path = None
         endpoint = Endpoint(lambda: monitor.latest, http=http)
     stack.enter_context(endpoint)
