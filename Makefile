@@ -15,7 +15,7 @@ help:
 	@echo "make coverage  the test suite with coverage"
 	@echo "make check     a small part of the withheld check of the diagnosis"
 	@echo "make faults    the table of faults on a live bus (prints the expected time first)"
-	@echo "make lowest    the lowest versions that pyproject.toml allows, and tests where they matter"
+	@echo "make lowest    the lowest versions that pyproject.toml allows, on every Python here (or PYTHONS=…)"
 	@echo "make site      the documentation as a site, in out/site"
 	@echo "make wheel     build the wheel and run the job from it in an environment of its own"
 	@echo "make trips     the table on the real BMW i3 trips (see README for the data)"
@@ -70,7 +70,7 @@ wheel:
 	.ci/wheel $(PYTHON)
 
 lowest:
-	.ci/lowest $(PYTHON)
+	.ci/lowest $(PYTHONS)
 
 clean:
 	rm -rf $(VENV) .venv-lowest out

@@ -256,6 +256,14 @@ CONFIG = [
     Fault("reload, empty", "SIGHUP with an empty file", REAL, plan=do.broken_config("")),
     Fault("reload, gone", "SIGHUP with the file removed", REAL, plan=do.broken_config(None)),
     Fault("reload, often", "SIGHUP twenty times in 4 s", REAL, plan=at(do.BEGIN, do.reload_often)),
+    Fault("reload, large DBC", "SIGHUP with a lawful DBC of 3.9 MB", REAL,
+          plan=at(do.BEGIN, do.large_dbc)),
+    Fault("reload, huge resistance", "SIGHUP with a model of R1 = -1e9 ohm", REAL,
+          plan=at(do.BEGIN, do.impossible_model(
+              lambda model: model["coefficients"]["R1"].update(value=-1e9)))),
+    Fault("reload, negative voltage", "SIGHUP with a model of k0 = -0.5 V", REAL,
+          plan=at(do.BEGIN, do.impossible_model(
+              lambda model: model["coefficients"]["k0"].update(value=-0.5)))),
 ]  # fmt: skip
 
 MACHINE = [
@@ -266,6 +274,12 @@ MACHINE = [
           frames=change.flood(change.foreign, 2000.0, 10.0)),
     Fault("two services", "a second service with the same ids on the bus", REAL,
           plan=at(do.BEGIN, do.second_service), reports=_TWO),
+    Fault("two services, one state", "a second service with the same --state", REAL,
+          plan=at(do.BEGIN, do.same_files("state")), needs=frozenset({"state"})),
+    Fault("two services, one recording", "a second service with the same --record", REAL,
+          plan=at(do.BEGIN, do.same_files("record")), config={"record": "shared.log"}),
+    Fault("slow HTTP clients", "64 connections with half a request; a health probe each second",
+          REAL, plan=at(do.BEGIN, do.slow_clients), config={"http": "127.0.0.1:0"}),
     Fault("slow consumer", "a listener that never reads", REAL,
           plan=at(do.BEGIN, do.deaf_listener)),
     Fault("SIGUSR1, SIGPIPE", "signals without meaning to the service", REAL, plan=during(

@@ -52,6 +52,13 @@ def prepare() -> None:
     warm.join()
 
 
+def run_command(arguments: list[str]) -> int:
+    """Run a command in a fresh interpreter; return its exit status."""
+    return subprocess.run(
+        [sys.executable, "-c", _COLD, *arguments], capture_output=True, timeout=60.0, check=False
+    ).returncode
+
+
 class Process:
     """One service.
 

@@ -298,6 +298,21 @@ def test_slow_and_greedy_clients_block_nobody(http: Endpoint) -> None:
         each.close()
 
 
+@pytest.mark.parametrize(
+    "first", ["", "GET /healthz HTTP/1.1\r\nX: ", "POST / HTTP/1.1\r\nContent-Length: 9\r\n\r\n"]
+)
+def test_slow_clients_leave_a_place_for_a_probe(http: Endpoint, first: str) -> None:
+    slow = [socket.create_connection(("127.0.0.1", http.port or 0)) for _ in range(64)]
+    for each in slow:
+        each.sendall(first.encode())
+    began = time.monotonic()
+    for _ in range(3 * MAX_CLIENTS):
+        assert get(http.port, "/healthz")[0] == 200
+    assert time.monotonic() - began < 3.0
+    for each in slow:
+        each.close()
+
+
 def test_closing_takes_no_time_even_with_a_client_in_between(watched: Watched) -> None:
     endpoint = Endpoint(lambda: watched.monitor.latest, http=http_address("127.0.0.1:0", None, {}))
     with endpoint:

@@ -22,7 +22,7 @@ import numpy as np
 from cantools.database.can import Database, Message, Signal
 from numpy.typing import NDArray
 
-from cangauge._io import MAX_DBC_BYTES, read_bounded
+from cangauge._io import MAX_DBC_BYTES, read_bounded, time_limit
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError, closest
 
@@ -119,6 +119,11 @@ class SignalCodec:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "decode", self.decoder())
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle without `decode`, which is made again."""
+        given = [getattr(self, each.name) for each in dataclasses.fields(self) if each.init]
+        return type(self), tuple(given)
 
     def decoder(self, gain: float = 1.0, shift: float = 0.0) -> Decode:
         """Return a function that decodes a payload to gain × value + shift.
@@ -408,6 +413,11 @@ def load_dbc(path: str | PathLike[str]) -> Database:
         If the file is absent, too large, not a DBC, or beyond what a CAN bus can carry.
     """
     path = Path(path)
+    with time_limit(path):
+        return _load_dbc(path)
+
+
+def _load_dbc(path: Path) -> Database:
     text = _read_text(path)
     _check_sizes(text, path)
     try:

@@ -97,6 +97,11 @@ class VehicleSignal:
     def __post_init__(self) -> None:
         object.__setattr__(self, "decode", self.codec.decoder(self.gain, self.offset))
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle without `decode`, which is made again."""
+        given = [getattr(self, each.name) for each in dataclasses.fields(self) if each.init]
+        return type(self), tuple(given)
+
     def encode_into(self, payload: bytearray, value: float) -> None:
         """Set the value in A, V, °C or %; NaN becomes "not available".
 

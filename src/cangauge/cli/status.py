@@ -107,6 +107,10 @@ def _rows(status: dict[str, Any]) -> list[tuple[str, str]]:
                 f" {record['lost_frames']} frames lost{problem}",
             )
         )
+    if problem := status["config"]["problem"]:
+        rows.append(("configuration", f"the latest one is REFUSED, the old one stays: {problem}"))
+    elif status["config"]["reloading"]:
+        rows.append(("configuration", "reading a new one"))
     if status["loop_stuck"]:
         rows.insert(0, ("LOOP STUCK", "the receive loop hangs; restart the service"))
     return [

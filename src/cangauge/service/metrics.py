@@ -107,6 +107,11 @@ def _about(snapshot: Snapshot, now_s: float) -> Iterator[Metric]:
         "cangauge_start_time_seconds", "Start time, seconds since 1970.", identity.began_s
     )
     yield GaugeMetricFamily(
+        "cangauge_config_last_reload_successful",
+        "0 if the latest configuration was refused and the one before it is in use.",
+        not snapshot.config.problem,
+    )
+    yield GaugeMetricFamily(
         "cangauge_loop_age_seconds",
         "Time since the latest turn of the receive loop.",
         now_s - snapshot.made_s,

@@ -15,6 +15,7 @@ import gzip
 import io
 import logging
 import os
+import stat
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,7 +26,7 @@ from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, Self, cast
 
 import can
 
-from cangauge._io import FULL, check_writable, refuse_foreign
+from cangauge._io import FOR_GROUP, FULL, check_writable, refuse_foreign
 from cangauge._logging import emit
 from cangauge.bus.captures.files import all_parts, part_path, run_path
 from cangauge.bus.time_source import whole_us
@@ -313,12 +314,12 @@ class _Disk:
         self.lost_frames = 0
 
     def begin(self, path: Path) -> None:
-        """Begin a new file, replacing an existing one."""
+        """Begin a new file; only an empty one is replaced."""
 
         def begin() -> None:
             self._close_file()
             refuse_foreign(path)  # the names of parts are known before they begin
-            self._file = io.FileIO(path, "w")
+            self._file = io.FileIO(_created(path), "w")
             self._end = self._at = 0
 
         self.writer.submit(begin)
@@ -385,6 +386,17 @@ class _Disk:
             limit="record.state",
             lost_frames=self.lost_frames,
         )
+
+
+def _created(path: Path) -> int:
+    """Return the descriptor of a new or empty file or a device; never of another recording."""
+    flags = os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC
+    file = os.open(path, flags, FOR_GROUP)
+    found = os.fstat(file)
+    if stat.S_ISFIFO(found.st_mode) or found.st_size:
+        os.close(file)
+        raise FileExistsError(errno.EEXIST, "exists already, and is not replaced", str(path))
+    return file
 
 
 @dataclass(slots=True)

@@ -10,9 +10,8 @@ import logging
 import math
 import time
 from bisect import bisect_left
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
 from cangauge._formatting import number
@@ -131,6 +130,22 @@ class Identity:
 
 
 @dataclass(frozen=True, slots=True)
+class ConfigState:
+    """Result of the latest reload of the configuration.
+
+    Parameters
+    ----------
+    reloading : bool
+        A new one is being read; the old one is in use meanwhile.
+    problem : str
+        Why the latest one was refused; "" if it is in use.
+    """
+
+    reloading: bool = False
+    problem: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Snapshot:
     """The state of the service at one moment.
 
@@ -163,6 +178,7 @@ class Snapshot:
         Time from receive stamp to published SoC; processing time of the frame that completes a
         sample.
     record : RecordState or None
+    config : ConfigState
     """
 
     identity: Identity
@@ -184,6 +200,7 @@ class Snapshot:
     latency: HistogramCounts
     step: HistogramCounts
     record: RecordState | None
+    config: ConfigState
 
     def is_stuck(self, now_s: float) -> bool:
         """Return whether the receive loop is stuck at a monotonic time [s]."""
@@ -269,6 +286,10 @@ def as_json(snapshot: Snapshot, now_s: float) -> dict[str, Any]:
         "bus_up": snapshot.bus_up,
         "bus_counts": dict(snapshot.bus),
         "bus_trouble": snapshot.bus_trouble or None,
+        "config": {
+            "reloading": snapshot.config.reloading,
+            "problem": snapshot.config.problem or None,
+        },
         "latency": _durations(snapshot.latency),
         "step": _durations(snapshot.step),
         "record": None
@@ -344,6 +365,7 @@ class Monitor:
         self._rate = 0.0
         self._rate_from = (now_s, 0)
         self._status: Status | None = None
+        self._config = ConfigState()
         self.latest = self._snapshot(now_s)
 
     def stepped(self, stamp_s: float, step_s: float, came_s: float) -> None:
@@ -372,14 +394,16 @@ class Monitor:
         if 0.0 <= latency_s < CLOCKS_APART_S:
             self._latency.add(latency_s)
 
-    @contextmanager
-    def reloading(self) -> Iterator[None]:
-        """Report a reload to systemd while the block runs."""
-        self._notifier.reloading()
-        try:
-            yield
-        finally:
-            self._notifier.ready(_status_line(self.latest))
+    def reload_begins(self, within_s: float) -> None:
+        """Report a reload that may take this time [s]; `reload_ends` ends it."""
+        self._config = replace(self._config, reloading=True)
+        self._notifier.reloading(within_s)
+
+    def reload_ends(self, problem: str) -> None:
+        """Report the end of a reload; `problem` is why it was refused, "" if it was not."""
+        self._config = ConfigState(problem=problem)
+        refused = f"; new configuration REFUSED: {problem}" if problem else ""
+        self._notifier.ready(_status_line(self.latest) + refused)
 
     def turn(self, now_s: float) -> bool:
         """Record a turn of the loop (monotonic time [s]); return whether `latest` is new."""
@@ -426,6 +450,7 @@ class Monitor:
             latency=self._latency.copy(),
             step=self._step.copy(),
             record=None if self._record is None else self._record.state,
+            config=self._config,
         )
 
     def _log_status(self, snapshot: Snapshot) -> None:

@@ -58,9 +58,10 @@ def mf4_messages(path: Path) -> Iterator[can.Message]:
         with plain.open("wb") as copy:
             shutil.copyfileobj(file, copy, MIB)
         patience_s = MF4_SILENCE_S + MF4_SILENCE_S_PER_MIB * plain.stat().st_size / MIB
-        # The same interpreter and our own module: nothing in the file becomes a command.
+        # The same interpreter and our own module: nothing in the file becomes a command, and by -P
+        # nothing beside it an imported module.
         with subprocess.Popen(  # noqa: S603
-            [sys.executable, "-m", "cangauge.bus.captures.mf4", str(plain)],
+            [sys.executable, "-P", "-m", "cangauge.bus.captures.mf4", str(plain)],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
