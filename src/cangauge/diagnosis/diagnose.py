@@ -268,11 +268,12 @@ def diagnose(
         Model of this pack, from `fit` or a model file.
     references : sequence of Log
         Logs on which the model is good, at least three for reliable probabilities. They show the
-        error to expect without a cause. Each needs an initial SoC, or starts full.
+        error to expect without a cause. The start of one without SoC is found from its voltage.
     leave_out : sequence of str
         Effects to leave out of the library.
     initial_soc_pct : float, optional
-        SoC at the first row of each diagnosed log, instead of the log's own [%].
+        SoC at the first row of each diagnosed log, instead of the log's own [%]; where neither is
+        known it is found from the voltage.
 
     Returns
     -------

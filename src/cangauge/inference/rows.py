@@ -63,7 +63,7 @@ class FitOptions:
     capacity_ah: float
     """Charge from 100 to 0 % [Ah]."""
     initial_soc_pct: float | None = None
-    """SoC at each log's first row [%]; by default its reference SoC, else 100."""
+    """SoC at each log's first row [%]; by default its reference SoC."""
     rate_hz: float = 1.0
     delay_s: tuple[float, ...] = DELAYS_S
     epsilon: float = 0.05
@@ -133,17 +133,16 @@ def fit_rows(log: Log, options: FitOptions, *, gap_s: float = GAP_S) -> FitRows:
     Raises
     ------
     InputError
-        If no row is left, or the counted SoC leaves 0–100 % by more than `SOC_TOLERANCE_PCT`.
+        If no row is left, the SoC is known nowhere, or the counted SoC leaves 0–100 % by more than
+        `SOC_TOLERANCE_PCT`.
     """
     source = log.source or log.name
     capacity_ah, delay_s = options.capacity_ah, options.delay_s
     soc = counted_soc_pct(log, capacity_ah, options.initial_soc_pct)
     low, high = float(soc.min()), float(soc.max())
     if low < -SOC_TOLERANCE_PCT or high > 100.0 + SOC_TOLERANCE_PCT:
-        assumed = options.initial_soc_pct is None and log.first_soc() is None
-        start = " from an assumed start at 100 %" if assumed else ""
         raise InputError(
-            f"the SoC counted with {capacity_ah:.2f} Ah{start} runs from {high:.1f} to {low:.1f} %",
+            f"the SoC counted with {capacity_ah:.2f} Ah runs from {high:.1f} to {low:.1f} %",
             source=source,
             field="soc_pct",
             cure="check --capacity-ah, the SoC at the start (soc_pct, --initial-soc) and the sign"
