@@ -21,7 +21,7 @@ from cangauge.estimation.settings import (
     Method,
 )
 from cangauge.estimation.validity import Estimate, Sample, Status, reason_names
-from cangauge.inference.rows import usual_gap_s
+from cangauge.logs.gaps import usual_gap_s
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import counted_soc_pct
 from cangauge.model.delay_line import GAP_S

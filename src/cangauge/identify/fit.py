@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from cangauge._formatting import duration
 from cangauge._typing import FloatArray
 from cangauge._version import __version__
 from cangauge.errors import InputError
@@ -34,7 +35,9 @@ from cangauge.inference.rows import (
     FitRows,
     fit_rows,
     sample_log,
+    usable_delays,
 )
+from cangauge.logs.gaps import bridge_s, uncounted_gaps, usual_step_s
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import (
     capacity_from_full_discharge,
@@ -189,8 +192,9 @@ def fit(
             "the capacity must be positive", field="capacity_ah", value=capacity_ah,
             cure="check the sign of current: positive must discharge",
         )  # fmt: skip
-    options = FitOptions(capacity_ah, None, rate_hz, tuple(delay_s), epsilon, t_ref_c)
-    own_soc, found_starts = logs, find_starts(logs, given, options)
+    usable = usable_delays(logs, delay_s)
+    options = FitOptions(capacity_ah, None, rate_hz, usable, epsilon, t_ref_c)
+    found_starts = find_starts(logs, given, options)
     logs = found_starts.logs
     rows = [fit_rows(log, options) for log in logs]
     _LOG.debug("fitting %d rows of %d logs", sum(map(len, rows)), len(rows))
@@ -257,10 +261,11 @@ def fit(
         soc_newton_mae_pct=float(np.mean(np.abs(newton_error))),
         remarks=(
             *_remarks(voltage_model, solution, rows),
+            *_remarks_on_time(logs, delay_s, usable),
             *found_starts.remarks(),
             *(
                 text
-                for log in own_soc
+                for log in found_starts.pieces
                 if (text := difference_from_reference(log, capacity_ah)) is not None
             ),
             *(found.remarks() if found is not None else ()),
@@ -432,6 +437,29 @@ def _sha256(log: Log) -> str:
     for channel in (log.time_s, log.current_a, log.voltage_v, log.temperature_c):
         digest.update(channel.tobytes())
     return digest.hexdigest()
+
+
+def _remarks_on_time(
+    logs: Sequence[Log], delay_s: Sequence[float], usable: Sequence[float]
+) -> list[str]:
+    remarks = []
+    if len(usable) < len(delay_s):
+        left_out = ", ".join(f"{delay:g}" for delay in delay_s if delay not in usable)
+        step_s = min(usual_step_s(log.time_s) for log in logs)
+        remarks.append(
+            f"rows every {step_s:.3g} s do not tell a delay of {left_out} s from the others: left"
+            " out"
+        )
+    for log in logs:
+        gaps = uncounted_gaps(log.time_s)
+        if gaps.size:
+            longest = float(np.max(np.diff(log.time_s)[gaps]))
+            remarks.append(
+                f"{log.name}: {gaps.size} gaps of more than {bridge_s(log.time_s):.0f} s, the"
+                f" longest {duration(longest)}: no charge is counted over them (a rest); split the"
+                " log there if the pack was used"
+            )
+    return remarks
 
 
 def _remarks(model: VoltageModel, solution: Solution, rows: Sequence[FitRows]) -> list[str]:

@@ -24,6 +24,7 @@ from cangauge.errors import InputError
 from cangauge.identify.voltage_fit import KT, fit_voltage_model, rising, stacked
 from cangauge.inference.least_squares import kt_prior
 from cangauge.inference.rows import FitOptions, FitRows, fit_rows
+from cangauge.logs.gaps import split_where_moved
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import discharged_ah
 from cangauge.model.effects.base import Signals
@@ -85,20 +86,28 @@ class Starts:
     Parameters
     ----------
     logs : tuple of Log
-        The first finite `soc_pct` of each is where counting starts.
+        The first finite `soc_pct` of each is where counting starts. A log that was charged or
+        driven in a gap is split there.
+    pieces : tuple of Log
+        The same with their own SoC.
     starts : tuple of Start
     std_error : array of shape (p,) or None
         Standard errors of the coefficients with the uncertainty of the estimated starts.
     """
 
     logs: tuple[Log, ...]
+    pieces: tuple[Log, ...]
     starts: tuple[Start, ...]
     std_error: FloatArray | None = None
 
     def remarks(self) -> list[str]:
         """Return a remark on the starts that were estimated."""
         found = [str(start) for start in self.starts if start.origin == "estimated"]
-        return [f"start estimated together with the curve: {'; '.join(found)}"] if found else []
+        told = [f"start estimated together with the curve: {'; '.join(found)}"] if found else []
+        parts = [log.name for log in self.logs if " part " in log.name]
+        if parts:
+            told.append(f"split where the pack was used in a gap: {', '.join(parts)}")
+        return told
 
 
 def with_start(log: Log, soc_pct: float) -> Log:
@@ -149,6 +158,13 @@ def find_starts(logs: Sequence[Log], given: Sequence[float | None], options: Fit
     InputError
         If no log pins the curve, or a start is not determined.
     """
+    split = [split_where_moved(log) for log in logs]
+    given = [
+        value if k == 0 else None
+        for value, of_log in zip(given, split, strict=True)
+        for k in range(len(of_log))
+    ]
+    logs = [piece for of_log in split for piece in of_log]
     known, starts = list(logs), []
     unknown: list[int] = []
     for k, (log, value) in enumerate(zip(logs, given, strict=True)):
@@ -164,7 +180,7 @@ def find_starts(logs: Sequence[Log], given: Sequence[float | None], options: Fit
             unknown.append(k)
             starts.append(Start(log.name, float("nan"), None, "estimated"))
     if not unknown:
-        return Starts(tuple(known), tuple(starts))
+        return Starts(tuple(known), tuple(logs), tuple(starts))
     if len(unknown) == len(logs):
         raise unknown_start(logs[0], others=len(logs) > 1)
     pinned = [fit_rows(log, options) for k, log in enumerate(known) if k not in unknown]
@@ -183,7 +199,7 @@ def find_starts(logs: Sequence[Log], given: Sequence[float | None], options: Fit
             )
         known[k] = with_start(logs[k], value)
         _LOG.info("%s", starts[k])
-    return Starts(tuple(known), tuple(starts), std_error)
+    return Starts(tuple(known), tuple(logs), tuple(starts), std_error)
 
 
 def unknown_start(log: Log, *, others: bool) -> InputError:

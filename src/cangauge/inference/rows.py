@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
+from cangauge.logs.gaps import usual_gap_s, usual_step_s
 from cangauge.logs.log import Log
 from cangauge.logs.resample import dequantize
 from cangauge.model.coulomb_counting import counted_soc_pct, discharged_ah
@@ -148,10 +149,7 @@ def fit_rows(log: Log, options: FitOptions, *, gap_s: float = GAP_S) -> FitRows:
             cure="check --capacity-ah, the SoC at the start (soc_pct, --initial-soc) and the sign"
             " of current (positive must discharge; see `cangauge inspect`)",
         )
-    ticks = decimate(log.time_s, options.rate_hz)
-    running = running_rows(log.time_s, log.voltage_v)[ticks]
-    full = filled_at(log.time_s, max(delay_s), log.time_s[ticks], usual_gap_s(log.time_s, gap_s))
-    keep = ticks[running & full]
+    keep, removed = usable_rows(log, delay_s, options.rate_hz, gap_s)
     if keep.size < 2:
         raise InputError(
             f"no rows are left for the fit: the log lasts {log.duration_s:.0f} s, and the first"
@@ -167,11 +165,7 @@ def fit_rows(log: Log, options: FitOptions, *, gap_s: float = GAP_S) -> FitRows:
         dequantized_c=dequantize(log).temperature_c[keep],
         soc_pct=soc[keep],
         delayed_current_a=delayed_currents(log.time_s, log.current_a, delay_s, log.time_s[keep]),
-        removed={
-            "decimation": len(log) - ticks.size,
-            "start_up_or_shut_down": int(np.sum(~running)),
-            "delay_line_filling": int(np.sum(running & ~full)),
-        },
+        removed=removed,
     )
 
 
@@ -193,9 +187,39 @@ def running_rows(time_s: FloatArray, voltage_v: FloatArray) -> NDArray[np.bool_]
     return np.asarray(np.minimum(to_next, to_last) > GUARD_S) & ~down
 
 
-def usual_gap_s(time_s: FloatArray, gap_s: float) -> float:
-    """Return the duration of a gap in a recorded log [s]: `gap_s`, at least 3 median steps."""
-    return max(gap_s, 3.0 * float(np.median(np.diff(time_s)))) if time_s.size > 1 else gap_s
+def usable_delays(logs: Sequence[Log], delay_s: Sequence[float]) -> tuple[float, ...]:
+    """Return the delays that the fastest of some logs can tell apart [s].
+
+    Between rows the current is interpolated, so that the columns of delays closer together than a
+    row depend on each other.
+
+    Parameters
+    ----------
+    logs : sequence of Log
+    delay_s : sequence of float
+        Increasing from 0 [s].
+    """
+    step_s = min(usual_step_s(log.time_s) for log in logs)
+    kept = [delay_s[0]]
+    for delay in delay_s[1:]:
+        if step_s <= delay - kept[-1] + 1e-9:
+            kept.append(delay)
+    return tuple(kept)
+
+
+def usable_rows(
+    log: Log, delay_s: Sequence[float], rate_hz: float, gap_s: float = GAP_S
+) -> tuple[NDArray[np.intp], dict[str, int]]:
+    """Return the indices of the rows of a log that take part in a fit, and the numbers removed."""
+    ticks = decimate(log.time_s, rate_hz)
+    running = running_rows(log.time_s, log.voltage_v)[ticks]
+    full = filled_at(log.time_s, max(delay_s), log.time_s[ticks], usual_gap_s(log.time_s, gap_s))
+    removed = {
+        "decimation": len(log) - ticks.size,
+        "start_up_or_shut_down": int(np.sum(~running)),
+        "delay_line_filling": int(np.sum(running & ~full)),
+    }
+    return ticks[running & full], removed
 
 
 def folds(logs: Sequence[FitRows]) -> Iterator[tuple[Mask, Mask]]:

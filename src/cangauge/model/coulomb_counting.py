@@ -12,10 +12,17 @@ from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
+from cangauge.logs.gaps import BRIDGE_S, discharged_ah, split_where_moved
 from cangauge.logs.log import Log
 
-BRIDGE_S = 60.0
-"""No charge is counted over a longer gap in the current [s]: the pack is assumed to rest."""
+__all__ = [
+    "BRIDGE_S",
+    "capacity_from_full_discharge",
+    "capacity_from_reference",
+    "counted_soc_pct",
+    "difference_from_reference",
+    "discharged_ah",
+]
 
 FULL_PCT, EMPTY_PCT = 95.0, 5.0
 """SoC at the start (at least) and end (at most) of a log from full to empty [%]."""
@@ -32,19 +39,6 @@ cell falls to 0.80 of its voltage (layered oxides: 4.15 to 3.3 V at rest) or 0.8
 TOLD_PCT = 1.0
 """Difference between the counted SoC and the log's own over the log from which it is reported [%]:
 the resolution of a dashboard."""
-
-
-def discharged_ah(time_s: FloatArray, current_a: FloatArray) -> FloatArray:
-    """Return the charge discharged since the first row [Ah], shape (n,), by the trapezoidal rule.
-
-    Parameters
-    ----------
-    time_s, current_a : array of shape (n,)
-        Time [s] and current [A], positive = discharge. Steps longer than `BRIDGE_S` count nothing.
-    """
-    step_s = np.diff(time_s)
-    step_ah = np.where(step_s > BRIDGE_S, 0.0, (current_a[1:] + current_a[:-1]) * step_s / 7200.0)
-    return np.concatenate(([0.0], np.cumsum(step_ah)))
 
 
 def counted_soc_pct(log: Log, capacity_ah: float, initial_soc_pct: float | None) -> FloatArray:
@@ -126,7 +120,7 @@ def capacity_from_reference(logs: Sequence[Log]) -> float:
         If no log has a reference SoC that moves by at least 1 %.
     """
     covariance = variance = 0.0
-    for log in logs:
+    for log in [piece for whole in logs for piece in split_where_moved(whole)]:
         if log.soc_pct is None:
             continue
         known = np.isfinite(log.soc_pct)
@@ -167,9 +161,10 @@ def capacity_from_full_discharge(
     if initial_soc_pct is None or isinstance(initial_soc_pct, int | float):
         initial_soc_pct = [initial_soc_pct] * len(logs)
     for log, initial in zip(logs, initial_soc_pct, strict=True):
-        capacity = _whole_capacity_ah(log, initial)
-        if capacity is not None:
-            return capacity
+        for k, piece in enumerate(split_where_moved(log)):
+            capacity = _whole_capacity_ah(piece, initial if k == 0 else None)
+            if capacity is not None:
+                return capacity
     raise InputError(
         f"unknown capacity: no log is proven to run from full to empty (its own SoC from"
         f" {FULL_PCT:.0f} % or more to {EMPTY_PCT:.0f} % or less; or --initial-soc of"
