@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from cangauge._display import figure, html
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.caveats import (
     extension_caveat,
@@ -190,6 +191,14 @@ class Diagnosis:
             ),
         ]
         return [sentence for sentence in found if sentence]
+
+    def plot(self) -> Any:
+        """Return the probabilities of the causes as bars, for `bokeh.plotting.show`."""
+        return figure("diagnosis_figure", self)
+
+    def _repr_html_(self) -> str:
+        """Return verdict, sizes, probabilities and caveats for a notebook."""
+        return html("diagnosis_html", self)
 
     def log_errors(self) -> list[LogErrors]:
         """Return the errors of each diagnosed log with the given and the extended model."""

@@ -7,10 +7,11 @@ import logging
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from cangauge._display import figure
 from cangauge._formatting import duration
 from cangauge._typing import FloatArray
 from cangauge._version import __version__
@@ -88,6 +89,10 @@ class Identification:
     """Fitted effects; None if none were requested."""
     starts: tuple[Start, ...] = ()
     """SoC at the start of each log, and how it is known."""
+
+    def plot(self) -> Any:
+        """Return pseudo-OCV and residuals, for `bokeh.plotting.show`."""
+        return figure("fit_figure", self)
 
     def to_dict(self) -> dict[str, object]:
         """Return the object that `cangauge fit --json` prints."""
