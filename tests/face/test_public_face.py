@@ -65,7 +65,7 @@ def test_each_notebook_runs(example: str, words: str, project: Path, tmp_path: P
     notebook = nbformat.read(project / "examples" / f"{example}.ipynb", as_version=4)
     assert not any(cell.get("outputs") for cell in notebook.cells)
     resources = {"metadata": {"path": str(tmp_path)}}
-    nbclient.NotebookClient(notebook, timeout=120, resources=resources).execute()
+    nbclient.NotebookClient(notebook, timeout=300, resources=resources).execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
     printed = "".join(str(output.get("text", output.get("data", ""))) for output in outputs)
     assert words in printed

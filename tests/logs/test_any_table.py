@@ -361,6 +361,15 @@ def test_workbook_reads_as_its_longest_sheet(tmp_path: Path) -> None:
     assert log.current_a == pytest.approx(CURRENT_A)
 
 
+def test_index_of_times_is_the_time(tmp_path: Path) -> None:
+    stamps = pa.array([k * 1_000_000 for k in range(ROWS)], pa.timestamp("us"))
+    table = pa.table(
+        {"Current [A]": CURRENT_A, "Voltage [V]": VOLTAGE_V, "__index_level_0__": stamps}
+    )
+    log = Log.from_dataframe(table, temperature_c=20.0)
+    assert log.time_s == pytest.approx(TIME_S)
+
+
 @pytest.mark.parametrize("kind", ["parquet", "frame"])
 def test_other_tables_take_the_same_columns(tmp_path: Path, kind: str) -> None:
     stamps = pa.array([START.timestamp() * 1e6 + k * 1e6 for k in range(ROWS)], pa.int64())
@@ -410,7 +419,7 @@ def test_other_tables_take_the_same_columns(tmp_path: Path, kind: str) -> None:
         ),
         (
             "Time,Current,Voltage,Temp\n" + "".join(f"{k},2,300000,20\n" for k in range(4)), {},
-            "voltage looks like millivolts",
+            r"voltage looks like millivolts .*--columns 'voltage=Voltage\[mV\]'",
         ),
         (
             "Time,Current,Voltage,Temp\n1,2,300,20\nsoon,2,300,20\n", {},

@@ -183,7 +183,6 @@ class Diagnosis:
                 [matrix.sampled for matrix in problem.diagnosed],
                 [matrix.sampled for matrix in problem.references],
                 problem.model.capacity_ah,
-                problem.options.initial_soc_pct,
                 problem.temperature_source,
             ),
             temperature_step_caveat(

@@ -181,6 +181,20 @@ def read_log(
     return file.read(temperature_c=temperature_c, temperature_source=temperature_source)
 
 
+_INDEX: Final = "__index_level_"
+"""Beginning of the column name of an unnamed pandas index."""
+
+
+def _with_time_index(frame: Any) -> Any:
+    """Return the table with an unnamed index of times as its column `time`."""
+    names = frame.column_names
+    kinds = {each.name: str(each.type) for each in frame.schema}
+    times = [name for name in names if name.startswith(_INDEX) and "timestamp" in kinds[name]]
+    if len(times) != 1 or "time" in names or "time_s" in {name.lower() for name in names}:
+        return frame
+    return frame.rename_columns(["time" if name == times[0] else name for name in names])
+
+
 def log_of_arrow(
     frame: Any,
     *,
@@ -191,7 +205,8 @@ def log_of_arrow(
     sign: Sign | None = None,
 ) -> Log:
     """Return the log of an Arrow table; see `Log.from_dataframe`."""
-    names = [each for each in frame.column_names if not each.startswith("__index_level_")]
+    frame = _with_time_index(frame)
+    names = [each for each in frame.column_names if not each.startswith(_INDEX)]
     frame = frame.select(names)
     if columns is None and arrow.is_canonical(names):
         places = arrow.find_fields(names, name)
