@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal
 
 from cangauge._io import MAX_HEADING
@@ -197,10 +197,10 @@ _PACK: Final = _words(
     "traktion bms ess storage"
 )
 _NEUTRAL: Final = _words(
-    "mid measured meas actual act value val signal avg average mean total tot sum dc "
-    "instant inst live real now main ch channel ist mess wert messwert system sys "
-    "device ctrl v b var the of in raw data test rec record id sensor usable bus line "
-    "overall current present"
+    "terminal surface skin absolute abs mid measured meas actual act value val signal avg "
+    "average mean total tot sum dc instant inst live real now main ch channel ist mess wert "
+    "messwert system sys device ctrl v b var the of in raw data test rec record id sensor "
+    "usable bus line overall current present"
 )
 _CELL: Final = _words("cell cells module mod zelle zellen zell string display displayed dash")
 _AMBIENT: Final = _words(
@@ -227,11 +227,11 @@ _ELAPSED: Final = _words(
 )
 _WORDS: Final[dict[str, frozenset[str]]] = {
     "time": _words(
-        "time zeit timestamp timestamps datetime date datum elapsed tiempo tempo seconds "
+        "time realtime zeit timestamp timestamps datetime date datum elapsed tiempo tempo seconds "
         "sec clock uhrzeit stamp changed 时间 总时间 测试时间 日期 绝对时间"
     ),
     "current": _words(
-        "current amps amp ampere amperes strom courant corriente corrente stroom curr 电流 "
+        "current cur amps amp ampere amperes strom courant corriente corrente stroom curr 电流 "
         "ibat ibatt ipack ihv"
     ),
     "voltage": _words(
@@ -243,6 +243,9 @@ _WORDS: Final[dict[str, frozenset[str]]] = {
     ),
     "soc": _words("soc rsoc usoc ladezustand ladestand"),
 }
+_AUXILIARY: Final = frozenset({"aux", "auxiliary"})
+_PACK_WORD: Final = frozenset({"battery"})
+_MEAN: Final = frozenset({"avg", "average", "mean"})
 _DATES: Final = frozenset({"date", "datum", "日期"})
 _DATE_ONLY: Final = "(date)"
 _STEMS: Final = {
@@ -250,7 +253,7 @@ _STEMS: Final = {
     "current": ("curr", "amp", "strom", "ibat"),
     "voltage": ("volt", "spann", "ubat", "vbat"),
     "temperature": ("temp",),
-    "soc": ("soc", "charge"),
+    "soc": ("soc",),
 }
 _GUESSED_AT_MOST: Final = 500
 _SYMBOLS: Final = {"i": "current", "u": "voltage", "v": "voltage", "e": "voltage", "t": "time"}
@@ -322,6 +325,12 @@ def _splits(heading: str, unit_below: str) -> list[tuple[str, str]]:
     return [*found, (heading, "")]
 
 
+def _is_unit(text: str) -> bool:
+    is_index = text in {"1", "-", "d"}
+    known = any(unit_of(field_name, text) is not None for field_name in FIELDS.values())
+    return text in FOREIGN_UNITS or (known and not is_index)
+
+
 def _bracketed(name: str) -> list[str]:
     """Return the texts in brackets, and a text after a slash, in lower case."""
     found = re.findall(r"[\[(]([^\[\]()]*)[\])]", name)
@@ -344,10 +353,12 @@ def _meaning(name: str, unit: str) -> Meaning | None:
         return None
     if quantity == "time" and _CLOCK.match(unit):
         unit = ""
+    if quantity == "time" and not unit and rest and rest[-1] in {"us", "ms"}:  # TimeUS
+        unit, rest = rest[-1], rest[:-1]
     if unit and unit_of(FIELDS[quantity], unit) is None:
         return None
-    if not unit and any(each in FOREIGN_UNITS for each in _bracketed(name)):
-        return None
+    if not unit and any(_is_unit(each) for each in _bracketed(name)):
+        return None  # of another quantity
     return Meaning(quantity, unit, *_rank(quantity, rest))
 
 
@@ -382,7 +393,8 @@ def _symbol(tokens: list[str], name: str, unit: str) -> tuple[str | None, list[s
     """Return the quantity of a formula letter that stands alone or with a word for the pack."""
     symbols = [token for token in tokens if token in _SYMBOLS]
     others = [token for token in tokens if token not in _SYMBOLS]
-    if len(symbols) != 1 or not all(each in _PACK | _CELL or each.isdigit() for each in others):
+    plain = _PACK | _CELL | _MEAN
+    if len(symbols) != 1 or not all(each in plain or each.isdigit() for each in others):
         return None, tokens
     quantity = _SYMBOLS[symbols[0]]
     if symbols == ["t"]:
@@ -402,6 +414,8 @@ def _rank(quantity: str, rest: list[str]) -> tuple[int, bool, TemperatureSource]
         source = "room" if words & _AMBIENT else "pack" if words & _PACK else "unknown"
         source = "cell" if words & _CELL else source
         words -= {"t", "probe", "sensor", "ntc"}
+        if words & _AUXILIARY:  # a cycler's thermocouple
+            words, numbered = words - _AUXILIARY | {"thermocouple"} | _PACK_WORD, True
     is_one = not numbered or quantity == "temperature" or bool(words & _PACK) or "1" in rest
     unknown = words - _PACK - _NEUTRAL - _CELL - _AMBIENT
     if words & _EXCLUDED or "12" in rest:
@@ -487,6 +501,9 @@ def choose_columns(
         of_it.sort(key=lambda item: item[:2])
         best = [item for item in of_it if item[0] == of_it[0][0]]
         column = _plain_column(quantity, [(place, meaning) for _, place, meaning in best])
+        if column is not None and quantity == "time":
+            others = tuple(place for rank, place, _ in of_it[1:] if rank < GUESS)
+            column = replace(column, others=others)
         if column is None or best[0][0] >= GUESS or _has_siblings(quantity, of_it):
             guesses[quantity] = of_it[0][1]
         else:
@@ -522,7 +539,7 @@ def _plain_column(quantity: str, best: list[tuple[int, Meaning]]) -> ChosenColum
     """Return the column of the best meanings; None if they are several and cannot be combined."""
     place, first = best[0]
     if quantity == "time":
-        return ChosenColumn((place,), first.unit, others=tuple(each for each, _ in best[1:]))
+        return ChosenColumn((place,), first.unit)
     if len(best) > 1 and quantity == "temperature":
         celsius = [item for item in best if unit_of("temperature_c", item[1].unit) == (1.0, 0.0)]
         best = celsius or [item for item in best if item[1].unit == first.unit]

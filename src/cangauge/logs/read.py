@@ -91,7 +91,7 @@ class LogFile:
 def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
     """Return the error for a file of unknown format: its columns if it is a table."""
     headings, choice = table.likely_table(file.content, None)
-    if len(headings) >= 3:
+    if len(headings) >= 3 and not table.is_of_frames(headings):
         return InputError(
             f"{problem}: no plain heading of {missing_quantities(choice)}"
             f" (found: {shown_headings(headings)})",

@@ -62,6 +62,7 @@ _HEADER_LINES: Final = 160
 _CELLS_TRIED: Final = 60_000
 """Cells to search for a header, over all lines and delimiters: bounds the time of a search."""
 _SUB_HEADERS: Final = 4
+_FRAME_WORDS: Final = frozenset({"id", "can id", "identifier", "dlc", "len", "data", "d1"})
 _LONG_FORMAT: Final = ("entity_id", "state", "last_changed")
 _QUANTITY_UNITS: Final = {
     "time": "s", "current": "A", "voltage": "V", "temperature": "°C", "soc": "%"
@@ -246,9 +247,15 @@ def likely_table(content: FileContent, given: ColumnMap | None) -> tuple[list[st
                 if len(cells) >= 3 and sum(meaning_of(cell) is not None for cell in cells) >= 2:
                     return cells, choose_columns(cells, (), given)
             cells = split_cells(content.head[number - 1], delimiter)
-            if len(cells) >= 2:
+            is_header = sum(_is_value(cell) for cell in cells) < 0.5 * len(cells)
+            if len(cells) >= 2 and is_header:
                 return cells, choose_columns(cells, (), given)
     return [], Choice({}, {})
+
+
+def is_of_frames(headings: Sequence[str]) -> bool:
+    """Return whether headings are those of CAN frames: an id, a length or bytes."""
+    return bool(_FRAME_WORDS & {heading.strip().lower() for heading in headings})
 
 
 def is_table(content: FileContent) -> bool:

@@ -181,7 +181,7 @@ def refuse_wrong_units(
     """
 
     def refuse(field: str, problem: str, value: float, cure: str, unit: str = "") -> InputError:
-        if unit and field in labels:
+        if unit and labels.get(field, field).lower() != field:
             quantity = field.rpartition("_")[0]
             cure += f" (or state the unit: --columns '{quantity}={labels[field]}[{unit}]')"
         return InputError(
