@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime as dt
 import math
 from collections.abc import Callable
@@ -292,6 +293,21 @@ def test_table_reads_to_the_same_log(tmp_path: Path, name: str) -> None:
     assert (log.soc_pct is not None) == table.has_soc
     if log.soc_pct is not None:
         np.testing.assert_allclose(log.soc_pct, SOC_PCT, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_damaged_tables_raise_nothing_but_input_errors(tmp_path: Path, name: str) -> None:
+    table, rng = TABLES[name], np.random.default_rng(11)
+    path = tmp_path / "x.csv"
+    for _ in range(8):
+        data = bytearray(table.content)
+        for place in rng.integers(len(data), size=rng.integers(1, 5)):
+            mark = int(rng.choice(list(b",;.-\t")))
+            data[place] = int(rng.integers(256)) if rng.random() < 0.5 else mark
+        path.write_bytes(bytes(data))
+        with contextlib.suppress(InputError):
+            log = read_log(path, temperature_c=table.temperature_c, **table.options)
+            assert np.isfinite(log.voltage_v).all()
 
 
 def test_what_was_assumed_is_told(tmp_path: Path) -> None:

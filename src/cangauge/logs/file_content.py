@@ -218,8 +218,7 @@ def _only_member(archive: zipfile.ZipFile, path: Path) -> zipfile.ZipInfo:
 
 
 def _as_utf8(data: bytes) -> bytes:
-    if data.startswith(b"\xef\xbb\xbf"):
-        return data[3:]
+    data = data.removeprefix(b"\xef\xbb\xbf")
     if data[:2] in {b"\xff\xfe", b"\xfe\xff"}:  # "Unicode text" of spreadsheets
         return data.decode("utf-16", errors="replace").encode()
     try:

@@ -410,13 +410,17 @@ def _seconds(
     texts = [cell if not isinstance(cell, np.ndarray) else _as_text(cell) for cell in cells]
     joined = texts[0] if len(texts) == 1 else pc.binary_join_element_wise(*texts, " ")
     unit = column.unit if is_time_format(column.unit) else ""
+    return _read_stamps(joined, unit, columns.source, draft.labels["time_s"])
+
+
+def _read_stamps(cells: Any, unit: str, source: str, label: str) -> tuple[FloatArray, str]:
     try:
-        return seconds_of_text(joined, unit)
+        return seconds_of_text(cells, unit)
     except UnreadableStampError as error:
         raise InputError(
             f"row {error.row + 1} is not a time",
-            source=columns.source,
-            field=draft.labels["time_s"],
+            source=source,
+            field=label,
             value=error.text,
             cure="seconds, hh:mm:ss or dates are read; name another column with --columns time=…",
         ) from error
@@ -515,14 +519,15 @@ def read_long_format(content: FileContent, given: ColumnMap | None) -> DraftLog:
     if not choice.is_complete:
         raise unknown_columns(str(content.path), headings, choice)
     draft = DraftLog(content.name, str(content.path), remarks=[*columns.remarks])
-    stamps, how = seconds_of_text(pc.utf8_trim_whitespace(columns.text["last_changed"]))
+    cells = pc.utf8_trim_whitespace(columns.text["last_changed"])
+    stamps, how = _read_stamps(cells, "", columns.source, "last_changed")
     order = np.argsort(stamps, kind="stable")
     stamps, entities = stamps[order], entities[order]
     states = columns.text["state"].to_pylist()
-    cells = [states[row] for row in order.tolist()]
+    of_rows = [states[row] for row in order.tolist()]
     draft.values["time_s"], draft.labels["time_s"] = stamps, "last_changed"
     draft.assumed.append(f'time = "last_changed" [{how}]')
-    pivot = _Pivot(entities, cells, columns.source)
+    pivot = _Pivot(entities, of_rows, columns.source)
     for name, column in choice.chosen.items():
         if name == "time":
             continue
