@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import datetime as dt
 import math
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -375,6 +376,19 @@ def test_workbook_reads_as_its_longest_sheet(tmp_path: Path) -> None:
     log = read_log(tmp_path / "log.xlsx")
     assert log.time_s - log.time_s[0] == pytest.approx(TIME_S)
     assert log.current_a == pytest.approx(CURRENT_A)
+
+
+def test_workbook_that_unpacks_to_too_much_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("openpyxl")
+    path = tmp_path / "bomb.xlsx"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("xl/workbook.xml", "<workbook/>")
+        archive.writestr("xl/worksheets/sheet1.xml", b"0" * (20 << 20))
+    with pytest.raises(InputError, match="unpacks to 20 MiB"):
+        read_log(path)
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(InputError, match=r"bomb\.xlsx"):
+        read_log(path)
 
 
 def test_index_of_times_is_the_time(tmp_path: Path) -> None:

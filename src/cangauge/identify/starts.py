@@ -209,8 +209,9 @@ def unknown_start(log: Log, *, others: bool) -> InputError:
         f"{which} its SoC (soc_pct), and the curve over SoC cannot begin anywhere",
         source=log.source or log.name,
         field="soc_pct",
-        cure="give --initial-soc P, the SoC at the first row (100 for a log from full), or add a"
-        " log with its SoC: the start of the others is then estimated",
+        cure="give --initial-soc P, the SoC at the first row (100 for a log from full), name the"
+        " SoC (--columns soc=…; for captures [soc] in the map file), or add a log with its SoC: the"
+        " start of the others is then estimated",
     )
 
 
