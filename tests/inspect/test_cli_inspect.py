@@ -148,7 +148,7 @@ def test_unknown_columns_are_refused_with_a_command(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, [str(path)])
     assert isinstance(result.exception, InputError)
     assert "(found: Stempel, Wert a, Wert b)" in str(result.exception)
-    assert "--columns 'time=?,current=?,voltage=?'" in str(result.exception)
+    assert "--columns 'time=Stempel,current=?,voltage=?'" in str(result.exception)
     assert "docs/logs.md" in str(result.exception)
 
 

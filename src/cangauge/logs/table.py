@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, Final, Protocol
 
 import numpy as np
@@ -62,6 +63,8 @@ _HEADER_LINES: Final = 160
 _CELLS_TRIED: Final = 60_000
 """Cells to search for a header, over all lines and delimiters: bounds the time of a search."""
 _SUB_HEADERS: Final = 4
+_ROWS_TRIED: Final = 20
+"""Rows that a guess of the time looks at."""
 _FRAME_WORDS: Final = frozenset({"id", "can id", "identifier", "dlc", "len", "data", "d1"})
 _LONG_FORMAT: Final = ("entity_id", "state", "last_changed")
 _QUANTITY_UNITS: Final = {
@@ -237,20 +240,47 @@ def likely_table(content: FileContent, given: ColumnMap | None) -> tuple[list[st
     """Return the likeliest header of a text and its incomplete choice, for messages."""
     for number, line in enumerate(content.head[:_HEADER_LINES]):
         for delimiter in _DELIMITERS:
-            if delimiter not in line:
+            if delimiter not in line or not number:
                 continue
-            values = sum(_is_value(cell) for cell in split_cells(line, delimiter))
-            if values < 2 or not number:
+            if sum(_is_value(cell) for cell in split_cells(line, delimiter)) < 2:
                 continue
-            for above in range(number - 1, max(number - 1 - _SUB_HEADERS, -1), -1):
-                cells = split_cells(content.head[above], delimiter)
-                if len(cells) >= 3 and sum(meaning_of(cell) is not None for cell in cells) >= 2:
-                    return cells, choose_columns(cells, (), given)
-            cells = split_cells(content.head[number - 1], delimiter)
-            is_header = sum(_is_value(cell) for cell in cells) < 0.5 * len(cells)
-            if len(cells) >= 2 and is_header:
-                return cells, choose_columns(cells, (), given)
+            cells = _header_above(content, number, delimiter)
+            if cells:
+                choice = choose_columns(cells, (), given)
+                return cells, _with_guess_of_time(choice, content, number, delimiter)
     return [], Choice({}, {})
+
+
+def _header_above(content: FileContent, number: int, delimiter: str) -> list[str]:
+    """Return the cells of the header above a first row of data, [] if there is none."""
+    for above in range(number - 1, max(number - 1 - _SUB_HEADERS, -1), -1):
+        cells = split_cells(content.head[above], delimiter)
+        if len(cells) >= 3 and sum(meaning_of(cell) is not None for cell in cells) >= 2:
+            return cells
+    cells = split_cells(content.head[number - 1], delimiter)
+    is_header = sum(_is_value(cell) for cell in cells) < 0.5 * len(cells)
+    return cells if len(cells) >= 2 and is_header else []
+
+
+def _with_guess_of_time(
+    choice: Choice, content: FileContent, number: int, delimiter: str
+) -> Choice:
+    """Return the choice with the first column that increases as a guess of the time."""
+    if "time" in choice.chosen or "time" in choice.guesses:
+        return choice
+    lines = content.head[number : number + _ROWS_TRIED]
+    rows = [
+        [cell.replace(",", ".") for cell in split_cells(line, delimiter)]
+        for line in lines
+        if line.strip()
+    ]
+    taken = {place for column in choice.chosen.values() for place in column.places}
+    for place in range(min(map(len, rows), default=0)):
+        values = [float(row[place]) for row in rows if is_number(row[place])]
+        increases = all(low < high for low, high in pairwise(values))
+        if place not in taken and len(values) == len(rows) > 2 and increases:
+            return Choice(choice.chosen, {**choice.guesses, "time": place})
+    return choice
 
 
 def is_of_frames(headings: Sequence[str]) -> bool:
