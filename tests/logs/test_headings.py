@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from cangauge.logs.headings import ColumnMap, choose_columns, meaning_of, suggestion
+from cangauge.logs.column_map import ColumnMap, choose_columns, suggestion
+from cangauge.logs.headings import meaning_of
 
 SPELLINGS = {
     "Arbin": (

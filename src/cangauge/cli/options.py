@@ -122,7 +122,7 @@ class TableOptions:
         from cangauge.bus.captures.capture import find_capture  # noqa: PLC0415
         from cangauge.bus.mapping import columns_of_map  # noqa: PLC0415
         from cangauge.bus.recording import open_recording  # noqa: PLC0415
-        from cangauge.logs.headings import ColumnMap  # noqa: PLC0415
+        from cangauge.logs.column_map import ColumnMap  # noqa: PLC0415
         from cangauge.logs.read import LogFile, open_log  # noqa: PLC0415
 
         sign = cast("Literal['charge', 'discharge'] | None", self.sign)

@@ -8,10 +8,10 @@ from os import PathLike
 from typing import Any, Final
 
 from cangauge.errors import InputError
-from cangauge.logs import arrow, canonical, formats, table
+from cangauge.logs import arrow, canonical, formats, table, table_columns
+from cangauge.logs.column_map import ColumnMap, missing_quantities, shown_headings, suggestion
 from cangauge.logs.draft import DraftLog, Sign
 from cangauge.logs.file_content import FileContent
-from cangauge.logs.headings import ColumnMap, missing_quantities, shown_headings, suggestion
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.sign import resolve_sign
 from cangauge.logs.units import COLDEST_C, HOTTEST_C, known_temperature_source
@@ -96,7 +96,8 @@ def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
             f"{problem}: no plain heading of {missing_quantities(choice)}"
             f" (found: {shown_headings(headings)})",
             source=file.content.path,
-            cure=f"name the columns, e.g. {suggestion(headings, choice)} (see {table.DOCS})",
+            cure=f"name the columns, e.g. {suggestion(headings, choice)}"
+            f" (see {table_columns.DOCS})",
         )
     shown = file.content.first_line.strip()
     is_text = bool(shown) and shown.isprintable()
@@ -105,7 +106,7 @@ def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
         source=file.content.path,
         field="first line" if is_text else None,
         value=shown[:80] if is_text else None,
-        cure=f"{cure}; other tables: --columns ({table.DOCS})",
+        cure=f"{cure}; other tables: --columns ({table_columns.DOCS})",
     )
 
 
@@ -214,7 +215,7 @@ def log_of_arrow(
         draft = arrow.draft_from_table(frame, places, names, name=name, source="")
     else:
         given = None if columns is None else ColumnMap.of(columns)
-        draft = table.draft_of_arrow(frame, given, name=name, source="")
+        draft = table_columns.draft_of_arrow(frame, given, name=name, source="")
     if temperature_source is not None:
         draft.temperature_source = known_temperature_source(temperature_source)
     if sign is not None:
