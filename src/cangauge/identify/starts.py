@@ -19,6 +19,7 @@ from typing import Final, Literal
 import numpy as np
 from scipy import optimize
 
+from cangauge._formatting import significant
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.identify.voltage_fit import KT, fit_voltage_model, rising, stacked
@@ -76,7 +77,8 @@ class Start:
 
     def __str__(self) -> str:
         """Return the start of the log in a phrase."""
-        return f"{self.name} starts at {self.soc_pct:.1f} ± {self.std_pct or 0.0:.1f} %"
+        std = "" if self.std_pct is None else f" ± {significant(self.std_pct, 2)}"
+        return f"{self.name} starts at {self.soc_pct:.1f}{std} %"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
