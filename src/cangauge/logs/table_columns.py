@@ -46,6 +46,9 @@ HOLD_ENTITY_S: Final = 60.0
 """The same for recorders that store a value when it changes [s]: no longer than charge is counted
 over a gap."""
 
+SHOWN_HEADING: Final = 80
+"""Longest heading in the line that says what was assumed [characters]."""
+
 LEAF_SPY_SOC: Final = 1e-4
 """LeafSpy writes SoC in ten-thousandths of a percent."""
 
@@ -112,7 +115,8 @@ def fill_draft(
             values, unit = quantity_values(draft, name, column, columns)
         draft.values[FIELDS[name]] = values
         factor = "" if column.factor == 1.0 else f" × {column.factor:g}"
-        draft.assumed.append(f'{name} = "{label}"{factor} [{unit}]')
+        shown = label if len(label) <= SHOWN_HEADING else f"{label[:SHOWN_HEADING]}…"
+        draft.assumed.append(f'{name} = "{shown}"{factor} [{unit}]')
     _leaf_spy(draft, headings)
     current = choice.chosen["current"]
     draft.sign_unknown = current.factor > 0.0
