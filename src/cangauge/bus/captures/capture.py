@@ -18,7 +18,6 @@ from cangauge.bus.captures.readers import (
     LIBRARY_FORMATS,
     TEXT_FORMATS,
     LibraryFormat,
-    Parser,
     TextFormat,
     library_messages,
 )
@@ -34,9 +33,9 @@ FEW_MALFORMED: Final = 100
 _HEAD_LINES: Final = 400
 
 KNOWN_CAPTURES: Final = (
-    "candump (log, and screen output), CRTD, Vector ASC and BLF, PEAK TRC, ASAM MF4,"
-    " python-can's CSV, tab-separated tables, and text of seconds, id, length, bytes; each may be"
-    " gzipped"
+    "candump (log, and screen output), CRTD, SavvyCAN's GVRET CSV, CAN Hacker and CARBUS traces,"
+    " Vector ASC and BLF, PEAK TRC, ASAM MF4, python-can's CSV, tab-separated tables, and text of"
+    " seconds, id, length, bytes; each may be gzipped"
 )
 _CURE: Final = f"known are: {KNOWN_CAPTURES}"
 
@@ -139,14 +138,12 @@ class Capture:
         self._finish()
 
     def _text(self, kind: TextFormat, path: Path) -> Iterator[can.Message]:
+        parse = kind.parser(_head_lines(read_head(path)))
+        if parse is None:
+            raise _unknown(path)
         lines = LineStream(path)
-        parse: Parser | None = None
         idle = 0
         for line in lines:
-            if parse is None:
-                parse = kind.parser(line)
-                if parse is None:
-                    raise _unknown(path)
             if not line.endswith("\n") and not kind.states_length and line.strip():
                 # The last line may have lost bytes, and its format does not show it.
                 self._cut_off = True
@@ -301,17 +298,21 @@ def _recognise(head: bytes) -> TextFormat | LibraryFormat | None:
     for kind in LIBRARY_FORMATS:
         if kind.matches(head):
             return kind
-    lines = head.decode("latin-1").split("\n")[:_HEAD_LINES]
-    if len(lines) > 1:
-        lines = lines[:-1]  # the last one may be cut
+    lines = _head_lines(head)
     scores = {text.name: _score(text, lines) for text in TEXT_FORMATS}
     best = max(TEXT_FORMATS, key=lambda text: scores[text.name])
     return best if scores[best.name] > 0 else None
 
 
+def _head_lines(head: bytes) -> list[str]:
+    text = head.decode("latin-1").replace("\r\n", "\n").replace("\r", "\n")
+    lines = text.split("\n")[:_HEAD_LINES]
+    return lines[:-1] if len(lines) > 1 else lines  # the last one may be cut
+
+
 def _score(kind: TextFormat, lines: list[str]) -> int:
     """Return the number of lines that are frames; 0 if most are malformed."""
-    parse = kind.parser(lines[0])
+    parse = kind.parser(lines)
     if parse is None:
         return 0
     frames = malformed = 0

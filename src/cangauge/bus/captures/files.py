@@ -153,7 +153,7 @@ class LineStream:
         """Yield the lines with their line ends; a line beyond `MAX_LINE` comes in pieces."""
         with open_bytes(self._path) as raw:
             salvage = _Salvage(raw, self)
-            text = io.TextIOWrapper(io.BufferedReader(salvage), "latin-1", newline="\n")
+            text = io.TextIOWrapper(io.BufferedReader(salvage), "latin-1", newline=None)
             while line := text.readline(MAX_LINE):
                 self.number += 1
                 yield line

@@ -11,7 +11,7 @@ import logging
 import re
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Self
@@ -292,14 +292,14 @@ class TextFormat:
     states_length : bool
         Whether a line states its number of bytes, so that a cut line is recognised.
     parser : callable
-        Takes the first line of the file; returns the parser of lines, or None if the first line
-        is not of this format (for formats with a header).
+        Takes the first lines of the file; returns the parser of lines, or None if they are not of
+        this format (for formats with a header).
     """
 
     name: str
     stamps: Stamps
     states_length: bool
-    parser: Callable[[str], Parser | None]
+    parser: Callable[[Sequence[str]], Parser | None]
 
 
 def _data(text: str, length: int) -> bytes:
@@ -321,7 +321,7 @@ def _id(text: str) -> tuple[int, bool]:
 _SPACED = re.compile(r"(\d+\.\d+) ([0-9A-Fa-f]{8}) (\d{1,2})((?: [0-9A-Fa-f]{2})*)\s*$")
 
 
-def _spaced(_first: str) -> Parser:
+def _spaced(_head: Sequence[str]) -> Parser:
     def parse(line: str) -> can.Message | None:
         match = _SPACED.match(line)
         if match is None:
@@ -341,9 +341,9 @@ def _spaced(_first: str) -> Parser:
 _TABLE_COLUMNS: Final = ("Ch", "T/R", "Time", "CAN ID", "Len", "Data")
 
 
-def _table(first: str) -> Parser | None:
+def _table(head: Sequence[str]) -> Parser | None:
     """Tab-separated, columns by their headings, time in whole milliseconds."""
-    headings = [cell.strip() for cell in first.rstrip("\r\n").split("\t")]
+    headings = [cell.strip() for cell in head[0].rstrip("\r\n").split("\t")]
     if any(name not in headings for name in _TABLE_COLUMNS):
         return None
     channel, way, time, number, length, data = (headings.index(name) for name in _TABLE_COLUMNS)
@@ -372,7 +372,7 @@ _CRTD = re.compile(r"(\d+\.\d+) (\d*)([RT])(11|29) ([0-9A-Fa-f]{1,8})((?: [0-9A-
 _CRTD_OTHER = re.compile(r"\d+\.\d+ \d*C[A-Z]{2}\b")
 
 
-def _crtd(_first: str) -> Parser:
+def _crtd(_head: Sequence[str]) -> Parser:
     def parse(line: str) -> can.Message | None:
         match = _CRTD.match(line)
         if match is None:
@@ -403,8 +403,8 @@ _CANDUMP = re.compile(
 )
 
 
-def _candump(*, with_stamps: bool) -> Callable[[str], Parser | None]:
-    def parser(_first: str) -> Parser:
+def _candump(*, with_stamps: bool) -> Callable[[Sequence[str]], Parser | None]:
+    def parser(_head: Sequence[str]) -> Parser:
         def parse(line: str) -> can.Message | None:
             match = _CANDUMP.match(line)
             if match is None:
@@ -438,7 +438,7 @@ _CANDUMP_LOG = re.compile(
 )
 
 
-def _candump_log(_first: str) -> Parser:
+def _candump_log(_head: Sequence[str]) -> Parser:
     def parse(line: str) -> can.Message | None:
         match = _CANDUMP_LOG.match(line)
         if match is None:
@@ -462,6 +462,132 @@ def _candump_log(_first: str) -> Parser:
     return parse
 
 
+# Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8
+# 22213513,00000111,false,Rx,0,8,00,00,00,00,00,00,00,00,
+_GVRET_HEADINGS: Final = ("Time Stamp", "ID", "Extended", "Bus", "D1")
+_BYTE_ORDER_MARK: Final = "\u00ef\u00bb\u00bf"
+"""Of UTF-8, read as latin-1."""
+_SHORTEST_FRAME_S: Final = 47e-6
+"""A standard frame without data, with the pause after it: 47 bits at 1 Mbit/s, the fastest [s]."""
+_FRAMES_FOR_UNIT: Final = 100
+"""Frames of one bus from which stamps in milliseconds are told from stamps that came in bursts."""
+
+
+def _gvret(head: Sequence[str]) -> Parser | None:
+    """SavvyCAN's GVRET CSV, with and without direction; time in µs, in some exports in ms."""
+    headings = [cell.strip() for cell in head[0].removeprefix(_BYTE_ORDER_MARK).split(",")]
+    length_name = next((name for name in ("LEN", "DLC") if name in headings), "")
+    if not length_name or any(name not in headings for name in _GVRET_HEADINGS):
+        return None
+    time, number, extended, bus, first = (headings.index(name) for name in _GVRET_HEADINGS)
+    length = headings.index(length_name)
+    way = headings.index("Dir") if "Dir" in headings else None
+    per_s = 1e3 if _is_too_fast(head[1:], time, bus) else 1e6
+
+    def parse(line: str) -> can.Message | None:
+        cells = line.strip().split(",")
+        if len(cells) <= length:
+            return _blank(line)
+        if cells[number] == "ID":
+            return None
+        arbitration_id, is_large = _id(cells[number])
+        count = int(cells[length])
+        data = bytes(int(cell, 16) for cell in cells[first : first + count])
+        return can.Message(
+            timestamp=int(cells[time]) / per_s,
+            arbitration_id=arbitration_id,
+            is_extended_id=is_large or cells[extended].lower() in {"true", "1"},
+            channel=int(cells[bus]),
+            is_rx=way is None or cells[way] != "Tx",
+            is_fd=count > 8,
+            data=_data(data.hex(), count),
+        )
+
+    return parse
+
+
+def _is_too_fast(lines: Sequence[str], time: int, bus: int) -> bool:
+    """Return whether a bus cannot carry so many frames if the stamps are microseconds."""
+    stamps: dict[str, list[int]] = {}
+    for line in lines:
+        cells = line.split(",")
+        if len(cells) > max(time, bus) and cells[time].isdecimal():
+            stamps.setdefault(cells[bus], []).append(int(cells[time]))
+    return any(
+        len(each) >= _FRAMES_FOR_UNIT
+        and max(each) - min(each) < (len(each) - 1) * _SHORTEST_FRAME_S * 1e6
+        for each in stamps.values()
+    )
+
+
+# @ TEXT @ 3 @ 64 @ 0 @ 1149 @ 7459 @ 00:00:07.459 @
+# 26,641405 <tab> 1 <tab> 00000004 <tab> 112 <tab> 8 <tab> 00 20 C1 0E 01 72 89 00 <tab> …
+_CARBUS_HEADER = re.compile(r"@ TEXT @ (\d) @")
+
+
+def _carbus(head: Sequence[str]) -> Parser | None:
+    """CARBUS Analyzer (canhacker.ru): seconds and microseconds; before version 3 milliseconds."""
+    match = _CARBUS_HEADER.match(head[0])
+    if match is None:
+        return None
+    per_s = 1e6 if int(match[1]) >= 3 else 1e3
+
+    def parse(line: str) -> can.Message | None:
+        if line.startswith(("@", "#")):
+            return None
+        cells = line.split("\t")
+        if len(cells) < 6:
+            return _blank(line)
+        seconds, fraction = cells[0].split(",")
+        arbitration_id, is_large = _id(cells[3])
+        return can.Message(
+            timestamp=int(seconds) + int(fraction) / per_s,
+            arbitration_id=arbitration_id,
+            is_extended_id=is_large,
+            channel=int(cells[1]),
+            data=_data(cells[5], int(cells[4])),
+        )
+
+    return parse
+
+
+# > <tab> 2 <tab>    17:18:39.355:2240.00 <tab> St <tab> 0x112 <tab> 0 <tab> 8 <tab> FF … <tab> p:2
+# Minutes, seconds and milliseconds are not padded (17:19:9.69 is 9.069 s); after them stand the
+# microseconds since the frame before.
+_CAN_HACKER_TIME = re.compile(r"\s*(\d{1,2}):(\d{1,2}):(\d{1,2})\.(\d{1,3})(?::\d+(?:\.\d+)?)?$")
+_HALF_A_DAY_S: Final = 43200.0
+
+
+def _can_hacker(_head: Sequence[str]) -> Parser:
+    day_s, latest_s = 0.0, 0.0
+
+    def parse(line: str) -> can.Message | None:
+        nonlocal day_s, latest_s
+        cells = line.rstrip("\r\n").split("\t")
+        if cells[0] != ">":
+            return None if line.startswith("CAN speed") else _blank(line)
+        match = _CAN_HACKER_TIME.match(cells[2]) if len(cells) > 7 else None
+        if match is None or cells[3] not in {"St", "Ext"}:
+            raise ValueError("not a frame")
+        hours, minutes, seconds, milliseconds = map(int, match.groups())
+        time_s = day_s + 3600 * hours + 60 * minutes + seconds + milliseconds / 1e3
+        if time_s < latest_s - _HALF_A_DAY_S:  # past midnight
+            day_s += 2 * _HALF_A_DAY_S
+            time_s += 2 * _HALF_A_DAY_S
+        latest_s = time_s
+        length = int(cells[6])
+        arbitration_id, is_large = _id(cells[4].removeprefix("0x"))
+        return can.Message(
+            timestamp=time_s,
+            arbitration_id=arbitration_id,
+            is_extended_id=is_large or cells[3] != "St",
+            channel=int(cells[-1].removeprefix("p:")),
+            data=_data("".join(cells[7 : 7 + length]), length),
+        )
+
+    return parse
+
+
 def _blank(line: str) -> can.Message | None:
     """Return None for a blank line; raise ValueError for any other."""
     if line.strip():
@@ -472,6 +598,9 @@ def _blank(line: str) -> can.Message | None:
 TEXT_FORMATS: Final = (
     TextFormat("CRTD (OVMS)", "us", states_length=False, parser=_crtd),
     TextFormat("candump log", "us", states_length=False, parser=_candump_log),
+    TextFormat("SavvyCAN GVRET CSV", "us", states_length=False, parser=_gvret),
+    TextFormat("CARBUS Analyzer trace", "us", states_length=True, parser=_carbus),
+    TextFormat("CAN Hacker log", "ms", states_length=True, parser=_can_hacker),
     TextFormat("tab-separated table", "ms", states_length=True, parser=_table),
     TextFormat("seconds, id, length, bytes", "us", states_length=True, parser=_spaced),
     TextFormat("candump with stamps", "us", True, parser=_candump(with_stamps=True)),
