@@ -22,7 +22,7 @@ from typing import BinaryIO, Final, cast
 import can
 
 from cangauge._io import MAX_MF4_MEMORY, MF4_SILENCE_S, MF4_SILENCE_S_PER_MIB, MIB
-from cangauge.bus.captures.files import open_bytes
+from cangauge.bus.captures.reader import BinaryReader, is_whole
 from cangauge.errors import InputError
 
 _FRAME: Final = struct.Struct("<dIBBiB")
@@ -43,37 +43,51 @@ _FRAMES, _END, _DAMAGED, _MISSING = b"F", b"E", b"D", b"M"
 _FRAMES_PER_BLOCK: Final = 500
 
 
-def mf4_messages(path: Path) -> Iterator[can.Message]:
-    """Yield the frames of an MF4 file, gzipped or not.
+class Mf4Reader(BinaryReader):
+    """ASAM MF4 with bus logging."""
 
-    Raises
-    ------
-    InputError
-        If asammdf is not installed.
-    ValueError
-        Where the file is damaged, or cannot be read within bounds of time and memory.
-    """
-    with tempfile.TemporaryDirectory() as folder, open_bytes(path) as file:
-        plain = Path(folder) / "x.mf4"
-        with plain.open("wb") as copy:
-            shutil.copyfileobj(file, copy, MIB)
-        patience_s = MF4_SILENCE_S + MF4_SILENCE_S_PER_MIB * plain.stat().st_size / MIB
-        # The same interpreter and our own module: nothing in the file becomes a command.
-        with subprocess.Popen(  # noqa: S603
-            [sys.executable, "-m", "cangauge.bus.captures.mf4", str(plain)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        ) as child:
-            try:
-                yield from _received(child, path, patience_s)
-            finally:
-                child.kill()
+    name = "ASAM MF4"
+
+    @classmethod
+    def matches(cls, head: bytes) -> int:
+        """Return 1 for an MDF file, else 0."""
+        return int(head.startswith((b"MDF     ", b"UnFinMF ")))
+
+    def read(self) -> Iterator[can.Message]:
+        """Yield the frames.
+
+        Raises
+        ------
+        InputError
+            If asammdf is not installed.
+        ValueError
+            Where the file is damaged, or cannot be read within bounds of time and memory.
+        """
+        with tempfile.TemporaryDirectory() as folder:
+            plain = Path(folder) / "x.mf4"
+            with plain.open("wb") as copy:
+                shutil.copyfileobj(self.raw, copy, MIB)
+            patience_s = MF4_SILENCE_S + MF4_SILENCE_S_PER_MIB * plain.stat().st_size / MIB
+            # The same interpreter and our own module: nothing in the file becomes a command.
+            with subprocess.Popen(  # noqa: S603
+                [sys.executable, "-m", "cangauge.bus.captures.mf4", str(plain)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            ) as child:
+                try:
+                    for message in _received(child, self.source, patience_s):
+                        if is_whole(message):
+                            yield message
+                        else:
+                            self.skip(None)
+                finally:
+                    child.kill()
 
 
 def _received(
-    child: subprocess.Popen[bytes], path: Path, patience_s: float
+    child: subprocess.Popen[bytes], path: Path | None, patience_s: float
 ) -> Iterator[can.Message]:
     while True:
         what, data = _next_block(child, patience_s)
