@@ -13,7 +13,7 @@ import can
 import pytest
 from can.io.generic import MessageWriter
 
-from cangauge.bus.captures import library, pcap, registry, text
+from cangauge.bus.captures import library, mcap, pcap, registry, text
 from cangauge.bus.captures.capture import open_capture
 from cangauge.bus.captures.files import read_head
 from cangauge.bus.captures.reader import CaptureReader, LineReader
@@ -339,6 +339,12 @@ class TestCsv(Written):
     has_channels = False
 
 
+class TestMcap(Written):
+    reader = mcap.McapReader
+    writer = mcap.McapWriter
+    kinds: ClassVar = {"remote": True, "error": True, "fd": True}
+
+
 def _socketcan(frame: can.Message, order: str = ">") -> bytes:
     """Return a frame as SocketCAN hands it to libpcap."""
     flags = 0x80000000 * frame.is_extended_id | 0x40000000 * frame.is_remote_frame
@@ -434,9 +440,11 @@ class TestPcapngBigEndian(TestPcapng):
     order = ">"
 
 
-@pytest.mark.parametrize("suffix", [".crtd", ".pcap", ".pcapng"])
+@pytest.mark.parametrize("suffix", [".crtd", ".pcap", ".pcapng", ".mcap"])
 def test_python_can_finds_our_readers(tmp_path: Path, suffix: str) -> None:
-    made = {".crtd": TestCrtd, ".pcap": TestPcap, ".pcapng": TestPcapng}[suffix]()
+    made = {
+        ".crtd": TestCrtd, ".pcap": TestPcap, ".pcapng": TestPcapng, ".mcap": TestMcap
+    }[suffix]()  # fmt: skip
     path = tmp_path / f"drive{suffix}"
     made.write(path, frames_of())
     packed = tmp_path / f"drive{suffix}.gz"

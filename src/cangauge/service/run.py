@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cangauge._formatting import number
 from cangauge._io import check_writable
@@ -20,7 +20,7 @@ from cangauge._logging import emit
 from cangauge.bus.reconnect import ReconnectingBus
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimation.validity import reason_names
+from cangauge.estimation.validity import Estimate, reason_names
 from cangauge.model.model_file import Model
 from cangauge.service.addresses import default_path, has_unix_sockets
 from cangauge.service.config import RunConfig, config_keys, load_config
@@ -31,6 +31,9 @@ from cangauge.service.pipeline import Pipeline
 from cangauge.service.recording import Recorder
 from cangauge.service.state import StateKeeper, check_state_path
 from cangauge.service.status import Identity, Monitor, Snapshot
+
+if TYPE_CHECKING:
+    from cangauge.service.estimate_table import EstimateWriter
 
 _LOG = logging.getLogger(__name__)
 
@@ -144,7 +147,7 @@ class Service:
             monitor = stack.enter_context(self._supervised(port, recorder))
             outputs = Outputs(
                 record=recorder,
-                table=None if table is None else table.add,
+                table=self._rows(table, recorder),
                 show=self._each_turn(monitor, recorder),
                 checkpoint=None if keeper is None else keeper.checkpoint,
                 reload=lambda: self._reload_for(monitor) if hangup() else None,
@@ -218,6 +221,23 @@ class Service:
                 method=self.pipeline.settings.estimator.method,
             )
         return settings
+
+    def _rows(
+        self, table: EstimateWriter | None, recorder: Recorder | None
+    ) -> Callable[[float, Estimate], None] | None:
+        """Return what takes each sample's estimate: the table, the recording, both or none."""
+        if recorder is None or not recorder.keeps_estimates:
+            return None if table is None else table.add
+        pipeline = self.pipeline
+
+        def add(time_s: float, estimate: Estimate) -> None:
+            if table is not None:
+                table.add(time_s, estimate)
+            if pipeline.latest_sample is not None:
+                soc_pct = pipeline.decoder.reference_soc_pct
+                recorder.write_estimate(pipeline.latest_sample, soc_pct, estimate)
+
+        return add
 
     def _each_turn(self, monitor: Monitor, recorder: Recorder | None) -> Callable[[float], None]:
         def turn(now_s: float) -> None:

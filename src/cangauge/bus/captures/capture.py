@@ -24,8 +24,8 @@ CLOCK_PERIOD_S: Final = 0.010
 
 KNOWN_CAPTURES: Final = (
     "candump (log, and screen output), CRTD, SavvyCAN's GVRET CSV, CAN Hacker and CARBUS traces,"
-    " Vector ASC and BLF, PEAK TRC, PCAP and PCAPNG, ASAM MF4, python-can's CSV, tab-separated"
-    " tables, and text of seconds, id, length, bytes; each may be gzipped"
+    " Vector ASC and BLF, PEAK TRC, PCAP and PCAPNG, ASAM MF4, MCAP, python-can's CSV,"
+    " tab-separated tables, and text of seconds, id, length, bytes; each may be gzipped"
 )
 _CURE: Final = f"known are: {KNOWN_CAPTURES}"
 

@@ -7,6 +7,7 @@ from importlib.metadata import entry_points
 from typing import Final
 
 from cangauge.bus.captures import library, text
+from cangauge.bus.captures.mcap import McapReader
 from cangauge.bus.captures.mf4 import Mf4Reader
 from cangauge.bus.captures.pcap import PcapReader
 from cangauge.bus.captures.reader import CaptureReader
@@ -23,6 +24,7 @@ _MARKED: Final[tuple[type[CaptureReader], ...]] = (
     Mf4Reader,
     library.CsvReader,
     PcapReader,
+    McapReader,
 )
 # The one with most frames in the beginning of a file is taken, the first of equals.
 _TEXTS: Final[tuple[type[CaptureReader], ...]] = (
