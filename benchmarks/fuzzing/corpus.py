@@ -199,6 +199,15 @@ def log_files() -> dict[str, bytes]:
         )
         + b"Total Number of Data Lines in the Database: 0000000012\n",
     }
+    files["x.bdf.csv"] = _table(
+        "Test Time / s,Voltage / V,Current / A,Cycle Count / 1,Ambient Temperature / degC,"
+        "Surface Temperature T1 / degC",
+        "{t},{u},{n},1,21,{T}",
+    )
+    files["bds.csv"] = _table(
+        "test_time_s,voltage_v,current_a,date_time,ambient_temperature_deg_c,temperature_t1_deg_c",
+        "{t},{u},{n},,{T},",
+    )
     for spelling, (head, row) in d3.items():
         files[f"{spelling} Test Data.txt"] = _table(head, row, "\r\n")
     files["log.csv.gz"] = gzip.compress(files["log.csv"], mtime=0)

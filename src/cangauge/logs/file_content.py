@@ -177,7 +177,7 @@ def _first_lines(beginning: bytes) -> tuple[str, ...]:
 
 
 def _stem(name: str) -> str:
-    for suffix in (".gz", ".zip", ".csv", ".txt", ".tsv", ".parquet", ".pq", ".dat"):
+    for suffix in (".gz", ".zip", ".csv", ".txt", ".tsv", ".parquet", ".pq", ".dat", ".bdf"):
         if name.lower().endswith(suffix):
             name = name[: -len(suffix)]
     return name.removesuffix(" Test Data")

@@ -17,15 +17,16 @@ from cangauge.logs.units import COLDEST_C, HOTTEST_C, known_temperature_source
 
 KNOWN_LOGS: Final = (
     "canonical Parquet and CSV (time_s, current_a, voltage_v, temperature_c, soc_pct), ANL D3"
-    " tests, BMW i3 trips, Arbin, Bitrode and VisuaLCN exports"
+    " tests, BMW i3 trips, Arbin, Bitrode and VisuaLCN exports, Battery Data Format"
 )
 
 _Reader = Callable[[FileContent], DraftLog]
 _TEXT_FORMATS: Final[tuple[tuple[Callable[[FileContent], bool], _Reader], ...]] = (
     (formats.is_bmw_i3, formats.read_bmw_i3),
     (formats.is_d3, formats.read_d3),
-    (canonical.is_canonical_csv, canonical.read_csv),
+    # Before the canonical log, whose names battery-data-standard partly shares.
     (formats.is_cycler, formats.read_cycler),
+    (canonical.is_canonical_csv, canonical.read_csv),
 )
 
 
