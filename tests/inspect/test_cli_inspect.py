@@ -68,7 +68,9 @@ def test_a_temperature_is_taken_where_the_file_has_none(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("option", ["--vehicle", "--dbc", "--map"])
 def test_a_log_needs_no_vehicle(path: Path, option: str) -> None:
-    result = CliRunner().invoke(app, [str(path), option, "x", "--json"])
+    given = path.with_name("given.toml")
+    given.write_text('[current]\nsignal = "x"\n')
+    result = CliRunner().invoke(app, [str(path), option, str(given), "--json"])
     assert isinstance(result.exception, InputError)
     assert result.exception.field == option
     assert result.stdout == ""
@@ -110,3 +112,37 @@ def test_a_nested_result_is_shown_whole() -> None:
         "one [remark]",
     ):
         assert words in buffer.getvalue()
+
+
+LOGGER = "Stempel;Wert a;Wert b\n" + "".join(
+    f"{k};{1000 * (10 - 50 * (k % 2))};{384 - 5 * (k % 2)}\n" for k in range(60)
+)
+"""Discharge negative, in mA."""
+
+
+@pytest.mark.parametrize("way", ["option", "map"])
+def test_columns_by_option_or_map_file_read_a_table(tmp_path: Path, way: str) -> None:
+    path = tmp_path / "logger.csv"
+    path.write_text(LOGGER)
+    options = ["--columns", "time=Stempel,current=Wert a[mA],voltage=Wert b"]
+    if way == "map":
+        (tmp_path / "car.toml").write_text(
+            '[columns]\ntime = "Stempel"\ncurrent = "Wert a[mA]"\nvoltage = "Wert b"\n'
+        )
+        options = ["--map", str(tmp_path / "car.toml")]
+    result = CliRunner().invoke(app, [str(path), *options, "--temperature", "20", "--json"])
+    found = json.loads(result.stdout)
+    assert found["channels"]["current_a"]["maximum"] == 40.0
+    (assumed,) = found["assumed"].values()
+    assert 'current = "Wert a" [mA]' in assumed
+    assert "positive current charges, found from the data" in assumed
+
+
+def test_unknown_columns_are_refused_with_a_command(tmp_path: Path) -> None:
+    path = tmp_path / "logger.csv"
+    path.write_text(LOGGER)
+    result = CliRunner().invoke(app, [str(path)])
+    assert isinstance(result.exception, InputError)
+    assert "(found: Stempel, Wert a, Wert b)" in str(result.exception)
+    assert "--columns 'time=?,current=?,voltage=?'" in str(result.exception)
+    assert "docs/logs.md" in str(result.exception)

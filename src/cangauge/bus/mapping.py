@@ -26,8 +26,12 @@ A map file in TOML, for any car with a DBC::
     signal = "PackTemperature"      # or: fixed_c = 21.5
     when = { Selector = 2 }         # only in frames where this signal has this raw value
 
-    [soc_reference]                 # optional, for comparison
+    [soc]                           # optional: the car's own, to begin from and to compare with
     signal = "DisplaySoc"
+
+    [columns]                       # optional: columns of this car's logs that are tables
+    time = "Timestamp"
+    current = "PackCurrent[mA]:-1"  # heading, unit, factor; or { heading = …, unit = …, sign = -1 }
 
     [messages.BMS_Status]           # optional
     protection = "my_rule"          # leaf, generic, crc_only, counter, e2e_01, e2e_02, e2e_04,
@@ -59,12 +63,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 from cantools.database.can import Message
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
+from cangauge._config import read_toml
 from cangauge.bus import database
 from cangauge.bus.protection import (
     LIST_LENGTH,
@@ -77,6 +83,7 @@ from cangauge.bus.protection import (
     ProtectionRule,
 )
 from cangauge.errors import InputError
+from cangauge.logs.headings import ColumnMap
 from cangauge.logs.log import TemperatureSource
 
 PAIR_WITHIN_S: Final = 0.020
@@ -346,7 +353,9 @@ class VehicleMap(_Strict):
     temperature : TemperatureMap, optional
         Without it, a fixed temperature must be given as an option.
     soc_reference : SignalMap, optional
-        The car's own state of charge, for comparison.
+        The car's own state of charge, to begin from and to compare with; also named `soc`.
+    columns : dict
+        Columns of the car's logs that are tables (`logs.headings.ColumnMap`).
     temperature_source : {"cell", "pack", "coolant", "room", "unknown"}
     pair_within_s : float
         Largest distance in bus time between paired current and voltage [s].
@@ -360,7 +369,10 @@ class VehicleMap(_Strict):
     current: SignalMap
     voltage: SignalMap
     temperature: TemperatureMap | None = None
-    soc_reference: SignalMap | None = None
+    soc_reference: SignalMap | None = Field(
+        default=None, validation_alias=AliasChoices("soc_reference", "soc")
+    )
+    columns: dict[str, Any] | None = None
     temperature_source: TemperatureSource = "unknown"
     pair_within_s: Annotated[FiniteFloat, Field(ge=0.0, le=1.0)] = PAIR_WITHIN_S
     messages: dict[str, MessageMap] = Field(default_factory=dict)
@@ -369,9 +381,31 @@ class VehicleMap(_Strict):
     @model_validator(mode="before")
     @classmethod
     def _single_dbc(cls, data: object) -> object:
-        if isinstance(data, dict) and isinstance(data.get("dbc"), str):
-            return {**data, "dbc": (data["dbc"],)}
-        return data
+        if not isinstance(data, dict):
+            return data
+        if isinstance(data.get("dbc"), str):
+            data = {**data, "dbc": (data["dbc"],)}
+        # `soc = "DisplaySoc"` is short for a table with the signal alone.
+        roles = ("current", "voltage", "temperature", "soc", "soc_reference")
+        short = {name: {"signal": data[name]} for name in roles if isinstance(data.get(name), str)}
+        return {**data, **short}
+
+
+def columns_of_map(path: Path | str) -> ColumnMap | None:
+    """Return `[columns]` of a map file, or None; the file may hold nothing else.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or a column is not understood.
+    """
+    columns = read_toml(path).get("columns")
+    if columns is None:
+        return None
+    where = f"{path}: columns"
+    if not isinstance(columns, dict):
+        raise InputError("must be a table", field=where, cure='write [columns], then time = "…"')
+    return ColumnMap.of(columns, where)
 
 
 @dataclass(frozen=True, slots=True)

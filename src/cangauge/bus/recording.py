@@ -7,11 +7,11 @@ samples lack.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from can.typechecking import Channel
@@ -31,6 +31,7 @@ from cangauge.bus.time_source import TimeSource, TimeSourceName, time_source
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.validity import Sample
+from cangauge.logs.draft import Sign
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.read import KNOWN_LOGS, LogFile, not_recognised, open_log
 from cangauge.logs.sign import resolve_sign
@@ -46,12 +47,15 @@ def read_recording(
     *,
     temperature_c: float | None = None,
     temperature_source: TemperatureSource | None = None,
+    columns: Mapping[str, Any] | str | None = None,
+    sign: Sign | None = None,
 ) -> Log:
     """Read a log, or a CAN capture by its vehicle; the format is recognised by content.
 
     Logs: canonical Parquet and CSV, ANL D3 tests, BMW i3 trips, exports of Arbin, Bitrode and
-    VisuaLCN cyclers; plain, gzipped or in a zip. Captures: candump, CRTD, ASC, BLF, TRC, MF4, CSV;
-    plain or gzipped. `Log.remarks` lists what was dropped, converted or assumed.
+    VisuaLCN cyclers, tables with plain headings or `columns`; plain, gzipped or in a zip.
+    Captures: candump, CRTD, ASC, BLF, TRC, MF4, CSV; plain or gzipped. `Log.remarks` lists what
+    was dropped, converted or assumed.
 
     Parameters
     ----------
@@ -63,6 +67,12 @@ def read_recording(
         Constant temperature [°C], in place of the recording's own.
     temperature_source : {"cell", "pack", "coolant", "room", "unknown"}, optional
         Location of the temperature sensor, in place of the recording's own.
+    columns : mapping or str, optional
+        Columns of a table: {"current": "I_batt[mA]:-1"} or "time=t,current=I_batt[mA]:-1"; heading,
+        unit and factor. What it leaves out is found by plain headings.
+    sign : {"charge", "discharge"}, optional
+        What a positive current in a log does; by default as the format defines it, or found from
+        the data.
 
     Returns
     -------
@@ -90,8 +100,9 @@ def read_recording(
     >>> log.name, log.current_a
     ('drive', array([10., 30.]))
     """
+    tabular = columns is not None or sign is not None
     return log_of(
-        open_recording(path),
+        open_log(path, columns=columns, sign=sign) if tabular else open_recording(path),
         vehicle,
         temperature_c=temperature_c,
         temperature_source=temperature_source,
@@ -360,7 +371,7 @@ def capture_to_log(
     voltage_v = _filled_voltage(time_s, samples.voltage_v[keep], path, vehicle, remarks)
     temperature_c = _filled_temperature(samples.temperature_c[keep], path, vehicle, remarks)
     complete = np.isfinite(voltage_v)
-    values = {
+    values: dict[str, Any] = {
         "time_s": time_s[complete],
         "current_a": samples.current_a[keep][complete],
         "voltage_v": voltage_v[complete],

@@ -14,16 +14,20 @@ from rich.progress import Progress
 from cangauge._formatting import number
 from cangauge._io import atomic_path
 from cangauge.bus.captures.capture import Capture
-from cangauge.bus.recording import capture_without_vehicle, open_recording
+from cangauge.bus.recording import capture_without_vehicle
 from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.options import (
+    ColumnsOption,
     DbcOption,
     JsonOption,
     MapOption,
     ReportOption,
+    SignOption,
+    TableOptions,
     TemperatureOption,
     TemperatureSourceOption,
     VehicleOption,
+    assumed_of,
     check_outputs,
     known_temperature_source,
     load_log,
@@ -99,6 +103,8 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     vehicle: VehicleOption = None,
     dbc: DbcOption = None,
     map_file: MapOption = None,
+    columns: ColumnsOption = None,
+    sign: SignOption = None,
     temperature: TemperatureOption = None,
     temperature_source: TemperatureSourceOption = None,
     report: ReportOption = None,
@@ -134,7 +140,8 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     )
     check_outputs([output, report], [log_path, model_path])
     model = Model.load(model_path)
-    if isinstance(open_recording(log_path), Capture):
+    assumed: dict[str, list[str]] = {}
+    if isinstance(TableOptions(columns, sign, map_file).open(log_path), Capture):
         if (vehicle, dbc, map_file) == (None, None, None):
             raise capture_without_vehicle(log_path)
         car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature)
@@ -151,8 +158,11 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
             map_file=map_file,
             temperature_c=temperature,
             temperature_source=temperature_source,
+            columns=columns,
+            sign=sign,
             refuse_inverted=True,
         )
+        assumed = assumed_of([log])
         with _progress(len(log)) as progress:
             done = estimate_recorded_log(
                 log,
@@ -184,7 +194,8 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     for warning in done.warnings:
         note(f"warning: {done.recorded.source}: {warning}")
     if json_output:
-        emit_json(done.to_dict() | {"output": str(output), "report": report and str(report)})
+        written = {"output": str(output), "report": report and str(report), "assumed": assumed}
+        emit_json(done.to_dict() | written)
         return
     _show(done)
     note(f"estimates: {output}" + (f"\nreport: {report}" if report else ""))

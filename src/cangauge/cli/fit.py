@@ -11,13 +11,16 @@ import typer
 from cangauge._formatting import number, significant, span
 from cangauge._io import write_texts_atomic
 from cangauge.cli.options import (
+    ColumnsOption,
     DbcOption,
     JsonOption,
     MapOption,
     ReportOption,
+    SignOption,
     TemperatureOption,
     TemperatureSourceOption,
     VehicleOption,
+    assumed_of,
     check_outputs,
     load_log,
     within,
@@ -90,6 +93,8 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
     vehicle: VehicleOption = None,
     dbc: DbcOption = None,
     map_file: MapOption = None,
+    columns: ColumnsOption = None,
+    sign: SignOption = None,
     temperature: TemperatureOption = None,
     temperature_source: TemperatureSourceOption = None,
     report: ReportOption = None,
@@ -132,6 +137,8 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
                     map_file=map_file,
                     temperature_c=temperature,
                     temperature_source=temperature_source,
+                    columns=columns,
+                    sign=sign,
                     refuse_inverted=True,
                 )
             )
@@ -167,7 +174,11 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         {output: result.model.to_json()} | ({report: page} if report and page else {})
     )
     if json_output:
-        extra: dict[str, object] = {"model": str(output), "report": report and str(report)}
+        extra: dict[str, object] = {
+            "model": str(output),
+            "report": report and str(report),
+            "assumed": assumed_of(recorded),
+        }
         if search is not None:
             extra["delay_search"] = [
                 {"delays_s": tried, "held_out_rmse_v": error} for tried, error in _best(search)

@@ -10,13 +10,16 @@ import typer
 from cangauge._formatting import NONE_KNOWN, number, printable
 from cangauge._io import write_texts_atomic
 from cangauge.cli.options import (
+    ColumnsOption,
     DbcOption,
     JsonOption,
     MapOption,
     ReportOption,
+    SignOption,
     TemperatureOption,
     TemperatureSourceOption,
     VehicleOption,
+    assumed_of,
     check_outputs,
     load_log,
     within,
@@ -64,6 +67,8 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     vehicle: VehicleOption = None,
     dbc: DbcOption = None,
     map_file: MapOption = None,
+    columns: ColumnsOption = None,
+    sign: SignOption = None,
     temperature: TemperatureOption = None,
     temperature_source: TemperatureSourceOption = None,
     report: ReportOption = None,
@@ -99,6 +104,8 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
             map_file=map_file,
             temperature_c=temperature,
             temperature_source=temperature_source,
+            columns=columns,
+            sign=sign,
             refuse_inverted=True,
         )
 
@@ -117,7 +124,8 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
         texts[report] = gap_report(found, InputFile.of_model(model_file, model))
     write_texts_atomic(texts)
     if json_output:
-        emit_json(found.to_dict(None if extended is None else str(extended)))
+        result = found.to_dict(None if extended is None else str(extended))
+        emit_json(result | {"assumed": assumed_of([*diagnosed, *references])})
         return
     _show(found)
     for written in (extended, report):

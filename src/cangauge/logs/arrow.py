@@ -29,6 +29,11 @@ _FIELDS: Final = (*REQUIRED, "soc_pct", SOURCE)
 _METADATA_KEY: Final = b"cangauge.temperature_source"
 
 
+def is_canonical(names: Sequence[str]) -> bool:
+    """Return whether columns have the names of a canonical log's, possibly an incomplete one."""
+    return len({name.strip().lower() for name in names} & set(REQUIRED)) >= 2
+
+
 def find_fields(names: Sequence[str], where: str) -> dict[str, int]:
     """Return the index of each canonical column that is present.
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
-from typing import Final, cast
+from typing import Any, Final, cast
 
 from cangauge._io import (
     MAX_LOG_BYTES,
@@ -22,11 +22,12 @@ from cangauge._io import (
 )
 from cangauge.errors import InputError
 
+_WORKBOOK: Final = "xl/workbook.xml"
 _ZIP: Final = b"PK\x03\x04"
 _PARQUET: Final = b"PAR1"
 _DELIMITERS: Final = ("\t", ";", ",")
 _HEAD_BYTES: Final = 64 * 1024
-_HEAD_LINES: Final = 60
+_HEAD_LINES: Final = 160
 _D3_MEMBER: Final = "test data.txt"
 # An LZMA member sets the memory of its reader; no exporter writes one.
 _ZIP_METHODS: Final = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -67,6 +68,10 @@ class FileContent:
                 file.read(1)  # raises if the file is damaged, not empty
         if not beginning.strip():
             raise InputError("the file is empty", source=self.path, cure="check the export")
+        self._sheet: bytes | None = None
+        if beginning.startswith(_ZIP):  # not unpacked: a workbook
+            self._sheet = sheet_text(self.path)
+            beginning = self._sheet[:_HEAD_BYTES]
         self.is_parquet = beginning.startswith(_PARQUET)
         self.head = () if self.is_parquet else _first_lines(beginning)
 
@@ -83,6 +88,8 @@ class FileContent:
         InputError
             If the file is damaged, or larger than a log may be.
         """
+        if self._sheet is not None:
+            return self._sheet
         with self._open() as file:
             data = read_all(file, self.path, MAX_LOG_BYTES, "a log")
         return data if self.is_parquet else _as_utf8(data)
@@ -99,6 +106,10 @@ class FileContent:
                 kind = "zip "
                 packed = io.BytesIO(read_all(file, self.path, MAX_LOG_BYTES, "a log"))
             with zipfile.ZipFile(packed) as archive:
+                if _WORKBOOK in archive.namelist():
+                    packed.seek(0)
+                    yield io.BufferedReader(packed)
+                    return
                 member = _only_member(archive, self.path)
                 self.name = _stem(Path(member.filename).name)
                 size = packed.getbuffer().nbytes
@@ -113,6 +124,58 @@ class FileContent:
             ) from error
         except (RuntimeError, NotImplementedError) as error:  # encrypted; unknown compression
             raise InputError(f"the zip cannot be unpacked: {error}", source=self.path) from error
+
+
+def sheet_text(path: Path) -> bytes:
+    """Return the longest sheet of an Excel workbook as tab-separated text.
+
+    Raises
+    ------
+    InputError
+        If the extra is not installed, or the workbook is damaged or larger than a log may be.
+    """
+    try:
+        import openpyxl  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise InputError(
+            "reading a workbook needs openpyxl",
+            source=path,
+            cure="install the extra: pip install 'cangauge[excel]', or export the sheet as CSV",
+        ) from error
+    try:
+        _refuse_large(path)
+        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
+        texts = [_sheet_rows(sheet) for sheet in book.worksheets]
+    except InputError:
+        raise
+    except Exception as error:  # openpyxl raises whatever a damaged part provokes
+        raise InputError(
+            f"the workbook is damaged ({type(error).__name__})",
+            source=path,
+            cure="save it again, or export the sheet as CSV",
+        ) from error
+    return max(texts, key=lambda text: text.count(b"\n"), default=b"")
+
+
+def _refuse_large(path: Path) -> None:
+    with zipfile.ZipFile(path) as archive:
+        unpacked = sum(info.file_size for info in archive.infolist())
+    if unpacked > MAX_LOG_BYTES:
+        raise InputError(
+            f"the workbook unpacks to more than the {MAX_LOG_BYTES >> 20} MiB of a log",
+            source=path,
+            cure="export the sheet as CSV",
+        )
+
+
+def _sheet_rows(sheet: Any) -> bytes:
+    lines = io.StringIO()
+    writer = csv.writer(lines, delimiter="\t", lineterminator="\n")
+    for row in sheet.iter_rows(values_only=True):
+        cells = ["" if cell is None else str(cell) for cell in row]
+        if any(cells):
+            writer.writerow(cells)
+    return lines.getvalue().encode()
 
 
 def delimiter_of(line: str) -> str | None:
@@ -177,7 +240,19 @@ def _first_lines(beginning: bytes) -> tuple[str, ...]:
 
 
 def _stem(name: str) -> str:
-    for suffix in (".gz", ".zip", ".csv", ".txt", ".tsv", ".parquet", ".pq", ".dat", ".bdf"):
+    for suffix in (
+        ".gz",
+        ".zip",
+        ".csv",
+        ".txt",
+        ".tsv",
+        ".parquet",
+        ".pq",
+        ".dat",
+        ".xlsx",
+        ".mpt",
+        ".bdf",
+    ):
         if name.lower().endswith(suffix):
             name = name[: -len(suffix)]
     return name.removesuffix(" Test Data")

@@ -278,7 +278,16 @@ _BITRODE: Final = _Cycler(
     "Bitrode", "time(s)", "current(a)", "voltage(v)", "exclude", -1.0, set_point=_HPPC
 )
 _CYCLERS: Final = (
-    _Cycler("Arbin", "test_time(s)", "current(a)", "voltage(v)", "step_index", -1.0, _SIGNED),
+    _Cycler(
+        "Arbin",
+        "test_time(s)",
+        "current(a)",
+        "voltage(v)",
+        "step_index",
+        -1.0,
+        set_point=_SIGNED,
+        sensors="aux_temperature",
+    ),
     _Cycler("ESC dynamic test", "time", "current", "voltage", "disah", +1.0, _SIGNED),
     _BITRODE,
     _Cycler(

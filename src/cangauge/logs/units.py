@@ -24,29 +24,49 @@ REQUIRED: Final = ("time_s", "current_a", "voltage_v", "temperature_c")
 # Spelling (lower case, without blanks) -> (factor, offset) to the unit of the canonical log.
 _UNITS: Final[dict[str, dict[str, tuple[float, float]]]] = {
     "time_s": {
-        **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), (1.0, 0.0)),
-        **dict.fromkeys(("ms", "msec"), (1e-3, 0.0)),
-        **dict.fromkeys(("min", "minutes"), (60.0, 0.0)),
-        **dict.fromkeys(("h", "hr", "hours"), (3600.0, 0.0)),
+        **dict.fromkeys(("s", "sec", "secs", "second", "seconds", "sek", "sekunden"), (1.0, 0.0)),
+        **dict.fromkeys(("ms", "msec", "millis", "milliseconds"), (1e-3, 0.0)),
+        **dict.fromkeys(("us", "µs", "μs", "usec", "microseconds"), (1e-6, 0.0)),
+        **dict.fromkeys(("ns", "nanoseconds"), (1e-9, 0.0)),
+        **dict.fromkeys(("min", "mins", "minutes", "minuten"), (60.0, 0.0)),
+        **dict.fromkeys(("h", "hr", "hrs", "hours", "stunden"), (3600.0, 0.0)),
+        **dict.fromkeys(("d", "days"), (86400.0, 0.0)),
     },
     "current_a": {
-        **dict.fromkeys(("a", "amp", "amps"), (1.0, 0.0)),
+        **dict.fromkeys(("a", "amp", "amps", "ampere", "adc"), (1.0, 0.0)),
         "ma": (1e-3, 0.0),
+        "ka": (1e3, 0.0),
     },
     "voltage_v": {
         **dict.fromkeys(("v", "volt", "volts"), (1.0, 0.0)),
         "mv": (1e-3, 0.0),
+        "vdc": (1.0, 0.0),
+        "kv": (1e3, 0.0),
     },
     "temperature_c": {
-        **dict.fromkeys(("c", "°c", "degc", "deg c", "celsius", "\ufffdc"), (1.0, 0.0)),
+        **dict.fromkeys(
+            ("c", "°c", "degc", "deg c", "deg. c", "celsius", "grad c", "℃", "º c", "ºc", "â°c"),
+            (1.0, 0.0),
+        ),
+        **dict.fromkeys(("\ufffdc", "grad celsius", "deg_c"), (1.0, 0.0)),
         **dict.fromkeys(("k", "kelvin"), (1.0, -273.15)),
-        **dict.fromkeys(("f", "°f", "degf", "fahrenheit"), (5.0 / 9.0, -160.0 / 9.0)),
+        **dict.fromkeys(
+            ("f", "°f", "degf", "deg f", "fahrenheit", "℉", "ºf", "â°f", "\ufffdf"),
+            (5.0 / 9.0, -160.0 / 9.0),
+        ),
     },
     "soc_pct": {
-        **dict.fromkeys(("%", "per", "pct", "percent"), (1.0, 0.0)),
-        **dict.fromkeys(("1", "-"), (100.0, 0.0)),
+        **dict.fromkeys(("%", "per", "pct", "percent", "prozent"), (1.0, 0.0)),
+        **dict.fromkeys(("1", "-", "0-1", "0..1", "fraction", "ratio", "pu"), (100.0, 0.0)),
     },
 }
+
+_FOREIGN: Final = (
+    "w kw wh kwh ah mah as nm rpm km/h kmh mph hz khz pa bar mbar ohm mohm ω mω v/s a/s k/s wh/kg"
+    " ah/kg mah/g m m/s kg l deg"
+)
+FOREIGN_UNITS: Final = frozenset(_FOREIGN.split())
+"""Units of quantities that no log holds; a heading with one of them is none of its columns."""
 
 # Plausible values, from a cell of 2 V to a truck's pack of 1000 V.
 MAX_VOLTAGE_V: Final = 1500.0
@@ -87,6 +107,17 @@ def known_temperature_source(
     return cast("TemperatureSource", word)
 
 
+def unit_of(field: str, unit: str) -> tuple[float, float] | None:
+    """Return (factor, offset) from a unit to the canonical one of a field; None if unknown.
+
+    Examples
+    --------
+    >>> unit_of("current_a", "mA")
+    (0.001, 0.0)
+    """
+    return _UNITS[field].get(" ".join(unit.lower().split()))
+
+
 def convert(
     values: FloatArray, field: str, unit: str, *, source: object, label: str
 ) -> tuple[FloatArray, str | None]:
@@ -112,19 +143,18 @@ def convert(
     InputError
         If the unit is not known for this quantity.
     """
-    spelling = unit.strip().lower()
-    if not spelling:
+    if not unit.strip():
         return values, None
-    try:
-        factor, offset = _UNITS[field][spelling]
-    except KeyError:
+    found = unit_of(field, unit)
+    if found is None:
         raise InputError(
             f"the unit is not known for {field}",
             source=str(source),
             field=label,
             value=unit,
             cure=f"convert it to one of: {', '.join(_UNITS[field])}",
-        ) from None
+        )
+    factor, offset = found
     if (factor, offset) == (1.0, 0.0):
         return values, None
     return values * factor + offset, f"{label}: converted from {unit} to {field}"

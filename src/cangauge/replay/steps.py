@@ -74,18 +74,18 @@ class LogSource:
 
     def __init__(self, log: Log, vehicle: Vehicle) -> None:
         self.name = log.name
-        self._log = log
+        self.log = log
         self.vehicle = vehicle
         FrameEncoder(vehicle).check_range(log)
 
     @property
     def duration_s(self) -> float:
         """Length [s]."""
-        return self._log.duration_s
+        return self.log.duration_s
 
     def steps(self, *, loop: bool) -> Iterator[Step]:
         """Yield a step per row; repetitions follow one typical step later."""
-        log = self._log
+        log = self.log
         soc_pct = np.full(len(log), math.nan) if log.soc_pct is None else log.soc_pct
         columns = (log.time_s, log.current_a, log.voltage_v, log.temperature_c, soc_pct)
         rows = list(zip(*(column.tolist() for column in columns), strict=True))
