@@ -10,12 +10,13 @@ from __future__ import annotations
 import io
 import json
 import math
+import struct
 import zlib
 from collections.abc import Iterator, Mapping
 from os import PathLike
 from typing import Any, Final, NamedTuple
 
-from cangauge._io import MAX_MCAP_RECORD
+from cangauge._io import MAX_MCAP_RECORD, MIB
 from cangauge.errors import InputError
 
 MAGIC: Final = b"\x89MCAP0\r\n"
@@ -103,56 +104,78 @@ def read_messages(file: Any, path: str | PathLike[str] | None) -> Iterator[McapM
     mcap = _need_mcap(path)
     schemas: dict[int, str] = {0: ""}
     channels: dict[int, Any] = {}
-    reader = mcap.stream_reader.StreamReader(
-        file, emit_chunks=True, record_size_limit=MAX_MCAP_RECORD
-    )
+    if file.read(len(MAGIC)) != MAGIC:
+        raise ValueError("it does not begin as an MCAP file")
     try:
-        for outer in reader.records:
-            is_chunk = isinstance(outer, mcap.records.Chunk)
-            for record in _chunk_records(mcap, outer) if is_chunk else (outer,):
-                if isinstance(record, mcap.records.Schema):
-                    schemas[record.id] = record.name
-                elif isinstance(record, mcap.records.Channel):
-                    channels[record.id] = record
-                elif isinstance(record, mcap.records.Message):
-                    channel = channels[record.channel_id]
-                    yield McapMessage(
-                        channel.topic,
-                        schemas.get(channel.schema_id, ""),
-                        channel.message_encoding,
-                        record.log_time,
-                        record.data,
-                    )
-    except mcap.exceptions.EndOfFile as error:
+        for record in _records(mcap, file):
+            if isinstance(record, mcap.records.Schema):
+                schemas[record.id] = record.name
+            elif isinstance(record, mcap.records.Channel):
+                channels[record.id] = record
+            else:
+                channel = channels[record.channel_id]
+                yield McapMessage(
+                    channel.topic,
+                    schemas.get(channel.schema_id, ""),
+                    channel.message_encoding,
+                    record.log_time,
+                    record.data,
+                )
+    except mcap.exceptions.McapError as error:
         raise EOFError("it ends in a record") from error
-    except (mcap.exceptions.McapError, RuntimeError, MemoryError) as error:
+    except (RuntimeError, MemoryError, struct.error) as error:
         raise ValueError(str(error) or type(error).__name__) from error
 
 
-def _chunk_records(mcap: Any, chunk: Any) -> Iterator[Any]:
-    """Yield the records of a chunk one by one: a chunk can hold millions."""
-    content = _unpacked(chunk)
-    if chunk.uncompressed_crc and zlib.crc32(content) != chunk.uncompressed_crc:
-        raise ValueError("a chunk with a wrong checksum")
-    stream = mcap.data_stream.ReadDataStream(io.BytesIO(content))
-    readers: dict[Any, Any] = {
-        mcap.opcode.Opcode.SCHEMA: lambda _: mcap.records.Schema.read(stream),
-        mcap.opcode.Opcode.CHANNEL: lambda _: mcap.records.Channel.read(stream),
-        mcap.opcode.Opcode.MESSAGE: lambda size: mcap.records.Message.read(stream, size),
-    }
-    while stream.count < len(content):
-        kind, size = stream.read1(), stream.read8()
-        if size > len(content) - stream.count:
-            raise ValueError("a record that is longer than its chunk")
-        if kind == mcap.opcode.Opcode.MESSAGE and size < _MESSAGE_HEAD:
-            raise ValueError("a message that is shorter than its header")
-        end = stream.count + size
-        if kind in readers:
-            yield readers[kind](size)
-        stream.read(max(end - stream.count, 0))
+def _records(mcap: Any, file: Any, *, is_chunk: bool = False) -> Iterator[Any]:
+    """Yield schemas, channels and messages; chunks are opened, other records passed over.
+
+    Read here, not by the package's StreamReader, which loads any record whole, such as an index of
+    a stated length without bound.
+    """
+    kinds = mcap.opcode.Opcode
+    while head := file.read(_HEAD.size):
+        if len(head) < _HEAD.size:
+            raise EOFError("it ends in a record")
+        kind, size = _HEAD.unpack(head)
+        if kind in {kinds.DATA_END, kinds.FOOTER} and not is_chunk:
+            return
+        if kind == kinds.CHUNK and not is_chunk:
+            content = _unpacked(mcap.records.Chunk.read(_body(mcap, file, size)))
+            yield from _records(mcap, io.BytesIO(content), is_chunk=True)
+        elif kind == kinds.SCHEMA:
+            yield mcap.records.Schema.read(_body(mcap, file, size))
+        elif kind == kinds.CHANNEL:
+            yield mcap.records.Channel.read(_body(mcap, file, size))
+        elif kind == kinds.MESSAGE:
+            yield mcap.records.Message.read(_body(mcap, file, size, _MESSAGE_HEAD), size)
+        else:
+            _pass_over(file, size)
+    if not is_chunk:
+        raise EOFError("it ends before its footer")
 
 
+_HEAD: Final = struct.Struct("<BQ")
+"""Kind of a record, and the number of bytes that follow."""
 _MESSAGE_HEAD: Final = 22
+
+
+def _body(mcap: Any, file: Any, size: int, least: int = 0) -> Any:
+    """Return the content of a record as the stream that the package reads."""
+    if not least <= size <= MAX_MCAP_RECORD:
+        raise ValueError(f"a record of {size} bytes")
+    body = file.read(size)
+    if len(body) < size:
+        raise EOFError("it ends in a record")
+    return mcap.data_stream.ReadDataStream(io.BytesIO(body))
+
+
+def _pass_over(file: Any, size: int) -> None:
+    while size > 0:
+        part = file.read(min(size, MIB))
+        if not part:
+            raise EOFError("it ends in a record")
+        size -= len(part)
 
 
 def _unpacked(chunk: Any) -> bytes:
@@ -176,6 +199,8 @@ def _unpacked(chunk: Any) -> bytes:
         content = chunk.data
     if len(content) > limit:
         raise ValueError(f"a chunk that unpacks to more than {limit} bytes")
+    if chunk.uncompressed_crc and zlib.crc32(content) != chunk.uncompressed_crc:
+        raise ValueError("a chunk with a wrong checksum")
     return content
 
 
@@ -257,7 +282,8 @@ def _need_mcap(path: str | PathLike[str] | None) -> Any:
     try:
         import mcap.data_stream  # noqa: PLC0415 - an extra
         import mcap.exceptions  # noqa: PLC0415
-        import mcap.stream_reader  # noqa: PLC0415
+        import mcap.opcode  # noqa: PLC0415
+        import mcap.records  # noqa: PLC0415
         import mcap.writer  # noqa: PLC0415
     except ImportError as error:
         raise InputError(
