@@ -7,6 +7,7 @@ current; other channels are brought to its times as for captures.
 from __future__ import annotations
 
 import json
+from array import array
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -233,7 +234,7 @@ def read_mcap(content: FileContent, given: ColumnMap | None = None) -> DraftLog:
     InputError
         If it is damaged before its end, a field is not found, or mcap is not installed.
     """
-    channels: dict[str, tuple[list[float], list[float]]] = {}
+    channels: dict[str, tuple[array[float], array[float]]] = {}
     cut_off = ""
     has_samples = False
     with open_unpacked(content.path, MAX_LOG_BYTES) as file:
@@ -278,7 +279,7 @@ def read_mcap(content: FileContent, given: ColumnMap | None = None) -> DraftLog:
 
 
 def _collect(
-    channels: dict[str, tuple[list[float], list[float]]],
+    channels: dict[str, tuple[array[float], array[float]]],
     message: McapMessage,
     path: Path,
     *,
@@ -290,7 +291,7 @@ def _collect(
         if name not in channels:
             if len(channels) >= MAX_LOG_COLUMNS:
                 continue
-            channels[name] = ([], [])
+            channels[name] = (array("d"), array("d"))
         times, values = channels[name]
         if len(times) >= MAX_LOG_ROWS:
             raise InputError(
