@@ -284,9 +284,9 @@ _TEXTS: dict[str, tuple[str, Callable[[can.Message], str]]] = {
         lambda f: f"{1e6 * f.timestamp:.0f},{f.arbitration_id:08X},false,Rx,0,{f.dlc}"
         f",{_hex(f, ',')},\n",
     ),
-    "gvret_ms.csv": (
+    "gvret_without_way.csv": (
         "\ufeffTime Stamp,ID,Extended,Bus,DLC,D1,D2,D3,D4,D5,D6,D7,D8\n",
-        lambda f: f"{1e3 * f.timestamp:.0f},{f.arbitration_id:x},0,1,{f.dlc},{_hex(f, ',')}\n",
+        lambda f: f"{1e6 * f.timestamp:.0f},{f.arbitration_id:x},0,1,{f.dlc},{_hex(f, ',')}\n",
     ),
     "id_data.csv": ("ID,Data Bytes\n", lambda f: f"{f.arbitration_id:08X},{_hex(f)} \n"),
     "carbus.trc": (
