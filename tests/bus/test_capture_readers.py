@@ -495,3 +495,11 @@ def test_pcap_of_a_network_names_the_cure(tmp_path: Path) -> None:
     type("Lan", (TestPcap,), {"link": 1})().write(path, frames_of())
     with pytest.raises(InputError, match=r"none of its 40 packets is a CAN frame; .*tcpdump"):
         list(open_capture(path))
+
+
+def test_a_cut_pcap_names_the_byte(tmp_path: Path) -> None:
+    path = tmp_path / "cut.pcap"
+    TestPcap().write(path, frames_of())
+    path.write_bytes(path.read_bytes()[:30])
+    with pytest.raises(InputError, match=r"cut\.pcap: the PCAP file is damaged .*at byte 30"):
+        list(open_capture(path))

@@ -58,6 +58,7 @@ class PcapReader(BinaryReader):
     def read(self) -> Iterator[can.Message]:
         """Yield the frames; other packets are counted in a remark."""
         self._order = "<"
+        self._place = 0
         other = idle = 0
         magic = self._exactly(4)
         packets = self._blocks() if magic == _SECTION_MARK else self._records(magic)
@@ -82,10 +83,9 @@ class PcapReader(BinaryReader):
 
     def _exactly(self, size: int) -> bytes:
         data = self.raw.read(size)
+        self._place += len(data)
         if len(data) < size:
-            raise EOFError(
-                "it ends in a packet" if data or self.frames else "it ends in its header"
-            )
+            raise EOFError(f"it ends in a header or a packet, at byte {self._place}")
         return data
 
     # --- Classic PCAP
@@ -97,9 +97,10 @@ class PcapReader(BinaryReader):
         interface = _Interface(link & 0x03FFFFFF, 0, ticks_per_s, 0)
         header = struct.Struct(self._order + "IIII")
         while start := self.raw.read(1):
+            self._place += 1
             seconds, ticks, size, _ = header.unpack(start + self._exactly(header.size - 1))
             if size > _MAX_PACKET:
-                raise ValueError(f"a packet of {size} bytes")
+                raise ValueError(f"a packet of {size} bytes before byte {self._place}")
             yield interface, seconds + ticks / ticks_per_s, self._exactly(size)
 
     # --- PCAPNG
@@ -119,7 +120,7 @@ class PcapReader(BinaryReader):
                 left = 8
             size = struct.unpack(self._order + "I", size_bytes)[0]
             if not left + 4 <= size <= _MAX_BLOCK or size % 4:
-                raise ValueError(f"a block of {size} bytes")
+                raise ValueError(f"a block of {size} bytes before byte {self._place}")
             body = self._exactly(size - left)[:-4]
             number = struct.unpack(self._order + "I", kind)[0]
             if number == 1:
@@ -131,6 +132,7 @@ class PcapReader(BinaryReader):
             start = self.raw.read(1)
             if not start:
                 break
+            self._place += 1
             kind = start + self._exactly(3)
         if unstamped:
             self.remarks.append(f"{unstamped} packets without time stamp omitted")
