@@ -214,6 +214,22 @@ def test_cut_and_damaged_mcap(tmp_path: Path) -> None:
     assert found
 
 
+@pytest.mark.parametrize("compression", ["NONE", "LZ4", "ZSTD"])
+def test_every_compression_is_read(tmp_path: Path, compression: str) -> None:
+    module = pytest.importorskip("mcap.writer")
+    path = tmp_path / "soc.mcap"
+    with path.open("wb") as file:
+        writer = module.Writer(file, compression=module.CompressionType[compression])
+        writer.start()
+        schema = writer.register_schema(SAMPLE, "jsonschema", b"{}")
+        channel = writer.register_channel("/sample", "json", schema)
+        for k in range(3000):
+            row = {"time_s": k, "current_a": 1.0, "voltage_v": 380.0, "temperature_c": 20.0}
+            writer.add_message(channel, k * 10**9, json.dumps(row).encode(), k * 10**9)
+        writer.finish()
+    assert len(read_log(path)) == 3000
+
+
 def test_a_compression_bomb_is_refused(tmp_path: Path) -> None:
     zstandard = pytest.importorskip("zstandard")
     records = pytest.importorskip("mcap.records")
