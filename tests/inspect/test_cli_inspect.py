@@ -6,14 +6,18 @@ import io
 import json
 from pathlib import Path
 
+import can
 import numpy as np
 import pytest
 import typer
 from rich.console import Console
 from typer.testing import CliRunner
 
+from cangauge.bus.encoder import FrameEncoder
+from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.inspect import _show, inspect_command
 from cangauge.errors import InputError
+from cangauge.estimation.validity import Sample
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
 
@@ -144,5 +148,31 @@ def test_unknown_columns_are_refused_with_a_command(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, [str(path)])
     assert isinstance(result.exception, InputError)
     assert "(found: Stempel, Wert a, Wert b)" in str(result.exception)
-    assert "--columns 'time=?,current=?,voltage=?'" in str(result.exception)
+    assert "--columns 'time=Stempel,current=?,voltage=?'" in str(result.exception)
     assert "docs/logs.md" in str(result.exception)
+
+
+def test_one_map_reads_captures_by_signals_and_tables_by_columns(
+    tmp_path: Path, project: Path
+) -> None:
+    (tmp_path / "car.toml").write_text(
+        'current = "current_a"\nvoltage = "voltage_v"\ntemperature = "temperature_c"\n'
+        'soc = "soc_pct"\n[columns]\ntime = "Stempel"\ncurrent = "Wert a[mA]"\n'
+        'voltage = "Wert b"\n'
+    )
+    (tmp_path / "logger.csv").write_text(LOGGER)
+    encoder = FrameEncoder(Vehicle.load("generic"))
+    with can.CanutilsLogWriter(tmp_path / "drive.log") as writer:
+        for k in range(300):
+            current_a = 40.0 * (k // 20 % 2)
+            sample = Sample(1000.0 + k / 10.0, current_a, 380.0 - 0.1 * current_a, 20.0)
+            for frame in encoder.encode(sample, 80.0):
+                writer.on_message_received(frame)
+    options = ["--map", str(tmp_path / "car.toml"), "--temperature", "20", "--json"]
+    table = CliRunner().invoke(app, [str(tmp_path / "logger.csv"), *options])
+    assert json.loads(table.stdout)["channels"]["current_a"]["maximum"] == 40.0
+    dbc = str(next((project / "dbc").glob("generic*.dbc")))
+    capture = CliRunner().invoke(app, [str(tmp_path / "drive.log"), "--dbc", dbc, *options])
+    found = json.loads(capture.stdout)
+    assert found["log"]["channels"]["current_a"]["maximum"] == 40.0
+    assert found["log"]["soc"]["first_pct"] == pytest.approx(80.0)

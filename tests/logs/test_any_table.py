@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime as dt
 import math
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -294,6 +296,21 @@ def test_table_reads_to_the_same_log(tmp_path: Path, name: str) -> None:
         np.testing.assert_allclose(log.soc_pct, SOC_PCT, atol=1e-3)
 
 
+@pytest.mark.parametrize("name", TABLES)
+def test_damaged_tables_raise_nothing_but_input_errors(tmp_path: Path, name: str) -> None:
+    table, rng = TABLES[name], np.random.default_rng(11)
+    path = tmp_path / "x.csv"
+    for _ in range(8):
+        data = bytearray(table.content)
+        for place in rng.integers(len(data), size=rng.integers(1, 5)):
+            mark = int(rng.choice(list(b",;.-\t")))
+            data[place] = int(rng.integers(256)) if rng.random() < 0.5 else mark
+        path.write_bytes(bytes(data))
+        with contextlib.suppress(InputError):
+            log = read_log(path, temperature_c=table.temperature_c, **table.options)
+            assert np.isfinite(log.voltage_v).all()
+
+
 def test_what_was_assumed_is_told(tmp_path: Path) -> None:
     log = read(tmp_path, TABLES["plain without units"])
     assert log.assumed == (
@@ -361,6 +378,28 @@ def test_workbook_reads_as_its_longest_sheet(tmp_path: Path) -> None:
     assert log.current_a == pytest.approx(CURRENT_A)
 
 
+def test_workbook_that_unpacks_to_too_much_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("openpyxl")
+    path = tmp_path / "bomb.xlsx"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("xl/workbook.xml", "<workbook/>")
+        archive.writestr("xl/worksheets/sheet1.xml", b"0" * (20 << 20))
+    with pytest.raises(InputError, match="unpacks to 20 MiB"):
+        read_log(path)
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(InputError, match=r"bomb\.xlsx"):
+        read_log(path)
+
+
+def test_index_of_times_is_the_time(tmp_path: Path) -> None:
+    stamps = pa.array([k * 1_000_000 for k in range(ROWS)], pa.timestamp("us"))
+    table = pa.table(
+        {"Current [A]": CURRENT_A, "Voltage [V]": VOLTAGE_V, "__index_level_0__": stamps}
+    )
+    log = Log.from_dataframe(table, temperature_c=20.0)
+    assert log.time_s == pytest.approx(TIME_S)
+
+
 @pytest.mark.parametrize("kind", ["parquet", "frame"])
 def test_other_tables_take_the_same_columns(tmp_path: Path, kind: str) -> None:
     stamps = pa.array([START.timestamp() * 1e6 + k * 1e6 for k in range(ROWS)], pa.int64())
@@ -410,7 +449,7 @@ def test_other_tables_take_the_same_columns(tmp_path: Path, kind: str) -> None:
         ),
         (
             "Time,Current,Voltage,Temp\n" + "".join(f"{k},2,300000,20\n" for k in range(4)), {},
-            "voltage looks like millivolts",
+            r"voltage looks like millivolts .*--columns 'voltage=Voltage\[mV\]'",
         ),
         (
             "Time,Current,Voltage,Temp\n1,2,300,20\nsoon,2,300,20\n", {},

@@ -26,6 +26,8 @@ NAMES = (
     "A123_DYN_50_P25_s1.csv",
     "Cell-HPPC-10C.csv",
     "module.csv",
+    "logger.csv",
+    "history.csv",
 )
 
 

@@ -83,7 +83,7 @@ from cangauge.bus.protection import (
     ProtectionRule,
 )
 from cangauge.errors import InputError
-from cangauge.logs.headings import ColumnMap
+from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.log import TemperatureSource
 
 PAIR_WITHIN_S: Final = 0.020
@@ -355,7 +355,7 @@ class VehicleMap(_Strict):
     soc_reference : SignalMap, optional
         The car's own state of charge, to begin from and to compare with; also named `soc`.
     columns : dict
-        Columns of the car's logs that are tables (`logs.headings.ColumnMap`).
+        Columns of the car's logs that are tables (`logs.column_map.ColumnMap`).
     temperature_source : {"cell", "pack", "coolant", "room", "unknown"}
     pair_within_s : float
         Largest distance in bus time between paired current and voltage [s].

@@ -28,6 +28,7 @@ from cangauge.cli.output import emit_json, note, print_table, progress_shown
 from cangauge.diagnosis import NONE, UNKNOWN, Diagnosis, diagnose
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
+from cangauge.model.coulomb_counting import difference_from_reference
 from cangauge.model.model_file import Model
 from cangauge.report.summary import headline, next_step, open_question, parameters_text
 
@@ -46,13 +47,17 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
         list[Path] | None,
         typer.Option(
             metavar="LOG",
-            help="Log without a fault; repeat the option. It needs soc_pct, at least at its start,"
-            " or starts full.",
+            help="Log without a fault; repeat the option. Without soc_pct its start is found from"
+            " the voltage.",
         ),
     ] = None,
     initial_soc: Annotated[
         float | None,
-        typer.Option(metavar="P", help="SoC at the first row of each diagnosed log [%], e.g. 80."),
+        typer.Option(
+            metavar="P",
+            help="SoC at the first row of each diagnosed log [%], e.g. 80. Default: its soc_pct,"
+            " else found from the voltage.",
+        ),
     ] = None,
     capacity_ah: Annotated[
         float | None,
@@ -111,6 +116,9 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
 
     diagnosed = [_long_enough(read(path)) for path in logs]
     references = [read(path) for path in given]
+    for log in (*diagnosed, *references):
+        if (difference := difference_from_reference(log, model_file.capacity_ah)) is not None:
+            note(f"warning: {difference}")
     with progress_shown("cangauge.diagnosis"):
         found = diagnose(diagnosed, model_file, references, initial_soc_pct=initial_soc)
     texts = {}

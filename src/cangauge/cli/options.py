@@ -119,24 +119,20 @@ class TableOptions:
             If the file cannot be read, or an option is wrong.
         """
         # Deferred: the service shares these options, but needs neither pyarrow nor the readers.
+        from cangauge.bus.captures.capture import find_capture  # noqa: PLC0415
         from cangauge.bus.mapping import columns_of_map  # noqa: PLC0415
         from cangauge.bus.recording import open_recording  # noqa: PLC0415
-        from cangauge.logs.headings import ColumnMap  # noqa: PLC0415
+        from cangauge.logs.column_map import ColumnMap  # noqa: PLC0415
         from cangauge.logs.read import LogFile, open_log  # noqa: PLC0415
 
         sign = cast("Literal['charge', 'discharge'] | None", self.sign)
         if self.columns is not None:
             return open_log(path, columns=ColumnMap.of(self.columns, "--columns"), sign=sign)
         mapped = None if self.map_file is None else columns_of_map(self.map_file)
-        if mapped is not None:
+        if mapped is not None and path.is_file():  # not the name of a recording's parts
             found = open_log(path)
-            if found.reader is None or found.is_any_table:
-                try:
-                    return open_log(path, columns=mapped, sign=sign)
-                except InputError:
-                    if found.reader is None and not isinstance(open_recording(path), LogFile):
-                        return open_recording(path)
-                    raise
+            if found.is_any_table or (found.reader is None and find_capture(path) is None):
+                return open_log(path, columns=mapped, sign=sign)
         recording = open_recording(path)
         return replace(recording, sign=sign) if isinstance(recording, LogFile) else recording
 

@@ -72,13 +72,13 @@ def fit_voltage_model(
         soc, temperature, current = soc[keep], temperature[keep], current[keep]
     _check_identifiable(rows, soc, current, columns.shape)
     span = float(soc.min()), float(soc.max())
-    solution = _rising(columns, volts, block, span, options.epsilon)
+    solution = rising(columns, volts, block, span, options.epsilon)
     if with_kt_prior:
         lengths = np.bincount(number, minlength=len(rows)).tolist()
         prior = kt_prior(columns, volts - columns @ solution.coefficients, volts, lengths, KT)
         row = np.zeros(columns.shape[1])
         row[KT] = prior.row_weight
-        solution = _rising(
+        solution = rising(
             np.vstack([columns, row]),
             np.append(volts, 0.0),
             np.append(block, block.max() + 1),
@@ -100,14 +100,17 @@ def fit_voltage_model(
     ), solution
 
 
-def _rising(
+def rising(
     columns: FloatArray,
     volts: FloatArray,
     block: NDArray[np.intp],
     span_pct: tuple[float, float],
     epsilon: float,
 ) -> Solution:
-    """Return the least-squares solution whose pseudo-OCV rises over a span of SoC."""
+    """Return the least-squares solution whose pseudo-OCV rises over a span of SoC [%].
+
+    Columns beyond those of `design_matrix` may follow.
+    """
     at_least = SLOPE_AT_LEAST * float(np.median(volts))
     grid = np.linspace(*span_pct, SLOPE_CHECKS)
     between = np.linspace(*span_pct, SLOPE_POINTS)

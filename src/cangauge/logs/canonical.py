@@ -27,13 +27,13 @@ from cangauge.logs.arrow import (
     is_canonical,
     is_text,
 )
+from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.columns import read_columns
 from cangauge.logs.draft import DraftLog
 from cangauge.logs.file_content import FileContent, delimiter_of, split_cells
 from cangauge.logs.formats import BDF_LABELS
-from cangauge.logs.headings import ColumnMap
 from cangauge.logs.log import Log
-from cangauge.logs.table import draft_of_arrow
+from cangauge.logs.table_columns import draft_of_arrow
 
 
 def read_parquet(content: FileContent) -> DraftLog:

@@ -106,7 +106,9 @@ class Columns:
         return pc.if_else(missing, pa.scalar(None, pa.string()), trimmed)
 
 
-_NUMBER_WITH_UNIT: Final = r"^(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(?P<unit>\D{1,4})$"
+_NUMBER_WITH_UNIT: Final = (
+    r"^(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(?P<unit>[^\d.]{1,4})$"
+)
 
 
 def _with_decimal_point(cells: Any) -> Any:

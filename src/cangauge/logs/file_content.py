@@ -15,6 +15,8 @@ from typing import Any, Final, cast
 
 from cangauge._io import (
     MAX_LOG_BYTES,
+    UNPACK_FREE_BYTES,
+    UNPACK_RATIO,
     bounded,
     open_unpacked,
     read_all,
@@ -30,6 +32,8 @@ _MDF: Final = (b"MDF     ", b"UnFinMF ")
 _DELIMITERS: Final = ("\t", ";", ",")
 _HEAD_BYTES: Final = 64 * 1024
 _HEAD_LINES: Final = 160
+MAX_WORKBOOK_TEXTS: Final = 64 << 20
+"""Distinct texts of a workbook [bytes]: all are held in memory, and a log holds numbers."""
 _D3_MEMBER: Final = "test data.txt"
 # An LZMA member sets the memory of its reader; no exporter writes one.
 _ZIP_METHODS: Final = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -163,11 +167,16 @@ def sheet_text(path: Path) -> bytes:
 
 
 def _refuse_large(path: Path) -> None:
+    """Refuse a workbook that unpacks to more than a log may hold, before it is parsed."""
     with zipfile.ZipFile(path) as archive:
-        unpacked = sum(info.file_size for info in archive.infolist())
-    if unpacked > MAX_LOG_BYTES:
+        parts = archive.infolist()
+    unpacked = sum(part.file_size for part in parts)
+    texts = sum(part.file_size for part in parts if part.filename.endswith("sharedStrings.xml"))
+    is_dense = unpacked > max(UNPACK_FREE_BYTES, UNPACK_RATIO * path.stat().st_size)
+    if unpacked > MAX_LOG_BYTES or texts > MAX_WORKBOOK_TEXTS or is_dense:
         raise InputError(
-            f"the workbook unpacks to more than the {MAX_LOG_BYTES >> 20} MiB of a log",
+            f"the workbook unpacks to {unpacked >> 20} MiB ({texts >> 20} MiB of texts), more than"
+            " a log's",
             source=path,
             cure="export the sheet as CSV",
         )
@@ -223,8 +232,7 @@ def _only_member(archive: zipfile.ZipFile, path: Path) -> zipfile.ZipInfo:
 
 
 def _as_utf8(data: bytes) -> bytes:
-    if data.startswith(b"\xef\xbb\xbf"):
-        return data[3:]
+    data = data.removeprefix(b"\xef\xbb\xbf")
     if data[:2] in {b"\xff\xfe", b"\xfe\xff"}:  # "Unicode text" of spreadsheets
         return data.decode("utf-16", errors="replace").encode()
     try:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cangauge._dataframes import ArrowExport
+from cangauge._display import figure
 from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.errors import InputError
 from cangauge.logs.units import (
@@ -201,6 +202,10 @@ class Log(ArrowExport):
         if self.soc_pct is not None:
             columns["soc_pct"] = self.soc_pct
         return build_table(columns, self.temperature_source)
+
+    def plot(self) -> Any:
+        """Return current, voltage, temperature and SoC over time, for `bokeh.plotting.show`."""
+        return figure("log_figure", self)
 
     def __len__(self) -> int:
         """Return the number of rows."""

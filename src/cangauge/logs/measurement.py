@@ -20,10 +20,11 @@ from cangauge._mcap import FRAME, SAMPLE, McapMessage, read_messages
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.arrow import build_table
+from cangauge.logs.column_map import ColumnMap, choose_columns
 from cangauge.logs.draft import DraftLog
 from cangauge.logs.file_content import FileContent
-from cangauge.logs.headings import FIELDS, ColumnMap, choose_columns
-from cangauge.logs.table import draft_of_arrow, unknown_columns
+from cangauge.logs.headings import FIELDS
+from cangauge.logs.table_columns import draft_of_arrow, unknown_columns
 
 VOLTAGE_FILL_S: Final = 1.0
 """Longest time between two values of a channel for interpolation [s], as in captures."""

@@ -8,10 +8,10 @@ from os import PathLike
 from typing import Any, Final
 
 from cangauge.errors import InputError
-from cangauge.logs import arrow, canonical, formats, measurement, table
+from cangauge.logs import arrow, canonical, formats, measurement, table, table_columns
+from cangauge.logs.column_map import ColumnMap, missing_quantities, shown_headings, suggestion
 from cangauge.logs.draft import DraftLog, Sign
 from cangauge.logs.file_content import FileContent
-from cangauge.logs.headings import ColumnMap, missing_quantities, shown_headings, suggestion
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.sign import resolve_sign
 from cangauge.logs.units import COLDEST_C, HOTTEST_C, known_temperature_source
@@ -93,12 +93,13 @@ class LogFile:
 def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
     """Return the error for a file of unknown format: its columns if it is a table."""
     headings, choice = table.likely_table(file.content, None)
-    if len(headings) >= 3:
+    if len(headings) >= 3 and not table.is_of_frames(headings):
         return InputError(
             f"{problem}: no plain heading of {missing_quantities(choice)}"
             f" (found: {shown_headings(headings)})",
             source=file.content.path,
-            cure=f"name the columns, e.g. {suggestion(headings, choice)} (see {table.DOCS})",
+            cure=f"name the columns, e.g. {suggestion(headings, choice)}"
+            f" (see {table_columns.DOCS})",
         )
     shown = file.content.first_line.strip()
     is_text = bool(shown) and shown.isprintable()
@@ -107,7 +108,7 @@ def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
         source=file.content.path,
         field="first line" if is_text else None,
         value=shown[:80] if is_text else None,
-        cure=f"{cure}; other tables: --columns ({table.DOCS})",
+        cure=f"{cure}; other tables: --columns ({table_columns.DOCS})",
     )
 
 
@@ -198,6 +199,20 @@ def read_log(
     return file.read(temperature_c=temperature_c, temperature_source=temperature_source)
 
 
+_INDEX: Final = "__index_level_"
+"""Beginning of the column name of an unnamed pandas index."""
+
+
+def _with_time_index(frame: Any) -> Any:
+    """Return the table with an unnamed index of times as its column `time`."""
+    names = frame.column_names
+    kinds = {each.name: str(each.type) for each in frame.schema}
+    times = [name for name in names if name.startswith(_INDEX) and "timestamp" in kinds[name]]
+    if len(times) != 1 or "time" in names or "time_s" in {name.lower() for name in names}:
+        return frame
+    return frame.rename_columns(["time" if name == times[0] else name for name in names])
+
+
 def log_of_arrow(
     frame: Any,
     *,
@@ -208,7 +223,8 @@ def log_of_arrow(
     sign: Sign | None = None,
 ) -> Log:
     """Return the log of an Arrow table; see `Log.from_dataframe`."""
-    names = [each for each in frame.column_names if not each.startswith("__index_level_")]
+    frame = _with_time_index(frame)
+    names = [each for each in frame.column_names if not each.startswith(_INDEX)]
     frame = frame.select(names)
     if columns is None and arrow.is_canonical(names):
         places = arrow.find_fields(names, name)
@@ -216,7 +232,7 @@ def log_of_arrow(
         draft = arrow.draft_from_table(frame, places, names, name=name, source="")
     else:
         given = None if columns is None else ColumnMap.of(columns)
-        draft = table.draft_of_arrow(frame, given, name=name, source="")
+        draft = table_columns.draft_of_arrow(frame, given, name=name, source="")
     if temperature_source is not None:
         draft.temperature_source = known_temperature_source(temperature_source)
     if sign is not None:

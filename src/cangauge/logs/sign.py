@@ -21,6 +21,7 @@ from scipy import special
 
 from cangauge._typing import FloatArray, IntArray
 from cangauge.errors import InputError
+from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log
 
 Kind = Literal["steps", "charge", "soc"]
@@ -230,9 +231,8 @@ def _ranks(values: FloatArray) -> FloatArray:
 
 
 def charge_ah(log: Log) -> FloatArray:
-    """Return the charge taken out since the first row [Ah], shape (n,), by trapezoids."""
-    parts = (log.current_a[1:] + log.current_a[:-1]) * np.diff(log.time_s) / 7200.0
-    return np.concatenate(([0.0], np.cumsum(parts)))
+    """Return the charge taken out since the first row [Ah], shape (n,); see `discharged_ah`."""
+    return discharged_ah(log.time_s, log.current_a)
 
 
 def spaced_rows(time_s: FloatArray, spacing_s: float) -> IntArray:

@@ -2,70 +2,57 @@
 
 The text may have a preamble, a second row of units, `,`, `;`, tab or `|` between the columns and
 decimal commas. What the headings leave open is assumed, and stated in `DraftLog.assumed`; the sign
-of current is then found from the data. Three shapes are read: a row per time; rows that hold only
-the channels that changed (exports of measurement tools); a row per entity and time (exports of
+of current is then found from the data. A row holds one time, or one entity at a time (exports of
 Home Assistant).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, Protocol
+from itertools import pairwise
+from typing import Any, Final
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.compute as pc
 
-from cangauge._typing import FloatArray, IntArray
+from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.logs.columns import is_number, read_columns
-from cangauge.logs.draft import MAX_INCOMPLETE, DraftLog
-from cangauge.logs.file_content import FileContent, split_cells
-from cangauge.logs.headings import (
-    FIELDS,
+from cangauge.logs.column_map import (
     Choice,
-    ChosenColumn,
     ColumnMap,
     choose_columns,
-    meaning_of,
     missing_quantities,
     shown_headings,
     suggestion,
 )
-from cangauge.logs.stamps import (
-    UnreadableStampError,
-    is_clock,
-    is_stamp,
-    is_time_format,
-    seconds_of_numbers,
-    seconds_of_text,
+from cangauge.logs.columns import is_number, read_columns
+from cangauge.logs.draft import DraftLog
+from cangauge.logs.file_content import FileContent, split_cells
+from cangauge.logs.headings import FIELDS, meaning_of
+from cangauge.logs.stamps import is_clock, is_stamp
+from cangauge.logs.table_columns import (
+    DOCS,
+    HOLD_ENTITY_S,
+    drop_or_hold,
+    fill_draft,
+    held,
+    quantity_values,
+    read_stamps,
+    temperature_source_of,
+    unknown_columns,
+    wanted_places,
 )
-from cangauge.logs.units import convert
-
-DOCS: Final = "docs/logs.md"
-"""Page that explains the columns of a log."""
-
-HOLD_S: Final = 1.0
-"""Longest time that a voltage is held to the next row with a current [s], where rows hold only the
-channels that changed: a voltage follows its current within this time, and a bus repeats both."""
-
-HOLD_ENTITY_S: Final = 60.0
-"""The same for recorders that store a value when it changes [s]: no longer than charge is counted
-over a gap."""
-
-LEAF_SPY_SOC: Final = 1e-4
-"""LeafSpy writes SoC in ten-thousandths of a percent."""
 
 _DELIMITERS: Final = ("\t", ";", ",", "|")
 _HEADER_LINES: Final = 160
 _CELLS_TRIED: Final = 60_000
 """Cells to search for a header, over all lines and delimiters: bounds the time of a search."""
 _SUB_HEADERS: Final = 4
+_ROWS_TRIED: Final = 20
+"""Rows that a guess of the time looks at."""
+_FRAME_WORDS: Final = frozenset({"id", "can id", "identifier", "dlc", "len", "data", "d1"})
 _LONG_FORMAT: Final = ("entity_id", "state", "last_changed")
-_QUANTITY_UNITS: Final = {
-    "time": "s", "current": "A", "voltage": "V", "temperature": "°C", "soc": "%"
-}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,20 +74,6 @@ class Layout:
     units: list[str]
     skip_lines: int
     choice: Choice
-
-
-class TableColumns(Protocol):
-    """Columns of a table in memory or text, by name."""
-
-    @property
-    def source(self) -> str:
-        """File or table, for messages."""
-
-    def numbers(self, name: str) -> FloatArray:
-        """Return a column as numbers, NaN where missing."""
-
-    def stamps(self, name: str) -> Any:
-        """Return a column as numbers, or as a pyarrow string array if it holds text."""
 
 
 def find_layout(content: FileContent, given: ColumnMap | None = None) -> Layout | None:
@@ -236,19 +209,52 @@ def likely_table(content: FileContent, given: ColumnMap | None) -> tuple[list[st
     """Return the likeliest header of a text and its incomplete choice, for messages."""
     for number, line in enumerate(content.head[:_HEADER_LINES]):
         for delimiter in _DELIMITERS:
-            if delimiter not in line:
+            if delimiter not in line or not number:
                 continue
-            values = sum(_is_value(cell) for cell in split_cells(line, delimiter))
-            if values < 2 or not number:
+            if sum(_is_value(cell) for cell in split_cells(line, delimiter)) < 2:
                 continue
-            for above in range(number - 1, max(number - 1 - _SUB_HEADERS, -1), -1):
-                cells = split_cells(content.head[above], delimiter)
-                if len(cells) >= 3 and sum(meaning_of(cell) is not None for cell in cells) >= 2:
-                    return cells, choose_columns(cells, (), given)
-            cells = split_cells(content.head[number - 1], delimiter)
-            if len(cells) >= 2:
-                return cells, choose_columns(cells, (), given)
+            cells = _header_above(content, number, delimiter)
+            if cells:
+                choice = choose_columns(cells, (), given)
+                return cells, _with_guess_of_time(choice, content, number, delimiter)
     return [], Choice({}, {})
+
+
+def _header_above(content: FileContent, number: int, delimiter: str) -> list[str]:
+    """Return the cells of the header above a first row of data, [] if there is none."""
+    for above in range(number - 1, max(number - 1 - _SUB_HEADERS, -1), -1):
+        cells = split_cells(content.head[above], delimiter)
+        if len(cells) >= 3 and sum(meaning_of(cell) is not None for cell in cells) >= 2:
+            return cells
+    cells = split_cells(content.head[number - 1], delimiter)
+    is_header = sum(_is_value(cell) for cell in cells) < 0.5 * len(cells)
+    return cells if len(cells) >= 2 and is_header else []
+
+
+def _with_guess_of_time(
+    choice: Choice, content: FileContent, number: int, delimiter: str
+) -> Choice:
+    """Return the choice with the first column that increases as a guess of the time."""
+    if "time" in choice.chosen or "time" in choice.guesses:
+        return choice
+    lines = content.head[number : number + _ROWS_TRIED]
+    rows = [
+        [cell.replace(",", ".") for cell in split_cells(line, delimiter)]
+        for line in lines
+        if line.strip()
+    ]
+    taken = {place for column in choice.chosen.values() for place in column.places}
+    for place in range(min(map(len, rows), default=0)):
+        values = [float(row[place]) for row in rows if is_number(row[place])]
+        increases = all(low < high for low, high in pairwise(values))
+        if place not in taken and len(values) == len(rows) > 2 and increases:
+            return Choice(choice.chosen, {**choice.guesses, "time": place})
+    return choice
+
+
+def is_of_frames(headings: Sequence[str]) -> bool:
+    """Return whether headings are those of CAN frames: an id, a length or bytes."""
+    return bool(_FRAME_WORDS & {heading.strip().lower() for heading in headings})
 
 
 def is_table(content: FileContent) -> bool:
@@ -279,201 +285,6 @@ def read_table(content: FileContent, given: ColumnMap | None = None) -> DraftLog
     draft = DraftLog(content.name, str(content.path), remarks=[*columns.remarks])
     fill_draft(draft, layout.choice, layout.headings, columns)
     return draft
-
-
-def unknown_columns(source: str, headings: Sequence[str], choice: Choice) -> InputError:
-    """Return the error for a table whose columns are not plain."""
-    return InputError(
-        f"no plain heading of {missing_quantities(choice)} (found: {shown_headings(headings)})",
-        source=source,
-        cure=f"name the columns, e.g. {suggestion(headings, choice)} ({DOCS})",
-    )
-
-
-def wanted_places(choice: Choice) -> dict[str, int]:
-    """Return the index of every column to read, by a name for `fill_draft`."""
-    wanted = {
-        f"{name} {k}": place
-        for name, column in choice.chosen.items()
-        for k, place in enumerate(column.places)
-    }
-    time = choice.chosen["time"]
-    return wanted | {f"time other {k}": place for k, place in enumerate(time.others)}
-
-
-def fill_draft(
-    draft: DraftLog, choice: Choice, headings: Sequence[str], columns: TableColumns
-) -> None:
-    """Set the values of a draft from the chosen columns, with its assumptions.
-
-    Parameters
-    ----------
-    draft : DraftLog
-    choice : Choice
-        Complete.
-    headings : sequence of str
-    columns : TableColumns
-        Holds the columns of `wanted_places`.
-    """
-    for name, column in choice.chosen.items():
-        label = " + ".join(headings[place] for place in column.places)
-        draft.labels[FIELDS[name]] = label
-        if name == "time":
-            values, unit = _time(draft, column, columns, headings)
-            label = draft.labels["time_s"]
-        else:
-            values, unit = _quantity(draft, name, column, columns)
-        draft.values[FIELDS[name]] = values
-        factor = "" if column.factor == 1.0 else f" × {column.factor:g}"
-        draft.assumed.append(f'{name} = "{label}"{factor} [{unit}]')
-    _leaf_spy(draft, headings)
-    current = choice.chosen["current"]
-    draft.sign_unknown = current.factor > 0.0
-    draft.temperature_source = _source_of(choice)
-    _drop_or_hold(draft, HOLD_S)
-
-
-def _source_of(choice: Choice) -> Any:
-    column = choice.chosen.get("temperature")
-    return "unknown" if column is None else column.source
-
-
-def _quantity(
-    draft: DraftLog, name: str, column: ChosenColumn, columns: TableColumns
-) -> tuple[FloatArray, str]:
-    field = FIELDS[name]
-    parts = [columns.numbers(f"{name} {k}") for k in range(len(column.places))]
-    values = parts[0]
-    if len(parts) > 1:
-        stacked = np.vstack(parts)
-        known = np.isfinite(stacked)
-        count = np.sum(known, axis=0)
-        total = np.sum(np.where(known, stacked, 0.0), axis=0)
-        values = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-        draft.remarks.append(f"{name}: mean of {len(parts)} columns")
-    values = values * column.factor
-    unit = column.unit
-    finite = values[np.isfinite(values)]
-    if (
-        name == "soc"
-        and not unit
-        and finite.size
-        and 0.0 < finite.max() <= 1.0
-        and finite.min() >= 0
-    ):
-        return 100.0 * values, "0–1, from its range"
-    label = draft.labels[field]
-    converted, _ = convert(values, field, unit, source=draft.source or draft.name, label=label)
-    return converted, unit or f"{_QUANTITY_UNITS[name]}, assumed"
-
-
-def _time(
-    draft: DraftLog, column: ChosenColumn, columns: TableColumns, headings: Sequence[str]
-) -> tuple[FloatArray, str]:
-    """Return time [s] and how it was read; of several time columns, the first that increases."""
-    first = _seconds(draft, column, columns, [f"time {k}" for k in range(len(column.places))])
-    for k, place in enumerate(column.others):
-        if _increases(first[0]):
-            break
-        draft.labels["time_s"] = headings[place]
-        try:
-            other = _seconds(draft, column, columns, [f"time other {k}"])
-        except InputError:
-            continue
-        if _increases(other[0]):
-            return other
-    if not _increases(first[0]) and column.others:
-        draft.labels["time_s"] = headings[column.places[0]]
-    return first
-
-
-def _increases(time_s: FloatArray) -> bool:
-    finite = time_s[np.isfinite(time_s)]
-    return finite.size > 1 and bool(np.all(np.diff(finite) >= 0.0)) and finite[-1] > finite[0]
-
-
-def _seconds(
-    draft: DraftLog, column: ChosenColumn, columns: TableColumns, names: Sequence[str]
-) -> tuple[FloatArray, str]:
-    cells = [columns.stamps(name) for name in names]
-    if len(cells) == 1 and isinstance(cells[0], np.ndarray):
-        unit = "" if is_time_format(column.unit) else column.unit
-        values, how = seconds_of_numbers(cells[0] * column.factor, unit)
-        return values, how
-    texts = [cell if not isinstance(cell, np.ndarray) else _as_text(cell) for cell in cells]
-    joined = texts[0] if len(texts) == 1 else pc.binary_join_element_wise(*texts, " ")
-    unit = column.unit if is_time_format(column.unit) else ""
-    try:
-        return seconds_of_text(joined, unit)
-    except UnreadableStampError as error:
-        raise InputError(
-            f"row {error.row + 1} is not a time",
-            source=columns.source,
-            field=draft.labels["time_s"],
-            value=error.text,
-            cure="seconds, hh:mm:ss or dates are read; name another column with --columns time=…",
-        ) from error
-
-
-def _as_text(values: FloatArray) -> Any:
-    return pc.cast(pa.array(values, from_pandas=True), pa.string())
-
-
-def _leaf_spy(draft: DraftLog, headings: Sequence[str]) -> None:
-    """Rescale the SoC of LeafSpy, known by its other headings."""
-    soc = draft.values.get("soc_pct")
-    if soc is None or not {"Gids", "AHr", "Pack Volts"} <= set(headings):
-        return
-    finite = soc[np.isfinite(soc)]
-    if finite.size and np.median(finite) > 110.0:
-        draft.values["soc_pct"] = soc * LEAF_SPY_SOC
-        draft.remarks.append("LeafSpy log: SoC in 0.0001 %")
-
-
-def _drop_or_hold(draft: DraftLog, hold_s: float) -> None:
-    """Drop the few incomplete rows; where rows hold only what changed, hold the latest values."""
-    draft.drop_incomplete = True
-    values = draft.values
-    time, current, voltage = (values[name] for name in ("time_s", "current_a", "voltage_v"))
-    temperature = values.get("temperature_c", time)
-    whole = np.isfinite(time) & np.isfinite(current) & np.isfinite(voltage)
-    missing = 1.0 - float(np.mean(whole & np.isfinite(temperature)))
-    if missing <= MAX_INCOMPLETE or not whole.size:
-        return
-    timed = np.isfinite(time)
-    at = np.flatnonzero(timed & np.isfinite(current))
-    if not at.size or not np.isfinite(voltage[timed]).any():
-        return
-    held, age_s = _held(time, voltage, at)
-    near = age_s <= hold_s
-    if np.mean(near) < 0.5:
-        return
-    at, held = at[near], held[near]
-    found = {"time_s": time[at], "current_a": current[at], "voltage_v": held}
-    for name in ("temperature_c", "soc_pct"):
-        if name in values:
-            found[name], _ = _held(time, values[name], at)
-    if "temperature_c" in found:
-        temperature = found["temperature_c"]
-        first = temperature[np.isfinite(temperature)][:1]
-        found["temperature_c"] = np.where(np.isnan(temperature), first if first.size else np.nan,
-                                          temperature)  # fmt: skip
-    draft.values = found
-    draft.remarks.append(
-        f"rows hold only what changed: {at.size} rows with a current kept, with the latest voltage"
-        f" (at most {float(age_s[near].max()):.2g} s old) and temperature"
-    )
-
-
-def _held(time: FloatArray, values: FloatArray, at: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return the latest known value at some rows, and its age [s]; NaN and infinity before any."""
-    known = np.flatnonzero(np.isfinite(values) & np.isfinite(time))
-    latest = np.searchsorted(known, at, side="right") - 1
-    if not known.size:
-        return np.full(at.size, np.nan), np.full(at.size, np.inf)
-    row = known[np.maximum(latest, 0)]
-    before = latest < 0
-    return np.where(before, np.nan, values[row]), np.where(before, np.inf, time[at] - time[row])
 
 
 # --- A row per entity and time
@@ -508,34 +319,35 @@ def read_long_format(content: FileContent, given: ColumnMap | None) -> DraftLog:
     if not choice.is_complete:
         raise unknown_columns(str(content.path), headings, choice)
     draft = DraftLog(content.name, str(content.path), remarks=[*columns.remarks])
-    stamps, how = seconds_of_text(pc.utf8_trim_whitespace(columns.text["last_changed"]))
+    cells = pc.utf8_trim_whitespace(columns.text["last_changed"])
+    stamps, how = read_stamps(cells, "", columns.source, "last_changed")
     order = np.argsort(stamps, kind="stable")
     stamps, entities = stamps[order], entities[order]
     states = columns.text["state"].to_pylist()
-    cells = [states[row] for row in order.tolist()]
+    of_rows = [states[row] for row in order.tolist()]
     draft.values["time_s"], draft.labels["time_s"] = stamps, "last_changed"
     draft.assumed.append(f'time = "last_changed" [{how}]')
-    pivot = _Pivot(entities, cells, columns.source)
+    pivot = _Pivot(entities, of_rows, columns.source)
     for name, column in choice.chosen.items():
         if name == "time":
             continue
         wanted = [headings[place] for place in column.places]
         draft.labels[FIELDS[name]] = " + ".join(wanted)
         pivot.wanted = dict(zip([f"{name} {k}" for k in range(len(wanted))], wanted, strict=True))
-        draft.values[FIELDS[name]], unit = _quantity(draft, name, column, pivot)
+        draft.values[FIELDS[name]], unit = quantity_values(draft, name, column, pivot)
         draft.assumed.append(f'{name} = "{draft.labels[FIELDS[name]]}" [{unit}]')
     draft.sign_unknown = choice.chosen["current"].factor > 0.0
-    draft.temperature_source = _source_of(choice)
+    draft.temperature_source = temperature_source_of(choice)
     # A recorder stores changes: between them current and voltage are the latest values. A row for
     # every time at which one of them changed.
     current, voltage = draft.values["current_a"], draft.values["voltage_v"]
     last = np.append(np.flatnonzero(np.diff(stamps) > 0.0), stamps.size - 1)
     changed = np.isin(stamps[last], stamps[np.isfinite(current) | np.isfinite(voltage)])
     at = last[changed]
-    latest, age_s = _held(stamps, current, at)
+    latest, age_s = held(stamps, current, at)
     draft.values["current_a"] = np.full(stamps.size, np.nan)
     draft.values["current_a"][at] = np.where(age_s <= HOLD_ENTITY_S, latest, np.nan)
-    _drop_or_hold(draft, HOLD_ENTITY_S)
+    drop_or_hold(draft, HOLD_ENTITY_S)
     return draft
 
 
@@ -562,99 +374,3 @@ class _Pivot:
 
 
 # --- Tables in memory
-
-
-@dataclass(frozen=True, slots=True)
-class ArrowColumns:
-    """Columns of an Arrow table, by name.
-
-    Parameters
-    ----------
-    table : pyarrow.Table
-    place : dict of str to int
-        Index by name.
-    source : str
-    """
-
-    table: Any
-    place: dict[str, int]
-    source: str
-
-    def numbers(self, name: str) -> FloatArray:
-        """Return a column as numbers, NaN where missing."""
-        column = self.table.column(self.place[name])
-        label = self.table.column_names[self.place[name]]
-        try:
-            plain = column.cast(pa.float64(), safe=False)
-        except (pa.ArrowException, OSError) as error:
-            raise InputError(
-                "the column does not hold numbers",
-                source=self.source,
-                field=label,
-                value=str(column.type)[:60],
-                cure="store it as floating point",
-            ) from error
-        return np.asarray(plain.to_numpy(), dtype=np.float64)
-
-    def stamps(self, name: str) -> Any:
-        """Return a time column as seconds, or as text."""
-        column = self.table.column(self.place[name])
-        kind = column.type
-        if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
-            per_second = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}[kind.unit]
-            counts = column.cast(pa.int64()).cast(pa.float64(), safe=False)
-            return np.asarray(counts.to_numpy(), dtype=np.float64) / per_second
-        if pa.types.is_date(kind):
-            return column.cast(pa.string())
-        if pa.types.is_string(kind) or pa.types.is_large_string(kind) or "string" in str(kind):
-            text = pc.utf8_trim_whitespace(column.cast(pa.string()))
-            try:
-                return np.asarray(text.cast(pa.float64()).to_numpy(), dtype=np.float64)
-            except pa.ArrowInvalid:
-                return text
-        return self.numbers(name)
-
-
-def draft_of_arrow(
-    table: Any,
-    given: ColumnMap | None,
-    *,
-    name: str,
-    source: str,
-    read: Callable[[Sequence[str]], Any] | None = None,
-) -> DraftLog:
-    """Return the draft of a table in memory, by plain headings or the columns of the user.
-
-    Parameters
-    ----------
-    table : pyarrow.Table, or its column names where `read` is given
-    given : ColumnMap, optional
-    name, source : str
-        Of the log.
-    read : callable, optional
-        Returns the table with some columns, for files that are read by column.
-
-    Raises
-    ------
-    InputError
-        If a column is not found or does not hold its quantity.
-    """
-    where = source or name
-    headings = list(table) if read is not None else list(table.column_names)
-    choice = choose_columns(headings, (), given)
-    if not choice.is_complete:
-        raise unknown_columns(where, headings, choice)
-    wanted = wanted_places(choice)
-    if read is not None:
-        names = list(dict.fromkeys(headings[place] for place in wanted.values()))
-        table = read(names)
-        wanted = {key: names.index(headings[place]) for key, place in wanted.items()}
-    if not table.num_rows:
-        raise InputError("the log holds no rows", source=where, cure="check the export")
-    draft = DraftLog(name, source)
-    fill_draft(draft, choice, headings, ArrowColumns(table, wanted, where))
-    for key, column in (("time_s", choice.chosen["time"]),):
-        kind = table.column(wanted["time 0"]).type
-        if pa.types.is_timestamp(kind) and not column.unit:
-            draft.assumed[0] = f'time = "{draft.labels[key]}" [{kind}]'
-    return draft

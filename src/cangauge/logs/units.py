@@ -89,7 +89,7 @@ FOLLOWS: Final = 0.7
 """Agreement from which a column follows the current [-]. Real drives: voltages at least 0.89,
 temperatures at most 0.01; voltages under constant current at most 0.6."""
 
-_Refuse = Callable[[str, str, float, str], InputError]
+_Refuse = Callable[..., InputError]
 
 
 def known_temperature_source(
@@ -180,7 +180,10 @@ def refuse_wrong_units(
         Remarks on possible but unusual values.
     """
 
-    def refuse(field: str, problem: str, value: float, cure: str) -> InputError:
+    def refuse(field: str, problem: str, value: float, cure: str, unit: str = "") -> InputError:
+        if unit and labels.get(field, field).lower() != field:
+            quantity = field.rpartition("_")[0]
+            cure += f" (or state the unit: --columns '{quantity}={labels[field]}[{unit}]')"
         return InputError(
             problem, source=str(source), field=labels.get(field, field), value=value, cure=cure
         )
@@ -224,7 +227,11 @@ def _check_time(values: dict[str, FloatArray], refuse: _Refuse) -> None:
     interval = float(np.median(np.diff(time)))
     if time[0] > _EPOCH_MS:
         raise refuse(
-            "time_s", "time looks like milliseconds since 1970", float(time[0]), "divide it by 1000"
+            "time_s",
+            "time looks like milliseconds since 1970",
+            float(time[0]),
+            "divide it by 1000",
+            "ms",
         )
     far = np.flatnonzero(np.abs(time) > MAX_STAMP_S)
     if far.size:
@@ -249,6 +256,7 @@ def _check_time(values: dict[str, FloatArray], refuse: _Refuse) -> None:
             f"rows are {interval:g} apart: time looks like milliseconds",
             interval,
             "divide it by 1000 (a log with a row every 90 s or more cannot be used)",
+            "ms",
         )
     if 0.0 < interval < 1.0 / MAX_RATE_HZ:
         raise refuse(
@@ -256,6 +264,7 @@ def _check_time(values: dict[str, FloatArray], refuse: _Refuse) -> None:
             f"rows are {interval:g} apart: time looks like hours or days",
             interval,
             "convert it to seconds",
+            "h",
         )
     _check_charge(time, values["current_a"], interval, refuse)
 
@@ -276,6 +285,7 @@ def _check_charge(time: FloatArray, current: FloatArray, interval: float, refuse
             " time looks like milliseconds",
             interval,
             "divide it by 1000",
+            "ms",
         )
 
 
@@ -307,13 +317,17 @@ def _may_be_temperature(values: FloatArray) -> bool:
 def _check_voltage(voltage: FloatArray, refuse: _Refuse) -> None:
     middle = float(np.median(voltage))
     if middle > MAX_VOLTAGE_V:
-        raise refuse("voltage_v", "voltage looks like millivolts", middle, "divide it by 1000")
+        raise refuse(
+            "voltage_v", "voltage looks like millivolts", middle, "divide it by 1000", "mV"
+        )
     if middle <= 0.0:
         raise refuse(
             "voltage_v", "the median voltage is not positive", middle, "check column and polarity"
         )
     if middle < 1.0:
-        raise refuse("voltage_v", "voltage looks like kilovolts", middle, "convert it to volts")
+        raise refuse(
+            "voltage_v", "voltage looks like kilovolts", middle, "convert it to volts", "kV"
+        )
     row = int(np.argmax(np.abs(voltage)))
     if abs(voltage[row]) > MAX_VOLTAGE_V:
         raise refuse(
@@ -341,6 +355,7 @@ def _check_current(current: FloatArray, refuse: _Refuse) -> None:
         f"current exceeds {MAX_CURRENT_A:g} A in row {row + 1}: it looks like milliamperes",
         float(current[row]),
         "divide it by 1000",
+        "mA",
     )
 
 
@@ -360,7 +375,7 @@ def _check_temperature(values: dict[str, FloatArray], refuse: _Refuse) -> tuple[
             voltage_follows = follows_current(values["current_a"], values["voltage_v"])
             if not voltage_follows and _may_be_temperature(values["voltage_v"]):
                 cure += ", or exchange it with the voltage if the two are swapped"
-            raise refuse("temperature_c", "temperature looks like kelvin", middle, cure)
+            raise refuse("temperature_c", "temperature looks like kelvin", middle, cure, "K")
     if not COLDEST_C <= middle <= HOTTEST_C:
         raise refuse(
             "temperature_c", "this is not a battery's temperature in °C", middle, "convert it to °C"
@@ -389,6 +404,7 @@ def _check_soc(soc: FloatArray, refuse: _Refuse) -> None:
             "SoC looks like a fraction of 1",
             high,
             "multiply it by 100 (or leave it out if it stays below 1 %)",
+            "-",
         )
     if high > 110.0 or low < -10.0:
         value = high if high > 110.0 else low

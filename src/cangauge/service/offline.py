@@ -35,6 +35,7 @@ from cangauge.estimation.offline import (
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.validity import Estimate, Reason, reason_name, reason_names
 from cangauge.logs.log import Log
+from cangauge.model.coulomb_counting import difference_from_reference
 from cangauge.model.model_file import Model
 from cangauge.service.pipeline import FrameCounts, Pipeline, PipelineSettings
 
@@ -164,6 +165,10 @@ class RecordedEstimate:
                 f" the samples. Check that {self.model.name} is the model of this pack and that its"
                 " capacity is right."
             )
+        if isinstance(self.recorded, Log):
+            capacity_ah = self.settings.capacity_ah or self.model.capacity_ah
+            difference = difference_from_reference(self.recorded, capacity_ah)
+            found.extend([] if difference is None else [f"{difference}."])
         return found
 
     def to_dict(self) -> dict[str, Any]:
