@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tarfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -58,11 +58,12 @@ signal = "SoC_Display"
 
 
 class Kind(NamedTuple):
-    """A kind of file: how one is made, its suffix, and options that it needs."""
+    """A kind of file: how one is made, its suffix, options that it needs, and more for the fit."""
 
     write: Callable[[cangauge.Log, Path], None]
     suffix: str
     options: list[str]
+    fit: Sequence[str] = ()
 
 
 def frames(log: cangauge.Log, vehicle: cangauge.Vehicle) -> Iterator[can.Message]:
@@ -197,7 +198,7 @@ KINDS = {
     "SavvyCAN GVRET": Kind(write_gvret, ".csv", ["--vehicle", "leaf_aze0"]),
     "CARBUS trace": Kind(write_carbus, ".trc", ["--map", "mycar.toml"]),
     "MCAP": Kind(write_mcap, ".mcap", ["--columns", "soc=/battery percentage"]),
-    "Battery Data Format": Kind(write_bdf, ".bdf.csv", []),
+    "Battery Data Format": Kind(write_bdf, ".bdf.csv", [], ["--initial-soc", "100"]),
 }
 ARBIN = "Arbin export"
 ARBIN_OPTIONS = ["--sign", "charge"]
@@ -280,7 +281,7 @@ def main() -> None:
             continue
         commands = [
             ["inspect", trip_name, *kind.options],
-            ["fit", full_name, *kind.options, "-o", "pack.json"],
+            ["fit", full_name, *kind.options, *kind.fit, "-o", "pack.json"],
             ["estimate", trip_name, *kind.options, "-m", "pack.json", "-o", "soc.csv",
              "--report", "soc.html"],
         ]  # fmt: skip
