@@ -45,6 +45,8 @@ from fuzzing.target import FindingError, Target, refusable
 
 FRAMES_AT_ONCE = 200
 """Frames of one stream; each counts as an input."""
+MF4_EVERY = 500
+"""Each MF4 log costs a process and a second."""
 ESTIMATED_ROWS = 200
 """Longer logs are read and inspected, not estimated."""
 
@@ -84,9 +86,12 @@ def _packed(rng: Random, data: bytes) -> bytes:
 
 def _make_log(rng: Random) -> bytes:
     files = corpus.log_files()
+    signals = corpus.mf4_signals()
+    if signals is not None and rng.randrange(MF4_EVERY) == 0:
+        return mutate(rng, signals, [signals])
     name = rng.choice(list(files))
     data = files[name]
-    if name.endswith((".parquet", ".gz", ".zip", "utf16.csv")):
+    if name.endswith((".mcap", ".parquet", ".gz", ".zip", "utf16.csv")):
         return mutate(rng, data, list(files.values()))
     mutant = mutate(rng, data, [files["log.csv"], files["TripA01.csv"]], text=True)
     if name.startswith("2012") and rng.randrange(8) == 0:
@@ -143,8 +148,10 @@ def _vehicles() -> tuple[Vehicle, ...]:
 
 def _make_capture(rng: Random) -> bytes:
     files = corpus.capture_files()
-    name = rng.choice(list(files))
-    is_text = not name.endswith((".blf", ".gz", ".mf4"))
+    name = rng.choice([name for name in files if name != "x.mf4"])
+    if "x.mf4" in files and rng.randrange(MF4_EVERY) == 0:
+        name = "x.mf4"
+    is_text = not name.endswith((".blf", ".gz", ".mf4", ".mcap", ".pcap", ".pcapng"))
     mutant = mutate(rng, files[name], list(files.values()), text=is_text)
     return _packed(rng, mutant) if is_text else mutant
 

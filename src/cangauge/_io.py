@@ -65,6 +65,8 @@ MAX_IDLE_LINES: Final = 1_000_000
 """Consecutive lines without a frame."""
 MAX_BLF_OBJECT: Final = 16 * MIB
 """One object of a BLF file, packed or unpacked (writers fill 128 KiB)."""
+MAX_MCAP_RECORD: Final = 64 * MIB
+"""One record of an MCAP file, packed or unpacked (writers fill chunks of 1–4 MiB)."""
 MAX_MF4_MEMORY: Final = 4096 * MIB
 """Memory of the process that reads an MF4 file."""
 MF4_SILENCE_S: Final = 60.0

@@ -40,6 +40,7 @@ from cangauge.errors import InputError
 from cangauge.estimation.settings import VALID_STD_PCT, EstimatorSettings, Method
 from cangauge.model.delay_line import GAP_S
 from cangauge.model.model_file import Model
+from cangauge.service.estimate_mcap import write_estimates_mcap
 from cangauge.service.estimate_table import require_table_suffix, write_estimates
 from cangauge.service.offline import (
     RecordedCapture,
@@ -59,7 +60,9 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     ],
     output: Annotated[
         Path,
-        typer.Option("-o", "--output", metavar="OUT", help="Table of estimates, .csv or .parquet."),
+        typer.Option(
+            "-o", "--output", metavar="OUT", help="Table of estimates, .csv, .parquet or .mcap."
+        ),
     ],
     method: Annotated[
         str,
@@ -112,7 +115,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     OUT has one row per sample: time_s [s], soc_pct, soc_std_pct, soc_newton_pct, soc_coulomb_pct
     [%], voltage_model_v, residual_v (measured − model) [V], status (initialising, valid, degraded,
     invalid) and reasons (separated by "; "). An unknown value is empty (CSV) or null (Parquet).
-    Positive current discharges.
+    An .mcap holds samples and estimates for Foxglove and PlotJuggler. Positive current discharges.
 
     Examples
     --------
@@ -122,7 +125,9 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge estimate drive.log --vehicle leaf_ze0 -m leaf.json -o soc.csv --method newton`
     """
-    require_table_suffix(output)
+    is_mcap = output.suffix.lower() == ".mcap"
+    if not is_mcap:
+        require_table_suffix(output)
     settings = EstimatorSettings(
         method=_method(method),
         initial_soc_pct=_initial_soc(initial_soc),
@@ -179,7 +184,11 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
 
         page = estimate_report(done, model_path)
     with ExitStack() as both:  # table and report, or neither
-        write_estimates(both.enter_context(atomic_path(output)), done.recorded.time_s, done.table)
+        part = both.enter_context(atomic_path(output))
+        if is_mcap:
+            write_estimates_mcap(part, done.recorded, done.table)
+        else:
+            write_estimates(part, done.recorded.time_s, done.table)
         if report is not None and page is not None:
             both.enter_context(atomic_path(report)).write_text(page, encoding="utf-8")
     for warning in done.warnings:

@@ -31,6 +31,7 @@ from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.columns import read_columns
 from cangauge.logs.draft import DraftLog
 from cangauge.logs.file_content import FileContent, delimiter_of, split_cells
+from cangauge.logs.formats import BDF_LABELS
 from cangauge.logs.log import Log
 from cangauge.logs.table_columns import draft_of_arrow
 
@@ -163,17 +164,32 @@ def write_log(log: Log, path: str | PathLike[str]) -> None:
     ----------
     log : Log
     path : path-like
-        `.parquet` or `.csv`.
+        `.parquet` or `.csv`; `.bdf`, `.bdf.csv` or `.bdf.parquet` for the Battery Data Format,
+        which has no SoC.
 
     Raises
     ------
     InputError
         If the suffix is another one, or the folder is absent or not writable.
     """
+    if ".bdf" in Path(path).suffixes[-2:]:
+        _write(_bdf_table(log), path)
+        return
     table = log.to_arrow()
     if Path(path).suffix.lower() == ".csv" and log.temperature_source != "unknown":
         table = table.append_column(SOURCE, [[log.temperature_source] * len(log)])
     _write(table, path)
+
+
+def _bdf_table(log: Log) -> Any:
+    place = "ambient" if log.temperature_source == "room" else "sensor"
+    columns = {
+        "time_s": log.time_s,
+        "voltage_v": log.voltage_v,
+        "current_a": 0.0 - log.current_a,  # positive charges
+        place: log.temperature_c,
+    }
+    return build_table({BDF_LABELS[name]: values for name, values in columns.items()})
 
 
 def write_table(columns: Mapping[str, Any], path: str | PathLike[str]) -> None:
@@ -196,12 +212,12 @@ def write_table(columns: Mapping[str, Any], path: str | PathLike[str]) -> None:
 
 def _write(table: Any, path: str | PathLike[str]) -> None:
     suffix = Path(path).suffix.lower()
-    if suffix not in {".parquet", ".pq", ".csv"}:
+    if suffix not in {".parquet", ".pq", ".csv", ".bdf"}:
         raise InputError(
             "unknown suffix for a table", source=path, value=suffix, cure="use .parquet or .csv"
         )
     with atomic_path(path) as part:
-        if suffix == ".csv":
+        if suffix in {".csv", ".bdf"}:
             with part.open("wb") as file:
                 file.write((",".join(table.column_names) + "\n").encode())
                 options = pacsv.WriteOptions(include_header=False, quoting_style="needed")

@@ -22,11 +22,13 @@ from cangauge._io import (
     read_all,
     read_beginning,
 )
+from cangauge._mcap import MAGIC
 from cangauge.errors import InputError
 
 _WORKBOOK: Final = "xl/workbook.xml"
 _ZIP: Final = b"PK\x03\x04"
 _PARQUET: Final = b"PAR1"
+_MDF: Final = (b"MDF     ", b"UnFinMF ")
 _DELIMITERS: Final = ("\t", ";", ",")
 _HEAD_BYTES: Final = 64 * 1024
 _HEAD_LINES: Final = 160
@@ -53,7 +55,7 @@ class FileContent:
         File name without folder and suffixes (of the member, for a zip).
     head : tuple of str
         The first lines, without line ends; empty for binary content.
-    is_parquet : bool
+    is_parquet, is_mf4, is_mcap : bool
 
     Raises
     ------
@@ -77,7 +79,10 @@ class FileContent:
             self._sheet = sheet_text(self.path)
             beginning = self._sheet[:_HEAD_BYTES]
         self.is_parquet = beginning.startswith(_PARQUET)
-        self.head = () if self.is_parquet else _first_lines(beginning)
+        self.is_mf4 = beginning.startswith(_MDF)
+        self.is_mcap = beginning.startswith(MAGIC)
+        is_binary = self.is_parquet or self.is_mf4 or self.is_mcap
+        self.head = () if is_binary else _first_lines(beginning)
 
     @property
     def first_line(self) -> str:
@@ -259,6 +264,9 @@ def _stem(name: str) -> str:
         ".dat",
         ".xlsx",
         ".mpt",
+        ".bdf",
+        ".mf4",
+        ".mcap",
     ):
         if name.lower().endswith(suffix):
             name = name[: -len(suffix)]

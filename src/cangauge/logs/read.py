@@ -8,7 +8,7 @@ from os import PathLike
 from typing import Any, Final
 
 from cangauge.errors import InputError
-from cangauge.logs import arrow, canonical, formats, table, table_columns
+from cangauge.logs import arrow, canonical, formats, measurement, table, table_columns
 from cangauge.logs.column_map import ColumnMap, missing_quantities, shown_headings, suggestion
 from cangauge.logs.draft import DraftLog, Sign
 from cangauge.logs.file_content import FileContent
@@ -18,15 +18,17 @@ from cangauge.logs.units import COLDEST_C, HOTTEST_C, known_temperature_source
 
 KNOWN_LOGS: Final = (
     "canonical Parquet and CSV (time_s, current_a, voltage_v, temperature_c, soc_pct), ANL D3"
-    " tests, BMW i3 trips, Arbin, Bitrode and VisuaLCN exports, any table with plain headings"
+    " tests, BMW i3 trips, Arbin, Bitrode and VisuaLCN exports, Battery Data Format, MF4"
+    " signals, MCAP samples, any table with plain headings"
 )
 
 _Reader = Callable[[FileContent], DraftLog]
 _TEXT_FORMATS: Final[tuple[tuple[Callable[[FileContent], bool], _Reader], ...]] = (
     (formats.is_bmw_i3, formats.read_bmw_i3),
     (formats.is_d3, formats.read_d3),
-    (canonical.is_canonical_csv, canonical.read_csv),
+    # Before the canonical log, whose names battery-data-standard partly shares.
     (formats.is_cycler, formats.read_cycler),
+    (canonical.is_canonical_csv, canonical.read_csv),
     (table.is_table, table.read_table),
 )
 
@@ -134,12 +136,27 @@ def open_log(
     content = FileContent(path)
     if columns is not None:
         given = ColumnMap.of(columns)
-        read_any = canonical.read_any_parquet if content.is_parquet else table.read_table
+        read_any = _reader_by_columns(content)
         return LogFile(content, lambda file: read_any(file, given), sign)
     if content.is_parquet:
         return LogFile(content, canonical.read_parquet, sign)
+    # With CAN frames they are captures.
+    if content.is_mf4:
+        is_capture = measurement.has_mf4_frames(content.path)
+        return LogFile(content, None if is_capture else measurement.read_mf4, sign)
+    if content.is_mcap:
+        is_capture = measurement.has_mcap_frames(content.path)
+        return LogFile(content, None if is_capture else measurement.read_mcap, sign)
     readers = (reader for matches, reader in _TEXT_FORMATS if matches(content))
     return LogFile(content, next(readers, None) if content.first_line else None, sign)
+
+
+def _reader_by_columns(content: FileContent) -> Callable[[FileContent, ColumnMap], DraftLog]:
+    if content.is_parquet:
+        return canonical.read_any_parquet
+    if content.is_mf4:
+        return measurement.read_mf4
+    return measurement.read_mcap if content.is_mcap else table.read_table
 
 
 def read_log(

@@ -288,10 +288,11 @@ class RunConfig(_Strict):
     )
     record: str | None = _key(
         None,
-        "Record the received frames (.log, .csv, .blf, .mf4): `cangauge estimate` on them gives"
-        " the live numbers, bit for bit. A kill loses the last half second, or a whole part of an"
-        " .mf4. A full disk costs frames of the recording, never the estimate. An existing"
-        " recording is kept: the next run is FILE-0001, FILE-0002, …",
+        "Record the received frames (.log, .csv, .blf, .mf4, .mcap): `cangauge estimate` on them"
+        " gives the live numbers, bit for bit; an .mcap also holds the estimates. A kill loses the"
+        " last half second, the last 64 KiB of an .mcap, or a whole part of an .mf4. A full disk"
+        " costs frames of the recording, never the estimate. An existing recording is kept: the"
+        " next run is FILE-0001, FILE-0002, …",
         "FILE",
         needs_restart=True,
         is_path=True,

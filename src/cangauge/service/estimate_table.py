@@ -53,7 +53,7 @@ def require_table_suffix(output: Path) -> None:
             source=output,
             field="--output",
             value=output.suffix,
-            cure="name it .csv or .parquet",
+            cure="name it .csv or .parquet (`cangauge estimate` also writes .mcap)",
         )
 
 

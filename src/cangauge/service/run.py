@@ -12,14 +12,14 @@ from dataclasses import replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cangauge._formatting import number
 from cangauge._io import READ_WITHIN_S, check_writable, refuse_pipe, sole_writer
 from cangauge._logging import emit
 from cangauge.bus.reconnect import ReconnectingBus
 from cangauge.errors import InputError
-from cangauge.estimation.validity import reason_names
+from cangauge.estimation.validity import Estimate, reason_names
 from cangauge.service.addresses import default_path, has_unix_sockets
 from cangauge.service.config import RunConfig, config_keys, load_config
 from cangauge.service.http import Endpoint
@@ -30,6 +30,9 @@ from cangauge.service.reading import START_S, BackgroundReader, Reading
 from cangauge.service.recording import Recorder
 from cangauge.service.state import StateKeeper, check_state_path
 from cangauge.service.status import Identity, Monitor, Snapshot
+
+if TYPE_CHECKING:
+    from cangauge.service.estimate_table import EstimateWriter
 
 _LOG = logging.getLogger(__name__)
 
@@ -145,7 +148,7 @@ class Service:
             monitor = stack.enter_context(self._supervised(port, recorder))
             outputs = Outputs(
                 record=recorder,
-                table=None if table is None else table.add,
+                table=self._rows(table, recorder),
                 show=self._each_turn(monitor, recorder),
                 checkpoint=None if keeper is None else keeper.checkpoint,
                 reload=lambda: self._poll_reload(monitor, wanted=hangup()),
@@ -241,6 +244,23 @@ class Service:
         if not self._reader.is_reading:
             monitor.reload_ends(str(result) if isinstance(result, InputError) else "")
         return settings
+
+    def _rows(
+        self, table: EstimateWriter | None, recorder: Recorder | None
+    ) -> Callable[[float, Estimate], None] | None:
+        """Return what takes each sample's estimate: the table, the recording, both or none."""
+        if recorder is None or not recorder.keeps_estimates:
+            return None if table is None else table.add
+        pipeline = self.pipeline
+
+        def add(time_s: float, estimate: Estimate) -> None:
+            if table is not None:
+                table.add(time_s, estimate)
+            if pipeline.latest_sample is not None:
+                soc_pct = pipeline.decoder.reference_soc_pct
+                recorder.write_estimate(pipeline.latest_sample, soc_pct, estimate)
+
+        return add
 
     def _each_turn(self, monitor: Monitor, recorder: Recorder | None) -> Callable[[float], None]:
         def turn(now_s: float) -> None:
