@@ -528,6 +528,18 @@ PRESETS: Final[dict[str, Preset]] = {
         0.100,
         has_temperature=False,
     ),
+    "bmw_i3": Preset(
+        dbc="bmw_i3.dbc",
+        about="BMW i3 60/94/120 Ah; needs --temperature",
+        mapping=VehicleMap(
+            name="BMW i3",
+            current=SignalMap(message="BATTERY_112", signal="current_a", sign=-1),
+            voltage=SignalMap(message="BATTERY_112", signal="voltage_v"),
+            soc_reference=SignalMap(message="BATTERY_112", signal="soc_pct"),
+            messages={"BATTERY_112": MessageMap(period_s=0.010)},
+        ),
+        periods_s={0x112: 0.010},
+    ),
 }
 """By the name that `--vehicle` takes."""
 
