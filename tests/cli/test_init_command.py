@@ -96,7 +96,8 @@ def test_nothing_to_look_at_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "preset"),
     [
-        ("leaf_can/EV-CANeplus2.log.gz", "leaf_ze1"),
+        ("leaf_can/EV-CANeplus2.log.gz", "leaf_ze1_polled"),
+        ("leaf_can/62kWh-Battery-only-EVcan.txt.gz", "leaf_ze1"),
         ("leaf_can/10bars.csv.gz", "leaf_ze0"),
         ("can_captures/bmw_i3_startcharge_gvret.csv.gz", "bmw_i3"),
     ],
