@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import can
 import pytest
 
+from cangauge.bus.captures.capture import open_capture
+from cangauge.bus.open import bus_address, open_bus
 from cangauge.bus.recording import capture_to_log
 from cangauge.bus.vehicle import Vehicle
 from cangauge.service.config import load_config
@@ -110,3 +115,39 @@ def test_known_vehicles_are_recognised(
     assert json.loads(done.stdout)["vehicle"] == preset
     config = load_config(tmp_path / "run.toml")
     assert config.load_vehicle().name == Vehicle.load(preset, temperature_c=20.0).name
+
+
+def test_a_live_bus_is_listened_to(mitsubishi: Path, tmp_path: Path) -> None:
+    port = 20_000 + (os.getpid() + 311) % 20_000
+    bus = ("--interface", "udp_multicast", "--bus-option", f"port={port}")
+    options = ("-o", tmp_path / "car", "--seconds", "8", "--json")
+    choice = ("--choose", "current=1", "--choose", "voltage=1")
+    arguments = [*bus, *options, *choice]
+    command = [sys.executable, "-m", "cangauge", "init", *map(str, arguments)]
+    stop = threading.Event()
+
+    def send() -> None:
+        with open_bus(bus_address("udp_multicast", options={"port": port}), []) as sender:
+            began_s, frames = time.monotonic(), list(open_capture(mitsubishi))
+            while not stop.is_set():
+                for frame in frames:
+                    wait_s = began_s + frame.timestamp / 4.0 - time.monotonic()
+                    if stop.wait(max(wait_s, 0.0)):
+                        return
+                    sender.send(frame)
+                began_s = time.monotonic()
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL
+        )
+    finally:
+        stop.set()
+        thread.join()
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["proof"]["samples"] > 500
+    config = load_config(tmp_path / "car" / "run.toml")
+    assert config.interface == "udp_multicast"
+    assert config.bus_options == {"port": port}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 import tempfile
@@ -132,8 +133,9 @@ def init_command(  # noqa: PLR0917 - typer fills the arguments by name
                 cure="give a capture, --interface and --channel, or --dbc FILE",
             )
         found = _find(paths, dbc, picks, targets, presets=presets, quiet=json_output)
-        files = found.files(targets, interface, channel)
+        files = found.files(targets, interface, channel, parse_bus_options(bus_option or []))
         found.proof = _prove(files, targets, paths, Path(folder), found)
+    targets.map.parent.mkdir(exist_ok=True)
     write_texts_atomic(files)
     if json_output:
         emit_json({**found.to_dict(), "files": [str(path) for path in files]})
@@ -166,16 +168,19 @@ class _Targets:
                 field="-o",
                 cure="give -o DIR, or --map FILE --config FILE",
             )
-        return cls(map_file, config, map_file.with_suffix(".dbc"))
+        return cls(map_file, config, map_file.parent / f"{map_file.stem or 'car'}.dbc")
 
     def check(self, *, force: bool) -> None:
         """Raise InputError if a file exists, or cannot be written."""
         for path in (self.map, self.config, self.dbc):
-            if path.exists() and not force:
+            # Of os.path: False for a name that no file can have.
+            if os.path.isfile(path) and not force:  # noqa: PTH113
                 raise InputError("exists", source=path, cure="give --force to overwrite it")
-        self.map.parent.mkdir(parents=True, exist_ok=True)
         for path in (self.map, self.config):
-            check_writable(path)
+            if os.path.isdir(path.parent):  # noqa: PTH112
+                check_writable(path)
+            elif not os.path.isdir(path.parent.parent):  # noqa: PTH112
+                raise InputError("cannot create this folder", source=path.parent)
 
 
 @dataclass
@@ -210,7 +215,11 @@ class _Found:
         }
 
     def files(
-        self, targets: _Targets, interface: str | None, channel: str | None
+        self,
+        targets: _Targets,
+        interface: str | None,
+        channel: str | None,
+        bus_options: Mapping[str, object],
     ) -> dict[Path, str]:
         """Return the texts by file."""
         texts = {}
@@ -233,6 +242,7 @@ class _Found:
             map_name=targets.map.name,
             interface=interface,
             channel=channel,
+            bus_options=bus_options,
         )
         return texts
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Final
 
 from cangauge.bus.mapping import VehicleMap
@@ -178,7 +179,12 @@ def mapped(mapping: VehicleMap, dbc: str, comments: tuple[str, ...]) -> Proposal
 
 
 def config_text(
-    *, vehicle: str | None, map_name: str, interface: str | None, channel: str | None
+    *,
+    vehicle: str | None,
+    map_name: str,
+    interface: str | None,
+    channel: str | None,
+    bus_options: Mapping[str, object] = MappingProxyType({}),
 ) -> str:
     """Return a commented configuration of the service."""
     lines = [
@@ -206,6 +212,10 @@ def config_text(
         '# state = "state.json"  # keep the SoC over restarts',
         "",
     ]
+    if bus_options:
+        lines.append("[bus_options]")
+        lines += [f"{key} = {json.dumps(value)}" for key, value in bus_options.items()]
+        lines.append("")
     return "\n".join(lines)
 
 

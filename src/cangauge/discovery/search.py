@@ -52,6 +52,9 @@ CURRENT_SCALES: Final = {
     0.02: -1.5,
 }  # fmt: skip
 """Usual scales [V, A] and their log priors [nats], by their frequency in public DBC files."""
+MOST_CURRENTS: Final = 4000
+MOST_VOLTAGES: Final = 1500
+"""Most fields whose pairs are tried: 50 MB for each of a dozen quantities."""
 SHOWN: Final = 3
 CLEARLY_NATS: Final = 3.0
 """Distance to the second candidate that makes the first clear: a likelihood ratio of 20."""
@@ -254,6 +257,9 @@ class _Search:
         currents = [row for each in range(len(self._fields)) if (row := self._as_current(each))]
         voltages = [row for each in range(len(self._fields)) if (row := self._as_voltage(each))]
         voltages += self._constant_voltages(currents)
+        # All pairs are held in memory: of the largest buses, the likelier fields.
+        currents = sorted(currents, key=lambda row: -row.prior)[:MOST_CURRENTS]
+        voltages = sorted(voltages, key=lambda row: -row.prior)[:MOST_VOLTAGES]
         remarks: list[str] = []
         if not currents or not voltages:
             remarks.append("no field of this capture can be the current or the voltage of a pack")
