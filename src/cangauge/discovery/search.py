@@ -64,6 +64,9 @@ SATURATION_NATS: Final = 20.0
 """Evidence from which on further samples count half: loads of a car are correlated."""
 SIBLING: Final = 0.02
 """Largest relative difference of two voltages of one frame that are those of two cells."""
+RIVAL: Final = 0.6
+"""Share of the first candidate's evidence with which another leaves the choice to the user: the
+evidence of loads that hang together differs by less than its saturation."""
 ENOUGH_STEPS: Final = 50
 LARGEST_RATIO: Final = 2.0
 """Fewest changes of a field that is taken without the user, and largest ratio of the resistances by
@@ -196,6 +199,8 @@ class Findings:
         one, two = found[0].halves_ohm
         if not max(one, two) <= LARGEST_RATIO * min(one, two):
             return False
+        if any(each.evidence > RIVAL * found[0].evidence for each in found[1:]):
+            return False  # the inverter's pair and the pack's: physics does not tell them apart
         return len(found) == 1 or found[0].score - found[1].score >= CLEARLY_NATS
 
 
