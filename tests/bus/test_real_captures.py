@@ -124,7 +124,9 @@ def test_values_are_those_of_the_car(folder: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", list(CAPTURES))
 def test_each_capture_matches_its_own_car_only(folder: Path, name: str) -> None:
-    assert inspect_capture(folder / name).matching == (CAPTURES[name][1],)
+    # In one capture a tester polls the battery: its replies have the temperature.
+    wanted = "leaf_ze1_polled" if name == "EV-CANeplus2.log.gz" else CAPTURES[name][1]
+    assert inspect_capture(folder / name).matching == (wanted,)
 
 
 def test_other_protected_ids_are_found(

@@ -9,6 +9,7 @@ from typing import ClassVar, Final
 
 import can
 
+from cangauge.bus.isotp import Reassembler, reply_id, reply_key
 from cangauge.bus.plausibility import (
     ConstantDetector,
     Fault,
@@ -18,7 +19,7 @@ from cangauge.bus.plausibility import (
     stuck_detectors,
 )
 from cangauge.bus.protection import SUSPECTED_AT, FrameChecker, Verdict
-from cangauge.bus.vehicle import EXTENDED, Vehicle, VehicleSignal
+from cangauge.bus.vehicle import EXTENDED, Vehicle, VehicleSignal, pgn_mask
 from cangauge.estimation.validity import Reason, Sample
 
 _MISSING: Final = {
@@ -322,6 +323,12 @@ class SampleDecoder:
         self._suspected_until_s = -math.inf
         self._pairing = Pairing(vehicle.pair_within_s, self.statistics)
         self._routes: dict[int, _Route] = {}
+        self._by_pgn = {
+            key & pgn_mask(key): key for key, each in vehicle.messages.items() if each.by_pgn
+        }
+        self._replies = {
+            reply_id(key): Reassembler() for key, each in vehicle.messages.items() if each.is_reply
+        }
         detectors = _detectors(vehicle, pack)
         for signal in vehicle.signals:
             self._add(signal, pack, detectors.get(signal.role))
@@ -370,7 +377,7 @@ class SampleDecoder:
         )
         route.has_both = self.vehicle.current.key == self.vehicle.voltage.key == signal.key
 
-    def handle(self, message: can.Message) -> Sample | None:  # noqa: C901 - one pass, in order
+    def handle(self, message: can.Message) -> Sample | None:  # noqa: C901, PLR0912 - one pass
         """Decode one frame; return the sample that it completes, if any.
 
         `voltage_v` and `temperature_c` of a sample may be NaN. Samples keep the order of their
@@ -385,6 +392,10 @@ class SampleDecoder:
         if message.is_extended_id:
             key |= EXTENDED
         route = self._routes.get(key)
+        if route is None and self._by_pgn and key & EXTENDED:
+            route = self._routes.get(self._by_pgn.get(key & pgn_mask(key), 0))
+        elif route is None and key in self._replies:
+            route, message = self._reply(key, message)
         payload = None if route is None else self._accept(route, message)
         if route is None or payload is None:
             return None
@@ -415,6 +426,14 @@ class SampleDecoder:
         if sample is not None:
             statistics.samples += 1
         return sample
+
+    def _reply(self, key: int, message: can.Message) -> tuple[_Route | None, can.Message]:
+        """Return the route and content of the reply (ISO-TP) that a frame completes, if any."""
+        reply = self._replies[key].take(message.data, message.timestamp)
+        if reply is None or len(reply) < 2:
+            return None, message
+        route = self._routes.get(reply_key(key, reply) | EXTENDED)
+        return route, can.Message(timestamp=message.timestamp, data=reply)
 
     def _accept(  # noqa: C901 - one pass, in order
         self, route: _Route, message: can.Message

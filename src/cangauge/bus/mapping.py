@@ -50,6 +50,13 @@ A map file in TOML, for any car with a DBC::
     counter = "AliveCounter"        # signal of the DBC
     counter_modulus = 15            # number of values; default: all that its bits can hold
 
+    [messages.HVESSD1]
+    j1939 = true                    # by its PGN: any source address and priority
+
+    [messages.Reply_6104]
+    isotp = true                    # a reply over ISO-TP; its id in the DBC is 0x7BB6104 for a
+                                    # reply 61 04 … on 0x7BB. Others poll it: nothing is sent
+
     [rules.my_rule]
     polynomial = 0x2F
     initial = 0xFF
@@ -198,6 +205,10 @@ class MessageMap(_Strict):
     ----------
     protection : str, optional
         One of `protection.RULES`, of [rules] or of `protection.PROFILES`, or "counter".
+    j1939 : bool
+        Whether its PGN identifies it: from any source address, at any priority.
+    isotp : bool
+        Whether it is a reply over ISO-TP, with the id of `isotp.reply_key` in the DBC.
     period_s : float, optional
         Frame period [s].
     data_id, data_id_list, data_id_mode, header_byte, protected_bytes
@@ -209,6 +220,8 @@ class MessageMap(_Strict):
     """
 
     protection: str | None = None
+    j1939: bool = False
+    isotp: bool = False
     period_s: _Positive | None = None
     data_id: Annotated[int, Field(ge=0, lt=1 << 32)] | None = None
     data_id_list: (

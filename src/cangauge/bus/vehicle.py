@@ -28,6 +28,7 @@ from cangauge.bus.database import (
     load_dbc,
     signal_codec,
 )
+from cangauge.bus.isotp import reply_id
 from cangauge.bus.mapping import (
     NO_OVERRIDES,
     CheckMap,
@@ -57,6 +58,14 @@ EXTENDED: Final = 1 << 31
 """Flag of an extended id in a message key, as in SocketCAN."""
 
 _LONGEST_CYCLE_MS: Final = 1e9
+
+
+def pgn_mask(key: int) -> int:
+    """Return the bits of an extended id that are its PGN (SAE J1939-21).
+
+    Below 0xF0 the PDU format is followed by a destination, which is no part of the PGN.
+    """
+    return 0x03FF0000 if (key >> 16 & 0xFF) < 0xF0 else 0x03FFFF00
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,10 +153,14 @@ class VehicleSignal:
 
 
 class MessageProtection(NamedTuple):
-    """Protection and period [s] of one message, where known."""
+    """Protection and period [s] of one message, where known, and how it is identified."""
 
     rule: Protection | None
     period_s: float | None
+    is_reply: bool = False
+    """Over ISO-TP."""
+    by_pgn: bool = False
+    """From any source address (J1939)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,19 +295,31 @@ class Vehicle:
     @property
     def wanted_ids(self) -> tuple[int, ...]:
         """Arbitration ids with a wanted signal, each once."""
-        return tuple(dict.fromkeys(signal.arbitration_id for signal in self.signals))
+        return tuple(dict.fromkeys(key & ~EXTENDED for key in self.frame_keys))
+
+    def _mask(self, key: int) -> int:
+        if not key & EXTENDED:
+            return 0x7FF
+        known = self.messages.get(key)
+        return pgn_mask(key) if known is not None and known.by_pgn else 0x1FFFFFFF
+
+    @property
+    def frame_keys(self) -> tuple[int, ...]:
+        """Ids of the frames with a wanted signal, plus `EXTENDED`, each once."""
+        keys = dict.fromkeys(signal.key for signal in self.signals)
+        replies = {key for key in keys if self.messages[key].is_reply}
+        return tuple(dict.fromkeys(reply_id(key) if key in replies else key for key in keys))
 
     @property
     def filters(self) -> list[CanFilter]:
         """The wanted ids as filters of python-can (`bus.set_filters`)."""
-        keys = dict.fromkeys(signal.key for signal in self.signals)
         return [
             {
                 "can_id": key & ~EXTENDED,
-                "can_mask": 0x1FFFFFFF if key & EXTENDED else 0x7FF,
+                "can_mask": self._mask(key),
                 "extended": bool(key & EXTENDED),
             }
-            for key in keys
+            for key in self.frame_keys
         ]
 
 
@@ -418,7 +443,8 @@ class _Binder:
         for key, message in self._found.items():
             each, source = stated.get(key, (MessageMap(), self._source))
             period_s = _cycle_s(message) if each.period_s is None else each.period_s
-            found[key] = MessageProtection(each.rule(message, rules, source=source), period_s)
+            rule = each.rule(message, rules, source=source)
+            found[key] = MessageProtection(rule, period_s, each.isotp, each.j1939)
         return found
 
     def _message_key(self, name: str) -> int:
@@ -482,6 +508,17 @@ class Preset:
         return binder.vehicle(temperature_c, pair_within_s)
 
 
+def _polled(leaf: Preset) -> Preset:
+    """Return a Leaf whose temperature comes in replies of its battery that a tester polls."""
+    temperature = TemperatureMap(message="LBC_04", signal="probe_1_c", timeout_s=60.0)
+    messages = {**leaf.mapping.messages, "LBC_04": MessageMap(isotp=True)}
+    mapping = leaf.mapping.model_copy(
+        update={"temperature": temperature, "temperature_source": "pack", "messages": messages}
+    )
+    about = "Nissan Leaf 40/62 kWh whose battery a tester polls: temperature from its replies"
+    return dataclasses.replace(leaf, about=about, mapping=mapping)
+
+
 def _leaf(name: str, about: str, period_5bc_s: float, *, has_temperature: bool = True) -> Preset:
     temperature = TemperatureMap(
         message="BATTERY_5C0", signal="temperature_average_c", timeout_s=10.0
@@ -505,6 +542,13 @@ def _leaf(name: str, about: str, period_5bc_s: float, *, has_temperature: bool =
     )
 
 
+_LEAF_ZE1: Final = _leaf(
+    "Nissan Leaf ZE1",
+    "Nissan Leaf 40/62 kWh, from 2018; needs --temperature",
+    0.100,
+    has_temperature=False,
+)
+
 PRESETS: Final[dict[str, Preset]] = {
     "generic": Preset(
         dbc="generic_pack.dbc",
@@ -527,11 +571,19 @@ PRESETS: Final[dict[str, Preset]] = {
         "Nissan Leaf 24/30 kWh, 2013-17; e-NV200; 40 kWh pack in such a car",
         0.100,
     ),
-    "leaf_ze1": _leaf(
-        "Nissan Leaf ZE1",
-        "Nissan Leaf 40/62 kWh, from 2018; needs --temperature",
-        0.100,
-        has_temperature=False,
+    "leaf_ze1": _LEAF_ZE1,
+    "leaf_ze1_polled": _polled(_LEAF_ZE1),
+    "bmw_i3": Preset(
+        dbc="bmw_i3.dbc",
+        about="BMW i3 60/94/120 Ah; needs --temperature",
+        mapping=VehicleMap(
+            name="BMW i3",
+            current=SignalMap(message="BATTERY_112", signal="current_a", sign=-1),
+            voltage=SignalMap(message="BATTERY_112", signal="voltage_v"),
+            soc_reference=SignalMap(message="BATTERY_112", signal="soc_pct"),
+            messages={"BATTERY_112": MessageMap(period_s=0.010)},
+        ),
+        periods_s={0x112: 0.010},
     ),
 }
 """By the name that `--vehicle` takes."""

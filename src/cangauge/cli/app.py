@@ -23,6 +23,8 @@ from cangauge.errors import CangaugeError, closest
 
 COMMANDS: Final = {
     "demo": "Fit a model, replay a log on a bus, estimate its SoC live, and report the errors.",
+    "init": "Find the car's signals, prove them against each other, and write a map and a"
+    " configuration.",
     "fit": "Identify the voltage model of a pack from recorded logs.",
     "estimate": "Estimate the state of charge of a recorded log or capture, offline.",
     "gap": "Diagnose the gap between a model and logs: size, place, probable cause.",
