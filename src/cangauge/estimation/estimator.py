@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from operator import mul
 
 from cangauge.errors import InputError
 from cangauge.estimation.counting import CoulombCounter, EstimatorClock
@@ -18,7 +19,9 @@ from cangauge.estimation.ekf import (
     SocEkf,
     count_std_pct,
 )
+from cangauge.estimation.health import Health, HealthEstimator, VoltageTick
 from cangauge.estimation.hypothesis_filter import HypothesisFilter
+from cangauge.estimation.power import LEVEL_MEMORY_S, PackNow, Power, PowerModel
 from cangauge.estimation.settings import (
     EstimatorSettings,
     SocReference,
@@ -42,8 +45,8 @@ from cangauge.estimation.validity import (
 )
 from cangauge.model.delay_line import DelayLine
 from cangauge.model.effects.base import Reading
-from cangauge.model.model_file import Model
-from cangauge.model.voltage_model import soc_from_ocv
+from cangauge.model.model_file import Model, effective_error_std_v
+from cangauge.model.voltage_model import TEMPERATURE_MARGIN_K, soc_from_ocv
 
 __all__ = ["Estimator", "EstimatorSettings"]
 
@@ -110,6 +113,20 @@ class Estimator:
         self._noise = MeasurementNoise(self._voltage_model, model, self.capacity_ah)
         self._bias_std_v = math.hypot(model.noise.slow_std_v, model.noise.lasting_std_v)
         self._nominal_v = self._voltage_model.pseudo_ocv_at(50.0)[0]
+        self._health = HealthEstimator(
+            self._curve,
+            steady_ohm=self._online.steady_ohm,
+            noise=model.noise,
+            fast_std_v=effective_error_std_v(model.noise, 1.0 / model.rate_hz),
+            nominal_v=self._nominal_v,
+            capacity_ah=self.capacity_ah,
+        )
+        self._power = PowerModel(
+            self._curve,
+            self._voltage_model,
+            model.noise,
+            self.settings.limits.of_model(self._voltage_model),
+        )
         self._permanent_reasons = temperature_mismatch(
             model.temperature_source, self.settings.temperature_source
         )
@@ -184,6 +201,29 @@ class Estimator:
         reasons = latest.reasons | Reason.IMPLAUSIBLE_INPUT
         return latest._replace(reasons=reasons, status=status_of(reasons))
 
+    @property
+    def health(self) -> Health:
+        """Capacity, resistance and current offset, with standard deviations."""
+        health = self._health.health
+        return health._replace(offset_a=self.filter.offset_a) if self._is_filtering else health
+
+    def power(self) -> Power:
+        """Return the currents possible for 10 s and the energy left, after the latest sample."""
+        return self._power.at(self._pack_now(), self._line)
+
+    def _pack_now(self) -> PackNow:
+        memory = self._memory
+        soc_pct, std_pct = self._soc_and_std_pct()
+        is_level = self._counter.state.time_s - memory.level_s <= LEVEL_MEMORY_S
+        return PackNow(
+            soc_pct,
+            std_pct,
+            memory.temperature_c,
+            memory.level_residual_v if is_level else math.nan,
+            memory.level_drop_v,
+            self.health,
+        )
+
     def _process(self, sample: Sample) -> None:
         """Count the charge of a corrected sample, and use its voltage where that is due."""
         memory, since = self._memory, self._since
@@ -230,6 +270,7 @@ class Estimator:
             self.filter.predict(since)
             if rest_s > REST_S:
                 self.filter.shrink_bias()
+        self._health.count(since)
         if math.isnan(sample.voltage_v):
             memory.newton_pct, memory.newton_inside = math.nan, True
             memory.newton_std_pct = math.nan
@@ -267,6 +308,35 @@ class Estimator:
             measurement = Measurement(sample.voltage_v, without_ocv_v, memory.newton_pct, std_v_at)
             if self.filter.update(measurement, since):
                 memory.contradicted_until_s = sample.time_s + CONTRADICTED_S
+        tick = self._voltage_tick(sample, without_ocv_v)
+        self._health.use(tick, since.seconds)
+        self._follow_level(tick, sample.time_s)
+
+    def _follow_level(self, tick: VoltageTick, time_s: float) -> None:
+        """Follow the levels of the residual and of the predicted drop."""
+        memory = self._memory
+        soc_pct = self._soc_and_std_pct()[0]
+        residual_v = tick.voltage_v - tick.without_ocv_v - self._curve.pseudo_ocv_at(soc_pct)[0]
+        weight = 1.0
+        if time_s - memory.level_s < LEVEL_MEMORY_S:
+            weight = -math.expm1((memory.level_s - time_s) / LEVEL_MEMORY_S)
+        memory.level_residual_v += weight * (residual_v - memory.level_residual_v)
+        memory.level_drop_v += weight * (tick.drop_v - memory.level_drop_v)
+        memory.level_s = time_s
+
+    def _voltage_tick(self, sample: Sample, without_ocv_v: float) -> VoltageTick:
+        memory, model = self._memory, self._voltage_model
+        cold, hot = model.temperature_range_c
+        margin_k = TEMPERATURE_MARGIN_K
+        drop_v = sum(map(mul, model.resistance_ohm, self._line.currents()))
+        return VoltageTick(
+            sample.voltage_v,
+            without_ocv_v,
+            drop_v,
+            memory.newton_pct if memory.newton_inside else math.nan,
+            _clip(self._coulomb_pct()),
+            is_usable=self._line.full and cold - margin_k <= memory.temperature_c <= hot + margin_k,
+        )
 
     def _voltage_without_ocv_v(self) -> float:
         """Return the model's voltage less the pseudo-OCV at the latest sample [V]."""
@@ -299,6 +369,8 @@ class Estimator:
         if math.isnan(self._memory.coulomb_start_pct):
             self._start(reference.soc_pct, reference.soc_std_pct)
             return
+        if not reference.is_by_voltage:
+            self._health.correct(reference.soc_pct, reference.soc_std_pct)
         soc_pct = _clip(self._coulomb_pct())
         var_pct2, reference_var_pct2 = self._coulomb_std_pct() ** 2, reference.soc_std_pct**2
         gain = var_pct2 / (var_pct2 + reference_var_pct2)
@@ -391,6 +463,7 @@ class Estimator:
             since=replace(self._since),
             references=replace(self._references.state),
             memory=replace(self._memory),
+            health=self._health.snapshot(),
             estimate=list(latest[:7]),
             reasons=int(latest.reasons),
         )
@@ -420,6 +493,7 @@ class Estimator:
         self._resume(state, age_s)
         self._online.restore(state.effects, state.clock.last_s)
         self._references.state = replace(state.references)
+        self._health.restore(state.health)
         if (state.method, state.capacity_ah) != (self.settings.method, self.capacity_ah):
             self._start_from(state)
             return self._latest
@@ -444,6 +518,8 @@ class Estimator:
             # The other delay line has dropped what this longer one needs.
             self._line.fill(line.time_s, line.current_a, max(line.since_s, line.time_s[0]))
         self._memory.tick = -1
+        self._memory.level_s = math.nan
+        self._health.take_over(before._health)
         self._start_from(state)
 
     def _resume(self, state: EstimatorState, age_s: float | None) -> None:

@@ -131,6 +131,19 @@ class DelayLine:
                 result.append(c0 + (c1 - c0) * (at - t0) / (t1 - t0))
         return result
 
+    def current_at(self, ago_s: float) -> float:
+        """Return I(t − `ago_s`) [A], t being the newest sample's time; see `currents`."""
+        times, currents = self._times, self._currents
+        at = times[-1] - ago_s
+        right = bisect_right(times, at)
+        if right == 0:
+            return currents[0]
+        if right == len(times):
+            return currents[-1]
+        t0, t1 = times[right - 1], times[right]
+        c0, c1 = currents[right - 1], currents[right]
+        return c0 + (c1 - c0) * (at - t0) / (t1 - t0)
+
     @property
     def contents(self) -> tuple[list[float], list[float], float]:
         """Copies of the times [s] and currents [A], and the start of the gap-free stretch [s]."""
