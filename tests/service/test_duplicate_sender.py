@@ -17,7 +17,9 @@ from cangauge.service.loop import DUPLICATE_WARN_EVERY_S, DuplicateSenderDetecto
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from live import Service, leaf_model, virtual_service, waits
 
-OTHER_IDS = PipelineSettings(ids=FrameIds(soc_estimate=0x5B0, soc_detail=0x5B1))
+OTHER_IDS = PipelineSettings(
+    ids=FrameIds(0x5B0, 0x5B1, soc_health=0x5B2, soc_power=0x5B3, soc_cells=0x5B4)
+)
 
 
 def frame(frame_id: int = 0x5A0, data: bytes = b"12345678") -> can.Message:

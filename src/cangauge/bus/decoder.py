@@ -9,6 +9,7 @@ from typing import ClassVar, Final
 
 import can
 
+from cangauge.bus.cells import CellVoltages
 from cangauge.bus.plausibility import (
     ConstantDetector,
     Fault,
@@ -178,6 +179,8 @@ class _Route:
     inputs: list[_Input] = field(default_factory=list)
     has_both: bool = False
     """Current and voltage: each frame is a sample by itself."""
+    read_cells: Callable[[bytes | bytearray, float], None] | None = None
+    """Takes a payload with cell voltages, and its time [s]."""
     last_s: float = -math.inf
 
 
@@ -203,6 +206,8 @@ class SampleDecoder:
         By role. Read only.
     now_s : float
         Bus time of the latest wanted frame [s]; −inf before the first.
+    cells : CellVoltages or None
+        Latest cell voltages, where the vehicle has them.
     """
 
     def __init__(self, vehicle: Vehicle, pack: Pack | None = None) -> None:
@@ -215,6 +220,12 @@ class SampleDecoder:
         detectors = _detectors(vehicle, pack)
         for signal in vehicle.signals:
             self._add(signal, pack, detectors.get(signal.role))
+        self.cells: CellVoltages | None = None
+        if vehicle.cells is not None:
+            self.cells = CellVoltages(vehicle.cells)
+            for group in vehicle.cells.groups:
+                route = self._route(group.key, group.length)
+                route.read_cells = self.cells.reader(group.key)
         for route in self._routes.values():
             # Slow signals first: a sample uses the temperature of its own frame.
             route.inputs.sort(key=lambda each: each.is_current + 2 * each.is_voltage)
@@ -227,11 +238,7 @@ class SampleDecoder:
         is_stuck: Callable[[float, float], bool] | None,
     ) -> None:
         message = self.vehicle.messages[signal.key]
-        route = self._routes.get(signal.key)
-        if route is None:
-            statistics = self.statistics.messages[signal.key] = MessageStatistics()
-            checker = None if message.rule is None else FrameChecker(message.rule, message.period_s)
-            route = self._routes[signal.key] = _Route(signal.length, checker, statistics)
+        route = self._route(signal.key, signal.length)
         is_fast = signal.role in {"current", "voltage"}
         is_multiplexed = bool(signal.codec.conditions)
         health = self.health[signal.role] = SignalHealth(
@@ -253,7 +260,16 @@ class SampleDecoder:
         )
         route.has_both = self.vehicle.current.key == self.vehicle.voltage.key == signal.key
 
-    def handle(self, message: can.Message) -> Sample | None:  # noqa: C901 - one pass, in order
+    def _route(self, key: int, length: int) -> _Route:
+        route = self._routes.get(key)
+        if route is None:
+            message = self.vehicle.messages[key]
+            statistics = self.statistics.messages[key] = MessageStatistics()
+            checker = None if message.rule is None else FrameChecker(message.rule, message.period_s)
+            route = self._routes[key] = _Route(length, checker, statistics)
+        return route
+
+    def handle(self, message: can.Message) -> Sample | None:  # noqa: C901, PLR0912 - one pass, in order
         """Decode one frame; return the sample that it completes, if any.
 
         `voltage_v` and `temperature_c` of a sample may be NaN. Samples keep the order of their
@@ -272,6 +288,8 @@ class SampleDecoder:
         if route is None or payload is None:
             return None
         time_s = message.timestamp
+        if route.read_cells is not None:
+            route.read_cells(payload, time_s)
         current_a = voltage_v = math.nan
         for signal in route.inputs:
             if signal.is_present is not None and not signal.is_present(payload):

@@ -7,10 +7,12 @@ or after each tick of bus time. The same samples give the same numbers, live or 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from operator import mul
 
 from cangauge.errors import InputError
+from cangauge.estimation.cells import PackTick
 from cangauge.estimation.counting import CoulombCounter, EstimatorClock
 from cangauge.estimation.ekf import (
     UNKNOWN_SOC_STD_PCT,
@@ -46,7 +48,7 @@ from cangauge.estimation.validity import (
 from cangauge.model.delay_line import DelayLine
 from cangauge.model.effects.base import Reading
 from cangauge.model.model_file import Model, effective_error_std_v
-from cangauge.model.voltage_model import TEMPERATURE_MARGIN_K, soc_from_ocv
+from cangauge.model.voltage_model import TEMPERATURE_MARGIN_K, VoltageModel, soc_from_ocv
 
 __all__ = ["Estimator", "EstimatorSettings"]
 
@@ -206,6 +208,36 @@ class Estimator:
         """Capacity, resistance and current offset, with standard deviations."""
         health = self._health.health
         return health._replace(offset_a=self.filter.offset_a) if self._is_filtering else health
+
+    @property
+    def voltage_model(self) -> VoltageModel:
+        """The voltage model without effects."""
+        return self._voltage_model
+
+    def pack_tick(self, sample: Sample) -> PackTick:
+        """Return what is known of the pack after its latest sample, for its cells."""
+        soc_pct, std_pct = self._soc_and_std_pct()
+        is_known = self._memory.samples > 0 and not math.isnan(self._counter.state.time_s)
+        currents = self._line.currents() if is_known else ()
+        drop_v = sum(map(mul, self._voltage_model.resistance_ohm, currents))
+        return PackTick(
+            sample.time_s,
+            soc_pct,
+            std_pct,
+            sample.voltage_v,
+            self._voltage_without_ocv_v() if is_known else math.nan,
+            drop_v,
+            self._counter.state.moved_pct,
+        )
+
+    def current_changes(self, time_s: float, stamps_s: Sequence[float]) -> list[float]:
+        """Return the current at a sample's time less that at other stamps [A]; NaN for NaN."""
+        if math.isnan(self._counter.state.time_s):
+            return [math.nan] * len(stamps_s)
+        known = {each for each in stamps_s if not math.isnan(each)}
+        at = {each: self._line.current_at(time_s - each) for each in known}
+        now_a = self._line.current_at(0.0)
+        return [now_a - at[each] if each in at else math.nan for each in stamps_s]
 
     def power(self) -> Power:
         """Return the currents possible for 10 s and the energy left, after the latest sample."""

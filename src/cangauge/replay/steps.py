@@ -163,7 +163,7 @@ class CaptureSource:
         clock: ReceiveTime | ReplayClock = ReceiveTime()
         if any(is_clock(message, ids.replay_clock) for message in self._messages()):
             clock = ReplayClock(ids.replay_clock)
-        own = {ids.soc_estimate, ids.soc_detail, ids.replay_clock}
+        own = {*ids.published, ids.replay_clock}
         for message in self._messages():
             time_s = clock.time_of(message)
             is_own = message.arbitration_id in own and not message.is_extended_id

@@ -30,7 +30,7 @@ from cangauge.service.loop import LoopSettings, Outputs, RunSummary, serve
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.recording import Recorder
 from cangauge.service.state import StateKeeper, check_state_path
-from cangauge.service.status import Identity, Monitor, Snapshot
+from cangauge.service.status import NO_REPORT, Identity, Monitor, Snapshot
 
 _LOG = logging.getLogger(__name__)
 
@@ -393,4 +393,5 @@ def _summary_json(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary
             "reasons": reason_names(int(latest.reasons)),
         },
         "soc_reference_pct": pipeline.decoder.reference_soc_pct,
+        **(pipeline.report().to_dict() if pipeline.samples else NO_REPORT),
     }

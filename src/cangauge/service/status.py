@@ -21,6 +21,7 @@ from cangauge._version import __version__
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.decoder import FrameStatistics
 from cangauge.bus.plausibility import MessageStatistics
+from cangauge.bus.publish import PackReport
 from cangauge.estimation.validity import Estimate, Reason, Sample, Status, reason_name, reason_names
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline
@@ -39,6 +40,13 @@ RATE_OVER_S: Final = 2.0
 """Averaging time of the sample rate [s]."""
 CLOCKS_APART_S: Final = 60.0
 """A receive stamp further than this from the wall clock belongs to another clock [s]."""
+
+REPORT_EVERY_S: Final = 1.0
+"""Interval of health, power and cells in the snapshots [s]."""
+NO_REPORT: Final[Mapping[str, Any]] = {
+    "health": None, "power": None, "cells": None, "notices": [],
+}  # fmt: skip
+"""Their objects before the first sample."""
 
 BUS_COUNTS: Final = ("garbled", "error_frames", "unsent", "queue_drops", "losses")
 """Counts of a bus to report, where it has them."""
@@ -163,6 +171,8 @@ class Snapshot:
         Time from receive stamp to published SoC; processing time of the frame that completes a
         sample.
     record : RecordState or None
+    report : PackReport or None
+        Health, power and cells, of the last second; None before the first sample.
     """
 
     identity: Identity
@@ -184,6 +194,7 @@ class Snapshot:
     latency: HistogramCounts
     step: HistogramCounts
     record: RecordState | None
+    report: PackReport | None = None
 
     def is_stuck(self, now_s: float) -> bool:
         """Return whether the receive loop is stuck at a monotonic time [s]."""
@@ -257,6 +268,8 @@ def as_json(snapshot: Snapshot, now_s: float) -> dict[str, Any]:
             "voltage_v": _finite(sample.voltage_v),
             "temperature_c": _finite(sample.temperature_c),
         },
+        **NO_REPORT,
+        **({} if snapshot.report is None else snapshot.report.to_dict()),
         "samples": snapshot.samples,
         "samples_per_s": _finite(snapshot.samples_per_s),
         "frames": {
@@ -344,6 +357,9 @@ class Monitor:
         self._rate = 0.0
         self._rate_from = (now_s, 0)
         self._status: Status | None = None
+        self._report: PackReport | None = None
+        self._report_due_s = now_s
+        self._had_notices = False
         self.latest = self._snapshot(now_s)
 
     def stepped(self, stamp_s: float, step_s: float, came_s: float) -> None:
@@ -388,6 +404,7 @@ class Monitor:
         self._due_s = now_s + SHOW_EVERY_S
         self.latest = snapshot = self._snapshot(now_s)
         self._log_status(snapshot)
+        self._log_notices(snapshot)
         ping_every_s = self._notifier.ping_every_s
         if ping_every_s is not None and now_s >= self._ping_s:
             self._ping_s = now_s + ping_every_s - SHOW_EVERY_S
@@ -404,6 +421,9 @@ class Monitor:
         if now_s - since_s >= RATE_OVER_S:
             self._rate = (samples - before) / (now_s - since_s)
             self._rate_from = (now_s, samples)
+        if samples and now_s >= self._report_due_s:
+            self._report_due_s = now_s + REPORT_EVERY_S
+            self._report = pipeline.report()
         statistics = pipeline.decoder.statistics
         rejects = _rejects(statistics)
         return Snapshot(
@@ -426,7 +446,16 @@ class Monitor:
             latency=self._latency.copy(),
             step=self._step.copy(),
             record=None if self._record is None else self._record.state,
+            report=self._report,
         )
+
+    def _log_notices(self, snapshot: Snapshot) -> None:
+        """Log the notices once when they appear."""
+        notices = [] if snapshot.report is None else snapshot.report.notices
+        if notices and not self._had_notices:
+            for notice in notices:
+                emit(_LOG, logging.WARNING, "cells.sum_differs", notice)
+        self._had_notices = bool(notices)
 
     def _log_status(self, snapshot: Snapshot) -> None:
         estimate = snapshot.estimate
