@@ -14,9 +14,10 @@ Counter and CRC are those of AUTOSAR E2E profile 2, with the data ids in the DBC
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import can
@@ -184,6 +185,12 @@ class PackReport(NamedTuple):
             ),
             "notices": self.notices,
         }
+
+
+NO_REPORT: Final[Mapping[str, Any]] = MappingProxyType(
+    {"health": None, "power": None, "cells": None, "notices": []}
+)
+"""What `PackReport.to_dict` gives before the first sample."""
 
 
 class _Layout:

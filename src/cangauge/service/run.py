@@ -17,6 +17,7 @@ from typing import Any
 from cangauge._formatting import number
 from cangauge._io import check_writable
 from cangauge._logging import emit
+from cangauge.bus.publish import NO_REPORT
 from cangauge.bus.reconnect import ReconnectingBus
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
@@ -30,7 +31,7 @@ from cangauge.service.loop import LoopSettings, Outputs, RunSummary, serve
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.recording import Recorder
 from cangauge.service.state import StateKeeper, check_state_path
-from cangauge.service.status import NO_REPORT, Identity, Monitor, Snapshot
+from cangauge.service.status import Identity, Monitor, Snapshot
 
 _LOG = logging.getLogger(__name__)
 

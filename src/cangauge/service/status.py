@@ -21,7 +21,7 @@ from cangauge._version import __version__
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.decoder import FrameStatistics
 from cangauge.bus.plausibility import MessageStatistics
-from cangauge.bus.publish import PackReport
+from cangauge.bus.publish import NO_REPORT, PackReport
 from cangauge.estimation.validity import Estimate, Reason, Sample, Status, reason_name, reason_names
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline
@@ -43,10 +43,6 @@ CLOCKS_APART_S: Final = 60.0
 
 REPORT_EVERY_S: Final = 1.0
 """Interval of health, power and cells in the snapshots [s]."""
-NO_REPORT: Final[Mapping[str, Any]] = {
-    "health": None, "power": None, "cells": None, "notices": [],
-}  # fmt: skip
-"""Their objects before the first sample."""
 
 BUS_COUNTS: Final = ("garbled", "error_frames", "unsent", "queue_drops", "losses")
 """Counts of a bus to report, where it has them."""
