@@ -367,7 +367,8 @@ class Estimator:
             drop_v,
             memory.newton_pct if memory.newton_inside else math.nan,
             _clip(self._coulomb_pct()),
-            is_usable=self._line.full and cold - margin_k <= memory.temperature_c <= hot + margin_k,
+            is_filled=self._line.full,
+            is_inside=cold - margin_k <= memory.temperature_c <= hot + margin_k,
         )
 
     def _voltage_without_ocv_v(self) -> float:

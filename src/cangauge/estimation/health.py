@@ -3,20 +3,22 @@
 *Capacity* is the charge per 100 % of the model's SoC scale. It is learned from pairs of charge
 moved and change of SoC by voltage, in a Kalman filter of its own with the state
 
-    (S, g, o, r, b, c₀ … c₁₀)
+    (S, g, o, r, b, l, c₀ … c₁₀)
 
 SoC S [%], charge gain g = reference capacity / capacity, offset of the current sensor o [A],
-relative deviation of the resistance r, a bias b that decays within minutes [V], and the error of
-the voltage curve c at 0, 10 … 100 % SoC [V]:
+relative deviation of the resistance r, the model's slow bias b and lasting bias l [V] as in the
+filter, and the error of the voltage curve c at 0, 10 … 100 % SoC [V]:
 
     S ← S − g·a·(i − o)·Δt,   a = 100/(3600·reference capacity)
-    U = OCV(S) + kt·(T − T_r) + (1 + r)·Σ Rj·I(t − dj) − R·o + b + c(S) + fast error
+    U = OCV(S) + kt·(T − T_r) + (1 + r)·Σ Rj·I(t − dj) − R·o + b + l + c(S) + fast error
 
 The curve's error belongs to the SoC, not to the drive, so it is the same each time that the SoC
 passes: no number of charges averages it out, and the standard deviation of the capacity stops
-falling where curve error and capacity cannot be told apart. An offset moves charge in proportion
-to time, a capacity in proportion to charge: they separate once the pack is charged and
-discharged. After an interval without observed charge the SoC is unknown; the other states stay.
+falling where curve error and capacity cannot be told apart. The identification judges whole logs,
+which do not tell an error of the curve from one of the day: each is taken at its full size. An
+offset moves charge in proportion to time, a capacity in proportion to charge: they separate once
+the pack is charged and discharged. After an interval without observed charge the SoC is unknown;
+the other states stay.
 
 *Resistance*, relative to the model, is the slope of the model's residual over its predicted drop,
 in Haar details of 4 to 32 s: errors of the OCV and slow polarisation lie on longer scales. Each
@@ -45,6 +47,7 @@ from cangauge.errors import InputError
 from cangauge.estimation.counting import moved_std_pct
 from cangauge.estimation.ekf import (
     LASTING_SPAN_PCT,
+    LASTING_TIME_S,
     OFFSET_STD_PER_AH,
     OFFSET_WALK_PER_SQRT_H,
     OUTLIER_SIGMAS,
@@ -87,7 +90,7 @@ SHORTEST_BLOCK_S: Final = 4.0
 DETAILS_AT_LEAST: Final = 8.0
 """Details of one scale from which its slope has a known noise."""
 
-_S, _G, _O, _R, _B, _C = 0, 1, 2, 3, 4, 5
+_S, _G, _O, _R, _B, _L, _C = range(7)
 STATES: Final = _C + NODES
 _HOUR_S: Final = 3600.0
 _DAY_S: Final = 86400.0
@@ -118,8 +121,10 @@ class VoltageTick(NamedTuple):
     """SoC by inverse of the model [%]; NaN where the voltage lies outside its range."""
     soc_counted_pct: float
     """SoC by counting [%]: without the filter's corrections."""
-    is_usable: bool
-    """Whether the delay line is full and the temperature within the identified range."""
+    is_filled: bool
+    """Whether the delay line is full: else the drop is not known."""
+    is_inside: bool
+    """Whether the temperature lies within the identified range: else the level is not known."""
 
 
 class HealthEstimator:
@@ -158,6 +163,7 @@ class HealthEstimator:
         self._fast_var = fast_std_v**2
         self._slow_var = noise.slow_std_v**2
         self._slow_time_s = noise.slow_time_s
+        self._lasting_var = noise.lasting_std_v**2
         self._reference_ah = capacity_ah
         self._pct_per_as = 100.0 / (3600.0 * capacity_ah)
         self._offset_std_a = OFFSET_STD_PER_AH * capacity_ah
@@ -184,12 +190,14 @@ class HealthEstimator:
 
     def use(self, tick: VoltageTick, seconds: float) -> None:
         """Take one voltage, `seconds` after the last one [s]."""
-        if not tick.is_usable:
+        if not tick.is_filled:
             self._resistance.restart()
             return
         counted_v = self._curve.pseudo_ocv_at(tick.soc_counted_pct)[0]
         residual_v = tick.voltage_v - tick.without_ocv_v - counted_v
         self._resistance.add(residual_v, tick.drop_v, seconds)
+        if not tick.is_inside:
+            return
         state = self.state
         if not state.is_started:
             if math.isnan(tick.soc_newton_pct):
@@ -296,6 +304,7 @@ class HealthEstimator:
         p[_O, _O] = self._offset_std_a**2
         p[_R, _R] = RESISTANCE_STD**2
         p[_B, _B] = self._slow_var
+        p[_L, _L] = self._lasting_var
         nodes = NODE_PCT * np.arange(NODES)
         like = np.exp(-np.abs(nodes[:, None] - nodes) / LASTING_SPAN_PCT)
         # Straight lines between the nodes have less variance than the nodes; over the whole curve
@@ -330,12 +339,14 @@ class HealthEstimator:
         gain = float(self._x[_G])
         charge_pct = state.discharged_pct - per_a * float(self._x[_O])
         slow_kept = math.exp(-seconds / self._slow_time_s - moved_pct / SLOW_SPAN_PCT)
+        lasting_kept = math.exp(-seconds / LASTING_TIME_S - moved_pct / LASTING_SPAN_PCT)
         resistance_kept = math.exp(-seconds / RESISTANCE_TIME_S)
         change = np.eye(STATES)
         change[_S, _G], change[_S, _O] = -charge_pct, gain * per_a
-        change[_B, _B], change[_R, _R] = slow_kept, resistance_kept
+        change[_B, _B], change[_L, _L], change[_R, _R] = slow_kept, lasting_kept, resistance_kept
         self._x[_S] -= gain * charge_pct
         self._x[_B] *= slow_kept
+        self._x[_L] *= lasting_kept
         self._x[_R] *= resistance_kept
         p = change @ self._p @ change.T
         p[_S, _S] += state.gap_var_pct2
@@ -343,6 +354,7 @@ class HealthEstimator:
         p[_O, _O] += (OFFSET_WALK_PER_SQRT_H * self._offset_std_a) ** 2 * seconds / _HOUR_S
         p[_R, _R] += RESISTANCE_STD**2 * (1.0 - resistance_kept**2)
         p[_B, _B] += self._slow_var * (1.0 - slow_kept**2)
+        p[_L, _L] += self._lasting_var * (1.0 - lasting_kept**2)
         # No state is known worse than before anything was measured.
         p[_G, _G] = min(p[_G, _G], CAPACITY_STD**2)
         p[_O, _O] = min(p[_O, _O], self._offset_std_a**2)
@@ -359,7 +371,7 @@ class HealthEstimator:
         row[_S] = self._curve.pseudo_ocv_at(soc_pct)[1]
         row[_O] = -self._steady_ohm
         row[_R] = drop_v
-        row[_B] = 1.0
+        row[_B] = row[_L] = 1.0
         row[_C + below], row[_C + below + 1] = 1.0 + below - place, place - below
         expected_v = float(row[_O:] @ self._x[_O:])
         self._fuse(row, mean_v - expected_v, self._fast_var / ticks)
