@@ -63,6 +63,9 @@ def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
     recorded = estimate_capture(ended.json["record"], Vehicle.load("generic"), leaf_model())
     assert recorded.table.soc_pct[-1] == ended.json["estimate"]["soc_pct"]
     assert recorded.table.soc_pct.size == 1200
+    assert recorded.pack.report is not None
+    offline = json.loads(json.dumps(recorded.pack.report.to_dict()))
+    assert {name: ended.json[name] for name in offline} == offline
 
 
 def test_a_disk_that_is_full_does_not_stop_the_service(bus: list[str], tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ from cangauge.logs.log import Log
 from cangauge.service.config import load_config
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cells_bus import ALL_CELLS, CAR, CELLS_DBC, CELLS_ON_BUS, all_cell_frames
-from live import leaf_model, short_log
+from live import collect, leaf_model, short_log, virtual_port, virtual_service
 
 NAN = math.nan
 ESTIMATE = Estimate(0.0, 63.2, 1.5, 62.1, 63.9, 370.0, -0.25, Status.VALID, Reason.NONE, 1)
@@ -177,7 +177,7 @@ def cells_of(log: Log, row: int) -> list[float]:
 
 
 def test_live_health_power_and_cells_equal_offline_ones(tmp_path: Path) -> None:
-    log, car = short_log(300.0, rate_hz=2.0), car_with_cells(tmp_path)
+    log, car = short_log(120.0, rate_hz=2.0), car_with_cells(tmp_path)
     log = FrameEncoder(car).quantize(log)
     pipeline = Pipeline(car, leaf_model(), PipelineSettings())
     offline = Estimator(leaf_model(), EstimatorSettings(temperature_source="unknown"))
@@ -222,3 +222,12 @@ def test_a_wrong_sum_is_a_notice_with_its_size() -> None:
     assert unknown["power"]["discharge_a"] is None
     assert unknown["cells"]["weakest"] is None
     assert PackReport(HEALTH, POWER).to_dict()["cells"] is None
+
+
+def test_a_running_service_sends_them_every_second() -> None:
+    with virtual_port("pack") as port, virtual_service("pack"):
+        frames = collect(port, 2.4)
+    kinds = [type(SocReader().read(each)) for each in frames]
+    assert 2 <= kinds.count(SocHealth) <= 3
+    assert kinds.count(SocPower) == kinds.count(SocHealth)
+    assert SocCells not in kinds
