@@ -20,7 +20,7 @@ from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_mod
 from synthetic import drive_current
 
 PACK = leaf_2012_model()
-HIGH_PCT, LOW_PCT = 92.0, 22.0
+HIGH_PCT, LOW_PCT = 96.0, 10.0
 CHARGE_A = 40.0
 
 
@@ -35,7 +35,7 @@ MODEL = model_with_noise(0.3)
 
 
 def current_of(charges: int, seed: int) -> np.ndarray:
-    """Drives of an hour from 92 to 22 %, each with a charge and rests [A]."""
+    """Drives of an hour from 96 to 10 %, each with a charge and rests [A]."""
     swing_ah = (HIGH_PCT - LOW_PCT) / 100.0 * CAPACITY_AH
     parts = []
     for number in range(charges):
@@ -180,7 +180,7 @@ def test_a_full_charge_counts_as_a_known_soc() -> None:
     samples = samples_of_pack(7, charges=1)
     known, unknown = (
         Estimator(MODEL, EstimatorSettings(method="coulomb", full_charge=rule))
-        for rule in (FullCharge(voltage_v=380.0, current_a=1.0, hold_s=60.0, soc_pct=92.0), None)
+        for rule in (FullCharge(voltage_v=380.0, current_a=1.0, hold_s=60.0, soc_pct=96.0), None)
     )
     for sample in samples:
         known.update(sample)

@@ -135,8 +135,10 @@ class Estimator:
         self._memory = EstimatorMemory()
         self._since = ChargeSinceUpdate()
         self._is_filtering = False
-        # Voltage less the pseudo-OCV at the latest sample [V]; NaN until it is needed.
+        # Voltage less the pseudo-OCV at the latest sample [V], NaN until it is needed, and the
+        # delayed currents [A] that it was computed from.
         self._without_ocv_v = math.nan
+        self._delayed_a: Sequence[float] = ()
         self._implausible = Reason.NONE
         self._is_refused = False
         self._latest = Estimate.unknown(Reason.NO_INITIAL_SOC)
@@ -218,15 +220,14 @@ class Estimator:
         """Return what is known of the pack after its latest sample, for its cells."""
         soc_pct, std_pct = self._soc_and_std_pct()
         is_known = self._memory.samples > 0 and not math.isnan(self._counter.state.time_s)
-        currents = self._line.currents() if is_known else ()
-        drop_v = sum(map(mul, self._voltage_model.resistance_ohm, currents))
+        without_ocv_v = self._voltage_without_ocv_v() if is_known else math.nan
         return PackTick(
             sample.time_s,
             soc_pct,
             std_pct,
             sample.voltage_v,
-            self._voltage_without_ocv_v() if is_known else math.nan,
-            drop_v,
+            without_ocv_v,
+            sum(map(mul, self._voltage_model.resistance_ohm, self._delayed_a)),
             self._counter.state.moved_pct,
         )
 
@@ -360,7 +361,7 @@ class Estimator:
         memory, model = self._memory, self._voltage_model
         cold, hot = model.temperature_range_c
         margin_k = TEMPERATURE_MARGIN_K
-        drop_v = sum(map(mul, model.resistance_ohm, self._line.currents()))
+        drop_v = sum(map(mul, model.resistance_ohm, self._delayed_a))
         return VoltageTick(
             sample.voltage_v,
             without_ocv_v,
@@ -377,9 +378,8 @@ class Estimator:
             temperature_c = self._memory.temperature_c
             if math.isnan(temperature_c):
                 temperature_c = self._voltage_model.t_ref_c
-            self._without_ocv_v = self._voltage_model.offset_at(
-                temperature_c, self._line.currents()
-            )
+            self._delayed_a = self._line.currents()
+            self._without_ocv_v = self._voltage_model.offset_at(temperature_c, self._delayed_a)
         return self._without_ocv_v
 
     def _start(self, soc_pct: float, std_pct: float) -> None:

@@ -3,14 +3,19 @@
 *Capacity* is the charge per 100 % of the model's SoC scale. It is learned from pairs of charge
 moved and change of SoC by voltage, in a Kalman filter of its own with the state
 
-    (S, g, o, r, b, l, c₀ … c₁₀)
+    (S, g, o, r, b, l, v, ξ₀ … ξ₁₀)
 
 SoC S [%], charge gain g = reference capacity / capacity, offset of the current sensor o [A],
 relative deviation of the resistance r, the model's slow bias b and lasting bias l [V] as in the
-filter, and the error of the voltage curve c at 0, 10 … 100 % SoC [V]:
+filter, the voltage sensor's error v [V], and the error ξ of the curve at 0, 10 … 100 % SoC, in
+standard deviations:
 
     S ← S − g·a·(i − o)·Δt,   a = 100/(3600·reference capacity)
-    U = OCV(S) + kt·(T − T_r) + (1 + r)·Σ Rj·I(t − dj) − R·o + b + l + c(S) + fast error
+    U = OCV(S) + kt·(T − T_r) + (1 + r)·Σ Rj·I(t − dj) − R·o + b + l + v + c(S)·ξ(S) + fast error
+
+The curve's standard deviation c is that of the lasting error in volts and, where the curve is
+steep, `AXIS_STD_PCT` of SoC times its slope: the knees of a curve lie where the SoC of its logs
+said, and move with temperature and current.
 
 The curve's error belongs to the SoC, not to the drive, so it is the same each time that the SoC
 passes: no number of charges averages it out, and the standard deviation of the capacity stops
@@ -56,7 +61,7 @@ from cangauge.estimation.ekf import (
 )
 from cangauge.estimation.state import ChargeSinceUpdate, HealthState, ResistanceState
 from cangauge.model.model_file import ModelNoise
-from cangauge.model.voltage_model import Curve
+from cangauge.model.voltage_model import Curve, soc_from_ocv
 
 CAPACITY_STD: Final = 0.1
 """Prior relative standard deviation of the capacity: a pack in service holds 80 % (the usual end
@@ -76,12 +81,25 @@ VOLTAGE_GAIN_STD: Final = 0.0025
 """Prior standard deviation of the voltage sensor, relative to the voltage: data sheets of pack
 sensors state ±0.5 %, taken as two standard deviations."""
 
+AXIS_STD_PCT: Final = 1.0
+"""Standard deviation of the SoC at which a feature of the curve lies [%]: the reference SoC of the
+logs that it was identified on, a car's or one counted from full, is seldom better."""
+
+FAR_PCT: Final = 1.0
+"""Distance between SoC and voltage's SoC from which the curve's slope is the secant's [%]."""
+
 WINDOW_S: Final = 60.0
 """Time over which voltages are averaged for one update of the capacity [s]."""
 
+SHORTEST_PCT: Final = 0.01
+"""Least travel of a window [% SoC]; keeps the noise finite."""
+
+BEYOND_PCT: Final = 10.0
+"""How far the filter's SoC may lie outside 0–100 % [%]: its errors are Gaussian."""
+
 NODE_PCT: Final = 10.0
 NODES: Final = 11
-"""Spacing [% SoC] and number of the curve error's nodes, with straight lines between them."""
+"""Spacing [% SoC] and number of the nodes of the curve's error."""
 
 SCALES: Final = 4
 SHORTEST_BLOCK_S: Final = 4.0
@@ -90,7 +108,7 @@ SHORTEST_BLOCK_S: Final = 4.0
 DETAILS_AT_LEAST: Final = 8.0
 """Details of one scale from which its slope has a known noise."""
 
-_S, _G, _O, _R, _B, _L, _C = range(7)
+_S, _G, _O, _R, _B, _L, _V, _C = range(8)
 STATES: Final = _C + NODES
 _HOUR_S: Final = 3600.0
 _DAY_S: Final = 86400.0
@@ -167,7 +185,7 @@ class HealthEstimator:
         self._reference_ah = capacity_ah
         self._pct_per_as = 100.0 / (3600.0 * capacity_ah)
         self._offset_std_a = OFFSET_STD_PER_AH * capacity_ah
-        self._prior = self._prior_covariance(noise.lasting_std_v, VOLTAGE_GAIN_STD * nominal_v)
+        self._prior = self._prior_covariance(VOLTAGE_GAIN_STD * nominal_v)
         self._x = np.zeros(STATES)
         self._x[_G] = 1.0
         self._p = self._prior.copy()
@@ -210,8 +228,10 @@ class HealthEstimator:
         state.ticks += 1
         state.window_s += seconds
         if state.window_s >= WINDOW_S:
+            moved_pct = state.moved_pct
             self._advance()
-            self._update(state.sum_v / state.ticks, state.sum_drop_v / state.ticks, state.ticks)
+            means = state.sum_v / state.ticks, state.sum_drop_v / state.ticks
+            self._update(*means, state.ticks, moved_pct)
             state.sum_v = state.sum_drop_v = state.window_s = 0.0
             state.ticks = 0
 
@@ -297,7 +317,7 @@ class HealthEstimator:
         state.moved_pct /= ratio
         state.gap_var_pct2 /= ratio**2
 
-    def _prior_covariance(self, lasting_std_v: float, level_std_v: float) -> FloatArray:
+    def _prior_covariance(self, sensor_std_v: float) -> FloatArray:
         p = np.zeros((STATES, STATES))
         p[_S, _S] = UNKNOWN_SOC_STD_PCT**2
         p[_G, _G] = CAPACITY_STD**2
@@ -305,12 +325,10 @@ class HealthEstimator:
         p[_R, _R] = RESISTANCE_STD**2
         p[_B, _B] = self._slow_var
         p[_L, _L] = self._lasting_var
+        p[_V, _V] = sensor_std_v**2
         nodes = NODE_PCT * np.arange(NODES)
         like = np.exp(-np.abs(nodes[:, None] - nodes) / LASTING_SPAN_PCT)
-        # Straight lines between the nodes have less variance than the nodes; over the whole curve
-        # it must be the lasting error's.
-        mean_var = (2.0 + float(like[0, 1])) / 3.0
-        p[_C:, _C:] = lasting_std_v**2 / mean_var * like + level_std_v**2
+        p[_C:, _C:] = like
         return p
 
     def _start(self, soc_pct: float) -> None:
@@ -362,20 +380,37 @@ class HealthEstimator:
         state.seconds = state.away_s = state.discharged_pct = state.moved_pct = 0.0
         state.gap_var_pct2 = 0.0
 
-    def _update(self, mean_v: float, drop_v: float, ticks: int) -> None:
-        """Update with the mean of the voltages of a window, less OCV and drop [V]."""
+    def _update(self, mean_v: float, drop_v: float, ticks: int, moved_pct: float) -> None:
+        """Update with the mean of the voltages of a window, less OCV and drop [V].
+
+        What the curve's error does between two nodes is not in the state: it is noise, the same
+        for as many windows as the SoC takes to the next node.
+        """
         soc_pct = float(self._x[_S])
-        place = min(max(soc_pct / NODE_PCT, 0.0), NODES - 1.0)
-        below = min(int(place), NODES - 2)
+        at = self._curve.pseudo_ocv_at
+        ocv_v, slope = at(soc_pct)
         row = np.zeros(STATES)
-        row[_S] = self._curve.pseudo_ocv_at(soc_pct)[1]
         row[_O] = -self._steady_ohm
         row[_R] = drop_v
-        row[_B] = row[_L] = 1.0
-        row[_C + below], row[_C + below + 1] = 1.0 + below - place, place - below
+        row[_B] = row[_L] = row[_V] = 1.0
+        # Where the voltage's own SoC lies elsewhere, the curve between both counts, and its error
+        # there: on a flat part the local slope would send the SoC far beyond a knee.
+        bias_v = float(row[_O:_C] @ self._x[_O:_C])
+        there = soc_from_ocv(self._curve, ocv_v + mean_v - bias_v, min(max(soc_pct, 0.0), 100.0))
+        there_v, there_slope = at(there.soc_pct)
+        if not there.inside:
+            mean_v = there_v - ocv_v + bias_v
+        if abs(there.soc_pct - soc_pct) > FAR_PCT:
+            slope = (there_v - ocv_v) / (there.soc_pct - soc_pct)
+        row[_S] = slope
+        std_v = math.hypot(math.sqrt(self._lasting_var), AXIS_STD_PCT * there_slope)
+        below, weights, between_var = _between_nodes(there.soc_pct)
+        row[_C + below], row[_C + below + 1] = std_v * weights[0], std_v * weights[1]
+        shared_by = max(0.5 * NODE_PCT / max(moved_pct, SHORTEST_PCT), 1.0)
+        variance = self._fast_var / ticks + between_var * std_v**2 * shared_by
         expected_v = float(row[_O:] @ self._x[_O:])
-        self._fuse(row, mean_v - expected_v, self._fast_var / ticks)
-        self._x[_S] = min(max(float(self._x[_S]), 0.0), 100.0)
+        self._fuse(row, mean_v - expected_v, variance)
+        self._x[_S] = min(max(float(self._x[_S]), -BEYOND_PCT), 100.0 + BEYOND_PCT)
 
     def _fuse(self, row: FloatArray, innovation: float, variance: float) -> None:
         """Update with one measurement; an outlier's variance is raised to its size."""
@@ -465,6 +500,21 @@ class ResistanceEstimator:
         """Continue from a state."""
         self.state = state
         self.state = self.snapshot()
+
+
+def _between_nodes(soc_pct: float) -> tuple[int, tuple[float, float], float]:
+    """Return the node below, both nodes' weights, and the variance that they leave open.
+
+    The best linear prediction of a first-order Gauss–Markov process of unit variance over SoC.
+    """
+    place = soc_pct / NODE_PCT
+    below = min(int(place), NODES - 2)
+    step = math.exp(-NODE_PCT / LASTING_SPAN_PCT)
+    one = math.exp(-(place - below) * NODE_PCT / LASTING_SPAN_PCT)
+    other = step / one
+    scale = 1.0 / (1.0 - step * step)
+    weights = scale * (one - step * other), scale * (other - step * one)
+    return below, weights, max(1.0 - weights[0] * one - weights[1] * other, 0.0)
 
 
 def _is_semidefinite(covariance: FloatArray) -> bool:
