@@ -109,6 +109,20 @@ class CellVoltages:
         groups = [group for group in self.signals.groups if group.key == key]
         if not groups:
             return None
+        selectors = {each.field for group in groups for each in group.conditions}
+        if len(selectors) == 1 and all(len(group.conditions) == 1 for group in groups):
+            # One multiplexer: its value finds the group; a large pack has dozens.
+            (selector,) = selectors
+            by_value: dict[int, list[CellGroup]] = {}
+            for group in groups:
+                for value in group.conditions[0].values:
+                    by_value.setdefault(value, []).append(group)
+
+            def read_selected(payload: bytes | bytearray, time_s: float) -> None:
+                for group in by_value.get(selector.get(payload), ()):
+                    self._read(group, payload, time_s)
+
+            return read_selected
 
         def read(payload: bytes | bytearray, time_s: float) -> None:
             for group in groups:
