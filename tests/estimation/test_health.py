@@ -219,3 +219,15 @@ def test_learned_capacity_survives_another_model_and_setting() -> None:
         restored = Estimator(MODEL, settings)
         restored.restore(before.snapshot())
         assert restored.health.capacity_ah == pytest.approx(learned_ah)
+
+
+def test_voltages_of_another_pack_are_survived() -> None:
+    rng = np.random.default_rng(0)
+    estimator = Estimator(MODEL, EstimatorSettings(method="coulomb"))
+    for sample in samples_of_pack(9, charges=1)[:4000]:
+        wrong_v = float(rng.choice([300.0, 330.0, 360.0, 400.0])) + rng.normal()
+        estimator.update(sample._replace(voltage_v=wrong_v))
+        health = estimator.health
+        assert 0.2 * CAPACITY_AH < health.capacity_ah < 5.0 * CAPACITY_AH
+        assert health.capacity_std_ah > 0.0
+        assert all(math.isfinite(each) for each in health)

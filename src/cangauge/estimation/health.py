@@ -51,12 +51,10 @@ from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.estimation.counting import moved_std_pct
 from cangauge.estimation.ekf import (
-    LASTING_SPAN_PCT,
     LASTING_TIME_S,
     OFFSET_STD_PER_AH,
     OFFSET_WALK_PER_SQRT_H,
     OUTLIER_SIGMAS,
-    SLOW_SPAN_PCT,
     UNKNOWN_SOC_STD_PCT,
 )
 from cangauge.estimation.state import ChargeSinceUpdate, HealthState, ResistanceState
@@ -66,6 +64,9 @@ from cangauge.model.voltage_model import Curve, soc_from_ocv
 CAPACITY_STD: Final = 0.1
 """Prior relative standard deviation of the capacity: a pack in service holds 80 % (the usual end
 of life in a car, IEC 62660) to somewhat above 100 % of its rated charge."""
+
+GAIN_WITHIN: Final = (0.2, 5.0)
+"""Plausible ratio of the reference capacity to the pack's: beyond, one of them is another's."""
 
 CAPACITY_WALK_PER_SQRT_DAY: Final = 1e-3
 """Random walk of the relative capacity: 2 % in a year, as cells age."""
@@ -80,6 +81,11 @@ RESISTANCE_TIME_S: Final = 3600.0
 VOLTAGE_GAIN_STD: Final = 0.0025
 """Prior standard deviation of the voltage sensor, relative to the voltage: data sheets of pack
 sensors state ±0.5 %, taken as two standard deviations."""
+
+SLOW_SPAN_PCT: Final = 3.0
+CURVE_SPAN_PCT: Final = 8.0
+"""SoC travel over which the slow bias, and the lasting bias and the curve's error, decorrelate [%]:
+spacing of the features of a pseudo-OCV (phases of graphite)."""
 
 AXIS_STD_PCT: Final = 1.0
 """Standard deviation of the SoC at which a feature of the curve lies [%]: the reference SoC of the
@@ -186,10 +192,8 @@ class HealthEstimator:
         self._pct_per_as = 100.0 / (3600.0 * capacity_ah)
         self._offset_std_a = OFFSET_STD_PER_AH * capacity_ah
         self._prior = self._prior_covariance(VOLTAGE_GAIN_STD * nominal_v)
-        self._x = np.zeros(STATES)
-        self._x[_G] = 1.0
-        self._p = self._prior.copy()
         self.state = HealthState(capacity_ah=capacity_ah)
+        self._forget()
         self._resistance = ResistanceEstimator()
 
     def count(self, since: ChargeSinceUpdate) -> None:
@@ -282,7 +286,8 @@ class HealthEstimator:
             raise InputError(f"not a filter of {STATES} states", field="health.p")
         covariance = np.zeros((STATES, STATES))
         covariance[rows, columns] = covariance[columns, rows] = state.p
-        if not _is_semidefinite(covariance) or not 0.1 < state.x[_G] < 10.0:
+        low, high = GAIN_WITHIN
+        if not _is_semidefinite(covariance) or not low < state.x[_G] < high:
             raise InputError(
                 "not a positive semidefinite covariance, or a capacity out of range",
                 field="health.p",
@@ -327,7 +332,7 @@ class HealthEstimator:
         p[_L, _L] = self._lasting_var
         p[_V, _V] = sensor_std_v**2
         nodes = NODE_PCT * np.arange(NODES)
-        like = np.exp(-np.abs(nodes[:, None] - nodes) / LASTING_SPAN_PCT)
+        like = np.exp(-np.abs(nodes[:, None] - nodes) / CURVE_SPAN_PCT)
         p[_C:, _C:] = like
         return p
 
@@ -357,7 +362,7 @@ class HealthEstimator:
         gain = float(self._x[_G])
         charge_pct = state.discharged_pct - per_a * float(self._x[_O])
         slow_kept = math.exp(-seconds / self._slow_time_s - moved_pct / SLOW_SPAN_PCT)
-        lasting_kept = math.exp(-seconds / LASTING_TIME_S - moved_pct / LASTING_SPAN_PCT)
+        lasting_kept = math.exp(-seconds / LASTING_TIME_S - moved_pct / CURVE_SPAN_PCT)
         resistance_kept = math.exp(-seconds / RESISTANCE_TIME_S)
         change = np.eye(STATES)
         change[_S, _G], change[_S, _O] = -charge_pct, gain * per_a
@@ -422,6 +427,16 @@ class HealthEstimator:
         self._x = self._x + gain * innovation
         p = self._p - np.outer(gain, towards)
         self._p = 0.5 * (p + p.T)
+        low, high = GAIN_WITHIN
+        if not (low < self._x[_G] < high and (np.diag(self._p) >= 0.0).all()):
+            self._forget()
+
+    def _forget(self) -> None:
+        """Begin again: arithmetic failed, or the voltages are those of another pack."""
+        self._x = np.zeros(STATES)
+        self._x[_G] = 1.0
+        self._p = self._prior.copy()
+        self.state.is_started = False
 
 
 class ResistanceEstimator:
@@ -509,8 +524,8 @@ def _between_nodes(soc_pct: float) -> tuple[int, tuple[float, float], float]:
     """
     place = soc_pct / NODE_PCT
     below = min(int(place), NODES - 2)
-    step = math.exp(-NODE_PCT / LASTING_SPAN_PCT)
-    one = math.exp(-(place - below) * NODE_PCT / LASTING_SPAN_PCT)
+    step = math.exp(-NODE_PCT / CURVE_SPAN_PCT)
+    one = math.exp(-(place - below) * NODE_PCT / CURVE_SPAN_PCT)
     other = step / one
     scale = 1.0 / (1.0 - step * step)
     weights = scale * (one - step * other), scale * (other - step * one)
