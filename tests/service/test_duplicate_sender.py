@@ -35,7 +35,9 @@ from live import (
     waits,
 )
 
-OTHER_IDS = PipelineSettings(ids=FrameIds(soc_estimate=0x5B0, soc_detail=0x5B1))
+OTHER_IDS = PipelineSettings(
+    ids=FrameIds(0x5B0, 0x5B1, soc_health=0x5B2, soc_power=0x5B3, soc_cells=0x5B4)
+)
 
 
 def frame(frame_id: int = 0x5A0, data: bytes = b"12345678") -> can.Message:

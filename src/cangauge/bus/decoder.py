@@ -9,6 +9,7 @@ from typing import ClassVar, Final
 
 import can
 
+from cangauge.bus.cells import CellVoltages
 from cangauge.bus.isotp import Reassembler, reply_id, reply_key
 from cangauge.bus.plausibility import (
     ConstantDetector,
@@ -199,6 +200,8 @@ class _Route:
     inputs: list[_Input] = field(default_factory=list)
     has_both: bool = False
     """Current and voltage: each frame is a sample by itself."""
+    read_cells: Callable[[bytes | bytearray, float], None] | None = None
+    """Takes a payload with cell voltages, and its time [s]."""
     last_s: float = -math.inf
     suspected_until_s: float = -math.inf
     """Until then its frames may be of two senders."""
@@ -313,6 +316,8 @@ class SampleDecoder:
         By role. Read only.
     now_s : float
         Bus time of the latest wanted frame [s]; −inf before the first.
+    cells : CellVoltages or None
+        Latest cell voltages, where the vehicle has them.
     """
 
     def __init__(self, vehicle: Vehicle, pack: Pack | None = None) -> None:
@@ -332,6 +337,12 @@ class SampleDecoder:
         detectors = _detectors(vehicle, pack)
         for signal in vehicle.signals:
             self._add(signal, pack, detectors.get(signal.role))
+        self.cells: CellVoltages | None = None
+        if vehicle.cells is not None:
+            self.cells = CellVoltages(vehicle.cells)
+            for group in vehicle.cells.groups:
+                route = self._route(group.key, group.message, group.length)
+                route.read_cells = self.cells.reader(group.key)
         for route in self._routes.values():
             # Slow signals first: a sample uses the temperature of its own frame.
             route.inputs.sort(key=lambda each: each.is_current + 2 * each.is_voltage)
@@ -344,13 +355,7 @@ class SampleDecoder:
         is_stuck: Callable[[float, float], bool] | None,
     ) -> None:
         message = self.vehicle.messages[signal.key]
-        route = self._routes.get(signal.key)
-        if route is None:
-            statistics = self.statistics.messages[signal.key] = MessageStatistics()
-            checker = None if message.rule is None else FrameChecker(message.rule, message.period_s)
-            route = self._routes[signal.key] = _Route(
-                signal.message, signal.length, checker, statistics, _RateCheck(message.period_s)
-            )
+        route = self._route(signal.key, signal.message, signal.length)
         is_fast = signal.role in {"current", "voltage"}
         is_multiplexed = bool(signal.codec.conditions)
         health = self.health[signal.role] = SignalHealth(
@@ -377,6 +382,17 @@ class SampleDecoder:
         )
         route.has_both = self.vehicle.current.key == self.vehicle.voltage.key == signal.key
 
+    def _route(self, key: int, name: str, length: int) -> _Route:
+        route = self._routes.get(key)
+        if route is None:
+            message = self.vehicle.messages[key]
+            statistics = self.statistics.messages[key] = MessageStatistics()
+            checker = None if message.rule is None else FrameChecker(message.rule, message.period_s)
+            route = self._routes[key] = _Route(
+                name, length, checker, statistics, _RateCheck(message.period_s)
+            )
+        return route
+
     def handle(self, message: can.Message) -> Sample | None:  # noqa: C901, PLR0912 - one pass
         """Decode one frame; return the sample that it completes, if any.
 
@@ -400,6 +416,8 @@ class SampleDecoder:
         if route is None or payload is None:
             return None
         time_s = message.timestamp
+        if route.read_cells is not None:
+            route.read_cells(payload, time_s)
         current_a = voltage_v = math.nan
         for signal in route.inputs:
             if signal.is_present is not None and not signal.is_present(payload):

@@ -33,6 +33,16 @@ A map file in TOML, for any car with a DBC::
     time = "Timestamp"
     current = "PackCurrent[mA]:-1"  # heading, unit, factor; or { heading = …, unit = …, sign = -1 }
 
+    [cells]                         # optional: cell voltages
+    signal = "CELL_{n}_VOLTAGE"     # one signal a cell; {n}: its number, {n:02d} with zeros
+    count = 96
+    first = 1                       # number of the first cell
+    # or groups of cells, numbered by a signal of the frame:
+    # message = "BMS_Cells"
+    # index = "GroupNumber"         # its raw value; the first group has first_index
+    # first_index = 0
+    # signals = ["CellA", "CellB", "CellC"]
+
     [messages.BMS_Status]           # optional
     protection = "my_rule"          # leaf, generic, crc_only, counter, e2e_01, e2e_02, e2e_04,
                                     # e2e_05, e2e_06, e2e_07, e2e_11, or one of [rules]
@@ -90,6 +100,7 @@ from cangauge.bus.protection import (
     ProtectionRule,
 )
 from cangauge.errors import InputError
+from cangauge.estimation.cells import CELLS_AT_MOST
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.log import TemperatureSource
 
@@ -196,6 +207,86 @@ class TemperatureMap(SignalMap):
         if bool(self.signal) == (self.fixed_c is not None):
             raise ValueError("give either signal or fixed_c")
         return self
+
+
+class CellsMap(_Strict):
+    """Voltages of the cells in series: one signal a cell, or groups numbered by a signal.
+
+    Parameters
+    ----------
+    count, first : int
+        Number of cells; number of the first.
+    signal : str, optional
+        Name of a cell's signal, with "{n}" for its number.
+    message : str or int, optional
+        Message of the signals, likewise with "{n}" if each cell has its own.
+    index : str, optional
+        Signal whose raw value numbers the group in a frame.
+    signals : tuple of str
+        Signals of a group, in the order of the cells.
+    first_index : int
+        Number of the first group.
+    scale, offset : float
+        For a DBC with a wrong or unknown unit: V = scale × (DBC value) + offset.
+    not_available : tuple of int
+        Raw codes without a value, besides those named so in the DBC's value table.
+    lowest, highest : float, optional
+        Plausible voltages [V].
+    timeout_s : float, optional
+        Age at which a voltage becomes old [s].
+    """
+
+    count: Annotated[int, Field(ge=2, le=CELLS_AT_MOST)]
+    first: Annotated[int, Field(ge=0, le=CELLS_AT_MOST)] = 1
+    signal: str | None = None
+    message: str | int | None = None
+    index: str | None = None
+    signals: tuple[str, ...] = ()
+    first_index: int = 0
+    scale: _Positive = 1.0
+    offset: FiniteFloat = 0.0
+    not_available: tuple[int, ...] = ()
+    lowest: FiniteFloat | None = None
+    highest: FiniteFloat | None = None
+    timeout_s: _Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        if (self.signal is None) is (self.index is None):
+            raise ValueError("give either signal, or index and signals")
+        if self.signal is not None and "{n" not in self.signal:
+            raise ValueError('signal needs "{n}" for the number of the cell')
+        if self.index is not None and (not self.signals or self.message is None):
+            raise ValueError("index needs signals and message")
+        if self.signal is not None and self.signals:
+            raise ValueError("signals belongs to index")
+        for name in (self.signal, self.message):
+            if isinstance(name, str):
+                try:
+                    name.format(n=1)
+                except (KeyError, IndexError, ValueError, AttributeError) as error:
+                    raise ValueError(f"{name!r} is not a name with {{n}}") from error
+        return self
+
+    def signal_maps(self) -> list[SignalMap]:
+        """Return the map of each cell's signal, or of each signal of a group."""
+        names: list[tuple[str, str | int | None]]
+        if self.signal is None:
+            names = [(name, self.message) for name in self.signals]
+        else:
+            numbers = range(self.first, self.first + self.count)
+            names = [
+                (
+                    self.signal.format(n=n),
+                    self.message.format(n=n) if isinstance(self.message, str) else self.message,
+                )
+                for n in numbers
+            ]
+        stated = {name: getattr(self, name) for name in {"scale", "offset"} & self.model_fields_set}
+        return [
+            SignalMap(message=message, signal=name, not_available=self.not_available, **stated)
+            for name, message in names
+        ]
 
 
 class MessageMap(_Strict):
@@ -369,6 +460,8 @@ class VehicleMap(_Strict):
         The car's own state of charge, to begin from and to compare with; also named `soc`.
     columns : dict
         Columns of the car's logs that are tables (`logs.column_map.ColumnMap`).
+    cells : CellsMap, optional
+        Voltages of the cells.
     temperature_source : {"cell", "pack", "coolant", "room", "unknown"}
     pair_within_s : float
         Largest distance in bus time between paired current and voltage [s].
@@ -386,6 +479,7 @@ class VehicleMap(_Strict):
         default=None, validation_alias=AliasChoices("soc_reference", "soc")
     )
     columns: dict[str, Any] | None = None
+    cells: CellsMap | None = None
     temperature_source: TemperatureSource = "unknown"
     pair_within_s: Annotated[FiniteFloat, Field(ge=0.0, le=1.0)] = PAIR_WITHIN_S
     messages: dict[str, MessageMap] = Field(default_factory=dict)

@@ -20,7 +20,14 @@ from numpy.typing import NDArray
 from cangauge._config import read_toml, validated
 from cangauge._resources import shared_file
 from cangauge._typing import FloatArray
+from cangauge.bus.cells import (
+    CELL_TIMEOUT_S,
+    CELL_WITHIN_V,
+    CellGroup,
+    CellSignals,
+)
 from cangauge.bus.database import (
+    Condition,
     Decode,
     SignalCodec,
     find_message,
@@ -28,9 +35,11 @@ from cangauge.bus.database import (
     load_dbc,
     signal_codec,
 )
+from cangauge.bus.database import Field as BitField
 from cangauge.bus.isotp import reply_id
 from cangauge.bus.mapping import (
     NO_OVERRIDES,
+    CellsMap,
     CheckMap,
     MessageMap,
     Overrides,
@@ -45,12 +54,13 @@ from cangauge.errors import InputError, closest
 from cangauge.logs.log import TemperatureSource
 from cangauge.logs.units import convert
 
-Role = Literal["current", "voltage", "temperature", "soc_reference"]
+Role = Literal["current", "voltage", "temperature", "soc_reference", "cells"]
 LOG_COLUMNS: Final = {
     "current": "current_a",
     "voltage": "voltage_v",
     "temperature": "temperature_c",
     "soc_reference": "soc_pct",
+    "cells": "voltage_v",
 }
 """Column of the canonical log by role."""
 
@@ -180,6 +190,8 @@ class Vehicle:
     messages : dict of int to MessageProtection
         By key (id, plus `EXTENDED`), for every message with a wanted signal.
     dbc_files : tuple of str
+    cells : CellSignals or None
+        Voltages of the cells.
     """
 
     name: str
@@ -192,6 +204,7 @@ class Vehicle:
     pair_within_s: float
     messages: dict[int, MessageProtection]
     dbc_files: tuple[str, ...]
+    cells: CellSignals | None = None
 
     @classmethod
     def load(
@@ -306,7 +319,8 @@ class Vehicle:
     @property
     def frame_keys(self) -> tuple[int, ...]:
         """Ids of the frames with a wanted signal, plus `EXTENDED`, each once."""
-        keys = dict.fromkeys(signal.key for signal in self.signals)
+        cells = () if self.cells is None else self.cells.keys
+        keys = dict.fromkeys((*(signal.key for signal in self.signals), *cells))
         replies = {key for key in keys if self.messages[key].is_reply}
         return tuple(dict.fromkeys(reply_id(key) if key in replies else key for key in keys))
 
@@ -356,6 +370,7 @@ class _Binder:
             fixed_c = temperature.fixed_c
         current = self._signal("current", mapping.current)
         voltage = self._signal("voltage", mapping.voltage)
+        cells = None if mapping.cells is None else self._cells(mapping.cells)
         return Vehicle(
             name=mapping.name,
             current=current,
@@ -371,6 +386,44 @@ class _Binder:
             pair_within_s=within_s,
             messages=self._messages(),
             dbc_files=tuple(str(path) for _, path in self._databases),
+            cells=cells,
+        )
+
+    def _cells(self, wanted: CellsMap) -> CellSignals:
+        signals = [self._signal("cells", each) for each in wanted.signal_maps()]
+        groups: dict[tuple[int, tuple[Condition, ...]], list[int]] = {}
+        for place, signal in enumerate(signals):
+            groups.setdefault((signal.key, signal.codec.conditions), []).append(place)
+        index: BitField | None = None
+        if wanted.index is not None:
+            if len(groups) > 1:
+                raise InputError(
+                    "the signals of a group are not in the same frame",
+                    source=self._source,
+                    field="cells.signals",
+                )
+            numbering = SignalMap(message=wanted.message, signal=wanted.index, scale=1.0)
+            index = self._signal("cells", numbering).codec.field
+        low, high = CELL_WITHIN_V
+        return CellSignals(
+            count=wanted.count,
+            first=wanted.first,
+            groups=tuple(
+                CellGroup(
+                    key=key,
+                    message=signals[places[0]].message,
+                    length=signals[places[0]].length,
+                    conditions=conditions,
+                    places=tuple(places),
+                    decoders=tuple(signals[place].decode for place in places),
+                    index=index,
+                    first_index=wanted.first_index,
+                )
+                for (key, conditions), places in groups.items()
+            ),
+            lowest_v=low if wanted.lowest is None else wanted.lowest,
+            highest_v=high if wanted.highest is None else wanted.highest,
+            timeout_s=wanted.timeout_s or CELL_TIMEOUT_S,
         )
 
     def _signal(self, role: Role, wanted: SignalMap) -> VehicleSignal:
@@ -395,7 +448,9 @@ class _Binder:
         )
         self._found[_key(message)] = message
         factor, offset = self._unit(role, wanted, codec)
-        checks = DEFAULTS[role].updated(wanted, self._overrides.checks.get(role, CheckMap()))
+        checks = DEFAULTS.get(role, SignalChecks()).updated(
+            wanted, self._overrides.checks.get(role, CheckMap())
+        )
         if checks.lowest >= checks.highest:
             raise InputError(
                 "lowest is not below highest",

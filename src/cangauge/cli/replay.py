@@ -108,7 +108,11 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge replay candump.log.gz --speed 10 --interface socketcan --channel vcan0 --loop`
     """
-    ids = FrameIds(**frame_ids(soc_estimate_id, soc_detail_id, replay_clock_id))
+    ids = FrameIds(
+        **frame_ids(
+            soc_estimate=soc_estimate_id, soc_detail=soc_detail_id, replay_clock=replay_clock_id
+        )
+    )
     settings = ReplaySettings(
         speed=_speed(speed),
         loop=loop,

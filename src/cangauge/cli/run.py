@@ -44,9 +44,11 @@ def run_command(
 ) -> None:
     """Estimate the state of charge from a bus, and publish it there.
 
-    Publishes SOC_ESTIMATE (0x5A0) every 100 ms and SOC_DETAIL (0x5A1) every second, as in
-    `dbc/soc_estimate.dbc`: SoC and its standard deviation [%], status, reasons. Ctrl-C or SIGTERM
-    stops it with a summary. Positive current discharges.
+    Publishes SOC_ESTIMATE (0x5A0) every 100 ms, and SOC_DETAIL (0x5A1), SOC_HEALTH (0x5A2),
+    SOC_POWER (0x5A3) and, where there are cell voltages, SOC_CELLS (0x5A4) every second, as in
+    `dbc/soc_estimate.dbc`: SoC and its standard deviation [%], status, reasons; capacity [Ah];
+    possible currents [A]; energy left [kWh]. Ctrl-C or SIGTERM stops it with a summary. Positive
+    current discharges.
 
     SIGHUP reloads configuration, model and vehicle: the SoC continues, an invalid configuration
     is refused. Changes of the bus, the time source and output files need a restart.

@@ -227,10 +227,11 @@ def estimate_log(
     model: Model,
     settings: EstimatorSettings,
     progress: Callable[[int], None] | None = None,
+    observe: Callable[[Estimator, Sample], None] | None = None,
 ) -> tuple[EstimateTable, Scores]:
     """Estimate a log with given settings, and score it; see `run_estimator` and `score`."""
     began = time.perf_counter()
-    table = run_estimator(samples_of(log), model, settings, progress)
+    table = run_estimator(samples_of(log), model, settings, progress, observe)
     return table, score(table, log, time.perf_counter() - began)
 
 
@@ -245,6 +246,7 @@ def run_estimator(
     model: Model,
     settings: EstimatorSettings,
     progress: Callable[[int], None] | None = None,
+    observe: Callable[[Estimator, Sample], None] | None = None,
 ) -> EstimateTable:
     """Return the estimates of all samples, in order.
 
@@ -255,11 +257,15 @@ def run_estimator(
     settings : EstimatorSettings
     progress : callable, optional
         Called with the number of samples done, every `PROGRESS_EVERY`.
+    observe : callable, optional
+        Called with estimator and sample after each sample.
     """
     estimator = Estimator(model, settings)
     estimates = []
     for done, sample in enumerate(samples, start=1):
         estimates.append(estimator.step(sample))
+        if observe is not None:
+            observe(estimator, sample)
         if progress is not None and done % PROGRESS_EVERY == 0:
             progress(done)
     return EstimateTable.of(estimates)

@@ -167,7 +167,7 @@ class CaptureSource:
             clock = ReplayClock(ids.replay_clock)
         # The stamps of two buses can be of two adapters.
         stamps: defaultdict[Channel | None, ReceiveTime] = defaultdict(ReceiveTime)
-        own = {ids.soc_estimate, ids.soc_detail, ids.replay_clock}
+        own = {*ids.published, ids.replay_clock}
         for message in self._messages():
             time_s = (clock or stamps[message.channel]).time_of(message)
             is_own = message.arbitration_id in own and not message.is_extended_id

@@ -45,13 +45,13 @@ _CLOSE_WITHIN_S: Final = 3.0
 _LOG = logging.getLogger(__name__)
 
 
-def require_table_suffix(output: Path) -> None:
+def require_table_suffix(output: Path, option: str = "--output") -> None:
     """Raise InputError unless the file is named .csv or .parquet."""
     if output.suffix.lower() not in {".csv", ".parquet"}:
         raise InputError(
             "the suffix is neither .csv nor .parquet",
             source=output,
-            field="--output",
+            field=option,
             value=output.suffix,
             cure="name it .csv or .parquet (`cangauge estimate` also writes .mcap)",
         )

@@ -480,7 +480,7 @@ class DuplicateSenderDetector:
 
     def watch(self, ids: FrameIds) -> None:
         """Watch for these ids from now on."""
-        self.ids = frozenset({ids.soc_estimate, ids.soc_detail})
+        self.ids = frozenset(ids.published)
 
     @property
     def filters(self) -> list[CanFilter]:
@@ -536,7 +536,8 @@ class DuplicateSenderDetector:
                 logging.WARNING,
                 "bus.duplicate_sender",
                 f"another node on this bus sends 0x{frame_id:X}, which this service publishes:"
-                " is a second service running? Give one of them other ids (--soc-estimate-id,"
-                " --soc-detail-id)",
+                " is a second service running? Give one of them other ids ([ids], or"
+                " --soc-estimate-id, --soc-detail-id, --soc-health-id, --soc-power-id,"
+                " --soc-cells-id)",
                 always=True,
             )

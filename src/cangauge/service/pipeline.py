@@ -15,10 +15,17 @@ from can.typechecking import CanFilter
 
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.plausibility import MISSED_AT_LEAST, MISSED_UNTIL_OLD, Pack
-from cangauge.bus.publish import ACKNOWLEDGE_EVERY, FrameIds, SocPublisher, standard_filter
+from cangauge.bus.publish import (
+    ACKNOWLEDGE_EVERY,
+    FrameIds,
+    PackReport,
+    SocPublisher,
+    standard_filter,
+)
 from cangauge.bus.time_source import ReplayClock, TimeSourceName, is_clock, time_source
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
+from cangauge.estimation.cells import CellEstimator
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.state import EstimatorState
@@ -113,6 +120,8 @@ class Pipeline:
     latest_sample : Sample or None
     published : Estimate
         The estimate in the frames made last.
+    cells : CellEstimator or None
+        Where the vehicle gives cell voltages.
 
     Raises
     ------
@@ -154,6 +163,8 @@ class Pipeline:
         self._estimated: Estimate | None = None
         self._latest = NOTHING_YET
         self._is_behind = False
+        self.cells = self._new_cells()
+        self._report: tuple[int, PackReport] | None = None
 
     # --- frames → estimates
 
@@ -185,7 +196,7 @@ class Pipeline:
         if self._publisher is None:
             return []
         self.published = self.latest
-        return self._publisher.beat(self.published, self.samples, 0.0)
+        return self._publisher.beat(self.published, self.samples, 0.0, self.report)
 
     @property
     def latest(self) -> Estimate:
@@ -199,6 +210,14 @@ class Pipeline:
         """Return the latest estimate with the signal health at the latest wanted frame."""
         self._evaluate()
         return self._with_health(self.decoder.now_s)
+
+    def report(self) -> PackReport:
+        """Return health, power and cells after the latest sample; computed once a sample."""
+        if self._report is None or self._report[0] != self.samples:
+            cells = None if self.cells is None else self.cells.report
+            report = PackReport(self.estimator.health, self.estimator.power(), cells)
+            self._report = self.samples, report
+        return self._report[1]
 
     @property
     def counts(self) -> FrameCounts:
@@ -232,7 +251,7 @@ class Pipeline:
         if not self._is_replay or self._publisher is None:
             return []
         self.published = self.latest
-        return self._publisher.publish(self.published, self.samples)
+        return self._publisher.publish(self.published, self.samples, self.report)
 
     def heartbeat(
         self, *, is_stale: bool, silent_s: float = 0.0, reasons: Reason = Reason.NONE
@@ -267,7 +286,7 @@ class Pipeline:
             estimate = estimate._replace(soc_std_pct=std_pct)
         self.published = estimate
         age_s = silent_s if self.samples else math.nan
-        return self._publisher.beat(estimate, self.samples, age_s)
+        return self._publisher.beat(estimate, self.samples, age_s, self.report)
 
     @property
     def least_timeout_s(self) -> float:
@@ -318,6 +337,8 @@ class Pipeline:
             self._earlier_counts, self._untimed = self.counts, 0
             self.vehicle, self._pack = vehicle or self.vehicle, pack
             self.decoder = SampleDecoder(self.vehicle, pack)
+            self.cells = self._new_cells()
+        self._report = None
         self.settings = settings
         if self._publisher is not None:
             self._publisher.ids = settings.ids
@@ -348,6 +369,7 @@ class Pipeline:
             self._time.resume(latest.time_s)
         reasons = latest.reasons | Reason.INPUT_STALE
         self._latest = latest._replace(status=Status.INVALID, reasons=reasons)
+        self._report = None
         self._is_behind = False
         return self._latest
 
@@ -375,6 +397,21 @@ class Pipeline:
             self.taken += 1
             self._refused = 0
         self._is_behind = True
+        if self.cells is not None and self.cells.is_due(sample.time_s):
+            self._follow_cells(self.cells, sample)
+
+    def _new_cells(self) -> CellEstimator | None:
+        signals = self.vehicle.cells
+        if signals is None:
+            return None
+        return CellEstimator(self.estimator.voltage_model, signals.count, signals.first)
+
+    def _follow_cells(self, cells: CellEstimator, sample: Sample) -> None:
+        """Hand the cell voltages that came in since the last second to their estimator."""
+        if self.decoder.cells is not None:
+            volts, times = self.decoder.cells.take(sample.time_s)
+            changes = self.estimator.current_changes(sample.time_s, times)
+            cells.update(self.estimator.pack_tick(sample), volts, changes)
 
     def _evaluate(self) -> Estimate:
         """Compute the estimate of the latest sample, unless that is done."""
@@ -415,6 +452,7 @@ class Pipeline:
             self._publisher.restart()
         self.decoder = SampleDecoder(self.vehicle, self._pack)
         self.estimator = Estimator(self.model, self.estimator.settings)
+        self.cells = self._new_cells()
         self._estimated = None
 
 
@@ -444,16 +482,15 @@ def _with_source(settings: EstimatorSettings, vehicle: Vehicle) -> EstimatorSett
 
 
 def _check_ids(vehicle: Vehicle, ids: FrameIds) -> None:
-    published = {
-        ids.soc_estimate: "soc_estimate",
-        ids.soc_detail: "soc_detail",
-        ids.replay_clock: "replay_clock",
-    }
-    for signal in vehicle.signals:
-        if not signal.is_extended and signal.arbitration_id in published:
+    published = ids.published | {ids.replay_clock: "replay_clock"}
+    used = {signal.key: signal.message for signal in vehicle.signals}
+    if vehicle.cells is not None:
+        used |= {group.key: group.message for group in vehicle.cells.groups}
+    for key, message in used.items():  # the key of an extended id is no standard id
+        if key in published:
             raise InputError(
-                f"{signal.message} of {vehicle.name} has this id",
-                field=f"ids.{published[signal.arbitration_id]}",
-                value=f"0x{signal.arbitration_id:X}",
+                f"{message} of {vehicle.name} has this id",
+                field=f"ids.{published[key]}",
+                value=f"0x{key:X}",
                 cure="choose another one",
             )

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from cangauge._formatting import number
 from cangauge._io import READ_WITHIN_S, check_writable, refuse_pipe, sole_writer
 from cangauge._logging import emit
+from cangauge.bus.publish import NO_REPORT
 from cangauge.bus.reconnect import ReconnectingBus
 from cangauge.errors import InputError
 from cangauge.estimation.validity import Estimate, reason_names
@@ -443,4 +444,5 @@ def _summary_json(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary
             "reasons": reason_names(int(latest.reasons)),
         },
         "soc_reference_pct": pipeline.decoder.reference_soc_pct,
+        **(pipeline.report().to_dict() if pipeline.samples else NO_REPORT),
     }

@@ -20,6 +20,7 @@ from cangauge._version import __version__
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.decoder import FrameStatistics
 from cangauge.bus.plausibility import MessageStatistics
+from cangauge.bus.publish import NO_REPORT, PackReport
 from cangauge.estimation.validity import Estimate, Reason, Sample, Status, reason_name, reason_names
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline
@@ -38,6 +39,9 @@ RATE_OVER_S: Final = 2.0
 """Averaging time of the sample rate [s]."""
 CLOCKS_APART_S: Final = 60.0
 """A receive stamp further than this from the wall clock belongs to another clock [s]."""
+
+REPORT_EVERY_S: Final = 1.0
+"""Interval of health, power and cells in the snapshots [s]."""
 
 BUS_COUNTS: Final = ("garbled", "error_frames", "unsent", "queue_drops", "losses", "foreign")
 """Counts of a bus to report, where it has them."""
@@ -179,6 +183,8 @@ class Snapshot:
         sample.
     record : RecordState or None
     config : ConfigState
+    report : PackReport or None
+        Health, power and cells, of the last second; None before the first sample.
     """
 
     identity: Identity
@@ -201,6 +207,7 @@ class Snapshot:
     step: HistogramCounts
     record: RecordState | None
     config: ConfigState
+    report: PackReport | None = None
 
     def is_stuck(self, now_s: float) -> bool:
         """Return whether the receive loop is stuck at a monotonic time [s]."""
@@ -274,6 +281,8 @@ def as_json(snapshot: Snapshot, now_s: float) -> dict[str, Any]:
             "voltage_v": _finite(sample.voltage_v),
             "temperature_c": _finite(sample.temperature_c),
         },
+        **NO_REPORT,
+        **({} if snapshot.report is None else snapshot.report.to_dict()),
         "samples": snapshot.samples,
         "samples_per_s": _finite(snapshot.samples_per_s),
         "frames": {
@@ -366,6 +375,9 @@ class Monitor:
         self._rate_from = (now_s, 0)
         self._status: Status | None = None
         self._config = ConfigState()
+        self._report: PackReport | None = None
+        self._report_due_s = now_s
+        self._had_notices = False
         self.latest = self._snapshot(now_s)
 
     def stepped(self, stamp_s: float, step_s: float, came_s: float) -> None:
@@ -412,6 +424,7 @@ class Monitor:
         self._due_s = now_s + SHOW_EVERY_S
         self.latest = snapshot = self._snapshot(now_s)
         self._log_status(snapshot)
+        self._log_notices(snapshot)
         ping_every_s = self._notifier.ping_every_s
         if ping_every_s is not None and now_s >= self._ping_s:
             self._ping_s = now_s + ping_every_s - SHOW_EVERY_S
@@ -428,6 +441,9 @@ class Monitor:
         if now_s - since_s >= RATE_OVER_S:
             self._rate = (samples - before) / (now_s - since_s)
             self._rate_from = (now_s, samples)
+        if samples and now_s >= self._report_due_s:
+            self._report_due_s = now_s + REPORT_EVERY_S
+            self._report = pipeline.report()
         statistics = pipeline.decoder.statistics
         rejects = _rejects(statistics)
         return Snapshot(
@@ -451,7 +467,16 @@ class Monitor:
             step=self._step.copy(),
             record=None if self._record is None else self._record.state,
             config=self._config,
+            report=self._report,
         )
+
+    def _log_notices(self, snapshot: Snapshot) -> None:
+        """Log the notices once when they appear."""
+        notices = [] if snapshot.report is None else snapshot.report.notices
+        if notices and not self._had_notices:
+            for notice in notices:
+                emit(_LOG, logging.WARNING, "cells.sum_differs", notice)
+        self._had_notices = bool(notices)
 
     def _log_status(self, snapshot: Snapshot) -> None:
         estimate = snapshot.estimate
