@@ -387,7 +387,8 @@ def _state_text() -> str:
     return state_file.state_text(
         state_file.StateContent(
             saved_s=1.7e9, boot_id="x", model=state_file.model_fingerprint(_model()),
-            model_name="x", time_source="receive", estimator=estimator.snapshot(),
+            model_name="x", bus="can0", vehicle="x", time_source="receive",
+            estimator=estimator.snapshot(),
         )
     )  # fmt: skip
 

@@ -32,6 +32,22 @@ GOOD: dict[str, Any] = {
     "sample": {"age_s": 0.1, "current_a": 1.0, "voltage_v": None, "temperature_c": 20},
     "samples": 5, "samples_per_s": 1.0, "frames": {"received": 1, "used": 1, "lost": 0},
     "rejects": {"crc_errors": 2}, "bus_counts": {"losses": 0}, "bus_trouble": None,
+    "health": {
+        "capacity_ah": 60.0, "capacity_std_ah": 2.0, "resistance_ratio": 1.0,
+        "resistance_std": 0.1, "offset_a": None,
+    },
+    "power": dict.fromkeys(
+        (
+            "discharge_a", "discharge_std_a", "charge_a", "charge_std_a", "energy_wh",
+            "energy_std_wh",
+        ),
+        5.0,
+    ),
+    "cells": {
+        "weakest": 3, "cells": 96, "soc_pct": 50.0, "soc_std_pct": 1.0, "spread_pct": 2.0,
+        "sum_error_v": 0.1, "sum_std_v": None,
+    },
+    "notices": ["the cells' sum differs"],
     "config": {"reloading": False, "problem": "broken"},
     "latency": {"count": 1, "p50_at_most_s": 0.001, "p99_at_most_s": None},
     "step": {"count": 0, "p50_at_most_s": None, "p99_at_most_s": None},

@@ -168,6 +168,38 @@ _SHAPE: Final[dict[str, Any]] = {
     "bus_counts": {"": int},
     "bus_trouble": (str, type(None)),
     "config": {"reloading": bool, "problem": (str, type(None))},
+    "health": (
+        None,
+        dict.fromkeys(
+            ("capacity_ah", "capacity_std_ah", "resistance_ratio", "resistance_std", "offset_a"),
+            _Number,
+        ),
+    ),
+    "power": (
+        None,
+        dict.fromkeys(
+            (
+                "discharge_a",
+                "discharge_std_a",
+                "charge_a",
+                "charge_std_a",
+                "energy_wh",
+                "energy_std_wh",
+            ),
+            _Number,
+        ),
+    ),
+    "cells": (
+        None,
+        {
+            "weakest": (int, type(None)),
+            "cells": int,
+            **dict.fromkeys(
+                ("soc_pct", "soc_std_pct", "spread_pct", "sum_error_v", "sum_std_v"), _Number
+            ),
+        },
+    ),
+    "notices": [str],
     "latency": _Durations,
     "step": _Durations,
     "record": (
