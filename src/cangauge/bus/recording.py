@@ -392,7 +392,7 @@ def capture_to_log(
         temperature_source=vehicle.temperature_source,
         remarks=tuple(remarks),
     )
-    refuse_wrong_units(values, source=path, labels=_labels(vehicle))
+    refuse_wrong_units(values, source=path, labels=_labels(vehicle), in_seconds=True)
     return resolve_sign(log, stored_sign_unknown=False)
 
 

@@ -161,7 +161,11 @@ def convert(
 
 
 def refuse_wrong_units(
-    values: dict[str, FloatArray], *, source: object, labels: dict[str, str]
+    values: dict[str, FloatArray],
+    *,
+    source: object,
+    labels: dict[str, str],
+    in_seconds: bool = False,
 ) -> tuple[str, ...]:
     """Raise InputError if the values cannot be in the canonical units.
 
@@ -173,6 +177,9 @@ def refuse_wrong_units(
         `time_s`, `current_a`, `voltage_v`, `temperature_c` (finite) and optionally `soc_pct`.
     source, labels : object, dict of str to str
         File, and heading by field, for messages.
+    in_seconds : bool
+        Whether the format fixes the unit of time, as a capture's does: rows may then be as close
+        as an accelerated replay makes them.
 
     Returns
     -------
@@ -188,7 +195,7 @@ def refuse_wrong_units(
             problem, source=str(source), field=labels.get(field, field), value=value, cure=cure
         )
 
-    _check_time(values, refuse)
+    _check_time(values, refuse, in_seconds=in_seconds)
     # Before the voltage: a temperature below 1 °C in its place looks like kilovolts or inverted.
     _check_swapped(values, labels.get("voltage_v", "voltage_v"), refuse)
     _check_voltage(values["voltage_v"], refuse)
@@ -220,7 +227,7 @@ def follows_current(current_a: FloatArray, values: FloatArray) -> bool:
     return bool(abs(agreement) >= FOLLOWS)
 
 
-def _check_time(values: dict[str, FloatArray], refuse: _Refuse) -> None:
+def _check_time(values: dict[str, FloatArray], refuse: _Refuse, *, in_seconds: bool) -> None:
     time = values["time_s"]
     if time.size < 2:
         return
@@ -258,7 +265,7 @@ def _check_time(values: dict[str, FloatArray], refuse: _Refuse) -> None:
             "divide it by 1000 (a log with a row every 90 s or more cannot be used)",
             "ms",
         )
-    if 0.0 < interval < 1.0 / MAX_RATE_HZ:
+    if not in_seconds and 0.0 < interval < 1.0 / MAX_RATE_HZ:
         raise refuse(
             "time_s",
             f"rows are {interval:g} apart: time looks like hours or days",
