@@ -115,13 +115,14 @@ class MeasurementNoise:
 
     def __init__(self, voltage_model: VoltageModel, model: Model, capacity_ah: float) -> None:
         self._model = voltage_model
+        self._nominal_v = voltage_model.pseudo_ocv_at(50.0)[0]
         self._fast_std_v = effective_error_std_v(model.noise, 1.0 / model.rate_hz)
         self._usual_a = USUAL_CURRENT_C_RATE * capacity_ah
         # All samples of one filling delay line share the same unknown currents.
         self._shared_by = max(voltage_model.delay_s[-1] * model.rate_hz, 1.0)
 
-    def at(self, temperature_c: float, line: DelayLine) -> Callable[[float], float]:
-        """Return a function from the SoC [%] to the standard deviation of a voltage [V].
+    def at(self, temperature_c: float, line: DelayLine) -> tuple[Callable[[float], float], float]:
+        """Return the standard deviation of a voltage over the SoC, and that of a lasting error.
 
         The voltage is less certain while the delay line fills, without a temperature, and outside
         the range that the model was identified on.
@@ -135,8 +136,11 @@ class MeasurementNoise:
 
         Returns
         -------
-        callable
-            Takes NaN for an unknown SoC.
+        std_v : callable
+            From the SoC [%], NaN for an unknown one, to the fast error's standard deviation [V].
+        outside_std_v : float
+            Standard deviation of the error outside the identified temperatures [V]. It lasts as
+            long as the temperature does, and does not average out.
         """
         model = self._model
         variance = self._fast_std_v**2
@@ -150,20 +154,17 @@ class MeasurementNoise:
             cold, hot = model.temperature_range_c
             beyond_k = max(cold - temperature_c, temperature_c - hot, 0.0)
         low, high = model.soc_range_pct
+        outside_v = OUTSIDE_TEMPERATURE_V_PER_K * self._nominal_v * beyond_k
 
         def std_v(soc_pct: float) -> float:
             is_known = not math.isnan(soc_pct)
             beyond_pct = max(low - soc_pct, soc_pct - high, 0.0) if is_known else 0.0
-            if beyond_pct == 0.0 and beyond_k == 0.0:
+            if beyond_pct == 0.0:
                 return math.sqrt(variance)
-            volts, slope = model.pseudo_ocv_at(soc_pct if is_known else 50.0)
-            outside_v = math.hypot(
-                OUTSIDE_SLOPE_ERROR * slope * beyond_pct,
-                OUTSIDE_TEMPERATURE_V_PER_K * volts * beyond_k,
-            )
-            return math.sqrt(variance + outside_v**2)
+            slope = model.pseudo_ocv_at(soc_pct)[1]
+            return math.sqrt(variance + (OUTSIDE_SLOPE_ERROR * slope * beyond_pct) ** 2)
 
-        return std_v
+        return std_v, outside_v
 
     def _filling_var_v2(self, filled_var_v2: float, filled_s: float) -> float:
         """Return the error's variance while the delay line fills [V²].
@@ -190,6 +191,8 @@ class Measurement(NamedTuple):
     """SoC by inverse of the voltage model [%]."""
     std_v: Callable[[float], float]
     """Standard deviation of the fast error [V] as a function of the SoC [%]."""
+    outside_std_v: float = 0.0
+    """Standard deviation of the lasting error outside the identified temperatures [V]."""
 
 
 class SocEkf:
@@ -224,6 +227,7 @@ class SocEkf:
         self._slow_time_s = noise.slow_time_s
         self._lasting_var = noise.lasting_std_v**2
         self._offset_std_a = OFFSET_STD_PER_AH * capacity_ah
+        self._outside_var = 0.0
         self._mean_innovation_v = 0.0
         self._mean_seconds = 0.0
         self.log_likelihood = 0.0
@@ -271,7 +275,7 @@ class SocEkf:
                 CAPACITY_STD**2 * CAPACITY_SPAN_PCT * moved_pct + gap_var_pct2,
                 offset_walk**2 * seconds / 3600.0,
                 self._slow_var * (1.0 - slow_kept**2),
-                self._lasting_var * (1.0 - lasting_kept**2),
+                (self._lasting_var + self._outside_var) * (1.0 - lasting_kept**2),
             ]
         )
         ekf.predict(u=np.array([[-discharged_pct]]))
@@ -286,6 +290,10 @@ class SocEkf:
             Whether a lasting contradiction made the SoC unknown again.
         """
         ekf = self._ekf
+        outside_var = measurement.outside_std_v**2
+        if outside_var > self._outside_var:
+            ekf.P[3, 3] += outside_var - self._outside_var
+        self._outside_var = outside_var
         soc_pct = float(ekf.x[0, 0])
         std_v = measurement.std_v(soc_pct)
         ocv_v, slope = self._curve.pseudo_ocv_at(soc_pct)
@@ -294,7 +302,12 @@ class SocEkf:
         if is_contradicted:
             ekf.x[2:, 0] = 0.0
             ekf.P = np.diag(
-                [UNKNOWN_SOC_STD_PCT**2, float(ekf.P[1, 1]), self._slow_var, self._lasting_var]
+                [
+                    UNKNOWN_SOC_STD_PCT**2,
+                    float(ekf.P[1, 1]),
+                    self._slow_var,
+                    self._lasting_var + self._outside_var,
+                ]
             )
             self._reset_innovations()
             predicted_v = self._predicted_v(measurement, ocv_v)
@@ -338,6 +351,7 @@ class SocEkf:
             self._ekf.P.tolist(),
             self._mean_innovation_v,
             self._mean_seconds,
+            self._outside_var,
         )
 
     def restore(self, state: EkfState) -> None:
@@ -356,6 +370,7 @@ class SocEkf:
         ekf.P = np.array(state.p)
         self._mean_innovation_v = state.mean_innovation_v
         self._mean_seconds = state.mean_seconds
+        self._outside_var = state.outside_v2
 
     def is_valid(self) -> bool:
         """Return whether state and covariance are finite, and the covariance semidefinite."""
@@ -380,6 +395,18 @@ class SocEkf:
     def offset_a(self) -> float:
         """Estimated offset of the current sensor [A]."""
         return float(self._ekf.x[1, 0])
+
+    @property
+    def bias_v(self) -> float:
+        """Estimated bias of the voltage model [V]."""
+        return float(self._ekf.x[2, 0] + self._ekf.x[3, 0])
+
+    @property
+    def strain(self) -> float:
+        """Larger of offset and bias, in their standard deviations before the first voltage."""
+        bias_var = self._slow_var + self._lasting_var + self._outside_var
+        bias = abs(self.bias_v) / math.sqrt(bias_var) if bias_var > 0.0 else 0.0
+        return max(abs(self.offset_a) / self._offset_std_a, bias)
 
     def summary(self, counted_s: float) -> tuple[float, float, float]:
         """Return SoC, its standard deviation, and the charge that the offset adds in a time [%]."""
@@ -414,7 +441,9 @@ class SocEkf:
         self._mean_seconds += seconds
         if self._mean_seconds < PERSISTENT_S:
             return False
-        mean_var = self._slow_var + self._lasting_var + slope**2 * float(ekf.P[0, 0])
+        mean_var = (
+            self._slow_var + self._lasting_var + self._outside_var + slope**2 * float(ekf.P[0, 0])
+        )
         mean_var += std_v**2 * seconds / (2.0 * PERSISTENT_S)
         seen = 1.0 - math.exp(-self._mean_seconds / PERSISTENT_S)
         mean = self._mean_innovation_v / seen

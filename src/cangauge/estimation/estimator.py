@@ -15,6 +15,7 @@ from cangauge.errors import InputError
 from cangauge.estimation.cells import PackTick
 from cangauge.estimation.counting import CoulombCounter, EstimatorClock
 from cangauge.estimation.ekf import (
+    CAPACITY_STD,
     UNKNOWN_SOC_STD_PCT,
     Measurement,
     MeasurementNoise,
@@ -60,6 +61,10 @@ REST_S = 600.0
 
 CONTRADICTED_S = 300.0
 """How long a lasting contradiction, or a restart of the filter, degrades the estimate [s]."""
+
+MISMATCH_SIGMAS = 3.0
+"""Offset, bias or learned capacity beyond this many of the standard deviations assumed for them:
+model and pack disagree. By chance one pack in 400 is beyond."""
 
 AGREES_PCT = 1e-6
 """Rounding error allowed between a state's last estimate and its filter or count [%]."""
@@ -332,11 +337,11 @@ class Estimator:
         guess_pct = 50.0 if math.isnan(memory.newton_pct) else memory.newton_pct
         newton = soc_from_ocv(self._curve, sample.voltage_v - without_ocv_v, guess_pct)
         memory.newton_pct, memory.newton_inside = newton
-        std_v_at = self._noise.at(memory.temperature_c, self._line)
+        std_v_at, outside_std_v = self._noise.at(memory.temperature_c, self._line)
         std_v = std_v_at(self.filter.soc_pct if self._is_filtering else memory.newton_pct)
         slope = self._curve.pseudo_ocv_at(memory.newton_pct)[1]
         memory.newton_std_pct = min(
-            math.hypot(std_v, self._bias_std_v) / slope, UNKNOWN_SOC_STD_PCT
+            math.hypot(std_v, self._bias_std_v, outside_std_v) / slope, UNKNOWN_SOC_STD_PCT
         )
         if math.isnan(memory.coulomb_start_pct):
             # No initial SoC: start from the voltage's with a wide prior, from which the filter
@@ -344,9 +349,15 @@ class Estimator:
             self._start(memory.newton_pct, UNKNOWN_SOC_STD_PCT)
             memory.coulomb_var_pct2 = memory.newton_std_pct**2
         if self._is_filtering:
-            measurement = Measurement(sample.voltage_v, without_ocv_v, memory.newton_pct, std_v_at)
+            measurement = Measurement(
+                sample.voltage_v, without_ocv_v, memory.newton_pct, std_v_at, outside_std_v
+            )
             if self.filter.update(measurement, since):
                 memory.contradicted_until_s = sample.time_s + CONTRADICTED_S
+            ekf = self.filter.likelier
+            memory.bias_pct = min(abs(ekf.bias_v) / slope, UNKNOWN_SOC_STD_PCT)
+            if ekf.strain > MISMATCH_SIGMAS or self._has_other_capacity():
+                memory.mismatch_until_s = sample.time_s + CONTRADICTED_S
         tick = self._voltage_tick(sample, without_ocv_v)
         self._health.use(tick, since.seconds)
         self._follow_level(tick, sample.time_s)
@@ -451,7 +462,19 @@ class Estimator:
             return math.nan, math.nan
         if method == "coulomb":
             return _clip(self._coulomb_pct()), self._coulomb_std_pct()
-        return self.filter.soc_after(self._since)
+        soc_pct, std_pct = self.filter.soc_after(self._since)
+        if self._clock.state.last_s < memory.mismatch_until_s:
+            # A model that does not fit: as uncertain as its inputs disagree.
+            counted_pct = _clip(self._coulomb_pct()) - soc_pct
+            std_pct = math.hypot(std_pct, memory.bias_pct, counted_pct)
+        return soc_pct, std_pct
+
+    def _has_other_capacity(self) -> bool:
+        """Return whether the learned capacity is beyond what the filter allows for, surely."""
+        health = self._health.health
+        difference_ah = abs(health.capacity_ah - self.capacity_ah)
+        allowed_ah = max(health.capacity_std_ah, CAPACITY_STD * self.capacity_ah)
+        return difference_ah > MISMATCH_SIGMAS * allowed_ah
 
     def _coulomb_pct(self) -> float:
         """Return the SoC by counting alone [%], not clipped; NaN until counting has started."""
@@ -463,7 +486,9 @@ class Estimator:
         moved_pct = counter.moved_pct - memory.coulomb_moved_pct
         return count_std_pct(self.capacity_ah, memory.coulomb_var_pct2, hours, moved_pct)
 
-    def _reasons(self, sample: Sample, soc_pct: float, std_pct: float) -> Reason:
+    def _reasons(  # noqa: C901 - one line a reason
+        self, sample: Sample, soc_pct: float, std_pct: float
+    ) -> Reason:
         # Operations on flags are slow, and usually none is set. Comparisons with NaN are false.
         memory = self._memory
         reasons = self._permanent_reasons
@@ -485,6 +510,8 @@ class Estimator:
             reasons |= Reason.VOLTAGE_OUTSIDE_MODEL
         if sample.time_s < memory.contradicted_until_s:
             reasons |= Reason.INNOVATION_LARGE
+        if sample.time_s < memory.mismatch_until_s:
+            reasons |= Reason.MODEL_MISMATCH
         outside = outside_model(self._voltage_model, soc_pct, sample)
         return reasons | outside if outside else reasons
 

@@ -183,6 +183,11 @@ class HypothesisFilter:
             return self._filters[0].offset_a
         return self._mean([each.offset_a for each in self._filters])
 
+    @property
+    def likelier(self) -> SocEkf:
+        """Filter of the likelier hypothesis."""
+        return self._filters[int(len(self._filters) > 1 and self._log_odds > 0.0)]
+
     def snapshot(self) -> HypothesisFilterState:
         """Return a copy of the state."""
         return HypothesisFilterState(
