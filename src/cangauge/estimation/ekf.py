@@ -266,6 +266,8 @@ class SocEkf:
         """
         slow_kept = math.exp(-seconds / self._slow_time_s - moved_pct / SLOW_SPAN_PCT)
         lasting_kept = math.exp(-seconds / LASTING_TIME_S - moved_pct / LASTING_SPAN_PCT)
+        # What was learned outside the identified temperatures fades as the lasting bias does.
+        self._outside_var *= lasting_kept**2
         offset_walk = OFFSET_WALK_PER_SQRT_H * self._offset_std_a
         ekf = self._ekf
         ekf.F = np.diag([1.0, 1.0, slow_kept, lasting_kept])
@@ -275,7 +277,7 @@ class SocEkf:
                 CAPACITY_STD**2 * CAPACITY_SPAN_PCT * moved_pct + gap_var_pct2,
                 offset_walk**2 * seconds / 3600.0,
                 self._slow_var * (1.0 - slow_kept**2),
-                (self._lasting_var + self._outside_var) * (1.0 - lasting_kept**2),
+                self._lasting_var * (1.0 - lasting_kept**2),
             ]
         )
         ekf.predict(u=np.array([[-discharged_pct]]))
@@ -293,7 +295,7 @@ class SocEkf:
         outside_var = measurement.outside_std_v**2
         if outside_var > self._outside_var:
             ekf.P[3, 3] += outside_var - self._outside_var
-        self._outside_var = outside_var
+            self._outside_var = outside_var
         soc_pct = float(ekf.x[0, 0])
         std_v = measurement.std_v(soc_pct)
         ocv_v, slope = self._curve.pseudo_ocv_at(soc_pct)

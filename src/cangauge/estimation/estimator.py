@@ -463,7 +463,7 @@ class Estimator:
         if method == "coulomb":
             return _clip(self._coulomb_pct()), self._coulomb_std_pct()
         soc_pct, std_pct = self.filter.soc_after(self._since)
-        if self._clock.state.last_s < memory.mismatch_until_s:
+        if self._counter.state.time_s < memory.mismatch_until_s:
             # A model that does not fit: as uncertain as its inputs disagree.
             counted_pct = _clip(self._coulomb_pct()) - soc_pct
             std_pct = math.hypot(std_pct, memory.bias_pct, counted_pct)
@@ -605,6 +605,7 @@ class Estimator:
     def _start_from(self, state: EstimatorState) -> None:
         """Start from the SoC of another estimator, if it knew one."""
         coulomb_pct = state.estimate[4]
+        self._memory.mismatch_until_s, self._memory.bias_pct = math.nan, 0.0
         if not (math.isnan(state.soc_pct) or math.isnan(state.soc_std_pct)):
             self._start(state.soc_pct, min(state.soc_std_pct, UNKNOWN_SOC_STD_PCT))
         elif not math.isnan(coulomb_pct):

@@ -268,11 +268,11 @@ class EstimatorMemory:
     gap_until_s: _MaybeNan = math.nan
     """Until when the last gap in the current degrades the estimate [s]."""
     contradicted_until_s: _MaybeNan = math.nan
+    """Until when the last contradiction degrades the estimate [s]."""
     mismatch_until_s: _MaybeNan = math.nan
     """Until when the evidence that model and pack disagree lasts [s]."""
     bias_pct: _Finite = 0.0
     """Bias of the voltage model in SoC [%]."""
-    """Until when the last contradiction degrades the estimate [s]."""
     rest_since_s: _MaybeNan = math.nan
     """Since when the pack has rested [s]; NaN: it does not."""
     level_s: _MaybeNan = math.nan
