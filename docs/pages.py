@@ -152,7 +152,7 @@ def effects_page() -> str:
             inspect.cleandoc(type(effect).__doc__ or ""),
             f"**Signature.** {effect.signature}",
             f"```text\n{effect.equation}\n```",
-            f"**Told apart by** {effect.separated_by}",
+            f"**Separated by** {effect.separated_by}",
             f"**Source.** {effect.source}",
         ]
         if effect.id not in STRUCTURE:

@@ -94,30 +94,30 @@ def write_mf4(log: cangauge.Log, path: Path) -> None:
         file.save(path, overwrite=True)
 
 
-def write_pcap(log: cangauge.Log, path: Path) -> None:
-    """Write SocketCAN frames by scapy, as tcpdump -i can0 captures them."""
+def packets(log: cangauge.Log, vehicle: str) -> list[Any]:
+    """Return SocketCAN packets of scapy."""
     from scapy.layers.can import CAN
-    from scapy.utils import wrpcap
 
-    packets = []
-    for frame in frames(log, cangauge.Vehicle.load("generic")):
+    made = []
+    for frame in frames(log, cangauge.Vehicle.load(vehicle)):
         packet = CAN(identifier=frame.arbitration_id, length=frame.dlc, data=bytes(frame.data))
         packet.time = frame.timestamp
-        packets.append(packet)
-    wrpcap(str(path), packets)
+        made.append(packet)
+    return made
+
+
+def write_pcap(log: cangauge.Log, path: Path) -> None:
+    """Write SocketCAN frames by scapy, as tcpdump -i can0 captures them."""
+    from scapy.utils import wrpcap
+
+    wrpcap(str(path), packets(log, "generic"))
 
 
 def write_pcapng(log: cangauge.Log, path: Path) -> None:
     """Write the same by scapy as PCAPNG, Wireshark's own format."""
-    from scapy.layers.can import CAN
     from scapy.utils import wrpcapng
 
-    packets = []
-    for frame in frames(log, cangauge.Vehicle.load("leaf_aze0")):
-        packet = CAN(identifier=frame.arbitration_id, length=frame.dlc, data=bytes(frame.data))
-        packet.time = frame.timestamp
-        packets.append(packet)
-    wrpcapng(str(path), packets)
+    wrpcapng(str(path), packets(log, "leaf_aze0"))
 
 
 def write_gvret(log: cangauge.Log, path: Path) -> None:

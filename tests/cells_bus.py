@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 import can
 
+from faults.large_dbc import SIGNALS
+
 CELLS_ON_BUS = 96
 
 
@@ -54,22 +56,10 @@ BO_ 1090 ALL_CELLS: 8 Car
 
 CELLS_DBC = _dbc()
 
-CAR = """
+CAR = f"""
 name = "car with cells"
 dbc = "cells.dbc"
-
-[current]
-message = "PACK_CURRENT"
-signal = "current_a"
-
-[voltage]
-message = "PACK_VOLTAGE"
-signal = "voltage_v"
-
-[temperature]
-message = "PACK_TEMPERATURE"
-signal = "temperature_c"
-
+{SIGNALS}
 [messages.PACK_CURRENT]
 protection = "generic"
 [messages.PACK_VOLTAGE]

@@ -8,7 +8,7 @@ A fault passes if all of these hold (`tests/faults` makes each fail):
 - No estimate was valid for longer than its time-out after the last good current, voltage or
   temperature was sent.
 - It was never silent for longer than `MAX_SILENCE_S` while it ran and the bus was up.
-- Where the fault says so: its reason was published while it lasted, and no estimate was valid from
+- Where the fault names a reason: it was published while it lasted, and no estimate was valid from
   `REPORTED_S` after its start to its end; the last estimate is valid again.
 
 The undisturbed run must itself be valid where it is compared, or nothing is judged.

@@ -373,7 +373,7 @@ def forged(
         Time after the true frame, and between copies [s].
     roles : tuple of str
     every : int
-        Forge a frame for one of so many true ones.
+        Forge one frame for each `every` true ones.
     copies : int
         Forged frames for each, with increasing counters.
     """

@@ -6,9 +6,7 @@ from pathlib import Path
 
 from cangauge._resources import shared_file
 
-MAP = """
-dbc = ["large.dbc"]
-name = "car of a large DBC"
+SIGNALS = """
 [current]
 message = "PACK_CURRENT"
 signal = "current_a"
@@ -19,6 +17,8 @@ signal = "voltage_v"
 message = "PACK_TEMPERATURE"
 signal = "temperature_c"
 """
+"""Signals of the generic pack, for a map file."""
+MAP = 'dbc = ["large.dbc"]\nname = "car of a large DBC"\n' + SIGNALS
 _SIGNAL = ' SG_ Signal_{0}_{1} : {2}|8@1+ (0.5,-40) [0|100] "unit" Vector__XXX\n'
 
 

@@ -85,7 +85,7 @@ class BoundedChild:
     def ask(self, line: bytes) -> None:
         """Send a line to the child."""
         pipe = cast("BinaryIO", self._process.stdin)
-        with contextlib.suppress(BrokenPipeError):  # it has ended; `blocks` tells why
+        with contextlib.suppress(BrokenPipeError):  # it has ended; `blocks` reports the cause
             pipe.write(line + b"\n")
             pipe.flush()
 

@@ -1,8 +1,7 @@
-"""What results show of themselves in a notebook: figures and HTML, made by `cangauge.report`.
+"""Figures and HTML of results in a notebook, made by `cangauge.report`.
 
-The report draws logs, estimates and diagnoses, and so stands above them. A result that is asked to
-draw itself finds it by name, as data frames are found in `_dataframes`; nothing is imported, and no
-bokeh is needed, before.
+The one place where a lower layer calls the report: by name and on use, so that neither the import
+nor bokeh is needed before.
 """
 
 from __future__ import annotations

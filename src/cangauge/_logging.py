@@ -121,7 +121,7 @@ def takes_text(stream: IO[str]) -> bool:
 
 class _Handler(logging.StreamHandler[TextIO]):
     def emit(self, record: logging.LogRecord) -> None:
-        """Write a record; drop it where nobody reads, rather than wait."""
+        """Write a record; drop it if its reader is stopped, instead of waiting."""
         if takes_text(self.stream):
             super().emit(record)
 

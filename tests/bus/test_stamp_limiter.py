@@ -1,4 +1,4 @@
-"""Stamps limited by the monotonic clock: whatever the stamps do, bus time goes on at its rate."""
+"""Stamps limited by the monotonic clock: whatever the stamps do, bus time keeps its rate."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ def test_few_forged_frames_are_found_too(vehicle: Vehicle, ahead: int, later: fl
 
 
 def test_forged_frames_that_fill_the_counter_are_too_many() -> None:
-    # Four forged frames, and the counter is again where the true sender goes on.
+    # Four forged frames, and the counter is again where the true sender continues.
     out = []
     for number, frame in enumerate(true_frames(LEAF, 2000)):
         out.append(frame)

@@ -11,7 +11,8 @@ import pytest
 
 from cangauge.bus.captures.capture import open_capture
 from cangauge.discovery.fields import collect
-from cangauge.discovery.search import Candidate, search
+from cangauge.discovery.pairs import Candidate
+from cangauge.discovery.search import search
 from drive_captures import CARS, Bits, Car, Frame, capture
 
 SEARCHED = {car.name: car for car in CARS}

@@ -95,7 +95,7 @@ def test_fit_leaves_out_the_delays_that_inspect_calls_too_short(
     shown = ", ".join(str(delay) for delay in kept)
     assert (verdict == "yes") == (len(kept) == 4)
     assert verdict == "yes" or f"identify delays of {shown} s only" in text
-    told = any("do not tell a delay of" in remark for remark in found.remarks)
+    told = any("do not resolve a delay of" in remark for remark in found.remarks)
     assert told == (len(kept) < 4)
     verdict, text = ability(inspect_log(log), "rows for a fit")
     assert verdict == "yes"

@@ -18,22 +18,10 @@ from cangauge.estimation.offline import samples_of
 from cangauge.estimation.validity import Reason
 from cangauge.service.loop import LoopSettings
 from cangauge.service.run import Service
+from faults.large_dbc import SIGNALS
 from live import LoggedLines, leaf_model_path, short_log, waits
 
-MAP = """
-dbc = ["pack.dbc"]
-name = "car"
-temperature_source = "pack"
-[current]
-message = "PACK_CURRENT"
-signal = "current_a"
-[voltage]
-message = "PACK_VOLTAGE"
-signal = "voltage_v"
-[temperature]
-message = "PACK_TEMPERATURE"
-signal = "temperature_c"
-"""
+MAP = 'dbc = ["pack.dbc"]\nname = "car"\ntemperature_source = "pack"\n' + SIGNALS
 
 
 class Car:

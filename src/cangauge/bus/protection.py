@@ -539,7 +539,7 @@ class FrameChecker:
         self._counted_s = self._last_s
         if steps == 0:
             self._continues, self._odd = continues, b""
-            # The second repetition in a row is a counter that stands still.
+            # The second repetition in a row is a stuck counter.
             self.inserted += not self._was_repeated and data != self._content
         elif counter == continues:
             self.inserted += 1.0

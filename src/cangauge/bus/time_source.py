@@ -38,7 +38,7 @@ REVERSAL_S: Final = 0.1
 """A smaller step back [s] is a matter of the order of writing, as of two buses in one file."""
 IRREGULAR_REVERSALS: Final = 3
 IRREGULAR_WITHIN_S: Final = 10.0
-"""Reversals within this time [s] that prove irregular stamps: nobody sets a clock as often."""
+"""Reversals within this time [s] that prove irregular stamps: a clock is not set that often."""
 IRREGULAR_FOR_S: Final = 60.0
 """Time after the latest reversal for which time stays uncertain [s]."""
 
@@ -151,7 +151,7 @@ class StampLimiter:
     """Limit stamps to the interval in which the frames can have arrived by the monotonic clock.
 
     A frame received now arrived after the receive queue was last seen empty. A stamp outside this
-    interval is replaced by the time of reading; so bus time goes on at the right rate whatever the
+    interval is replaced by the time of reading; so bus time keeps the right rate whatever the
     stamps do. Stamps that are off by a constant amount come from a clock that was set: they are
     shifted from then on, and exact again.
 

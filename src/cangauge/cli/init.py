@@ -26,6 +26,7 @@ from cangauge.cli.config_options import BusOptionOption, ChannelOption, Interfac
 from cangauge.cli.options import JsonOption, within
 from cangauge.cli.output import console, emit_json, note, print_table, progress_shown
 from cangauge.discovery.by_name import NamedSignal, named_signals
+from cangauge.discovery.pairs import Candidate
 from cangauge.discovery.proposal import (
     SIGNALS,
     UNITS,
@@ -37,7 +38,7 @@ from cangauge.discovery.proposal import (
     mapped,
     message_name,
 )
-from cangauge.discovery.search import Candidate, Findings, search
+from cangauge.discovery.search import Findings, search
 from cangauge.errors import CangaugeError, InputError
 from cangauge.inspect.capture import inspect_capture
 

@@ -38,7 +38,7 @@ console = PlainConsole(stderr=True, highlight=False)
 def note(text: str) -> None:
     """Print one line on stderr."""
     if sys.stderr is not None:
-        with suppress(OSError):  # a full disk behind it: the exit code says the rest
+        with suppress(OSError):  # a full disk behind it: the exit code reports the failure
             sys.stderr.write(printable(text.rstrip()) + "\n")
             sys.stderr.flush()
 

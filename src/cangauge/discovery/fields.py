@@ -1,8 +1,8 @@
 """Fields of frames: streams of one id, their alive counters and CRCs, and the numbers in them.
 
 A field is a run of 8–16 bits in reading order: Motorola reads the payload from its first byte,
-Intel from its last. Bits that toggle together as one number are told from neighbours by carries:
-when the part above a cut steps by one, the part below wraps.
+Intel from its last. Bits that toggle together as one number are separated from neighbours by
+carries: when the part above a cut steps by one, the part below wraps.
 """
 
 from __future__ import annotations
@@ -435,7 +435,7 @@ def _ends(  # noqa: C901 - one rule after the other
     count, flips = len(order.flips), order.flips
     score = _WIDTHS[last - first + 1]
     main, minor = (first % 8, (last + 1) % 8) if order.is_motorola else ((last + 1) % 8, first % 8)
-    # A field that begins anywhere is packed tightly: its end on a byte says less.
+    # A field that begins anywhere is packed tightly: its end on a byte is weaker evidence.
     aligned = 0.8 if main in {0, 4} else 0.4
     score += {0: 1.2, 4: 0.4}.get(main, -0.3) + {0: aligned, 4: 0.4}.get(minor, -0.3)
     if first % 8 and flips[first - 1] == 0 and order.set_mostly[first - 1]:
@@ -454,7 +454,7 @@ def _ends(  # noqa: C901 - one rule after the other
         if flips[last + 1] < 0.6 * flips[last]:
             score += 0.5
         elif (last + 1) % 8:
-            score -= 1.0  # the noise of a measurement may go on below
+            score -= 1.0  # the noise of a measurement may extend below
     if last % 8 == 7 and other.is_linked(turned(last)):
         score -= 2.5
     if order.is_linked(first - 1):

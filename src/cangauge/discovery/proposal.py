@@ -10,7 +10,7 @@ from typing import Final
 
 from cangauge.bus.mapping import VehicleMap
 from cangauge.bus.vehicle import EXTENDED
-from cangauge.discovery.search import Candidate
+from cangauge.discovery.pairs import Candidate
 
 UNITS: Final = {"current": "A", "voltage": "V", "temperature": "degC", "soc_reference": "%"}
 SIGNALS: Final = {

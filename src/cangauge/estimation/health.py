@@ -14,13 +14,13 @@ standard deviations:
     U = OCV(S) + kt·(T − T_r) + (1 + r)·Σ Rj·I(t − dj) − R·o + b + l + v + c(S)·ξ(S) + fast error
 
 The curve's standard deviation c is that of the lasting error in volts and, where the curve is
-steep, `AXIS_STD_PCT` of SoC times its slope: the knees of a curve lie where the SoC of its logs
-said, and move with temperature and current.
+steep, `AXIS_STD_PCT` of SoC times its slope: the knees of a curve are placed by the SoC of its
+logs, and move with temperature and current.
 
 The curve's error belongs to the SoC, not to the drive, so it is the same each time that the SoC
 passes: no number of charges averages it out, and the standard deviation of the capacity stops
-falling where curve error and capacity cannot be told apart. The identification judges whole logs,
-which do not tell an error of the curve from one of the day: each is taken at its full size. An
+falling where curve error and capacity are not separable. The identification judges whole logs,
+which do not separate an error of the curve from one of the day: each is taken at its full size. An
 offset moves charge in proportion to time, a capacity in proportion to charge: they separate once
 the pack is charged and discharged. After an interval without observed charge the SoC is unknown;
 the other states stay.
@@ -30,7 +30,8 @@ in Haar details of 4 to 32 s: errors of the OCV and slow polarisation lie on lon
 scale has its own slope; where they differ, polarisation leaks in, and the spread is part of the
 standard deviation.
 
-Neither feeds back into the SoC: they are published, for the user to set `capacity_ah`.
+Neither changes the SoC: they are published, for the user to set `capacity_ah`. A learned
+capacity far from the model's marks a model mismatch.
 
 References
 ----------
@@ -337,7 +338,7 @@ class HealthEstimator:
         return p
 
     def _start(self, soc_pct: float) -> None:
-        """Begin with a SoC that only the next voltage says more of."""
+        """Begin with an unknown SoC."""
         self._x[_S] = soc_pct
         self._p[_S, :] = self._p[:, _S] = 0.0
         self._p[_S, _S] = UNKNOWN_SOC_STD_PCT**2

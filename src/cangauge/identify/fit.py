@@ -452,8 +452,7 @@ def _remarks_on_time(
         left_out = ", ".join(f"{delay:g}" for delay in delay_s if delay not in usable)
         step_s = min(usual_step_s(log.time_s) for log in logs)
         remarks.append(
-            f"rows every {step_s:.3g} s do not tell a delay of {left_out} s from the others: left"
-            " out"
+            f"rows every {step_s:.3g} s do not resolve a delay of {left_out} s: left out"
         )
     for log in logs:
         gaps = uncounted_gaps(log.time_s)

@@ -22,8 +22,7 @@ from scipy import optimize
 from cangauge._formatting import significant
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.identify.voltage_fit import KT, fit_voltage_model, rising, stacked
-from cangauge.inference.least_squares import kt_prior
+from cangauge.identify.voltage_fit import fit_voltage_model, rising_with_kt_prior, stacked
 from cangauge.inference.rows import FitOptions, FitRows, fit_rows
 from cangauge.logs.gaps import split_where_moved
 from cangauge.logs.log import Log
@@ -105,11 +104,11 @@ class Starts:
     def remarks(self) -> list[str]:
         """Return a remark on the starts that were estimated."""
         found = [str(start) for start in self.starts if start.origin == "estimated"]
-        told = [f"start estimated together with the curve: {'; '.join(found)}"] if found else []
+        remarks = [f"start estimated together with the curve: {'; '.join(found)}"] if found else []
         parts = [log.name for log in self.logs if " part " in log.name]
         if parts:
-            told.append(f"split where the pack was used in a gap: {', '.join(parts)}")
-        return told
+            remarks.append(f"split where the pack was used in a gap: {', '.join(parts)}")
+        return remarks
 
 
 def with_start(log: Log, soc_pct: float) -> Log:
@@ -261,21 +260,12 @@ class _JointFit:
         table = np.hstack([columns, of_starts])
         span = float(soc.min()), float(soc.max())
         lengths = [len(item) for item in rows]
-        solution = rising(table, volts, block, span, options.epsilon)
-        residual = volts - table @ solution.coefficients
-        prior = kt_prior(table, residual, volts, lengths, KT)
-        row = np.zeros(table.shape[1])
-        row[KT] = prior.row_weight
-        solution = rising(
-            np.vstack([table, row]),
-            np.append(volts, 0.0),
-            np.append(block, block.max() + 1),
-            span,
-            options.epsilon,
+        solution, _ = rising_with_kt_prior(
+            table, volts, block, span, options.epsilon, lengths=lengths
         )
         std_pct = solution.std_error[n:]
-        # The least squares knows of no error that lasts as long as a log and shifts its voltage as
-        # a whole. Residuals averaged over five minutes show how large those that last are.
+        # The least squares does not model an error that lasts as long as a log and shifts its whole
+        # voltage. Residuals averaged over five minutes show how large those that last are.
         error_v = volts - table @ solution.coefficients
         _, of_block, rows_of = np.unique(block, return_inverse=True, return_counts=True)
         means_v = np.bincount(of_block, weights=error_v) / rows_of

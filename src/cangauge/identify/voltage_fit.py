@@ -72,20 +72,14 @@ def fit_voltage_model(
         soc, temperature, current = soc[keep], temperature[keep], current[keep]
     _check_identifiable(rows, soc, current, columns.shape)
     span = float(soc.min()), float(soc.max())
-    solution = rising(columns, volts, block, span, options.epsilon)
     if with_kt_prior:
         lengths = np.bincount(number, minlength=len(rows)).tolist()
-        prior = kt_prior(columns, volts - columns @ solution.coefficients, volts, lengths, KT)
-        row = np.zeros(columns.shape[1])
-        row[KT] = prior.row_weight
-        solution = rising(
-            np.vstack([columns, row]),
-            np.append(volts, 0.0),
-            np.append(block, block.max() + 1),
-            span,
-            options.epsilon,
+        solution, prior = rising_with_kt_prior(
+            columns, volts, block, span, options.epsilon, lengths=lengths
         )
         solution = _with_prior_errors(solution, prior)
+    else:
+        solution = _rising(columns, volts, block, span, options.epsilon)
     x = [float(value) for value in solution.coefficients]
     return VoltageModel(
         ocv_v=tuple(x[: len(BASIS_NAMES)]),
@@ -100,7 +94,7 @@ def fit_voltage_model(
     ), solution
 
 
-def rising(
+def _rising(
     columns: FloatArray,
     volts: FloatArray,
     block: NDArray[np.intp],
@@ -124,6 +118,44 @@ def rising(
         # Near empty the curve bends so sharply that it may fall between two constraints.
         grid = np.union1d(grid, between[slope < at_least])
     return solution
+
+
+def rising_with_kt_prior(
+    columns: FloatArray,
+    volts: FloatArray,
+    block: NDArray[np.intp],
+    span_pct: tuple[float, float],
+    epsilon: float,
+    *,
+    lengths: Sequence[int],
+) -> tuple[Solution, KtPrior]:
+    """Return the least-squares solution with a rising pseudo-OCV and the prior on kt.
+
+    Parameters
+    ----------
+    columns : array of shape (n, m)
+        Those of `design_matrix`; others may follow.
+    volts : array of shape (n,)
+    block : array of int of shape (n,)
+        Block of correlated rows that each row belongs to.
+    span_pct : pair of float
+        SoC over which the pseudo-OCV rises [%].
+    epsilon : float
+    lengths : sequence of int
+        Rows of each log.
+    """
+    solution = _rising(columns, volts, block, span_pct, epsilon)
+    prior = kt_prior(columns, volts - columns @ solution.coefficients, volts, lengths, KT)
+    row = np.zeros(columns.shape[1])
+    row[KT] = prior.row_weight
+    solution = _rising(
+        np.vstack([columns, row]),
+        np.append(volts, 0.0),
+        np.append(block, block.max() + 1),
+        span_pct,
+        epsilon,
+    )
+    return solution, prior
 
 
 def _with_prior_errors(solution: Solution, prior: KtPrior) -> Solution:

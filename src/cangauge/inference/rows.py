@@ -188,7 +188,7 @@ def running_rows(time_s: FloatArray, voltage_v: FloatArray) -> NDArray[np.bool_]
 
 
 def usable_delays(logs: Sequence[Log], delay_s: Sequence[float]) -> tuple[float, ...]:
-    """Return the delays that the fastest of some logs can tell apart [s].
+    """Return the delays that the fastest of some logs resolves [s].
 
     Between rows the current is interpolated, so that the columns of delays closer together than a
     row depend on each other.

@@ -161,7 +161,7 @@ class ChosenColumn:
     given : bool
         Whether the user named the column.
     source : str
-        Where a temperature is measured, as far as its heading tells.
+        Where a temperature is measured, if its heading defines it.
     others : tuple of int
         Further time columns, in case that the first does not increase.
     """

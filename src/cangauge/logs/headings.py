@@ -1,4 +1,4 @@
-"""What a heading of a table says: which quantity, in which unit, how directly.
+"""Meaning of a table's heading: which quantity, in which unit, how directly.
 
 A heading is *plain* if its words name a quantity and nothing contradicts it: `Time [s]`,
 `Pack Current (A)`, `Ecell/V`, `Spannung [mV]`, `v.b.soc`. Words that make it another quantity
@@ -98,7 +98,7 @@ _CLOCK: Final = re.compile(r"^h+\s*:\s*m", re.IGNORECASE)
 
 @dataclass(frozen=True, slots=True)
 class Meaning:
-    """What a heading says.
+    """Meaning of a heading.
 
     Parameters
     ----------

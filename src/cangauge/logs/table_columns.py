@@ -47,7 +47,7 @@ HOLD_ENTITY_S: Final = 60.0
 over a gap."""
 
 SHOWN_HEADING: Final = 80
-"""Longest heading in the line that says what was assumed [characters]."""
+"""Longest heading in the line of assumptions [characters]."""
 
 LEAF_SPY_SOC: Final = 1e-4
 """LeafSpy writes SoC in ten-thousandths of a percent."""
@@ -125,7 +125,7 @@ def fill_draft(
 
 
 def temperature_source_of(choice: Choice) -> TemperatureSource:
-    """Return where the chosen temperature is measured, as far as its heading tells."""
+    """Return where the chosen temperature is measured, if its heading defines it."""
     column = choice.chosen.get("temperature")
     return "unknown" if column is None else column.source
 

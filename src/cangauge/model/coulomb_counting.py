@@ -36,7 +36,7 @@ EMPTY_VOLTAGE = 0.88
 cell falls to 0.80 of its voltage (layered oxides: 4.15 to 3.3 V at rest) or 0.87 (LFP: 3.35 to
 2.9 V); over half of its charge to no less than 0.89 (4.15 to 3.7 V)."""
 
-TOLD_PCT = 1.0
+DIFFERENT_PCT = 1.0
 """Difference between the counted SoC and the log's own over the log from which it is reported [%]:
 the resolution of a dashboard."""
 
@@ -89,7 +89,7 @@ def difference_from_reference(log: Log, capacity_ah: float) -> str | None:
     -------
     str or None
         Both changes and the capacity that the log implies; None where they agree within
-        `TOLD_PCT`, or the log has no reference that moves.
+        `DIFFERENT_PCT`, or the log has no reference that moves.
     """
     if log.soc_pct is None:
         return None
@@ -102,12 +102,12 @@ def difference_from_reference(log: Log, capacity_ah: float) -> str | None:
     ends = [int(np.argmax(soc)), int(np.argmin(soc))]
     own = float(soc[ends[0]] - soc[ends[1]])
     counted = float(100.0 * (out[ends[1]] - out[ends[0]]) / capacity_ah)
-    if abs(counted - own) < TOLD_PCT or own < TOLD_PCT:
+    if abs(counted - own) < DIFFERENT_PCT or own < DIFFERENT_PCT:
         return None
     implied = 100.0 * float(out[ends[1]] - out[ends[0]]) / own
     return (
-        f"{log.name}: counted {counted:.1f} %, the log's own SoC says {own:.1f} %: its capacity"
-        f" would be {implied:.1f} Ah, not {capacity_ah:.1f} Ah"
+        f"{log.name}: counted {counted:.1f} %, the log's own SoC changes by {own:.1f} %:"
+        f" its capacity would be {implied:.1f} Ah, not {capacity_ah:.1f} Ah"
     )
 
 

@@ -183,47 +183,31 @@ class LongRestConfig(_Strict):
     )
 
 
+def _limit(text: str, default_text: str, *, unit: str, le: float = 1e4) -> Any:
+    return _key(None, text, unit=unit, default_text=default_text, ge=0.0, le=le)
+
+
 class LimitsConfig(_Strict):
     """Limits for the possible currents and the energy left; see `PackLimits`."""
 
-    min_voltage_v: FiniteFloat | None = _key(
-        None,
-        "Lowest pack voltage.",
-        unit="V",
-        default_text="the pseudo-OCV at the lower end of the identified SoC",
-        ge=0.0,
-        le=1e4,
+    min_voltage_v: FiniteFloat | None = _limit(
+        "Lowest pack voltage.", "the pseudo-OCV at the lower end of the identified SoC", unit="V"
     )
-    max_voltage_v: FiniteFloat | None = _key(
-        None,
-        "Highest pack voltage.",
-        unit="V",
-        default_text="the pseudo-OCV at the upper end of the identified SoC",
-        ge=0.0,
-        le=1e4,
+    max_voltage_v: FiniteFloat | None = _limit(
+        "Highest pack voltage.", "the pseudo-OCV at the upper end of the identified SoC", unit="V"
     )
-    max_discharge_a: FiniteFloat | None = _key(
-        None,
-        "Largest discharge current.",
-        unit="A",
-        default_text="the largest that the model was identified on",
-        ge=0.0,
-        le=1e4,
+    max_discharge_a: FiniteFloat | None = _limit(
+        "Largest discharge current.", "the largest that the model was identified on", unit="A"
     )
-    max_charge_a: FiniteFloat | None = _key(
-        None,
+    max_charge_a: FiniteFloat | None = _limit(
         "Largest charge current, positive.",
+        "the largest that the model was identified on",
         unit="A",
-        default_text="the largest that the model was identified on",
-        ge=0.0,
-        le=1e4,
     )
-    cutoff_soc_pct: FiniteFloat | None = _key(
-        None,
+    cutoff_soc_pct: FiniteFloat | None = _limit(
         "SoC at which the energy ends; it also ends at the lowest voltage.",
+        "the lower end of the identified SoC",
         unit="%",
-        default_text="the lower end of the identified SoC",
-        ge=0.0,
         le=100.0,
     )
 

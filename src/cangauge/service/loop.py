@@ -340,8 +340,8 @@ class _Loop:
                     _LOG,
                     logging.WARNING,
                     "bus.clock_set",
-                    f"the clock of the time stamps was set by {step_s:+.1f} s; bus time goes on"
-                    " by the monotonic clock",
+                    f"the clock of the time stamps was set by {step_s:+.1f} s; bus time follows"
+                    " the monotonic clock",
                     step_s=step_s,
                 )
         if stamps.is_uncertain(steady_s()):

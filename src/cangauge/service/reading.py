@@ -173,7 +173,7 @@ def _limit_resources() -> None:
     """Leave processor and memory to the service, as far as the system allows."""
     with contextlib.suppress(OSError, AttributeError):
         os.setpriority(os.PRIO_PROCESS, 0, 19)
-    with contextlib.suppress(OSError):  # whom the kernel ends first when memory is short
+    with contextlib.suppress(OSError):  # the kernel ends this process first when memory is short
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
     if sys.platform == "win32":
         return

@@ -203,7 +203,7 @@ _BYTE_ORDER_MARK: Final = "\u00ef\u00bb\u00bf"
 _SHORTEST_FRAME_S: Final = 47e-6
 """A standard frame without data, with the pause after it: 47 bits at 1 Mbit/s, the fastest [s]."""
 _FRAMES_FOR_UNIT: Final = 100
-"""Frames of one bus from which stamps in milliseconds are told from stamps that came in bursts."""
+"""Frames of one bus from which stamps in milliseconds are distinguished from bursts."""
 _AS_NUMBER = re.compile(r"([1-9])\.00E\+0(\d)")
 """What a spreadsheet makes of an id such as 2E6; 0E6 is lost."""
 
@@ -227,7 +227,7 @@ class GvretReader(LineReader):
             self._per_s = 1e3
             self.stamps = "ms"
             self.remarks.append(
-                "no bus carries so many frames a microsecond: time stamps are milliseconds"
+                "too many frames per microsecond for any bus: time stamps are taken as milliseconds"
             )
         self._repaired = 0
         return True
@@ -267,7 +267,7 @@ class GvretReader(LineReader):
 
 
 def _is_too_fast(lines: Sequence[str], time: int, bus: int) -> bool:
-    """Return whether a bus cannot carry so many frames if the stamps are microseconds."""
+    """Return whether stamps in microseconds would exceed the capacity of a bus."""
     stamps: dict[str, list[int]] = {}
     for line in lines:
         cells = line.split(",")
