@@ -35,6 +35,7 @@ VALID = {
     "replay": ["absent.csv"],
     "inspect": ["absent.csv"],
     "twin": ["-o", "absent/out.csv"],
+    "packs-check": ["--data", "absent"],
 }
 
 
