@@ -90,7 +90,7 @@ def packs_check_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge packs-check --data recorded --pack i3 --logs 5 --case withheld`
 
-    `cangauge packs-check --data recorded --json > packs.json`
+    `cangauge packs-check --data recorded --json > packs.json 2> packs.txt`
     """
     by_name = {each.name: each for each in packs.CASES}
     for name in case or ():
@@ -120,7 +120,6 @@ def packs_check_command(  # noqa: PLR0917 - typer passes options by name
             seed=seed,
             progress=lambda done, total: progress.update(estimating, completed=done, total=total),
         )
+    print_bench(bench, PlainConsole(stderr=json_output, highlight=False, width=WIDTH))
     if json_output:
         emit_json(bench.to_dict())
-    else:
-        print_bench(bench, PlainConsole(highlight=False, width=WIDTH))

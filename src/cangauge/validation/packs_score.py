@@ -201,6 +201,8 @@ class Row:
 def pool_scores(scores: Sequence[LogScore], chemistry: Mapping[str, str]) -> tuple[Row, ...]:
     """Return a row for each pack, number of training logs and case, in order of appearance.
 
+    A log without a scored sample is in no row.
+
     Parameters
     ----------
     scores : sequence of LogScore
@@ -209,7 +211,8 @@ def pool_scores(scores: Sequence[LogScore], chemistry: Mapping[str, str]) -> tup
     """
     groups: dict[tuple[str, int, str], list[LogScore]] = {}
     for score in scores:
-        groups.setdefault((score.pack, score.size, score.case), []).append(score)
+        if score.rows:
+            groups.setdefault((score.pack, score.size, score.case), []).append(score)
     rows = []
     for (pack, size, _), group in groups.items():
         row = _pooled(group)
