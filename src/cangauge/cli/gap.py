@@ -286,4 +286,6 @@ def _show_simulator(found: SimulatorDiagnosis) -> None:
         ]
         for each in found.errors()
     ]
-    print_table("Measured less simulated voltage, RMS [V]", ["<log", "as it is", "corrected"], rows)
+    print_table(
+        "Measured less simulated voltage", ["<log", "RMS as it is [V]", "corrected [V]"], rows
+    )

@@ -28,9 +28,9 @@ CORRECTIONS: Final = {
     "initial_soc": "start the simulator with {offset_pct:+.3g} % SoC",
     "coulombic_efficiency": "let the simulator count {efficiency:.4g} of the charging current",
     "current_offset": "subtract {offset_a:.3g} A from the current that the simulator is given",
-    "current_gain": "divide the current that the simulator is given by 1 {gain_pct:+.3g} %",
+    "current_gain": "divide the current that the simulator is given by {factor:.4g}",
     "voltage_offset": "subtract {offset_v:.3g} V from the measured voltage, not the simulator's",
-    "voltage_gain": "divide the measured voltage, not the simulator's, by 1 {gain_pct:+.3g} %",
+    "voltage_gain": "divide the measured voltage, not the simulator's, by {factor:.4g}",
     "time_skew": "shift the current that the simulator is given by {skew_s:+.3g} s",
 }
 """Effect → what to change in the simulator's inputs or parameters, or in the measurement. The
@@ -119,7 +119,8 @@ class SimulatorDiagnosis:
         sentences = []
         for effect_id, values in self.diagnosis.extension.cause.items():
             sentence = CORRECTIONS.get(effect_id, "add the voltage of {effect}")
-            sentences.append(sentence.format(effect=effect_id, **values))
+            factor = 1.0 + values.get("gain_pct", 0.0) / 100.0
+            sentences.append(sentence.format(effect=effect_id, factor=factor, **values))
         text = "; ".join(sentences)
         return text and f"To correct the simulator: {text}."
 
