@@ -6,6 +6,7 @@ raises `InputError` before it costs time or memory.
 
 from __future__ import annotations
 
+import bz2
 import errno
 import gzip
 import io
@@ -102,7 +103,7 @@ MAX_READING_MEMORY: Final = 2048 * MIB
 
 # --- Reading
 
-_GZIP: Final = b"\x1f\x8b"
+_UNPACKERS: Final = {b"\x1f\x8b": gzip.GzipFile, b"BZh": bz2.BZ2File}
 # Opening these could block, never end, or trigger a device.
 _NOT_FILES: Final = (
     (stat.S_ISFIFO, "this is a pipe (FIFO), not a file"),
@@ -136,9 +137,9 @@ def open_regular(path: str | PathLike[str]) -> BinaryIO:
 
 
 def open_unpacked(path: str | PathLike[str], limit: int) -> io.BufferedReader:
-    """Open a regular file for reading; gzip is recognised by content and unpacked within bounds.
+    """Open a regular file for reading; gzip and bzip2 are recognised by content and unpacked.
 
-    A damaged gzip file raises `EOFError`, `OSError` or `zlib.error` while it is read.
+    A damaged packed file raises `EOFError`, `OSError` or `zlib.error` while it is read.
 
     Parameters
     ----------
@@ -149,19 +150,20 @@ def open_unpacked(path: str | PathLike[str], limit: int) -> io.BufferedReader:
     Raises
     ------
     InputError
-        As `open_regular`; while reading, if gzip unpacks to more than `limit` or beyond
+        As `open_regular`; while reading, if it unpacks to more than `limit` or beyond
         `UNPACK_RATIO`.
     """
     file = open_regular(path)
     try:
-        packed = file.read(len(_GZIP)) == _GZIP
+        beginning = file.read(3)
         file.seek(0)
     except OSError as error:
         file.close()
         raise _unreadable(error, path) from error
-    if not packed:
+    unpack = next((each for mark, each in _UNPACKERS.items() if beginning.startswith(mark)), None)
+    if unpack is None:
         return cast("io.BufferedReader", file)
-    unpacked = gzip.GzipFile(fileobj=file, mode="rb")
+    unpacked = gzip.GzipFile(fileobj=file) if unpack is gzip.GzipFile else bz2.BZ2File(file)
     return bounded(unpacked, path, limit, os.fstat(file.fileno()).st_size, also_close=file)
 
 

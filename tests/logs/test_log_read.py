@@ -97,7 +97,7 @@ def test_damaged_bytes_raise_nothing_but_input_errors(
         ),
         (b"%PDF-1.4\n", r"first line: .*not a known kind of log.* \(got '%PDF-1.4'\)"),
         (b"a,b,c\n1,2,3\n", r"found: a, b, c\); name the columns"),
-        (b"\x1f\x8bnot gzip", "gzip file is cut off or damaged"),
+        (b"\x1f\x8bnot gzip", "packed file is cut off or damaged"),
         (b"PK\x03\x04not zip", "zip file is cut off or damaged"),
         (b"PAR1not parquet", "Parquet file is cut off or damaged"),
     ],

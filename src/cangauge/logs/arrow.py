@@ -17,6 +17,7 @@ import pyarrow.compute as pc
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.draft import DraftLog
+from cangauge.logs.headings import meaning_of
 from cangauge.logs.units import (
     REQUIRED,
     TEMPERATURE_SOURCES,
@@ -35,9 +36,14 @@ def is_canonical(names: Sequence[str]) -> bool:
     A temperature of another name is not a missing one: such a table is a logger's own.
     """
     spelled = {name.strip().lower() for name in names}
-    if "temperature_c" not in spelled and any("temperature" in n for n in spelled - {SOURCE}):
+    if "temperature_c" not in spelled and any(map(_is_temperature, spelled - {SOURCE})):
         return False
     return len(spelled & set(REQUIRED)) >= 2
+
+
+def _is_temperature(name: str) -> bool:
+    meaning = meaning_of(name)
+    return "temperature" in name or (meaning is not None and meaning.quantity == "temperature")
 
 
 def find_fields(names: Sequence[str], where: str) -> dict[str, int]:
@@ -161,6 +167,7 @@ def describe(draft: DraftLog, words: Any, names: Sequence[str]) -> None:
         )
     word = distinct.pop() if distinct else "unknown"
     draft.temperature_source = known_temperature_source(word, source=where, field=SOURCE)
+    draft.headings = tuple(names)
     extra = [name for name in names if name and name.strip().lower() not in _FIELDS]
     if extra:
         shown = ", ".join(extra[:6]) + (", …" if len(extra) > 6 else "")

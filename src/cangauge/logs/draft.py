@@ -10,6 +10,7 @@ import numpy as np
 
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import InputError
+from cangauge.logs.column_map import shown_headings
 from cangauge.logs.units import REQUIRED, TemperatureSource, refuse_wrong_units
 
 Sign = Literal["charge", "discharge"]
@@ -46,6 +47,8 @@ class DraftLog:
         How the columns of an arbitrary table were understood, a phrase each.
     remarks : list of str
         Changes and findings of the reader.
+    headings : tuple of str
+        All columns of the file, for messages.
     """
 
     name: str
@@ -58,15 +61,15 @@ class DraftLog:
     negated: bool = False
     assumed: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
+    headings: tuple[str, ...] = ()
 
     def require(self, *fields: str, headings: Sequence[str]) -> None:
         """Raise InputError if one of these fields was not found under any heading."""
         for name in fields:
             if name not in self.values:
-                shown = ", ".join(headings[:12]) + (", …" if len(headings) > 12 else "")
                 raise self._error(
                     name,
-                    f"no column of this file holds it (found: {shown})",
+                    f"no column of this file holds it (found: {shown_headings(headings)})",
                     cure="check the export, or convert it to a canonical log",
                 )
 
@@ -121,10 +124,12 @@ class DraftLog:
             self.values["temperature_c"] = np.full(self.values["time_s"].size, given_c)
             self.temperature_source = "unknown"
         elif "temperature_c" not in self.values:
+            found = f" (found: {shown_headings(self.headings)})" if self.headings else ""
+            named = "name its column with --columns temperature=…" if found else "add this column"
             raise self._error(
                 "temperature_c",
-                f"the {self._kind} holds no temperature",
-                cure="add this column [°C], or give a constant with "
+                f"the {self._kind} holds no temperature{found}",
+                cure=f"{named} [°C], or give a constant with "
                 + ("--temperature" if self.source else "temperature_c"),
             )
 

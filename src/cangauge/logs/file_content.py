@@ -1,4 +1,4 @@
-"""Content of a log file: gzip and zip unpacked, text decoded; its beginning for recognition."""
+"""Content of a log file: unpacked (gzip, bzip2, zip), text decoded; its beginning to know it."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from cangauge._io import (
 )
 from cangauge._mcap import MAGIC
 from cangauge.errors import InputError
+from cangauge.logs.foreign import NDAX_CURE
 
 _WORKBOOK: Final = "xl/workbook.xml"
 _ZIP: Final = b"PK\x03\x04"
@@ -32,6 +33,7 @@ _MDF: Final = (b"MDF     ", b"UnFinMF ")
 _DELIMITERS: Final = ("\t", ";", ",")
 _HEAD_BYTES: Final = 64 * 1024
 _HEAD_LINES: Final = 160
+_MAGIC_BYTES: Final = 64
 MAX_WORKBOOK_TEXTS: Final = 64 << 20
 """Distinct texts of a workbook [bytes]: all are held in memory, and a log holds numbers."""
 _D3_MEMBER: Final = "test data.txt"
@@ -55,6 +57,8 @@ class FileContent:
         File name without folder and suffixes (of the member, for a zip).
     head : tuple of str
         The first lines, without line ends; empty for binary content.
+    magic : bytes
+        The first bytes.
     is_parquet, is_mf4, is_mcap : bool
 
     Raises
@@ -78,6 +82,7 @@ class FileContent:
         if beginning.startswith(_ZIP):  # not unpacked: a workbook
             self._sheet = sheet_text(self.path)
             beginning = self._sheet[:_HEAD_BYTES]
+        self.magic = beginning[:_MAGIC_BYTES]
         self.is_parquet = beginning.startswith(_PARQUET)
         self.is_mf4 = beginning.startswith(_MDF)
         self.is_mcap = beginning.startswith(MAGIC)
@@ -108,7 +113,7 @@ class FileContent:
         kind = ""
         try:
             with open_unpacked(self.path, MAX_LOG_BYTES) as file:
-                kind = "" if file.seekable() else "gzip "
+                kind = "" if file.seekable() else "packed "
                 if not file.peek(len(_ZIP)).startswith(_ZIP):
                     yield file
                     return
@@ -216,10 +221,11 @@ def _only_member(archive: zipfile.ZipFile, path: Path) -> zipfile.ZipInfo:
     if len(chosen) != 1:
         names = ", ".join(info.filename for info in chosen[:4])
         more = ", …" if len(chosen) > 4 else ""
+        is_ndax = any(info.filename == "data.ndc" for info in chosen)
         raise InputError(
             f"the zip holds {len(chosen)} files ({names}{more})" if chosen else "the zip is empty",
             source=path,
-            cure="unpack it and name one of them",
+            cure=NDAX_CURE if is_ndax else "unpack it and name one of them",
         )
     if chosen[0].compress_type not in _ZIP_METHODS:
         raise InputError(
@@ -235,6 +241,11 @@ def _as_utf8(data: bytes) -> bytes:
     data = data.removeprefix(b"\xef\xbb\xbf")
     if data[:2] in {b"\xff\xfe", b"\xfe\xff"}:  # "Unicode text" of spreadsheets
         return data.decode("utf-16", errors="replace").encode()
+    nul = data[:_HEAD_BYTES].count(0)
+    for first, codec in ((1, "utf-16-le"), (0, "utf-16-be")):  # without a BOM: every second byte
+        halves = data[first:_HEAD_BYTES:2]
+        if nul and 2 * nul > len(halves) and halves.count(0) == nul:
+            return data.decode(codec, errors="replace").encode()
     try:
         data.decode("utf-8")
     except UnicodeDecodeError:
@@ -255,6 +266,7 @@ def _first_lines(beginning: bytes) -> tuple[str, ...]:
 def _stem(name: str) -> str:
     for suffix in (
         ".gz",
+        ".bz2",
         ".zip",
         ".csv",
         ".txt",

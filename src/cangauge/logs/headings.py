@@ -40,7 +40,7 @@ _NEUTRAL: Final = _words(
     "terminal surface skin absolute abs mid measured meas actual act value val signal avg "
     "average mean total tot sum dc instant inst live real now main ch channel ist mess wert "
     "messwert system sys device ctrl v b var the of in raw data test rec record id sensor "
-    "usable bus line overall current present"
+    "usable bus line overall current present averaged volume gesamt klemmen klemm"
 )
 _CELL: Final = _words("cell cells module mod zelle zellen zell string display displayed dash")
 _AMBIENT: Final = _words(
@@ -68,7 +68,7 @@ _ELAPSED: Final = _words(
 _WORDS: Final[dict[str, frozenset[str]]] = {
     "time": _words(
         "time realtime zeit timestamp timestamps datetime date datum elapsed tiempo tempo seconds "
-        "sec clock uhrzeit stamp changed 时间 总时间 测试时间 日期 绝对时间"
+        "sec clock uhrzeit stamp zeitstempel changed 时间 总时间 测试时间 日期 绝对时间"
     ),
     "current": _words(
         "current cur amps amp ampere amperes strom courant corriente corrente stroom curr 电流 "
@@ -83,11 +83,18 @@ _WORDS: Final[dict[str, frozenset[str]]] = {
     ),
     "soc": _words("soc rsoc usoc ladezustand ladestand"),
 }
+_ABBREVIATED: Final = {"temps": "time", "vol": "voltage"}
+"""Words that are another quantity's too (French; volume): the unit decides."""
+_COMPOUND: Final = re.compile(
+    r"(\w{3,}?)(strom|spannung|temperatur|zeit|stroom|spanning|temperatuur)"
+)
+"""A Germanic noun whose last word is the quantity: `Batteriespannung`, `Motorstrom`."""
 _AUXILIARY: Final = frozenset({"aux", "auxiliary"})
 _PACK_WORD: Final = frozenset({"battery"})
 _MEAN: Final = frozenset({"avg", "average", "mean"})
 _DATES: Final = frozenset({"date", "datum", "日期"})
 _DATE_ONLY: Final = "(date)"
+_FIRST_PARTS: Final = _PACK | _NEUTRAL | _CELL | _AMBIENT | _EXCLUDED | _TIME_EXCLUDED | _ELAPSED
 _SYMBOLS: Final = {"i": "current", "u": "voltage", "v": "voltage", "e": "voltage", "t": "time"}
 _TOKEN: Final = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_A-Za-z]+")
 _BRACKETS: Final = re.compile(r"^(?P<name>.*?)[\s_]*[\[({](?P<unit>[^\[\](){}]*)[\])}]?\s*$")
@@ -148,12 +155,14 @@ def meaning_of(heading: str, unit_below: str = "") -> Meaning | None:
 def _splits(heading: str, unit_below: str) -> list[tuple[str, str]]:
     """Return (name, unit) as the heading may be meant, the most explicit first."""
     found = []
-    if unit_below.strip():
-        found.append((heading, unit_below.strip().strip("[](){}").strip()))
     for pattern in (_BRACKETS, _SLASH, _TAIL):
         match = pattern.match(heading.strip())
         if match is not None and match["name"].strip():
             found.append((match["name"], match["unit"].strip()))
+    below = unit_below.strip().strip("[](){}").strip()
+    if below:  # instead of the heading's own unit, as in `Pack_V`
+        names = [name for name, unit in found if _is_unit(unit)]
+        found = [*((name, below) for name in (*names, heading)), *found]
     return [*found, (heading, "")]
 
 
@@ -174,7 +183,22 @@ def tokens_of(name: str) -> list[str]:
     """Return the words of a heading in lower case, without accents; camel case is split."""
     plain = unicodedata.normalize("NFKD", name.replace("SoC", "Soc").replace("SOC", "Soc"))
     plain = "".join(char for char in plain if not unicodedata.combining(char))
-    return [token.lower() for token in _TOKEN.findall(plain)]
+    words: list[str] = []
+    for token in _TOKEN.findall(plain):
+        words += _parts_of_compound(token.lower())
+    return words
+
+
+def _parts_of_compound(word: str) -> list[str]:
+    """Return the parts of a Germanic compound whose first part is a known word, else the word."""
+    match = _COMPOUND.fullmatch(word)
+    if match is None:
+        return [word]
+    first, last = match.groups()
+    for part in (first, first.removesuffix("s"), first.removesuffix("n")):
+        if part in _FIRST_PARTS:
+            return [part, last]
+    return [word]
 
 
 def _meaning(name: str, unit: str) -> Meaning | None:
@@ -201,15 +225,16 @@ def _quantity(tokens: list[str], name: str, unit: str) -> tuple[str | None, list
         if phrase in text:
             return "soc", text.replace(phrase, "").split()
     named = {each for each, words in _WORDS.items() if words.intersection(tokens)}
-    if "temps" in tokens and unit_of("time_s", unit):  # French
-        named = {"time"}
+    short = next((word for word in tokens if word in _ABBREVIATED), "")
+    if short and unit_of(FIELDS[_ABBREVIATED[short]], unit):
+        named = {_ABBREVIATED[short]}
     if len(named) > 1 and "current" in tokens:  # also an adjective
         named.discard("current")
     if len(named) > 1:
         named.discard("time")  # the instant of anything
     if len(named) == 1:
         quantity = named.pop()
-        words = _WORDS[quantity] | ({"temps"} if quantity == "time" else set())
+        words = _WORDS[quantity] | ({short} if _ABBREVIATED.get(short) == quantity else set())
         others = [token for token in tokens if token not in words]
         if quantity == "time" and len(others) < len(tokens) and set(tokens) <= _DATES:
             others.append(_DATE_ONLY)
@@ -245,7 +270,7 @@ def _rank(quantity: str, rest: list[str]) -> tuple[int, bool, TemperatureSource]
     if quantity == "temperature":
         source = "room" if words & _AMBIENT else "pack" if words & _PACK else "unknown"
         source = "cell" if words & _CELL else source
-        words -= {"t", "probe", "sensor", "ntc"}
+        words -= {"t", "probe", "sensor", "ntc", "log"}
         if words & _AUXILIARY:  # a cycler's thermocouple
             words, numbered = words - _AUXILIARY | {"thermocouple"} | _PACK_WORD, True
     is_one = not numbered or quantity == "temperature" or bool(words & _PACK) or "1" in rest

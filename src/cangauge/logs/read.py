@@ -12,6 +12,7 @@ from cangauge.logs import arrow, canonical, formats, measurement, table, table_c
 from cangauge.logs.column_map import ColumnMap, missing_quantities, shown_headings, suggestion
 from cangauge.logs.draft import DraftLog, Sign
 from cangauge.logs.file_content import FileContent
+from cangauge.logs.foreign import foreign_format
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.sign import resolve_sign
 from cangauge.logs.units import COLDEST_C, HOTTEST_C, known_temperature_source
@@ -92,6 +93,11 @@ class LogFile:
 
 def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
     """Return the error for a file of unknown format: its columns if it is a table."""
+    foreign = foreign_format(file.content.magic)
+    if foreign is not None:
+        return InputError(
+            f"{problem}: it is {foreign[0]}", source=file.content.path, cure=foreign[1]
+        )
     headings, choice = table.likely_table(file.content, None)
     if len(headings) >= 3 and not table.is_of_frames(headings):
         return InputError(

@@ -13,6 +13,7 @@ findings and is not a measured frequency; weights are capped, so that no kind ov
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, Literal
 
@@ -99,6 +100,10 @@ class SignFinding:
         """The strongest evidence for the finding."""
         return max(self.evidence, key=lambda item: item.weight * (self.sign or 1))
 
+    def by_kind(self, kind: Kind) -> Evidence:
+        """Return the evidence of one kind."""
+        return next(item for item in self.evidence if item.kind == kind)
+
     @property
     def sentence(self) -> str:
         """The finding and its evidence in one line."""
@@ -117,7 +122,11 @@ class SignFinding:
 
 def sign_of_current(log: Log) -> SignFinding:
     """Determine from the data whether positive current discharges; either sign is accepted."""
-    evidence = (_from_steps(log), _from_charge(log), _from_soc(log))
+    return _finding((_from_steps(log), _from_charge(log), _from_soc(log)))
+
+
+def _finding(evidence: Sequence[Evidence]) -> SignFinding:
+    """Return the sign that some evidence gives together."""
     weight = sum(item.weight for item in evidence)
     opposed = any(item.weight * weight < 0.0 and abs(item.weight) >= 1.0 for item in evidence)
     sure = abs(weight) >= SURE_WEIGHT and not opposed
@@ -125,8 +134,17 @@ def sign_of_current(log: Log) -> SignFinding:
     return SignFinding(
         sign=(1 if weight > 0.0 else -1) if sure else 0,
         confidence=min(float(odds / (1.0 + odds)), MOST_CONFIDENT),
-        evidence=evidence,
+        evidence=tuple(evidence),
     )
+
+
+def _by_voltage_against_soc(finding: SignFinding) -> SignFinding | None:
+    """Return the finding by voltage alone where that is sure and the SoC contradicts it."""
+    voltage = [item for item in finding.evidence if item.kind != "soc"]
+    soc = finding.by_kind("soc")
+    alone = _finding(voltage)
+    contradicts = abs(soc.weight) >= 1.0 and soc.weight * alone.sign < 0.0
+    return alone if finding.sign == 0 and contradicts else None
 
 
 def require_discharge_positive(log: Log) -> None:
@@ -260,6 +278,16 @@ def resolve_sign(log: Log, *, stored_sign_unknown: bool, is_stated: bool = False
         With a remark where the data disagree with the sign, or cannot confirm an unknown one.
     """
     finding = sign_of_current(log)
+    by_voltage = _by_voltage_against_soc(finding)
+    if by_voltage is not None and log.soc_pct is not None:
+        known = log.soc_pct[np.isfinite(log.soc_pct)]
+        text = (
+            f"SoC left out: it moves from {known[0]:.4g} to {known[-1]:.4g} % against the charge,"
+            f" by the sign of current that the voltage proves ({by_voltage.strongest.text}); is it"
+            " a depth of discharge?"
+        )
+        log = replace(log, soc_pct=None, remarks=(*log.remarks, text))
+        finding = by_voltage
     if stored_sign_unknown and finding.sign < 0:
         because = finding.strongest.text
         text = f"current negated, sign found from the data: {because}"

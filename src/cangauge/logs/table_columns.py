@@ -105,6 +105,7 @@ def fill_draft(
     columns : TableColumns
         Holds the columns of `wanted_places`.
     """
+    draft.headings = tuple(headings)
     for name, column in choice.chosen.items():
         label = " + ".join(headings[place] for place in column.places)
         draft.labels[FIELDS[name]] = label

@@ -6,7 +6,7 @@ follow those of the current.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Final, Literal, cast, get_args
 
 import numpy as np
@@ -80,6 +80,8 @@ ZERO_C_IN_K: Final = 273.15
 MAX_HOURS_AT_PEAK: Final = 100.0
 """Largest charge, in hours of the largest current [h]."""
 _EPOCH_MS: Final = 1e11
+_EXCEL_1990: Final = 32_874.0
+"""1990-01-01 as a spreadsheet's date [d since 1899-12-30]; as hours, nearly four years."""
 
 # Test whether a column follows the current.
 LARGE_SHARE: Final = 0.25
@@ -202,7 +204,7 @@ def refuse_wrong_units(
     _check_current(values["current_a"], refuse)
     if "soc_pct" in values:
         _check_soc(values["soc_pct"], refuse)
-    return _check_temperature(values, refuse)
+    return _check_temperature(values, labels, refuse)
 
 
 def follows_current(current_a: FloatArray, values: FloatArray) -> bool:
@@ -266,12 +268,14 @@ def _check_time(values: dict[str, FloatArray], refuse: _Refuse, *, in_seconds: b
             "ms",
         )
     if not in_seconds and 0.0 < interval < 1.0 / MAX_RATE_HZ:
+        in_days = time[0] > _EXCEL_1990
         raise refuse(
             "time_s",
-            f"rows are {interval:g} apart: time looks like hours or days",
+            f"rows are {interval:g} apart: time looks like "
+            + ("days (dates of a spreadsheet)" if in_days else "hours or days"),
             interval,
             "convert it to seconds",
-            "h",
+            "d" if in_days else "h",
         )
     _check_charge(time, values["current_a"], interval, refuse)
 
@@ -366,7 +370,9 @@ def _check_current(current: FloatArray, refuse: _Refuse) -> None:
     )
 
 
-def _check_temperature(values: dict[str, FloatArray], refuse: _Refuse) -> tuple[str, ...]:
+def _check_temperature(
+    values: dict[str, FloatArray], labels: Mapping[str, str], refuse: _Refuse
+) -> tuple[str, ...]:
     temperature = values["temperature_c"]
     middle = float(np.median(temperature))
     if middle > HOTTEST_C:
@@ -396,7 +402,11 @@ def _check_temperature(values: dict[str, FloatArray], refuse: _Refuse) -> tuple[
             "remove the row: codes such as 255 mean 'not available'",
         )
     if middle > UNUSUALLY_HOT_C:
-        return (f"temperature {middle:.0f} °C is unusually hot: if it is °F, convert it",)
+        label = labels.get("temperature_c", "temperature_c")
+        return (
+            f"temperature {middle:.0f} °C is unusually hot: if it is °F, state the unit:"
+            f" --columns 'temperature={label}[°F]'",
+        )
     return ()
 
 

@@ -89,7 +89,7 @@ def difference_from_reference(log: Log, capacity_ah: float) -> str | None:
     -------
     str or None
         Both changes and the capacity that the log implies; None where they agree within
-        `DIFFERENT_PCT`, or the log has no reference that moves.
+        `DIFFERENT_PCT`, or the reference moves less than that without being frozen.
     """
     if log.soc_pct is None:
         return None
@@ -99,6 +99,12 @@ def difference_from_reference(log: Log, capacity_ah: float) -> str | None:
     # A start stated for the first row is no reading of the log's own.
     out = discharged_ah(log.time_s, log.current_a)[known]
     soc = log.soc_pct[known]
+    counted_range = 100.0 * float(np.ptp(out)) / capacity_ah
+    if np.ptp(soc) == 0.0 and counted_range >= DIFFERENT_PCT:
+        return (
+            f"{log.name}: its own SoC stays at {soc[0]:g} % while {counted_range:.1f} % is counted:"
+            " a column that is not updated; state the start with --initial-soc"
+        )
     ends = [int(np.argmax(soc)), int(np.argmin(soc))]
     own = float(soc[ends[0]] - soc[ends[1]])
     counted = float(100.0 * (out[ends[1]] - out[ends[0]]) / capacity_ah)
