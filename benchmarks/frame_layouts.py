@@ -23,7 +23,7 @@ class Bits:
     offset: float = 0.0
     signed: bool = False
 
-    def places(self, length: int) -> np.ndarray:
+    def places(self) -> np.ndarray:
         """Return its bits, most significant first, in reading order from byte 0."""
         if self.motorola:
             first = 8 * (self.start // 8) + 7 - self.start % 8
@@ -33,7 +33,7 @@ class Bits:
 
     def raw(self, payload: np.ndarray) -> np.ndarray:
         """Return its raw numbers in payloads (n, length), as signed integers where signed."""
-        bits = np.unpackbits(payload, axis=1)[:, self.places(payload.shape[1])].astype(np.int64)
+        bits = np.unpackbits(payload, axis=1)[:, self.places()].astype(np.int64)
         code = bits @ (1 << np.arange(self.width - 1, -1, -1))
         return np.where(
             self.signed & (code >> (self.width - 1) == 1), code - (1 << self.width), code
@@ -87,21 +87,21 @@ def encode(
 def _payload(frame: Frame, steps: np.ndarray, truth: Mapping[str, np.ndarray]) -> np.ndarray:
     bits = np.zeros((len(steps), 8 * frame.length), np.uint8)
     for name, where in frame.signals.items():
-        _put(bits, where, quantized(truth[name][steps], where), frame.length)
+        _put(bits, where, quantized(truth[name][steps], where))
     if frame.multiplexed is not None:
         selector, parts = frame.multiplexed
         turn = np.arange(len(steps)) % len(parts)
-        _put(bits, selector, turn, frame.length)
+        _put(bits, selector, turn)
         for value, signals in enumerate(parts):
             mine = np.flatnonzero(turn == value)
             part = bits[mine]
             for name, where in signals.items():
-                _put(part, where, quantized(truth[name][steps[mine]], where), frame.length)
+                _put(part, where, quantized(truth[name][steps[mine]], where))
             bits[mine] = part
     for where, raw in frame.constant.items():
-        _put(bits, where, np.full(len(steps), raw), frame.length)
+        _put(bits, where, np.full(len(steps), raw))
     if frame.counter is not None:
-        _put(bits, frame.counter, np.arange(len(steps)), frame.length)
+        _put(bits, frame.counter, np.arange(len(steps)))
     payload = np.packbits(bits, axis=1)
     if frame.crc_byte is not None:
         payload[:, frame.crc_byte] = 0
@@ -120,9 +120,9 @@ def quantized(values: np.ndarray, where: Bits) -> np.ndarray:
     return np.clip(raw, 0, (1 << where.width) - 1)
 
 
-def _put(bits: np.ndarray, where: Bits, raw: np.ndarray, length: int) -> None:
+def _put(bits: np.ndarray, where: Bits, raw: np.ndarray) -> None:
     shifts = np.arange(where.width - 1, -1, -1)
-    bits[:, where.places(length)] = (raw[:, None] >> shifts) & 1
+    bits[:, where.places()] = (raw[:, None] >> shifts) & 1
 
 
 def _crc_table() -> np.ndarray:

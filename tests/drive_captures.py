@@ -158,7 +158,7 @@ TESLA_CURRENT, TESLA_VOLTAGE = Bits(16, 16, False, 0.1, signed=True), Bits(0, 16
 MEB_CURRENT, MEB_VOLTAGE = Bits(24, 14, False, 0.25, -2047.0), Bits(38, 12, False, 0.25)
 ZOE_CURRENT, ZOE_VOLTAGE = Bits(11, 12, True, 0.25, -500.0), Bits(7, 10, True, 0.5)
 PRIUS_CURRENT, PRIUS_VOLTAGE = Bits(3, 12, True, 0.1, signed=True), Bits(23, 16, True, 1.0)
-BOLT_CURRENT, BOLT_VOLTAGE = Bits(4, 13, True, 0.15), Bits(36, 13, True, 0.125)
+BOLT_CURRENT, BOLT_VOLTAGE = Bits(4, 13, True, 0.15, signed=True), Bits(36, 13, True, 0.125)
 MIEV_CURRENT, MIEV_VOLTAGE = Bits(23, 16, True, 0.01, -327.68), Bits(39, 16, True, 0.1)
 
 CARS = (

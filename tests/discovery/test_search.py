@@ -23,7 +23,7 @@ FIRST = ("hyundai_kia", "tesla_3", "mitsubishi")
 def rank(found: tuple[Candidate, ...], wanted: tuple[int, Bits]) -> int:
     """Return the place of a signal among candidates, 99 if it is not there; zeros above may be."""
     number, bits = wanted
-    last = int(bits.places(8)[-1])
+    last = int(bits.places()[-1])
     for place, each in enumerate(found, 1):
         lowest = each.place.last if each.place.is_motorola else None
         same_end = lowest == last if bits.motorola else each.start == bits.start
@@ -142,6 +142,6 @@ def test_the_generators_layouts_decode_to_the_drive() -> None:
     car = SEARCHED["renault_zoe"]
     frames = [each for each in capture(car) if each.arbitration_id == 0x155]
     payloads = np.array([list(each.data) for each in islice(frames, 50)], np.uint8)
-    bits = np.unpackbits(payloads, axis=1)[:, car.current[1].places(8)]
+    bits = np.unpackbits(payloads, axis=1)[:, car.current[1].places()]
     raw = bits.astype(int) @ (1 << np.arange(11, -1, -1))
     assert np.all(np.abs(0.25 * raw - 500.0) < 250.0)

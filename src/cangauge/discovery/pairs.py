@@ -23,14 +23,16 @@ TREND_S: Final = 10.0
 """Width of the moving average that is taken away [s]: shorter than SoC and temperature move."""
 MOVE_S: Final = 0.5
 """Time of one move [s]: the load of a car changes no faster."""
-LARGEST_R2: Final = 0.998
-"""Polarisation and quantization leave some of a voltage's variance without the current."""
+LARGEST_R2: Final = 0.97
+"""Polarisation within seconds leaves some of a voltage's variance without the current: a closer
+relation is no further evidence of a pack."""
 FEW_MOVES: Final = 4.0
 """Fewer independent moves than this may be one coincidence, such as the wake-up of all nodes."""
 ALIKE: Final = 3.5
 """Largest ratio of the steps of two copies: one has at most a bit or two more."""
 MANY_MOVES: Final = 20.0
-"""With more independent moves than this, a voltage without any residual is not taken for a copy."""
+"""With more independent moves than this, a voltage shows its polarisation: what follows a current
+closer than COPY_R2 is the same quantity."""
 COPY_R2: Final = 0.9985
 RESISTANCE_OHM: Final = (0.008, 1.2)
 TYPICAL_OHM: Final = 0.12
@@ -52,6 +54,14 @@ SATURATION_NATS: Final = 20.0
 """Evidence from which on further samples count half: loads of a car are correlated."""
 SIBLING: Final = 0.02
 """Largest relative difference of two voltages of one frame that are those of two cells."""
+USUAL_LOSS: Final = 0.1
+LOSS_SPREAD: Final = 0.7
+"""Share of a pack's power that its resistance takes at a car's peaks, and its log spread: packs
+are 90–98 % efficient there, small and cold ones 80 %."""
+AT_ZERO: Final = 0.05
+IS_ROUND_NATS: Final = 3.0
+"""A number at a round zero without current, to this share of its range, is a torque or a power with
+an offset; a voltage is there by chance once in twenty."""
 IMPOSSIBLE: Final = -99.0
 
 
@@ -270,6 +280,8 @@ class Pairs:
         constants = np.array([float(row.constant) for row in currents])
         middle = (np.median(two, axis=1) + constants)[None, :]
         is_copy = (np.abs(self.slope * middle / level - 1.0) < 0.25) & (self.r > 0.5)
+        likely = likely + self._loss_prior(one, two, level)
+        likely = likely + self._offset_prior(one, two, currents, voltages)
         ids = np.array([row.field.stream for row in currents])
         same = np.array([row.field.stream for row in voltages])[:, None] == ids[None, :]
         # Correlated loads (torque, power) are no independent samples: evidence saturates.
@@ -283,6 +295,31 @@ class Pairs:
             + np.where(is_copy, IMPOSSIBLE, 0.0)
             - 1.5 * self._has_sibling(voltages)[:, None]
         )
+
+    def _loss_prior(self, u: FloatArray, i: FloatArray, level: FloatArray) -> FloatArray:
+        """Return the log prior of the share of a peak's power that the resistance takes."""
+        span = np.diff(np.percentile(i, [2.0, 98.0], axis=1), axis=0)
+        share = self.slope * span / level
+        excess = np.log(np.maximum(share / USUAL_LOSS, 1.0)) / LOSS_SPREAD
+        return np.asarray(-0.5 * excess**2)
+
+    def _offset_prior(
+        self, u: FloatArray, i: FloatArray, currents: Sequence[Row], voltages: Sequence[Row]
+    ) -> FloatArray:
+        """Return the log prior of the voltage at no current: not the round zero of another load."""
+        zeros = np.array([self._zero(row) - row.constant for row in currents])
+        turned = np.sign(self.r) * self.slope
+        open_circuit = np.median(u, axis=1)[:, None] - turned * (np.median(i, axis=1) - zeros)
+        out = np.zeros(self.r.shape)
+        for number, row in enumerate(voltages):
+            low, high = (float(each) + row.constant for each in np.percentile(u[number], [1, 99]))
+            rounds = np.array(round_zeros(low - (high - low), high + (high - low), row.place.width))
+            if not len(rounds):
+                continue
+            at = open_circuit[number] + row.constant
+            apart = np.abs(at[:, None] - rounds).min(1)
+            out[number, apart < AT_ZERO * (high - low)] = -IS_ROUND_NATS
+        return out
 
     def _has_sibling(self, voltages: Sequence[Row]) -> Bits:
         """Return which voltages are one of two in a frame: lowest and highest cell."""
@@ -304,7 +341,8 @@ class Pairs:
         slope = np.abs(self.r) * self._u.std[:, None] / np.maximum(self._i.std[None, :], 1e-9)
         alike = (slope > 1.0 / ALIKE) & (slope < ALIKE)
         return np.asarray(
-            alike & (self.r**2 > COPY_R2) & (lost < 0.1 * (1.0 + slope**2)) & (count < MANY_MOVES)
+            (self.r**2 > COPY_R2)
+            & ((alike & (lost < 0.1 * (1.0 + slope**2))) | (count > MANY_MOVES))
         )
 
     def best(self, make: Any) -> tuple[tuple[Candidate, ...], tuple[Candidate, ...], Row | None]:

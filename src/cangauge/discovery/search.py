@@ -197,7 +197,8 @@ class _Search:
             rest = min((abs(each - seen.resting - best[2]) for each in zeros), default=math.inf)
             if any(each and math.log2(each).is_integer() for each in zeros):
                 prior += 1.0
-            prior -= 5.0 if not zeros else 1.0 if rest > 0.15 * (high - low) else 0.0
+            # A pack's current has two signs: a number from zero upwards is none.
+            prior -= 5.0 if not any(zeros) else 1.0 if rest > 0.15 * (high - low) else 0.0
         if seen.count < 3 and not field.place.is_signed:
             return None
         return Row(field, best[0], prior, 1.0, seen.median, best[2], field.missing)
