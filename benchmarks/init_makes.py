@@ -513,6 +513,12 @@ _OTHERS: dict[str, tuple[int, float, float, bool]] = {
     "cell_low": (13, 0.001, 0.0, False), "cell_high": (13, 0.001, 0.0, False),
 }  # fmt: skip
 """Other signals of a car: bits, scale, offset, sign."""
+_REPEATED = [
+    "wheel_0", "wheel_1", "speed", "rpm", "torque", "torque_wanted", "pedal", "brake",
+    "acceleration", "lateral", "steering", "yaw", "soc_display", "range", "temperature", "ambient",
+    "odometer", "clock", "flag", "state",
+]  # fmt: skip
+"""What gateways and other nodes send again."""
 _SLOW = frozenset({
     "soc", "soc_display", "energy_out", "energy_in", "range", "temperature", "coolant", "ambient",
     "isolation", "odometer", "clock", "heater_power", "charge_limit",
@@ -528,7 +534,7 @@ def others(make: Make) -> list[Frame]:
     numbers = [n for n in rng.permutation(np.arange(0x080, 0x700)).tolist() if n not in taken]
     frames = []
     while len(frames) < make.ids:
-        names = names or rng.choice(list(_OTHERS), 12).tolist()
+        names = names or rng.choice(_REPEATED, 12).tolist()
         picked = [names.pop() for _ in range(min(int(rng.integers(1, 4)), len(names)))]
         picked = list(dict.fromkeys(picked))
         slow = all(name in _SLOW for name in picked)
@@ -568,9 +574,9 @@ def capture(data: Path, make: Make) -> Iterator[can.Message]:
 def rank(
     found: tuple[Candidate, ...], wanted: tuple[int, Bits], messages: list[can.Message]
 ) -> int | None:
-    """Return the place of a signal among candidates: one with the same numbers but for an offset.
+    """Return the place of a signal among candidates, None where it is not among them.
 
-    None where it is not among them.
+    The numbers must be the same; those of a current but for an offset, which its zero decides.
     """
     number, bits = wanted
     frames = [bytes(each.data) for each in messages if each.arbitration_id == number]
@@ -582,7 +588,8 @@ def rank(
         own = Bits(
             each.start, each.place.width, each.place.is_motorola, 1.0, 0.0, each.place.is_signed
         ).raw(payload)
-        if len(np.unique(own - truth)) == 1:
+        apart = own - truth
+        if apart[0] == apart.max() == apart.min() and (apart[0] == 0 or bits.offset or bits.signed):
             return place
     return None
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
+from scipy.signal import lfilter
 
 from cangauge._typing import FloatArray
 from cangauge.discovery.fields import Bits, Field, Ints, Place, Selector, Stream
@@ -54,14 +55,14 @@ SATURATION_NATS: Final = 20.0
 """Evidence from which on further samples count half: loads of a car are correlated."""
 SIBLING: Final = 0.02
 """Largest relative difference of two voltages of one frame that are those of two cells."""
-USUAL_LOSS: Final = 0.1
-LOSS_SPREAD: Final = 0.7
-"""Share of a pack's power that its resistance takes at a car's peaks, and its log spread: packs
-are 90–98 % efficient there, small and cold ones 80 %."""
-AT_ZERO: Final = 0.05
-IS_ROUND_NATS: Final = 3.0
-"""A number at a round zero without current, to this share of its range, is a torque or a power with
-an offset; a voltage is there by chance once in twenty."""
+POLARISATION_S: Final = 3.0
+"""Time constant with which a sustained current is seen [s]: the diffusion of lithium-ion cells
+shows from seconds on, and slower parts are taken away as a trend."""
+POLARISATION: Final = (0.1, 0.2, 0.4, 0.8)
+"""Ratios of the resistance that grows within that time to the ohmic one: a cell's 10-s resistance
+is 1.2 to 2 times that of the first 0.1 s."""
+TRUSTED_NATS: Final = 10.0
+"""Most that this test counts: its model is not exact, and cells sag as the pack does."""
 IMPOSSIBLE: Final = -99.0
 
 
@@ -242,6 +243,7 @@ class Pairs:
         rows = one.shape[1]
         self._u, self._i = u, i
         self.r = np.asarray(u.values @ i.values.T / rows, dtype=np.float64)
+        self.polarisation = self._polarisation(two, step_s)
         # A measured quantity dithers: several changes make one independent move.
         moves = [np.array([row.steps / 4.0 for row in rows]) for rows in (voltages, currents)]
         count = np.minimum(
@@ -276,18 +278,18 @@ class Pairs:
         likely = np.where(unknown, -1.0, np.maximum(likely, -3.0))
         guessed = [max(CURRENT_SCALES, key=lambda each: _guess(each, width)) for width in widths[0]]
         self.current_scale = np.where(unknown, np.array(guessed)[None, :], self.current_scale)
+        self.likely = likely
         level = np.array([row.level for row in voltages])[:, None]
         constants = np.array([float(row.constant) for row in currents])
         middle = (np.median(two, axis=1) + constants)[None, :]
         is_copy = (np.abs(self.slope * middle / level - 1.0) < 0.25) & (self.r > 0.5)
-        likely = likely + self._loss_prior(one, two, level)
-        likely = likely + self._offset_prior(one, two, currents, voltages)
         ids = np.array([row.field.stream for row in currents])
         same = np.array([row.field.stream for row in voltages])[:, None] == ids[None, :]
         # Correlated loads (torque, power) are no independent samples: evidence saturates.
         self.evidence = SATURATION_NATS * np.log1p(evidence / SATURATION_NATS)
         self.score = (
             self.evidence
+            + self.polarisation
             + np.array([row.prior for row in voltages])[:, None]
             + np.array([row.prior for row in currents])[None, :]
             + likely
@@ -296,30 +298,29 @@ class Pairs:
             - 1.5 * self._has_sibling(voltages)[:, None]
         )
 
-    def _loss_prior(self, u: FloatArray, i: FloatArray, level: FloatArray) -> FloatArray:
-        """Return the log prior of the share of a peak's power that the resistance takes."""
-        span = np.diff(np.percentile(i, [2.0, 98.0], axis=1), axis=0)
-        share = self.slope * span / level
-        excess = np.log(np.maximum(share / USUAL_LOSS, 1.0)) / LOSS_SPREAD
-        return np.asarray(-0.5 * excess**2)
+    def _polarisation(self, current: FloatArray, step_s: float) -> FloatArray:
+        """Return the evidence that the voltage sags on under a sustained current.
 
-    def _offset_prior(
-        self, u: FloatArray, i: FloatArray, currents: Sequence[Row], voltages: Sequence[Row]
-    ) -> FloatArray:
-        """Return the log prior of the voltage at no current: not the round zero of another load."""
-        zeros = np.array([self._zero(row) - row.constant for row in currents])
-        turned = np.sign(self.r) * self.slope
-        open_circuit = np.median(u, axis=1)[:, None] - turned * (np.median(i, axis=1) - zeros)
-        out = np.zeros(self.r.shape)
-        for number, row in enumerate(voltages):
-            low, high = (float(each) + row.constant for each in np.percentile(u[number], [1, 99]))
-            rounds = np.array(round_zeros(low - (high - low), high + (high - low), row.place.width))
-            if not len(rounds):
-                continue
-            at = open_circuit[number] + row.constant
-            apart = np.abs(at[:, None] - rounds).min(1)
-            out[number, apart < AT_ZERO * (high - low)] = -IS_ROUND_NATS
-        return out
+        U = a − R·(I + ρ·⟨I⟩) with ⟨I⟩ the current through a low pass. The polarisation of a cell makes
+        ρ > 0; torque, power and speed follow each other with ρ = 0. The evidence is the likelihood
+        ratio of the two, where the relation is close enough to show it.
+        """
+        keep = math.exp(-step_s / POLARISATION_S)
+        past = lfilter([1.0 - keep], [1.0, -keep], current - current[:, :1], axis=1)
+        low = _Moves.of(np.asarray(past), step_s)
+        rows = current.shape[1]
+        with_past = np.asarray(self._u.values @ low.values.T / rows, dtype=np.float64)
+        own = (self._i.values * low.values).mean(1, dtype=np.float64)
+        spread = low.std / np.maximum(self._i.std, 1e-9)
+        best = np.full(self.r.shape, -np.inf)
+        for ratio in POLARISATION:
+            share = ratio * spread
+            r = self.r + share * with_past
+            r /= np.sqrt(1.0 + 2.0 * share * own + share**2)
+            best = np.maximum(best, r**2)
+        count = rows * step_s / POLARISATION_S
+        left = np.maximum(1.0 - best, 1e-6) / np.maximum(1.0 - self.r**2, 1e-6)
+        return np.clip(-0.5 * count * np.log(left), -TRUSTED_NATS, TRUSTED_NATS)
 
     def _has_sibling(self, voltages: Sequence[Row]) -> Bits:
         """Return which voltages are one of two in a frame: lowest and highest cell."""
@@ -405,7 +406,9 @@ class Pairs:
         ):
             bits = each.place.bits(each.length)
             if not any(
-                overlap(each, bits, one, one.place.bits(one.length)) or _same_numbers(each, one)
+                overlap(each, bits, one, one.place.bits(one.length))
+                or _same_numbers(each, one)
+                or _are_siblings(each, one)
                 for one in found
             ):
                 found.append(replace(each, partner=partner.name))
@@ -465,6 +468,13 @@ def _same_numbers(one: Candidate, two: Candidate) -> bool:
     return (one.arbitration_id, one.start, one.place.width, one.place.is_motorola) == (
         two.arbitration_id, two.start, two.place.width, two.place.is_motorola,
     )  # fmt: skip
+
+
+def _are_siblings(one: Candidate, two: Candidate) -> bool:
+    """Whether two candidates are cells of one pack: same range in raw numbers, in one message."""
+    same = (one.bus, one.arbitration_id, one.scale) == (two.bus, two.arbitration_id, two.scale)
+    middles = [(each.low + each.high) / 2.0 for each in (one, two)]
+    return same and one.low > 0.0 and abs(middles[0] / middles[1] - 1.0) < SIBLING
 
 
 def _ratio(r: FloatArray, count: FloatArray) -> FloatArray:

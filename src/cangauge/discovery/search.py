@@ -16,7 +16,7 @@ import can
 import numpy as np
 
 from cangauge._typing import FloatArray
-from cangauge.discovery.fields import Field, Place, Stream, collect, fields_of
+from cangauge.discovery.fields import Field, Place, Stream, byte_order, collect, fields_of
 from cangauge.discovery.pairs import (
     CLEARLY_NATS,
     IMPOSSIBLE,
@@ -100,9 +100,10 @@ def search(messages: Iterable[can.Message]) -> Findings:
             "no id has enough frames to search", cure="record at least a minute, while driving"
         )
     fields: list[Field] = []
+    order = byte_order(streams)
     for index, stream in enumerate(streams):
         _LOG.debug("id %d of %d: %s", index + 1, len(streams), stream.name)
-        fields += fields_of(index, stream)
+        fields += fields_of(index, stream, order)
     return _Search(streams, fields).findings()
 
 
@@ -172,8 +173,10 @@ class _Search:
         )  # fmt: skip
 
     def _rate_prior(self, stream: Stream) -> float:
-        """Return the log prior of a period: pack messages are fast."""
+        """Return the log prior of a period: pack messages are fast, and not in turns."""
         period_s = stream.period_s
+        if stream.selector is not None:
+            return -2.0
         if period_s <= 0.11:
             return 0.8 if period_s <= 0.025 else 0.4
         return 0.0 if period_s < 0.3 else -1.0
