@@ -9,7 +9,7 @@ usual scales, resistance.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -63,6 +63,9 @@ POLARISATION: Final = (0.1, 0.2, 0.4, 0.8)
 is 1.2 to 2 times that of the first 0.1 s."""
 TRUSTED_NATS: Final = 10.0
 """Most that this test counts: its model is not exact, and cells sag as the pack does."""
+BESIDE_NATS: Final = 10.0
+"""Largest distance to the best pair of another that shares its voltage or current, and is shown
+before pairs that share neither: that one member is right is as sure as the pair's polarisation."""
 IMPOSSIBLE: Final = -99.0
 
 
@@ -195,6 +198,8 @@ class _Moves:
     std: FloatArray
     independent: FloatArray
     """Number of independent moves."""
+    memory: FloatArray
+    """Autocorrelation over one move."""
 
     @classmethod
     def of(cls, grid: FloatArray, step_s: float) -> _Moves:
@@ -211,7 +216,8 @@ class _Moves:
         # One lone step moves the mean of many slots, and is still one.
         both = np.sqrt(steps * _participation(_grouped(free, group)))
         values = (free / np.maximum(std, 1e-12)[:, None]).astype(np.float32)
-        return cls(values, std, np.minimum(np.where(steps < 3.0, steps, both), 200.0))
+        memory = (values[:, group:] * values[:, :-group]).mean(1, dtype=np.float64)
+        return cls(values, std, np.minimum(np.where(steps < 3.0, steps, both), 200.0), memory)
 
 
 def _grouped(rows: FloatArray, group: int) -> FloatArray:
@@ -250,6 +256,10 @@ class Pairs:
             np.minimum(u.independent, moves[0])[:, None],
             np.minimum(i.independent, moves[1])[None, :],
         )
+        # Bartlett (1946): what moves slowly, such as speeds, has few independent samples.
+        memory = np.clip(u.memory[:, None] * i.memory[None, :], 0.0, 0.99)
+        slots = rows * step_s / MOVE_S
+        count = np.minimum(count, np.maximum(slots * (1.0 - memory) / (1.0 + memory), 1.0))
         evidence = _ratio(self.r, count) - 0.5 * np.log(np.maximum(count, 1.0))
         half = rows // 2
         first = _correlation(u.values[:, :half], i.values[:, :half])
@@ -352,9 +362,7 @@ class Pairs:
         roles: tuple[list[Row], list[Row]] = ([], [])
         currents: list[Candidate] = []
         voltages: list[Candidate] = []
-        flat = np.argsort(-self.score, axis=None)[: 200 * 200]
-        for place in flat:
-            a, b = divmod(int(place), self.score.shape[1])
+        for a, b in self._ordered():
             u, i = self._voltages[a], self._currents[b]
             if self.score[a, b] < IMPOSSIBLE / 2.0:
                 break
@@ -372,6 +380,23 @@ class Pairs:
             if len(currents) >= SHOWN and len(voltages) >= SHOWN:
                 break
         return tuple(currents[:SHOWN]), tuple(voltages[:SHOWN]), chosen
+
+    def _ordered(self) -> Iterator[tuple[int, int]]:
+        """Yield pairs, best first; after the first one, first others of its voltage or current.
+
+        What is proven against the best current is a likelier voltage than that of another pair.
+        """
+        columns = self.score.shape[1]
+        a, b = divmod(int(self.score.argmax()), columns)
+        yield a, b
+        beside = [(float(self.score[a, other]), a, other) for other in range(columns)]
+        beside += [(float(self.score[other, b]), other, b) for other in range(len(self.score))]
+        if self.evidence[a, b] >= 1.0:
+            for score, row, column in sorted(beside, reverse=True):
+                if score > self.score[a, b] - BESIDE_NATS:
+                    yield row, column
+        for place in np.argsort(-self.score, axis=None)[: 200 * 200]:
+            yield divmod(int(place), columns)
 
     def _share_bits(self, one: Row, two: Row) -> bool:
         """Whether two fields share bits; a gateway repeats frames on other buses."""
