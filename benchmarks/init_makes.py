@@ -528,7 +528,7 @@ _SLOW = frozenset({
 def others(make: Make) -> list[Frame]:
     """Return the frames that a car has beside those of its pack: each signal once, then copies."""
     rng = np.random.default_rng([make.seed + 1, *make.name.encode()])
-    names = list(_OTHERS)
+    names = [name for name in _OTHERS if name not in {"cell_low", "cell_high"}]
     rng.shuffle(names)
     taken = {frame.number for frame in make.frames}
     numbers = [n for n in rng.permutation(np.arange(0x080, 0x700)).tolist() if n not in taken]
@@ -561,6 +561,13 @@ def others(make: Make) -> list[Frame]:
          for k in range(4)}
         for part in range(6)
     )  # fmt: skip
+    extremes = {
+        name: Bits(start, 13, make.motorola, 0.001)
+        for name, start in zip(
+            ("cell_low", "cell_high"), (4, 20) if make.motorola else (0, 16), strict=True
+        )
+    }
+    frames.append(Frame(int(numbers.pop()), 0.1, signals=extremes))
     frames.append(Frame(int(numbers.pop()), 0.05, multiplexed=(Bits(7, 8, True, 1.0), cells)))
     return frames
 

@@ -24,6 +24,9 @@ TREND_S: Final = 10.0
 """Width of the moving average that is taken away [s]: shorter than SoC and temperature move."""
 MOVE_S: Final = 0.5
 """Time of one move [s]: the load of a car changes no faster."""
+MOST_MOVES: Final = 60.0
+"""Independent moves from which on a chance is excluded: two minutes of driving have as many, and
+the noise of a sensor that is sent twice has more."""
 LARGEST_R2: Final = 0.97
 """Polarisation within seconds leaves some of a voltage's variance without the current: a closer
 relation is no further evidence of a pack."""
@@ -62,7 +65,11 @@ POLARISATION: Final = (0.1, 0.2, 0.4, 0.8)
 """Ratios of the resistance that grows within that time to the ohmic one: a cell's 10-s resistance
 is 1.2 to 2 times that of the first 0.1 s."""
 TRUSTED_NATS: Final = 10.0
-"""Most that this test counts: its model is not exact, and cells sag as the pack does."""
+SHOWN_NATS: Final = 5.0
+"""Most that this test counts against a pair, as its model is not exact, and for one: cells sag as
+the pack does, and finer numbers show it better."""
+SAME_FRAME_NATS: Final = 4.0
+"""Log prior of a pair in one frame: 5 of 7 public layouts against one of the car's dozens of ids."""
 BESIDE_NATS: Final = 10.0
 """Largest distance to the best pair of another that shares its voltage or current, and is shown
 before pairs that share neither: that one member is right is as sure as the pair's polarisation."""
@@ -217,7 +224,7 @@ class _Moves:
         both = np.sqrt(steps * _participation(_grouped(free, group)))
         values = (free / np.maximum(std, 1e-12)[:, None]).astype(np.float32)
         memory = (values[:, group:] * values[:, :-group]).mean(1, dtype=np.float64)
-        return cls(values, std, np.minimum(np.where(steps < 3.0, steps, both), 200.0), memory)
+        return cls(values, std, np.minimum(np.where(steps < 3.0, steps, both), MOST_MOVES), memory)
 
 
 def _grouped(rows: FloatArray, group: int) -> FloatArray:
@@ -303,7 +310,7 @@ class Pairs:
             + np.array([row.prior for row in voltages])[:, None]
             + np.array([row.prior for row in currents])[None, :]
             + likely
-            + np.where(same, 2.5, 0.0)
+            + np.where(same, SAME_FRAME_NATS, 0.0)
             + np.where(is_copy, IMPOSSIBLE, 0.0)
             - 1.5 * self._has_sibling(voltages)[:, None]
         )
@@ -330,7 +337,7 @@ class Pairs:
             best = np.maximum(best, r**2)
         count = rows * step_s / POLARISATION_S
         left = np.maximum(1.0 - best, 1e-6) / np.maximum(1.0 - self.r**2, 1e-6)
-        return np.clip(-0.5 * count * np.log(left), -TRUSTED_NATS, TRUSTED_NATS)
+        return np.clip(-0.5 * count * np.log(left), -TRUSTED_NATS, SHOWN_NATS)
 
     def _has_sibling(self, voltages: Sequence[Row]) -> Bits:
         """Return which voltages are one of two in a frame: lowest and highest cell."""
@@ -496,10 +503,13 @@ def _same_numbers(one: Candidate, two: Candidate) -> bool:
 
 
 def _are_siblings(one: Candidate, two: Candidate) -> bool:
-    """Whether two candidates are cells of one pack: same range in raw numbers, in one message."""
-    same = (one.bus, one.arbitration_id, one.scale) == (two.bus, two.arbitration_id, two.scale)
-    middles = [(each.low + each.high) / 2.0 for each in (one, two)]
-    return same and one.low > 0.0 and abs(middles[0] / middles[1] - 1.0) < SIBLING
+    """Whether two candidates are cells in one message: raw numbers alike, but for cut bits."""
+    same = (one.bus, one.arbitration_id) == (two.bus, two.arbitration_id)
+    middles = [(each.low + each.high) / 2.0 / each.scale for each in (one, two)]
+    if not same or min(one.low, two.low) <= 0.0:
+        return False
+    octaves = math.log2(middles[0] / middles[1])
+    return abs(octaves - round(octaves)) < SIBLING
 
 
 def _ratio(r: FloatArray, count: FloatArray) -> FloatArray:

@@ -45,6 +45,10 @@ ENOUGH_NATS: Final = 3.0
 RIVAL: Final = 0.6
 """Share of the first candidate's evidence with which another leaves the choice to the user: the
 evidence of loads that hang together differs by less than its saturation."""
+AT_HALF: Final = 0.03
+AT_HALF_NATS: Final = 3.0
+"""A number that rests at half its range, to this share, is a torque, a yaw rate or the like with
+an offset; a voltage is there by chance once in twenty or thirty."""
 ENOUGH_STEPS: Final = 50
 LARGEST_RATIO: Final = 2.0
 """Fewest changes of a field that is taken without the user, and largest ratio of the resistances by
@@ -225,6 +229,8 @@ class _Search:
                 continue
             if level > 0.95 * (1 << place.width):
                 continue  # nearly all ones: a small negative number
+            if abs(level / (1 << (place.width - 1)) - 1.0) < AT_HALF:
+                nature -= AT_HALF_NATS
             for scale, usual in VOLTAGE_SCALES.items():
                 likely = _level_prior(level * scale)
                 prior = nature + rate + seen.prior + usual + likely
