@@ -9,7 +9,7 @@ usual scales, resistance.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -70,9 +70,6 @@ SHOWN_NATS: Final = 5.0
 the pack does, and finer numbers show it better."""
 SAME_FRAME_NATS: Final = 4.0
 """Log prior of a pair in one frame: 5 of 7 public layouts against one of the car's dozens of ids."""
-BESIDE_NATS: Final = 10.0
-"""Largest distance to the best pair of another that shares its voltage or current, and is shown
-before pairs that share neither: that one member is right is as sure as the pair's polarisation."""
 IMPOSSIBLE: Final = -99.0
 
 
@@ -369,7 +366,9 @@ class Pairs:
         roles: tuple[list[Row], list[Row]] = ([], [])
         currents: list[Candidate] = []
         voltages: list[Candidate] = []
-        for a, b in self._ordered():
+        flat = np.argsort(-self.score, axis=None)[: 200 * 200]
+        for place in flat:
+            a, b = divmod(int(place), self.score.shape[1])
             u, i = self._voltages[a], self._currents[b]
             if self.score[a, b] < IMPOSSIBLE / 2.0:
                 break
@@ -387,23 +386,6 @@ class Pairs:
             if len(currents) >= SHOWN and len(voltages) >= SHOWN:
                 break
         return tuple(currents[:SHOWN]), tuple(voltages[:SHOWN]), chosen
-
-    def _ordered(self) -> Iterator[tuple[int, int]]:
-        """Yield pairs, best first; after the first one, first others of its voltage or current.
-
-        What is proven against the best current is a likelier voltage than that of another pair.
-        """
-        columns = self.score.shape[1]
-        a, b = divmod(int(self.score.argmax()), columns)
-        yield a, b
-        beside = [(float(self.score[a, other]), a, other) for other in range(columns)]
-        beside += [(float(self.score[other, b]), other, b) for other in range(len(self.score))]
-        if self.evidence[a, b] >= 1.0:
-            for score, row, column in sorted(beside, reverse=True):
-                if score > self.score[a, b] - BESIDE_NATS:
-                    yield row, column
-        for place in np.argsort(-self.score, axis=None)[: 200 * 200]:
-            yield divmod(int(place), columns)
 
     def _share_bits(self, one: Row, two: Row) -> bool:
         """Whether two fields share bits; a gateway repeats frames on other buses."""
