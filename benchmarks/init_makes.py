@@ -630,11 +630,15 @@ class Result:
         return " | ".join(texts)
 
 
-def evaluate(data: Path, make: Make) -> Result:
-    """Search a make's capture."""
+NOMINAL_V = 360.0
+"""Nominal voltage of the packs of both recordings [V]: 96 cells of 3.75 V."""
+
+
+def evaluate(data: Path, make: Make, *, nominal: bool = False) -> Result:
+    """Search a make's capture; `nominal`: the user states the pack's nominal voltage."""
     messages = list(capture(data, make))
     before = time.process_time()
-    findings = search(messages)
+    findings = search(messages, NOMINAL_V * make.volts if nominal else None)
     seconds = time.process_time() - before
     return Result(
         make, findings, rank(findings.current, make.current, messages),
@@ -649,6 +653,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", default=[], help="makes")
     parser.add_argument("--set", choices=("development", "held-out", "both"), default="both")
     parser.add_argument("--seed", type=int, default=0, help="of the other frames and the noise")
+    parser.add_argument("--nominal", action="store_true", help="state the nominal voltage")
     parser.add_argument("--verbose", action="store_true", help="print the candidates")
     options = parser.parse_args()
     sets = {"development": DEVELOPMENT, "held-out": HELD_OUT}
@@ -660,7 +665,9 @@ def main() -> None:
         found = 0
         chosen = [each for each in makes if not options.only or each.name in options.only]
         for make in chosen:
-            result = evaluate(options.data, replace(make, seed=options.seed))
+            result = evaluate(
+                options.data, replace(make, seed=options.seed), nominal=options.nominal
+            )
             found += result.is_found
             soc = result.findings.soc_reference
             print(

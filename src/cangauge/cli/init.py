@@ -84,6 +84,14 @@ def init_command(  # noqa: PLR0917 - typer fills the arguments by name
             metavar="ROLE=N", help="Take candidate N for current, voltage, soc or temperature."
         ),
     ] = None,
+    nominal_voltage: Annotated[
+        float | None,
+        typer.Option(
+            metavar="V",
+            help="Voltage of the pack, nominal or as a meter shows it [V]: decides its scale.",
+            show_default=False,
+        ),
+    ] = None,
     presets: Annotated[
         bool, typer.Option("--presets/--no-presets", help="Look for known vehicles.")
     ] = True,
@@ -116,6 +124,8 @@ def init_command(  # noqa: PLR0917 - typer fills the arguments by name
     """
     picks = _picks(choose or [])
     within(seconds, 1.0, 86400.0, option="--seconds", unit="s")
+    if nominal_voltage is not None:
+        within(nominal_voltage, 10.0, 1500.0, option="--nominal-voltage", unit="V")
     targets = _Targets.of(output, map_file, config)
     targets.check(force=force)
     with tempfile.TemporaryDirectory(prefix="cangauge-init-") as folder:
@@ -133,7 +143,15 @@ def init_command(  # noqa: PLR0917 - typer fills the arguments by name
                 field="CAPTURE",
                 cure="give a capture, --interface and --channel, or --dbc FILE",
             )
-        found = _find(paths, dbc, picks, targets, presets=presets, quiet=json_output)
+        found = _find(
+            paths,
+            dbc,
+            picks,
+            targets,
+            presets=presets,
+            quiet=json_output,
+            nominal_v=nominal_voltage,
+        )
         files = found.files(targets, interface, channel, parse_bus_options(bus_option or []))
         found.proof = _prove(files, targets, paths, Path(folder), found)
     targets.map.parent.mkdir(exist_ok=True)
@@ -377,6 +395,7 @@ def _find(
     *,
     presets: bool,
     quiet: bool,
+    nominal_v: float | None,
 ) -> _Found:
     if dbc is not None:
         messages = chain.from_iterable(open_capture(path) for path in paths)
@@ -386,7 +405,7 @@ def _find(
             return _Found("preset", vehicle=known)
         status = console.status("reading frames")
         with status, progress_shown("cangauge.discovery", status.update):
-            found = _Found("physics", findings=search(_joined(paths)))
+            found = _Found("physics", findings=search(_joined(paths), nominal_v))
     _choose(found, picks, targets, quiet=quiet)
     return found
 

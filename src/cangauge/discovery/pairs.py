@@ -69,7 +69,7 @@ SHOWN_NATS: Final = 5.0
 """Most that this test counts against a pair, as its model is not exact, and for one: cells sag as
 the pack does, and finer numbers show it better."""
 SAME_FRAME_NATS: Final = 4.0
-"""Log prior of a pair in one frame: 5 of 7 public layouts against one of the car's dozens of ids."""
+"""Log prior of a pair in one frame: 5 of 7 public layouts, against one of a car's dozens of ids."""
 IMPOSSIBLE: Final = -99.0
 
 
@@ -253,7 +253,7 @@ class Pairs:
         rows = one.shape[1]
         self._u, self._i = u, i
         self.r = np.asarray(u.values @ i.values.T / rows, dtype=np.float64)
-        self.polarisation = self._polarisation(two, step_s)
+        polarisation = self._polarisation(two, step_s)
         # A measured quantity dithers: several changes make one independent move.
         moves = [np.array([row.steps / 4.0 for row in rows]) for rows in (voltages, currents)]
         count = np.minimum(
@@ -292,7 +292,6 @@ class Pairs:
         likely = np.where(unknown, -1.0, np.maximum(likely, -3.0))
         guessed = [max(CURRENT_SCALES, key=lambda each: _guess(each, width)) for width in widths[0]]
         self.current_scale = np.where(unknown, np.array(guessed)[None, :], self.current_scale)
-        self.likely = likely
         level = np.array([row.level for row in voltages])[:, None]
         constants = np.array([float(row.constant) for row in currents])
         middle = (np.median(two, axis=1) + constants)[None, :]
@@ -303,7 +302,7 @@ class Pairs:
         self.evidence = SATURATION_NATS * np.log1p(evidence / SATURATION_NATS)
         self.score = (
             self.evidence
-            + self.polarisation
+            + polarisation
             + np.array([row.prior for row in voltages])[:, None]
             + np.array([row.prior for row in currents])[None, :]
             + likely
@@ -315,9 +314,9 @@ class Pairs:
     def _polarisation(self, current: FloatArray, step_s: float) -> FloatArray:
         """Return the evidence that the voltage sags on under a sustained current.
 
-        U = a − R·(I + ρ·⟨I⟩) with ⟨I⟩ the current through a low pass. The polarisation of a cell makes
-        ρ > 0; torque, power and speed follow each other with ρ = 0. The evidence is the likelihood
-        ratio of the two, where the relation is close enough to show it.
+        U = a − R·(I + ρ·⟨I⟩), ⟨I⟩ the current through a low pass. Polarisation makes ρ > 0; torque,
+        power and speed follow each other with ρ = 0. The evidence is the likelihood ratio of the
+        two, where the relation is close enough to show it.
         """
         keep = math.exp(-step_s / POLARISATION_S)
         past = lfilter([1.0 - keep], [1.0, -keep], current - current[:, :1], axis=1)
@@ -334,7 +333,7 @@ class Pairs:
             best = np.maximum(best, r**2)
         count = rows * step_s / POLARISATION_S
         left = np.maximum(1.0 - best, 1e-6) / np.maximum(1.0 - self.r**2, 1e-6)
-        return np.clip(-0.5 * count * np.log(left), -TRUSTED_NATS, SHOWN_NATS)
+        return np.asarray(np.clip(-0.5 * count * np.log(left), -TRUSTED_NATS, SHOWN_NATS))
 
     def _has_sibling(self, voltages: Sequence[Row]) -> Bits:
         """Return which voltages are one of two in a frame: lowest and highest cell."""

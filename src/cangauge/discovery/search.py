@@ -45,6 +45,9 @@ ENOUGH_NATS: Final = 3.0
 RIVAL: Final = 0.6
 """Share of the first candidate's evidence with which another leaves the choice to the user: the
 evidence of loads that hang together differs by less than its saturation."""
+NOMINAL_SPREAD: Final = 0.06
+"""Log spread of a pack's voltage about the nominal one: between 10 and 90 % SoC cells have 3.4 to
+4.1 V at 3.7 V nominal."""
 AT_HALF: Final = 0.03
 AT_HALF_NATS: Final = 3.0
 """A number that rests at half its range, to this share, is a torque, a yaw rate or the like with
@@ -90,8 +93,14 @@ class Findings:
         return len(found) == 1 or found[0].score - found[1].score >= CLEARLY_NATS
 
 
-def search(messages: Iterable[can.Message]) -> Findings:
+def search(messages: Iterable[can.Message], nominal_v: float | None = None) -> Findings:
     """Find current, voltage, SoC and temperature in the frames of a capture.
+
+    Parameters
+    ----------
+    messages : iterable of can.Message
+    nominal_v : float, optional
+        Voltage of the pack, nominal or as a meter shows it [V]: decides the voltage's scale.
 
     Raises
     ------
@@ -108,12 +117,15 @@ def search(messages: Iterable[can.Message]) -> Findings:
     for index, stream in enumerate(streams):
         _LOG.debug("id %d of %d: %s", index + 1, len(streams), stream.name)
         fields += fields_of(index, stream, order)
-    return _Search(streams, fields).findings()
+    return _Search(streams, fields, nominal_v).findings()
 
 
 class _Search:
-    def __init__(self, streams: Sequence[Stream], fields: Sequence[Field]) -> None:
+    def __init__(
+        self, streams: Sequence[Stream], fields: Sequence[Field], nominal_v: float | None
+    ) -> None:
         self._streams = streams
+        self._nominal_v = nominal_v
         self._fields = fields
         start_s = min(float(each.time_s[0]) for each in streams)
         end_s = max(float(each.time_s[-1]) for each in streams)
@@ -229,11 +241,11 @@ class _Search:
                 continue
             if level > 0.95 * (1 << place.width):
                 continue  # nearly all ones: a small negative number
-            if abs(level / (1 << (place.width - 1)) - 1.0) < AT_HALF:
-                nature -= AT_HALF_NATS
+            at_half = abs(level / (1 << (place.width - 1)) - 1.0) < AT_HALF
             for scale, usual in VOLTAGE_SCALES.items():
-                likely = _level_prior(level * scale)
+                likely = _level_prior(level * scale, self._nominal_v)
                 prior = nature + rate + seen.prior + usual + likely
+                prior -= AT_HALF_NATS if at_half else 0.0
                 prior += _full_scale_prior(scale, place.width)
                 if likely > IMPOSSIBLE and (best is None or prior > best.prior):
                     best = Row(field, place, prior, scale, level, constant, missing)
@@ -247,7 +259,7 @@ class _Search:
             stream = self._streams[index]
             if stream.period_s > 0.11:
                 continue
-            rows += _constants(index, stream, self._rate_prior(stream))
+            rows += _constants(index, stream, self._rate_prior(stream), self._nominal_v)
         return rows
 
     def _grid(self, row: Row) -> FloatArray:
@@ -405,8 +417,12 @@ class _Statistics:
         )
 
 
-def _level_prior(volts: float) -> float:
+def _level_prior(volts: float, nominal_v: float | None = None) -> float:
     """Return the log prior of a pack's voltage [nats]: most cars have 250–450 V."""
+    if nominal_v is not None:
+        if volts <= 0.0:
+            return IMPOSSIBLE
+        return -0.5 * (math.log(volts / nominal_v) / NOMINAL_SPREAD) ** 2
     if 250.0 <= volts <= 450.0:
         return 0.0
     if 450.0 < volts <= 900.0:
@@ -427,7 +443,7 @@ def _full_scale_prior(scale: float, width: int) -> float:
 
 
 def _constants(  # noqa: C901 - one walk over the places
-    index: int, stream: Stream, rate: float
+    index: int, stream: Stream, rate: float, nominal_v: float | None
 ) -> list[Row]:
     """Return constant fields at the voltage of a car's pack."""
     rows = []
@@ -457,8 +473,8 @@ def _constants(  # noqa: C901 - one walk over the places
                     continue
                 missing = np.asarray(raw != raw[-1])
                 for scale, usual in VOLTAGE_SCALES.items():
-                    likely = _level_prior(level * scale)
-                    if likely < 0.0:
+                    likely = _level_prior(level * scale, nominal_v)
+                    if likely < -1.0:
                         continue
                     prior = rate + usual + _full_scale_prior(scale, width) - 0.5
                     prior += {16: 0.6, 12: 0.4, 10: 0.2}[width]
