@@ -38,7 +38,7 @@ from cangauge.discovery.proposal import (
     mapped,
     message_name,
 )
-from cangauge.discovery.search import Findings, search
+from cangauge.discovery.search import BETWEEN_S, Findings, search
 from cangauge.errors import CangaugeError, InputError
 from cangauge.inspect.capture import inspect_capture
 
@@ -53,8 +53,6 @@ NEEDED: Final = ("current", "voltage")
 CLEARLY_NAMED: Final = 1.0
 """Distance in score of the first signal of a DBC that makes it clear: one matching word."""
 LONGEST_PAIR_S: Final = 1.0
-BETWEEN_S: Final = 10.0
-"""Pause that is put between captures [s]: as long as trends that the search takes away."""
 
 
 def init_command(  # noqa: PLR0917 - typer fills the arguments by name

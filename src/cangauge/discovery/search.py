@@ -35,6 +35,8 @@ from cangauge.errors import InputError
 
 _LOG = logging.getLogger(__name__)
 
+BETWEEN_S: Final = 10.0
+"""Pause that is put between captures [s]: as long as trends that the search takes away."""
 GRID_S: Final = 0.1
 """Interval of the grid [s]: pack messages come every 10–100 ms."""
 MOST_CURRENTS: Final = 4000
@@ -309,21 +311,30 @@ class _Search:
         amps = current.scale * (self._grid(row) + row.constant) + current.offset
         amps *= current.sign
         drawn_ah = np.cumsum(amps) * self._step_s / 3600.0
+        span = self._longest()
         found = []
         for index, each in enumerate(self._fields):
             seen = self._statistics[index]
             if each.place.is_signed or seen.count < 4:
                 continue
-            made = self._as_charge(each, drawn_ah)
+            made = self._as_charge(each, drawn_ah[span], span)
             if made is not None:
                 found.append(made)
         return _apart(found)[:SHOWN]
 
-    def _as_charge(self, field: Field, drawn_ah: FloatArray) -> Candidate | None:
+    def _longest(self) -> slice:
+        """Return the rows of the longest capture: between captures the SoC jumps."""
+        filled = np.unique(np.concatenate(self._slots))
+        ends = np.flatnonzero(np.diff(filled) * self._step_s > 0.5 * BETWEEN_S)
+        firsts, lasts = np.append(0, ends + 1), np.append(ends, len(filled) - 1)
+        longest = int((filled[lasts] - filled[firsts]).argmax())
+        return slice(int(filled[firsts[longest]]), int(filled[lasts[longest]]) + 1)
+
+    def _as_charge(self, field: Field, drawn_ah: FloatArray, span: slice) -> Candidate | None:
         best = None
         for place, nature, constant in field.extensions:
             row = Row(field, place, 0.0, 1.0, 0.0, constant, field.missing)
-            values = self._grid(row) + constant
+            values = self._grid(row)[span] + constant
             spread, moved = float(np.std(values)), float(np.std(drawn_ah))
             if spread == 0.0 or moved == 0.0:
                 continue
