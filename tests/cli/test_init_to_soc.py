@@ -63,7 +63,7 @@ def car(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with captures, and what `init` and `fit` make of them."""
     folder = tmp_path_factory.mktemp("car")
     drive(folder, "full", "--discharge", "--hours", "1")
-    drive(folder, "trip", "--day", "2", "--hours", "0.15")
+    drive(folder, "trip", "--day", "2", "--hours", "0.25")
     choice = ("--choose", "current=1", "--choose", "voltage=1", "--nominal-voltage", "420")
     cangauge(folder, "init", "trip.log", "full.log", "--no-presets", "-o", "mycar", *choice)
     cangauge(folder, "fit", "full.log", "--map", "mycar/car.toml", "-o", "mycar/model.json")

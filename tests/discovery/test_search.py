@@ -14,6 +14,7 @@ from cangauge.discovery.fields import collect
 from cangauge.discovery.pairs import Candidate
 from cangauge.discovery.search import search
 from drive_captures import CARS, Bits, Car, Frame, capture
+from init_makes import HELD_OUT, evaluate
 
 SEARCHED = {car.name: car for car in CARS}
 FIRST = ("hyundai_kia", "tesla_3", "mitsubishi")
@@ -51,6 +52,22 @@ def test_unaligned_or_separate_pairs_are_among_three(name: str) -> None:
     found = search(capture(car))
     assert rank(found.current, car.current) <= 3
     assert rank(found.voltage, car.voltage) <= 3
+
+
+def test_a_stated_voltage_decides_the_scale() -> None:
+    car = SEARCHED["mitsubishi"]
+    found = search(capture(car, seconds=30.0), nominal_v=165.0)
+    assert rank(found.voltage, car.voltage) == 1
+    assert found.voltage[0].scale == pytest.approx(0.05)
+
+
+@pytest.mark.real
+def test_a_real_drive_is_found_among_a_cars_signals(shared_data: Path) -> None:
+    make = next(each for each in HELD_OUT if each.name == "stellantis_van")
+    result = evaluate(shared_data, make)
+    assert (result.current, result.voltage) == (1, 1)
+    assert result.findings.current[0].sign == -1
+    assert result.findings.soc_reference[0].name == "0x4F4 15|10@0+"
 
 
 def test_the_sign_follows_the_bus() -> None:

@@ -37,6 +37,7 @@ from cangauge.discovery.proposal import (
     map_text,
     mapped,
     message_name,
+    scale_line,
 )
 from cangauge.discovery.search import BETWEEN_S, Findings, search
 from cangauge.errors import CangaugeError, InputError
@@ -210,6 +211,7 @@ class _Found:
     named: Mapping[str, Sequence[NamedSignal]] = field(default_factory=dict)
     chosen: dict[str, int] = field(default_factory=dict)
     dbc: Path | None = None
+    nominal_v: float | None = None
     proof: dict[str, Any] = field(default_factory=dict)
 
     def candidates(self, role: str) -> Sequence[Candidate | NamedSignal]:
@@ -249,7 +251,7 @@ class _Found:
             chosen = {role: self.candidates(role)[number] for role, number in self.chosen.items()}
             fields = {role: each for role, each in chosen.items() if isinstance(each, Candidate)}
             texts[targets.dbc] = dbc_text(fields)
-            proposal = _by_physics(fields, self.findings, targets.dbc.name)
+            proposal = _by_physics(fields, self.findings, targets.dbc.name, self.nominal_v)
         else:
             proposal = self._by_name(targets)
         texts[targets.map] = map_text(proposal)
@@ -287,13 +289,15 @@ class _Found:
         )  # fmt: skip
 
 
-def _by_physics(chosen: Mapping[str, Candidate], findings: Findings, dbc: str) -> Proposal:
+def _by_physics(
+    chosen: Mapping[str, Candidate], findings: Findings, dbc: str, nominal_v: float | None
+) -> Proposal:
     roles = {}
     for role, each in chosen.items():
         unit = UNITS[role].replace("degC", "°C")
         lines = [f"{each.name}: {each.low:.5g} … {each.high:.5g} {unit}, {each.steps} steps."]
         if role in NEEDED:
-            lines.append(_physics_line(each))
+            lines += [_physics_line(each), scale_line(role, each, nominal_v)]
         elif each.partner:
             lines.append(f"Falls with the charge (r = {each.correlation:.2f}): {each.partner}.")
         others = [one.name for one in getattr(findings, role) if one is not each]
@@ -315,8 +319,8 @@ def _by_physics(chosen: Mapping[str, Candidate], findings: Findings, dbc: str) -
         comments=(
             f"Found by physics in {findings.duration_s:.0f} s of frames: {findings.fields} numbers"
             f" of {findings.streams} ids.",
-            "Scales are usual ones, not measured: compare voltage and current with a meter or the",
-            "car's display, and correct factor and offset in the DBC.",
+            "Bits do not tell factors: compare voltage and current with a meter or the car's",
+            "display, and correct factor and offset in the DBC.",
             *findings.remarks,
             *([f"Slow and plausible as a temperature: {', '.join(hints)}."] if hints else []),
         ),
@@ -403,7 +407,8 @@ def _find(
             return _Found("preset", vehicle=known)
         status = console.status("reading frames")
         with status, progress_shown("cangauge.discovery", status.update):
-            found = _Found("physics", findings=search(_joined(paths), nominal_v))
+            findings = search(_joined(paths), nominal_v)
+            found = _Found("physics", findings=findings, nominal_v=nominal_v)
     _choose(found, picks, targets, quiet=quiet)
     return found
 
