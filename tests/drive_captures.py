@@ -8,43 +8,12 @@ the inverter, wheel speeds, counters, CRCs, limits and multiplexed temperatures.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import can
 import numpy as np
 
-
-@dataclass(frozen=True)
-class Bits:
-    """A signal of a frame, numbered as in a DBC."""
-
-    start: int
-    width: int
-    motorola: bool
-    scale: float
-    offset: float = 0.0
-
-    def places(self, length: int) -> np.ndarray:
-        """Return its bits, most significant first, in reading order from byte 0."""
-        if self.motorola:
-            first = 8 * (self.start // 8) + 7 - self.start % 8
-            return np.arange(first, first + self.width)
-        bits = np.arange(self.start + self.width - 1, self.start - 1, -1)
-        return 8 * (bits // 8) + 7 - bits % 8
-
-
-@dataclass
-class Frame:
-    """An id with its period, its signals by name, and its protection."""
-
-    number: int
-    period_s: float
-    length: int = 8
-    signals: dict[str, Bits] = field(default_factory=dict)
-    counter: Bits | None = None
-    crc_byte: int | None = None
-    constant: dict[Bits, int] = field(default_factory=dict)
-    extended: bool = False
+from frame_layouts import Bits, Frame, encode
 
 
 @dataclass(frozen=True)
@@ -113,55 +82,7 @@ def capture(car: Car, seed: int = 1, seconds: float = 60.0) -> Iterator[can.Mess
     truth = drive(seed, car.volts, car.ohm, seconds)
     if car.charge_positive:
         truth["current"] = -truth["current"]
-    rows = []
-    for frame in car.frames:
-        steps = np.arange(0, int(seconds * 100), round(frame.period_s * 100))
-        bits = np.zeros((len(steps), 8 * frame.length), np.uint8)
-        for name, where in frame.signals.items():
-            raw = np.rint((truth[name][steps] - where.offset) / where.scale).astype(np.int64)
-            _put(bits, where, raw, frame.length)
-        for where, raw in frame.constant.items():
-            _put(bits, where, np.full(len(steps), raw), frame.length)
-        if frame.counter is not None:
-            _put(bits, frame.counter, np.arange(len(steps)), frame.length)
-        payload = np.packbits(bits, axis=1)
-        if frame.crc_byte is not None:
-            for row in payload:
-                row[frame.crc_byte] = 0
-                row[frame.crc_byte] = _crc(row.tobytes())
-        stamps = steps / 100.0 + rng.uniform(0.0, 0.004) + rng.normal(0.0, 2e-4, len(steps))
-        rows += [
-            (stamp, frame, data.tobytes()) for stamp, data in zip(stamps, payload, strict=True)
-        ]
-    rows.sort(key=lambda row: row[0])
-    for stamp, frame, data in rows:
-        yield can.Message(
-            timestamp=stamp,
-            arbitration_id=frame.number,
-            is_extended_id=frame.extended,
-            data=data,
-            is_fd=frame.length > 8,
-        )
-
-
-def _put(bits: np.ndarray, where: Bits, raw: np.ndarray, length: int) -> None:
-    shifts = np.arange(where.width - 1, -1, -1)
-    bits[:, where.places(length)] = (raw[:, None] >> shifts) & 1
-
-
-_TABLE = []
-for _byte in range(256):
-    _value = _byte
-    for _ in range(8):
-        _value = (_value << 1) ^ (0x2F if _value & 0x80 else 0)
-    _TABLE.append(_value & 0xFF)
-
-
-def _crc(data: bytes) -> int:
-    crc = 0xFF
-    for byte in data:
-        crc = _TABLE[crc ^ byte]
-    return crc
+    yield from encode(car.frames, truth, rng)
 
 
 def _others(base: int) -> tuple[Frame, ...]:
@@ -232,12 +153,12 @@ def _others(base: int) -> tuple[Frame, ...]:
     )
 
 
-KIA_CURRENT, KIA_VOLTAGE = Bits(32, 16, False, 0.1), Bits(48, 16, False, 0.1)
-TESLA_CURRENT, TESLA_VOLTAGE = Bits(16, 16, False, 0.1), Bits(0, 16, False, 0.01)
+KIA_CURRENT, KIA_VOLTAGE = Bits(32, 16, False, 0.1, signed=True), Bits(48, 16, False, 0.1)
+TESLA_CURRENT, TESLA_VOLTAGE = Bits(16, 16, False, 0.1, signed=True), Bits(0, 16, False, 0.01)
 MEB_CURRENT, MEB_VOLTAGE = Bits(24, 14, False, 0.25, -2047.0), Bits(38, 12, False, 0.25)
 ZOE_CURRENT, ZOE_VOLTAGE = Bits(11, 12, True, 0.25, -500.0), Bits(7, 10, True, 0.5)
-PRIUS_CURRENT, PRIUS_VOLTAGE = Bits(3, 12, True, 0.1), Bits(23, 16, True, 1.0)
-BOLT_CURRENT, BOLT_VOLTAGE = Bits(4, 13, True, 0.15), Bits(36, 13, True, 0.125)
+PRIUS_CURRENT, PRIUS_VOLTAGE = Bits(3, 12, True, 0.1, signed=True), Bits(23, 16, True, 1.0)
+BOLT_CURRENT, BOLT_VOLTAGE = Bits(4, 13, True, 0.15, signed=True), Bits(36, 13, True, 0.125)
 MIEV_CURRENT, MIEV_VOLTAGE = Bits(23, 16, True, 0.01, -327.68), Bits(39, 16, True, 0.1)
 
 CARS = (

@@ -14,6 +14,7 @@ from cangauge.discovery.fields import collect
 from cangauge.discovery.pairs import Candidate
 from cangauge.discovery.search import search
 from drive_captures import CARS, Bits, Car, Frame, capture
+from init_makes import HELD_OUT, evaluate
 
 SEARCHED = {car.name: car for car in CARS}
 FIRST = ("hyundai_kia", "tesla_3", "mitsubishi")
@@ -23,7 +24,7 @@ FIRST = ("hyundai_kia", "tesla_3", "mitsubishi")
 def rank(found: tuple[Candidate, ...], wanted: tuple[int, Bits]) -> int:
     """Return the place of a signal among candidates, 99 if it is not there; zeros above may be."""
     number, bits = wanted
-    last = int(bits.places(8)[-1])
+    last = int(bits.places()[-1])
     for place, each in enumerate(found, 1):
         lowest = each.place.last if each.place.is_motorola else None
         same_end = lowest == last if bits.motorola else each.start == bits.start
@@ -51,6 +52,22 @@ def test_unaligned_or_separate_pairs_are_among_three(name: str) -> None:
     found = search(capture(car))
     assert rank(found.current, car.current) <= 3
     assert rank(found.voltage, car.voltage) <= 3
+
+
+def test_a_stated_voltage_decides_the_scale() -> None:
+    car = SEARCHED["mitsubishi"]
+    found = search(capture(car, seconds=30.0), nominal_v=165.0)
+    assert rank(found.voltage, car.voltage) == 1
+    assert found.voltage[0].scale == pytest.approx(0.05)
+
+
+@pytest.mark.real
+def test_a_real_drive_is_found_among_a_cars_signals(shared_data: Path) -> None:
+    make = next(each for each in HELD_OUT if each.name == "stellantis_van")
+    result = evaluate(shared_data, make)
+    assert (result.current, result.voltage) == (1, 1)
+    assert result.findings.current[0].sign == -1
+    assert result.findings.soc_reference[0].name == "0x4F4 15|10@0+"
 
 
 def test_the_sign_follows_the_bus() -> None:
@@ -142,6 +159,6 @@ def test_the_generators_layouts_decode_to_the_drive() -> None:
     car = SEARCHED["renault_zoe"]
     frames = [each for each in capture(car) if each.arbitration_id == 0x155]
     payloads = np.array([list(each.data) for each in islice(frames, 50)], np.uint8)
-    bits = np.unpackbits(payloads, axis=1)[:, car.current[1].places(8)]
+    bits = np.unpackbits(payloads, axis=1)[:, car.current[1].places()]
     raw = bits.astype(int) @ (1 << np.arange(11, -1, -1))
     assert np.all(np.abs(0.25 * raw - 500.0) < 250.0)

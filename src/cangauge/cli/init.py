@@ -37,8 +37,9 @@ from cangauge.discovery.proposal import (
     map_text,
     mapped,
     message_name,
+    scale_line,
 )
-from cangauge.discovery.search import Findings, search
+from cangauge.discovery.search import BETWEEN_S, Findings, search
 from cangauge.errors import CangaugeError, InputError
 from cangauge.inspect.capture import inspect_capture
 
@@ -53,8 +54,6 @@ NEEDED: Final = ("current", "voltage")
 CLEARLY_NAMED: Final = 1.0
 """Distance in score of the first signal of a DBC that makes it clear: one matching word."""
 LONGEST_PAIR_S: Final = 1.0
-BETWEEN_S: Final = 10.0
-"""Pause that is put between captures [s]: as long as trends that the search takes away."""
 
 
 def init_command(  # noqa: PLR0917 - typer fills the arguments by name
@@ -82,6 +81,14 @@ def init_command(  # noqa: PLR0917 - typer fills the arguments by name
         list[str] | None,
         typer.Option(
             metavar="ROLE=N", help="Take candidate N for current, voltage, soc or temperature."
+        ),
+    ] = None,
+    nominal_voltage: Annotated[
+        float | None,
+        typer.Option(
+            metavar="V",
+            help="Voltage of the pack, nominal or as a meter shows it [V]: decides its scale.",
+            show_default=False,
         ),
     ] = None,
     presets: Annotated[
@@ -116,6 +123,8 @@ def init_command(  # noqa: PLR0917 - typer fills the arguments by name
     """
     picks = _picks(choose or [])
     within(seconds, 1.0, 86400.0, option="--seconds", unit="s")
+    if nominal_voltage is not None:
+        within(nominal_voltage, 10.0, 1500.0, option="--nominal-voltage", unit="V")
     targets = _Targets.of(output, map_file, config)
     targets.check(force=force)
     with tempfile.TemporaryDirectory(prefix="cangauge-init-") as folder:
@@ -133,7 +142,15 @@ def init_command(  # noqa: PLR0917 - typer fills the arguments by name
                 field="CAPTURE",
                 cure="give a capture, --interface and --channel, or --dbc FILE",
             )
-        found = _find(paths, dbc, picks, targets, presets=presets, quiet=json_output)
+        found = _find(
+            paths,
+            dbc,
+            picks,
+            targets,
+            presets=presets,
+            quiet=json_output,
+            nominal_v=nominal_voltage,
+        )
         files = found.files(targets, interface, channel, parse_bus_options(bus_option or []))
         found.proof = _prove(files, targets, paths, Path(folder), found)
     targets.map.parent.mkdir(exist_ok=True)
@@ -194,6 +211,7 @@ class _Found:
     named: Mapping[str, Sequence[NamedSignal]] = field(default_factory=dict)
     chosen: dict[str, int] = field(default_factory=dict)
     dbc: Path | None = None
+    nominal_v: float | None = None
     proof: dict[str, Any] = field(default_factory=dict)
 
     def candidates(self, role: str) -> Sequence[Candidate | NamedSignal]:
@@ -233,7 +251,7 @@ class _Found:
             chosen = {role: self.candidates(role)[number] for role, number in self.chosen.items()}
             fields = {role: each for role, each in chosen.items() if isinstance(each, Candidate)}
             texts[targets.dbc] = dbc_text(fields)
-            proposal = _by_physics(fields, self.findings, targets.dbc.name)
+            proposal = _by_physics(fields, self.findings, targets.dbc.name, self.nominal_v)
         else:
             proposal = self._by_name(targets)
         texts[targets.map] = map_text(proposal)
@@ -271,13 +289,15 @@ class _Found:
         )  # fmt: skip
 
 
-def _by_physics(chosen: Mapping[str, Candidate], findings: Findings, dbc: str) -> Proposal:
+def _by_physics(
+    chosen: Mapping[str, Candidate], findings: Findings, dbc: str, nominal_v: float | None
+) -> Proposal:
     roles = {}
     for role, each in chosen.items():
         unit = UNITS[role].replace("degC", "°C")
         lines = [f"{each.name}: {each.low:.5g} … {each.high:.5g} {unit}, {each.steps} steps."]
         if role in NEEDED:
-            lines.append(_physics_line(each))
+            lines += [_physics_line(each), scale_line(role, each, nominal_v)]
         elif each.partner:
             lines.append(f"Falls with the charge (r = {each.correlation:.2f}): {each.partner}.")
         others = [one.name for one in getattr(findings, role) if one is not each]
@@ -299,8 +319,8 @@ def _by_physics(chosen: Mapping[str, Candidate], findings: Findings, dbc: str) -
         comments=(
             f"Found by physics in {findings.duration_s:.0f} s of frames: {findings.fields} numbers"
             f" of {findings.streams} ids.",
-            "Scales are usual ones, not measured: compare voltage and current with a meter or the",
-            "car's display, and correct factor and offset in the DBC.",
+            "Bits do not tell factors: compare voltage and current with a meter or the car's",
+            "display, and correct factor and offset in the DBC.",
             *findings.remarks,
             *([f"Slow and plausible as a temperature: {', '.join(hints)}."] if hints else []),
         ),
@@ -377,6 +397,7 @@ def _find(
     *,
     presets: bool,
     quiet: bool,
+    nominal_v: float | None,
 ) -> _Found:
     if dbc is not None:
         messages = chain.from_iterable(open_capture(path) for path in paths)
@@ -386,7 +407,8 @@ def _find(
             return _Found("preset", vehicle=known)
         status = console.status("reading frames")
         with status, progress_shown("cangauge.discovery", status.update):
-            found = _Found("physics", findings=search(_joined(paths)))
+            findings = search(_joined(paths), nominal_v)
+            found = _Found("physics", findings=findings, nominal_v=nominal_v)
     _choose(found, picks, targets, quiet=quiet)
     return found
 

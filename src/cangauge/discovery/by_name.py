@@ -20,12 +20,12 @@ from cangauge.logs.units import convert
 _PACK = re.compile(r"bat|bms|pack|traction|hv|hochvolt|esu|rechargeable", re.IGNORECASE)
 _OTHER = re.compile(
     r"lim|max|min|allow|req|target|set_?point|dem(and)?|cell|12v|lv_?|aux|charger|obc|dcdc|motor"
-    r"|inv|peak|rated|avail|cap(acity)?|err|fault|delta|dev|isol|pre_?ch|full|remain|energy|power",
+    r"|inv|peak|nom|_nv$|ulo|rated|avail|cap(acity)?|err|fault|delta|dev|isol|pre_?ch|full|remain|energy|power",
     re.IGNORECASE,
 )
 _ROLES: Final = {
-    "current": ("current_a", re.compile(r"cur|amp|strom|^i_|_i$|ibat", re.IGNORECASE)),
-    "voltage": ("voltage_v", re.compile(r"volt|spann|^u_|_u$|_v$|ubat|vbat", re.IGNORECASE)),
+    "current": ("current_a", re.compile(r"cur|amp|strom|(^|_)i(_|$)|ibat", re.IGNORECASE)),
+    "voltage": ("voltage_v", re.compile(r"volt|spann|(^|_)u(_|$)|_v$|ubat|vbat", re.IGNORECASE)),
     "temperature": ("temperature_c", re.compile(r"temp", re.IGNORECASE)),
     "soc_reference": ("soc_pct", re.compile(r"soc|state_?of_?charge|ladezustand", re.IGNORECASE)),
 }

@@ -7,6 +7,7 @@ carries: when the part above a cut steps by one, the part below wraps.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Final
@@ -32,6 +33,8 @@ MOST_VALUES: Final = 32
 """Most values of a multiplexer."""
 MULTIPLEXED: Final = 0.4
 """Largest ratio of the changes among frames of one multiplexer value to those of all frames."""
+LARGEST_ODDS: Final = 3.0
+"""Largest log odds of a byte order [nats]: modules of several suppliers share a bus."""
 LINK_EVENTS: Final = 4
 """Fewest carries from which a cut is judged."""
 NATURAL: Final = -2.0
@@ -257,7 +260,7 @@ class Field:
     """The same with constant bits above: place, nature, what they add."""
 
 
-def fields_of(index: int, stream: Stream) -> list[Field]:
+def fields_of(index: int, stream: Stream, byte_order: float = 0.0) -> list[Field]:
     """Return the numbers in a stream that its bits make plausible, each once.
 
     Parameters
@@ -265,12 +268,14 @@ def fields_of(index: int, stream: Stream) -> list[Field]:
     index : int
         Index of the stream, for the fields.
     stream : Stream
+    byte_order : float
+        Log odds that a car's numbers are in Motorola order; see `byte_order`.
     """
-    dead = _counters_and_crcs(stream.payload)
-    orders = [_read(stream.payload, dead, is_motorola=each) for each in (True, False)]
+    orders = read_orders(stream)
+    odds = {True: min(byte_order, 0.0), False: min(-byte_order, 0.0)}
     found: dict[bytes, Field] = {}
     for order, other in (orders, orders[::-1]):
-        for first, last, extensions in _candidates(order, other):
+        for first, last, extensions in _candidates(order, other, odds[order.is_motorola]):
             for is_signed in (False, True):
                 made = _number(index, order, first, last, extensions, is_signed=is_signed)
                 if made is None:
@@ -285,6 +290,29 @@ def fields_of(index: int, stream: Stream) -> list[Field]:
                         made.extensions = kept.extensions
                         found[key] = made
     return list(found.values())
+
+
+def read_orders(stream: Stream) -> list[_Order]:
+    """Return how the bits of a stream move, read in Motorola and in Intel order."""
+    dead = _counters_and_crcs(stream.payload)
+    return [_read(stream.payload, dead, is_motorola=each) for each in (True, False)]
+
+
+def byte_order(streams: Iterable[Stream]) -> float:
+    """Return the log odds that a car's numbers are in Motorola order [nats].
+
+    A maker uses one order nearly throughout. Carries between bytes show it: ids vote.
+    """
+    votes = [0, 0]
+    for stream in streams:
+        linked = [
+            sum(order.is_linked(cut) for cut in range(7, 8 * stream.length - 1, 8))
+            for order in read_orders(stream)
+        ]
+        if linked[0] != linked[1]:
+            votes[linked[1] > linked[0]] += 1
+    odds = math.log((votes[0] + 1.0) / (votes[1] + 1.0))
+    return max(-LARGEST_ODDS, min(LARGEST_ODDS, odds))
 
 
 def _read(payload: NDArray[np.uint8], dead: Bits, *, is_motorola: bool) -> _Order:
@@ -353,7 +381,7 @@ def _counters_and_crcs(payload: NDArray[np.uint8]) -> Bits:
     changed = bits[1:] != bits[:-1]
     dead: Bits = np.asarray(changed.mean(0) > 0.9)
     for byte in np.flatnonzero(changed.reshape(count - 1, length, 8).any((0, 2))).tolist():
-        for width, offsets in ((8, (0,)), (4, (0, 4)), (3, (0, 1, 5)), (2, (0, 2, 4, 6))):
+        for width, offsets in ((8, (0,)), (4, range(5)), (3, (0, 1, 5)), (2, (0, 2, 4, 6))):
             for offset in offsets:
                 codes = (payload[:, byte] >> (8 - offset - width)) & ((1 << width) - 1)
                 if _counts(codes.astype(np.int64), 1 << width):
@@ -370,6 +398,12 @@ def _counts(codes: NDArray[np.int64], modulus: int) -> bool:
     if steps[1:].max(initial=0) <= STEADY * steps.sum():
         return False
     uses = np.bincount(codes, minlength=modulus)
+    if modulus > 16:
+        # A nibble of something else above a counter does not step as the counter wraps.
+        wraps = np.flatnonzero(np.diff(codes % 16) < 0)
+        carries = np.diff(codes)[wraps] % modulus == int(steps[1:].argmax()) + 1
+        if not len(wraps) or carries.mean() < STEADY:
+            return False
     return bool((uses > 0).sum() >= modulus - 1 and uses.max() < 2.5 * len(codes) / modulus)
 
 
@@ -386,7 +420,7 @@ def _is_crc(changed: Bits, byte: int) -> bool:
 
 
 def _candidates(  # noqa: C901 - one walk over the bits
-    order: _Order, other: _Order
+    order: _Order, other: _Order, odds: float
 ) -> Iterator[tuple[int, int, list[tuple[int, float, int]]]]:
     """Yield first and last toggling bit of plausible fields, with what may stand above them."""
     toggles = np.flatnonzero((order.flips > 0) & ~order.dead)
@@ -403,6 +437,7 @@ def _candidates(  # noqa: C901 - one walk over the bits
             while True:
                 if last - top + 1 >= LEAST_BITS:
                     nature = body + _ends(order, other, top, int(last))
+                    nature += odds if top // 8 != int(last) // 8 else 0.0
                     if nature > NATURAL:
                         found.append((top, nature, constant))
                 above = top - 1

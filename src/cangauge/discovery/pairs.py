@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
+from scipy.signal import lfilter
 
 from cangauge._typing import FloatArray
 from cangauge.discovery.fields import Bits, Field, Ints, Place, Selector, Stream
@@ -23,14 +24,19 @@ TREND_S: Final = 10.0
 """Width of the moving average that is taken away [s]: shorter than SoC and temperature move."""
 MOVE_S: Final = 0.5
 """Time of one move [s]: the load of a car changes no faster."""
-LARGEST_R2: Final = 0.998
-"""Polarisation and quantization leave some of a voltage's variance without the current."""
+MOST_MOVES: Final = 60.0
+"""Independent moves from which on a chance is excluded: two minutes of driving have as many, and
+the noise of a sensor that is sent twice has more."""
+LARGEST_R2: Final = 0.97
+"""Polarisation within seconds leaves some of a voltage's variance without the current: a closer
+relation is no further evidence of a pack."""
 FEW_MOVES: Final = 4.0
 """Fewer independent moves than this may be one coincidence, such as the wake-up of all nodes."""
 ALIKE: Final = 3.5
 """Largest ratio of the steps of two copies: one has at most a bit or two more."""
 MANY_MOVES: Final = 20.0
-"""With more independent moves than this, a voltage without any residual is not taken for a copy."""
+"""With more independent moves than this, a voltage shows its polarisation: what follows a current
+closer than COPY_R2 is the same quantity."""
 COPY_R2: Final = 0.9985
 RESISTANCE_OHM: Final = (0.008, 1.2)
 TYPICAL_OHM: Final = 0.12
@@ -52,6 +58,18 @@ SATURATION_NATS: Final = 20.0
 """Evidence from which on further samples count half: loads of a car are correlated."""
 SIBLING: Final = 0.02
 """Largest relative difference of two voltages of one frame that are those of two cells."""
+POLARISATION_S: Final = 3.0
+"""Time constant with which a sustained current is seen [s]: the diffusion of lithium-ion cells
+shows from seconds on, and slower parts are taken away as a trend."""
+POLARISATION: Final = (0.1, 0.2, 0.4, 0.8)
+"""Ratios of the resistance that grows within that time to the ohmic one: a cell's 10-s resistance
+is 1.2 to 2 times that of the first 0.1 s."""
+TRUSTED_NATS: Final = 10.0
+SHOWN_NATS: Final = 5.0
+"""Most that this test counts against a pair, as its model is not exact, and for one: cells sag as
+the pack does, and finer numbers show it better."""
+SAME_FRAME_NATS: Final = 4.0
+"""Log prior of a pair in one frame: 5 of 7 public layouts, against one of a car's dozens of ids."""
 IMPOSSIBLE: Final = -99.0
 
 
@@ -184,6 +202,8 @@ class _Moves:
     std: FloatArray
     independent: FloatArray
     """Number of independent moves."""
+    memory: FloatArray
+    """Autocorrelation over one move."""
 
     @classmethod
     def of(cls, grid: FloatArray, step_s: float) -> _Moves:
@@ -200,7 +220,8 @@ class _Moves:
         # One lone step moves the mean of many slots, and is still one.
         both = np.sqrt(steps * _participation(_grouped(free, group)))
         values = (free / np.maximum(std, 1e-12)[:, None]).astype(np.float32)
-        return cls(values, std, np.minimum(np.where(steps < 3.0, steps, both), 200.0))
+        memory = (values[:, group:] * values[:, :-group]).mean(1, dtype=np.float64)
+        return cls(values, std, np.minimum(np.where(steps < 3.0, steps, both), MOST_MOVES), memory)
 
 
 def _grouped(rows: FloatArray, group: int) -> FloatArray:
@@ -232,12 +253,17 @@ class Pairs:
         rows = one.shape[1]
         self._u, self._i = u, i
         self.r = np.asarray(u.values @ i.values.T / rows, dtype=np.float64)
+        polarisation = self._polarisation(two, step_s)
         # A measured quantity dithers: several changes make one independent move.
         moves = [np.array([row.steps / 4.0 for row in rows]) for rows in (voltages, currents)]
         count = np.minimum(
             np.minimum(u.independent, moves[0])[:, None],
             np.minimum(i.independent, moves[1])[None, :],
         )
+        # Bartlett (1946): what moves slowly, such as speeds, has few independent samples.
+        memory = np.clip(u.memory[:, None] * i.memory[None, :], 0.0, 0.99)
+        slots = rows * step_s / MOVE_S
+        count = np.minimum(count, np.maximum(slots * (1.0 - memory) / (1.0 + memory), 1.0))
         evidence = _ratio(self.r, count) - 0.5 * np.log(np.maximum(count, 1.0))
         half = rows // 2
         first = _correlation(u.values[:, :half], i.values[:, :half])
@@ -276,13 +302,38 @@ class Pairs:
         self.evidence = SATURATION_NATS * np.log1p(evidence / SATURATION_NATS)
         self.score = (
             self.evidence
+            + polarisation
             + np.array([row.prior for row in voltages])[:, None]
             + np.array([row.prior for row in currents])[None, :]
             + likely
-            + np.where(same, 2.5, 0.0)
+            + np.where(same, SAME_FRAME_NATS, 0.0)
             + np.where(is_copy, IMPOSSIBLE, 0.0)
             - 1.5 * self._has_sibling(voltages)[:, None]
         )
+
+    def _polarisation(self, current: FloatArray, step_s: float) -> FloatArray:
+        """Return the evidence that the voltage sags on under a sustained current.
+
+        U = a − R·(I + ρ·⟨I⟩), ⟨I⟩ the current through a low pass. Polarisation makes ρ > 0; torque,
+        power and speed follow each other with ρ = 0. The evidence is the likelihood ratio of the
+        two, where the relation is close enough to show it.
+        """
+        keep = math.exp(-step_s / POLARISATION_S)
+        past = lfilter([1.0 - keep], [1.0, -keep], current - current[:, :1], axis=1)
+        low = _Moves.of(np.asarray(past), step_s)
+        rows = current.shape[1]
+        with_past = np.asarray(self._u.values @ low.values.T / rows, dtype=np.float64)
+        own = (self._i.values * low.values).mean(1, dtype=np.float64)
+        spread = low.std / np.maximum(self._i.std, 1e-9)
+        best = np.full(self.r.shape, -np.inf)
+        for ratio in POLARISATION:
+            share = ratio * spread
+            r = self.r + share * with_past
+            r /= np.sqrt(1.0 + 2.0 * share * own + share**2)
+            best = np.maximum(best, r**2)
+        count = rows * step_s / POLARISATION_S
+        left = np.maximum(1.0 - best, 1e-6) / np.maximum(1.0 - self.r**2, 1e-6)
+        return np.asarray(np.clip(-0.5 * count * np.log(left), -TRUSTED_NATS, SHOWN_NATS))
 
     def _has_sibling(self, voltages: Sequence[Row]) -> Bits:
         """Return which voltages are one of two in a frame: lowest and highest cell."""
@@ -304,7 +355,8 @@ class Pairs:
         slope = np.abs(self.r) * self._u.std[:, None] / np.maximum(self._i.std[None, :], 1e-9)
         alike = (slope > 1.0 / ALIKE) & (slope < ALIKE)
         return np.asarray(
-            alike & (self.r**2 > COPY_R2) & (lost < 0.1 * (1.0 + slope**2)) & (count < MANY_MOVES)
+            (self.r**2 > COPY_R2)
+            & ((alike & (lost < 0.1 * (1.0 + slope**2))) | (count > MANY_MOVES))
         )
 
     def best(self, make: Any) -> tuple[tuple[Candidate, ...], tuple[Candidate, ...], Row | None]:
@@ -367,7 +419,9 @@ class Pairs:
         ):
             bits = each.place.bits(each.length)
             if not any(
-                overlap(each, bits, one, one.place.bits(one.length)) or _same_numbers(each, one)
+                overlap(each, bits, one, one.place.bits(one.length))
+                or _same_numbers(each, one)
+                or _are_siblings(each, one)
                 for one in found
             ):
                 found.append(replace(each, partner=partner.name))
@@ -427,6 +481,16 @@ def _same_numbers(one: Candidate, two: Candidate) -> bool:
     return (one.arbitration_id, one.start, one.place.width, one.place.is_motorola) == (
         two.arbitration_id, two.start, two.place.width, two.place.is_motorola,
     )  # fmt: skip
+
+
+def _are_siblings(one: Candidate, two: Candidate) -> bool:
+    """Whether two candidates are cells in one message: raw numbers alike, but for cut bits."""
+    same = (one.bus, one.arbitration_id) == (two.bus, two.arbitration_id)
+    middles = [(each.low + each.high) / 2.0 / each.scale for each in (one, two)]
+    if not same or min(one.low, two.low) <= 0.0:
+        return False
+    octaves = math.log2(middles[0] / middles[1])
+    return abs(octaves - round(octaves)) < SIBLING
 
 
 def _ratio(r: FloatArray, count: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ from typing import Final
 
 from cangauge.bus.mapping import VehicleMap
 from cangauge.bus.vehicle import EXTENDED
-from cangauge.discovery.pairs import Candidate
+from cangauge.discovery.pairs import CURRENT_SCALES, VOLTAGE_SCALES, Candidate
 
 UNITS: Final = {"current": "A", "voltage": "V", "temperature": "degC", "soc_reference": "%"}
 SIGNALS: Final = {
@@ -113,6 +113,28 @@ def dbc_text(chosen: Mapping[str, Candidate]) -> str:
         cycles.append(f'BA_ "GenMsgCycleTime" BO_ {key} {max(round(1e3 * first.period_s), 1)};')
     lines += ['BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;', 'BA_DEF_DEF_ "GenMsgCycleTime" 0;']
     return "\n".join([*lines, *cycles, "", *values, ""])
+
+
+def scale_line(role: str, candidate: Candidate, nominal_v: float | None) -> str:
+    """Return how the scale of a current or a voltage was determined, and which others may be."""
+    usual = VOLTAGE_SCALES if role == "voltage" else CURRENT_SCALES
+    others = [each for each in sorted(usual) if each != candidate.scale]
+    if role == "current":
+        zero = round(-candidate.offset / candidate.scale)
+        return (
+            f"Factor {candidate.scale:g} is the usual one that gives a plausible R; the data fit as"
+            f" well with {', '.join(f'{each:g}' for each in others)}. No current at raw {zero}:"
+            f" {'signed' if candidate.place.is_signed else 'a round number near the most common'}."
+        )
+    middle = (candidate.low + candidate.high) / 2.0 / candidate.scale
+    shown = [f"{each:g} ({each * middle:.0f} V)" for each in others if 60 < each * middle < 1000]
+    if nominal_v is not None:
+        return f"Factor {candidate.scale:g} is the usual one nearest to the stated {nominal_v:g} V."
+    return (
+        f"Factor {candidate.scale:g} is the usual one with the likeliest level"
+        + (f"; the data fit as well with {', '.join(shown)}" if shown else "")
+        + ". --nominal-voltage decides."
+    )
 
 
 def map_text(proposal: Proposal) -> str:

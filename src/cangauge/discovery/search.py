@@ -16,7 +16,7 @@ import can
 import numpy as np
 
 from cangauge._typing import FloatArray
-from cangauge.discovery.fields import Field, Place, Stream, collect, fields_of
+from cangauge.discovery.fields import Field, Place, Stream, byte_order, collect, fields_of
 from cangauge.discovery.pairs import (
     CLEARLY_NATS,
     IMPOSSIBLE,
@@ -35,6 +35,8 @@ from cangauge.errors import InputError
 
 _LOG = logging.getLogger(__name__)
 
+BETWEEN_S: Final = 10.0
+"""Pause that is put between captures [s]: as long as trends that the search takes away."""
 GRID_S: Final = 0.1
 """Interval of the grid [s]: pack messages come every 10–100 ms."""
 MOST_CURRENTS: Final = 4000
@@ -45,6 +47,13 @@ ENOUGH_NATS: Final = 3.0
 RIVAL: Final = 0.6
 """Share of the first candidate's evidence with which another leaves the choice to the user: the
 evidence of loads that hang together differs by less than its saturation."""
+NOMINAL_SPREAD: Final = 0.06
+"""Log spread of a pack's voltage about the nominal one: between 10 and 90 % SoC cells have 3.4 to
+4.1 V at 3.7 V nominal."""
+AT_HALF: Final = 0.03
+AT_HALF_NATS: Final = 3.0
+"""A number that rests at half its range, to this share, is a torque, a yaw rate or the like with
+an offset; a voltage is there by chance once in twenty or thirty."""
 ENOUGH_STEPS: Final = 50
 LARGEST_RATIO: Final = 2.0
 """Fewest changes of a field that is taken without the user, and largest ratio of the resistances by
@@ -86,8 +95,14 @@ class Findings:
         return len(found) == 1 or found[0].score - found[1].score >= CLEARLY_NATS
 
 
-def search(messages: Iterable[can.Message]) -> Findings:
+def search(messages: Iterable[can.Message], nominal_v: float | None = None) -> Findings:
     """Find current, voltage, SoC and temperature in the frames of a capture.
+
+    Parameters
+    ----------
+    messages : iterable of can.Message
+    nominal_v : float, optional
+        Voltage of the pack, nominal or as a meter shows it [V]: decides the voltage's scale.
 
     Raises
     ------
@@ -100,15 +115,19 @@ def search(messages: Iterable[can.Message]) -> Findings:
             "no id has enough frames to search", cure="record at least a minute, while driving"
         )
     fields: list[Field] = []
+    order = byte_order(streams)
     for index, stream in enumerate(streams):
         _LOG.debug("id %d of %d: %s", index + 1, len(streams), stream.name)
-        fields += fields_of(index, stream)
-    return _Search(streams, fields).findings()
+        fields += fields_of(index, stream, order)
+    return _Search(streams, fields, nominal_v).findings()
 
 
 class _Search:
-    def __init__(self, streams: Sequence[Stream], fields: Sequence[Field]) -> None:
+    def __init__(
+        self, streams: Sequence[Stream], fields: Sequence[Field], nominal_v: float | None
+    ) -> None:
         self._streams = streams
+        self._nominal_v = nominal_v
         self._fields = fields
         start_s = min(float(each.time_s[0]) for each in streams)
         end_s = max(float(each.time_s[-1]) for each in streams)
@@ -172,8 +191,10 @@ class _Search:
         )  # fmt: skip
 
     def _rate_prior(self, stream: Stream) -> float:
-        """Return the log prior of a period: pack messages are fast."""
+        """Return the log prior of a period: pack messages are fast, and not in turns."""
         period_s = stream.period_s
+        if stream.selector is not None:
+            return -2.0
         if period_s <= 0.11:
             return 0.8 if period_s <= 0.025 else 0.4
         return 0.0 if period_s < 0.3 else -1.0
@@ -197,7 +218,8 @@ class _Search:
             rest = min((abs(each - seen.resting - best[2]) for each in zeros), default=math.inf)
             if any(each and math.log2(each).is_integer() for each in zeros):
                 prior += 1.0
-            prior -= 5.0 if not zeros else 1.0 if rest > 0.15 * (high - low) else 0.0
+            # A pack's current has two signs: a number from zero upwards is none.
+            prior -= 5.0 if not any(zeros) else 1.0 if rest > 0.15 * (high - low) else 0.0
         if seen.count < 3 and not field.place.is_signed:
             return None
         return Row(field, best[0], prior, 1.0, seen.median, best[2], field.missing)
@@ -221,9 +243,11 @@ class _Search:
                 continue
             if level > 0.95 * (1 << place.width):
                 continue  # nearly all ones: a small negative number
+            at_half = abs(level / (1 << (place.width - 1)) - 1.0) < AT_HALF
             for scale, usual in VOLTAGE_SCALES.items():
-                likely = _level_prior(level * scale)
+                likely = _level_prior(level * scale, self._nominal_v)
                 prior = nature + rate + seen.prior + usual + likely
+                prior -= AT_HALF_NATS if at_half else 0.0
                 prior += _full_scale_prior(scale, place.width)
                 if likely > IMPOSSIBLE and (best is None or prior > best.prior):
                     best = Row(field, place, prior, scale, level, constant, missing)
@@ -237,7 +261,7 @@ class _Search:
             stream = self._streams[index]
             if stream.period_s > 0.11:
                 continue
-            rows += _constants(index, stream, self._rate_prior(stream))
+            rows += _constants(index, stream, self._rate_prior(stream), self._nominal_v)
         return rows
 
     def _grid(self, row: Row) -> FloatArray:
@@ -287,21 +311,30 @@ class _Search:
         amps = current.scale * (self._grid(row) + row.constant) + current.offset
         amps *= current.sign
         drawn_ah = np.cumsum(amps) * self._step_s / 3600.0
+        span = self._longest()
         found = []
         for index, each in enumerate(self._fields):
             seen = self._statistics[index]
             if each.place.is_signed or seen.count < 4:
                 continue
-            made = self._as_charge(each, drawn_ah)
+            made = self._as_charge(each, drawn_ah[span], span)
             if made is not None:
                 found.append(made)
         return _apart(found)[:SHOWN]
 
-    def _as_charge(self, field: Field, drawn_ah: FloatArray) -> Candidate | None:
+    def _longest(self) -> slice:
+        """Return the rows of the longest capture: between captures the SoC jumps."""
+        filled = np.unique(np.concatenate(self._slots))
+        ends = np.flatnonzero(np.diff(filled) * self._step_s > 0.5 * BETWEEN_S)
+        firsts, lasts = np.append(0, ends + 1), np.append(ends, len(filled) - 1)
+        longest = int((filled[lasts] - filled[firsts]).argmax())
+        return slice(int(filled[firsts[longest]]), int(filled[lasts[longest]]) + 1)
+
+    def _as_charge(self, field: Field, drawn_ah: FloatArray, span: slice) -> Candidate | None:
         best = None
         for place, nature, constant in field.extensions:
             row = Row(field, place, 0.0, 1.0, 0.0, constant, field.missing)
-            values = self._grid(row) + constant
+            values = self._grid(row)[span] + constant
             spread, moved = float(np.std(values)), float(np.std(drawn_ah))
             if spread == 0.0 or moved == 0.0:
                 continue
@@ -395,8 +428,12 @@ class _Statistics:
         )
 
 
-def _level_prior(volts: float) -> float:
+def _level_prior(volts: float, nominal_v: float | None = None) -> float:
     """Return the log prior of a pack's voltage [nats]: most cars have 250–450 V."""
+    if nominal_v is not None:
+        if volts <= 0.0:
+            return IMPOSSIBLE
+        return -0.5 * (math.log(volts / nominal_v) / NOMINAL_SPREAD) ** 2
     if 250.0 <= volts <= 450.0:
         return 0.0
     if 450.0 < volts <= 900.0:
@@ -417,7 +454,7 @@ def _full_scale_prior(scale: float, width: int) -> float:
 
 
 def _constants(  # noqa: C901 - one walk over the places
-    index: int, stream: Stream, rate: float
+    index: int, stream: Stream, rate: float, nominal_v: float | None
 ) -> list[Row]:
     """Return constant fields at the voltage of a car's pack."""
     rows = []
@@ -447,8 +484,8 @@ def _constants(  # noqa: C901 - one walk over the places
                     continue
                 missing = np.asarray(raw != raw[-1])
                 for scale, usual in VOLTAGE_SCALES.items():
-                    likely = _level_prior(level * scale)
-                    if likely < 0.0:
+                    likely = _level_prior(level * scale, nominal_v)
+                    if likely < -1.0:
                         continue
                     prior = rate + usual + _full_scale_prior(scale, width) - 0.5
                     prior += {16: 0.6, 12: 0.4, 10: 0.2}[width]

@@ -33,7 +33,7 @@ _UNITS: Final[dict[str, dict[str, tuple[float, float]]]] = {
         **dict.fromkeys(("d", "days"), (86400.0, 0.0)),
     },
     "current_a": {
-        **dict.fromkeys(("a", "amp", "amps", "ampere", "adc"), (1.0, 0.0)),
+        **dict.fromkeys(("a", "amp", "amps", "amper", "ampere", "adc"), (1.0, 0.0)),
         "ma": (1e-3, 0.0),
         "ka": (1e3, 0.0),
     },
@@ -117,7 +117,7 @@ def unit_of(field: str, unit: str) -> tuple[float, float] | None:
     >>> unit_of("current_a", "mA")
     (0.001, 0.0)
     """
-    return _UNITS[field].get(" ".join(unit.lower().split()))
+    return _UNITS[field].get(" ".join(unit.lower().removeprefix("unit_").split()))
 
 
 def convert(

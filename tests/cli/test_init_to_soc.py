@@ -1,0 +1,118 @@
+"""From captures of an unknown car to a live SoC: `init`, `fit` and `run`."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+from frame_layouts import STEP_S, Bits, Frame, encode
+
+PACK = Frame(
+    0x100,
+    0.1,
+    signals={
+        "voltage_v": Bits(0, 16, False, 0.1),
+        "current_a": Bits(16, 16, False, 0.1, -500.0),
+        "soc_pct": Bits(32, 16, False, 0.1),
+    },
+)
+POWER = Frame(
+    0x210,
+    0.1,
+    signals={"power_kw": Bits(0, 12, False, 0.1, -100.0)},
+    counter=Bits(56, 4, False, 1.0),
+    crc_byte=6,
+)
+
+
+def cangauge(
+    folder: Path, *arguments: str, codes: tuple[int, ...] = (0,)
+) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(
+        [sys.executable, "-m", "cangauge", *arguments],
+        cwd=folder, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL,
+    )  # fmt: skip
+    assert done.returncode in codes, done.stderr
+    return done
+
+
+def drive(folder: Path, name: str, *arguments: str) -> None:
+    """Write a capture NAME.log of a drive of the twin at 20 °C, and its truth as NAME.csv."""
+    table = f"{name}.csv"
+    cangauge(folder, "twin", "--seed", "5", "--ambient-c", "20", *arguments, "-o", table)
+    log = np.genfromtxt(folder / table, delimiter=",", names=True, usecols=range(5))
+    at = np.arange(log["time_s"][0], log["time_s"][-1], STEP_S)
+    truth = {
+        key: np.interp(at, log["time_s"], log[key]) for key in ("current_a", "voltage_v", "soc_pct")
+    }
+    truth["power_kw"] = truth["current_a"] * truth["voltage_v"] / 1000.0
+    with can.CanutilsLogWriter(folder / f"{name}.log") as writer:
+        for message in encode([PACK, POWER], truth, np.random.default_rng(0)):
+            message.channel = "can0"
+            writer.on_message_received(message)
+
+
+@pytest.fixture(scope="module")
+def car(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with captures, and what `init` and `fit` make of them."""
+    folder = tmp_path_factory.mktemp("car")
+    drive(folder, "full", "--discharge", "--hours", "1")
+    drive(folder, "trip", "--day", "2", "--hours", "0.25")
+    choice = ("--choose", "current=1", "--choose", "voltage=1", "--nominal-voltage", "420")
+    cangauge(folder, "init", "trip.log", "full.log", "--no-presets", "-o", "mycar", *choice)
+    cangauge(folder, "fit", "full.log", "--map", "mycar/car.toml", "-o", "mycar/model.json")
+    return folder
+
+
+def test_the_files_hold_the_cars_own_scales(car: Path) -> None:
+    text = (car / "mycar" / "car.dbc").read_text()
+    assert "current_a : 16|16@1+ (0.1,-500)" in text
+    assert "voltage_v : 0|16@1+ (0.1,0)" in text
+    assert "soc_pct : 32|16@1+ (0.1,0)" in text
+
+
+def test_the_service_reaches_the_cars_soc(car: Path) -> None:
+    bus = ("--interface", "udp_multicast", "--channel", "239.74.163.34",
+           "--bus-option", f"port={22_000 + os.getpid() % 20_000}")  # fmt: skip
+    service = [sys.executable, "-m", "cangauge", "run", "--config", "mycar/run.toml", *bus]
+    service += ["--time-source", "replay-clock", "--status-socket", "run.sock"]
+    with (
+        (car / "run.err").open("w") as log,
+        subprocess.Popen(service, cwd=car, stdout=log, stderr=log) as running,
+    ):
+        try:
+            until_s = time.monotonic() + 60.0
+            while not (car / "run.sock").exists() and time.monotonic() < until_s:
+                time.sleep(0.1)
+            cangauge(
+                car,
+                "replay",
+                "trip.log",
+                "--map",
+                "mycar/car.toml",
+                "--speed",
+                "max",
+                "--wait",
+                "30",
+                *bus,
+            )
+            status = json.loads(
+                cangauge(
+                    car, "status", "--endpoint", "run.sock", "--json", codes=(0, 1)
+                ).stdout  # 1: the replay is over, its input stale
+            )
+        finally:
+            running.terminate()
+            running.wait(20.0)
+    truth = np.genfromtxt(car / "trip.csv", delimiter=",", names=True, usecols=range(5))
+    estimate = status["estimate"]
+    assert abs(estimate["soc_pct"] - truth["soc_pct"][-1]) < 3.0 * estimate["soc_std_pct"]
+    assert estimate["soc_std_pct"] < 5.0

@@ -1,0 +1,66 @@
+"""Signals of a DBC are found by the names and units that public DBC files of other makes use."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from cangauge.discovery.by_name import named_signals
+
+# make: signals with their units; the first two are current and voltage of the pack
+PUBLIC = {
+    "tesla": (
+        ("BMS_packCurrent", "A"), ("BMS_packVoltage", "V"), ("BMS_maxDischargeCurrent", "A"),
+        ("BMS_chargeVoltageTarget", "V"), ("DI_motorCurrent", "A"), ("PCS_dcdcLvBusVolt", "V"),
+    ),
+    "tesla_132": (
+        ("SmoothBattCurrent132", "A"), ("BattVoltage132", "V"), ("MaxChargeCurrent252", "A"),
+        ("DCDCvoltage2B4", "V"), ("DCDCcurrent2B4", "A"),
+    ),
+    "ford": (
+        ("BattTrac_I_Actl", "Amps"), ("BattTrac_U_Actl", "Volts"), ("BattTrac_U_LimHi", "Volts"),
+        ("BattTrac_U_LimLo", "Volts"), ("MtrTrac2_I_Actl", "Amps"), ("BattULo_U_Actl", "Volts"),
+    ),
+    "vw": (
+        ("BMS_IstStrom", "Unit_Amper"), ("BMS_IstSpannung", "Unit_Volt"),
+        ("BMS_MaxStrom_Laden", "Unit_Amper"), ("DCW_IstSpannung_NV", "Unit_Volt"),
+    ),
+    "gm": (
+        ("HVBatteryCurrent", "A"), ("HVBatteryVoltage", "V"), ("HVBatteryMaxCellVoltage", "V"),
+        ("AuxBatteryVoltage", "V"), ("MotorCurrentPhaseA", "A"),
+    ),
+    "bmw": (
+        ("Battery_Current", "Amps"), ("Battery_Volts", "Volts"), ("DC_link", "Volts"),
+        ("Charging_Current_Max", "Amps"), ("Discharge_Voltage_Min", "Volts"),
+    ),
+    "nissan": (
+        ("LB_Current", "A"), ("LB_Total_Voltage", "V"), ("LB_Discharge_Power_Limit", "kW"),
+        ("Cell_Voltage_Max", "V"),
+    ),
+    "china": (
+        ("BMS_PackCurrent", "A"), ("BMS_PackVoltage", "V"), ("VCU_MaxChargeCurrent", "A"),
+        ("VCU_TargetVoltage", "V"), ("BMS_Cell01_V", "V"),
+    ),
+    "without_units": (
+        ("Pack_Current", ""), ("Pack_Voltage", ""), ("High_Cell_Volt", ""), ("Low_Cell_Volt", ""),
+        ("MaxChargeCurrent", ""),
+    ),
+    "stellantis": (
+        ("HV_BATT_REAL_CURR_HD", "A"), ("HV_BATT_REAL_VOLT_HD", "V"),
+        ("HV_BATT_MAX_REAL_CURR", "A"), ("HV_BATT_NOM_CH_VOLTAGE", "V"),
+        ("HV_BATT_PEAK_DISCH_CURR_HD", "A"),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("make", list(PUBLIC))
+def test_the_packs_signals_come_first_by_name(make: str, tmp_path: Path) -> None:
+    lines = ['VERSION "1"', "NS_ :", "BS_:", "BU_: V"]
+    for number, (name, unit) in enumerate(reversed(PUBLIC[make])):
+        lines.append(f"BO_ {256 + number} M{number}: 8 V")
+        lines.append(f' SG_ {name} : 7|16@0+ (0.1,0) [0|0] "{unit}" V')
+    (tmp_path / "car.dbc").write_text("\n".join([*lines, ""]))
+    found = named_signals(tmp_path / "car.dbc", [])
+    assert found["current"][0].signal == PUBLIC[make][0][0]
+    assert found["voltage"][0].signal == PUBLIC[make][1][0]
