@@ -9,10 +9,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
+import can
+
+from cangauge._resources import shared_file
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
 from cangauge.service.run import Service
+from cells_bus import ALL_CELLS, CAR, CELLS_DBC, CELLS_ON_BUS, all_cell_frames
 from live import leaf_model_path, short_log, virtual_port, waits
 
 SAMPLE_S = 0.05
@@ -35,11 +39,20 @@ class RunningService:
         Further lines of the configuration.
     port : int, optional
         Of HTTP.
+    with_cells : bool
+        A car that gives the voltages of 96 cells, the 40th of them lower.
     """
 
-    def __init__(self, folder: Path, text: str = "", port: int | None = None) -> None:
+    def __init__(
+        self, folder: Path, text: str = "", port: int | None = None, *, with_cells: bool = False
+    ) -> None:
         self.port = port or free_port()
         self._channel = folder.name
+        self._with_cells = with_cells
+        if with_cells:
+            (folder / "cells.dbc").write_text(CELLS_DBC)
+            (folder / "car.toml").write_text(CAR + ALL_CELLS)
+            text = f'dbc = "{shared_file("dbc", "generic_pack.dbc")}"\nmap = "car.toml"\n{text}'
         path = folder / "run.toml"
         path.write_text(
             f'model = "{leaf_model_path()}"\ninterface = "virtual"\nchannel = "{folder.name}"\n'
@@ -80,8 +93,15 @@ class RunningService:
                 break
             due_s += SAMPLE_S
             if not self.silent.is_set():
-                for frame in encoder.encode(sample):
+                for frame in [*self._cells(sample.voltage_v), *encoder.encode(sample)]:
                     frame.timestamp = time.time()
                     bus.send(frame)
         with suppress(Exception):
             bus.close()
+
+    def _cells(self, voltage_v: float) -> list[can.Message]:
+        if not self._with_cells:
+            return []
+        cells_v = [voltage_v / CELLS_ON_BUS] * CELLS_ON_BUS
+        cells_v[39] -= 0.02
+        return all_cell_frames(cells_v)
