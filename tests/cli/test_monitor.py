@@ -73,7 +73,7 @@ async def until(app: MonitorScreen, pilot: object, pattern: str, seconds: float 
 
 def test_a_small_terminal_shows_everything(running: RunningService) -> None:
     async def act(app: MonitorScreen, pilot: object) -> None:
-        await until(app, pilot, r"energy left +[1-9]")
+        await until(app, pilot, r"frames +[1-9]\d* /s +energy left +[1-9]")
         rows = shown(app)
         assert len(rows) == 24
         text = "\n".join(rows)

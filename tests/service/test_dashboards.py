@@ -16,11 +16,10 @@ from typing import Any
 
 import pytest
 
-from conftest import PROJECT
 from live import waits
 from running import RunningService, free_port
 
-GRAFANA = PROJECT / "contrib" / "grafana"
+GRAFANA = Path(__file__).resolve().parents[2] / "contrib" / "grafana"
 BOARDS = sorted((GRAFANA / "dashboards").glob("*.json"))
 NOT_ON_THIS_BUS = {"cangauge_bus_queue_drops_total"}
 """A count of SocketCAN only."""
