@@ -17,21 +17,28 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from cangauge.cli import status as status_module
+from cangauge.cli.monitor import status_line
+from cangauge.cli.monitor_screen import lines as screen_lines
 from cangauge.errors import CangaugeError
 from cangauge.service import status_client
 from cangauge.service.status_client import fetch_status
+from cangauge.service.status_feed import StatusFeed
 from live import in_process
 
 NUMBERS = dict.fromkeys(
-    ("soc_pct", "soc_std_pct", "soc_newton_pct", "soc_coulomb_pct", "residual_v"), 1.5
-)
+    (
+        "soc_pct", "soc_std_pct", "soc_newton_pct", "soc_coulomb_pct", "voltage_model_v",
+        "residual_v",
+    ),
+    1.5,
+)  # fmt: skip
 GOOD: dict[str, Any] = {
     "schema": 1, "version": "0.1.0", "bus": "can0", "vehicle": "x", "model": "m.json",
     "method": "ekf", "time_source": "receive", "status": "valid", "reasons": ["input_stale"],
     "uptime_s": 3.0, "loop_stuck": False, "estimate": NUMBERS,
     "sample": {"age_s": 0.1, "current_a": 1.0, "voltage_v": None, "temperature_c": 20},
     "samples": 5, "samples_per_s": 1.0, "frames": {"received": 1, "used": 1, "lost": 0},
-    "rejects": {"crc_errors": 2}, "bus_counts": {"losses": 0}, "bus_trouble": None,
+    "rejects": {"crc_errors": 2}, "bus_up": True, "bus_counts": {"losses": 0}, "bus_trouble": None,
     "health": {
         "capacity_ah": 60.0, "capacity_std_ah": 2.0, "resistance_ratio": 1.0,
         "resistance_std": 0.1, "offset_a": None,
@@ -129,8 +136,14 @@ def test_any_object_is_shown_or_refused(changes: list[tuple[tuple[Any, ...], Any
         found = status_client._content(body, "x")
     except CangaugeError:
         return
-    assert status_module._rows(found)
+    assert status_module.status_rows(found)
     assert isinstance(found["status"] in status_module.USABLE, bool)
+    feed = StatusFeed("x")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("cangauge.service.status_feed.fetch_status", lambda *_: found)
+        feed.poll()
+    assert status_line(feed.view())
+    assert len(screen_lines(feed.view(), 80, 23, 60.0, is_paused=False)) >= 20
 
 
 def test_a_good_answer_is_shown(tmp_path: Path) -> None:

@@ -32,6 +32,7 @@ COMMANDS: Final = {
     "packs-check": "Measure the SoC errors, and their σ, on recorded packs.",
     "run": "Estimate the state of charge from a bus, and publish it there.",
     "status": "Show the state of a running service: SoC ± standard deviation [%], frames, delays.",
+    "monitor": "Watch a running service in the terminal: values, charts, status with its reasons.",
     "replay": "Play a recorded log or capture on a bus.",
     "inspect": "Show what a log or capture holds, and the sign of its current.",
     "twin": "Simulate a pack, a drive, the weather and the sensors: a log whose truth is known.",

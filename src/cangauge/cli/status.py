@@ -58,12 +58,13 @@ def status_command(
     if json_output:
         emit_json(status)
     else:
-        print_table(f"cangauge at {place}", ("", "<"), _rows(status))
+        print_table(f"cangauge at {place}", ("", "<"), status_rows(status))
     if status.get("status") not in USABLE:
         raise typer.Exit(1)
 
 
-def _rows(status: dict[str, Any]) -> list[tuple[str, str]]:
+def status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return the rows of name and value that show a status."""
     estimate, sample = status["estimate"], status["sample"] or {}
     frames, record = status["frames"], status["record"]
     reasons = "; ".join(each.replace("_", " ") for each in status["reasons"])
@@ -128,39 +129,40 @@ def _pack_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
     rows = []
     if health is not None:
         rows += [
-            ("capacity", _with_std(health["capacity_ah"], health["capacity_std_ah"], "Ah")),
+            ("capacity", with_std(health["capacity_ah"], health["capacity_std_ah"], "Ah")),
             (
                 "resistance",
-                _with_std(health["resistance_ratio"], health["resistance_std"], "× the model's", 2),
+                with_std(health["resistance_ratio"], health["resistance_std"], "× the model's", 2),
             ),
             ("current offset", number(health["offset_a"], 2, "A")),
         ]
     if power is not None:
-        energy = _with_std(
+        energy = with_std(
             _times(power["energy_wh"], 1e-3), _times(power["energy_std_wh"], 1e-3), "kWh"
         )
         rows += [
             (
                 "discharge for 10 s",
-                _with_std(power["discharge_a"], power["discharge_std_a"], "A", 0),
+                with_std(power["discharge_a"], power["discharge_std_a"], "A", 0),
             ),
-            ("charge for 10 s", _with_std(power["charge_a"], power["charge_std_a"], "A", 0)),
+            ("charge for 10 s", with_std(power["charge_a"], power["charge_std_a"], "A", 0)),
             ("energy left", energy),
         ]
     if cells is not None:
         weakest = "" if cells["weakest"] is None else f"number {cells['weakest']}: "
         rows += [
-            ("weakest cell", weakest + _with_std(cells["soc_pct"], cells["soc_std_pct"], "%")),
+            ("weakest cell", weakest + with_std(cells["soc_pct"], cells["soc_std_pct"], "%")),
             (
                 "cells",
                 f"{cells['cells']} known, spread {number(cells['spread_pct'], 1, '%')}; pack less"
-                f" their sum {_with_std(cells['sum_error_v'], cells['sum_std_v'], 'V', 2)}",
+                f" their sum {with_std(cells['sum_error_v'], cells['sum_std_v'], 'V', 2)}",
             ),
         ]
     return rows + [("NOTICE", each) for each in status["notices"]]
 
 
-def _with_std(value: float | None, std: float | None, unit: str, digits: int = 1) -> str:
+def with_std(value: float | None, std: float | None, unit: str, digits: int = 1) -> str:
+    """Return a value and its standard deviation with their unit."""
     return f"{number(value, digits)} ± {number(std, digits, unit)}"
 
 

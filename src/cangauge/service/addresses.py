@@ -26,6 +26,7 @@ from cangauge.errors import InputError
 _LOG = logging.getLogger(__name__)
 
 TOKEN_VARIABLE: Final = "CANGAUGE_HTTP_TOKEN"  # noqa: S105 - the variable's name, no secret
+MQTT_PASSWORD_VARIABLE: Final = "CANGAUGE_MQTT_PASSWORD"  # noqa: S105 - as above
 LOOPBACK: Final = "127.0.0.1"
 SHORTEST_TOKEN: Final = 16
 LONGEST_TOKEN: Final = 1024
@@ -131,6 +132,34 @@ def read_token(path: str | PathLike[str] | None, environment: Mapping[str, str])
     if path is None:
         given = environment.get(TOKEN_VARIABLE)
         return None if given is None else _checked(given, TOKEN_VARIABLE)
+    text = _read_secret(path, "http.token_exposed", "token", "http_token_file")
+    return _checked(text, str(path))
+
+
+def read_mqtt_password(
+    path: str | PathLike[str] | None, environment: Mapping[str, str]
+) -> str | None:
+    """Return the password in a file, or in the environment; None if there is neither.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or is empty, too long or not UTF-8 text of one line.
+    """
+    if path is None:
+        return environment.get(MQTT_PASSWORD_VARIABLE)
+    text = _read_secret(path, "mqtt.password_exposed", "password", "mqtt.password_file")
+    password = text.rstrip("\r\n")
+    if not 0 < len(password) <= LONGEST_TOKEN or not password.isprintable():
+        raise InputError(
+            f"a password is one line of 1 to {LONGEST_TOKEN} printable characters",
+            source=path,
+            field="mqtt.password_file",
+        )
+    return password
+
+
+def _read_secret(path: str | PathLike[str], event: str, kind: str, key: str) -> str:
     with open_regular(path) as file:
         rights = os.fstat(file.fileno()).st_mode
         data = file.read(LONGEST_TOKEN + 2)
@@ -138,14 +167,14 @@ def read_token(path: str | PathLike[str] | None, environment: Mapping[str, str])
         emit(
             _LOG,
             logging.WARNING,
-            "http.token_exposed",
-            f"{path}: every user of this machine can read or change this token: chmod 600 it",
+            event,
+            f"{path}: every user of this machine can read or change this {kind}: chmod 600 it",
             path=str(path),
         )
     try:
-        return _checked(data.decode("utf-8"), str(path))
+        return data.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise InputError("not UTF-8 text", source=path, field="http_token_file") from error
+        raise InputError("not UTF-8 text", source=path, field=key) from error
 
 
 def _checked(content: str, source: str) -> str:

@@ -21,12 +21,14 @@ reference of all keys as Markdown. Paths in a file are relative to it::
 from __future__ import annotations
 
 import os
+import re
+import socket
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Self, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, get_args, get_origin
 
 from pydantic import (
     BaseModel,
@@ -57,11 +59,14 @@ from cangauge.estimation.settings import (
 )
 from cangauge.logs.log import TEMPERATURE_SOURCES, TemperatureSource
 from cangauge.model.delay_line import GAP_S
-from cangauge.service.addresses import HttpAddress, http_address
+from cangauge.service.addresses import HttpAddress, http_address, read_mqtt_password
 from cangauge.service.loop import CHECKPOINT_EVERY_S, LoopSettings
 from cangauge.service.pipeline import PipelineSettings
 from cangauge.service.recording import RecordLimits
 from cangauge.service.state import StateSettings, state_path
+
+if TYPE_CHECKING:
+    from cangauge.service.mqtt import MqttSettings
 
 DEFAULT_VEHICLE: Final = "generic"
 """Default of `replay` as well, so that both commands work together without options."""
@@ -103,10 +108,10 @@ def _key(
     default_text: str = "",
     needs_restart: bool = False,
     is_path: bool = False,
-    **bounds: float,
+    **bounds: float | str,
 ) -> Any:
     info = OptionInfo(metavar, flags, unit, default_text, needs_restart, is_path)
-    field: FieldInfo = Field(default, description=text, **bounds)  # type: ignore[call-overload] # bounds are numbers
+    field: FieldInfo = Field(default, description=text, **bounds)  # type: ignore[call-overload] # bounds are numbers or patterns
     field.metadata.append(info)
     return field
 
@@ -125,6 +130,10 @@ def _none_for_auto(value: object) -> object:
         except ValueError:
             raise ValueError("neither a number nor auto") from None
     return value
+
+
+_TOPIC: Final = r"^[^/+#\s\x00]+(/[^/+#\s\x00]+)*$"
+"""Topic of MQTT without wildcards and empty levels."""
 
 
 class _Strict(BaseModel):
@@ -222,6 +231,59 @@ class LimitsConfig(_Strict):
         "the lower end of the identified SoC",
         unit="%",
         le=100.0,
+    )
+
+
+class MqttConfig(_Strict):
+    """MQTT broker that takes the state; see `MqttSettings`."""
+
+    broker: str = _key(
+        ..., "Host name or address of the MQTT broker.", needs_restart=True, min_length=1
+    )
+    port: int | None = _key(
+        None,
+        "Its port.",
+        default_text="1883, with TLS 8883",
+        needs_restart=True,
+        ge=1,
+        le=65535,
+    )
+    tls: StrictBool = _key(False, "Encrypt, and check its certificate.", needs_restart=True)
+    ca_file: str | None = _key(
+        None,
+        "PEM file of the authority that signed it.",
+        default_text="the system's",
+        needs_restart=True,
+        is_path=True,
+    )
+    user: str | None = _key(None, "User name.", needs_restart=True)
+    password_file: str | None = _key(
+        None,
+        "File with the password; or in CANGAUGE_MQTT_PASSWORD.",
+        needs_restart=True,
+        is_path=True,
+    )
+    topic_prefix: str = _key(
+        "cangauge",
+        "Topics are PREFIX/DEVICE/state and PREFIX/DEVICE/availability.",
+        needs_restart=True,
+        pattern=_TOPIC,
+    )
+    discovery_prefix: str = _key(
+        "homeassistant",
+        'Home Assistant\'s prefix of discovery; "" without discovery.',
+        needs_restart=True,
+        pattern=f"{_TOPIC}|^$",
+    )
+    device: str | None = _key(
+        None,
+        "Name of this service among those of the broker.",
+        default_text="cangauge_HOST_CHANNEL",
+        needs_restart=True,
+        pattern=r"^[A-Za-z0-9_-]{1,64}$",
+    )
+    every_s: FiniteFloat = _key(
+        1.0, "Interval of the states.", unit="s", needs_restart=True, ge=0.1, le=3600.0
     )
 
 
@@ -446,6 +508,7 @@ class RunConfig(_Strict):
         needs_restart=True,
         is_path=True,
     )
+    mqtt: MqttConfig | None = _key(None, "MQTT broker that takes the state (extra `mqtt`).")
     status_socket: str = _key(
         "auto",
         "Unix socket for `cangauge status`; auto: in the user's runtime folder.",
@@ -513,6 +576,25 @@ class RunConfig(_Strict):
         """Return the address of HTTP, None without; may raise InputError."""
         return None if self.http is None else http_address(self.http, self.http_token_file)
 
+    def mqtt_settings(self, bus: str) -> MqttSettings | None:
+        """Return the MQTT broker for a bus of this name, None without; may raise InputError."""
+        if self.mqtt is None:
+            return None
+        # An optional dependency: the import raises the error if it is missing.
+        from cangauge.service.mqtt import MqttSettings  # noqa: PLC0415
+
+        given = self.mqtt.model_dump(exclude={"password_file"})
+        given["port"] = self.mqtt.port or (8883 if self.mqtt.tls else 1883)
+        given["device"] = self.mqtt.device or re.sub(
+            r"[^A-Za-z0-9_-]+", "_", f"cangauge_{socket.gethostname()}_{bus}"
+        )
+        password = read_mqtt_password(self.mqtt.password_file, os.environ)
+        if password is not None and self.mqtt.user is None:
+            raise InputError(
+                "is missing", field="mqtt.user", cure="name the user whose password is given"
+            )
+        return MqttSettings(**given, password=password)
+
     def unix_path(self) -> Path | None:
         """Return the path of the unix socket, if one is given."""
         return None if self.status_socket in {"auto", "off"} else Path(self.status_socket)
@@ -567,9 +649,23 @@ class RunConfig(_Strict):
             raise InputError(problem, source=self._file, field="poll", cure=cure)
 
 
-_PATHS: Final = tuple(
-    name for name, field in RunConfig.model_fields.items() if option_info(field).is_path
-)
+def _in_folder(model: type[BaseModel], data: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return data of a file with its paths relative to the file's folder."""
+    found = dict(data)
+    for name in data.keys() & model.model_fields.keys():
+        field, value = model.model_fields[name], data[name]
+        if option_info(field).is_path and isinstance(value, str):
+            found[name] = str(folder / value)
+        elif isinstance(value, Mapping) and (inner := _own_model(field)) is not None:
+            found[name] = _in_folder(inner, value, folder)
+    return found
+
+
+def _own_model(field: FieldInfo) -> type[BaseModel] | None:
+    """Return the model of a key that is a table of further keys."""
+    return next(
+        (each for each in (field.annotation, *get_args(field.annotation)) if _is_own(each)), None
+    )
 
 
 def load_config(
@@ -600,8 +696,7 @@ def load_config(
         return RunConfig.model_validate(given)
     data = read_toml(path)
     validated(RunConfig, _with_model(data), path)
-    folder = Path(path).parent
-    data |= {key: str(folder / data[key]) for key in _PATHS if isinstance(data.get(key), str)}
+    data = _in_folder(RunConfig, data, Path(path).parent)
     if given.keys() & {"vehicle", "dbc", "map"}:
         # A vehicle given as an option replaces the file's as a whole.
         data = {key: value for key, value in data.items() if key not in {"vehicle", "dbc", "map"}}
@@ -675,9 +770,8 @@ def config_keys() -> list[ConfigKey]:
 
 def _keys(model: type[BaseModel], prefix: str) -> Iterator[ConfigKey]:
     for name, field in model.model_fields.items():
-        inner = [each for each in (field.annotation, *get_args(field.annotation)) if _is_own(each)]
-        if inner:
-            yield from _keys(inner[0], f"{prefix}{name}.")
+        if (inner := _own_model(field)) is not None:
+            yield from _keys(inner, f"{prefix}{name}.")
             continue
         info = option_info(field)
         flags = info.flags or ((f"--{name.replace('_', '-')}",) if info.metavar else ())

@@ -292,6 +292,7 @@ class Service:
                 self.pipeline, port, identity=identity, notifier=notifier, record=recorder
             )
             _serve_status(config, monitor, stack)
+            _publish_mqtt(config, monitor, stack)
             emit(
                 _LOG,
                 logging.INFO,
@@ -337,7 +338,7 @@ def _log_changes(old: RunConfig, new: RunConfig) -> None:
 
 def _value(content: Any, key: str) -> object:
     for part in key.split("."):
-        content = content[part]
+        content = None if content is None else content[part]
     return content
 
 
@@ -374,6 +375,15 @@ def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None
             + (", with a token" if http.token else ", without a token"),
             port=endpoint.port,
         )
+
+
+def _publish_mqtt(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None:
+    settings = config.mqtt_settings(monitor.latest.identity.bus)
+    if settings is not None:
+        # An optional dependency.
+        from cangauge.service.mqtt import MqttPublisher  # noqa: PLC0415
+
+        stack.enter_context(MqttPublisher(lambda: monitor.latest, settings))
 
 
 def _summary_line(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary) -> str:

@@ -155,7 +155,15 @@ _SHAPE: Final[dict[str, Any]] = {
     "uptime_s": (int, float),
     "loop_stuck": bool,
     "estimate": dict.fromkeys(
-        ("soc_pct", "soc_std_pct", "soc_newton_pct", "soc_coulomb_pct", "residual_v"), _Number
+        (
+            "soc_pct",
+            "soc_std_pct",
+            "soc_newton_pct",
+            "soc_coulomb_pct",
+            "voltage_model_v",
+            "residual_v",
+        ),
+        _Number,
     ),
     "sample": (
         None,
@@ -165,6 +173,7 @@ _SHAPE: Final[dict[str, Any]] = {
     "samples_per_s": _Number,
     "frames": {"received": int, "used": int, "lost": int},
     "rejects": {"": int},
+    "bus_up": bool,
     "bus_counts": {"": int},
     "bus_trouble": (str, type(None)),
     "config": {"reloading": bool, "problem": (str, type(None))},
@@ -213,8 +222,8 @@ _SHAPE: Final[dict[str, Any]] = {
         },
     ),
 }
-"""What `cangauge status` needs of an answer: types by key, of every item of a list, of every value
-of an object whose keys may be any (""); a pair with None may be null."""
+"""What `cangauge status` and `cangauge monitor` need of an answer: types by key, of every item of a
+list, of every value of an object whose keys may be any (""); a pair with None may be null."""
 _LARGEST: Final = 1e18
 
 

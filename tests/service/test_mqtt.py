@@ -1,0 +1,250 @@
+"""MQTT against a real mosquitto: discovery, states, last will, and a broker that goes away."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cangauge.errors import InputError
+from cangauge.service.config import load_config
+from live import Command, leaf_model_path, waits
+from running import RunningService, free_port
+
+MOSQUITTO = shutil.which("mosquitto", path=f"{os.environ['PATH']}:/usr/sbin")
+if MOSQUITTO is None:
+    pytest.skip("mosquitto is not installed (apt-get install mosquitto)", allow_module_level=True)
+mqtt = pytest.importorskip("paho.mqtt.client", reason="needs the extra cangauge[mqtt]")
+
+PASSWORD = "made up for this test"  # noqa: S105
+
+
+class Broker:
+    """A mosquitto on a port of its own that keeps nothing on disk."""
+
+    def __init__(self, folder: Path, lines: str = "allow_anonymous true\n") -> None:
+        self.port = free_port()
+        self._config = folder / "mosquitto.conf"
+        self._config.write_text(
+            f"user root\nlistener {self.port} 127.0.0.1\npersistence false\n{lines}"
+        )
+        self.start()
+
+    def start(self) -> None:
+        self.process = subprocess.Popen(
+            [MOSQUITTO, "-c", self._config], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+
+    def end(self) -> None:
+        self.process.send_signal(signal.SIGCONT)
+        self.process.terminate()
+        self.process.wait(5.0)
+
+
+class Listener:
+    """The latest message of each topic, as Home Assistant would see them."""
+
+    def __init__(self, broker: Broker, user: str | None = None, ca: Path | None = None) -> None:
+        self.latest: dict[str, str] = {}
+        self.retained: set[str] = set()
+        self._client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
+        self._client.reconnect_delay_set(1, 1)
+        if user:
+            self._client.username_pw_set(user, PASSWORD)
+        if ca:
+            self._client.tls_set(str(ca))
+        self._client.on_connect = lambda client, *_: client.subscribe("#")
+        self._client.on_message = self._take
+        self._client.connect_async("127.0.0.1" if ca is None else "localhost", broker.port)
+        self._client.loop_start()
+
+    def _take(self, client: Any, data: object, message: Any) -> None:
+        self.latest[message.topic] = message.payload.decode()
+        if message.retain:
+            self.retained.add(message.topic)
+
+    def state(self) -> dict[str, Any]:
+        found: dict[str, Any] = json.loads(self.latest.get("cangauge/bench/state", "{}"))
+        return found
+
+    @property
+    def availability(self) -> str | None:
+        return self.latest.get("cangauge/bench/availability")
+
+    def close(self) -> None:
+        self._client.disconnect()
+        self._client.loop_stop()
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    broker = Broker(tmp_path)
+    yield broker
+    broker.end()
+
+
+@pytest.fixture
+def listener(broker: Broker) -> Iterator[Listener]:
+    listener = Listener(broker)
+    yield listener
+    listener.close()
+
+
+def section(port: int, more: str = "") -> str:
+    return f'[mqtt]\nbroker = "127.0.0.1"\nport = {port}\ndevice = "bench"\nevery_s = 0.2\n{more}'
+
+
+def test_home_assistant_finds_sensors_and_states(
+    tmp_path: Path, broker: Broker, listener: Listener
+) -> None:
+    with RunningService(tmp_path, section(broker.port)) as running:
+        assert waits(lambda: (listener.state().get("energy_kwh") or 0.0) > 0.0, 10.0)
+        state = listener.state()
+        estimate = running.service.pipeline.latest
+        assert state["soc_pct"] == pytest.approx(estimate.soc_pct, abs=0.5)
+        assert 0.0 < state["soc_std_pct"] < 5.0
+        assert 250.0 < state["voltage_v"] < 450.0
+        assert listener.availability == "online"
+        sensors = {
+            topic.split("/")[3]: json.loads(text)
+            for topic, text in listener.latest.items()
+            if topic.startswith("homeassistant/sensor/bench/")
+        }
+        for key, sensor in sensors.items():
+            assert f"value_json.{key}" in sensor["value_template"]
+            assert key in state
+            assert sensor["state_topic"] == "cangauge/bench/state"
+            assert sensor["availability"][0]["topic"] == "cangauge/bench/availability"
+        kinds = {
+            key: (each.get("device_class"), each.get("unit_of_measurement"))
+            for key, each in sensors.items()
+        }
+        assert kinds["soc_pct"] == ("battery", "%")
+        assert kinds["current_a"] == ("current", "A")
+        assert kinds["energy_kwh"] == ("energy_storage", "kWh")
+        assert kinds["status"] == ("enum", None)
+        assert "initialising" in sensors["status"]["options"]
+        late = Listener(broker)
+        assert waits(lambda: "cangauge/bench/state" in late.retained)
+        assert f"homeassistant/sensor/bench/{next(iter(sensors))}/config" in late.retained
+        late.close()
+    assert waits(lambda: listener.availability == "offline")
+
+
+def test_a_broker_that_goes_costs_no_sample(
+    tmp_path: Path, broker: Broker, listener: Listener
+) -> None:
+    with RunningService(tmp_path, section(broker.port)) as running:
+        assert waits(lambda: listener.availability == "online")
+        broker.end()
+        before, began_s = running.service.pipeline.samples, time.monotonic()
+        time.sleep(2.0)
+        rate = (running.service.pipeline.samples - before) / (time.monotonic() - began_s)
+        listener.latest.clear()
+        broker.start()
+        # A broker without memory has discovery, availability and state again.
+        assert waits(lambda: listener.availability == "online", 10.0)
+        assert waits(lambda: "soc_pct" in listener.state())
+        assert "homeassistant/sensor/bench/soc_pct/config" in listener.latest
+    assert rate == pytest.approx(20.0, rel=0.15)
+    assert running.summary is not None
+    assert running.summary["lost"] == 0
+
+
+def test_a_broker_that_hangs_delays_no_stop(tmp_path: Path, broker: Broker) -> None:
+    running = RunningService(tmp_path, section(broker.port))
+    with running:
+        time.sleep(0.5)
+        broker.process.send_signal(signal.SIGSTOP)
+        time.sleep(0.5)
+        began_s = time.monotonic()
+    assert time.monotonic() - began_s < 3.0
+    assert running.summary is not None
+
+
+def test_a_killed_service_is_offline_by_its_last_will(
+    tmp_path: Path, broker: Broker, listener: Listener
+) -> None:
+    path = tmp_path / "run.toml"
+    path.write_text(
+        f'model = "{leaf_model_path()}"\ninterface = "virtual"\nchannel = "x"\n'
+        f'status_socket = "off"\n{section(broker.port)}'
+    )
+    service = Command("run", "--config", path)
+    try:
+        assert waits(lambda: listener.availability == "online", 30.0)
+    finally:
+        service.process.kill()
+        service.end()
+    assert waits(lambda: listener.availability == "offline")
+
+
+def test_password_and_tls_are_used(tmp_path: Path) -> None:
+    certificate = tmp_path / "ca.pem"
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj",
+         "/CN=localhost", "-addext", "subjectAltName=DNS:localhost",
+         "-keyout", tmp_path / "key.pem", "-out", certificate],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    secret = tmp_path / "password"
+    secret.write_text(PASSWORD + "\n")
+    secret.chmod(0o600)
+    subprocess.run(
+        ["mosquitto_passwd", "-b", "-c", tmp_path / "users", "car", PASSWORD],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    broker = Broker(
+        tmp_path,
+        f"cafile {certificate}\ncertfile {certificate}\nkeyfile {tmp_path / 'key.pem'}\n"
+        f"allow_anonymous false\npassword_file {tmp_path / 'users'}\n",
+    )
+    listener = Listener(broker, "car", certificate)
+    text = section(broker.port, 'tls = true\nca_file = "ca.pem"\nuser = "car"\n')
+    text = text.replace("127.0.0.1", "localhost") + 'password_file = "password"\n'
+    try:
+        with RunningService(tmp_path, text):
+            assert waits(lambda: "soc_pct" in listener.state())
+    finally:
+        listener.close()
+        broker.end()
+
+
+@pytest.mark.parametrize(
+    ("lines", "field"),
+    [
+        ('broker = ""\n', "mqtt.broker"),
+        ('broker = "b"\nport = 0\n', "mqtt.port"),
+        ('broker = "b"\ntopic_prefix = "a/#"\n', "mqtt.topic_prefix"),
+        ('broker = "b"\ndevice = "a/b"\n', "mqtt.device"),
+        ('broker = "b"\npassword = "x"\n', "mqtt.password"),
+        ('broker = "b"\npassword_file = "run.toml"\n', "mqtt.password_file"),
+        ('broker = "b"\npassword_file = "short"\n', "mqtt.user"),
+    ],
+)
+def test_a_wrong_section_is_refused_by_key(tmp_path: Path, lines: str, field: str) -> None:
+    (tmp_path / "short").write_text("x\n")
+    path = tmp_path / "run.toml"
+    path.write_text(f'model = "{leaf_model_path()}"\n[mqtt]\n{lines}')
+    with pytest.raises(InputError) as caught:
+        load_config(path).mqtt_settings("can0")
+    assert caught.value.field == field
+
+
+def test_a_password_is_in_no_repr(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CANGAUGE_MQTT_PASSWORD", PASSWORD)
+    path = tmp_path / "run.toml"
+    path.write_text(f'model = "{leaf_model_path()}"\n[mqtt]\nbroker = "b"\nuser = "u"\n')
+    config = load_config(path)
+    settings = config.mqtt_settings("can0")
+    assert settings is not None
+    assert settings.password == PASSWORD
+    assert PASSWORD not in repr(settings) + repr(config)
