@@ -60,13 +60,13 @@ def degraded(estimate: RecordedEstimate, *spans: tuple[int, int]) -> RecordedEst
 
 def test_fit_states_range_and_what_is_missing(found: Identification) -> None:
     text = fit_verdict(found)
-    assert text.startswith("Covers 40 to 90 % SoC with a mean voltage error of ")
-    assert "too few rows below 40 % and above 90 %" in text
+    assert text.startswith("Covers 42 to 87 % SoC with a mean voltage error of ")
+    assert "too few rows below 42 % and above 87 %" in text
 
 
 def test_fit_over_a_full_discharge_lacks_no_range() -> None:
     text = fit_verdict(fit([synthetic_log(hours=1.2, noise_v=0.5, name="full")]))
-    assert text.startswith("Covers 0 to 100 % SoC")
+    assert text.startswith("Covers 1 to 98 % SoC")
     assert "too few rows" not in text
 
 
@@ -132,8 +132,8 @@ def test_inspection_states_what_is_identifiable(log: Log) -> None:
     text = inspect_verdict(found)
     lacking = next(item for item in found.abilities if item.verdict == "no")
     assert text.startswith("This log can identify ")
-    assert f"but not {lacking.topic}" in text
-    assert text.endswith(f"{lacking.text.rstrip('.')}.")
+    assert f"; not {lacking.topic}" in text
+    assert text.endswith(f". {lacking.topic.capitalize()}: {lacking.text.rstrip('.')}.")
 
 
 @pytest.mark.parametrize("rows", [1, 10])
@@ -160,3 +160,30 @@ def test_inspect_never_overwrites_its_log(log: Log, tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["inspect", str(path), "--report", str(path)])
     assert isinstance(done.exception, InputError)
     assert path.read_text(encoding="utf-8").startswith("time_s")
+
+
+def test_figures_are_written_as_png_and_svg(log: Log, tmp_path: Path) -> None:
+    image = pytest.importorskip("matplotlib.image")
+    path, folder = tmp_path / "drive.csv", tmp_path / "figures"
+    write_log(log, path)
+    done = CliRunner().invoke(app, ["inspect", str(path), "--figures", str(folder)])
+    assert done.exit_code == 0, done.output
+    names = ["01-current", "02-voltage", "03-temperature", "04-state-of-charge"]
+    assert sorted(each.stem for each in folder.glob("*.png")) == names
+    for name in names:
+        pixels = image.imread(folder / f"{name}.png")
+        assert pixels.shape[1] == 2000
+        assert np.unique(pixels.reshape(-1, pixels.shape[2]), axis=0).shape[0] > 20
+        assert "<svg" in (folder / f"{name}.svg").read_text(encoding="utf-8")
+
+
+def test_figures_name_the_extra_they_need(
+    log: Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_log(log, tmp_path / "drive.csv")
+    monkeypatch.setattr("cangauge.cli.options.find_spec", lambda _name: None)
+    arguments = ["inspect", str(tmp_path / "drive.csv"), "--figures", str(tmp_path / "figures")]
+    done = CliRunner().invoke(app, arguments)
+    assert isinstance(done.exception, InputError)
+    assert "pip install 'cangauge[figures]'" in str(done.exception)
+    assert not (tmp_path / "figures").exists()

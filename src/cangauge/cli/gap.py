@@ -12,6 +12,7 @@ from cangauge._io import write_texts_atomic
 from cangauge.cli.options import (
     ColumnsOption,
     DbcOption,
+    FiguresOption,
     JsonOption,
     MapOption,
     ReportOption,
@@ -24,7 +25,7 @@ from cangauge.cli.options import (
     load_log,
     within,
 )
-from cangauge.cli.output import emit_json, note, print_table, progress_shown
+from cangauge.cli.output import emit_json, note, print_table, progress_shown, save_figures
 from cangauge.diagnosis import NONE, UNKNOWN, Diagnosis, diagnose
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
@@ -77,6 +78,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     temperature: TemperatureOption = None,
     temperature_source: TemperatureSourceOption = None,
     report: ReportOption = None,
+    figures: FiguresOption = None,
     json_output: JsonOption = False,
 ) -> None:
     """Diagnose the gap between a model and logs: size, place, probable cause.
@@ -131,6 +133,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
 
         texts[report] = gap_report(found, InputFile.of_model(model_file, model))
     write_texts_atomic(texts)
+    save_figures(figures, "diagnosis.gap_page", found)
     if json_output:
         result = found.to_dict(None if extended is None else str(extended))
         emit_json(result | {"assumed": assumed_of([*diagnosed, *references])})

@@ -15,6 +15,7 @@ from cangauge._io import write_texts_atomic
 from cangauge.cli.options import (
     ColumnsOption,
     DbcOption,
+    FiguresOption,
     JsonOption,
     MapOption,
     ReportOption,
@@ -25,7 +26,7 @@ from cangauge.cli.options import (
     assumed_of,
     check_outputs,
 )
-from cangauge.cli.output import PlainConsole, emit_json, note
+from cangauge.cli.output import PlainConsole, emit_json, note, save_figures
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -56,6 +57,7 @@ def inspect_command(  # noqa: PLR0917 - typer fills the arguments by name
     sign: SignOption = None,
     temperature: TemperatureOption = None,
     report: ReportOption = None,
+    figures: FiguresOption = None,
     json_output: JsonOption = False,
 ) -> None:
     """Show what a log or capture holds, and the sign of its current.
@@ -109,13 +111,14 @@ def inspect_command(  # noqa: PLR0917 - typer fills the arguments by name
         found: LogInspection | CaptureInspection
         found = of_log = inspect_log(log)
         _write_report(report, of_log, log)
+        save_figures(figures, "inspection.inspect_page", of_log, log)
     else:
-        if report is not None:
+        if report is not None or figures is not None:
             raise InputError(
                 "shows a log, and this is a capture",
                 source=path,
-                field="--report",
-                value=str(report),
+                field="--report" if report is not None else "--figures",
+                value=str(report or figures),
                 cure="omit it, or use cangauge estimate --report",
             )
         car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature) if given else None

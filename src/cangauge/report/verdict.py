@@ -114,7 +114,9 @@ def fit_verdict(result: Identification) -> str:
         return f"Too few rows: no {SOC_STEP_PCT:.0f} % of SoC has {MIN_BIN_ROWS} rows."
     low, high = covered
     text = f"Covers {low:.0f} to {high:.0f} % SoC with a mean voltage error of {error}"
-    sides = [f"below {low:.0f} %"] * (low > 0.0) + [f"above {high:.0f} %"] * (high < 100.0)
+    sides = [f"below {low:.0f} %"] * (low >= SOC_STEP_PCT) + [f"above {high:.0f} %"] * (
+        high <= 100.0 - SOC_STEP_PCT
+    )
     if sides:
         text += f"; too few rows {' and '.join(sides)}"
     temperatures = np.concatenate([item.rows.temperature_c for item in result.fits])
@@ -132,7 +134,10 @@ def _covered(soc_pct: np.ndarray) -> tuple[float, float] | None:
     if not runs:
         return None
     begin, end = max(runs, key=lambda run: run[1] - run[0])
-    return float(edges[begin]), float(edges[end])
+    # A range is named no wider than its rows: 87 %, not 90 %.
+    return max(float(edges[begin]), float(soc_pct.min())), min(
+        float(edges[end]), float(soc_pct.max())
+    )
 
 
 def inspect_verdict(found: LogInspection) -> str:
@@ -142,11 +147,13 @@ def inspect_verdict(found: LogInspection) -> str:
         names[ability.verdict].append(ability.topic)
     parts = [
         f"{words} {', '.join(names[verdict])}"
-        for verdict, words in (("yes", "can identify"), ("partly", "partly"), ("no", "but not"))
+        for verdict, words in (("yes", "can identify"), ("partly", "in part"), ("no", "not"))
         if names[verdict]
     ]
-    reason = next((each.text for each in found.abilities if each.verdict == "no"), "")
+    lacking = next((each for each in found.abilities if each.verdict == "no"), None)
     text = "This log " + "; ".join(parts)
     if names["no"] and not names["yes"] and not names["partly"]:
         text = f"This log cannot identify {', '.join(names['no'])}"
-    return f"{text}: {reason.rstrip('.')}." if reason else f"{text}."
+    if lacking is None:
+        return f"{text}."
+    return f"{text}. {lacking.topic.capitalize()}: {lacking.text.rstrip('.')}."
