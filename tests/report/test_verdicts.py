@@ -173,7 +173,7 @@ def test_figures_are_written_as_png_and_svg(log: Log, tmp_path: Path) -> None:
     for name in names:
         pixels = image.imread(folder / f"{name}.png")
         assert pixels.shape[1] == 2000
-        assert np.unique(pixels.reshape(-1, pixels.shape[2]), axis=0).shape[0] > 20
+        assert 0.005 < np.mean(pixels[:, :, 0] < 0.9) < 0.5  # lines on white
         assert "<svg" in (folder / f"{name}.svg").read_text(encoding="utf-8")
 
 
