@@ -20,6 +20,7 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.options import (
     ColumnsOption,
     DbcOption,
+    FiguresOption,
     JsonOption,
     MapOption,
     ReportOption,
@@ -36,7 +37,7 @@ from cangauge.cli.options import (
     refuse_single_row,
     within,
 )
-from cangauge.cli.output import console, emit_json, note, print_table
+from cangauge.cli.output import console, emit_json, note, print_table, save_figures
 from cangauge.errors import InputError
 from cangauge.estimation.settings import VALID_STD_PCT, EstimatorSettings, Method
 from cangauge.logs.canonical import write_table
@@ -119,6 +120,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
         ),
     ] = None,
     report: ReportOption = None,
+    figures: FiguresOption = None,
     json_output: JsonOption = False,
 ) -> None:
     """Estimate the state of charge of a recorded log or capture, offline.
@@ -212,6 +214,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
             write_estimates(part, done.recorded.time_s, done.table)
         if report is not None and page is not None:
             both.enter_context(atomic_path(report)).write_text(page, encoding="utf-8")
+    save_figures(figures, "estimate.estimate_page", done, model_path)
     for warning in done.warnings:
         note(f"warning: {done.recorded.source}: {warning}")
     if json_output:

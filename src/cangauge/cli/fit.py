@@ -13,6 +13,7 @@ from cangauge._io import write_texts_atomic
 from cangauge.cli.options import (
     ColumnsOption,
     DbcOption,
+    FiguresOption,
     JsonOption,
     MapOption,
     ReportOption,
@@ -25,7 +26,7 @@ from cangauge.cli.options import (
     load_log,
     within,
 )
-from cangauge.cli.output import console, emit_json, note, print_table, progress_shown
+from cangauge.cli.output import console, emit_json, note, print_table, progress_shown, save_figures
 from cangauge.errors import InputError
 from cangauge.identify.delays import DelaySearch, search_delays
 from cangauge.identify.effect_search import parse_effect_ids
@@ -102,6 +103,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
     temperature: TemperatureOption = None,
     temperature_source: TemperatureSourceOption = None,
     report: ReportOption = None,
+    figures: FiguresOption = None,
     json_output: JsonOption = False,
 ) -> None:
     """Identify the voltage model of a pack from recorded logs.
@@ -182,6 +184,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
     write_texts_atomic(
         {output: result.model.to_json()} | ({report: page} if report and page else {})
     )
+    save_figures(figures, "fit.fit_page", result)
     if json_output:
         extra: dict[str, object] = {
             "model": str(output),

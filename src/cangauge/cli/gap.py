@@ -12,6 +12,7 @@ from cangauge._io import write_texts_atomic
 from cangauge.cli.options import (
     ColumnsOption,
     DbcOption,
+    FiguresOption,
     JsonOption,
     MapOption,
     ReportOption,
@@ -24,7 +25,7 @@ from cangauge.cli.options import (
     load_log,
     within,
 )
-from cangauge.cli.output import emit_json, note, print_table, progress_shown
+from cangauge.cli.output import emit_json, note, print_table, progress_shown, save_figures
 from cangauge.cli.simulator import SimulatorOptions, corrected_path, write_corrected
 from cangauge.diagnosis import NONE, UNKNOWN, Diagnosis, diagnose
 from cangauge.diagnosis.simulator import SimulatorDiagnosis, diagnose_simulator
@@ -109,6 +110,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     temperature: TemperatureOption = None,
     temperature_source: TemperatureSourceOption = None,
     report: ReportOption = None,
+    figures: FiguresOption = None,
     json_output: JsonOption = False,
 ) -> None:
     """Diagnose the gap between a model and logs: size, place, probable cause.
@@ -168,6 +170,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
             )
             found = of_simulator.diagnosis
     _write(found, model, report, extended)
+    save_figures(figures, "diagnosis.gap_page", found)
     if of_simulator is not None and corrected is not None:
         write_corrected(of_simulator, logs, corrected)
     if json_output:

@@ -11,23 +11,28 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from cangauge._io import write_texts_atomic
 from cangauge.cli.options import (
     ColumnsOption,
     DbcOption,
+    FiguresOption,
     JsonOption,
     MapOption,
+    ReportOption,
     SignOption,
     TableOptions,
     TemperatureOption,
     VehicleOption,
     assumed_of,
+    check_outputs,
 )
-from cangauge.cli.output import PlainConsole, emit_json, note
+from cangauge.cli.output import PlainConsole, emit_json, note, save_figures
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
     from cangauge.inspect.capture import CaptureInspection
     from cangauge.inspect.log import LogInspection
+    from cangauge.logs.log import Log
 
 PIPED_WIDTH = 140
 """Width of the tables where stdout is no terminal [characters]."""
@@ -51,6 +56,8 @@ def inspect_command(  # noqa: PLR0917 - typer fills the arguments by name
     columns: ColumnsOption = None,
     sign: SignOption = None,
     temperature: TemperatureOption = None,
+    report: ReportOption = None,
+    figures: FiguresOption = None,
     json_output: JsonOption = False,
 ) -> None:
     """Show what a log or capture holds, and the sign of its current.
@@ -66,6 +73,8 @@ def inspect_command(  # noqa: PLR0917 - typer fills the arguments by name
 
     `cangauge inspect TripA01.csv.gz --json`
 
+    `cangauge inspect drive.parquet --report drive.html`
+
     `cangauge inspect 1C-Discharge.csv --temperature 24`
 
     `cangauge inspect logger.csv --columns 'time=Stamp,current=I_batt[mA]:-1,voltage=U_batt'`
@@ -79,6 +88,7 @@ def inspect_command(  # noqa: PLR0917 - typer fills the arguments by name
     from cangauge.inspect.log import LogInspection, inspect_log  # noqa: PLC0415
     from cangauge.logs.read import LogFile  # noqa: PLC0415
 
+    check_outputs([report], [path])
     recording = TableOptions(columns, sign, map_file).open(path)
     assumed: dict[str, list[str]] = {}
     options = {"--vehicle": vehicle, "--dbc": dbc, "--map": map_file}
@@ -98,8 +108,19 @@ def inspect_command(  # noqa: PLR0917 - typer fills the arguments by name
         assumed = assumed_of([log])
         if log.assumed:
             note(f"{path}: read as {', '.join(log.assumed)}")
-        found: LogInspection | CaptureInspection = inspect_log(log)
+        found: LogInspection | CaptureInspection
+        found = of_log = inspect_log(log)
+        _write_report(report, of_log, log)
+        save_figures(figures, "inspection.inspect_page", of_log, log)
     else:
+        if report is not None or figures is not None:
+            raise InputError(
+                "shows a log, and this is a capture",
+                source=path,
+                field="--report" if report is not None else "--figures",
+                value=str(report or figures),
+                cure="omit it, or use cangauge estimate --report",
+            )
         car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature) if given else None
         found = inspect_capture(path, car)
     if json_output:
@@ -114,6 +135,16 @@ def inspect_command(  # noqa: PLR0917 - typer fills the arguments by name
         _show(console, {key: value for key, value in found.to_dict().items() if key != "log"})
         if found.log is not None:
             _show_log(console, found.log)
+
+
+def _write_report(path: Path | None, found: LogInspection, log: Log) -> None:
+    if path is None:
+        return
+    # bokeh takes half a second to import.
+    from cangauge.report.inspection import inspect_report  # noqa: PLC0415
+
+    write_texts_atomic({path: inspect_report(found, log)})
+    note(f"report: {path}")
 
 
 def _show_log(console: Console, found: LogInspection) -> None:

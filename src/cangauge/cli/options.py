@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sized
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeVar, cast
 
@@ -85,6 +86,33 @@ ReportOption = Annotated[
     Path | None,
     typer.Option(
         "--report", metavar="FILE.html", help="Write a report as one self-contained page."
+    ),
+]
+
+
+def _drawable(folder: Path | None) -> Path | None:
+    """Refuse `--figures` before any long work if nothing could draw them."""
+    if folder is None:
+        return None
+    if find_spec("matplotlib") is None:
+        raise InputError(
+            "figures are drawn by matplotlib, which is not installed",
+            field="--figures",
+            value=str(folder),
+            cure="pip install 'cangauge[figures]'",
+        )
+    if folder.exists() and not folder.is_dir():
+        raise InputError("is a file", field="--figures", value=str(folder), cure="name a folder")
+    return folder
+
+
+FiguresOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--figures",
+        metavar="DIR",
+        callback=_drawable,
+        help="Write each figure of the report as PNG and SVG (extra `figures`).",
     ),
 ]
 

@@ -8,6 +8,8 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from rich import box
@@ -124,3 +126,25 @@ def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) 
         # Text: brackets in names are not markup.
         table.add_row(*(Text(printable(cell)) for cell in row))
     PlainConsole(highlight=False).print(table)
+
+
+def save_figures(folder: Path | None, page: str, *result: Any) -> None:
+    """Write the figures of a result's page as PNG and SVG, unless `folder` is None.
+
+    Parameters
+    ----------
+    folder : Path, optional
+    page : str
+        Module of `cangauge.report` and function that makes the page, such as "fit.fit_page".
+    *result
+        Arguments of the function.
+    """
+    if folder is None:
+        return
+    # bokeh and matplotlib take a second to import.
+    from cangauge.report.export import write_figures  # noqa: PLC0415
+
+    module, function = page.split(".")
+    make_page = getattr(import_module(f"cangauge.report.{module}"), function)
+    write_figures(make_page(*result), folder)
+    note(f"figures: {folder}")

@@ -306,6 +306,10 @@ class Timeline:
         """Return the axis positions of times [s] of log `number`."""
         return np.asarray(self.start[number] + (time_s - self._first_s[number]) / self._unit_s)
 
+    def since_start(self, elapsed_s: FloatArray) -> FloatArray:
+        """Return the axis positions of times since the start of the first log [s]."""
+        return np.asarray(elapsed_s / self._unit_s)
+
     def line(
         self, pieces: Sequence[tuple[FloatArray, FloatArray]], *, gap_s: float | None = None
     ) -> tuple[FloatArray, FloatArray]:

@@ -35,6 +35,7 @@ from cangauge.report.page import (
     Bullets,
     Figure,
     InputFile,
+    Moment,
     Page,
     Paragraph,
     Section,
@@ -43,6 +44,7 @@ from cangauge.report.page import (
     reconstruction_banners,
     render,
 )
+from cangauge.report.verdict import Period, estimate_verdict, periods
 from cangauge.service.offline import Recorded, RecordedEstimate
 
 _METHODS: Final = {
@@ -58,6 +60,8 @@ _STATUS_COLORS: Final = {
 }
 _MAX_BARS: Final = 500
 """Gaps shorter than the time axis over this number are closed: no screen resolves them."""
+_LISTED_PERIODS: Final = 20
+"""Most periods without a valid estimate to list, the longest ones."""
 
 
 def estimate_report(estimate: RecordedEstimate, model_path: Path | None = None) -> str:
@@ -76,17 +80,26 @@ def estimate_page(estimate: RecordedEstimate, model_path: Path | None = None) ->
     """Return the report's content (see `estimate_report`); `figures` holds the bokeh figures."""
     log, model, settings = estimate.recorded, estimate.model, estimate.settings
     time = TimeFigures([log])
+    found = periods(estimate.table)
+    soc = _soc(estimate, time)
     sections = [
-        Section("State of charge", _soc(estimate, time)),
+        Section("State of charge", soc),
         *_errors(estimate),
         Section("Voltage", _voltage(log, estimate.table, time)),
         Section("Input", _input(log, time)),
-        Section("Status", [_status_figure(log, estimate.table, time), _reasons(estimate.table)]),
+        Section(
+            "Status",
+            [
+                _status_figure(log, estimate.table, time),
+                *_periods(found, soc[0], time),
+                _reasons(estimate.table),
+            ],
+        ),
         Section("Model and settings", _settings(estimate)),
     ]
     return Page(
         title=f"State of charge of {log.name}",
-        lead=_lead(estimate),
+        lead=estimate_verdict(estimate, found),
         subtitle=f"{duration(log.duration_s)}, {len(log):,} samples, estimated by"
         f" {_METHODS[settings.method]} with the model {model.name}.",
         tiles=_tiles(estimate),
@@ -100,24 +113,6 @@ def estimate_page(estimate: RecordedEstimate, model_path: Path | None = None) ->
             *estimate.warnings,
         ],
     )
-
-
-def _lead(estimate: RecordedEstimate) -> str:
-    table, scores = estimate.table, estimate.scores
-    known = np.flatnonzero(np.isfinite(table.soc_pct))
-    if not known.size:
-        return "No sample gives a state of charge."
-    last = known[-1]
-    text = (
-        f"From {number(table.soc_pct[known[0]], 1)} to {number(table.soc_pct[last], 1)} % SoC"
-        f" (±{number(2.0 * table.soc_std_pct[last], 1, '%')} at the end, 2σ)."
-    )
-    if _reference(estimate.recorded) is not None and scores.soc_mae_pct is not None:
-        text += (
-            f" Mean error against the reference {number(scores.soc_mae_pct, 2, '%')},"
-            f" largest {number(scores.soc_max_pct, 2, '%')}."
-        )
-    return text
 
 
 def _tiles(estimate: RecordedEstimate) -> list[Tile]:
@@ -152,7 +147,7 @@ def _reference(log: Recorded) -> FloatArray | None:
     return log.soc_pct
 
 
-def _soc(estimate: RecordedEstimate, time: TimeFigures) -> list[Block]:
+def _soc(estimate: RecordedEstimate, time: TimeFigures) -> list[Figure]:
     log, table = estimate.recorded, estimate.table
     reference = _reference(log)
     at = log.time_s
@@ -372,6 +367,30 @@ def _reasons(table: EstimateTable) -> Table:
         for reason in _occurring(table)
     ]
     return Table(["status or reason", "share of samples", "meaning"], rows)
+
+
+def _periods(found: Sequence[Period], figure: Figure, time: TimeFigures) -> list[Block]:
+    """Return the table of the periods without a valid estimate, each leading to the figure."""
+    if not found:
+        return []
+    longest = sorted(found, key=lambda period: period.start_s - period.end_s)[:_LISTED_PERIODS]
+    rows: list[list[str | Moment]] = []
+    for period in sorted(longest):
+        margin_s = 0.25 * (period.end_s - period.start_s) + 1.0
+        first_s, last_s = period.start_s - margin_s, period.end_s + margin_s
+        start, end = time.timeline.since_start(np.array([first_s, last_s]))
+        rows.append(
+            [
+                Moment(period.when(), figure, float(start), float(end)),
+                duration(period.end_s - period.start_s),
+                period.status.name.lower(),
+                REASON_WORDS.get(period.reason, ""),
+            ]
+        )
+    note = "h:mm:ss since the start of the log. A link zooms the figures to the period."
+    if len(found) > len(rows):
+        note += f" The longest {len(rows)} of {len(found):,} periods."
+    return [Table(["period", "duration", "status", "main reason"], rows, note)]
 
 
 def _occurring(table: EstimateTable) -> Sequence[Reason]:

@@ -51,6 +51,7 @@ from cangauge.report.page import (
     render,
 )
 from cangauge.report.summary import effect_rows, rounded, search_rows
+from cangauge.report.verdict import fit_verdict
 
 _UNITS: Final = {"V": "V", "V/K": "V/K", "ohm": "Ω"}
 _REMOVED_BY: Final = {
@@ -83,8 +84,7 @@ def fit_page(result: Identification) -> Page:
     ]
     return Page(
         title=f"Voltage model {model.name}",
-        lead=f"Voltage error {number(result.voltage_mae_pct, 2, '%')} on the logs of the fit,"
-        f" {number(model.noise.voltage_mae_pct, 2, '%')} on data held out (mean absolute).",
+        lead=fit_verdict(result),
         subtitle=f"Identified from {joined([log.name for log in logs])}:"
         f" {duration(sum(log.duration_s for log in logs))}, {rows:,} rows used.",
         tiles=_tiles(result),

@@ -109,20 +109,46 @@ class Tile:
     hint: str = ""
 
 
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """A table cell that leads to a time in a figure: it zooms the figure's time axis there.
+
+    Parameters
+    ----------
+    text : str
+        Says the time: on paper nothing can be clicked.
+    figure : Figure
+    start, end : float
+        On the figure's horizontal axis.
+    """
+
+    text: str
+    figure: Figure
+    start: float
+    end: float
+
+    def __str__(self) -> str:
+        """Return its text."""
+        return self.text
+
+
 @dataclass(frozen=True)
 class Table:
     """A table of texts; columns of numbers are set flush right."""
 
     kind: ClassVar[str] = "table"
     head: Sequence[str]
-    rows: Sequence[Sequence[str]]
+    rows: Sequence[Sequence[str | Moment]]
     note: str = ""
 
     @property
     def is_numeric(self) -> list[bool]:
         """Whether each column holds nothing but numbers."""
         columns = list(zip(*self.rows, strict=True)) or [()] * len(self.head)
-        return [bool(column) and all(map(_NUMBER.fullmatch, column)) for column in columns]
+        return [
+            bool(column) and all(_NUMBER.fullmatch(str(cell)) for cell in column)
+            for column in columns
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,6 +168,11 @@ class Figure:
     title: str
     plot: Any
     caption: str
+
+    @property
+    def anchor(self) -> str:
+        """Name by which a link of the page leads to the figure."""
+        return re.sub(r"[^a-z0-9]+", "-", f"figure {self.title}".lower()).strip("-")
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,189 @@
+"""The sentence on top of a page: what was found, in words, from the numbers."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from cangauge.cli.app import app
+from cangauge.errors import InputError
+from cangauge.estimation.offline import estimate_log
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.validity import Reason, Status
+from cangauge.identify.fit import Identification, fit
+from cangauge.inspect.log import inspect_log
+from cangauge.logs.canonical import write_log
+from cangauge.logs.log import Log
+from cangauge.model.published import CAPACITY_AH
+from cangauge.report.estimate import estimate_report
+from cangauge.report.inspection import inspect_report
+from cangauge.report.verdict import estimate_verdict, fit_verdict, inspect_verdict, periods
+from cangauge.service.offline import RecordedEstimate
+from report_html import MAX_PAGE_BYTES, Html
+from synthetic import synthetic_log
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    return synthetic_log(hours=1.0, start_pct=88.0, end_pct=42.0, noise_v=0.5, name="drive")
+
+
+@pytest.fixture(scope="module")
+def found(log: Log) -> Identification:
+    return fit([log], capacity_ah=CAPACITY_AH)
+
+
+@pytest.fixture(scope="module")
+def estimate(found: Identification, log: Log) -> RecordedEstimate:
+    settings = EstimatorSettings()
+    return RecordedEstimate(log, *estimate_log(log, found.model, settings), found.model, settings)
+
+
+def degraded(estimate: RecordedEstimate, *spans: tuple[int, int]) -> RecordedEstimate:
+    """Return the estimate, valid but for rows without a temperature."""
+    status = np.full(len(estimate.table), Status.VALID)
+    reasons = np.zeros(status.size, dtype=np.int64)
+    for begin, end in spans:
+        status[begin:end] = Status.DEGRADED
+        reasons[begin:end] = Reason.TEMPERATURE_MISSING
+    return replace(
+        estimate,
+        table=replace(estimate.table, status=status, reasons=reasons),
+        scores=replace(estimate.scores, valid_fraction=float(np.mean(status == Status.VALID))),
+    )
+
+
+def test_fit_states_range_and_what_is_missing(found: Identification) -> None:
+    text = fit_verdict(found)
+    assert text.startswith("Covers 42 to 87 % SoC with a mean voltage error of ")
+    assert "too few rows below 42 % and above 87 %" in text
+
+
+def test_fit_over_a_full_discharge_lacks_no_range() -> None:
+    text = fit_verdict(fit([synthetic_log(hours=1.2, noise_v=0.5, name="full")]))
+    assert text.startswith("Covers 1 to 98 % SoC")
+    assert "too few rows" not in text
+
+
+def test_constant_temperature_leaves_kt_unidentified(log: Log) -> None:
+    level = replace(log, temperature_c=np.full(len(log), 24.0))
+    text = fit_verdict(fit([level], capacity_ah=CAPACITY_AH))
+    assert "only 0.0 K of temperature, so kt is not identified" in text
+
+
+def test_estimate_states_error_and_longest_period(estimate: RecordedEstimate, log: Log) -> None:
+    estimate = degraded(estimate, (700, 940), (2000, 2010))
+    text = estimate_verdict(estimate, periods(estimate.table))
+    assert text.startswith(f"SoC within {estimate.scores.soc_max_pct:.1f} % of the log's own")
+    assert "degraded from 0:11:40 to 0:15:40 because the sample has no temperature" in text
+    assert text.endswith("the longest of 2 periods.")
+
+
+def test_estimate_without_reference_states_its_sigma(estimate: RecordedEstimate, log: Log) -> None:
+    estimate = replace(degraded(estimate), recorded=replace(log, soc_pct=None))
+    text = estimate_verdict(estimate, periods(estimate.table))
+    assert re.match(
+        r"SoC from [\d.]+ to [\d.]+ % \(±[\d.]+ % at the end, 2σ\); valid through", text
+    )
+
+
+def test_estimate_that_never_was_valid_says_so(estimate: RecordedEstimate, log: Log) -> None:
+    estimate = degraded(estimate, (0, len(log)))
+    assert "; never valid; degraded from 0:00:00" in estimate_verdict(
+        estimate, periods(estimate.table)
+    )
+
+
+def test_initialising_is_no_period(estimate: RecordedEstimate, log: Log) -> None:
+    estimate = degraded(estimate, (700, 940))
+    estimate.table.status[:60] = Status.INITIALISING
+    assert [period.start_s for period in periods(estimate.table)] == [700.0]
+
+
+def test_a_period_leads_to_its_moment_in_the_figure(estimate: RecordedEstimate) -> None:
+    page = estimate_report(degraded(estimate, (700, 940)))
+    link = re.search(
+        r'<a href="#([\w-]+)" data-axis="([\w-]+)" data-start="([\d.]+)" data-end="([\d.]+)">'
+        r"0:11:40 … 0:15:40</a>",
+        page,
+    )
+    assert link
+    anchor, axis, start, end = link.groups()
+    assert f'<figure id="{anchor}"><h3>Estimated state of charge' in page
+    assert f'"id":"{axis}"' in page
+    assert float(start) < 700.0 / 60.0 < 940.0 / 60.0 < float(end)
+
+
+def test_every_link_has_its_anchor_and_each_id_is_unique(estimate: RecordedEstimate) -> None:
+    page = estimate_report(degraded(estimate, (700, 940)))
+    markup = re.sub(r"<(script|style).*?</\1>", "", page, flags=re.DOTALL)
+    ids = re.findall(r' id="([^"]+)"', markup)
+    assert len(set(ids)) == len(ids)
+    assert set(re.findall(r'href="#([^"]+)"', markup)) <= set(ids)
+
+
+def test_inspection_states_what_is_identifiable(log: Log) -> None:
+    found = inspect_log(log)
+    text = inspect_verdict(found)
+    lacking = next(item for item in found.abilities if item.verdict == "no")
+    assert text.startswith("This log can identify ")
+    assert f"; not {lacking.topic}" in text
+    assert text.endswith(f". {lacking.topic.capitalize()}: {lacking.text.rstrip('.')}.")
+
+
+@pytest.mark.parametrize("rows", [1, 10])
+def test_a_short_log_still_gives_a_page(log: Log, rows: int) -> None:
+    short = log.rows(slice(0, rows))
+    assert "Recorded data" in Html(inspect_report(inspect_log(short), short)).headings
+
+
+def test_inspect_writes_an_offline_page(log: Log, tmp_path: Path) -> None:
+    path, report = tmp_path / "drive.csv", tmp_path / "drive.html"
+    write_log(log, path)
+    done = CliRunner().invoke(app, ["inspect", str(path), "--report", str(report)])
+    assert done.exit_code == 0, done.output
+    page = report.read_text(encoding="utf-8")
+    html = Html(page)
+    assert html.fetched == []
+    assert {"Current", "Voltage", "Temperature", "What this log can identify"} <= set(html.headings)
+    assert len(page.encode()) < MAX_PAGE_BYTES
+
+
+def test_inspect_never_overwrites_its_log(log: Log, tmp_path: Path) -> None:
+    path = tmp_path / "drive.csv"
+    write_log(log, path)
+    done = CliRunner().invoke(app, ["inspect", str(path), "--report", str(path)])
+    assert isinstance(done.exception, InputError)
+    assert path.read_text(encoding="utf-8").startswith("time_s")
+
+
+def test_figures_are_written_as_png_and_svg(log: Log, tmp_path: Path) -> None:
+    image = pytest.importorskip("matplotlib.image")
+    path, folder = tmp_path / "drive.csv", tmp_path / "figures"
+    write_log(log, path)
+    done = CliRunner().invoke(app, ["inspect", str(path), "--figures", str(folder)])
+    assert done.exit_code == 0, done.output
+    names = ["01-current", "02-voltage", "03-temperature", "04-state-of-charge"]
+    assert sorted(each.stem for each in folder.glob("*.png")) == names
+    for name in names:
+        pixels = image.imread(folder / f"{name}.png")
+        assert pixels.shape[1] == 2000
+        assert 0.005 < np.mean(pixels[:, :, 0] < 0.9) < 0.5  # lines on white
+        assert "<svg" in (folder / f"{name}.svg").read_text(encoding="utf-8")
+
+
+def test_figures_name_the_extra_they_need(
+    log: Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_log(log, tmp_path / "drive.csv")
+    monkeypatch.setattr("cangauge.cli.options.find_spec", lambda _name: None)
+    arguments = ["inspect", str(tmp_path / "drive.csv"), "--figures", str(tmp_path / "figures")]
+    done = CliRunner().invoke(app, arguments)
+    assert isinstance(done.exception, InputError)
+    assert "pip install 'cangauge[figures]'" in str(done.exception)
+    assert not (tmp_path / "figures").exists()
