@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from operator import mul
 
 from cangauge.errors import InputError
 from cangauge.estimation.counting import CoulombCounter, EstimatorClock
 from cangauge.estimation.ekf import (
     UNKNOWN_SOC_STD_PCT,
+    CurveFunctions,
     Measurement,
     MeasurementNoise,
     SocEkf,
@@ -109,6 +111,7 @@ class Estimator:
         self._references = SocReferenceDetector(self.settings.full_charge, self.settings.long_rest)
         self._noise = MeasurementNoise(self._voltage_model, model, self.capacity_ah)
         self._bias_std_v = math.hypot(model.noise.slow_std_v, model.noise.lasting_std_v)
+        self._functions = CurveFunctions(model.noise)
         self._nominal_v = self._voltage_model.pseudo_ocv_at(50.0)[0]
         self._permanent_reasons = temperature_mismatch(
             model.temperature_source, self.settings.temperature_source
@@ -252,19 +255,26 @@ class Estimator:
         guess_pct = 50.0 if math.isnan(memory.newton_pct) else memory.newton_pct
         newton = soc_from_ocv(self._curve, sample.voltage_v - without_ocv_v, guess_pct)
         memory.newton_pct, memory.newton_inside = newton
-        std_v_at = self._noise.at(memory.temperature_c, self._line)
-        std_v = std_v_at(self.filter.soc_pct if self._is_filtering else memory.newton_pct)
+        std_v, kt_std_v = self._noise.at(memory.temperature_c, self._line)
+        resistance_std_v = self._noise.resistance_std(memory.temperature_c) * self._drop_v()
         slope = self._curve.pseudo_ocv_at(memory.newton_pct)[1]
-        memory.newton_std_pct = min(
-            math.hypot(std_v, self._bias_std_v) / slope, UNKNOWN_SOC_STD_PCT
-        )
+        curve_std_v = self._functions.std_v(memory.newton_pct)
+        error_v = math.hypot(std_v, self._bias_std_v, curve_std_v, kt_std_v, resistance_std_v)
+        memory.newton_std_pct = min(error_v / slope, UNKNOWN_SOC_STD_PCT)
         if math.isnan(memory.coulomb_start_pct):
             # No initial SoC: start from the voltage's with a wide prior, from which the filter
             # learns how SoC and bias share what the voltage cannot separate.
             self._start(memory.newton_pct, UNKNOWN_SOC_STD_PCT)
             memory.coulomb_var_pct2 = memory.newton_std_pct**2
         if self._is_filtering:
-            measurement = Measurement(sample.voltage_v, without_ocv_v, memory.newton_pct, std_v_at)
+            measurement = Measurement(
+                sample.voltage_v,
+                without_ocv_v,
+                memory.newton_pct,
+                std_v,
+                kt_std_v,
+                resistance_std_v,
+            )
             if self.filter.update(measurement, since):
                 memory.contradicted_until_s = sample.time_s + CONTRADICTED_S
 
@@ -278,6 +288,11 @@ class Estimator:
                 temperature_c, self._line.currents()
             )
         return self._without_ocv_v
+
+    def _drop_v(self) -> float:
+        """Return the model's voltage drop at the latest sample [V]."""
+        resistance = self._voltage_model.resistance_ohm
+        return sum(map(mul, resistance, self._line.currents()))
 
     def _start(self, soc_pct: float, std_pct: float) -> None:
         """Start counting, and the filter where it is used, from a SoC [%]."""

@@ -203,7 +203,7 @@ class HypothesisFilter:
             If a hypothesis is not a valid filter with a SoC within 0–100 %.
         """
         filters = [self._restored(each) for each in state.hypotheses]
-        if not all(each.is_valid() and 0.0 <= each.soc_pct <= 100.0 for each in filters):
+        if not all(each.is_valid() for each in filters):
             raise InputError(
                 "not a positive semidefinite covariance, or a SoC outside 0–100 %",
                 field="filter.hypotheses",

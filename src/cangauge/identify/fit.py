@@ -23,8 +23,8 @@ from cangauge.identify.evaluate import (
     evaluate_extended,
     slope_resistance,
 )
-from cangauge.identify.noise import describe_noise
 from cangauge.identify.voltage_fit import KT, fit_voltage_model, held_out_errors, stacked
+from cangauge.inference.error_model import KNOTS_PCT, LogResidual, describe_error
 from cangauge.inference.least_squares import Solution
 from cangauge.inference.rows import (
     DELAYS_S,
@@ -40,6 +40,7 @@ from cangauge.model.effects.library import effect_entries
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import (
     Coefficient,
+    CurveNoise,
     Information,
     Made,
     Model,
@@ -221,7 +222,7 @@ def fit(
             temperature_c=voltage_model.temperature_range_c,
             current_a=voltage_model.current_range_a,
         ),
-        noise=_noise(fits, held_out, options.rate_hz),
+        noise=_noise(voltage_model, fits, held_out, options.rate_hz),
         effects=[] if found is None else effect_entries(found.model.effects),
         information=_information(rows, options, names, solution, found),
         made=_made(logs, options, effect_ids, rows),
@@ -293,33 +294,47 @@ def _unit(name: str) -> Literal["V", "V/K", "ohm"]:
 
 
 def _noise(
-    fits: Sequence[LogFit], held_out_error_v: Sequence[FloatArray], rate_hz: float
+    voltage_model: VoltageModel,
+    fits: Sequence[LogFit],
+    held_out_error_v: Sequence[FloatArray],
+    rate_hz: float,
 ) -> ModelNoise:
     errors = np.concatenate(held_out_error_v)
     volts = np.concatenate([item.rows.voltage_v for item in fits])
     known = np.isfinite(errors)
-    whole_logs = len(fits) >= LOGS_AT_LEAST
     if not known.any():
         errors = np.concatenate([item.residual_v for item in fits])
         known = np.isfinite(errors)
         judged_on = "the rows of the fit itself (too short a log to hold any out)"
-    elif whole_logs:
+    elif len(fits) >= LOGS_AT_LEAST:
         judged_on = "whole logs left out in turn"
     else:
         judged_on = "interleaved blocks of 240 s left out in turn"
-    # Held-out blocks are short and far apart, which hides the duration of an error: the residual of
-    # the whole log shows it.
-    shown = held_out_error_v if whole_logs else [item.residual_v for item in fits]
-    noise = describe_noise(
+    time_error, curve = describe_error(
         [
-            (item.rows.time_s[finite], values[finite])
-            for item, values in zip(fits, shown, strict=True)
-            if (finite := np.isfinite(values)).any()
+            LogResidual(
+                item.residual_v,
+                item.rows.soc_pct,
+                item.rows.temperature_c,
+                item.rows.delayed_current_a,
+            )
+            for item in fits
         ],
+        voltage_model.pseudo_ocv(KNOTS_PCT),
+        voltage_model.resistance_ohm,
         rate_hz,
     )
     return ModelNoise(
-        **vars(noise),
+        **vars(time_error),
+        lasting_time_s=float(np.mean([np.ptp(item.rows.time_s) for item in fits])),
+        lasting_soc_pct=float(np.mean([np.ptp(item.rows.soc_pct) for item in fits])),
+        curve=CurveNoise(
+            soc_pct=curve.soc_pct.tolist(),
+            functions_v=curve.function_v.tolist(),
+            temperature_c=curve.temperature_c,
+            kt_std_v_per_k=curve.kt_std_v_per_k,
+            resistance_std_per_k=curve.resistance_std_per_k,
+        ),
         voltage_mae_pct=100.0 * float(np.mean(np.abs(errors[known]) / volts[known])),
         voltage_rmse_v=float(np.sqrt(np.mean(errors[known] ** 2))),
         judged_on=judged_on,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
+from cangauge.inference.error_model import KNOTS_PCT, curve_prior_rows
 from cangauge.inference.least_squares import CLUSTER_S, KtPrior, Solution, kt_prior, solve
 from cangauge.inference.linearized import SLOPE_CHECKS
 from cangauge.inference.rows import (
@@ -28,6 +29,11 @@ from cangauge.model.voltage_model import (
     ocv_basis,
     ocv_basis_slope,
 )
+
+PRIOR_ERROR, PRIOR_ERROR_S = 1e-3, 300.0
+"""Error of the voltage against which the prior of the curve is weighed, relative to the voltage,
+and its correlation time [s]: a tenth of a per cent over five minutes. The error model comes after
+the fit; where the logs show the curve the prior's weight hardly matters."""
 
 REFINED_AT_MOST = 6
 """Fits with further slope constraints where the pseudo-OCV fell between two of them."""
@@ -72,10 +78,20 @@ def fit_voltage_model(
         soc, temperature, current = soc[keep], temperature[keep], current[keep]
     _check_identifiable(rows, soc, current, columns.shape)
     span = float(soc.min()), float(soc.max())
+    voltage_v = float(np.median(volts))
+    rows_v2 = (PRIOR_ERROR * voltage_v) ** 2 * 2.0 * PRIOR_ERROR_S * options.rate_hz
+    weight, target = curve_prior_rows(voltage_v, rows_v2)
+    prior_columns = np.zeros((target.size, columns.shape[1]))
+    prior_columns[:, : len(BASIS_NAMES)] = weight @ ocv_basis(KNOTS_PCT, options.epsilon)
+    columns0, volts0 = columns, volts
+    own = volts.size
+    columns, volts = np.vstack([columns, prior_columns]), np.append(volts, target)
+    block = np.append(block, block.max() + 1 + np.arange(target.size))
+    number = np.append(number, np.full(target.size, len(rows)))
     solution = _rising(columns, volts, block, span, options.epsilon)
     if with_kt_prior:
-        lengths = np.bincount(number, minlength=len(rows)).tolist()
-        prior = kt_prior(columns, volts - columns @ solution.coefficients, volts, lengths, KT)
+        lengths = np.bincount(number[:own], minlength=len(rows)).tolist()
+        prior = kt_prior(columns0, volts0 - columns0 @ solution.coefficients, volts0, lengths, KT)
         row = np.zeros(columns.shape[1])
         row[KT] = prior.row_weight
         solution = _rising(
@@ -108,7 +124,7 @@ def _rising(
     epsilon: float,
 ) -> Solution:
     """Return the least-squares solution whose pseudo-OCV rises over a span of SoC."""
-    at_least = SLOPE_AT_LEAST * float(np.median(volts))
+    at_least = SLOPE_AT_LEAST * float(np.median(volts[: 1 + volts.size // 2]))
     grid = np.linspace(*span_pct, SLOPE_CHECKS)
     between = np.linspace(*span_pct, SLOPE_POINTS)
     for _ in range(REFINED_AT_MOST):
