@@ -133,7 +133,8 @@ class MeasurementNoise:
         curve = model.noise.curve
         self._mean_c = voltage_model.t_ref_c if curve is None else curve.temperature_c
         self._kt_std = 0.0 if curve is None else curve.kt_std_v_per_k
-        self._resistance_std = 0.0 if curve is None else curve.resistance_std_per_k
+        self._resistance_std = 0.0 if curve is None else curve.resistance_std
+        self._resistance_std_per_k = 0.0 if curve is None else curve.resistance_std_per_k
         self._usual_a = USUAL_CURRENT_C_RATE * capacity_ah
         # All samples of one filling delay line share the same unknown currents.
         self._shared_by = max(voltage_model.delay_s[-1] * model.rate_hz, 1.0)
@@ -574,7 +575,7 @@ class SocEkf:
         mean_var += fast_v2 * seconds / (2.0 * PERSISTENT_S)
         seen = 1.0 - math.exp(-self._mean_seconds / PERSISTENT_S)
         mean = self._mean_innovation_v / seen
-        return mean**2 > PERSISTENT_SIGMAS**2 * mean_var
+        return bool(mean**2 > PERSISTENT_SIGMAS**2 * mean_var)
 
     def _reset_innovations(self) -> None:
         self._mean_innovation_v = 0.0

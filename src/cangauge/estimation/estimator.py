@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from operator import mul
 
 from cangauge.errors import InputError
 from cangauge.estimation.counting import CoulombCounter, EstimatorClock
@@ -290,9 +289,9 @@ class Estimator:
         return self._without_ocv_v
 
     def _drop_v(self) -> float:
-        """Return the model's voltage drop at the latest sample [V]."""
-        resistance = self._voltage_model.resistance_ohm
-        return sum(map(mul, resistance, self._line.currents()))
+        """Return the voltage drop of the mean of the delayed currents [V]."""
+        currents = self._line.currents()
+        return self._online.steady_ohm * sum(currents) / len(currents)
 
     def _start(self, soc_pct: float, std_pct: float) -> None:
         """Start counting, and the filter where it is used, from a SoC [%]."""

@@ -30,11 +30,6 @@ from cangauge.model.voltage_model import (
     ocv_basis_slope,
 )
 
-PRIOR_ERROR, PRIOR_ERROR_S = 1e-3, 300.0
-"""Error of the voltage against which the prior of the curve is weighed, relative to the voltage,
-and its correlation time [s]: a tenth of a per cent over five minutes. The error model comes after
-the fit; where the logs show the curve the prior's weight hardly matters."""
-
 REFINED_AT_MOST = 6
 """Fits with further slope constraints where the pseudo-OCV fell between two of them."""
 
@@ -78,29 +73,20 @@ def fit_voltage_model(
         soc, temperature, current = soc[keep], temperature[keep], current[keep]
     _check_identifiable(rows, soc, current, columns.shape)
     span = float(soc.min()), float(soc.max())
-    voltage_v = float(np.median(volts))
-    rows_v2 = (PRIOR_ERROR * voltage_v) ** 2 * 2.0 * PRIOR_ERROR_S * options.rate_hz
-    weight, target = curve_prior_rows(voltage_v, rows_v2)
-    prior_columns = np.zeros((target.size, columns.shape[1]))
-    prior_columns[:, : len(BASIS_NAMES)] = weight @ ocv_basis(KNOTS_PCT, options.epsilon)
-    columns0, volts0 = columns, volts
-    own = volts.size
-    columns, volts = np.vstack([columns, prior_columns]), np.append(volts, target)
-    block = np.append(block, block.max() + 1 + np.arange(target.size))
-    number = np.append(number, np.full(target.size, len(rows)))
     solution = _rising(columns, volts, block, span, options.epsilon)
+    residual_v = volts - columns @ solution.coefficients
+    # The slow error of clusters that count as independent; without an error there is no prior.
+    prior_v2 = CLUSTER_S * options.rate_hz * _mean_square_of_means(residual_v, block)
+    priors = [_curve_rows(float(np.median(volts)), prior_v2, columns.shape[1], options.epsilon)]
+    prior = None
     if with_kt_prior:
-        lengths = np.bincount(number[:own], minlength=len(rows)).tolist()
-        prior = kt_prior(columns0, volts0 - columns0 @ solution.coefficients, volts0, lengths, KT)
-        row = np.zeros(columns.shape[1])
-        row[KT] = prior.row_weight
-        solution = _rising(
-            np.vstack([columns, row]),
-            np.append(volts, 0.0),
-            np.append(block, block.max() + 1),
-            span,
-            options.epsilon,
-        )
+        lengths = np.bincount(number, minlength=len(rows)).tolist()
+        prior = kt_prior(columns, residual_v, volts, lengths, KT)
+        row = np.zeros((1, columns.shape[1]))
+        row[0, KT] = prior.row_weight
+        priors.append((row, np.zeros(1)))
+    solution = _rising(columns, volts, block, span, options.epsilon, priors)
+    if prior is not None:
         solution = _with_prior_errors(solution, prior)
     x = [float(value) for value in solution.coefficients]
     return VoltageModel(
@@ -116,17 +102,42 @@ def fit_voltage_model(
     ), solution
 
 
+def _mean_square_of_means(values: FloatArray, block: NDArray[np.intp]) -> float:
+    """Return the mean square of the blocks' means, weighted by their rows."""
+    count = np.bincount(block)
+    total = np.bincount(block, values)
+    seen = count > 0
+    return float(np.sum(total[seen] ** 2 / count[seen]) / values.size)
+
+
+def _curve_rows(
+    voltage_v: float, variance_v2: float, size: int, epsilon: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the prior of the pseudo-OCV as columns, shape (m, size), and target, shape (m,)."""
+    weight, target = curve_prior_rows(voltage_v, variance_v2)
+    columns = np.zeros((target.size, size))
+    columns[:, : len(BASIS_NAMES)] = weight @ ocv_basis(KNOTS_PCT, epsilon)
+    return columns, target
+
+
 def _rising(
     columns: FloatArray,
     volts: FloatArray,
     block: NDArray[np.intp],
     span_pct: tuple[float, float],
     epsilon: float,
+    priors: Sequence[tuple[FloatArray, FloatArray]] = (),
 ) -> Solution:
-    """Return the least-squares solution whose pseudo-OCV rises over a span of SoC."""
-    at_least = SLOPE_AT_LEAST * float(np.median(volts[: 1 + volts.size // 2]))
+    """Return the least-squares solution whose pseudo-OCV rises over a span of SoC.
+
+    `priors` are further rows and their targets; each counts as a block of its own.
+    """
+    at_least = SLOPE_AT_LEAST * float(np.median(volts))
     grid = np.linspace(*span_pct, SLOPE_CHECKS)
     between = np.linspace(*span_pct, SLOPE_POINTS)
+    for more, target in priors:
+        columns, volts = np.vstack([columns, more]), np.append(volts, target)
+        block = np.append(block, block.max() + 1 + np.arange(target.size))
     for _ in range(REFINED_AT_MOST):
         bounds = np.zeros((grid.size, columns.shape[1]))
         bounds[:, : len(BASIS_NAMES)] = ocv_basis_slope(grid, epsilon)

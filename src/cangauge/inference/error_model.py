@@ -27,9 +27,10 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from cangauge._typing import FloatArray
@@ -38,9 +39,7 @@ from cangauge.inference.time_scales import haar_transform
 SCALES: Final = 14
 """Time scales: stretches of 2, 4, … 16,384 rows; longer ones count as the last."""
 
-KNOTS_PCT: Final = np.array(
-    [0, 2.5, 5, 7.5, 10, 12.5, 15, 20, 25, 30, 35, 40, 45, 50, 55, 60, 65, 70, 75, 80, 85, 90, 95, 100]
-)  # fmt: skip
+KNOTS_PCT: Final = np.concatenate((np.arange(0.0, 15.0, 2.5), np.arange(15.0, 101.0, 5.0)))
 """SoC between which the error of the curve is interpolated [%]; closer near empty, at the knee."""
 
 PART_STD: Final = 0.003
@@ -129,6 +128,8 @@ class CurveError:
     """Mean temperature of the logs [°C]."""
     kt_std_v_per_k: float
     """Standard deviation of the temperature coefficient [V/K]."""
+    resistance_std: float
+    """Relative standard deviation of the resistance to a lasting current."""
     resistance_std_per_k: float
     """Standard deviation of the resistance's relative change with temperature [1/K]."""
 
@@ -355,6 +356,7 @@ def describe_error(
         principal_functions(second[:m, :m]),
         mean_c,
         math.sqrt(second[m, m]),
+        math.sqrt(float(second[m + 2 :, m + 2 :].sum())) / total_ohm,
         math.sqrt(second[m + 1, m + 1]),
     )
 
@@ -444,7 +446,7 @@ def haar_variances(variance_v2: float, rows: float) -> FloatArray:
     return np.asarray(variance_v2 * sums / (2.0 * half))
 
 
-def variance_of_sum(n: FloatArray, rows: float) -> FloatArray:
+def variance_of_sum(n: NDArray[np.floating[Any]], rows: float) -> FloatArray:
     """Return the variance of a sum of n rows of unit variance, correlated over `rows` rows."""
     kept = math.exp(-1.0 / rows) if rows > 1e-3 else 0.0
     return n * (1.0 + kept) / (1.0 - kept) - 2.0 * kept * (1.0 - kept**n) / (1.0 - kept) ** 2
