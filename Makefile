@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 # Where SocketCAN is not to be had directly, a command that provides it (as in .ci/run).
 SOCKETCAN ?= $(wildcard ../shared/tools/with-socketcan)
 
-.PHONY: help demo test lint coverage check faults trips lowest clean
+.PHONY: help demo test lint coverage check faults trips lowest site wheel clean
 
 help:
 	@echo "make demo      the whole job on the shipped log: fit, bus, service, report"
@@ -15,7 +15,9 @@ help:
 	@echo "make coverage  the test suite with coverage"
 	@echo "make check     a small part of the withheld check of the diagnosis"
 	@echo "make faults    the table of faults on a live bus (prints the expected time first)"
-	@echo "make lowest    the lowest versions that pyproject.toml allows, and tests where they matter"
+	@echo "make lowest    the lowest versions that pyproject.toml allows, on every Python here (or PYTHONS=…)"
+	@echo "make site      the documentation as a site, in out/site"
+	@echo "make wheel     build the wheel and run the job from it in an environment of its own"
 	@echo "make trips     the table on the real BMW i3 trips (see README for the data)"
 
 $(VENV)/installed: pyproject.toml
@@ -26,6 +28,10 @@ $(VENV)/installed: pyproject.toml
 
 $(VENV)/installed-dev: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $@
+
+$(VENV)/installed-docs: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	touch $@
 
 demo: $(VENV)/installed
@@ -55,8 +61,16 @@ trips: $(VENV)/installed
 faults: $(VENV)/installed
 	PYTHONPATH=benchmarks $(BIN)/python -m faults $(if $(SOCKETCAN),--socketcan "$(SOCKETCAN) -t 3600 -m 2G")
 
+site: export NO_MKDOCS_2_WARNING := 1
+site: $(VENV)/installed-docs
+	$(BIN)/mkdocs build --strict --quiet
+	@echo "out/site/index.html"
+
+wheel:
+	.ci/wheel $(PYTHON)
+
 lowest:
-	.ci/lowest $(PYTHON)
+	.ci/lowest $(PYTHONS)
 
 clean:
 	rm -rf $(VENV) .venv-lowest out

@@ -357,6 +357,8 @@ class Player(threading.Thread):
             "run", "-m", model, "--interface", "udp_multicast", "--channel", CHANNEL,
             "--bus-option", f"port={PORT}", "--initial-soc", START_PCT - 15.0,
             "--soc-estimate-id", f"0x{frame_id:X}", "--soc-detail-id", f"0x{frame_id + 1:X}",
+            "--soc-health-id", f"0x{frame_id + 2:X}", "--soc-power-id", f"0x{frame_id + 3:X}",
+            "--soc-cells-id", f"0x{frame_id + 4:X}",
             "--replay-clock-id", f"0x{frame_id + 15:X}", "--log-format", "json", *kept,
         ]  # fmt: skip
         with self._log.open("ab") as log:

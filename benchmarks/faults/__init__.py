@@ -8,6 +8,7 @@ published frames (`dbc/soc_estimate.dbc`) only.
 fault      a fault: name, description, what it changes and does
 catalogue  the named faults; add one here
 frames     a log → frames with times, and changes of values and frames
+stamps     changed time stamps
 actions    actions on the service, its files, the bus interface and the machine
 bench      one service on one bus
 line       a separate bus for each fault: UDP multicast, or a vcan interface

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import socket
 import time
+import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 from random import Random
@@ -13,10 +15,18 @@ from typing import Any, Final, Literal
 from faults.bench import Bench
 from faults.fault import Action, Plan, at
 from faults.frames import Profile
+from faults.large_dbc import write_large_dbc
 from faults.line import HarnessBus, run
+from faults.process import run_command
 
 DISK_KB: Final = 256
 """Size of the small disk; fits several state files [kB]."""
+LARGE_DBC_MB: Final = 3.9
+"""Just below the largest that is read [MB]."""
+RELOAD_S: Final = 8.0
+"""Time in which a small configuration is read, on a busy machine [s]."""
+REFUSED: Final = 2
+"""Exit status of a command with bad input."""
 
 
 def down_for(seconds: float, times: int = 1, up_s: float = 0.0) -> Plan:
@@ -144,6 +154,67 @@ def reload_often(bench: Bench) -> None:
     for _ in range(20):
         bench.reload()
         bench.wait(0.2)
+
+
+def large_dbc(bench: Bench) -> None:
+    """Reload with a lawful DBC of nearly the largest size."""
+    write_large_dbc(bench.folder, LARGE_DBC_MB)
+    bench.write_config(
+        vehicle=None, dbc=str(bench.folder / "large.dbc"), map=str(bench.folder / "map.toml")
+    )
+    bench.reload()
+
+
+def impossible_model(change: Callable[[dict[str, Any]], None]) -> Callable[[Bench], None]:
+    """Reload with a model that no pack has; it must be refused."""
+
+    def do(bench: Bench) -> None:
+        content = json.loads(Path(bench.config["model"]).read_text())
+        change(content)
+        model = bench.folder / "impossible.json"
+        model.write_text(json.dumps(content))
+        bench.write_config(model=str(model))
+        bench.reload()
+        bench.wait(RELOAD_S)
+        if "config.refused" not in bench.service.output():
+            bench.incidents.append("an impossible model was taken")
+
+    return do
+
+
+def same_files(option: Literal["state", "record"]) -> Callable[[Bench], None]:
+    """Start a second service with a file of the first; it must be refused, with exit status 2."""
+
+    def do(bench: Bench) -> None:
+        path = bench.state_path if option == "state" else bench.folder / bench.config["record"]
+        arguments = ["run", "--config", str(bench.config_path), f"--{option}", str(path)]
+        arguments += ["--interface", "virtual", "--channel", "elsewhere", "--duration", "0.5"]
+        ended = run_command(arguments)
+        if ended != REFUSED:
+            bench.incidents.append(f"a second service with its --{option} ended with {ended}")
+
+    return do
+
+
+def slow_clients(bench: Bench) -> None:
+    """Hold 64 connections with half a request, and probe the health once a second."""
+    found = re.search(r"http://127\.0\.0\.1:(\d+)/metrics", bench.service.output())
+    if found is None:
+        bench.incidents.append("HTTP is not served")
+        return
+    port = int(found[1])
+    clients = [socket.create_connection(("127.0.0.1", port)) for _ in range(64)]
+    for client in clients:
+        client.sendall(b"GET /status HTTP/1.1\r\nX: ")
+    bench.at_end(lambda: [client.close() for client in clients])
+    for _ in range(5):
+        try:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=2.0) as answer:
+                answer.read()
+        except OSError as error:
+            bench.incidents.append(f"a health probe failed: {error}")
+            return
+        bench.wait(1.0)
 
 
 def second_service(bench: Bench) -> None:

@@ -1,8 +1,8 @@
 """All named faults, grouped by what they disturb.
 
 To add a fault, append a `Fault` to the list of its kind: name, description, and one or more of
-`values` (changes of samples), `frames` (changes of frames, see `frames`) and `plan` (actions on the
-service, the bus or the machine, see `actions`).
+`values` (changes of samples), `frames` (changes of frames, see `frames`), `plan` (actions on the
+service, the bus or the machine, see `actions`) and `target` (changed stamps, see `stamps`).
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ from pathlib import Path
 from random import Random
 from typing import Final
 
+from cangauge.estimation.validity import Reason
 from faults import actions as do
 from faults import frames as change
+from faults import stamps
 from faults.bench import Bench
 from faults.fault import UNDISTURBED, Fault, Need, at, during
 from faults.frames import REAL, ROLES, SHORT
@@ -193,9 +195,9 @@ DISK = [
 
 MACHINE_CLOCK = [
     Fault("machine's clock back", "set back by an hour", REAL, plan=do.clock_set(-3600.0),
-          needs=frozenset({"vcan", "root", "alone"})),
+          needs=frozenset({"vcan", "root", "alone"}), recovers=True),
     Fault("machine's clock forward", "set forward by an hour", REAL, plan=do.clock_set(3600.0),
-          needs=frozenset({"vcan", "root", "alone"})),
+          needs=frozenset({"vcan", "root", "alone"}), recovers=True),
 ]  # fmt: skip
 
 RESTARTS = [
@@ -207,6 +209,44 @@ RESTARTS = [
           needs=frozenset({"state"})),
 ]  # fmt: skip
 
+_TWO: Final = Reason.DUPLICATE_SENDER
+OTHERS = [
+    Fault("forged ahead", "false values with valid CRC, 10 ms before the true frames", REAL,
+          frames=change.forged(0, -0.01), reports=_TWO),
+    Fault("forged after", "false values with the next counter, 20 ms after", REAL,
+          frames=change.forged(1, 0.02), reports=_TWO),
+    Fault("forged between", "false values with a counter of their own", REAL,
+          frames=change.forged(7, 0.03), reports=_TWO),
+    Fault("forged current", "false currents, 10 ms before the true ones", REAL,
+          frames=change.forged(0, -0.01, CURRENT), reports=_TWO),
+    Fault("forged voltage", "false voltages, 10 ms before the true ones", REAL,
+          frames=change.forged(0, -0.01, VOLTAGE), reports=_TWO),
+    Fault("forged flood", "ten false frames for each true one", REAL,
+          frames=change.forged(3, 0.004, copies=10), reports=_TWO),
+    Fault("old drive", "frames of 8 s ago sent again, between the true ones", REAL,
+          frames=change.old_drive(8.0, 0.04), reports=_TWO),
+    Fault("own id", "10 frames/s with the id of SOC_DETAIL", REAL,
+          frames=change.flood(change.detail, 10.0), reports=_TWO),
+]  # fmt: skip
+
+_TIME: Final = Reason.TIME_UNCERTAIN
+STAMPS = [
+    Fault("stamps still", "receive stamps stand still", REAL, target=stamps.still, reports=_TIME),
+    Fault("stamps backwards", "receive stamps run backwards slowly", REAL,
+          target=stamps.backwards, reports=_TIME),
+    Fault("stamps random", "receive stamps ± 0.9 s at random", REAL,
+          target=stamps.irregular, reports=_TIME),
+    Fault("stamps fast", "receive stamps run ten times faster", REAL,
+          target=stamps.fast, reports=_TIME),
+    Fault("stamps zero", "no receive stamps: all 0", REAL, target=stamps.zero, reports=_TIME),
+    Fault("stamps forward", "the stamps' clock set forward by a day", REAL,
+          target=stamps.forward, recovers=True),
+    Fault("stamps back", "the stamps' clock set back by a day", REAL,
+          target=stamps.back, recovers=True),
+    Fault("stamps from 1970", "the stamps' clock set forward by 53 years", REAL,
+          target=stamps.from_1970, recovers=True),
+]  # fmt: skip
+
 CONFIG = [
     Fault("reload, good", "SIGHUP with another max_gap_s", REAL, plan=at(do.BEGIN, do.good_config)),
     Fault("reload, unknown key", "SIGHUP with an unknown key", REAL,
@@ -216,6 +256,14 @@ CONFIG = [
     Fault("reload, empty", "SIGHUP with an empty file", REAL, plan=do.broken_config("")),
     Fault("reload, gone", "SIGHUP with the file removed", REAL, plan=do.broken_config(None)),
     Fault("reload, often", "SIGHUP twenty times in 4 s", REAL, plan=at(do.BEGIN, do.reload_often)),
+    Fault("reload, large DBC", "SIGHUP with a lawful DBC of 3.9 MB", REAL,
+          plan=at(do.BEGIN, do.large_dbc)),
+    Fault("reload, huge resistance", "SIGHUP with a model of R1 = -1e9 ohm", REAL,
+          plan=at(do.BEGIN, do.impossible_model(
+              lambda model: model["coefficients"]["R1"].update(value=-1e9)))),
+    Fault("reload, negative voltage", "SIGHUP with a model of k0 = -0.5 V", REAL,
+          plan=at(do.BEGIN, do.impossible_model(
+              lambda model: model["coefficients"]["k0"].update(value=-0.5)))),
 ]  # fmt: skip
 
 MACHINE = [
@@ -225,7 +273,13 @@ MACHINE = [
           plan=during((do.BEGIN, Bench.suspend), (0.3, Bench.resume)),
           frames=change.flood(change.foreign, 2000.0, 10.0)),
     Fault("two services", "a second service with the same ids on the bus", REAL,
-          plan=at(do.BEGIN, do.second_service)),
+          plan=at(do.BEGIN, do.second_service), reports=_TWO),
+    Fault("two services, one state", "a second service with the same --state", REAL,
+          plan=at(do.BEGIN, do.same_files("state")), needs=frozenset({"state"})),
+    Fault("two services, one recording", "a second service with the same --record", REAL,
+          plan=at(do.BEGIN, do.same_files("record")), config={"record": "shared.log"}),
+    Fault("slow HTTP clients", "64 connections with half a request; a health probe each second",
+          REAL, plan=at(do.BEGIN, do.slow_clients), config={"http": "127.0.0.1:0"}),
     Fault("slow consumer", "a listener that never reads", REAL,
           plan=at(do.BEGIN, do.deaf_listener)),
     Fault("SIGUSR1, SIGPIPE", "signals without meaning to the service", REAL, plan=during(
@@ -276,10 +330,10 @@ STATE_FILE = [
 ]  # fmt: skip
 
 ON_ANY_BUS: Final = [
-    *LOSS, *TIMES, *PROTECTION, *VALUES, *MISSING, *CLOCK, *ERRORS, *RESTARTS, *CONFIG, *MACHINE,
-    *STATE_FILE,
+    *LOSS, *TIMES, *PROTECTION, *VALUES, *MISSING, *CLOCK, *ERRORS, *OTHERS, *RESTARTS, *CONFIG,
+    *MACHINE, *STATE_FILE,
 ]  # fmt: skip
-ON_UDP: Final = [*ON_ANY_BUS, *UDP_PACKETS]
+ON_UDP: Final = [*ON_ANY_BUS, *STAMPS, *UDP_PACKETS]
 _ON_KERNEL: Final = ("error frames", "remote frames")
 """Faults that SocketCAN handles differently: run on vcan too."""
 _VCAN_ONLY: Final = [*INTERFACE, *DISK, *MACHINE_CLOCK]

@@ -8,6 +8,8 @@ A fault passes if all of these hold (`tests/faults` makes each fail):
 - No estimate was valid for longer than its time-out after the last good current, voltage or
   temperature was sent.
 - It was never silent for longer than `MAX_SILENCE_S` while it ran and the bus was up.
+- Where the fault says so: its reason was published while it lasted, and no estimate was valid from
+  `REPORTED_S` after its start to its end; the last estimate is valid again.
 
 The undisturbed run must itself be valid where it is compared, or nothing is judged.
 """
@@ -25,6 +27,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cangauge._typing import FloatArray
+from cangauge.estimation.validity import Reason, reason_name
 from faults.fault import Fault
 
 MAX_SOC_ERROR_PCT: Final = 1.0
@@ -40,6 +43,9 @@ RECOVERED_SHARE: Final = 0.9
 
 TIMEOUT_S: Final = {"current": 2.0, "voltage": 2.0, "temperature": 10.0}
 """Time-outs of the values: documented defaults of the service [s]."""
+
+REPORTED_S: Final = 5.0
+"""Longest time from the start of a fault to its reason [s]: the SoC of a drive changes by 0.1 %."""
 
 INITIALISING, VALID, DEGRADED, INVALID = range(4)
 STATUS: Final = ("initialising", "valid", "degraded", "invalid")
@@ -167,8 +173,22 @@ def bus_time(times_s: list[float], observed: Observation) -> FloatArray:
     return found
 
 
-def judge(observed: Observation, reference: Reference) -> Verdict:
-    """Judge a run."""
+def judge(
+    observed: Observation,
+    reference: Reference,
+    *,
+    reports: Reason = Reason.NONE,
+    recovers: bool = False,
+) -> Verdict:
+    """Judge a run.
+
+    Parameters
+    ----------
+    observed : Observation
+    reference : Reference
+    reports, recovers
+        Of the fault.
+    """
     errors = _errors(observed, reference)
     recovered = [
         (error, each.soc_std_pct)
@@ -189,6 +209,10 @@ def judge(observed: Observation, reference: Reference) -> Verdict:
         failures.append(f"SoC {error_pct:.1f} % off and valid after recovery")
     if stale_s > 0.0:
         failures.append(f"{stale} {stale_s:.1f} s beyond its time-out and valid")
+    if reports:
+        failures += _unreported(observed, reports)
+    if recovers and not (after and after[-1].status == VALID):
+        failures.append("not valid again")
     if silent_s > MAX_SILENCE_S:
         failures.append(f"silent for {silent_s:.1f} s")
     return Verdict(
@@ -246,6 +270,19 @@ def _stale(observed: Observation) -> tuple[float, str]:
             if age_s - limit_s > worst:
                 worst, what = age_s - limit_s, role
     return worst, what
+
+
+def _unreported(observed: Observation, reason: Reason) -> list[str]:
+    """Return what is missing of the report of a fault."""
+    first_s, last_s = observed.fault_s
+    during = [each for each in observed.published if first_s <= each.time_s <= last_s]
+    failures = []
+    if not any(each.reason & reason for each in during):
+        failures.append(f"no {reason_name(reason)} reported")
+    late = [each for each in during if each.time_s > first_s + REPORTED_S and each.status == VALID]
+    if late:
+        failures.append(f"valid {late[0].time_s - first_s:.0f} s into the fault")
+    return failures
 
 
 def _silent(observed: Observation) -> float:

@@ -7,8 +7,10 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import Any, Final, Literal
 
+from cangauge.estimation.validity import Reason
 from faults.bench import Bench
 from faults.frames import FAST, FrameChange, Profile, ValueChange
+from faults.process import Target
 
 Need = Literal["vcan", "root", "state", "alone"]
 """A vcan interface; root rights; a service with --state; no other run at the same time."""
@@ -48,6 +50,12 @@ class Fault:
         "generic", or "float": IEEE floats without CRC.
     cold : bool
         Start the service in a fresh interpreter.
+    target : callable, optional
+        Instead of the service as it is: with changed stamps (see `stamps`).
+    reports : Reason
+        Must be published while the fault lasts, and no valid estimate from `REPORTED_S` on.
+    recovers : bool
+        Whether the estimate must be valid again at the end.
     """
 
     name: str
@@ -61,6 +69,9 @@ class Fault:
     config: dict[str, Any] = field(default_factory=dict)
     vehicle: str = "generic"
     cold: bool = False
+    target: Target | None = None
+    reports: Reason = Reason.NONE
+    recovers: bool = False
 
     @property
     def reference_key(self) -> tuple[str, str, str]:

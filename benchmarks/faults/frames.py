@@ -360,6 +360,67 @@ def _protected(event: Event, vehicle: Vehicle, data: bytes, counter: int | None 
     return rule.protect(bytearray(data), rule.counter(data) if counter is None else counter)
 
 
+def forged(
+    counter: int, later_s: float, roles: tuple[str, ...] = ROLES, every: int = 1, copies: int = 1
+) -> FrameChange:
+    """Add frames of false values with valid CRC, as another node's.
+
+    Parameters
+    ----------
+    counter : int
+        Alive counter, relative to that of the true frame.
+    later_s : float
+        Time after the true frame, and between copies [s].
+    roles : tuple of str
+    every : int
+        Forge a frame for one of so many true ones.
+    copies : int
+        Forged frames for each, with increasing counters.
+    """
+
+    def whole(found: list[Event], profile: Profile, vehicle: Vehicle, _rng: Random) -> list[Event]:
+        first, last = profile.fault_s
+        out, seen = list(found), 0
+        for event in found:
+            rule = _rule(event, vehicle) if event.roles else None
+            is_hit = first <= event.at_s + min(later_s, 0.0) and event.at_s < last
+            if rule is None or not is_hit or not set(event.roles) & set(roles):
+                continue
+            seen += 1
+            if seen % every:
+                continue
+            data = bytearray(event.frame.data)
+            data[2 if len(data) > 4 else 1] ^= 0x04  # 26 A, 26 V, 10 K
+            for number in range(copies):
+                forged_data = rule.protect(data, rule.counter(data) + counter + number)
+                out.append(event.bad(data=forged_data).later(later_s * (1 + number)))
+        return in_order(out)
+
+    return whole
+
+
+def old_drive(seconds: float, later_s: float) -> FrameChange:
+    """Add the frames of an earlier part of the drive, with their own counters [s]."""
+
+    def whole(found: list[Event], profile: Profile, vehicle: Vehicle, _rng: Random) -> list[Event]:
+        first, last = profile.fault_s
+        encoder, out = FrameEncoder(vehicle), list(found)
+        for sample in _samples(profile)[0]:
+            if not first <= sample.time_s + seconds < last:
+                continue
+            at_s = sample.time_s + seconds + later_s
+            frames = encoder.encode(sample, math.nan)
+            out.extend(Event(at_s, frame, is_good=False) for frame in frames)
+        return in_order(out)
+
+    return whole
+
+
+def detail(_number: int, rng: Random) -> can.Message:
+    """Make a frame with the id of SOC_DETAIL."""
+    return can.Message(arbitration_id=0x5A1, is_extended_id=False, data=rng.randbytes(8))
+
+
 def crc_wrong(share: float = 1.0, roles: tuple[str, ...] = ROLES) -> FrameChange:
     """Flip a bit of the CRC or of the values."""
 

@@ -24,6 +24,7 @@ Target = Callable[[list[str]], None]
 CONTEXT: Final = multiprocessing.get_context("forkserver")
 PRELOAD: Final = [
     "faults.process",
+    "faults.stamps",
     "cangauge.cli.app",
     "cangauge.cli.run",
     "cangauge.estimation.ekf",
@@ -49,6 +50,13 @@ def prepare() -> None:
     warm = CONTEXT.Process(target=_nothing)
     warm.start()
     warm.join()
+
+
+def run_command(arguments: list[str]) -> int:
+    """Run a command in a fresh interpreter; return its exit status."""
+    return subprocess.run(
+        [sys.executable, "-c", _COLD, *arguments], capture_output=True, timeout=60.0, check=False
+    ).returncode
 
 
 class Process:

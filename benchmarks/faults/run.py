@@ -329,7 +329,7 @@ def run_all(
     def one(fault: Fault) -> Observation:
         line = free.get()
         try:
-            return run_fault(fault, line, seed, target)
+            return run_fault(fault, line, seed, fault.target or target)
         finally:
             free.put(line)
             progress(fault.name)
@@ -395,7 +395,8 @@ def _done(fault: Fault, observed: Observation, reference: Reference | str) -> Re
         return Result(fault, None, reference)
     if observed.late_s > MAX_SEND_DELAY_S:
         return Result(fault, None, f"the machine delayed frames by {observed.late_s:.1f} s, twice")
-    return Result(fault, judge(observed, reference))
+    verdict = judge(observed, reference, reports=fault.reports, recovers=fault.recovers)
+    return Result(fault, verdict)
 
 
 def _with_undisturbed(faults: list[Fault]) -> list[Fault]:

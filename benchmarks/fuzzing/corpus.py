@@ -5,9 +5,10 @@ from __future__ import annotations
 import gzip
 import io
 import json
+import struct
 import tempfile
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,11 @@ from typing import Any
 import can
 import pyarrow as pa
 import pyarrow.parquet as pq
+from mcap.writer import CompressionType, Writer
 
+from cangauge._mcap import FRAME, SAMPLE
 from cangauge._resources import shared_file
+from cangauge.bus.captures.mcap import frame_content, frame_topic
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.validity import Sample
@@ -199,8 +203,29 @@ def log_files() -> dict[str, bytes]:
         )
         + b"Total Number of Data Lines in the Database: 0000000012\n",
     }
+    files["x.bdf.csv"] = _table(
+        "Test Time / s,Voltage / V,Current / A,Cycle Count / 1,Ambient Temperature / degC,"
+        "Surface Temperature T1 / degC",
+        "{t},{u},{n},1,21,{T}",
+    )
+    files["bds.csv"] = _table(
+        "test_time_s,voltage_v,current_a,date_time,ambient_temperature_deg_c,temperature_t1_deg_c",
+        "{t},{u},{n},,{T},",
+    )
     for spelling, (head, row) in d3.items():
         files[f"{spelling} Test Data.txt"] = _table(head, row, "\r\n")
+    samples = [
+        dict(
+            zip(("time_s", "current_a", "voltage_v", "temperature_c", "soc_pct"), row, strict=True)
+        )
+        for row in log_rows()
+    ]
+    files["samples.mcap"] = _mcap(
+        ("/sample", SAMPLE, row["time_s"], json.dumps(row).encode()) for row in samples
+    )
+    files["others.mcap"] = _mcap(
+        ("/bms", "Battery", row["time_s"], json.dumps({"pack": row}).encode()) for row in samples
+    )
     files["log.csv.gz"] = gzip.compress(files["log.csv"], mtime=0)
     files["leaf.zip"] = zipped("61201019 Test Data.txt", files["2012 Test Data.txt"])
     return files
@@ -254,6 +279,27 @@ _TEXTS: dict[str, tuple[str, Callable[[can.Message], str]]] = {
     "candump.log": (
         "", lambda f: f"({f.timestamp:.6f}) can0 {f.arbitration_id:03X}#{_hex(f, '')}\n",
     ),
+    "gvret.csv": (
+        "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8\n",
+        lambda f: f"{1e6 * f.timestamp:.0f},{f.arbitration_id:08X},false,Rx,0,{f.dlc}"
+        f",{_hex(f, ',')},\n",
+    ),
+    "gvret_without_way.csv": (
+        "\ufeffTime Stamp,ID,Extended,Bus,DLC,D1,D2,D3,D4,D5,D6,D7,D8\n",
+        lambda f: f"{1e6 * f.timestamp:.0f},{f.arbitration_id:x},0,1,{f.dlc},{_hex(f, ',')}\n",
+    ),
+    "id_data.csv": ("ID,Data Bytes\n", lambda f: f"{f.arbitration_id:08X},{_hex(f)} \n"),
+    "carbus.trc": (
+        "@ TEXT @ 3 @ 64 @ 0 @ 48 @ 1100 @ 00:00:01.100 @\r",
+        lambda f: f"{int(f.timestamp)},{round(1e6 * f.timestamp) % 1000000:06}\t1\t00000004"
+        f"\t{f.arbitration_id:03X}\t{f.dlc}\t{_hex(f)}\t00000000\t        \t\r",
+    ),
+    "can_hacker.log": (
+        "CAN speed 1: 500k CAN speed 2: 500k Id format: HEX | Data format: HEX\n\t \n",
+        lambda f: f">\t0\t   0:16:{f.timestamp - 960.0:.0f}."
+        f"{round(1e3 * f.timestamp) % 1000}:10.00\tSt\t0x{f.arbitration_id:X}\t0\t{f.dlc}"
+        f"\t{_hex(f, chr(9))}\tp:1\n",
+    ),
 }  # fmt: skip
 _WRITERS: dict[str, Callable[..., can.io.generic.MessageWriter]] = {
     "x.asc": can.ASCWriter,
@@ -274,6 +320,12 @@ def capture_files() -> dict[str, bytes]:
     # Uncompressed, so that mutants reach the content of a container.
     files["plain.blf"] = _written("x.blf", compression_level=0)
     files["candump.log.gz"] = gzip.compress(files["candump.log"], mtime=0)
+    files["x.pcap"] = _pcap()
+    files["x.pcapng"] = _pcapng()
+    files["x.mcap"] = _mcap(
+        (frame_topic(frame), FRAME, frame.timestamp, frame_content(frame))
+        for frame in leaf_frames()
+    )
     mf4 = _mf4()
     return files if mf4 is None else files | {"x.mf4": mf4}
 
@@ -297,6 +349,53 @@ def _on_channel_0(frame: can.Message) -> can.Message:
     )
 
 
+def _socketcan(frame: can.Message) -> bytes:
+    return struct.pack(">IBBxx", frame.arbitration_id, frame.dlc, 0) + frame.data.ljust(8, b"\0")
+
+
+def _pcap() -> bytes:
+    out = [struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 262144, 227)]
+    for frame in leaf_frames():
+        packet = _socketcan(frame)
+        seconds, ticks = divmod(round(1e6 * frame.timestamp), 1_000_000)
+        out.append(struct.pack("<IIII", seconds, ticks, len(packet), len(packet)) + packet)
+    return b"".join(out)
+
+
+def _pcapng() -> bytes:
+    def block(kind: int, body: bytes) -> bytes:
+        size = struct.pack("<I", len(body) + 12)
+        return struct.pack("<I", kind) + size + body + size
+
+    options = struct.pack("<HH4sHH", 2, 4, b"can0", 9, 1) + b"\x09\0\0\0" + bytes(4)
+    out = [
+        block(0x0A0D0D0A, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1)),
+        block(1, struct.pack("<HHI", 227, 0, 262144) + options),
+    ]
+    for frame in leaf_frames():
+        packet = _socketcan(frame)
+        high, low = divmod(round(1e9 * frame.timestamp), 1 << 32)
+        head = struct.pack("<IIIII", 0, high, low, len(packet), len(packet))
+        out.append(block(6, head + packet))
+    return b"".join(out)
+
+
+def _mcap(messages: Iterable[tuple[str, str, float, bytes]]) -> bytes:
+    """Return an MCAP file without compression and checksums, so that mutants reach its content."""
+    out = io.BytesIO()
+    writer = Writer(out, compression=CompressionType.NONE, enable_crcs=False)
+    writer.start()
+    channels: dict[str, int] = {}
+    for topic, schema, time_s, content in messages:
+        if topic not in channels:
+            number = writer.register_schema(schema, "jsonschema", b"{}")
+            channels[topic] = writer.register_channel(topic, "json", number)
+        time_ns = round(1e9 * time_s)
+        writer.add_message(channels[topic], time_ns, content, time_ns)
+    writer.finish()
+    return out.getvalue()
+
+
 def _mf4() -> bytes | None:
     try:
         import asammdf  # noqa: F401, PLC0415 - an extra
@@ -307,6 +406,32 @@ def _mf4() -> bytes | None:
         with can.MF4Writer(path) as writer:
             for frame in leaf_frames():
                 writer.on_message_received(_on_channel_0(frame))
+        return path.read_bytes()
+
+
+@cache
+def mf4_signals() -> bytes | None:
+    """Return the rows as MF4 signals on two rasters, None without asammdf."""
+    try:
+        import asammdf  # noqa: PLC0415 - an extra
+        import numpy as np  # noqa: PLC0415
+    except ModuleNotFoundError:
+        return None
+    times, current, voltage, temperature, soc = np.array(log_rows()).T
+    signal = asammdf.Signal
+    with tempfile.TemporaryDirectory() as folder, asammdf.MDF() as file:
+        fast = [
+            signal(current, times, unit="A", name="PackCurrent"),
+            signal(voltage, times, unit="V", name="PackVoltage"),
+        ]
+        slow = [
+            signal(temperature[::4], times[::4], unit="°C", name="PackTemperature"),
+            signal(soc[::4], times[::4], unit="%", name="SoC"),
+        ]
+        file.append(fast)
+        file.append(slow)
+        path = Path(folder) / "x.mf4"
+        file.save(path)
         return path.read_bytes()
 
 

@@ -24,7 +24,7 @@ from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import GENERIC_RULE
 from cangauge.bus.publish import SocPublisher, SocReader
 from cangauge.bus.recording import capture_to_log
-from cangauge.bus.time_source import ClockFrames
+from cangauge.bus.time_source import ClockFrames, StampLimiter
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import estimate_log
@@ -45,6 +45,8 @@ from fuzzing.target import FindingError, Target, refusable
 
 FRAMES_AT_ONCE = 200
 """Frames of one stream; each counts as an input."""
+MF4_EVERY = 500
+"""Each MF4 log costs a process and a second."""
 ESTIMATED_ROWS = 200
 """Longer logs are read and inspected, not estimated."""
 
@@ -84,9 +86,12 @@ def _packed(rng: Random, data: bytes) -> bytes:
 
 def _make_log(rng: Random) -> bytes:
     files = corpus.log_files()
+    signals = corpus.mf4_signals()
+    if signals is not None and rng.randrange(MF4_EVERY) == 0:
+        return mutate(rng, signals, [signals])
     name = rng.choice(list(files))
     data = files[name]
-    if name.endswith((".parquet", ".gz", ".zip", "utf16.csv")):
+    if name.endswith((".mcap", ".parquet", ".gz", ".zip", "utf16.csv")):
         return mutate(rng, data, list(files.values()))
     mutant = mutate(rng, data, [files["log.csv"], files["TripA01.csv"]], text=True)
     if name.startswith("2012") and rng.randrange(8) == 0:
@@ -143,8 +148,10 @@ def _vehicles() -> tuple[Vehicle, ...]:
 
 def _make_capture(rng: Random) -> bytes:
     files = corpus.capture_files()
-    name = rng.choice(list(files))
-    is_text = not name.endswith((".blf", ".gz", ".mf4"))
+    name = rng.choice([name for name in files if name != "x.mf4"])
+    if "x.mf4" in files and rng.randrange(MF4_EVERY) == 0:
+        name = "x.mf4"
+    is_text = not name.endswith((".blf", ".gz", ".mf4", ".mcap", ".pcap", ".pcapng"))
     mutant = mutate(rng, files[name], list(files.values()), text=is_text)
     return _packed(rng, mutant) if is_text else mutant
 
@@ -190,12 +197,15 @@ def _run_frames(data: bytes) -> bool:
     settings = PipelineSettings(estimator, source)
     pipeline = Pipeline(vehicle, _model(), settings, publishes=False)
     reader, publisher = SocReader(), SocPublisher()
+    limiter = rng.choice((None, StampLimiter(0.02), StampLimiter(0.25, 1.7e9)))
     good = _good_frames(which)
     now_s = rng.choice((0.0, 1000.0, 1.7e9))
     for number in range(FRAMES_AT_ONCE):
         frame = _mutant_frame(rng, good[number % len(good)], vehicle)
         now_s += rng.choice((0.01, 0.01, 0.01, 0.0, 1.0, 5.0, -0.5, 1e5, -1e6, 1e-9))
-        frame.timestamp = now_s
+        frame.timestamp = now_s if rng.randrange(20) else rng.choice(_ODD_STAMPS)
+        if limiter is not None:
+            _limit(rng, limiter, frame, number)
         is_complete = pipeline.handle(frame)
         reader.read(frame)
         if is_complete:
@@ -206,6 +216,18 @@ def _run_frames(data: bytes) -> bool:
     if pipeline.samples:
         _check_estimate(pipeline.latest)
     return bool(pipeline.samples)
+
+
+_ODD_STAMPS = (math.nan, math.inf, -math.inf, -1.0, 0.0, 1e300, 1e11, -1e-6)
+
+
+def _limit(rng: Random, limiter: StampLimiter, frame: can.Message, number: int) -> None:
+    """Limit a stamp; bus time must stay in the interval in which the frame arrived."""
+    begin_s = 100.0 + 0.1 * number
+    limiter.limit([frame], begin_s, begin_s + rng.choice((0.0, 0.001, 0.1)))
+    bus_s = frame.timestamp - (limiter.offset_s + begin_s)
+    if not -1.0 <= bus_s <= 1.0:
+        raise FindingError(f"bus time {bus_s} s from the time of receiving")
 
 
 def _read_back(rng: Random, reader: SocReader, message: can.Message) -> None:
@@ -231,7 +253,8 @@ def _mutant_frame(rng: Random, frame: can.Message, vehicle: Vehicle) -> can.Mess
     data = bytearray(frame.data)
     number, extended = frame.arbitration_id, frame.is_extended_id
     kinds: dict[str, bool] = {}
-    for _ in range(rng.choice((0, 1, 1, 2))):
+    # None at all: repeated or, with another counter, inserted frames.
+    for _ in range(rng.choice((0, 0, 1, 1, 2))):
         what = rng.randrange(7)
         if what <= 2 and data:
             data[rng.randrange(len(data))] = rng.choice((0, 255, 127, 128, rng.randrange(256)))
@@ -364,7 +387,8 @@ def _state_text() -> str:
     return state_file.state_text(
         state_file.StateContent(
             saved_s=1.7e9, boot_id="x", model=state_file.model_fingerprint(_model()),
-            model_name="x", time_source="receive", estimator=estimator.snapshot(),
+            model_name="x", bus="can0", vehicle="x", time_source="receive",
+            estimator=estimator.snapshot(),
         )
     )  # fmt: skip
 

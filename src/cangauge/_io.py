@@ -1,4 +1,4 @@
-"""File access: size limits, safe opening of user-named paths, atomic writing.
+"""File access: limits of size and time, safe opening, atomic writing, one writer to a file.
 
 Limits are far above real files and far below the memory of a small machine. A file beyond a limit
 raises `InputError` before it costs time or memory.
@@ -11,15 +11,24 @@ import gzip
 import io
 import os
 import secrets
+import signal
 import stat
+import threading
+import time
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from os import PathLike
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, BinaryIO, Final, cast
 
 from cangauge.errors import CangaugeError, InputError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment] # checked before use
 
 if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
@@ -56,6 +65,8 @@ MAX_IDLE_LINES: Final = 1_000_000
 """Consecutive lines without a frame."""
 MAX_BLF_OBJECT: Final = 16 * MIB
 """One object of a BLF file, packed or unpacked (writers fill 128 KiB)."""
+MAX_MCAP_RECORD: Final = 64 * MIB
+"""One record of an MCAP file, packed or unpacked (writers fill chunks of 1–4 MiB)."""
 MAX_MF4_MEMORY: Final = 4096 * MIB
 """Memory of the process that reads an MF4 file."""
 MF4_SILENCE_S: Final = 60.0
@@ -78,8 +89,15 @@ MAX_MODEL_BYTES: Final = 4 * MIB
 MAX_MODEL_COLUMNS: Final = 256
 """Columns of the information matrix in a model file."""
 MAX_MODEL_ITEMS: Final = 4096
-"""Effects, source logs and coefficients in a model file, each."""
+"""Source logs, options and coefficients in a model file, each."""
+MAX_MODEL_EFFECTS: Final = 32
+"""Effects in a model file: each costs time at every sample, and the library has 22 kinds."""
 MAX_SPEED_TRACE_BYTES: Final = 64 * MIB
+READ_WITHIN_S: Final = 120.0
+"""Time for reading a configuration with its model, map and DBC [s]: the largest DBC takes up to
+24 s (see `MAX_DBC_BYTES`), on a machine five times slower 120 s."""
+MAX_READING_MEMORY: Final = 2048 * MIB
+"""Memory of the process that does so; the largest DBC takes 0.3 GB."""
 
 
 # --- Reading
@@ -263,6 +281,58 @@ def read_all(file: BinaryIO, path: str | PathLike[str], limit: int, what: str) -
     return bytes(data)
 
 
+class _OutOfTime(BaseException):
+    """Not an Exception: parsers catch those."""
+
+
+_limited: bool = False
+
+
+@contextmanager
+def time_limit(path: str | PathLike[str], seconds: float = READ_WITHIN_S) -> Iterator[None]:
+    """Raise InputError if the block takes longer [s]; the outermost limit counts.
+
+    For parsers in Python: a call into C is interrupted at its end. Without effect outside the main
+    thread and on Windows, which have no signal to interrupt with.
+
+    Parameters
+    ----------
+    path : path-like
+        The file that is read, for the message.
+    seconds : float
+    """
+    global _limited  # noqa: PLW0603 - there is one timer in a process
+    is_main = threading.current_thread() is threading.main_thread()
+    if _limited or not is_main or not hasattr(signal, "setitimer"):
+        yield
+        return
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        raise _OutOfTime
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    began_s = time.monotonic()
+    # Repeated: a finalizer, in which Python ignores exceptions, may meet the first one.
+    left_s, _ = signal.setitimer(signal.ITIMER_REAL, seconds, 1.0)
+    _limited = True
+    try:
+        yield
+    except _OutOfTime:
+        raise InputError(
+            f"takes more than {seconds:g} s to read",
+            source=path,
+            cure="remove the messages and values that you do not need, or read it on a faster"
+            " machine",
+        ) from None
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        _limited = False
+        signal.signal(signal.SIGALRM, before)
+        if left_s:
+            elapsed_s = time.monotonic() - began_s
+            signal.setitimer(signal.ITIMER_REAL, max(left_s - elapsed_s, 1e-3))
+
+
 def _megabytes(size: int) -> str:
     return f"{size // MIB} MB" if size >= MIB else f"{size // 1024} kB"
 
@@ -297,8 +367,14 @@ _WRITE_ERRORS: Final[dict[int, tuple[str, str]]] = {
 }
 
 
+PRIVATE: Final = 0o600
+"""Rights of a state: for its owner only."""
+FOR_GROUP: Final = 0o640
+"""Rights of a recording: the group may read where and how the car was driven, others not."""
+
+
 @contextmanager
-def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
+def atomic_path(path: str | PathLike[str], rights: int | None = None) -> Iterator[Path]:
     """Yield a temporary path beside `path` and rename it to `path` when the block succeeds.
 
     The temporary file exists (empty), is on the same file system and keeps the suffix. If the
@@ -310,6 +386,8 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
     ----------
     path : path-like
         The file to write; a symbolic link is followed (see `refuse_foreign`).
+    rights : int, optional
+        Its permissions. By default those of the file that is replaced, or the umask's.
 
     Yields
     ------
@@ -329,13 +407,13 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
         yield target
         return
     target = Path(os.path.realpath(target))
-    part = _create_beside(target, shown=path)
+    part = _create_beside(target, shown=path, rights=0o666 if rights is None else rights)
     try:
         yield part
         with part.open("rb") as written:
             os.fsync(written.fileno())
         mode = _mode(target)
-        if mode is not None:
+        if rights is None and mode is not None:
             part.chmod(stat.S_IMODE(mode))
         part.replace(target)
     except OSError as error:
@@ -348,9 +426,9 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
             part.unlink()
 
 
-def write_text_atomic(path: str | PathLike[str], text: str) -> None:
+def write_text_atomic(path: str | PathLike[str], text: str, rights: int | None = None) -> None:
     """Write `text` as UTF-8 to `path`, all or nothing (see `atomic_path`)."""
-    with atomic_path(path) as part:
+    with atomic_path(path, rights) as part:
         part.write_text(text, encoding="utf-8", newline="\n")
 
 
@@ -367,6 +445,94 @@ def check_writable(path: str | PathLike[str]) -> None:
     refuse_foreign(path)
     if not _is_device(Path(path)):
         _create_beside(Path(os.path.realpath(path)), shown=path).unlink()
+
+
+def refuse_pipe(path: str | PathLike[str]) -> None:
+    """Raise InputError for a pipe that a service would write: whoever reads it could stop it.
+
+    A command may write one: Ctrl-C ends it.
+    """
+    if stat.S_ISFIFO(_mode(Path(path)) or 0):
+        raise InputError(
+            "this is a pipe (FIFO): whoever reads it could stop the service",
+            source=path,
+            cure="name a file",
+        )
+
+
+@contextmanager
+def sole_writer(path: str | PathLike[str]) -> Iterator[None]:
+    """Hold a file for this process while the block runs.
+
+    A lock on a file beside it, which the kernel releases at the latest when the process ends. Where
+    there can be no lock (a read-only or full disk, a network file system without locks, Windows)
+    the block runs without.
+
+    Raises
+    ------
+    InputError
+        If another process holds it; names that process.
+    """
+    if fcntl is None:
+        yield
+        return
+    target = Path(os.path.realpath(path))
+    lock = target.with_name(f".{target.name[:200]}.lock")
+    held = _locked(lock, path)
+    try:
+        yield
+    finally:
+        if held is not None:
+            with suppress(OSError):
+                lock.unlink()
+            os.close(held)
+
+
+def _locked(lock: Path, shown: str | PathLike[str]) -> int | None:
+    """Return the descriptor of a locked file; None where there can be none."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    while True:
+        try:
+            held = os.open(lock, flags, PRIVATE)
+        except OSError as error:
+            if error.errno in _NO_LOCK:
+                return None
+            raise InputError(
+                f"cannot be locked: {lock.name}: {error.strerror}",
+                source=shown,
+                cure="remove that file, or name another one",
+            ) from error
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # Its last holder may have removed it between both calls.
+            if os.path.samestat(os.fstat(held), lock.lstat()):
+                with suppress(OSError):
+                    os.ftruncate(held, 0)
+                    os.write(held, f"{os.getpid()}\n".encode())
+                return held
+        except BlockingIOError as error:
+            holder = os.read(held, 20).decode("ascii", "replace").strip()
+            os.close(held)
+            raise InputError(
+                f"another service{f' (process {holder})' if holder else ''} writes this file",
+                source=shown,
+                cure="stop that one, or name another file",
+            ) from error
+        except FileNotFoundError:
+            pass
+        except OSError as error:
+            os.close(held)
+            if error.errno in _NO_LOCK:
+                return None
+            raise
+        os.close(held)
+
+
+_NO_LOCK: Final = FULL | {
+    errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP,
+    errno.ENOENT, errno.ENOTDIR, errno.EINVAL,
+}  # fmt: skip
+"""Errors of places without locks; where nothing can be written at all, writing reports it."""
 
 
 def refuse_foreign(path: str | PathLike[str]) -> None:
@@ -435,14 +601,14 @@ def _mode(path: Path) -> int | None:
         return None
 
 
-def _create_beside(target: Path, *, shown: str | PathLike[str]) -> Path:
+def _create_beside(target: Path, *, shown: str | PathLike[str], rights: int = 0o666) -> Path:
     mode = _mode(target)
     if mode is not None and stat.S_ISDIR(mode):
         raise InputError("this is a folder", source=shown, cure="name a file in it")
     # The suffix stays last: writers such as pyarrow and bokeh choose the format by it.
     part = target.with_name(f".{target.stem[:200]}.{secrets.token_hex(4)}{target.suffix}")
     try:
-        part.touch(exist_ok=False)
+        part.touch(rights, exist_ok=False)
     except OSError as error:
         problem, cure = _WRITE_ERRORS.get(
             error.errno or 0, (f"cannot be written: {error.strerror}", "name another path")

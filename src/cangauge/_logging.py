@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import select
 import sys
 import threading
 import time
@@ -21,7 +22,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any, Final, Literal, TextIO
+from typing import IO, Any, Final, Literal, TextIO
 
 from cangauge._formatting import printable, printable_json
 
@@ -104,7 +105,26 @@ def logging_to(
         bus.setLevel(before[3])
 
 
+def takes_text(stream: IO[str]) -> bool:
+    """Return whether a stream takes a line without waiting.
+
+    A pipe whose reader has stopped, or a terminal after Ctrl-S, does not: whoever writes there
+    would stop with it.
+    """
+    try:
+        ready = select.poll()
+        ready.register(stream.fileno(), select.POLLOUT)
+        return bool(ready.poll(0))
+    except (AttributeError, OSError, ValueError):  # Windows; no real file
+        return True
+
+
 class _Handler(logging.StreamHandler[TextIO]):
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a record; drop it where nobody reads, rather than wait."""
+        if takes_text(self.stream):
+            super().emit(record)
+
     def write(self, record: logging.LogRecord) -> None:
         """Write a record without filtering it."""
         self.acquire()

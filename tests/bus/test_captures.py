@@ -58,7 +58,32 @@ CANDUMP_LOG = (
     "(1436509052.650005) vcan0 124##1AABB\n"
     "(1436509052.650006) vcan0 20000080#0000000000000000\n"
 )
+GVRET = (
+    "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8\n"
+    "22213513,00000111,false,Rx,0,8,00,01,02,03,04,05,06,07,\n"
+    "22214519,18FF0001,true,Tx,1,2,0A,3C,00,00,00,00,00,00,\n"
+)
+GVRET_WITHOUT_DIRECTION = (
+    "\ufeffTime Stamp,ID,Extended,Bus,DLC,D1,D2,D3,D4,D5,D6,D7,D8\n"
+    "2124377,3a0,0,1,8,ff,ff,c0,ff,ff,ff,ff,fd\n"
+    "2124378,18ff0001,1,1,2,ff,ff,0,0,0,0,0,0\n"
+)
+CARBUS = (
+    "@ TEXT @ 3 @ 64 @ 0 @ 2 @ 7459 @ 00:00:07.459 @\r# $LocalTime=11:19:54.503$\r"
+    "26,641405\t1\t00000004\t112\t8\t00 20 C1 0E 01 72 89 00\t00000000\t     r  \t\r"
+    "26,671594\t2\t00000004\t18FF0001\t2\t0F 00                  \t00000000\t  \t\r"
+)
+CAN_HACKER = (
+    "CAN speed 1: 500k CAN speed 2: 500k CAN speed 3: 1000k/4000k Id format: HEX | Data format: HEX"
+    "\n\t \n"
+    ">\t0\t   23:59:59.303:4446.00\tSt\t0x197\t0\t4\t64\tE0\t9E\tC0\t \t \t \t \tp:1\n"
+    ">\t1\t   0:0:9.69:298.00\tSt\t0x10B\t0\t3\tBA\t0D\tFC\t \t \t \t \t \tp:2\n"
+    ">\t2\t   0:0:9.70:298.00\tExt\t0x18FF0001\t0\t1\tBA\t \t \t \t \t \t \t \tp:2\n"
+)
 TEXTS = {
+    "SavvyCAN GVRET CSV": (GVRET, 2),
+    "CARBUS Analyzer trace": (CARBUS, 2),
+    "CAN Hacker log": (CAN_HACKER, 3),
     "seconds, id, length, bytes": (SPACED, 4),
     "tab-separated table": (TABLE, 2),
     "CRTD (OVMS)": (CRTD, 3),
@@ -125,6 +150,35 @@ def test_crtd_keeps_the_buses_apart(tmp_path: Path) -> None:
     assert facts(first) == (1632509059.541604, 0x174, False, "000000aa0f000000")
     assert (first.channel, second.channel, third.channel) == (2, 1, 1)
     assert (first.is_rx, second.is_rx) == (True, False)
+
+
+def test_gvret_csv_in_both_spellings(tmp_path: Path) -> None:
+    first, second = read_capture(write(tmp_path, GVRET))
+    assert facts(first) == (22.213513, 0x111, False, "0001020304050607")
+    assert facts(second) == (22.214519, 0x18FF0001, True, "0a3c")
+    assert (first.channel, second.channel, first.is_rx, second.is_rx) == (0, 1, True, False)
+    first, second = read_capture(write(tmp_path, GVRET_WITHOUT_DIRECTION))
+    assert facts(first) == (2.124377, 0x3A0, False, "ffffc0fffffffffd")
+    assert facts(second) == (2.124378, 0x18FF0001, True, "ffff")
+
+
+def test_gvret_stamps_too_fast_for_a_bus_are_milliseconds(tmp_path: Path) -> None:
+    rows = "".join(f"{5000 + k // 2},112,0,1,2,ff,{k:x}\n" for k in range(200))
+    text = GVRET_WITHOUT_DIRECTION.splitlines(keepends=True)[0] + rows
+    times = [each.timestamp for each in read_capture(write(tmp_path, text))]
+    assert (times[0], times[-1]) == (5.0, 5.099)
+
+
+def test_traces_of_can_hacker_and_carbus(tmp_path: Path) -> None:
+    first, second = read_capture(write(tmp_path, CARBUS))
+    assert facts(first) == (26.641405, 0x112, False, "0020c10e01728900")
+    assert facts(second) == (26.671594, 0x18FF0001, True, "0f00")
+    milliseconds = CARBUS.replace("TEXT @ 3", "TEXT @ 2").replace("641405", "641")
+    assert next(read_capture(write(tmp_path, milliseconds))).timestamp == 26.641
+    first, second, third = read_capture(write(tmp_path, CAN_HACKER))
+    assert facts(first) == (86399.303, 0x197, False, "64e09ec0")
+    assert facts(second) == (86409.069, 0x10B, False, "ba0dfc")  # past midnight
+    assert (third.is_extended_id, third.channel) == (True, 2)
 
 
 def test_without_stamps_frames_of_the_clock_count_time(tmp_path: Path) -> None:

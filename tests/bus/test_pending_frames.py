@@ -168,12 +168,15 @@ def test_a_closed_connection_leaks_no_descriptor() -> None:
     assert descriptors() == before
 
 
-def test_other_interfaces_give_one_frame_at_a_time() -> None:
+def test_other_interfaces_are_read_until_they_are_empty() -> None:
     frame = can.Message(arbitration_id=1)
     script: list[object] = [frame, frame, None, unpack_error(), frame, network_down()]
     port = BusConnection(BrokenBus(script), "x")  # type: ignore[arg-type] # what is used of one
-    assert [len(port.receive_pending(0.0)) for _ in range(5)] == [1, 1, 0, 0, 1]
+    assert len(port.receive_pending(0.0)) == 2
+    assert port.is_drained
+    assert [len(port.receive_pending(0.0)) for _ in range(2)] == [0, 1]
     assert port.garbled == 1
+    assert not port.is_drained
     with pytest.raises(BusError):
         port.receive_pending(0.0)
 

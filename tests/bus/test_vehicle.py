@@ -217,7 +217,7 @@ def test_the_map_file_defines_protection_rules(own: Path) -> None:
         ("sign = -1", 'scale = "a"', "current.scale", "number"),
         ("sign = -1", "singn = -1", "current.singn", "did you mean sign"),
         ("sign = -1", "when = { Nonsense = 1 }", "current.when", "no such signal"),
-        ("[voltage]", "[volts]", "volts", "did you mean voltage?"),
+        ("[voltage]", "[volts]", "volts", "did you mean voltage"),
         ('[voltage]\nsignal = "PackVoltage"\n', "", "voltage", "is missing"),
         ('"pack"', '"battery"', "temperature_source", "'battery'"),
         (

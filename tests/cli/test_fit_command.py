@@ -15,6 +15,7 @@ from cangauge.logs.canonical import write_log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH
+from synthetic import synthetic_log
 
 Run = Callable[..., object]
 
@@ -265,3 +266,46 @@ def test_vehicle_options_do_not_apply_to_a_log(run: Run, made: Path, tmp_path: P
     assert ran.code == 0
     assert "do not apply" in ran.err
     assert np.isfinite(json.loads(ran.out)["voltage_rmse_v"])
+
+
+def test_columns_and_starts_of_a_logger_s_tables(run: Run, tmp_path: Path) -> None:
+    paths = []
+    for seed, (start, end) in enumerate(((90.0, 30.0), (75.0, 45.0)), start=1):
+        log = synthetic_log(hours=0.8, start_pct=start, end_pct=end, noise_v=0.3, seed=seed)
+        rows = zip(log.time_s, -1e3 * log.current_a, log.voltage_v, log.temperature_c, strict=True)
+        path = tmp_path / f"drive{seed}.csv"
+        path.write_text("Stempel;Ibatt x;U [V];T1\n" + "".join(
+            f"{t};{i};{u};{c}\n" for t, i, u, c in rows
+        ))  # fmt: skip
+        paths.append(path)
+    options = ("-o", tmp_path / "m.json", "--columns", "time=Stempel,current=Ibatt x[mA]")
+    refused(run("fit", *paths, *options, "--capacity-ah", "51"), "no log states", "--initial-soc")
+    starts = ("--capacity-ah", CAPACITY_AH, "--initial-soc", "90", "--initial-soc", "auto")
+    ran = run("fit", *paths, *options, *starts, "--json")
+    assert ran.code == 0, ran.err
+    found = json.loads(ran.out)
+    assert [item["initial_soc_from"] for item in found["logs"]] == ["given", "estimated"]
+    assert found["logs"][1]["initial_soc_pct"] == pytest.approx(75.0, abs=1.5)
+    assert list(found["assumed"]) == [str(path) for path in paths]
+    assert "positive current charges, found from the data" in found["assumed"][str(paths[0])]
+    assert f'{paths[0]}: read as time = "Stempel" [s, assumed], current = "Ibatt x" [mA]' in ran.err
+    refused(run("fit", *paths, *options, "--initial-soc", "90", "--initial-soc", "120"), "100 %")
+    refused(run("fit", paths[0], *options, "--initial-soc", "9", "--initial-soc", "8"), "2 values")
+
+
+def test_the_same_log_twice_is_refused(run: Run, made: Path, tmp_path: Path) -> None:
+    ran = run("fit", made / "full.parquet", made / "full.parquet", "-o", tmp_path / "m.json")
+    refused(ran, "same rows as", "give each log once")
+
+
+def test_a_count_that_differs_from_the_log_is_told(run: Run, made: Path, tmp_path: Path) -> None:
+    options = ("--capacity-ah", "45", "--initial-soc", "80", "-o", tmp_path / "m.json", "--json")
+    ran = run("fit", made / "part.csv", *options)
+    assert ran.code == 0, ran.err
+    remarks = json.loads(ran.out)["remarks"]
+    told = [text for text in remarks if "the log's own SoC says" in text]
+    assert len(told) == 1
+    assert f"its capacity would be {CAPACITY_AH:.1f} Ah, not 45.0 Ah" in told[0]
+    out = ("-o", tmp_path / "soc.csv")
+    ran = run("estimate", made / "part.csv", "-m", tmp_path / "m.json", *out)
+    assert "its capacity would be" in ran.err

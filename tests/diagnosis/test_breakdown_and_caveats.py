@@ -143,9 +143,9 @@ def test_a_segment_is_a_minute_either_side_in_its_log() -> None:
 # --- caveats ---
 
 
-def caveats(log: Log, references: int = 3, initial_soc_pct: float | None = None) -> str:
+def caveats(log: Log, references: int = 3) -> str:
     known = [sampled(long_log(name=f"reference {k}")) for k in range(references)]
-    return " ".join(log_caveats([sampled(log)], known, CAPACITY_AH, initial_soc_pct))
+    return " ".join(log_caveats([sampled(log)], known, CAPACITY_AH))
 
 
 def test_a_good_log_has_no_caveat() -> None:
@@ -167,7 +167,6 @@ def test_a_short_and_narrow_log_has_caveats() -> None:
 @pytest.mark.parametrize(
     ("log", "references", "sentence"),
     [
-        (long_log(soc_pct=None), 3, "No initial SoC of synthetic"),
         (long_log(), 0, "No reference logs"),
         (long_log(), 2, "Only 2 reference logs"),
         (replace(long_log(), temperature_c=long_log().temperature_c - 15.0), 3,
@@ -181,18 +180,10 @@ def test_each_limitation_has_its_caveat(log: Log, references: int, sentence: str
     assert sentence in caveats(log, references)
 
 
-def test_a_reference_without_soc_is_a_caveat() -> None:
-    known = [sampled(long_log()), sampled(long_log(soc_pct=None, name="silent"))]
-    words = " ".join(log_caveats([sampled(long_log())], known, CAPACITY_AH))
-    assert "No initial SoC of the reference silent: 100 % assumed" in words
-
-
 def test_another_temperature_source_is_a_caveat() -> None:
     log, known = [sampled(long_log())], [sampled(long_log())] * 3
-    assert log_caveats(log, known, CAPACITY_AH, None, "room") == log_caveats(
-        log, known, CAPACITY_AH
-    )
-    words = " ".join(log_caveats(log, known, CAPACITY_AH, None, "pack"))
+    assert log_caveats(log, known, CAPACITY_AH, "room") == log_caveats(log, known, CAPACITY_AH)
+    words = " ".join(log_caveats(log, known, CAPACITY_AH, "pack"))
     assert "measured on pack, that of these logs on room" in words
 
 
@@ -201,10 +192,6 @@ def test_time_counts_from_the_start_of_the_log() -> None:
     spans = [p for p in error_shares([item], [np.ones(len(item.sampled.rows))], CAPACITY_AH)
              if p.axis == "time"]  # fmt: skip
     assert spans[-1].high == pytest.approx(item.sampled.log.duration_s, abs=2.0)
-
-
-def test_a_given_initial_soc_needs_no_caveat() -> None:
-    assert "No initial SoC" not in caveats(long_log(soc_pct=None), initial_soc_pct=80.0)
 
 
 def test_coarse_temperature_steps_are_a_caveat() -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from cangauge.estimation.validity import Reason
 from faults.criteria import (
     DEGRADED,
     INVALID,
@@ -174,3 +175,30 @@ def test_unexpected_end_of_the_process_fails() -> None:
 def test_invalid_undisturbed_run_is_refused(bad: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="undisturbed"):
         Reference(observed(**bad))
+
+
+def reported(reason: Reason, first: float, last: float, status: int = DEGRADED) -> Observation:
+    """A run that publishes a reason for a time."""
+    changed = [
+        replace(each, reason=int(reason), status=status) if first <= each.time_s < last else each
+        for each in observed().published
+    ]
+    return observed(published=changed)
+
+
+def test_fault_must_be_reported_and_not_valid() -> None:
+    reference, reason = Reference(observed()), Reason.DUPLICATE_SENDER
+    first, last = FAULT
+    assert judge(reported(reason, first + 2.0, last), reference, reports=reason).passed
+    none = judge(observed(), reference, reports=reason)
+    assert "no duplicate sender reported" in none.failures
+    assert judge(observed(), reference).passed
+    early = judge(reported(reason, first, first + 8.0), reference, reports=reason)
+    assert early.failures == ("valid 8 s into the fault",)
+
+
+def test_fault_that_must_recover_is_valid_at_the_end() -> None:
+    reference = Reference(observed())
+    assert judge(observed(), reference, recovers=True).passed
+    late = judge(reported(Reason.CURRENT_GAP, FAULT[0], math.inf), reference, recovers=True)
+    assert late.failures == ("not valid again",)

@@ -28,6 +28,7 @@ COMMANDS: dict[str, Any] = {
 VALID = {
     # Complete but for an absent file, so that none of them starts to work.
     "demo": ["--folder", "file.txt"],
+    "init": ["absent.log", "--map", "car.toml", "--config", "run.toml"],
     "fit": ["absent.csv", "-o", "out.json"],
     "estimate": ["absent.csv", "-m", "model.json", "-o", "out.csv"],
     "gap": ["absent.csv", "-m", "model.json"],
@@ -108,7 +109,7 @@ def test_what_is_valid_ends_at_the_missing_file(command: str, refused: Callable[
 def test_unknown_options_and_too_many_arguments(command: str, refused: Callable[..., str]) -> None:
     given = [command, *VALID[command]] if command else []
     assert "--bogus" in refused(*given, "--bogus")
-    if command not in {"fit", "gap"}:  # which take any number of logs
+    if command not in {"fit", "gap", "init"}:  # which take any number of files
         assert "unexpected extra argument" in refused(*given, "x") or not command
     assert f"see `cangauge{' ' * bool(command)}{command} --help`" in refused(*given, "--bogus")
 

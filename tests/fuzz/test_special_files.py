@@ -16,6 +16,7 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
+from cangauge.service.addresses import read_token
 from cangauge.service.config import load_config
 from cangauge.validation.twin.drive import read_speed
 
@@ -27,6 +28,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "config": load_config,
     "model": Model.load,
     "speed": read_speed,
+    "token": lambda path: read_token(path, {}),
 }
 
 

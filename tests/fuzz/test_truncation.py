@@ -31,10 +31,10 @@ CAPTURES = [
 ]
 
 
-def outcomes(path: Path, data: bytes, read: Callable[[Path], int]) -> list[int]:
+def outcomes(path: Path, data: bytes, read: Callable[[Path], int], step: int = 1) -> list[int]:
     """Return the amount read of every beginning of the file, 0 where it was refused."""
     found = []
-    for length in range(len(data)):
+    for length in range(0, len(data), step):
         path.write_bytes(data[:length])
         try:
             found.append(read(path))
@@ -53,9 +53,10 @@ def test_logs(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", CAPTURES)
 def test_captures(tmp_path: Path, name: str) -> None:
-    found = outcomes(
-        tmp_path / name, corpus.capture_files()[name], lambda path: len(list(read_capture(path)))
-    )
+    data = corpus.capture_files()[name]
+    # Each MF4 costs a process and a second.
+    step = len(data) // 8 if name == "x.mf4" else 1
+    found = outcomes(tmp_path / name, data, lambda path: len(list(read_capture(path))), step)
     assert max(found) <= len(corpus.leaf_frames())
 
 

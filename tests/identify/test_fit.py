@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cangauge.identify.noise import describe_noise
 
 from cangauge.errors import InputError
 from cangauge.identify.delays import search_delays
 from cangauge.identify.fit import common_name, fit
-from cangauge.identify.noise import describe_noise
 from cangauge.inference.least_squares import solve
 from cangauge.inference.rows import FitOptions
 from cangauge.logs.log import Log
@@ -99,10 +99,10 @@ def test_several_logs_cover_more_soc_than_each() -> None:
 
 def test_capacity_needs_a_log_from_full_to_empty() -> None:
     whole = replace(synthetic_log(end_pct=0.0), soc_pct=None)
-    assert capacity_from_full_discharge([whole], None) == pytest.approx(CAPACITY_AH, rel=0.005)
+    assert capacity_from_full_discharge([whole], 100.0) == pytest.approx(CAPACITY_AH, rel=0.005)
     part = replace(synthetic_log(end_pct=30.0), soc_pct=None)
     with pytest.raises(InputError, match="full to empty"):
-        capacity_from_full_discharge([part], None)
+        capacity_from_full_discharge([part], 100.0)
     referenced = synthetic_log(start_pct=90.0, end_pct=30.0)
     with pytest.raises(InputError, match="--capacity-ah"):
         fit([referenced])
@@ -125,8 +125,9 @@ def test_names_the_reason_why_a_log_identifies_nothing(log: Log, words: str) -> 
 
 def test_refuses_logs_with_different_temperature_sources() -> None:
     log = synthetic_log(hours=0.5)
+    other = replace(synthetic_log(hours=0.5, seed=2), temperature_source="cell")
     with pytest.raises(InputError, match="different sources"):
-        fit([log, replace(log, temperature_source="cell")], capacity_ah=CAPACITY_AH)
+        fit([log, other], capacity_ah=CAPACITY_AH)
 
 
 def test_information_reproduces_the_solution() -> None:
@@ -247,5 +248,6 @@ def test_a_model_is_named_after_the_common_part_of_its_logs(
 def test_a_given_name_is_kept() -> None:
     log = synthetic_log(hours=0.5, name="day")
     assert fit([log], capacity_ah=CAPACITY_AH).model.name == "day"
-    assert fit([log, log], capacity_ah=CAPACITY_AH).model.name == "day (2 logs)"
+    other = synthetic_log(hours=0.5, seed=2, name="day")
+    assert fit([log, other], capacity_ah=CAPACITY_AH).model.name == "day (2 logs)"
     assert fit([log], capacity_ah=CAPACITY_AH, name="pack").model.name == "pack"

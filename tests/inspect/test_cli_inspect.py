@@ -6,14 +6,18 @@ import io
 import json
 from pathlib import Path
 
+import can
 import numpy as np
 import pytest
 import typer
 from rich.console import Console
 from typer.testing import CliRunner
 
+from cangauge.bus.encoder import FrameEncoder
+from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.inspect import _show, inspect_command
 from cangauge.errors import InputError
+from cangauge.estimation.validity import Sample
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
 
@@ -68,7 +72,9 @@ def test_a_temperature_is_taken_where_the_file_has_none(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("option", ["--vehicle", "--dbc", "--map"])
 def test_a_log_needs_no_vehicle(path: Path, option: str) -> None:
-    result = CliRunner().invoke(app, [str(path), option, "x", "--json"])
+    given = path.with_name("given.toml")
+    given.write_text('[current]\nsignal = "x"\n')
+    result = CliRunner().invoke(app, [str(path), option, str(given), "--json"])
     assert isinstance(result.exception, InputError)
     assert result.exception.field == option
     assert result.stdout == ""
@@ -110,3 +116,63 @@ def test_a_nested_result_is_shown_whole() -> None:
         "one [remark]",
     ):
         assert words in buffer.getvalue()
+
+
+LOGGER = "Stempel;Wert a;Wert b\n" + "".join(
+    f"{k};{1000 * (10 - 50 * (k % 2))};{384 - 5 * (k % 2)}\n" for k in range(60)
+)
+"""Discharge negative, in mA."""
+
+
+@pytest.mark.parametrize("way", ["option", "map"])
+def test_columns_by_option_or_map_file_read_a_table(tmp_path: Path, way: str) -> None:
+    path = tmp_path / "logger.csv"
+    path.write_text(LOGGER)
+    options = ["--columns", "time=Stempel,current=Wert a[mA],voltage=Wert b"]
+    if way == "map":
+        (tmp_path / "car.toml").write_text(
+            '[columns]\ntime = "Stempel"\ncurrent = "Wert a[mA]"\nvoltage = "Wert b"\n'
+        )
+        options = ["--map", str(tmp_path / "car.toml")]
+    result = CliRunner().invoke(app, [str(path), *options, "--temperature", "20", "--json"])
+    found = json.loads(result.stdout)
+    assert found["channels"]["current_a"]["maximum"] == 40.0
+    (assumed,) = found["assumed"].values()
+    assert 'current = "Wert a" [mA]' in assumed
+    assert "positive current charges, found from the data" in assumed
+
+
+def test_unknown_columns_are_refused_with_a_command(tmp_path: Path) -> None:
+    path = tmp_path / "logger.csv"
+    path.write_text(LOGGER)
+    result = CliRunner().invoke(app, [str(path)])
+    assert isinstance(result.exception, InputError)
+    assert "(found: Stempel, Wert a, Wert b)" in str(result.exception)
+    assert "--columns 'time=Stempel,current=?,voltage=?'" in str(result.exception)
+    assert "docs/logs.md" in str(result.exception)
+
+
+def test_one_map_reads_captures_by_signals_and_tables_by_columns(
+    tmp_path: Path, project: Path
+) -> None:
+    (tmp_path / "car.toml").write_text(
+        'current = "current_a"\nvoltage = "voltage_v"\ntemperature = "temperature_c"\n'
+        'soc = "soc_pct"\n[columns]\ntime = "Stempel"\ncurrent = "Wert a[mA]"\n'
+        'voltage = "Wert b"\n'
+    )
+    (tmp_path / "logger.csv").write_text(LOGGER)
+    encoder = FrameEncoder(Vehicle.load("generic"))
+    with can.CanutilsLogWriter(tmp_path / "drive.log") as writer:
+        for k in range(300):
+            current_a = 40.0 * (k // 20 % 2)
+            sample = Sample(1000.0 + k / 10.0, current_a, 380.0 - 0.1 * current_a, 20.0)
+            for frame in encoder.encode(sample, 80.0):
+                writer.on_message_received(frame)
+    options = ["--map", str(tmp_path / "car.toml"), "--temperature", "20", "--json"]
+    table = CliRunner().invoke(app, [str(tmp_path / "logger.csv"), *options])
+    assert json.loads(table.stdout)["channels"]["current_a"]["maximum"] == 40.0
+    dbc = str(next((project / "dbc").glob("generic*.dbc")))
+    capture = CliRunner().invoke(app, [str(tmp_path / "drive.log"), "--dbc", dbc, *options])
+    found = json.loads(capture.stdout)
+    assert found["log"]["channels"]["current_a"]["maximum"] == 40.0
+    assert found["log"]["soc"]["first_pct"] == pytest.approx(80.0)

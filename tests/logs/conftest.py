@@ -163,4 +163,16 @@ def every_format(tmp_path: Path, small_log: Log) -> dict[str, bytes]:
         + "".join(f"{k}.0,1,-{k},24.9,0,22,23,DCHG,\n" for k in range(1, 5))
         + "Total Number of Data Lines in the Database: 0000000004\n"
     ).encode()
+    files["logger.csv"] = (
+        "Zeit;Strom;Spannung;Temperatur\n;mA;V;°C\n"
+        + "".join(f"13.03.2024 10:00:0{k},5;{k}000,5;38{k},25;21,5\n" for k in range(6))
+    ).encode("latin-1")
+    files["history.csv"] = (
+        "entity_id,state,last_changed\n"
+        + "".join(
+            f"sensor.battery_{name},{value},2024-03-13T23:59:3{k}.000Z\n"
+            for k in range(6)
+            for name, value in (("current", k), ("voltage", 380 + k), ("temperature", 21))
+        )
+    ).encode()
     return files

@@ -208,3 +208,13 @@ def test_tables_of_any_columns(tmp_path: Path) -> None:
     columns = {"time_s": np.array([0.0, 1.0]), "status": pa.array(["valid", "a,b"])}
     write_table(columns | {"soc": np.array([np.nan, 0.1])}, tmp_path / "x.csv")
     assert (tmp_path / "x.csv").read_text() == 'time_s,status,soc\n0,"valid",\n1,"a,b",0.1\n'
+
+
+def test_a_temperature_of_another_name_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    rows = [f"{t},{20 + 10 * (t // 30 % 3)},{378 - t // 30 % 3},22" for t in range(600)]
+    header = "Time_s,Current_A,Voltage_V,Cell_Temperature_C"
+    path.write_text("\n".join([header, *rows]) + "\n")
+    log = read_log(path)
+    assert log.temperature_c[0] == 22.0
+    assert log.current_a[0] == 20.0

@@ -26,6 +26,8 @@ NAMES = (
     "A123_DYN_50_P25_s1.csv",
     "Cell-HPPC-10C.csv",
     "module.csv",
+    "logger.csv",
+    "history.csv",
 )
 
 
@@ -94,7 +96,7 @@ def test_damaged_bytes_raise_nothing_but_input_errors(
             "not a known kind of log; known are: canonical Parquet",
         ),
         (b"%PDF-1.4\n", r"first line: .*not a known kind of log.* \(got '%PDF-1.4'\)"),
-        (b"a,b,c\n1,2,3\n", r"\(got 'a,b,c'\)"),
+        (b"a,b,c\n1,2,3\n", r"found: a, b, c\); name the columns"),
         (b"\x1f\x8bnot gzip", "gzip file is cut off or damaged"),
         (b"PK\x03\x04not zip", "zip file is cut off or damaged"),
         (b"PAR1not parquet", "Parquet file is cut off or damaged"),

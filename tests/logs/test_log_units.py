@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from cangauge.errors import InputError
 from cangauge.logs.draft import DraftLog
 from cangauge.logs.log import Log
-from cangauge.logs.units import convert
+from cangauge.logs.units import convert, refuse_wrong_units
 
 
 def drive(
@@ -143,3 +143,9 @@ def test_an_unknown_unit_lists_the_known_ones() -> None:
         InputError, match=r"x: V x \[kelvin\].*\(got 'kelvin'\).*v, volt, volts, mv"
     ):
         convert(np.ones(1), "voltage_v", "kelvin", source="x", label="V x [kelvin]")
+
+
+def test_a_capture_of_a_fast_replay_is_not_in_hours() -> None:
+    values = drive()
+    values["time_s"] = values["time_s"] / 3600.0
+    assert refuse_wrong_units(values, source="a.log", labels={}, in_seconds=True) == ()

@@ -158,6 +158,7 @@ def test_hangups_at_the_start_and_malformed_packets_do_not_end_the_service(
         for hostile in HOSTILE:
             send(sender, hostile, packet(), hostile)
         time.sleep(0.3)
+        service.wait_for("config.reloaded")
     service.process.send_signal(signal.SIGTERM)
     ended = service.end()
     assert ended.code == 0, ended.err

@@ -21,6 +21,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from watched import Watched
 
 from cangauge.errors import CangaugeError, InputError
+from cangauge.model.published import CAPACITY_AH
 from cangauge.service.addresses import default_path, http_address, open_unix, served_sockets
 from cangauge.service.http import MAX_CLIENTS, Endpoint
 from cangauge.service.status_client import NotRunningError, fetch_status, find_socket
@@ -60,6 +61,10 @@ def test_status_and_health(http: Endpoint) -> None:
     assert headers["Content-Type"] == "application/json"
     assert content["status"] == "valid"
     assert content["samples"] == 900
+    assert content["health"]["capacity_ah"] == pytest.approx(CAPACITY_AH, rel=0.2)
+    assert content["power"]["discharge_std_a"] >= 0.0
+    assert content["cells"] is None
+    assert content["notices"] == []
     code, body, _ = get(http.port, "/healthz")
     assert code == 200
     assert json.loads(body) == {"ok": True, "status": "valid"}
@@ -91,6 +96,12 @@ def test_metrics_are_what_prometheus_reads(http: Endpoint) -> None:
     assert value["cangauge_status", "invalid"] == 0
     assert value["cangauge_reason", "input_stale"] == 0
     assert 70 < value["cangauge_soc_percent",] < 85
+    assert value["cangauge_capacity_ah",] == pytest.approx(CAPACITY_AH, rel=0.2)
+    assert 0 < value["cangauge_capacity_std_ah",] < 0.2 * CAPACITY_AH
+    assert 0.5 < value["cangauge_resistance_ratio",] < 1.5
+    assert 0 < value["cangauge_discharge_amperes",] <= 200
+    assert 5_000 < value["cangauge_energy_watt_hours",] < 20_000
+    assert not any(name[0].startswith("cangauge_weakest") for name in value)
     assert value["cangauge_rejects_total", "crc_errors"] == 0
     assert value["cangauge_bus_queue_drops_total",] == 4
     assert value["cangauge_bus_up",] == 1
@@ -295,6 +306,21 @@ def test_slow_and_greedy_clients_block_nobody(http: Endpoint) -> None:
     with contextlib.suppress(ConnectionResetError):
         assert slow[0].recv(100) == b""
     for each in (*slow, greedy):
+        each.close()
+
+
+@pytest.mark.parametrize(
+    "first", ["", "GET /healthz HTTP/1.1\r\nX: ", "POST / HTTP/1.1\r\nContent-Length: 9\r\n\r\n"]
+)
+def test_slow_clients_leave_a_place_for_a_probe(http: Endpoint, first: str) -> None:
+    slow = [socket.create_connection(("127.0.0.1", http.port or 0)) for _ in range(64)]
+    for each in slow:
+        each.sendall(first.encode())
+    began = time.monotonic()
+    for _ in range(3 * MAX_CLIENTS):
+        assert get(http.port, "/healthz")[0] == 200
+    assert time.monotonic() - began < 3.0
+    for each in slow:
         each.close()
 
 

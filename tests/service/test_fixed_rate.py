@@ -34,6 +34,10 @@ class SimulatedPort:
         self.work_s = 0.0
         self._began_s = began_s
 
+    @property
+    def is_drained(self) -> bool:
+        return not self._frames or self._frames[0][0] > self.now_s
+
     def receive_pending(self, timeout_s: float) -> list[can.Message]:
         if self._frames and self._frames[0][0] <= self.now_s + timeout_s:
             at_s, frame = self._frames.pop(0)
@@ -70,6 +74,7 @@ def served(
         process_time=time.process_time,
     )
     monkeypatch.setattr(loop, "time", clock)
+    monkeypatch.setattr(loop, "steady_s", lambda: port.now_s)
     pipeline = Pipeline(Vehicle.load("generic"), leaf_model(), PipelineSettings())
     serve(port, pipeline, LoopSettings(duration_s=seconds), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for
     return port
@@ -129,6 +134,7 @@ def test_missed_heartbeats_are_skipped_on_the_grid(
         process_time=time.process_time,
     )
     monkeypatch.setattr(loop, "time", clock)
+    monkeypatch.setattr(loop, "steady_s", lambda: port.now_s)
     pipeline = Pipeline(Vehicle.load("generic"), leaf_model(), PipelineSettings())
     serve(port, pipeline, LoopSettings(duration_s=12.0), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for
     published = [at_s for at_s, _ in published_on(port)]
@@ -177,6 +183,7 @@ def test_backlog_is_stale_until_it_is_processed(
         process_time=time.process_time,
     )
     monkeypatch.setattr(loop, "time", clock)
+    monkeypatch.setattr(loop, "steady_s", lambda: port.now_s)
     known = PipelineSettings(EstimatorSettings(initial_soc_pct=60.0))
     pipeline = Pipeline(Vehicle.load("generic"), leaf_model(), known)
     serve(port, pipeline, LoopSettings(duration_s=14.0), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for

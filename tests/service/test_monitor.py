@@ -11,6 +11,7 @@ import pytest
 from watched import StandInPort, Watched
 
 from cangauge._logging import RateLimitFilter
+from cangauge.estimation.cells import CellReport
 from cangauge.estimation.validity import Reason, Status
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.status import BOUNDS_S, Histogram, as_json
@@ -30,6 +31,7 @@ def test_before_the_first_frame() -> None:
     content = as_json(watched.monitor.latest, watched.now_s)
     assert content["status"] == "initialising"
     assert content["sample"] is None
+    assert content["health"] is content["power"] is content["cells"] is None
     assert content["estimate"]["soc_pct"] is None
     assert content["latency"]["p99_at_most_s"] is None
     json.dumps(content, allow_nan=False)
@@ -65,6 +67,37 @@ def test_a_snapshot_never_changes() -> None:
     watched.turn()
     assert watched.monitor.latest is not snapshot
     assert as_json(snapshot, 0.0) == before
+
+
+def test_health_and_power_are_renewed_every_second() -> None:
+    watched = Watched()
+    watched.drive(90.0)
+    watched.turn()
+    first = watched.monitor.latest.report
+    assert first is not None
+    assert first.health == watched.pipeline.estimator.health
+    watched.turn(0.5)
+    assert watched.monitor.latest.report is first
+    watched.drive(10.0)
+    watched.turn(1.0)
+    assert watched.monitor.latest.report == watched.pipeline.report()
+
+
+def test_a_wrong_sum_of_cells_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    watched = Watched()
+    watched.drive(5.0)
+    cells = CellReport(96, 3, 50.0, 1.0, 2.0, -2.5, 0.1, is_sum_wrong=True)
+    report = watched.pipeline.report()._replace(cells=cells)
+    watched.pipeline.report = lambda: report  # type: ignore[method-assign] # a sensor that is wrong
+    with caplog.at_level(logging.WARNING, logger="cangauge"):
+        for _ in range(4):
+            watched.turn(1.0)
+    found = [each for each in caplog.records if "-2.50 V" in each.getMessage()]
+    assert len(found) == 1
+    content = as_json(watched.monitor.latest, watched.now_s)
+    assert "-2.50 V" in content["notices"][0]
+    assert content["cells"]["weakest"] == 3
+    json.dumps(content, allow_nan=False)
 
 
 def test_refused_frames_are_counted_by_reason() -> None:

@@ -49,6 +49,8 @@ def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
     found = in_process("status", "--endpoint", sock, "--json")
     assert found.json["samples"] == 1200
     assert found.json["latency"]["count"] > 0
+    shown = in_process("status", "--endpoint", sock).out
+    assert all(name in shown for name in ("capacity", "discharge for 10 s", "energy left"))
     assert found.json["record"]["lost_frames"] == 0
     with urllib.request.urlopen(f"http://127.0.0.1:{http_port}/metrics") as answer:
         assert b"cangauge_samples_total 1200.0" in answer.read()
@@ -63,6 +65,9 @@ def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
     recorded = estimate_capture(ended.json["record"], Vehicle.load("generic"), leaf_model())
     assert recorded.table.soc_pct[-1] == ended.json["estimate"]["soc_pct"]
     assert recorded.table.soc_pct.size == 1200
+    assert recorded.pack.report is not None
+    offline = json.loads(json.dumps(recorded.pack.report.to_dict()))
+    assert {name: ended.json[name] for name in offline} == offline
 
 
 def test_a_disk_that_is_full_does_not_stop_the_service(bus: list[str], tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from cangauge.service.pipeline import Pipeline
 from cangauge.service.recording import RecordBuffer, Recorder, RecordLimits
 from live import in_process, leaf_model, leaf_model_path, short_log, waits
 
-FORMATS = [".log", ".csv", ".log.gz", ".blf", ".mf4"]
+FORMATS = [".log", ".csv", ".log.gz", ".blf", ".mf4", ".mcap"]
 
 
 def frames(seconds: float, begin_s: float = 1.7e9) -> list[can.Message]:
@@ -111,7 +111,7 @@ def test_the_commands_take_the_name_of_a_run(tmp_path: Path) -> None:
     assert "no such file" in ended.err
 
 
-@pytest.mark.parametrize("suffix", [".log", ".csv", ".blf"])
+@pytest.mark.parametrize("suffix", [".log", ".csv", ".blf", ".mcap"])
 def test_a_clock_that_is_set_back_is_kept(tmp_path: Path, suffix: str) -> None:
     messages = frames(5.0) + frames(5.0, begin_s=1.6e9) + frames(5.0, begin_s=12.0)
     with Recorder(tmp_path / f"drive{suffix}") as recorder:

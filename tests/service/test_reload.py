@@ -114,12 +114,16 @@ def test_a_reload_ignores_the_initial_soc(car: Car) -> None:
     assert car.pipeline.latest.soc_pct == pytest.approx(before.soc_pct, abs=0.05)
 
 
+PACK_IDS = (0x5A2, 0x5A3)
+"""SOC_HEALTH and SOC_POWER."""
+
+
 def test_published_ids_change_and_their_counters_go_on(car: Car) -> None:
-    assert {each.arbitration_id for each in car.drive(1000, 1020)} == {0x5A0, 0x5A1}
+    assert {each.arbitration_id for each in car.drive(1000, 1020)} == {0x5A0, 0x5A1, *PACK_IDS}
     last = estimate_counter(car.drive(1020, 1021)[0])
     assert car.reload("[ids]\nsoc_estimate = 0x100\n") is not None
     sent = car.drive(1021, 1042)
-    assert {each.arbitration_id for each in sent} == {0x100, 0x5A1}
+    assert {each.arbitration_id for each in sent} == {0x100, 0x5A1, *PACK_IDS}
     first = next(each for each in sent if each.arbitration_id == 0x100)
     assert estimate_counter(first) == (last + 1) % 16
 

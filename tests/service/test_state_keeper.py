@@ -632,3 +632,22 @@ def test_a_refused_state_starts_by_voltage(machine: Machine, method: Any) -> Non
     # Nor is it taken up again when the configuration is read again.
     again.pipeline.reconfigure(None, machine.model, machine.settings)
     assert again.drive(DRIVE[1000:1010])[-1].soc_pct == pytest.approx(79.0, abs=4.0)
+
+
+@pytest.mark.parametrize("of", ["bus", "vehicle"])
+def test_a_state_of_another_bus_or_vehicle_is_set_aside(machine: Machine, of: str) -> None:
+    kept(machine)
+    before = machine.path.read_text()
+    rewritten(machine.path, lambda content: content.update({of: "another one"}))
+    service = machine.start()
+    assert not service.keeper.restored
+    assert math.isnan(service.pipeline.latest.soc_pct)
+    assert f"of another {of} (another one)" in machine.text
+    aside = machine.path.with_name(machine.path.name + ".refused")
+    assert "another one" in aside.read_text() != before
+
+
+def test_a_state_is_for_its_owner_only(machine: Machine) -> None:
+    machine.path.touch(0o666)
+    kept(machine)
+    assert machine.path.stat().st_mode & 0o777 == 0o600

@@ -21,7 +21,7 @@ SEED = 3
 BRIEF = Profile("replay clock, brief", 55.0, 200.0, (90.0, 130.0), 12.0)
 """Seventeen seconds, for a machine of one slow core."""
 
-ALWAYS = ("interface down, long", "adapter unplugged")
+ALWAYS = ("interface down, long", "adapter unplugged", "forged current")
 DRAWN_FROM = (
     "error frames", "drop 5 %", "drop 20 %", "duplicate", "swap", "jitter", "CRC wrong, some",
     "counter jumps", "DLC short", "DLC 0", "remote frames", "extended id", "wrong id",

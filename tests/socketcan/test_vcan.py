@@ -18,7 +18,14 @@ from cangauge.bus.backend import NoPendingFrameError, pending_frames
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, has_socketcan, open_bus
-from cangauge.bus.publish import FrameIds, SocEstimate, SocReader, standard_filter
+from cangauge.bus.publish import (
+    FrameIds,
+    SocEstimate,
+    SocHealth,
+    SocPower,
+    SocReader,
+    standard_filter,
+)
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.offline import run_estimator, samples_of
@@ -198,7 +205,8 @@ def test_unwanted_traffic_costs_no_wanted_frame(replay_port: BusConnection, tmp_
 
 
 def test_others_can_read_the_published_frames(replay_port: BusConnection) -> None:
-    listener = can.Bus("vcan0", interface="socketcan", ignore_config=True, can_filters=SOC_FRAMES)
+    wanted = [standard_filter(each) for each in FrameIds().published]
+    listener = can.Bus("vcan0", interface="socketcan", ignore_config=True, can_filters=wanted)
     with service("generic", PipelineSettings(time_source="replay-clock")) as live:
         log = short_log(20.0)
         play(replay_port, LogSource(log, Vehicle.load("generic")), MAX, stop=never)
@@ -213,6 +221,8 @@ def test_others_can_read_the_published_frames(replay_port: BusConnection) -> Non
     assert reader.refused == 0
     assert len(published) >= len(log)  # every 100 ms of bus time
     assert published[-1].soc_pct == pytest.approx(live.rows[-1][1].soc_pct, abs=0.005)
+    kinds = [type(reader.read(each)) for each in frames]
+    assert kinds.count(SocHealth) == kinds.count(SocPower) >= 20  # every second of bus time
 
 
 def test_a_bus_that_does_not_exist(tmp_path: Path) -> None:

@@ -69,6 +69,10 @@ class BusConnection:
         Whether the controller reported bus-off, with no frame received since.
     unsent : int
         Frames dropped because the transmit queue stayed full (no other node?), or without a bus.
+    is_drained : bool
+        Whether the receive queue was empty after the latest call that received.
+    foreign : int
+        Frames from another sender with ids that the service sends; counted by its loop.
     """
 
     def __init__(
@@ -88,6 +92,8 @@ class BusConnection:
         self.error_kinds: Counter[str] = Counter()
         self.is_off = False
         self.unsent = 0
+        self.is_drained = False
+        self.foreign = 0
         self._posted: deque[tuple[float, can.Message]] = deque()
         self._dropped_before: int | None = None
         if bus is not None:
@@ -119,6 +125,7 @@ class BusConnection:
             If the bus is gone.
         """
         timeout_s = self._before_receiving(timeout_s)
+        self.is_drained = False
         try:
             message = self._open_bus().recv(timeout_s)
         except BusError:
@@ -127,6 +134,7 @@ class BusConnection:
             self._classify(error)
             return None
         if message is None:
+            self.is_drained = True
             return None
         if message.is_error_frame:
             self._count_error(message)
@@ -148,27 +156,44 @@ class BusConnection:
             If the bus is gone.
         """
         if self._pending is None:
-            message = self.receive(timeout_s)
-            return [] if message is None else [message]
+            return self._receive_one_by_one(timeout_s)
         timeout_s = self._before_receiving(timeout_s)
         if self._failed is not None:
             raise self._failed
         try:
             # After a full read more frames are probably pending: do not wait.
             if self._is_empty and not self._pending.wait(timeout_s):
+                self.is_drained = True
                 return []
         except Exception as error:  # noqa: BLE001 - as above
             self._classify(error)
         return self._read(self._pending)
 
+    def _receive_one_by_one(self, timeout_s: float) -> list[can.Message]:
+        found: list[can.Message] = []
+        if self._failed is not None:
+            raise self._failed
+        while len(found) < AT_ONCE:
+            try:
+                message = self.receive(0.0 if found else timeout_s)
+            except BusError as lost:
+                if not found:
+                    raise
+                self._failed = lost  # as below
+                break
+            if message is None:
+                break
+            found.append(message)
+        return found
+
     def _read(self, pending: PendingFrames) -> list[can.Message]:
         found: list[can.Message] = []
-        self._is_empty = False
+        self._is_empty = self.is_drained = False
         for _ in range(AT_ONCE):
             try:
                 message = pending.next()
             except NoPendingFrameError:
-                self._is_empty = True
+                self._is_empty = self.is_drained = True
                 break
             except Exception as error:  # noqa: BLE001 - as above
                 try:

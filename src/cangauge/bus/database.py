@@ -16,13 +16,14 @@ from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Final, Literal
+from xml.etree import ElementTree as ET
 
 import cantools.database
 import numpy as np
 from cantools.database.can import Database, Message, Signal
 from numpy.typing import NDArray
 
-from cangauge._io import MAX_DBC_BYTES, read_bounded
+from cangauge._io import MAX_DBC_BYTES, read_bounded, time_limit
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError, closest
 
@@ -119,6 +120,11 @@ class SignalCodec:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "decode", self.decoder())
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle without `decode`, which is made again."""
+        given = [getattr(self, each.name) for each in dataclasses.fields(self) if each.init]
+        return type(self), tuple(given)
 
     def decoder(self, gain: float = 1.0, shift: float = 0.0) -> Decode:
         """Return a function that decodes a payload to gain × value + shift.
@@ -367,7 +373,13 @@ MAX_MULTIPLEXER_WORK: Final = 20_000_000
 _STEPS_PER_LAYOUT: Final = 200
 """Steps that an empty layout takes, in units of one signal of it."""
 
+_KINDS: Final = {".arxml": "arxml", ".kcd": "kcd", ".sym": "sym"}
+"""Formats besides DBC, by suffix."""
+_ENTITY = re.compile(r"<!(?:DOCTYPE|ENTITY)", re.IGNORECASE)
+"""Entities of XML can unfold to any size."""
+
 _CANTOOLS_ERRORS: Final = (
+    ET.ParseError,
     cantools.Error,
     LookupError,
     ValueError,
@@ -398,7 +410,7 @@ logging.getLogger("cantools").addHandler(logging.NullHandler())
 
 
 def load_dbc(path: str | PathLike[str]) -> Database:
-    """Read a DBC file.
+    """Read a DBC file, or an ARXML, KCD or SYM file by its suffix.
 
     Overlapping signals are accepted: many files have some in messages that are not wanted.
 
@@ -408,20 +420,31 @@ def load_dbc(path: str | PathLike[str]) -> Database:
         If the file is absent, too large, not a DBC, or beyond what a CAN bus can carry.
     """
     path = Path(path)
+    with time_limit(path):
+        return _load_dbc(path)
+
+
+def _load_dbc(path: Path) -> Database:
     text = _read_text(path)
-    _check_sizes(text, path)
+    kind = _KINDS.get(path.suffix.lower(), "dbc")
+    if kind == "dbc":
+        _check_sizes(text, path)
+    elif _ENTITY.search(text):
+        raise InputError("defines XML entities", source=path, cure="export the file without them")
     try:
-        database = cantools.database.load_string(text, "dbc", strict=False)
+        database = cantools.database.load_string(text, kind, strict=False)
     except RecursionError as error:
         raise InputError("signals are multiplexed in a circle", source=path) from error
     except _CANTOOLS_ERRORS as error:
         raise InputError(
-            f"not a DBC file that can be read: {_first_line(error)}",
+            f"not a {kind.upper()} file that can be read: {_first_line(error)}",
             source=path,
-            cure="open it in a DBC editor, which names the error",
+            cure=f"open it in a {kind.upper()} editor, which names the error",
         ) from error
     if not isinstance(database, Database) or not database.messages:
-        raise InputError("the DBC defines no messages", source=path)
+        raise InputError(f"the {kind.upper()} defines no messages", source=path)
+    if kind != "dbc":
+        _check_messages(database, path)
     return database
 
 
@@ -550,6 +573,20 @@ def _check_sizes(text: str, path: Path) -> None:
     if values > MAX_MULTIPLEXER_VALUES:
         raise InputError("the DBC lists too many multiplexer values", source=path, value=values)
     _refuse_nesting(text, path)
+
+
+def _check_messages(database: Database, path: Path) -> None:
+    """Raise InputError for sizes that no CAN bus carries."""
+    if len(database.messages) > MAX_MESSAGES:
+        raise InputError(
+            f"defines more than {MAX_MESSAGES} messages", source=path, value=len(database.messages)
+        )
+    for message in database.messages:
+        if not 0 <= message.length <= MAX_MESSAGE_BYTES:
+            raise InputError(
+                "a message that is too long (bytes)", source=path, field=message.name,
+                value=message.length,
+            )  # fmt: skip
 
 
 @dataclass(slots=True)

@@ -9,6 +9,8 @@ from typing import ClassVar, Final
 
 import can
 
+from cangauge.bus.cells import CellVoltages
+from cangauge.bus.isotp import Reassembler, reply_id, reply_key
 from cangauge.bus.plausibility import (
     ConstantDetector,
     Fault,
@@ -17,8 +19,8 @@ from cangauge.bus.plausibility import (
     SignalHealth,
     stuck_detectors,
 )
-from cangauge.bus.protection import FrameChecker, Verdict
-from cangauge.bus.vehicle import EXTENDED, Vehicle, VehicleSignal
+from cangauge.bus.protection import SUSPECTED_AT, FrameChecker, Verdict
+from cangauge.bus.vehicle import EXTENDED, Vehicle, VehicleSignal, pgn_mask
 from cangauge.estimation.validity import Reason, Sample
 
 _MISSING: Final = {
@@ -34,7 +36,24 @@ _REASONS: Final = {
     Fault.RANGE: Reason.IMPLAUSIBLE_INPUT,
     Fault.RATE: Reason.IMPLAUSIBLE_INPUT,
     Fault.STUCK: Reason.SIGNAL_STUCK,
+    Fault.TWO_SENDERS: Reason.DUPLICATE_SENDER,
 }
+
+SUSPECTED_FOR_S: Final = 10.0
+"""Time after the last sign of a second sender for which a message is refused [s]: longer than an
+attacker's pause between two tries, well below the longest gap over which charge is counted."""
+
+COUNTED: Final = 64
+"""Frames over which the rate of a message is measured: a few loop periods of a sender's jitter, or
+an adapter's batch, are a small part of them."""
+TOO_MANY: Final = 1.5
+"""Rate of a message, relative to the stated one, above which frames are surplus."""
+KEPT: Final = 5
+"""Times in a row that the stated rate was kept, from which it is known to be right."""
+HELD_UP_S: Final = 10.0
+SURPLUS_S: Final = 6.0
+"""Time over which the frames due are counted [s], and surplus frames, as time at the stated rate,
+that prove a second sender [s]: longer than frames are held up and then delivered at once."""
 
 _GOOD: Final = Verdict.GOOD  # looked up for every frame; enum members are slow to look up
 
@@ -82,6 +101,7 @@ class FrameStatistics:
     implausible: ClassVar[_Total] = _Total()
     stuck: ClassVar[_Total] = _Total()
     held_back: ClassVar[_Total] = _Total()
+    two_senders: ClassVar[_Total] = _Total()
 
 
 class Pairing:
@@ -172,22 +192,115 @@ class _Input:
 class _Route:
     """A wanted message: its checks and its signals."""
 
+    name: str
     length: int
     checker: FrameChecker | None
     statistics: MessageStatistics
+    rate: _RateCheck
     inputs: list[_Input] = field(default_factory=list)
     has_both: bool = False
     """Current and voltage: each frame is a sample by itself."""
+    read_cells: Callable[[bytes | bytearray, float], None] | None = None
+    """Takes a payload with cell voltages, and its time [s]."""
     last_s: float = -math.inf
+    suspected_until_s: float = -math.inf
+    """Until then its frames may be of two senders."""
+
+
+class _RateCheck:
+    """Detect more frames of a message than its stated period allows; learn one that is not stated.
+
+    Parameters
+    ----------
+    stated_s : float, optional
+        Stated period [s].
+
+    Attributes
+    ----------
+    learned_s : float
+        Longest period of the last `HELD_UP_S` to twice that [s], so that a second sender does not
+        shorten it soon; NaN while it is not known, or where one is stated.
+    held_until_s : float
+        Nothing is learned until then [s].
+    """
+
+    __slots__ = ("_before", "_frames", "_is_stated", "_kept", "_most", "_period_s", "_seen_s",
+                 "_since_s", "_spare_s", "held_until_s", "learned_s")  # fmt: skip
+
+    def __init__(self, stated_s: float | None) -> None:
+        self._is_stated = stated_s is not None
+        self._period_s = math.nan if stated_s is None else stated_s
+        self._seen_s = self._since_s = -math.inf
+        self._frames = self._kept = 0
+        self._spare_s = 0.0
+        # Frames beyond those due, or periods [s]: largest number so far in this interval of
+        # `HELD_UP_S`, and in the one before.
+        self._most = self._before = math.inf if self._is_stated else 0.0
+        self.learned_s = math.nan
+        self.held_until_s = -math.inf
+
+    def _learn(self, time_s: float) -> None:
+        took_s, self._seen_s = time_s - self._seen_s, time_s
+        if not 0.0 < took_s < math.inf or time_s < self.held_until_s:
+            return
+        if time_s - self._since_s >= HELD_UP_S:
+            self._since_s, self._most, self._before = time_s, 0.0, self._most
+        self._most = max(self._most, took_s / COUNTED)
+        self.learned_s = max(self._most, self._before)
+
+    def is_exceeded(self, time_s: float, statistics: MessageStatistics) -> bool:
+        """Return whether a lasting surplus proves two senders; called every `COUNTED` frames.
+
+        A message is judged once it has kept its period for a while: the stated one may be wrong.
+        """
+        if not self._is_stated:
+            self._learn(time_s)
+            return False
+        surplus = self._surplus(time_s, statistics)
+        # A repeated frame is refused anyway; CAN itself repeats some after an error.
+        frames = _whole(statistics) - statistics.counter_repeats
+        due_s, self._frames = (frames - self._frames) * self._period_s, frames
+        took_s, self._seen_s = time_s - self._seen_s, time_s
+        if took_s > HELD_UP_S + due_s:
+            self._since_s, self._most, self._before = time_s, surplus, surplus
+            return False
+        if time_s - self._since_s >= HELD_UP_S:
+            self._since_s, self._most, self._before = time_s, surplus, self._most
+        self._most = max(self._most, surplus)
+        if self._kept < KEPT:
+            is_kept = due_s / TOO_MANY <= took_s <= TOO_MANY * due_s
+            self._kept = self._kept + 1 if is_kept else 0
+            return False
+        self._spare_s = min(max(self._spare_s + TOO_MANY * took_s - due_s, -SURPLUS_S), 0.0)
+        return self._spare_s <= -SURPLUS_S
+
+    def has_surplus(self, time_s: float, statistics: MessageStatistics) -> bool:
+        """Return whether frames came that were not due; False while that is not known.
+
+        Frames that were lost, and delivered in bursts, can look like those of two senders.
+        """
+        if not self._is_stated:
+            return True
+        return self._surplus(time_s, statistics) - self._before >= SUSPECTED_AT / 2
+
+    def _surplus(self, time_s: float, statistics: MessageStatistics) -> float:
+        return _whole(statistics) - time_s / self._period_s
+
+
+def _whole(statistics: MessageStatistics) -> int:
+    """Return the number of frames that were neither damaged nor too short."""
+    return statistics.wanted - statistics.crc_errors - statistics.short
 
 
 class SampleDecoder:
     """Decode a vehicle's frames to samples; a pure function of frames and time stamps.
 
-    Refused are: frames with a wrong CRC, a repeated alive counter or too few bytes; values that are
-    not available or implausible (see `plausibility`). A jump of the alive counter counts as a loss,
-    and the frame is used. Error frames, remote frames and frames of the wrong id width are
-    ignored. The temperature of a sample is the latest value while it is usable, else NaN.
+    Refused are: frames with a wrong CRC, a repeated alive counter or too few bytes; all frames of a
+    message that seems to have two senders, until `SUSPECTED_FOR_S` after the last sign of the
+    second, since a mixture of both is worse than a gap; values that are not available or
+    implausible (see `plausibility`). A jump of the alive counter counts as a loss, and the frame is
+    used. Error frames, remote frames and frames of the wrong id width are ignored. The temperature
+    of a sample is the latest value while it is usable, else NaN.
 
     Parameters
     ----------
@@ -203,6 +316,8 @@ class SampleDecoder:
         By role. Read only.
     now_s : float
         Bus time of the latest wanted frame [s]; −inf before the first.
+    cells : CellVoltages or None
+        Latest cell voltages, where the vehicle has them.
     """
 
     def __init__(self, vehicle: Vehicle, pack: Pack | None = None) -> None:
@@ -210,11 +325,24 @@ class SampleDecoder:
         self.statistics = FrameStatistics()
         self.health: dict[str, SignalHealth] = {}
         self.now_s = -math.inf
+        self._suspected_until_s = -math.inf
         self._pairing = Pairing(vehicle.pair_within_s, self.statistics)
         self._routes: dict[int, _Route] = {}
+        self._by_pgn = {
+            key & pgn_mask(key): key for key, each in vehicle.messages.items() if each.by_pgn
+        }
+        self._replies = {
+            reply_id(key): Reassembler() for key, each in vehicle.messages.items() if each.is_reply
+        }
         detectors = _detectors(vehicle, pack)
         for signal in vehicle.signals:
             self._add(signal, pack, detectors.get(signal.role))
+        self.cells: CellVoltages | None = None
+        if vehicle.cells is not None:
+            self.cells = CellVoltages(vehicle.cells)
+            for group in vehicle.cells.groups:
+                route = self._route(group.key, group.message, group.length)
+                route.read_cells = self.cells.reader(group.key)
         for route in self._routes.values():
             # Slow signals first: a sample uses the temperature of its own frame.
             route.inputs.sort(key=lambda each: each.is_current + 2 * each.is_voltage)
@@ -227,11 +355,7 @@ class SampleDecoder:
         is_stuck: Callable[[float, float], bool] | None,
     ) -> None:
         message = self.vehicle.messages[signal.key]
-        route = self._routes.get(signal.key)
-        if route is None:
-            statistics = self.statistics.messages[signal.key] = MessageStatistics()
-            checker = None if message.rule is None else FrameChecker(message.rule, message.period_s)
-            route = self._routes[signal.key] = _Route(signal.length, checker, statistics)
+        route = self._route(signal.key, signal.message, signal.length)
         is_fast = signal.role in {"current", "voltage"}
         is_multiplexed = bool(signal.codec.conditions)
         health = self.health[signal.role] = SignalHealth(
@@ -242,6 +366,11 @@ class SampleDecoder:
             is_stuck=is_stuck,
             statistics=route.statistics,
         )
+        if route.checker is not None and not is_multiplexed:
+            rate = route.rate
+            route.checker.learned_period_s = lambda: (
+                health.period_s if math.isnan(rate.learned_s) else rate.learned_s
+            )
         route.inputs.append(
             _Input(
                 signal.decode,
@@ -253,7 +382,18 @@ class SampleDecoder:
         )
         route.has_both = self.vehicle.current.key == self.vehicle.voltage.key == signal.key
 
-    def handle(self, message: can.Message) -> Sample | None:  # noqa: C901 - one pass, in order
+    def _route(self, key: int, name: str, length: int) -> _Route:
+        route = self._routes.get(key)
+        if route is None:
+            message = self.vehicle.messages[key]
+            statistics = self.statistics.messages[key] = MessageStatistics()
+            checker = None if message.rule is None else FrameChecker(message.rule, message.period_s)
+            route = self._routes[key] = _Route(
+                name, length, checker, statistics, _RateCheck(message.period_s)
+            )
+        return route
+
+    def handle(self, message: can.Message) -> Sample | None:  # noqa: C901, PLR0912 - one pass
         """Decode one frame; return the sample that it completes, if any.
 
         `voltage_v` and `temperature_c` of a sample may be NaN. Samples keep the order of their
@@ -268,10 +408,16 @@ class SampleDecoder:
         if message.is_extended_id:
             key |= EXTENDED
         route = self._routes.get(key)
+        if route is None and self._by_pgn and key & EXTENDED:
+            route = self._routes.get(self._by_pgn.get(key & pgn_mask(key), 0))
+        elif route is None and key in self._replies:
+            route, message = self._reply(key, message)
         payload = None if route is None else self._accept(route, message)
         if route is None or payload is None:
             return None
         time_s = message.timestamp
+        if route.read_cells is not None:
+            route.read_cells(payload, time_s)
         current_a = voltage_v = math.nan
         for signal in route.inputs:
             if signal.is_present is not None and not signal.is_present(payload):
@@ -299,13 +445,25 @@ class SampleDecoder:
             statistics.samples += 1
         return sample
 
-    def _accept(self, route: _Route, message: can.Message) -> bytearray | None:
+    def _reply(self, key: int, message: can.Message) -> tuple[_Route | None, can.Message]:
+        """Return the route and content of the reply (ISO-TP) that a frame completes, if any."""
+        reply = self._replies[key].take(message.data, message.timestamp)
+        if reply is None or len(reply) < 2:
+            return None, message
+        route = self._routes.get(reply_key(key, reply) | EXTENDED)
+        return route, can.Message(timestamp=message.timestamp, data=reply)
+
+    def _accept(  # noqa: C901 - one pass, in order
+        self, route: _Route, message: can.Message
+    ) -> bytearray | None:
         """Return the payload, cut to the message's length; None for a refused frame."""
         statistics, time_s, payload = route.statistics, message.timestamp, message.data
         statistics.wanted += 1
         if time_s < route.last_s:
             self._rewind(route.last_s, time_s)
         self.now_s = time_s
+        if not statistics.wanted % COUNTED and route.rate.is_exceeded(time_s, statistics):
+            self._suspect(route, time_s)
         if len(payload) != route.length:
             if len(payload) < route.length:
                 statistics.short += 1
@@ -318,13 +476,30 @@ class SampleDecoder:
                 if verdict is Verdict.CRC_WRONG:
                     statistics.crc_errors += 1
                     return _refuse(route, Fault.PROTECTION)
+                if checker.suspects_second_sender and route.rate.has_surplus(time_s, statistics):
+                    self._suspect(route, time_s)
                 if verdict is Verdict.REPEATED:
                     statistics.counter_repeats += 1
                     return _refuse(route, Fault.REPEATED)
                 statistics.counter_jumps += 1
                 statistics.frames_lost += checker.lost
+        if time_s < route.suspected_until_s:
+            statistics.two_senders += 1
+            return _refuse(route, Fault.TWO_SENDERS)
         route.last_s = time_s
         return payload
+
+    def _suspect(self, route: _Route, time_s: float) -> None:
+        """Refuse a message for a while: its frames may be of two senders."""
+        route.suspected_until_s = self._suspected_until_s = time_s + SUSPECTED_FOR_S
+        route.rate.held_until_s = route.suspected_until_s
+
+    @property
+    def two_sender_messages(self) -> tuple[str, ...]:
+        """Names of the messages that seem to have two senders at present."""
+        return tuple(
+            route.name for route in self._routes.values() if self.now_s < route.suspected_until_s
+        )
 
     def flush(self) -> Sample | None:
         """Return the last current, if it is unpaired, as a sample without voltage."""
@@ -339,7 +514,7 @@ class SampleDecoder:
         A missing signal without a further reason is old, never came, or is sent as "not
         available".
         """
-        reasons = Reason.NONE
+        reasons = Reason.DUPLICATE_SENDER if now_s < self._suspected_until_s else Reason.NONE
         for role, missing in _MISSING.items():
             health = self.health.get(role)
             if health is not None and not health.is_usable(now_s):

@@ -49,6 +49,12 @@ class FrameEncoder:
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
+        if any(each.is_reply for each in vehicle.messages.values()):
+            raise InputError(
+                "replies over ISO-TP are received only",
+                source=vehicle.name,
+                cure="use a vehicle without them, and --temperature",
+            )
         self.vehicle = vehicle
         self._counters = dict.fromkeys(vehicle.messages, 0)
         self._frames = _plan(vehicle)

@@ -26,8 +26,22 @@ A map file in TOML, for any car with a DBC::
     signal = "PackTemperature"      # or: fixed_c = 21.5
     when = { Selector = 2 }         # only in frames where this signal has this raw value
 
-    [soc_reference]                 # optional, for comparison
+    [soc]                           # optional: the car's own, to begin from and to compare with
     signal = "DisplaySoc"
+
+    [columns]                       # optional: columns of this car's logs that are tables
+    time = "Timestamp"
+    current = "PackCurrent[mA]:-1"  # heading, unit, factor; or { heading = …, unit = …, sign = -1 }
+
+    [cells]                         # optional: cell voltages
+    signal = "CELL_{n}_VOLTAGE"     # one signal a cell; {n}: its number, {n:02d} with zeros
+    count = 96
+    first = 1                       # number of the first cell
+    # or groups of cells, numbered by a signal of the frame:
+    # message = "BMS_Cells"
+    # index = "GroupNumber"         # its raw value; the first group has first_index
+    # first_index = 0
+    # signals = ["CellA", "CellB", "CellC"]
 
     [messages.BMS_Status]           # optional
     protection = "my_rule"          # leaf, generic, crc_only, counter, e2e_01, e2e_02, e2e_04,
@@ -46,6 +60,13 @@ A map file in TOML, for any car with a DBC::
     counter = "AliveCounter"        # signal of the DBC
     counter_modulus = 15            # number of values; default: all that its bits can hold
 
+    [messages.HVESSD1]
+    j1939 = true                    # by its PGN: any source address and priority
+
+    [messages.Reply_6104]
+    isotp = true                    # a reply over ISO-TP; its id in the DBC is 0x7BB6104 for a
+                                    # reply 61 04 … on 0x7BB. Others poll it: nothing is sent
+
     [rules.my_rule]
     polynomial = 0x2F
     initial = 0xFF
@@ -59,12 +80,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 from cantools.database.can import Message
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
+from cangauge._config import read_toml
 from cangauge.bus import database
 from cangauge.bus.protection import (
     LIST_LENGTH,
@@ -77,6 +100,8 @@ from cangauge.bus.protection import (
     ProtectionRule,
 )
 from cangauge.errors import InputError
+from cangauge.estimation.cells import CELLS_AT_MOST
+from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.log import TemperatureSource
 
 PAIR_WITHIN_S: Final = 0.020
@@ -184,6 +209,86 @@ class TemperatureMap(SignalMap):
         return self
 
 
+class CellsMap(_Strict):
+    """Voltages of the cells in series: one signal a cell, or groups numbered by a signal.
+
+    Parameters
+    ----------
+    count, first : int
+        Number of cells; number of the first.
+    signal : str, optional
+        Name of a cell's signal, with "{n}" for its number.
+    message : str or int, optional
+        Message of the signals, likewise with "{n}" if each cell has its own.
+    index : str, optional
+        Signal whose raw value numbers the group in a frame.
+    signals : tuple of str
+        Signals of a group, in the order of the cells.
+    first_index : int
+        Number of the first group.
+    scale, offset : float
+        For a DBC with a wrong or unknown unit: V = scale × (DBC value) + offset.
+    not_available : tuple of int
+        Raw codes without a value, besides those named so in the DBC's value table.
+    lowest, highest : float, optional
+        Plausible voltages [V].
+    timeout_s : float, optional
+        Age at which a voltage becomes old [s].
+    """
+
+    count: Annotated[int, Field(ge=2, le=CELLS_AT_MOST)]
+    first: Annotated[int, Field(ge=0, le=CELLS_AT_MOST)] = 1
+    signal: str | None = None
+    message: str | int | None = None
+    index: str | None = None
+    signals: tuple[str, ...] = ()
+    first_index: int = 0
+    scale: _Positive = 1.0
+    offset: FiniteFloat = 0.0
+    not_available: tuple[int, ...] = ()
+    lowest: FiniteFloat | None = None
+    highest: FiniteFloat | None = None
+    timeout_s: _Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        if (self.signal is None) is (self.index is None):
+            raise ValueError("give either signal, or index and signals")
+        if self.signal is not None and "{n" not in self.signal:
+            raise ValueError('signal needs "{n}" for the number of the cell')
+        if self.index is not None and (not self.signals or self.message is None):
+            raise ValueError("index needs signals and message")
+        if self.signal is not None and self.signals:
+            raise ValueError("signals belongs to index")
+        for name in (self.signal, self.message):
+            if isinstance(name, str):
+                try:
+                    name.format(n=1)
+                except (KeyError, IndexError, ValueError, AttributeError) as error:
+                    raise ValueError(f"{name!r} is not a name with {{n}}") from error
+        return self
+
+    def signal_maps(self) -> list[SignalMap]:
+        """Return the map of each cell's signal, or of each signal of a group."""
+        names: list[tuple[str, str | int | None]]
+        if self.signal is None:
+            names = [(name, self.message) for name in self.signals]
+        else:
+            numbers = range(self.first, self.first + self.count)
+            names = [
+                (
+                    self.signal.format(n=n),
+                    self.message.format(n=n) if isinstance(self.message, str) else self.message,
+                )
+                for n in numbers
+            ]
+        stated = {name: getattr(self, name) for name in {"scale", "offset"} & self.model_fields_set}
+        return [
+            SignalMap(message=message, signal=name, not_available=self.not_available, **stated)
+            for name, message in names
+        ]
+
+
 class MessageMap(_Strict):
     """Protection and period of a message.
 
@@ -191,6 +296,10 @@ class MessageMap(_Strict):
     ----------
     protection : str, optional
         One of `protection.RULES`, of [rules] or of `protection.PROFILES`, or "counter".
+    j1939 : bool
+        Whether its PGN identifies it: from any source address, at any priority.
+    isotp : bool
+        Whether it is a reply over ISO-TP, with the id of `isotp.reply_key` in the DBC.
     period_s : float, optional
         Frame period [s].
     data_id, data_id_list, data_id_mode, header_byte, protected_bytes
@@ -202,6 +311,8 @@ class MessageMap(_Strict):
     """
 
     protection: str | None = None
+    j1939: bool = False
+    isotp: bool = False
     period_s: _Positive | None = None
     data_id: Annotated[int, Field(ge=0, lt=1 << 32)] | None = None
     data_id_list: (
@@ -346,7 +457,11 @@ class VehicleMap(_Strict):
     temperature : TemperatureMap, optional
         Without it, a fixed temperature must be given as an option.
     soc_reference : SignalMap, optional
-        The car's own state of charge, for comparison.
+        The car's own state of charge, to begin from and to compare with; also named `soc`.
+    columns : dict
+        Columns of the car's logs that are tables (`logs.column_map.ColumnMap`).
+    cells : CellsMap, optional
+        Voltages of the cells.
     temperature_source : {"cell", "pack", "coolant", "room", "unknown"}
     pair_within_s : float
         Largest distance in bus time between paired current and voltage [s].
@@ -360,7 +475,11 @@ class VehicleMap(_Strict):
     current: SignalMap
     voltage: SignalMap
     temperature: TemperatureMap | None = None
-    soc_reference: SignalMap | None = None
+    soc_reference: SignalMap | None = Field(
+        default=None, validation_alias=AliasChoices("soc_reference", "soc")
+    )
+    columns: dict[str, Any] | None = None
+    cells: CellsMap | None = None
     temperature_source: TemperatureSource = "unknown"
     pair_within_s: Annotated[FiniteFloat, Field(ge=0.0, le=1.0)] = PAIR_WITHIN_S
     messages: dict[str, MessageMap] = Field(default_factory=dict)
@@ -369,9 +488,31 @@ class VehicleMap(_Strict):
     @model_validator(mode="before")
     @classmethod
     def _single_dbc(cls, data: object) -> object:
-        if isinstance(data, dict) and isinstance(data.get("dbc"), str):
-            return {**data, "dbc": (data["dbc"],)}
-        return data
+        if not isinstance(data, dict):
+            return data
+        if isinstance(data.get("dbc"), str):
+            data = {**data, "dbc": (data["dbc"],)}
+        # `soc = "DisplaySoc"` is short for a table with the signal alone.
+        roles = ("current", "voltage", "temperature", "soc", "soc_reference")
+        short = {name: {"signal": data[name]} for name in roles if isinstance(data.get(name), str)}
+        return {**data, **short}
+
+
+def columns_of_map(path: Path | str) -> ColumnMap | None:
+    """Return `[columns]` of a map file, or None; the file may hold nothing else.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or a column is not understood.
+    """
+    columns = read_toml(path).get("columns")
+    if columns is None:
+        return None
+    where = f"{path}: columns"
+    if not isinstance(columns, dict):
+        raise InputError("must be a table", field=where, cure='write [columns], then time = "…"')
+    return ColumnMap.of(columns, where)
 
 
 @dataclass(frozen=True, slots=True)

@@ -154,6 +154,8 @@ class Fault(enum.IntEnum):
     RANGE = 4
     RATE = 5
     STUCK = 6
+    TWO_SENDERS = 7
+    """The frame may be another sender's."""
 
 
 class SignalState(enum.IntEnum):
@@ -195,6 +197,8 @@ class MessageStatistics:
     """Values refused: the signal is stuck."""
     held_back: int = 0
     """Good values not used yet, while the signal recovers from failures."""
+    two_senders: int = 0
+    """Frames refused: two senders use the id."""
 
 
 class SignalHealth:

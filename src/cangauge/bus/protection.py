@@ -411,6 +411,14 @@ class E2eRule:
 SILENCE_S: Final = 2.0
 """Silence after which a sender may have restarted, with any counter value [s]."""
 
+SUSPECTED_AT: Final = 8.0
+"""Frames that fit no single sender, from which a second one is suspected: a sender that restarts
+makes one or two, and a frame that CAN repeats after an error is identical."""
+FORGOTTEN_AFTER: Final = 50.0
+"""Periods after which one such frame is forgotten."""
+SOON: Final = 1.5
+"""Two frames closer than this have no third between them [periods]: none was lost."""
+
 WIDE: Final = 256
 """A counter with at least this many values does not wrap within a normal loss. If it steps back
 sooner, the sender restarted or frames came out of order: no loss is proven."""
@@ -421,6 +429,11 @@ class FrameChecker:
 
     A repeated counter is no new frame, unless enough time has passed for the counter to wrap: on a
     lossy bus one in `modulus` of the surviving frames looks like a repetition.
+
+    Two senders of one message are recognised by frames that were *inserted* into a sequence: the
+    counter of the frame before comes again at once, with another content, or the sequence continues
+    after one frame as if that had not been. A sender with wrong counters replaces frames instead,
+    and losses leave time; neither counts.
 
     Parameters
     ----------
@@ -434,17 +447,28 @@ class FrameChecker:
     lost : int
         Frames missing right before the latest accepted one, at least: whole wraps of the counter
         are not visible.
+    inserted : float
+        Recent frames that fit no single sender, as evidence of a second one.
+    learned_period_s : callable
+        Returns the frame period [s] where none is stated; NaN while it is not known.
     """
 
     __slots__ = (
+        "_content",
+        "_continues",
+        "_counted_s",
         "_counter",
         "_half_wrap_s",
         "_is_whole",
         "_last",
         "_last_s",
         "_modulus",
+        "_odd",
         "_period_s",
         "_refused",
+        "_was_repeated",
+        "inserted",
+        "learned_period_s",
         "lost",
     )
 
@@ -459,6 +483,19 @@ class FrameChecker:
         self._last_s = 0.0
         self._refused = 0
         self.lost = 0
+        self.inserted = 0.0
+        self.learned_period_s: Callable[[], float] = lambda: math.nan
+        self._counted_s = -math.inf
+        self._continues = -1
+        # Payloads of the latest accepted frame, and of the latest one out of sequence.
+        self._content: bytes | bytearray = b""
+        self._odd: bytes | bytearray = b""
+        self._was_repeated = False
+
+    @property
+    def suspects_second_sender(self) -> bool:
+        """Whether the latest frames came from two senders."""
+        return self.inserted >= SUSPECTED_AT
 
     def check(self, data: bytes | bytearray, time_s: float) -> Verdict:
         """Check a payload of the message's own length, received at bus time `time_s` [s]."""
@@ -472,8 +509,11 @@ class FrameChecker:
         elapsed_s, self._last_s = time_s - self._last_s, time_s
         steps = (counter - last) % modulus
         if steps == 1 or last < 0:
-            self._last, self._refused = counter, 0
+            self._last, self._refused, self._content = counter, 0, data
+            self._was_repeated = False
             return _GOOD
+        self._look_for_insertion(steps, counter, data, elapsed_s)
+        self._was_repeated = steps == 0
         if steps == 0:
             if elapsed_s <= self._half_wrap_s:
                 return Verdict.REPEATED
@@ -482,5 +522,27 @@ class FrameChecker:
             steps = 1
         # Damaged frames are counted as damaged, not as lost.
         self.lost = max(steps - 1 - self._refused, 0)
-        self._last, self._refused = counter, 0
+        self._last, self._refused, self._content = counter, 0, data
         return Verdict.AFTER_LOSS if self.lost else Verdict.GOOD
+
+    def _look_for_insertion(
+        self, steps: int, counter: int, data: bytes | bytearray, elapsed_s: float
+    ) -> None:
+        """Count a frame whose counter does not follow the one before it."""
+        continues, self._continues = self._continues, (self._last + 1) % self._modulus
+        is_next, self._odd = self._content is self._odd, data
+        period_s = self._period_s if math.isfinite(self._period_s) else self.learned_period_s()
+        if not 0.0 <= elapsed_s <= SOON * period_s:  # false for NaN
+            return
+        forgotten = (self._last_s - self._counted_s) / (FORGOTTEN_AFTER * period_s)
+        self.inserted = max(self.inserted - forgotten, 0.0)
+        self._counted_s = self._last_s
+        if steps == 0:
+            self._continues, self._odd = continues, b""
+            # The second repetition in a row is a counter that stands still.
+            self.inserted += not self._was_repeated and data != self._content
+        elif counter == continues:
+            self.inserted += 1.0
+        elif is_next and counter == (continues + 1) % self._modulus:  # it replaced a frame
+            self.inserted = max(self.inserted - 2.0, 0.0)
+        self.inserted = min(self.inserted, 2.0 * SUSPECTED_AT)

@@ -1,11 +1,12 @@
-"""Published frames: SOC_ESTIMATE and SOC_DETAIL, made and read.
+"""Published frames: SOC_ESTIMATE, SOC_DETAIL, SOC_HEALTH, SOC_POWER, SOC_CELLS, made and read.
 
 Normally the clock of the loop sets the rate (`SocPublisher.beat`), with or without samples: a
-SOC_ESTIMATE at each beat, a SOC_DETAIL at every tenth.
+SOC_ESTIMATE at each beat, the others at every tenth; SOC_CELLS only where there are cells.
 
 During a replay at another speed, log time sets the rate (`SocPublisher.publish`): SOC_ESTIMATE
-with the first sample of every 100 ms, SOC_DETAIL with the first of every second and, as an
-acknowledgement, at the latest after `acknowledge_every` samples. Beats continue in the silences.
+with the first sample of every 100 ms, the others with the first of every second. SOC_DETAIL is also
+sent, as an acknowledgement, at the latest after `acknowledge_every` samples. Beats continue in the
+silences.
 
 Counter and CRC are those of AUTOSAR E2E profile 2, with the data ids in the DBC.
 """
@@ -13,9 +14,11 @@ Counter and CRC are those of AUTOSAR E2E profile 2, with the data ids in the DBC
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, NamedTuple
+from types import MappingProxyType
+from typing import Any, Final, NamedTuple
 
 import can
 from can.typechecking import CanFilter
@@ -26,6 +29,9 @@ from cangauge.bus.database import SignalCodec, load_dbc, signal_codec
 from cangauge.bus.protection import E2eRule
 from cangauge.bus.time_source import REPLAY_CLOCK_ID
 from cangauge.errors import InputError
+from cangauge.estimation.cells import CellReport
+from cangauge.estimation.health import Health
+from cangauge.estimation.power import Power
 from cangauge.estimation.validity import Estimate, Reason, Status
 
 ESTIMATE_EVERY_S: Final = 0.1
@@ -59,10 +65,19 @@ class FrameIds:
     soc_estimate: int = 0x5A0
     soc_detail: int = 0x5A1
     replay_clock: int = REPLAY_CLOCK_ID
+    soc_health: int = 0x5A2
+    soc_power: int = 0x5A3
+    soc_cells: int = 0x5A4
+
+    @property
+    def published(self) -> dict[int, str]:
+        """Names of the frames that the service sends, by id."""
+        names = ("soc_estimate", "soc_detail", "soc_health", "soc_power", "soc_cells")
+        return {getattr(self, name): name for name in names}
 
     def __post_init__(self) -> None:
         seen: dict[int, str] = {}
-        for name in ("soc_estimate", "soc_detail", "replay_clock"):
+        for name in self.__dataclass_fields__:
             value = getattr(self, name)
             if not 0 <= value <= 0x7FF:
                 raise InputError(
@@ -97,6 +112,85 @@ class SocDetail(NamedTuple):
     """Measured minus predicted voltage [V]; NaN: not available."""
     samples: int
     """Samples processed so far, modulo `SAMPLES_MODULO`."""
+
+
+class SocHealth(NamedTuple):
+    """Content of a SOC_HEALTH; NaN: not available."""
+
+    capacity_ah: float
+    capacity_std_ah: float
+    resistance_ratio: float
+    """Resistance relative to the model's [-]."""
+    resistance_std: float
+    current_offset_a: float
+
+
+class SocPower(NamedTuple):
+    """Content of a SOC_POWER; NaN: not available."""
+
+    discharge_a: float
+    discharge_std_a: float
+    charge_a: float
+    charge_std_a: float
+    energy_kwh: float
+    energy_std_kwh: float
+
+
+class SocCells(NamedTuple):
+    """Content of a SOC_CELLS; NaN: not available."""
+
+    weakest_cell: float
+    weakest_soc_pct: float
+    weakest_soc_std_pct: float
+    cell_spread_pct: float
+    """SoC of the strongest cell less that of the weakest [%]."""
+    sum_error_v: float
+    """Pack voltage less the sum of the cells [V]."""
+    sum_check: float
+    """0: not known, 1: agrees, 2: differs by more than both sensors allow."""
+
+
+SocContent = SocEstimate | SocDetail | SocHealth | SocPower | SocCells
+
+
+class PackReport(NamedTuple):
+    """What is published every second besides the estimate."""
+
+    health: Health
+    power: Power
+    cells: CellReport | None = None
+    """None: the vehicle gives no cell voltages."""
+
+    @property
+    def notices(self) -> list[str]:
+        """What the user should look after, one sentence each."""
+        cells = self.cells
+        if cells is None or not cells.is_sum_wrong:
+            return []
+        return [
+            f"the pack voltage reads {cells.sum_error_v:+.2f} V (±{cells.sum_std_v:.2f} V) against"
+            " the sum of the cells: check the voltage sensor, or count and scale of [cells]"
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the objects "health", "power", "cells" and "notices" of a JSON status."""
+        cells = self.cells
+        return {
+            "health": _finite(self.health._asdict()),
+            "power": _finite(self.power._asdict()),
+            "cells": None
+            if cells is None
+            else _finite(
+                cells._asdict() | {"weakest": cells.weakest if cells.weakest >= 0 else None}
+            ),
+            "notices": self.notices,
+        }
+
+
+NO_REPORT: Final[Mapping[str, Any]] = MappingProxyType(
+    {"health": None, "power": None, "cells": None, "notices": []}
+)
+"""What `PackReport.to_dict` gives before the first sample."""
 
 
 class _Layout:
@@ -137,14 +231,14 @@ class _Layout:
         return {name: codec.decode(data) for name, codec in self._codecs.items()}
 
 
-def _layouts() -> tuple[_Layout, _Layout]:
+def _layouts() -> dict[str, _Layout]:
     path = shared_file("dbc", "soc_estimate.dbc")
     database = load_dbc(path)
-    return _Layout(database, "SOC_ESTIMATE", path), _Layout(database, "SOC_DETAIL", path)
+    return {name: _Layout(database, name.upper(), path) for name in FrameIds().published.values()}
 
 
 class SocPublisher:
-    """Encode estimates as SOC_ESTIMATE and SOC_DETAIL frames.
+    """Encode estimates, health, power and cells as frames.
 
     Parameters
     ----------
@@ -156,15 +250,20 @@ class SocPublisher:
     def __init__(self, ids: FrameIds | None = None, acknowledge_every: int | None = None) -> None:
         self.ids = ids or FrameIds()
         self._acknowledge_every = acknowledge_every
-        self._estimate, self._detail = _layouts()
-        self._estimates_made = 0
-        self._details_made = 0
+        self._layouts = _layouts()
+        self._made = dict.fromkeys(self._layouts, 0)
         self._beats = 0
         self._estimate_due_s = -math.inf
         self._detail_due_s = -math.inf
         self._acknowledged = 0
 
-    def beat(self, estimate: Estimate, samples: int, age_s: float) -> list[can.Message]:
+    def beat(
+        self,
+        estimate: Estimate,
+        samples: int,
+        age_s: float,
+        report: Callable[[], PackReport] | None = None,
+    ) -> list[can.Message]:
         """Return the frames of one beat; due every `ESTIMATE_EVERY_S`.
 
         Parameters
@@ -174,15 +273,24 @@ class SocPublisher:
             Samples processed so far, including refused ones.
         age_s : float
             Time since the latest of them [s]; NaN: none yet.
+        report : callable, optional
+            Returns health, power and cells; called where their frames are due.
         """
         frames = [self.estimate_frame(estimate, age_s)]
         is_due = self._beats % DETAIL_EVERY_BEATS == 0
         self._beats += 1
         if is_due or (self._acknowledge_every is not None and samples != self._acknowledged):
             frames.append(self.detail_frame(estimate, samples))
+        if is_due and report is not None:
+            frames += self.report_frames(report())
         return frames
 
-    def publish(self, estimate: Estimate, samples: int) -> list[can.Message]:
+    def publish(
+        self,
+        estimate: Estimate,
+        samples: int,
+        report: Callable[[], PackReport] | None = None,
+    ) -> list[can.Message]:
         """Return the frames due with a sample of a replayed log; arguments as in `beat`."""
         now_s = estimate.time_s
         frames = []
@@ -194,6 +302,8 @@ class SocPublisher:
             if is_due:
                 self._detail_due_s = _next_due(self._detail_due_s, DETAIL_EVERY_S, now_s)
             frames.append(self.detail_frame(estimate, samples))
+            if is_due and report is not None:
+                frames += self.report_frames(report())
         return frames
 
     def restart(self) -> None:
@@ -202,29 +312,68 @@ class SocPublisher:
 
     def estimate_frame(self, estimate: Estimate, age_s: float = 0.0) -> can.Message:
         """Return SOC_ESTIMATE with the next counter; arguments as in `beat`."""
-        data = self._estimate.encode(
-            self._estimates_made,
+        return self._frame(
+            "soc_estimate",
             soc_pct=estimate.soc_pct,
             soc_std_pct=estimate.soc_std_pct,
             age_s=age_s if math.isnan(age_s) else min(math.floor(age_s), AGE_AT_MOST_S),
             reason=float(estimate.reasons),
             status=float(estimate.status),
         )
-        self._estimates_made += 1
-        return _message(self.ids.soc_estimate, data)
 
     def detail_frame(self, estimate: Estimate, samples: int) -> can.Message:
         """Return SOC_DETAIL with the next counter."""
-        data = self._detail.encode(
-            self._details_made,
+        self._acknowledged = samples
+        return self._frame(
+            "soc_detail",
             soc_newton_pct=estimate.soc_newton_pct,
             soc_coulomb_pct=estimate.soc_coulomb_pct,
             samples=float(samples % SAMPLES_MODULO),
             residual_v=estimate.residual_v,
         )
-        self._details_made += 1
-        self._acknowledged = samples
-        return _message(self.ids.soc_detail, data)
+
+    def report_frames(self, report: PackReport) -> list[can.Message]:
+        """Return SOC_HEALTH, SOC_POWER and, where there are cells, SOC_CELLS."""
+        health, power, cells = report
+        frames = [
+            self._frame(
+                "soc_health",
+                capacity_ah=health.capacity_ah,
+                capacity_std_ah=health.capacity_std_ah,
+                resistance_ratio=health.resistance_ratio,
+                resistance_std=health.resistance_std,
+                current_offset_a=health.offset_a,
+            ),
+            self._frame(
+                "soc_power",
+                discharge_a=power.discharge_a,
+                discharge_std_a=power.discharge_std_a,
+                charge_a=power.charge_a,
+                charge_std_a=power.charge_std_a,
+                energy_kwh=1e-3 * power.energy_wh,
+                energy_std_kwh=1e-3 * power.energy_std_wh,
+            ),
+        ]
+        if cells is not None:
+            is_checked = not math.isnan(cells.sum_error_v)
+            frames.append(
+                self._frame(
+                    "soc_cells",
+                    weakest_cell=math.nan if cells.weakest < 0 else float(cells.weakest),
+                    weakest_soc_pct=cells.soc_pct,
+                    weakest_soc_std_pct=cells.soc_std_pct,
+                    cell_spread_pct=cells.spread_pct,
+                    sum_error_v=cells.sum_error_v,
+                    sum_check=float(is_checked + cells.is_sum_wrong),
+                )
+            )
+        return frames
+
+    def _frame(self, name: str, **values: float) -> can.Message:
+        """Return a frame with the next counter."""
+        data = self._layouts[name].encode(self._made[name], **values)
+        self._made[name] += 1
+        return _message(getattr(self.ids, name), data)
 
 
 class SocReader:
@@ -243,40 +392,57 @@ class SocReader:
     def __init__(self, ids: FrameIds | None = None) -> None:
         self.ids = ids or FrameIds()
         self.refused = 0
-        self._estimate, self._detail = _layouts()
+        self._layouts = _layouts()
 
-    def read(self, message: can.Message) -> SocEstimate | SocDetail | None:
+    def read(self, message: can.Message) -> SocContent | None:
         """Return the content of a frame; None for other frames and damaged ones."""
         if message.is_extended_id or message.is_error_frame or message.is_remote_frame:
             return None
-        if message.arbitration_id == self.ids.soc_estimate:
-            values = self._estimate.decode(message.data)
-            if values is not None:
-                return SocEstimate(
-                    values["soc_pct"],
-                    values["soc_std_pct"],
-                    Status(int(values["status"])),
-                    Reason(int(values["reason"])),
-                    values["age_s"],
-                )
-        elif message.arbitration_id == self.ids.soc_detail:
-            values = self._detail.decode(message.data)
-            if values is not None:
-                return SocDetail(
-                    values["soc_newton_pct"],
-                    values["soc_coulomb_pct"],
-                    values["residual_v"],
-                    int(values["samples"]),
-                )
-        else:
+        name = self.ids.published.get(message.arbitration_id)
+        if name is None:
             return None
-        self.refused += 1
-        return None
+        values = self._layouts[name].decode(message.data)
+        if values is None:
+            self.refused += 1
+            return None
+        return _CONTENTS[name](values)
+
+
+def _estimate_content(values: dict[str, float]) -> SocEstimate:
+    return SocEstimate(
+        values["soc_pct"],
+        values["soc_std_pct"],
+        Status(int(values["status"])),
+        Reason(int(values["reason"])),
+        values["age_s"],
+    )
+
+
+_CONTENTS: Final[dict[str, Callable[[dict[str, float]], SocContent]]] = {
+    "soc_estimate": _estimate_content,
+    "soc_detail": lambda values: SocDetail(
+        values["soc_newton_pct"],
+        values["soc_coulomb_pct"],
+        values["residual_v"],
+        int(values["samples"]),
+    ),
+    "soc_health": lambda values: SocHealth(**values),
+    "soc_power": lambda values: SocPower(**values),
+    "soc_cells": lambda values: SocCells(**values),
+}
 
 
 def standard_filter(frame_id: int) -> CanFilter:
     """Return python-can's filter for one standard id."""
     return {"can_id": frame_id, "can_mask": 0x7FF, "extended": False}
+
+
+def _finite(values: dict[str, Any]) -> dict[str, Any]:
+    """Return the values, None for NaN."""
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in values.items()
+    }
 
 
 def _next_due(due_s: float, every_s: float, now_s: float) -> float:

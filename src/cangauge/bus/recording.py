@@ -7,11 +7,11 @@ samples lack.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from can.typechecking import Channel
@@ -27,10 +27,11 @@ from cangauge.bus.captures.capture import (
 )
 from cangauge.bus.captures.files import CaptureInfo, parts_of_run
 from cangauge.bus.decoder import FrameStatistics, SampleDecoder
-from cangauge.bus.time_source import TimeSource, TimeSourceName, time_source
+from cangauge.bus.time_source import ReceiveTime, TimeSource, TimeSourceName, time_source
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.validity import Sample
+from cangauge.logs.draft import Sign
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.read import KNOWN_LOGS, LogFile, not_recognised, open_log
 from cangauge.logs.sign import resolve_sign
@@ -46,12 +47,15 @@ def read_recording(
     *,
     temperature_c: float | None = None,
     temperature_source: TemperatureSource | None = None,
+    columns: Mapping[str, Any] | str | None = None,
+    sign: Sign | None = None,
 ) -> Log:
     """Read a log, or a CAN capture by its vehicle; the format is recognised by content.
 
     Logs: canonical Parquet and CSV, ANL D3 tests, BMW i3 trips, exports of Arbin, Bitrode and
-    VisuaLCN cyclers; plain, gzipped or in a zip. Captures: candump, CRTD, ASC, BLF, TRC, MF4, CSV;
-    plain or gzipped. `Log.remarks` lists what was dropped, converted or assumed.
+    VisuaLCN cyclers, tables with plain headings or `columns`; plain, gzipped or in a zip.
+    Captures: candump, CRTD, ASC, BLF, TRC, MF4, CSV; plain or gzipped. `Log.remarks` lists what
+    was dropped, converted or assumed.
 
     Parameters
     ----------
@@ -63,6 +67,12 @@ def read_recording(
         Constant temperature [°C], in place of the recording's own.
     temperature_source : {"cell", "pack", "coolant", "room", "unknown"}, optional
         Location of the temperature sensor, in place of the recording's own.
+    columns : mapping or str, optional
+        Columns of a table: {"current": "I_batt[mA]:-1"} or "time=t,current=I_batt[mA]:-1"; heading,
+        unit and factor. What it leaves out is found by plain headings.
+    sign : {"charge", "discharge"}, optional
+        What a positive current in a log does; by default as the format defines it, or found from
+        the data.
 
     Returns
     -------
@@ -90,8 +100,9 @@ def read_recording(
     >>> log.name, log.current_a
     ('drive', array([10., 30.]))
     """
+    tabular = columns is not None or sign is not None
     return log_of(
-        open_recording(path),
+        open_log(path, columns=columns, sign=sign) if tabular else open_recording(path),
         vehicle,
         temperature_c=temperature_c,
         temperature_source=temperature_source,
@@ -241,6 +252,8 @@ def capture_samples(
     remarks = [*capture.info.remarks, *_losses(bus.decoder.statistics)]
     if sum(bool(other.values) for other in buses.values()) > 1:
         remarks.append(f"several buses carry the frames; bus {channel} is used: most samples")
+    if isinstance(bus.clock, ReceiveTime) and bus.clock.irregular:
+        remarks.append(f"{bus.clock.irregular} time stamps step back: they are irregular")
     if clock.beginnings:
         remarks.append(f"the replay clock starts again {clock.beginnings} times")
     return CaptureSamples(
@@ -256,9 +269,10 @@ def capture_samples(
 
 
 class _Bus:
-    """One bus of a capture: its decoder and the decoded values."""
+    """One bus of a capture: its time, its decoder and the decoded values."""
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle: Vehicle, clock: TimeSource) -> None:
+        self.clock = clock
         self.decoder = SampleDecoder(vehicle)
         # Time, current, voltage, temperature and the car's SoC of each sample in turn.
         self.values = array("d")
@@ -272,13 +286,15 @@ class _Bus:
 def _decode(capture: Capture, vehicle: Vehicle, clock: TimeSource) -> dict[Channel | None, _Bus]:
     buses: dict[Channel | None, _Bus] = {}
     for message in capture:
-        time_s = clock.time_of(message)
+        bus = buses.get(message.channel)
+        if bus is None:
+            # The stamps of two buses can be of two adapters.
+            own = ReceiveTime() if isinstance(clock, ReceiveTime) else clock
+            bus = buses[message.channel] = _Bus(vehicle, own)
+        time_s = bus.clock.time_of(message)
         if time_s is None:
             continue
         message.timestamp = time_s
-        bus = buses.get(message.channel)
-        if bus is None:
-            bus = buses[message.channel] = _Bus(vehicle)
         bus.add(bus.decoder.handle(message))
     for bus in buses.values():
         bus.add(bus.decoder.flush())
@@ -306,6 +322,7 @@ def _losses(statistics: FrameStatistics) -> list[str]:
             (statistics.crc_errors, "frames refused: wrong CRC"),
             (statistics.counter_repeats, "frames refused: repeated counter"),
             (statistics.short, "frames refused: too short"),
+            (statistics.two_senders, "frames refused: two senders use their id"),
             (statistics.not_available, "values refused: code for 'not available'"),
         )
         if count
@@ -360,7 +377,7 @@ def capture_to_log(
     voltage_v = _filled_voltage(time_s, samples.voltage_v[keep], path, vehicle, remarks)
     temperature_c = _filled_temperature(samples.temperature_c[keep], path, vehicle, remarks)
     complete = np.isfinite(voltage_v)
-    values = {
+    values: dict[str, Any] = {
         "time_s": time_s[complete],
         "current_a": samples.current_a[keep][complete],
         "voltage_v": voltage_v[complete],
@@ -375,7 +392,7 @@ def capture_to_log(
         temperature_source=vehicle.temperature_source,
         remarks=tuple(remarks),
     )
-    refuse_wrong_units(values, source=path, labels=_labels(vehicle))
+    refuse_wrong_units(values, source=path, labels=_labels(vehicle), in_seconds=True)
     return resolve_sign(log, stored_sign_unknown=False)
 
 

@@ -1,5 +1,8 @@
 """Bus time of frames: the receive stamp, or the log time of a replay (REPLAY_CLOCK).
 
+A live service first limits the stamps by its monotonic clock (`StampLimiter`), which no time server
+sets. It records the limited stamps, so that a recording gives the same numbers.
+
 `replay` sends REPLAY_CLOCK ahead of the frames of each log time, so that a replay at any speed
 gives the same charge and the same delays. Times are whole microseconds, the resolution of most
 capture formats, so that a live run and its recording see equal numbers.
@@ -7,6 +10,10 @@ capture formats, so that a live run and its recording see equal numbers.
 
 from __future__ import annotations
 
+import math
+import time
+from collections import deque
+from collections.abc import Iterable
 from functools import lru_cache
 from typing import Final, Literal, Protocol
 
@@ -15,6 +22,7 @@ import can
 from cangauge._resources import shared_file
 from cangauge.bus.database import SignalCodec, load_dbc, signal_codec
 from cangauge.bus.protection import CRC_ONLY_RULE
+from cangauge.estimation.counting import LATEST_S
 
 TimeSourceName = Literal["receive", "replay-clock"]
 
@@ -25,6 +33,14 @@ MICROSECONDS: Final = 1e6
 
 STEP_BACK_S: Final = 1.0
 """A larger step back in time [s] means a clock that was set, or a new log."""
+
+REVERSAL_S: Final = 0.1
+"""A smaller step back [s] is a matter of the order of writing, as of two buses in one file."""
+IRREGULAR_REVERSALS: Final = 3
+IRREGULAR_WITHIN_S: Final = 10.0
+"""Reversals within this time [s] that prove irregular stamps: nobody sets a clock as often."""
+IRREGULAR_FOR_S: Final = 60.0
+"""Time after the latest reversal for which time stays uncertain [s]."""
 
 
 def whole_us(time_s: float) -> int:
@@ -38,6 +54,10 @@ class TimeSource(Protocol):
     beginnings: int
     """Number of new logs so far, after the first."""
 
+    @property
+    def is_uncertain(self) -> bool:
+        """Whether time is uncertain at present."""
+
     def time_of(self, message: can.Message) -> float | None:
         """Return the bus time of a frame [s]; None for a clock frame, or while not known."""
 
@@ -46,30 +66,187 @@ class ReceiveTime:
     """Receive stamps.
 
     After a step back of more than `STEP_BACK_S` time continues from the latest stamp, so that
-    setting the clock does not stop the estimate. A step forward is a gap.
+    setting the clock does not stop the estimate. A step forward is a gap. Stamps that step back
+    again and again are irregular: none of these steps then counts as a clock that was set.
 
     Attributes
     ----------
     steps_back : int
         Number of such steps.
+    irregular : int
+        Number of steps back that were not taken for one.
     """
 
     def __init__(self) -> None:
         self.beginnings = 0
         self.steps_back = 0
-        self._last_us: int | None = None
+        self.irregular = 0
+        self._latest_us: int | None = None
+        self._previous_us = 0
         self._shift_us = 0
+        # Time and shift before each of the latest reversals.
+        self._reversals: deque[tuple[int, int]] = deque(maxlen=IRREGULAR_REVERSALS)
+        self._irregular_until_us = 0
 
     def time_of(self, message: can.Message) -> float | None:
         """Return the bus time of a frame [s]."""
-        now_us = round(message.timestamp * MICROSECONDS) + self._shift_us
-        last_us = self._last_us
-        if last_us is not None and now_us < last_us - STEP_BACK_S * MICROSECONDS:
-            self.steps_back += 1
-            self._shift_us += last_us - now_us
-            now_us = last_us
-        self._last_us = now_us
+        latest_us = self._latest_us
+        stamp_s = message.timestamp
+        if not abs(stamp_s) <= LATEST_S:  # NaN too
+            return (latest_us or 0) / MICROSECONDS
+        now_us = round(stamp_s * MICROSECONDS) + self._shift_us
+        if latest_us is None or now_us >= latest_us:
+            self._latest_us = self._previous_us = now_us
+        else:
+            now_us = self._back(now_us, latest_us)
         return now_us / MICROSECONDS
+
+    @property
+    def is_uncertain(self) -> bool:
+        """Whether the stamps are irregular at present."""
+        return self._latest_us is not None and self._latest_us < self._irregular_until_us
+
+    def _back(self, now_us: int, latest_us: int) -> int:
+        """Return the time of a stamp that lies before the latest one [µs]."""
+        back_us, self._previous_us = self._previous_us - now_us, now_us
+        is_far = latest_us - now_us > STEP_BACK_S * MICROSECONDS
+        if not (is_far or back_us > REVERSAL_S * MICROSECONDS or self.is_uncertain):
+            return now_us
+        reversals = self._reversals
+        reversals.append((latest_us, self._shift_us))
+        within_us = latest_us - reversals[0][0]
+        if self.is_uncertain or (
+            len(reversals) == IRREGULAR_REVERSALS and within_us <= IRREGULAR_WITHIN_S * MICROSECONDS
+        ):
+            if not self.is_uncertain:
+                now_us -= self._shift_us - reversals[0][1]
+                self._shift_us = reversals[0][1]
+            self._irregular_until_us = latest_us + whole_us(IRREGULAR_FOR_S)
+            self.irregular += 1
+            return max(now_us, latest_us - whole_us(REVERSAL_S))
+        if is_far:
+            self.steps_back += 1
+            self._shift_us += latest_us - now_us
+            self._previous_us = latest_us
+            return latest_us
+        return now_us
+
+
+KERNEL_TOLERANCE_S: Final = 0.02
+"""Difference of a kernel's stamp from the monotonic clock that is no error [s]: both clocks are of
+one machine and run at one rate; the rest is scheduling between two readings of them."""
+DRIVER_TOLERANCE_S: Final = 0.25
+"""The same for other stamps [s]: an adapter's own clock, delivered with its latency."""
+STEP_AFTER_S: Final = 1.0
+STEP_FRAMES: Final = 5
+"""Time [s] and frames over which stamps must be off by the same amount to prove a set clock."""
+UNCERTAIN_AFTER_S: Final = 2.0
+"""Time over which stamps were unusable, from which time is uncertain [s]: longer than it takes to
+recognise a set clock."""
+CERTAIN_AFTER_S: Final = 10.0
+"""Time without an unusable stamp after which time is certain again [s]."""
+
+
+class StampLimiter:
+    """Limit stamps to the interval in which the frames can have arrived by the monotonic clock.
+
+    A frame received now arrived after the receive queue was last seen empty. A stamp outside this
+    interval is replaced by the time of reading; so bus time goes on at the right rate whatever the
+    stamps do. Stamps that are off by a constant amount come from a clock that was set: they are
+    shifted from then on, and exact again.
+
+    Parameters
+    ----------
+    tolerance_s : float
+        Difference that is no error [s].
+    offset_s : float
+        Stamps minus monotonic time [s]; NaN: known from the first frame.
+
+    Attributes
+    ----------
+    offset_s : float
+        Bus time minus monotonic time [s].
+    shift_s : float
+        Added to the stamps at present [s].
+    limited : int
+        Number of stamps replaced.
+    """
+
+    def __init__(self, tolerance_s: float, offset_s: float = math.nan) -> None:
+        self._tolerance_s = tolerance_s
+        self.offset_s = offset_s
+        self.shift_s = 0.0
+        self.limited = 0
+        # Replaced stamps in a row: their number, since when, and how far they were off.
+        self._run = 0
+        self._run_since_s = 0.0
+        self._low_s = self._high_s = 0.0
+        self._unusable_since_s = self._unusable_s = -math.inf
+
+    def limit(self, messages: Iterable[can.Message], since_s: float, now_s: float) -> float:
+        """Set the stamps of frames that were received together.
+
+        Parameters
+        ----------
+        messages : iterable of can.Message
+        since_s, now_s : float
+            Monotonic times [s]: the receive queue was last seen empty; the frames were read.
+
+        Returns
+        -------
+        float
+            Monotonic time at which the last of them arrived [s].
+        """
+        stamp_s = math.nan
+        for message in messages:
+            stamp_s = message.timestamp + self.shift_s
+            early_s = since_s + self.offset_s - self._tolerance_s
+            if early_s <= stamp_s <= now_s + self.offset_s + self._tolerance_s:
+                self._run = 0
+            else:
+                stamp_s = self._replaced(stamp_s, since_s, now_s)
+            message.timestamp = stamp_s
+        return min(stamp_s - self.offset_s, now_s)
+
+    def is_uncertain(self, now_s: float) -> bool:
+        """Return whether the stamps are unusable at a monotonic time [s]."""
+        return (
+            now_s - self._unusable_s < CERTAIN_AFTER_S
+            and self._unusable_s - self._unusable_since_s >= UNCERTAIN_AFTER_S
+        )
+
+    def _replaced(self, stamp_s: float, since_s: float, now_s: float) -> float:
+        """Return the time for a stamp outside the interval [s]."""
+        if math.isnan(self.offset_s):
+            if not abs(stamp_s) <= LATEST_S:  # NaN too
+                stamp_s = 0.0
+            self.offset_s = stamp_s - now_s
+            return stamp_s
+        self.limited += 1
+        if now_s - self._unusable_s >= CERTAIN_AFTER_S:
+            self._unusable_since_s = now_s
+        self._unusable_s = now_s
+        off_s = stamp_s - now_s - self.offset_s
+        low_s, high_s = min(self._low_s, off_s), max(self._high_s, off_s)
+        if self._run == 0 or not high_s - low_s <= self._tolerance_s:
+            self._run, self._run_since_s = 0, now_s
+            low_s = high_s = off_s
+        self._run += 1
+        self._low_s, self._high_s = low_s, high_s
+        if self._run >= STEP_FRAMES and now_s - self._run_since_s >= STEP_AFTER_S:
+            self.shift_s -= high_s
+            self._run, self._unusable_since_s = 0, now_s
+            stamp_s -= high_s
+        received_s = now_s + self.offset_s
+        return stamp_s if since_s + self.offset_s <= stamp_s <= received_s else received_s
+
+
+def steady_s() -> float:
+    """Return a monotonic time that counts a suspended machine too, where the system has one [s]."""
+    return time.clock_gettime(_STEADY) if _STEADY is not None else time.monotonic()
+
+
+_STEADY: Final[int | None] = getattr(time, "CLOCK_BOOTTIME", None)
 
 
 class ReplayClock:
@@ -89,6 +266,7 @@ class ReplayClock:
     def __init__(self, frame_id: int = REPLAY_CLOCK_ID) -> None:
         self.beginnings = 0
         self.refused = 0
+        self.is_uncertain = False
         self._id = frame_id
         self._codec = _clock_codec()
         self._now_us: int | None = None

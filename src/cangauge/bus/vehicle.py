@@ -20,7 +20,14 @@ from numpy.typing import NDArray
 from cangauge._config import read_toml, validated
 from cangauge._resources import shared_file
 from cangauge._typing import FloatArray
+from cangauge.bus.cells import (
+    CELL_TIMEOUT_S,
+    CELL_WITHIN_V,
+    CellGroup,
+    CellSignals,
+)
 from cangauge.bus.database import (
+    Condition,
     Decode,
     SignalCodec,
     find_message,
@@ -28,8 +35,11 @@ from cangauge.bus.database import (
     load_dbc,
     signal_codec,
 )
+from cangauge.bus.database import Field as BitField
+from cangauge.bus.isotp import reply_id
 from cangauge.bus.mapping import (
     NO_OVERRIDES,
+    CellsMap,
     CheckMap,
     MessageMap,
     Overrides,
@@ -44,12 +54,13 @@ from cangauge.errors import InputError, closest
 from cangauge.logs.log import TemperatureSource
 from cangauge.logs.units import convert
 
-Role = Literal["current", "voltage", "temperature", "soc_reference"]
+Role = Literal["current", "voltage", "temperature", "soc_reference", "cells"]
 LOG_COLUMNS: Final = {
     "current": "current_a",
     "voltage": "voltage_v",
     "temperature": "temperature_c",
     "soc_reference": "soc_pct",
+    "cells": "voltage_v",
 }
 """Column of the canonical log by role."""
 
@@ -57,6 +68,14 @@ EXTENDED: Final = 1 << 31
 """Flag of an extended id in a message key, as in SocketCAN."""
 
 _LONGEST_CYCLE_MS: Final = 1e9
+
+
+def pgn_mask(key: int) -> int:
+    """Return the bits of an extended id that are its PGN (SAE J1939-21).
+
+    Below 0xF0 the PDU format is followed by a destination, which is no part of the PGN.
+    """
+    return 0x03FF0000 if (key >> 16 & 0xFF) < 0xF0 else 0x03FFFF00
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +115,11 @@ class VehicleSignal:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "decode", self.codec.decoder(self.gain, self.offset))
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle without `decode`, which is made again."""
+        given = [getattr(self, each.name) for each in dataclasses.fields(self) if each.init]
+        return type(self), tuple(given)
 
     def encode_into(self, payload: bytearray, value: float) -> None:
         """Set the value in A, V, °C or %; NaN becomes "not available".
@@ -139,10 +163,14 @@ class VehicleSignal:
 
 
 class MessageProtection(NamedTuple):
-    """Protection and period [s] of one message, where known."""
+    """Protection and period [s] of one message, where known, and how it is identified."""
 
     rule: Protection | None
     period_s: float | None
+    is_reply: bool = False
+    """Over ISO-TP."""
+    by_pgn: bool = False
+    """From any source address (J1939)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,6 +190,8 @@ class Vehicle:
     messages : dict of int to MessageProtection
         By key (id, plus `EXTENDED`), for every message with a wanted signal.
     dbc_files : tuple of str
+    cells : CellSignals or None
+        Voltages of the cells.
     """
 
     name: str
@@ -174,6 +204,7 @@ class Vehicle:
     pair_within_s: float
     messages: dict[int, MessageProtection]
     dbc_files: tuple[str, ...]
+    cells: CellSignals | None = None
 
     @classmethod
     def load(
@@ -277,19 +308,32 @@ class Vehicle:
     @property
     def wanted_ids(self) -> tuple[int, ...]:
         """Arbitration ids with a wanted signal, each once."""
-        return tuple(dict.fromkeys(signal.arbitration_id for signal in self.signals))
+        return tuple(dict.fromkeys(key & ~EXTENDED for key in self.frame_keys))
+
+    def _mask(self, key: int) -> int:
+        if not key & EXTENDED:
+            return 0x7FF
+        known = self.messages.get(key)
+        return pgn_mask(key) if known is not None and known.by_pgn else 0x1FFFFFFF
+
+    @property
+    def frame_keys(self) -> tuple[int, ...]:
+        """Ids of the frames with a wanted signal, plus `EXTENDED`, each once."""
+        cells = () if self.cells is None else self.cells.keys
+        keys = dict.fromkeys((*(signal.key for signal in self.signals), *cells))
+        replies = {key for key in keys if self.messages[key].is_reply}
+        return tuple(dict.fromkeys(reply_id(key) if key in replies else key for key in keys))
 
     @property
     def filters(self) -> list[CanFilter]:
         """The wanted ids as filters of python-can (`bus.set_filters`)."""
-        keys = dict.fromkeys(signal.key for signal in self.signals)
         return [
             {
                 "can_id": key & ~EXTENDED,
-                "can_mask": 0x1FFFFFFF if key & EXTENDED else 0x7FF,
+                "can_mask": self._mask(key),
                 "extended": bool(key & EXTENDED),
             }
-            for key in keys
+            for key in self.frame_keys
         ]
 
 
@@ -326,6 +370,7 @@ class _Binder:
             fixed_c = temperature.fixed_c
         current = self._signal("current", mapping.current)
         voltage = self._signal("voltage", mapping.voltage)
+        cells = None if mapping.cells is None else self._cells(mapping.cells)
         return Vehicle(
             name=mapping.name,
             current=current,
@@ -341,6 +386,44 @@ class _Binder:
             pair_within_s=within_s,
             messages=self._messages(),
             dbc_files=tuple(str(path) for _, path in self._databases),
+            cells=cells,
+        )
+
+    def _cells(self, wanted: CellsMap) -> CellSignals:
+        signals = [self._signal("cells", each) for each in wanted.signal_maps()]
+        groups: dict[tuple[int, tuple[Condition, ...]], list[int]] = {}
+        for place, signal in enumerate(signals):
+            groups.setdefault((signal.key, signal.codec.conditions), []).append(place)
+        index: BitField | None = None
+        if wanted.index is not None:
+            if len(groups) > 1:
+                raise InputError(
+                    "the signals of a group are not in the same frame",
+                    source=self._source,
+                    field="cells.signals",
+                )
+            numbering = SignalMap(message=wanted.message, signal=wanted.index, scale=1.0)
+            index = self._signal("cells", numbering).codec.field
+        low, high = CELL_WITHIN_V
+        return CellSignals(
+            count=wanted.count,
+            first=wanted.first,
+            groups=tuple(
+                CellGroup(
+                    key=key,
+                    message=signals[places[0]].message,
+                    length=signals[places[0]].length,
+                    conditions=conditions,
+                    places=tuple(places),
+                    decoders=tuple(signals[place].decode for place in places),
+                    index=index,
+                    first_index=wanted.first_index,
+                )
+                for (key, conditions), places in groups.items()
+            ),
+            lowest_v=low if wanted.lowest is None else wanted.lowest,
+            highest_v=high if wanted.highest is None else wanted.highest,
+            timeout_s=wanted.timeout_s or CELL_TIMEOUT_S,
         )
 
     def _signal(self, role: Role, wanted: SignalMap) -> VehicleSignal:
@@ -365,7 +448,9 @@ class _Binder:
         )
         self._found[_key(message)] = message
         factor, offset = self._unit(role, wanted, codec)
-        checks = DEFAULTS[role].updated(wanted, self._overrides.checks.get(role, CheckMap()))
+        checks = DEFAULTS.get(role, SignalChecks()).updated(
+            wanted, self._overrides.checks.get(role, CheckMap())
+        )
         if checks.lowest >= checks.highest:
             raise InputError(
                 "lowest is not below highest",
@@ -413,7 +498,8 @@ class _Binder:
         for key, message in self._found.items():
             each, source = stated.get(key, (MessageMap(), self._source))
             period_s = _cycle_s(message) if each.period_s is None else each.period_s
-            found[key] = MessageProtection(each.rule(message, rules, source=source), period_s)
+            rule = each.rule(message, rules, source=source)
+            found[key] = MessageProtection(rule, period_s, each.isotp, each.j1939)
         return found
 
     def _message_key(self, name: str) -> int:
@@ -477,6 +563,17 @@ class Preset:
         return binder.vehicle(temperature_c, pair_within_s)
 
 
+def _polled(leaf: Preset) -> Preset:
+    """Return a Leaf whose temperature comes in replies of its battery that a tester polls."""
+    temperature = TemperatureMap(message="LBC_04", signal="probe_1_c", timeout_s=60.0)
+    messages = {**leaf.mapping.messages, "LBC_04": MessageMap(isotp=True)}
+    mapping = leaf.mapping.model_copy(
+        update={"temperature": temperature, "temperature_source": "pack", "messages": messages}
+    )
+    about = "Nissan Leaf 40/62 kWh whose battery a tester polls: temperature from its replies"
+    return dataclasses.replace(leaf, about=about, mapping=mapping)
+
+
 def _leaf(name: str, about: str, period_5bc_s: float, *, has_temperature: bool = True) -> Preset:
     temperature = TemperatureMap(
         message="BATTERY_5C0", signal="temperature_average_c", timeout_s=10.0
@@ -500,6 +597,13 @@ def _leaf(name: str, about: str, period_5bc_s: float, *, has_temperature: bool =
     )
 
 
+_LEAF_ZE1: Final = _leaf(
+    "Nissan Leaf ZE1",
+    "Nissan Leaf 40/62 kWh, from 2018; needs --temperature",
+    0.100,
+    has_temperature=False,
+)
+
 PRESETS: Final[dict[str, Preset]] = {
     "generic": Preset(
         dbc="generic_pack.dbc",
@@ -522,11 +626,19 @@ PRESETS: Final[dict[str, Preset]] = {
         "Nissan Leaf 24/30 kWh, 2013-17; e-NV200; 40 kWh pack in such a car",
         0.100,
     ),
-    "leaf_ze1": _leaf(
-        "Nissan Leaf ZE1",
-        "Nissan Leaf 40/62 kWh, from 2018; needs --temperature",
-        0.100,
-        has_temperature=False,
+    "leaf_ze1": _LEAF_ZE1,
+    "leaf_ze1_polled": _polled(_LEAF_ZE1),
+    "bmw_i3": Preset(
+        dbc="bmw_i3.dbc",
+        about="BMW i3 60/94/120 Ah; needs --temperature",
+        mapping=VehicleMap(
+            name="BMW i3",
+            current=SignalMap(message="BATTERY_112", signal="current_a", sign=-1),
+            voltage=SignalMap(message="BATTERY_112", signal="voltage_v"),
+            soc_reference=SignalMap(message="BATTERY_112", signal="soc_pct"),
+            messages={"BATTERY_112": MessageMap(period_s=0.010)},
+        ),
+        periods_s={0x112: 0.010},
     ),
 }
 """By the name that `--vehicle` takes."""

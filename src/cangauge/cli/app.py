@@ -15,6 +15,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command as build_command
 
+from cangauge._io import FULL
 from cangauge._resources import one_thread
 from cangauge._version import __version__
 from cangauge.cli.output import emit_json, note
@@ -22,6 +23,8 @@ from cangauge.errors import CangaugeError, closest
 
 COMMANDS: Final = {
     "demo": "Fit a model, replay a log on a bus, estimate its SoC live, and report the errors.",
+    "init": "Find the car's signals, prove them against each other, and write a map and a"
+    " configuration.",
     "fit": "Identify the voltage model of a pack from recorded logs.",
     "estimate": "Estimate the state of charge of a recorded log or capture, offline.",
     "gap": "Diagnose the gap between a model and logs: size, place, probable cause.",
@@ -133,6 +136,13 @@ def main() -> None:
             note(line)
         _emit_failure(_usage_dict(error), 2)
         sys.exit(2)
+    except OSError as error:
+        if error.errno not in FULL:
+            raise
+        # Files are written elsewhere: this is stdout, into a file on a full disk.
+        note(f"error: stdout: {error.strerror}")
+        _discard_stdout()
+        sys.exit(1)
     except Exception as error:  # a bug: Python prints the traceback and exits with 1
         _emit_failure(CangaugeError(f"{type(error).__name__}: {error}").to_dict(), 1)
         raise
@@ -164,9 +174,13 @@ def _emit_failure(error: Mapping[str, Any], exit_code: int) -> None:
     try:
         emit_json({"error": error, "exit_code": exit_code})
     except OSError:
-        # A closed pipe or a full disk. The exit code stays that of the failure, also when Python
-        # flushes stdout once more at the end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # A closed pipe or a full disk. The exit code stays that of the failure.
+        _discard_stdout()
+
+
+def _discard_stdout() -> None:
+    """Discard what is left for stdout: Python flushes it once more at the end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _usage_line(error: Any) -> str:

@@ -58,13 +58,11 @@ def config_values(options: Mapping[str, Any]) -> dict[str, Any]:
     values = {name: options[_parameter(name)] for name in _KEYS if "." not in name}
     values = {name: str(v) if isinstance(v, Path) else v for name, v in values.items()}
     values["bus_options"] = parse_bus_options(values["bus_options"] or [])
-    ids = (options[f"{name}_id"] for name in ("soc_estimate", "soc_detail", "replay_clock"))
-    return {**values, "ids": frame_ids(*ids)}
+    names = [name.removeprefix("ids.") for name in _KEYS if name.startswith("ids.")]
+    return {**values, "ids": frame_ids(**{name: options[f"{name}_id"] for name in names})}
 
 
-def frame_ids(
-    soc_estimate: str | None, soc_detail: str | None, replay_clock: str | None
-) -> dict[str, int]:
+def frame_ids(**given: str | None) -> dict[str, int]:
     """Return the given ids by key; "0x…" is hexadecimal.
 
     Raises
@@ -72,7 +70,6 @@ def frame_ids(
     InputError
         If one is not a number.
     """
-    given = {"soc_estimate": soc_estimate, "soc_detail": soc_detail, "replay_clock": replay_clock}
     ids = {}
     for key, text in given.items():
         if text is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -103,15 +104,18 @@ def _play(model: Path, log: Path, live: Path) -> float:
     bus = ["--interface", "socketcan", "--channel", "vcan0"]
     if not has_socketcan("vcan0"):
         bus = []  # the default, which takes nothing from other machines
-    cangauge = [sys.executable, "-m", "cangauge"]
+    cangauge = [sys.executable, "-P", "-m", "cangauge"]  # -P: no modules of the working folder
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     service = [
         *cangauge, "run", *bus, "-m", str(model), "--time-source", "replay-clock",
         "--temperature-source", "room", "--until-idle", str(IDLE_S), "--output", str(live),
     ]  # fmt: skip
     began = time.monotonic()
-    with subprocess.Popen(service, stderr=subprocess.PIPE, text=True) as running:  # noqa: S603 - our own commands
+    with subprocess.Popen(  # noqa: S603 - our own commands
+        service, stderr=subprocess.PIPE, text=True, env=environment
+    ) as running:
         replay = subprocess.run(  # noqa: S603 - our own commands
-            [*cangauge, "replay", str(log), *bus, "--speed", "max"], check=False
+            [*cangauge, "replay", str(log), *bus, "--speed", "max"], check=False, env=environment
         )
         seconds = time.monotonic() - began
         try:

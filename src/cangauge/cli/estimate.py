@@ -14,16 +14,21 @@ from rich.progress import Progress
 from cangauge._formatting import number
 from cangauge._io import atomic_path
 from cangauge.bus.captures.capture import Capture
-from cangauge.bus.recording import capture_without_vehicle, open_recording
+from cangauge.bus.publish import PackReport
+from cangauge.bus.recording import capture_without_vehicle
 from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.options import (
+    ColumnsOption,
     DbcOption,
     JsonOption,
     MapOption,
     ReportOption,
+    SignOption,
+    TableOptions,
     TemperatureOption,
     TemperatureSourceOption,
     VehicleOption,
+    assumed_of,
     check_outputs,
     known_temperature_source,
     load_log,
@@ -34,10 +39,14 @@ from cangauge.cli.options import (
 from cangauge.cli.output import console, emit_json, note, print_table
 from cangauge.errors import InputError
 from cangauge.estimation.settings import VALID_STD_PCT, EstimatorSettings, Method
+from cangauge.logs.canonical import write_table
+from cangauge.logs.cells import read_cells
 from cangauge.model.delay_line import GAP_S
 from cangauge.model.model_file import Model
+from cangauge.service.estimate_mcap import write_estimates_mcap
 from cangauge.service.estimate_table import require_table_suffix, write_estimates
 from cangauge.service.offline import (
+    PackHistory,
     RecordedCapture,
     RecordedEstimate,
     estimate_recorded_capture,
@@ -55,7 +64,9 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     ],
     output: Annotated[
         Path,
-        typer.Option("-o", "--output", metavar="OUT", help="Table of estimates, .csv or .parquet."),
+        typer.Option(
+            "-o", "--output", metavar="OUT", help="Table of estimates, .csv, .parquet or .mcap."
+        ),
     ],
     method: Annotated[
         str,
@@ -96,8 +107,17 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     vehicle: VehicleOption = None,
     dbc: DbcOption = None,
     map_file: MapOption = None,
+    columns: ColumnsOption = None,
+    sign: SignOption = None,
     temperature: TemperatureOption = None,
     temperature_source: TemperatureSourceOption = None,
+    pack: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PACK",
+            help="Table of health, power and cells, once a second, .csv or .parquet.",
+        ),
+    ] = None,
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:
@@ -106,7 +126,11 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     OUT has one row per sample: time_s [s], soc_pct, soc_std_pct, soc_newton_pct, soc_coulomb_pct
     [%], voltage_model_v, residual_v (measured − model) [V], status (initialising, valid, degraded,
     invalid) and reasons (separated by "; "). An unknown value is empty (CSV) or null (Parquet).
-    Positive current discharges.
+    An .mcap holds samples and estimates for Foxglove and PlotJuggler. Positive current discharges.
+
+    PACK has one row per second: capacity_ah, resistance_ratio, offset_a, discharge_a and charge_a
+    (possible for 10 s), energy_wh (left), with standard deviations; and, where the log has cell
+    voltages (columns cell_1_v, cell_2_v, …, or [cells] of the map file), the weakest cell.
 
     Examples
     --------
@@ -116,7 +140,10 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge estimate drive.log --vehicle leaf_ze0 -m leaf.json -o soc.csv --method newton`
     """
-    require_table_suffix(output)
+    is_mcap = output.suffix.lower() == ".mcap"
+    if not is_mcap:
+        require_table_suffix(output)
+    require_table_suffix(pack or Path("pack.csv"), option="--pack")
     settings = EstimatorSettings(
         method=_method(method),
         initial_soc_pct=_initial_soc(initial_soc),
@@ -127,16 +154,19 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
         capacity_ah=within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah"),
         gap_s=within(max_gap_s, 1e-3, 3600.0, option="--max-gap-s", unit="s") or GAP_S,
     )
-    check_outputs([output, report], [log_path, model_path])
+    check_outputs([output, pack, report], [log_path, model_path])
     model = Model.load(model_path)
-    if isinstance(open_recording(log_path), Capture):
+    assumed: dict[str, list[str]] = {}
+    if isinstance(TableOptions(columns, sign, map_file).open(log_path), Capture):
         if (vehicle, dbc, map_file) == (None, None, None):
             raise capture_without_vehicle(log_path)
         car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature)
         source = known_temperature_source(temperature_source) or "unknown"
         settings = replace(settings, temperature_source=source)
         with _progress(None) as progress:
-            done = estimate_recorded_capture(log_path, car, model, settings, progress=progress)
+            done = estimate_recorded_capture(
+                log_path, car, model, settings, keeps_pack=pack is not None, progress=progress
+            )
         _check_capture(done, model)
     else:
         log = load_log(
@@ -146,8 +176,12 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
             map_file=map_file,
             temperature_c=temperature,
             temperature_source=temperature_source,
+            columns=columns,
+            sign=sign,
             refuse_inverted=True,
         )
+        assumed = assumed_of([log])
+        cells = read_cells(log_path, log.time_s)
         with _progress(len(log)) as progress:
             done = estimate_recorded_log(
                 log,
@@ -155,6 +189,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
                 settings,
                 soc_from_log=initial_soc is None,
                 gap_from_log=max_gap_s is None,
+                pack=PackHistory(keeps_rows=pack is not None, cells=cells),
                 progress=progress,
             )
         if max_gap_s is None and done.settings.gap_s > GAP_S:
@@ -168,17 +203,32 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
         from cangauge.report.estimate import estimate_report  # noqa: PLC0415
 
         page = estimate_report(done, model_path)
+    _write_pack(done, pack)
     with ExitStack() as both:  # table and report, or neither
-        write_estimates(both.enter_context(atomic_path(output)), done.recorded.time_s, done.table)
+        part = both.enter_context(atomic_path(output))
+        if is_mcap:
+            write_estimates_mcap(part, done.recorded, done.table)
+        else:
+            write_estimates(part, done.recorded.time_s, done.table)
         if report is not None and page is not None:
             both.enter_context(atomic_path(report)).write_text(page, encoding="utf-8")
     for warning in done.warnings:
         note(f"warning: {done.recorded.source}: {warning}")
     if json_output:
-        emit_json(done.to_dict() | {"output": str(output), "report": report and str(report)})
+        written = {"output": str(output), "pack": pack and str(pack), "assumed": assumed}
+        emit_json(done.to_dict() | written | {"report": report and str(report)})
         return
     _show(done)
-    note(f"estimates: {output}" + (f"\nreport: {report}" if report else ""))
+    note(
+        f"estimates: {output}"
+        + (f"\nhealth, power and cells: {pack}" if pack else "")
+        + (f"\nreport: {report}" if report else "")
+    )
+
+
+def _write_pack(done: RecordedEstimate, pack: Path | None) -> None:
+    if pack is not None:
+        write_table(done.pack.columns, pack)
 
 
 def _method(given: str) -> Method:
@@ -241,6 +291,36 @@ def _show(done: RecordedEstimate) -> None:
             ["computing time", number(scores.seconds, 1), "s"],
         ],
     )
+    if done.pack.report is not None:
+        _show_pack(done.pack.report)
     if shares := done.reason_shares:
         rows = [[name, number(100.0 * share, 1)] for name, share in shares.items()]
         print_table("Reasons for less than valid estimates", ["reason", "% of samples"], rows)
+
+
+def _show_pack(report: PackReport) -> None:
+    health, power, cells = report
+    rows = [
+        ["capacity", _with_std(health.capacity_ah, health.capacity_std_ah, 1), "Ah"],
+        [
+            "resistance, relative",
+            _with_std(health.resistance_ratio, health.resistance_std, 2),
+            "× the model's",
+        ],
+        ["current offset", number(health.offset_a, 2), "A"],
+        ["discharge for 10 s", _with_std(power.discharge_a, power.discharge_std_a, 0), "A"],
+        ["charge for 10 s", _with_std(power.charge_a, power.charge_std_a, 0), "A"],
+        ["energy left", _with_std(1e-3 * power.energy_wh, 1e-3 * power.energy_std_wh, 1), "kWh"],
+    ]
+    if cells is not None:
+        name = "weakest cell" if cells.weakest < 0 else f"weakest cell: number {cells.weakest}"
+        rows += [
+            [name, _with_std(cells.soc_pct, cells.soc_std_pct, 1), "%"],
+            ["  spread of the cells", number(cells.spread_pct, 1), "%"],
+            ["pack less sum of cells", _with_std(cells.sum_error_v, cells.sum_std_v, 2), "V"],
+        ]
+    print_table("The pack at the end", ["", "value", "<unit"], rows)
+
+
+def _with_std(value: float, std: float, digits: int) -> str:
+    return f"{number(value, digits)} ± {number(std, digits)}"

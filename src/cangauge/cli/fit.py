@@ -11,13 +11,16 @@ import typer
 from cangauge._formatting import number, significant, span
 from cangauge._io import write_texts_atomic
 from cangauge.cli.options import (
+    ColumnsOption,
     DbcOption,
     JsonOption,
     MapOption,
     ReportOption,
+    SignOption,
     TemperatureOption,
     TemperatureSourceOption,
     VehicleOption,
+    assumed_of,
     check_outputs,
     load_log,
     within,
@@ -27,6 +30,7 @@ from cangauge.errors import InputError
 from cangauge.identify.delays import DelaySearch, search_delays
 from cangauge.identify.effect_search import parse_effect_ids
 from cangauge.identify.fit import Identification, fit
+from cangauge.identify.starts import find_starts, given_starts
 from cangauge.inference.rows import DELAYS_S, FitOptions
 from cangauge.model.coulomb_counting import capacity_from_full_discharge, capacity_from_reference
 from cangauge.report.summary import effect_rows, rounded, search_rows
@@ -54,9 +58,12 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         ),
     ] = None,
     initial_soc: Annotated[
-        float | None,
+        list[str] | None,
         typer.Option(
-            metavar="P", help="SoC at the first row of each log [%]. Default: its soc_pct, or 100."
+            metavar="P|auto",
+            help="SoC at the first row [%]; once for all logs, or repeated, once for each in order."
+            " Default, and auto: its soc_pct; a log without is estimated together with the curve,"
+            " if another log pins it.",
         ),
     ] = None,
     rate_hz: Annotated[
@@ -90,6 +97,8 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
     vehicle: VehicleOption = None,
     dbc: DbcOption = None,
     map_file: MapOption = None,
+    columns: ColumnsOption = None,
+    sign: SignOption = None,
     temperature: TemperatureOption = None,
     temperature_source: TemperatureSourceOption = None,
     report: ReportOption = None,
@@ -98,7 +107,8 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
     """Identify the voltage model of a pack from recorded logs.
 
     A log has time_s [s], current_a [A] (positive discharges), voltage_v [V], temperature_c [°C]
-    and optionally soc_pct [%]; `cangauge inspect` shows what a file holds.
+    and optionally soc_pct [%], or columns of other names (--columns); `cangauge inspect` shows what
+    a file holds. The SoC at the start of at least one log must be known.
 
     Examples
     --------
@@ -110,10 +120,13 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge fit trip1.csv trip2.csv trip3.csv -o pack.json --capacity-ah from-soc --effects auto`
 
+    `cangauge fit known.csv other.csv -o pack.json --capacity-ah 60 --initial-soc 92 --initial-soc
+    auto`
+
     Model file and report are written together, or neither.
     """
     capacity = _capacity(capacity_ah)
-    within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
+    initial = _initial_soc(initial_soc, len(logs))
     within(rate_hz, 0.01, 1000.0, option="--rate-hz", unit="Hz")
     within(epsilon, 1e-4, 0.49, option="--epsilon", unit="")
     within(t_ref, -60.0, 120.0, option="--t-ref", unit="°C")
@@ -132,6 +145,8 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
                     map_file=map_file,
                     temperature_c=temperature,
                     temperature_source=temperature_source,
+                    columns=columns,
+                    sign=sign,
                     refuse_inverted=True,
                 )
             )
@@ -140,15 +155,16 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         search = None
         with progress_shown("cangauge.identify", status.update):
             if delays == AUTO:
+                given = given_starts(initial, len(recorded))
                 if capacity is None:
-                    capacity = capacity_from_full_discharge(recorded, initial_soc)
-                options = FitOptions(capacity, initial_soc, rate_hz, epsilon=epsilon, t_ref_c=t_ref)
-                search = search_delays(recorded, options)
+                    capacity = capacity_from_full_discharge(recorded, given)
+                options = FitOptions(capacity, None, rate_hz, epsilon=epsilon, t_ref_c=t_ref)
+                search = search_delays(find_starts(recorded, given, options).logs, options)
                 delay_s = search.delay_s
             result = fit(
                 recorded,
                 capacity_ah=capacity,
-                initial_soc_pct=initial_soc,
+                initial_soc_pct=initial,
                 rate_hz=rate_hz,
                 delay_s=delay_s,
                 epsilon=epsilon,
@@ -167,7 +183,11 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         {output: result.model.to_json()} | ({report: page} if report and page else {})
     )
     if json_output:
-        extra: dict[str, object] = {"model": str(output), "report": report and str(report)}
+        extra: dict[str, object] = {
+            "model": str(output),
+            "report": report and str(report),
+            "assumed": assumed_of(recorded),
+        }
         if search is not None:
             extra["delay_search"] = [
                 {"delays_s": tried, "held_out_rmse_v": error} for tried, error in _best(search)
@@ -192,6 +212,28 @@ def _capacity(given: str | None) -> float | None:
             value=given,
             cure=f"give it as 51.5, or as {FROM_SOC} to take it from the logs' soc_pct",
         ) from error
+
+
+def _initial_soc(given: list[str] | None, number: int) -> float | list[float | None] | None:
+    """Return the value for all logs, or one for each; None where it is not given."""
+    if not given:
+        return None
+    found: list[float | None] = []
+    for text in given:
+        try:
+            value = None if text == AUTO else float(text)
+        except ValueError as error:
+            raise InputError(
+                "neither a number nor auto", field="--initial-soc", value=text, cure="give it as 80"
+            ) from error
+        found.append(within(value, 0.0, 100.0, option="--initial-soc", unit="%"))
+    if len(found) not in {1, number}:
+        raise InputError(
+            f"{len(found)} values for {number} logs",
+            field="--initial-soc",
+            cure="give one for all, or one for each log in order (auto where it is unknown)",
+        )
+    return found[0] if len(found) == 1 else found
 
 
 def _delays(given: str) -> tuple[float, ...]:

@@ -10,13 +10,16 @@ import typer
 from cangauge._formatting import NONE_KNOWN, number, printable
 from cangauge._io import write_texts_atomic
 from cangauge.cli.options import (
+    ColumnsOption,
     DbcOption,
     JsonOption,
     MapOption,
     ReportOption,
+    SignOption,
     TemperatureOption,
     TemperatureSourceOption,
     VehicleOption,
+    assumed_of,
     check_outputs,
     load_log,
     within,
@@ -25,6 +28,7 @@ from cangauge.cli.output import emit_json, note, print_table, progress_shown
 from cangauge.diagnosis import NONE, UNKNOWN, Diagnosis, diagnose
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
+from cangauge.model.coulomb_counting import difference_from_reference
 from cangauge.model.model_file import Model
 from cangauge.report.summary import headline, next_step, open_question, parameters_text
 
@@ -43,13 +47,17 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
         list[Path] | None,
         typer.Option(
             metavar="LOG",
-            help="Log without a fault; repeat the option. It needs soc_pct, at least at its start,"
-            " or starts full.",
+            help="Log without a fault; repeat the option. Without soc_pct its start is found from"
+            " the voltage.",
         ),
     ] = None,
     initial_soc: Annotated[
         float | None,
-        typer.Option(metavar="P", help="SoC at the first row of each diagnosed log [%], e.g. 80."),
+        typer.Option(
+            metavar="P",
+            help="SoC at the first row of each diagnosed log [%], e.g. 80. Default: its soc_pct,"
+            " else found from the voltage.",
+        ),
     ] = None,
     capacity_ah: Annotated[
         float | None,
@@ -64,6 +72,8 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     vehicle: VehicleOption = None,
     dbc: DbcOption = None,
     map_file: MapOption = None,
+    columns: ColumnsOption = None,
+    sign: SignOption = None,
     temperature: TemperatureOption = None,
     temperature_source: TemperatureSourceOption = None,
     report: ReportOption = None,
@@ -99,11 +109,16 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
             map_file=map_file,
             temperature_c=temperature,
             temperature_source=temperature_source,
+            columns=columns,
+            sign=sign,
             refuse_inverted=True,
         )
 
     diagnosed = [_long_enough(read(path)) for path in logs]
     references = [read(path) for path in given]
+    for log in (*diagnosed, *references):
+        if (difference := difference_from_reference(log, model_file.capacity_ah)) is not None:
+            note(f"warning: {difference}")
     with progress_shown("cangauge.diagnosis"):
         found = diagnose(diagnosed, model_file, references, initial_soc_pct=initial_soc)
     texts = {}
@@ -117,7 +132,8 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
         texts[report] = gap_report(found, InputFile.of_model(model_file, model))
     write_texts_atomic(texts)
     if json_output:
-        emit_json(found.to_dict(None if extended is None else str(extended)))
+        result = found.to_dict(None if extended is None else str(extended))
+        emit_json(result | {"assumed": assumed_of([*diagnosed, *references])})
         return
     _show(found)
     for written in (extended, report):

@@ -12,13 +12,17 @@ from rich.markup import escape
 from rich.table import Table
 
 from cangauge.cli.options import (
+    ColumnsOption,
     DbcOption,
     JsonOption,
     MapOption,
+    SignOption,
+    TableOptions,
     TemperatureOption,
     VehicleOption,
+    assumed_of,
 )
-from cangauge.cli.output import PlainConsole, emit_json
+from cangauge.cli.output import PlainConsole, emit_json, note
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -36,14 +40,16 @@ def inspect_command(  # noqa: PLR0917 - typer fills the arguments by name
         Path,
         typer.Argument(
             metavar="LOG|CAPTURE",
-            help="Log (canonical Parquet or CSV, ANL D3 test, BMW i3 trip, cycler export; also"
-            " gzipped or zipped) or CAN capture.",
+            help="Log (canonical Parquet or CSV, ANL D3 test, BMW i3 trip, cycler export, or any"
+            " table with a heading for each column; also gzipped or zipped) or CAN capture.",
             show_default=False,
         ),
     ],
     vehicle: VehicleOption = None,
     dbc: DbcOption = None,
     map_file: MapOption = None,
+    columns: ColumnsOption = None,
+    sign: SignOption = None,
     temperature: TemperatureOption = None,
     json_output: JsonOption = False,
 ) -> None:
@@ -62,20 +68,24 @@ def inspect_command(  # noqa: PLR0917 - typer fills the arguments by name
 
     `cangauge inspect 1C-Discharge.csv --temperature 24`
 
+    `cangauge inspect logger.csv --columns 'time=Stamp,current=I_batt[mA]:-1,voltage=U_batt'`
+
     `cangauge inspect capture.log --vehicle leaf_ze0`
     """
     # Deferred: the readers and the decoder take half a second to import.
-    from cangauge.bus.recording import open_recording  # noqa: PLC0415
+    from cangauge.bus.mapping import columns_of_map  # noqa: PLC0415
     from cangauge.bus.vehicle import Vehicle  # noqa: PLC0415
     from cangauge.inspect.capture import inspect_capture  # noqa: PLC0415
     from cangauge.inspect.log import LogInspection, inspect_log  # noqa: PLC0415
     from cangauge.logs.read import LogFile  # noqa: PLC0415
 
-    recording = open_recording(path)
+    recording = TableOptions(columns, sign, map_file).open(path)
+    assumed: dict[str, list[str]] = {}
     options = {"--vehicle": vehicle, "--dbc": dbc, "--map": map_file}
     given = {option: str(value) for option, value in options.items() if value is not None}
     if isinstance(recording, LogFile):
-        if given:
+        is_of_columns = map_file is not None and columns_of_map(map_file) is not None
+        if given and not (is_of_columns and list(given) == ["--map"]):
             option, value = next(iter(given.items()))
             raise InputError(
                 "this is a log; the option is for captures",
@@ -84,14 +94,16 @@ def inspect_command(  # noqa: PLR0917 - typer fills the arguments by name
                 value=value,
                 cure="omit it",
             )
-        found: LogInspection | CaptureInspection = inspect_log(
-            recording.read(temperature_c=temperature)
-        )
+        log = recording.read(temperature_c=temperature)
+        assumed = assumed_of([log])
+        if log.assumed:
+            note(f"{path}: read as {', '.join(log.assumed)}")
+        found: LogInspection | CaptureInspection = inspect_log(log)
     else:
         car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature) if given else None
         found = inspect_capture(path, car)
     if json_output:
-        emit_json(found.to_dict())
+        emit_json(found.to_dict() | {"assumed": assumed})
         return
     console = PlainConsole(highlight=False)
     if not console.is_terminal:

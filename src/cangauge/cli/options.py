@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sized
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar, cast
 
 import typer
 
@@ -14,6 +15,10 @@ from cangauge.errors import InputError
 from cangauge.logs import units
 from cangauge.logs.log import Log
 from cangauge.logs.units import TEMPERATURE_SOURCES, TemperatureSource
+
+if TYPE_CHECKING:
+    from cangauge.bus.captures.capture import Capture
+    from cangauge.logs.read import LogFile
 
 _Value = TypeVar("_Value", bound=float | None)
 
@@ -52,6 +57,26 @@ TemperatureSourceOption = Annotated[
         f"{', '.join(TEMPERATURE_SOURCES)}.",
     ),
 ]
+ColumnsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--columns",
+        metavar="NAME=HEADING,…",
+        help="For a table of other headings: time, current, voltage, temperature, soc, each"
+        " NAME=HEADING[UNIT]:FACTOR; unit and factor only where the heading leaves them open."
+        " 'current=I_batt[mA]:-1' (mA, discharge negative); 'time=Date+Time' joins two columns;"
+        " 'temperature=T1+T2' averages; '#3' is the third column. See docs/logs.md.",
+    ),
+]
+SignOption = Annotated[
+    str | None,
+    typer.Option(
+        "--sign",
+        metavar="charge|discharge",
+        help="What a positive current in the file does. Default: as its format defines it, else"
+        " found from the data.",
+    ),
+]
 JsonOption = Annotated[
     bool,
     typer.Option("--json", help="Print exactly one JSON object on stdout, also for an error."),
@@ -64,6 +89,54 @@ ReportOption = Annotated[
 ]
 
 
+@dataclass(frozen=True, slots=True)
+class TableOptions:
+    """Options on the columns of a log: `--columns`, `--sign`, and `[columns]` of a map file.
+
+    Parameters
+    ----------
+    columns : str, optional
+    sign : str, optional
+    map_file : Path, optional
+        Its `[columns]` apply to a log unless `columns` is given.
+    """
+
+    columns: str | None = None
+    sign: str | None = None
+    map_file: Path | None = None
+
+    @property
+    def are_given(self) -> bool:
+        """Whether the user states columns: the file is then a table, not a capture."""
+        return self.columns is not None
+
+    def open(self, path: Path) -> LogFile | Capture:
+        """Open a log by these columns, or any recording by its content.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be read, or an option is wrong.
+        """
+        # Deferred: the service shares these options, but needs neither pyarrow nor the readers.
+        from cangauge.bus.captures.capture import find_capture  # noqa: PLC0415
+        from cangauge.bus.mapping import columns_of_map  # noqa: PLC0415
+        from cangauge.bus.recording import open_recording  # noqa: PLC0415
+        from cangauge.logs.column_map import ColumnMap  # noqa: PLC0415
+        from cangauge.logs.read import LogFile, open_log  # noqa: PLC0415
+
+        sign = cast("Literal['charge', 'discharge'] | None", self.sign)
+        if self.columns is not None:
+            return open_log(path, columns=ColumnMap.of(self.columns, "--columns"), sign=sign)
+        mapped = None if self.map_file is None else columns_of_map(self.map_file)
+        if mapped is not None and path.is_file():  # not the name of a recording's parts
+            found = open_log(path)
+            if found.is_any_table or (found.reader is None and find_capture(path) is None):
+                return open_log(path, columns=mapped, sign=sign)
+        recording = open_recording(path)
+        return replace(recording, sign=sign) if isinstance(recording, LogFile) else recording
+
+
 def load_log(
     path: Path,
     *,
@@ -72,6 +145,8 @@ def load_log(
     map_file: Path | None = None,
     temperature_c: float | None = None,
     temperature_source: str | None = None,
+    columns: str | None = None,
+    sign: str | None = None,
     refuse_inverted: bool = False,
 ) -> Log:
     """Read a log, or decode a capture by its vehicle; print the reader's remarks on stderr.
@@ -82,13 +157,17 @@ def load_log(
     vehicle : str, optional
         Preset of the car (captures only).
     dbc, map_file : Path, optional
-        DBC and map of signals, in place of a preset (captures only).
+        DBC and map of signals, in place of a preset (captures only); `[columns]` of the map apply
+        to a log.
     temperature_c : float, optional
         Constant temperature [°C].
     temperature_source : str, optional
         Location of the temperature sensor.
+    columns, sign : str, optional
+        Values of `--columns` and `--sign`.
     refuse_inverted : bool
-        Refuse a single row, and a log whose data show clearly that positive current charges.
+        Refuse a single row, and a log whose data show clearly that positive current charges, unless
+        `sign` states it.
 
     Returns
     -------
@@ -101,27 +180,49 @@ def load_log(
         If the input cannot be read, an option has an unknown value, or (with `refuse_inverted`)
         the sign of current is inverted.
     """
-    # Deferred: the service shares these options, but needs neither pyarrow nor the readers.
-    from cangauge.bus.recording import log_of, open_recording  # noqa: PLC0415
+    # Deferred as in `TableOptions.open`.
+    from cangauge.bus.mapping import columns_of_map  # noqa: PLC0415
+    from cangauge.bus.recording import log_of  # noqa: PLC0415
     from cangauge.bus.vehicle import Vehicle  # noqa: PLC0415
     from cangauge.logs.read import LogFile  # noqa: PLC0415
 
     source = known_temperature_source(temperature_source)
-    recording = open_recording(path)
+    recording = TableOptions(columns, sign, map_file).open(path)
     is_capture = not isinstance(recording, LogFile)
     car = None
     if vehicle is not None or dbc is not None or map_file is not None:
         if is_capture:
             car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature_c)
-        else:
+        elif map_file is None or columns_of_map(map_file) is None:
             note(f"{path}: a log, not a capture: --vehicle, --dbc and --map do not apply to it")
+    if is_capture and sign is not None:
+        raise InputError(
+            "this is a capture, whose map states the sign",
+            source=path,
+            field="--sign",
+            value=sign,
+            cure="set sign = -1 under [current] of the map file",
+        )
     log = log_of(recording, car, temperature_c=temperature_c, temperature_source=source)
     if refuse_inverted:
         refuse_single_row(log)
-        refuse_inverted_current(log, is_capture=is_capture)
+        if sign is None:
+            refuse_inverted_current(log, is_capture=is_capture)
+    note_reading(log)
+    return log
+
+
+def note_reading(log: Log) -> None:
+    """Print on stderr what was assumed of a log's columns, in one line, and the remarks."""
+    if log.assumed:
+        note(f"{log.source or log.name}: read as {', '.join(log.assumed)}")
     for remark in log.remarks:
         note(f"{log.source or log.name}: {remark}")
-    return log
+
+
+def assumed_of(logs: Iterable[Log]) -> dict[str, list[str]]:
+    """Return what was assumed of the logs' columns, by file, for JSON."""
+    return {log.source or log.name: list(log.assumed) for log in logs if log.assumed}
 
 
 def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> None:

@@ -7,7 +7,7 @@ import logging
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from rich import box
@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from cangauge._formatting import printable, printable_json
+from cangauge.errors import CangaugeError
 
 
 class PlainConsole(Console):
@@ -36,8 +37,10 @@ console = PlainConsole(stderr=True, highlight=False)
 
 def note(text: str) -> None:
     """Print one line on stderr."""
-    sys.stderr.write(printable(text.rstrip()) + "\n")
-    sys.stderr.flush()
+    if sys.stderr is not None:
+        with suppress(OSError):  # a full disk behind it: the exit code says the rest
+            sys.stderr.write(printable(text.rstrip()) + "\n")
+            sys.stderr.flush()
 
 
 @contextmanager
@@ -77,6 +80,8 @@ class _ProgressHandler(logging.Handler):
 
 def emit_json(result: Mapping[str, Any]) -> None:
     """Print exactly one JSON object on stdout; NaN and infinities become null."""
+    if sys.stdout is None:
+        raise CangaugeError("stdout is closed: the result cannot be printed")
     plain = _plain(result)
     text = printable_json(json.dumps(plain, ensure_ascii=False))
     try:

@@ -15,7 +15,6 @@ from cangauge.bus.connection import BusConnection
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import bus_address, open_bus, parse_bus_options
 from cangauge.bus.publish import FrameIds, standard_filter
-from cangauge.bus.recording import open_recording
 from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.config_options import (
     BusDbcOption,
@@ -30,7 +29,14 @@ from cangauge.cli.config_options import (
     InterfaceOption,
     frame_ids,
 )
-from cangauge.cli.options import JsonOption
+from cangauge.cli.options import (
+    ColumnsOption,
+    JsonOption,
+    SignOption,
+    TableOptions,
+    assumed_of,
+    note_reading,
+)
 from cangauge.cli.output import console, emit_json, note
 from cangauge.errors import InputError
 from cangauge.logs.read import LogFile
@@ -53,6 +59,8 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
     dbc: BusDbcOption = None,
     map_file: BusMapOption = None,
     temperature: BusTemperatureOption = None,
+    columns: ColumnsOption = None,
+    sign: SignOption = None,
     speed: Annotated[
         str,
         typer.Option(
@@ -100,7 +108,11 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge replay candump.log.gz --speed 10 --interface socketcan --channel vcan0 --loop`
     """
-    ids = FrameIds(**frame_ids(soc_estimate_id, soc_detail_id, replay_clock_id))
+    ids = FrameIds(
+        **frame_ids(
+            soc_estimate=soc_estimate_id, soc_detail=soc_detail_id, replay_clock=replay_clock_id
+        )
+    )
     settings = ReplaySettings(
         speed=_speed(speed),
         loop=loop,
@@ -111,7 +123,8 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
     car: Vehicle | None = None
     if (vehicle, dbc, map_file) != (None, None, None):
         car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature)
-    source = _source(recorded, car, ids)
+    options = TableOptions(columns, sign, map_file)
+    source = _source(recorded, options, car, ids, temperature_c=temperature)
     address = bus_address(interface, channel, parse_bus_options(bus_option or []))
     with ExitStack() as stack:
         stop = stack.enter_context(stop_on_signals())
@@ -130,13 +143,19 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
         raise KeyboardInterrupt
 
 
-def _source(recorded: Path, car: Vehicle | None, ids: FrameIds) -> Source:
-    recording = open_recording(recorded)
+def _source(
+    recorded: Path,
+    options: TableOptions,
+    car: Vehicle | None,
+    ids: FrameIds,
+    *,
+    temperature_c: float | None,
+) -> Source:
+    recording = options.open(recorded)
     if not isinstance(recording, LogFile):
         return CaptureSource(recorded, car, ids)
-    log = recording.read()
-    for remark in log.remarks:
-        note(f"{recorded}: {remark}")
+    log = recording.read(temperature_c=temperature_c)
+    note_reading(log)
     return LogSource(log, car or Vehicle.load(DEFAULT_VEHICLE))
 
 
@@ -220,6 +239,7 @@ def _as_json(state: ReplayState, bus: BusConnection, source: Source) -> dict[str
     }
     if isinstance(source, LogSource):
         result["quantisation"] = FrameEncoder(source.vehicle).quantization()
+        result["assumed"] = assumed_of([source.log])
     if isinstance(source, CaptureSource):
         result["dropped"] = source.dropped
     return result

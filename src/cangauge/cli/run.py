@@ -15,13 +15,14 @@ from rich.live import Live
 from rich.text import Text
 
 from cangauge._formatting import number
-from cangauge._logging import LogFormat, emit, logging_to
+from cangauge._logging import LogFormat, emit, logging_to, takes_text
 from cangauge.cli.config_options import config_options, config_values
 from cangauge.cli.options import JsonOption
 from cangauge.cli.output import console, emit_json
 from cangauge.errors import CangaugeError
 from cangauge.estimation.validity import Status, reason_names
-from cangauge.service.config import RunConfig, load_config
+from cangauge.service.config import load_config
+from cangauge.service.lifecycle import deadline_after_signal
 from cangauge.service.run import Service
 from cangauge.service.status import Snapshot
 
@@ -43,9 +44,11 @@ def run_command(
 ) -> None:
     """Estimate the state of charge from a bus, and publish it there.
 
-    Publishes SOC_ESTIMATE (0x5A0) every 100 ms and SOC_DETAIL (0x5A1) every second, as in
-    `dbc/soc_estimate.dbc`: SoC and its standard deviation [%], status, reasons. Ctrl-C or SIGTERM
-    stops it with a summary. Positive current discharges.
+    Publishes SOC_ESTIMATE (0x5A0) every 100 ms, and SOC_DETAIL (0x5A1), SOC_HEALTH (0x5A2),
+    SOC_POWER (0x5A3) and, where there are cell voltages, SOC_CELLS (0x5A4) every second, as in
+    `dbc/soc_estimate.dbc`: SoC and its standard deviation [%], status, reasons; capacity [Ah];
+    possible currents [A]; energy left [kWh]. Ctrl-C or SIGTERM stops it with a summary. Positive
+    current discharges.
 
     SIGHUP reloads configuration, model and vehicle: the SoC continues, an invalid configuration
     is refused. Changes of the bus, the time source and output files need a restart.
@@ -62,23 +65,20 @@ def run_command(
     `cangauge run --config car.toml --state /var/lib/cangauge`
     """
     given = config_values(options)
-
-    def read() -> RunConfig:
-        return load_config(config, given)
-
-    loaded = read()
+    loaded = load_config(config, given)
     with ExitStack() as stack:
         stack.enter_context(logging_to(loaded.log_format, loaded.log_level))
         stack.enter_context(_failures_logged(loaded.log_format))
-        service = Service(loaded, read=read)
+        service = Service(config, **given)
         if console.is_terminal:
             service.on_status = stack.enter_context(LiveLine(console)).show
         # Everything loaded so far lives until exit. Garbage collection of it would pause the loop,
         # and destroying it would delay the exit by a second.
         gc.freeze()
+        stack.enter_context(deadline_after_signal())
         result = service.run()
-    if json_output:
-        emit_json(result)
+        if json_output:
+            emit_json(result)
 
 
 @contextmanager
@@ -121,7 +121,9 @@ class LiveLine:
         self._live.stop()
 
     def show(self, snapshot: Snapshot) -> None:
-        """Draw a snapshot."""
+        """Draw a snapshot, unless the terminal is stopped."""
+        if not takes_text(self._live.console.file):
+            return
         self._live.update(live_text(snapshot), refresh=True)
 
 

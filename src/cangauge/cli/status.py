@@ -77,6 +77,7 @@ def _rows(status: dict[str, Any]) -> list[tuple[str, str]]:
         ("voltage", number(sample.get("voltage_v"), 2, "V")),
         ("residual", number(_times(estimate["residual_v"], 1e3), 0, "mV")),
         ("temperature", number(sample.get("temperature_c"), 1, "°C")),
+        *_pack_rows(status),
         ("latest sample", f"{number(sample.get('age_s'), 2, 's')} ago"),
         ("samples", f"{status['samples']} ({number(status['samples_per_s'], 1, '/s')})"),
         (
@@ -107,6 +108,10 @@ def _rows(status: dict[str, Any]) -> list[tuple[str, str]]:
                 f" {record['lost_frames']} frames lost{problem}",
             )
         )
+    if problem := status["config"]["problem"]:
+        rows.append(("configuration", f"the latest one is REFUSED, the old one stays: {problem}"))
+    elif status["config"]["reloading"]:
+        rows.append(("configuration", "reading a new one"))
     if status["loop_stuck"]:
         rows.insert(0, ("LOOP STUCK", "the receive loop hangs; restart the service"))
     return [
@@ -115,6 +120,48 @@ def _rows(status: dict[str, Any]) -> list[tuple[str, str]]:
         ("model", f"{status['model']} ({status['method']}, time: {status['time_source']})"),
         ("running for", f"{duration(status['uptime_s'])}, cangauge {status['version']}"),
     ]
+
+
+def _pack_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return the rows of health, power and cells, where known."""
+    health, power, cells = status["health"], status["power"], status["cells"]
+    rows = []
+    if health is not None:
+        rows += [
+            ("capacity", _with_std(health["capacity_ah"], health["capacity_std_ah"], "Ah")),
+            (
+                "resistance",
+                _with_std(health["resistance_ratio"], health["resistance_std"], "× the model's", 2),
+            ),
+            ("current offset", number(health["offset_a"], 2, "A")),
+        ]
+    if power is not None:
+        energy = _with_std(
+            _times(power["energy_wh"], 1e-3), _times(power["energy_std_wh"], 1e-3), "kWh"
+        )
+        rows += [
+            (
+                "discharge for 10 s",
+                _with_std(power["discharge_a"], power["discharge_std_a"], "A", 0),
+            ),
+            ("charge for 10 s", _with_std(power["charge_a"], power["charge_std_a"], "A", 0)),
+            ("energy left", energy),
+        ]
+    if cells is not None:
+        weakest = "" if cells["weakest"] is None else f"number {cells['weakest']}: "
+        rows += [
+            ("weakest cell", weakest + _with_std(cells["soc_pct"], cells["soc_std_pct"], "%")),
+            (
+                "cells",
+                f"{cells['cells']} known, spread {number(cells['spread_pct'], 1, '%')}; pack less"
+                f" their sum {_with_std(cells['sum_error_v'], cells['sum_std_v'], 'V', 2)}",
+            ),
+        ]
+    return rows + [("NOTICE", each) for each in status["notices"]]
+
+
+def _with_std(value: float | None, std: float | None, unit: str, digits: int = 1) -> str:
+    return f"{number(value, digits)} ± {number(std, digits, unit)}"
 
 
 def _counts(counts: dict[str, int]) -> str:

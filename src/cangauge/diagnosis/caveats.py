@@ -9,8 +9,8 @@ import numpy as np
 from cangauge.diagnosis.error_breakdown import REST_C_RATE
 from cangauge.diagnosis.problem import COVERED_K, COVERED_PCT
 from cangauge.inference.rows import SampledLog
+from cangauge.logs.gaps import bridge_s
 from cangauge.logs.log import TemperatureSource
-from cangauge.model.coulomb_counting import BRIDGE_S
 
 SHORT_S = 600.0
 """Duration below which slow effects hardly develop [s]."""
@@ -36,7 +36,6 @@ def log_caveats(
     logs: Sequence[SampledLog],
     references: Sequence[SampledLog],
     capacity_ah: float,
-    initial_soc_pct: float | None = None,
     temperature_source: TemperatureSource = "unknown",
 ) -> list[str]:
     """Return the caveats of the diagnosed logs and references.
@@ -46,8 +45,6 @@ def log_caveats(
     logs, references : sequence of SampledLog
     capacity_ah : float
         Of the model [Ah].
-    initial_soc_pct : float, optional
-        SoC at each diagnosed log's first row, if given by the user [%].
     temperature_source : str
         Where the model's temperature was measured.
     """
@@ -57,8 +54,6 @@ def log_caveats(
         *_soc(logs, references),
         _recording_gaps(logs),
         _temperature_source([*logs, *references], temperature_source),
-        _initial_soc(logs, initial_soc_pct),
-        _reference_initial_soc(references),
         *_current(logs, capacity_ah),
         _reference_number(len(references)),
     ]
@@ -192,7 +187,7 @@ def _recording_gaps(logs: Sequence[SampledLog]) -> str:
         time_s = item.log.time_s
         steps = np.diff(time_s)
         at = int(np.argmax(steps))
-        if steps[at] > BRIDGE_S:
+        if steps[at] > bridge_s(time_s):
             after_h = (time_s[at] - time_s[0]) / 3600.0
             found.append(f"{item.log.name} ({steps[at] / 60.0:.0f} min after {after_h:.1f} h)")
     if not found:
@@ -212,27 +207,6 @@ def _temperature_source(logs: Sequence[SampledLog], of_model: TemperatureSource)
         f"The model's temperature was measured on {of_model}, that of these logs on"
         f" {', '.join(others)}: effects of the temperature on voltage and resistance cannot be"
         " judged."
-    )
-
-
-def _initial_soc(logs: Sequence[SampledLog], initial_soc_pct: float | None) -> str:
-    names = [item.log.name for item in logs if item.log.first_soc() is None]
-    if initial_soc_pct is not None or not names:
-        return ""
-    return (
-        f"No initial SoC of {', '.join(names)}: 100 % assumed. A wrong one looks like initial_soc,"
-        " voltage_offset or capacity. Give it with --initial-soc."
-    )
-
-
-def _reference_initial_soc(references: Sequence[SampledLog]) -> str:
-    names = [item.log.name for item in references if item.log.first_soc() is None]
-    if not names:
-        return ""
-    return (
-        f"No initial SoC of the reference{'s' if len(names) > 1 else ''} {', '.join(names)}: 100 %"
-        " assumed. A wrong one falsifies the model of the healthy pack. Give references with"
-        " soc_pct; one value is enough."
     )
 
 

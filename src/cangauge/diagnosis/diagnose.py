@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from cangauge._display import figure, html
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.caveats import (
     extension_caveat,
@@ -182,7 +183,6 @@ class Diagnosis:
                 [matrix.sampled for matrix in problem.diagnosed],
                 [matrix.sampled for matrix in problem.references],
                 problem.model.capacity_ah,
-                problem.options.initial_soc_pct,
                 problem.temperature_source,
             ),
             temperature_step_caveat(
@@ -190,6 +190,14 @@ class Diagnosis:
             ),
         ]
         return [sentence for sentence in found if sentence]
+
+    def plot(self) -> Any:
+        """Return the probabilities of the causes as bars, for `bokeh.plotting.show`."""
+        return figure("diagnosis_figure", self)
+
+    def _repr_html_(self) -> str:
+        """Return verdict, sizes, probabilities and caveats for a notebook."""
+        return html("diagnosis_html", self)
 
     def log_errors(self) -> list[LogErrors]:
         """Return the errors of each diagnosed log with the given and the extended model."""
@@ -268,11 +276,12 @@ def diagnose(
         Model of this pack, from `fit` or a model file.
     references : sequence of Log
         Logs on which the model is good, at least three for reliable probabilities. They show the
-        error to expect without a cause. Each needs an initial SoC, or starts full.
+        error to expect without a cause. The start of one without SoC is found from its voltage.
     leave_out : sequence of str
         Effects to leave out of the library.
     initial_soc_pct : float, optional
-        SoC at the first row of each diagnosed log, instead of the log's own [%].
+        SoC at the first row of each diagnosed log, instead of the log's own [%]; where neither is
+        known it is found from the voltage.
 
     Returns
     -------

@@ -34,6 +34,7 @@ from cangauge.diagnosis.linear_gaussian import (
 )
 from cangauge.diagnosis.structure import learn_structure, reference_equations, reference_matrices
 from cangauge.errors import InputError
+from cangauge.identify.starts import start_by_model, with_start
 from cangauge.inference.linearized import residual
 from cangauge.inference.rows import FitOptions, SampledLog, sample_log
 from cangauge.logs.log import Log, TemperatureSource
@@ -103,7 +104,7 @@ class DiagnosisProblem:
     temperature_source: TemperatureSource = "unknown"
     """Where the model's temperature was measured."""
     outliers: tuple[str, ...] = ()
-    """One sentence for each row left out as an outlier."""
+    """One sentence for each row left out as an outlier, and each start found from the voltage."""
 
     @cached_property
     def reference_errors_v(self) -> tuple[FloatArray, ...]:
@@ -186,6 +187,12 @@ def build_problem(
     """
     given = model.extended_model()
     logs, references, outliers = check_inputs(logs, references, given)
+    start_std_pct = SOC_STD_PCT
+    if initial_soc_pct is None:
+        logs, std_pct, sentences = _with_starts(logs, model)
+        start_std_pct, outliers = math.hypot(start_std_pct, std_pct), [*outliers, *sentences]
+    references, std_pct, sentences = _with_starts(references, model)
+    start_std_pct, outliers = math.hypot(start_std_pct, std_pct), [*outliers, *sentences]
     widened = with_wider_range(given, [*logs, *references])
     options = FitOptions(
         capacity_ah=model.capacity_ah,
@@ -210,7 +217,13 @@ def build_problem(
     without_start = replace(options, initial_soc_pct=None)
     of_references = [sample_log(resample(dequantize(log)), without_start) for log in references]
     covered = not of_references or temperatures_covered(of_references, of_logs)
-    hypotheses = _hypotheses(model, choices, has_references=bool(of_references), covered=covered)
+    hypotheses = _hypotheses(
+        model,
+        choices,
+        has_references=bool(of_references),
+        covered=covered,
+        start_std_pct=start_std_pct,
+    )
     error = error_from_noise(model.noise, model.rate_hz, hypotheses)
     known, structured = widened, None
     matrices: tuple[DesignMatrix, ...] = ()
@@ -278,8 +291,34 @@ def with_wider_range(model: ExtendedModel, logs: Sequence[Log]) -> ExtendedModel
     return replace(model, model=voltage_model)
 
 
+def _with_starts(logs: Sequence[Log], model: Model) -> tuple[list[Log], float, list[str]]:
+    """Return logs with a start, the largest deviation of those found [%], a sentence for each.
+
+    Where a log states no SoC its start is found from the voltage by the model. It is then known as
+    well as the model's lasting error allows, which the prior of every log's start allows for.
+    """
+    found, std_pct, sentences = list(logs), 0.0, []
+    for k, log in enumerate(logs):
+        if log.first_soc() is not None:
+            continue
+        start = start_by_model(log, model)
+        found[k] = with_start(log, start.soc_pct)
+        std_pct = max(std_pct, start.std_pct or 0.0)
+        sentences.append(
+            f"{log.name} states no SoC: its start of {start.soc_pct:.1f} ± {start.std_pct or 0:.1f}"
+            " % was found from the voltage. A cause that shifts the voltage as a whole may hide in"
+            " it; --initial-soc states the start."
+        )
+    return found, std_pct, sentences
+
+
 def _hypotheses(
-    model: Model, choices: Sequence[Candidate], *, has_references: bool, covered: bool
+    model: Model,
+    choices: Sequence[Candidate],
+    *,
+    has_references: bool,
+    covered: bool,
+    start_std_pct: float,
 ) -> Hypotheses:
     """Assign the candidates' roles and the prior of the voltage model."""
     # References cannot show the temperature dependence at temperatures that they do not cover.
@@ -290,7 +329,7 @@ def _hypotheses(
         and choice.effect.is_structure
         and (covered or not _depends_on_temperature(choice))
     )
-    per_log, per_log_std = _per_log_effects(choices, model)
+    per_log, per_log_std = _per_log_effects(choices, model, start_std_pct)
     information = model.information
     root, scale = None, np.ones(9 + len(model.delays_s))
     if information is not None:
@@ -303,7 +342,7 @@ def _depends_on_temperature(choice: Candidate) -> bool:
 
 
 def _per_log_effects(
-    choices: Sequence[Candidate], model: Model
+    choices: Sequence[Candidate], model: Model, start_std_pct: float
 ) -> tuple[tuple[int, ...], FloatArray]:
     """Return the per-log effects, every effect at its usual shapes, with their prior deviations."""
     by_effect: dict[str, dict[tuple[object, ...], int]] = {}
@@ -314,7 +353,7 @@ def _per_log_effects(
             shapes.setdefault(tuple(choice.shape.items()), k)
     noise = model.noise
     constant_v = max(noise.lasting_std_v, 0.25 * math.hypot(noise.fast_std_v, noise.slow_std_v))
-    known_std = {"voltage_offset": [constant_v], "initial_soc": [SOC_STD_PCT]}
+    known_std = {"voltage_offset": [constant_v], "initial_soc": [start_std_pct]}
     per_log: list[int] = []
     stds: list[float] = []
     for effect_id, shapes in by_effect.items():

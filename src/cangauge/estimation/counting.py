@@ -119,6 +119,8 @@ class CoulombCounter:
     def __init__(self, capacity_ah: float, gap_s: float) -> None:
         self._pct_per_as = 100.0 / (3600.0 * capacity_ah)
         self._gap_s = gap_s
+        # Of a slow log the usual step may exceed a minute; as offline (`logs.gaps.bridge_s`).
+        self._bridge_s = max(BRIDGE_S, gap_s)
         self._is_restored = False
         self.state = CounterState()
 
@@ -144,7 +146,7 @@ class CoulombCounter:
         # from below.
         mean_square_a2 = state.mean_square_a2
         state.mean_square_a2 = kept * state.mean_square_a2 + (1.0 - kept) * current_a**2
-        if seconds > BRIDGE_S:
+        if seconds > self._bridge_s:
             away_pct = min(AWAY_PCT_PER_HOUR * seconds / 3600.0, AWAY_AT_MOST_PCT)
             rms_a = math.sqrt(max(mean_square_a2, last_a**2))
             parked_pct = parked_std_pct(seconds, rms_a * self._pct_per_as)
@@ -157,6 +159,14 @@ class CoulombCounter:
             return ChargeStep(seconds, out_pct, 0.0)
         rms_a = math.sqrt(max(mean_square_a2, 0.5 * (current_a**2 + last_a**2)))
         return ChargeStep(seconds, out_pct, rms_a * seconds * self._pct_per_as)
+
+    def uncounted_std_pct(self, seconds: float) -> float:
+        """Return the standard deviation of the charge since the last sample [%]."""
+        state = self.state
+        if math.isnan(state.time_s):
+            return 0.0
+        rms_a = math.sqrt(max(state.mean_square_a2, state.current_a**2))
+        return min(rms_a * seconds * self._pct_per_as, MOVED_STD_AT_MOST_PCT)
 
     def restore(self, state: CounterState) -> None:
         """Continue from a state after a restart; the counter works on it."""

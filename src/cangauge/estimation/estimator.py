@@ -7,9 +7,12 @@ or after each tick of bus time. The same samples give the same numbers, live or 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from operator import mul
 
 from cangauge.errors import InputError
+from cangauge.estimation.cells import PackTick
 from cangauge.estimation.counting import CoulombCounter, EstimatorClock
 from cangauge.estimation.ekf import (
     UNKNOWN_SOC_STD_PCT,
@@ -19,7 +22,9 @@ from cangauge.estimation.ekf import (
     SocEkf,
     count_std_pct,
 )
+from cangauge.estimation.health import Health, HealthEstimator, VoltageTick
 from cangauge.estimation.hypothesis_filter import HypothesisFilter
+from cangauge.estimation.power import LEVEL_MEMORY_S, PackNow, Power, PowerModel
 from cangauge.estimation.settings import (
     EstimatorSettings,
     SocReference,
@@ -43,8 +48,8 @@ from cangauge.estimation.validity import (
 )
 from cangauge.model.delay_line import DelayLine
 from cangauge.model.effects.base import Reading
-from cangauge.model.model_file import Model
-from cangauge.model.voltage_model import soc_from_ocv
+from cangauge.model.model_file import Model, effective_error_std_v
+from cangauge.model.voltage_model import TEMPERATURE_MARGIN_K, VoltageModel, soc_from_ocv
 
 __all__ = ["Estimator", "EstimatorSettings"]
 
@@ -77,6 +82,8 @@ class Estimator:
         Charge from 100 to 0 % [Ah].
     filter : HypothesisFilter
         Offset of the current sensor, and the verdict on the last unobserved interval.
+    is_refused : bool
+        Whether the latest sample was refused: without a plausible current, or not later.
 
     Examples
     --------
@@ -112,16 +119,32 @@ class Estimator:
         self._bias_std_v = math.hypot(model.noise.slow_std_v, model.noise.lasting_std_v)
         self._functions = CurveFunctions(model.noise)
         self._nominal_v = self._voltage_model.pseudo_ocv_at(50.0)[0]
+        self._health = HealthEstimator(
+            self._curve,
+            steady_ohm=self._online.steady_ohm,
+            noise=model.noise,
+            fast_std_v=effective_error_std_v(model.noise, 1.0 / model.rate_hz),
+            nominal_v=self._nominal_v,
+            capacity_ah=self.capacity_ah,
+        )
+        self._power = PowerModel(
+            self._curve,
+            self._voltage_model,
+            model.noise,
+            self.settings.limits.of_model(self._voltage_model),
+        )
         self._permanent_reasons = temperature_mismatch(
             model.temperature_source, self.settings.temperature_source
         )
         self._memory = EstimatorMemory()
         self._since = ChargeSinceUpdate()
         self._is_filtering = False
-        # Voltage less the pseudo-OCV at the latest sample [V]; NaN until it is needed.
+        # Voltage less the pseudo-OCV at the latest sample [V], NaN until it is needed, and the
+        # delayed currents [A] that it was computed from.
         self._without_ocv_v = math.nan
+        self._delayed_a: Sequence[float] = ()
         self._implausible = Reason.NONE
-        self._is_refused = False
+        self.is_refused = False
         self._latest = Estimate.unknown(Reason.NO_INITIAL_SOC)
         # Sample and stamp of which the estimate is not computed yet; None: it is computed.
         self._pending: tuple[Sample, float] | None = None
@@ -152,7 +175,7 @@ class Estimator:
         time_s = None
         if abs(sample.current_a) <= CURRENT_AT_MOST_A:  # false for NaN
             time_s = self._clock.time_of(sample.time_s)
-        self._is_refused = time_s is None
+        self.is_refused = time_s is None
         if time_s is None:
             return
         stamp_s = sample.time_s
@@ -177,14 +200,70 @@ class Estimator:
         else:
             self._latest = self._latest._replace(time_s=stamp_s, samples=memory.samples)
 
+    def uncounted_std_pct(self, seconds: float) -> float:
+        """Return what the SoC's standard deviation lacks [%] when no sample came for a time [s]."""
+        return self._counter.uncounted_std_pct(seconds)
+
     @property
     def estimate(self) -> Estimate:
         """The estimate after the latest sample; SoC and voltages are NaN until they are known."""
         latest = self._evaluate()
-        if not self._is_refused:
+        if not self.is_refused:
             return latest
         reasons = latest.reasons | Reason.IMPLAUSIBLE_INPUT
         return latest._replace(reasons=reasons, status=status_of(reasons))
+
+    @property
+    def health(self) -> Health:
+        """Capacity, resistance and current offset, with standard deviations."""
+        health = self._health.health
+        return health._replace(offset_a=self.filter.offset_a) if self._is_filtering else health
+
+    @property
+    def voltage_model(self) -> VoltageModel:
+        """The voltage model without effects."""
+        return self._voltage_model
+
+    def pack_tick(self, sample: Sample) -> PackTick:
+        """Return what is known of the pack after its latest sample, for its cells."""
+        soc_pct, std_pct = self._soc_and_std_pct()
+        is_known = self._memory.samples > 0 and not math.isnan(self._counter.state.time_s)
+        without_ocv_v = self._voltage_without_ocv_v() if is_known else math.nan
+        return PackTick(
+            sample.time_s,
+            soc_pct,
+            std_pct,
+            sample.voltage_v,
+            without_ocv_v,
+            sum(map(mul, self._voltage_model.resistance_ohm, self._delayed_a)),
+            self._counter.state.moved_pct,
+        )
+
+    def current_changes(self, time_s: float, stamps_s: Sequence[float]) -> list[float]:
+        """Return the current at a sample's time less that at other stamps [A]; NaN for NaN."""
+        if math.isnan(self._counter.state.time_s):
+            return [math.nan] * len(stamps_s)
+        known = {each for each in stamps_s if not math.isnan(each)}
+        at = {each: self._line.current_at(time_s - each) for each in known}
+        now_a = self._line.current_at(0.0)
+        return [now_a - at[each] if each in at else math.nan for each in stamps_s]
+
+    def power(self) -> Power:
+        """Return the currents possible for 10 s and the energy left, after the latest sample."""
+        return self._power.at(self._pack_now(), self._line)
+
+    def _pack_now(self) -> PackNow:
+        memory = self._memory
+        soc_pct, std_pct = self._soc_and_std_pct()
+        is_level = self._counter.state.time_s - memory.level_s <= LEVEL_MEMORY_S
+        return PackNow(
+            soc_pct,
+            std_pct,
+            memory.temperature_c,
+            memory.level_residual_v if is_level else math.nan,
+            memory.level_drop_v,
+            self.health,
+        )
 
     def _process(self, sample: Sample) -> None:
         """Count the charge of a corrected sample, and use its voltage where that is due."""
@@ -232,6 +311,7 @@ class Estimator:
             self.filter.predict(since)
             if rest_s > REST_S:
                 self.filter.shrink_bias()
+        self._health.count(since)
         if math.isnan(sample.voltage_v):
             memory.newton_pct, memory.newton_inside = math.nan, True
             memory.newton_std_pct = math.nan
@@ -276,6 +356,36 @@ class Estimator:
             )
             if self.filter.update(measurement, since):
                 memory.contradicted_until_s = sample.time_s + CONTRADICTED_S
+        tick = self._voltage_tick(sample, without_ocv_v)
+        self._health.use(tick, since.seconds)
+        self._follow_level(tick, sample.time_s)
+
+    def _follow_level(self, tick: VoltageTick, time_s: float) -> None:
+        """Follow the levels of the residual and of the predicted drop."""
+        memory = self._memory
+        soc_pct = self._soc_and_std_pct()[0]
+        residual_v = tick.voltage_v - tick.without_ocv_v - self._curve.pseudo_ocv_at(soc_pct)[0]
+        weight = 1.0
+        if time_s - memory.level_s < LEVEL_MEMORY_S:
+            weight = -math.expm1((memory.level_s - time_s) / LEVEL_MEMORY_S)
+        memory.level_residual_v += weight * (residual_v - memory.level_residual_v)
+        memory.level_drop_v += weight * (tick.drop_v - memory.level_drop_v)
+        memory.level_s = time_s
+
+    def _voltage_tick(self, sample: Sample, without_ocv_v: float) -> VoltageTick:
+        memory, model = self._memory, self._voltage_model
+        cold, hot = model.temperature_range_c
+        margin_k = TEMPERATURE_MARGIN_K
+        drop_v = sum(map(mul, model.resistance_ohm, self._delayed_a))
+        return VoltageTick(
+            sample.voltage_v,
+            without_ocv_v,
+            drop_v,
+            memory.newton_pct if memory.newton_inside else math.nan,
+            _clip(self._coulomb_pct()),
+            is_filled=self._line.full,
+            is_inside=cold - margin_k <= memory.temperature_c <= hot + margin_k,
+        )
 
     def _voltage_without_ocv_v(self) -> float:
         """Return the model's voltage less the pseudo-OCV at the latest sample [V]."""
@@ -283,9 +393,8 @@ class Estimator:
             temperature_c = self._memory.temperature_c
             if math.isnan(temperature_c):
                 temperature_c = self._voltage_model.t_ref_c
-            self._without_ocv_v = self._voltage_model.offset_at(
-                temperature_c, self._line.currents()
-            )
+            self._delayed_a = self._line.currents()
+            self._without_ocv_v = self._voltage_model.offset_at(temperature_c, self._delayed_a)
         return self._without_ocv_v
 
     def _drop_v(self) -> float:
@@ -313,6 +422,8 @@ class Estimator:
         if math.isnan(self._memory.coulomb_start_pct):
             self._start(reference.soc_pct, reference.soc_std_pct)
             return
+        if not reference.is_by_voltage:
+            self._health.correct(reference.soc_pct, reference.soc_std_pct)
         soc_pct = _clip(self._coulomb_pct())
         var_pct2, reference_var_pct2 = self._coulomb_std_pct() ** 2, reference.soc_std_pct**2
         gain = var_pct2 / (var_pct2 + reference_var_pct2)
@@ -405,6 +516,7 @@ class Estimator:
             since=replace(self._since),
             references=replace(self._references.state),
             memory=replace(self._memory),
+            health=self._health.snapshot(),
             estimate=list(latest[:7]),
             reasons=int(latest.reasons),
         )
@@ -434,6 +546,7 @@ class Estimator:
         self._resume(state, age_s)
         self._online.restore(state.effects, state.clock.last_s)
         self._references.state = replace(state.references)
+        self._health.restore(state.health)
         if (state.method, state.capacity_ah) != (self.settings.method, self.capacity_ah):
             self._start_from(state)
             return self._latest
@@ -458,6 +571,8 @@ class Estimator:
             # The other delay line has dropped what this longer one needs.
             self._line.fill(line.time_s, line.current_a, max(line.since_s, line.time_s[0]))
         self._memory.tick = -1
+        self._memory.level_s = math.nan
+        self._health.take_over(before._health)
         self._start_from(state)
 
     def _resume(self, state: EstimatorState, age_s: float | None) -> None:
@@ -471,7 +586,7 @@ class Estimator:
         self._latest = Estimate._make(
             [*state.estimate, status_of(reasons), reasons, state.memory.samples]
         )
-        self._pending, self._is_refused = None, False
+        self._pending, self.is_refused = None, False
         self._is_filtering = False
 
     def _start_from(self, state: EstimatorState) -> None:

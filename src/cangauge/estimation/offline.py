@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cangauge._dataframes import ArrowExport
+from cangauge._display import figure
 from cangauge._typing import FloatArray
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import (
@@ -21,7 +22,7 @@ from cangauge.estimation.settings import (
     Method,
 )
 from cangauge.estimation.validity import Estimate, Sample, Status, reason_names
-from cangauge.inference.rows import usual_gap_s
+from cangauge.logs.gaps import usual_gap_s
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import counted_soc_pct
 from cangauge.model.delay_line import GAP_S
@@ -98,6 +99,16 @@ class EstimateTable(ArrowExport):
         }
         numbers: dict[str, Any] = {name: np.array(by_name[name], np.float64) for name in NUMBERS}
         return cls(**numbers, **flags)
+
+    def plot(self, log: Log | None = None) -> Any:
+        """Return SoC with ±2σ and voltage residual over time, for `bokeh.plotting.show`.
+
+        Parameters
+        ----------
+        log : Log, optional
+            Its reference SoC is drawn too.
+        """
+        return figure("estimate_figure", self, log=log)
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -216,10 +227,11 @@ def estimate_log(
     model: Model,
     settings: EstimatorSettings,
     progress: Callable[[int], None] | None = None,
+    observe: Callable[[Estimator, Sample], None] | None = None,
 ) -> tuple[EstimateTable, Scores]:
     """Estimate a log with given settings, and score it; see `run_estimator` and `score`."""
     began = time.perf_counter()
-    table = run_estimator(samples_of(log), model, settings, progress)
+    table = run_estimator(samples_of(log), model, settings, progress, observe)
     return table, score(table, log, time.perf_counter() - began)
 
 
@@ -234,6 +246,7 @@ def run_estimator(
     model: Model,
     settings: EstimatorSettings,
     progress: Callable[[int], None] | None = None,
+    observe: Callable[[Estimator, Sample], None] | None = None,
 ) -> EstimateTable:
     """Return the estimates of all samples, in order.
 
@@ -244,11 +257,15 @@ def run_estimator(
     settings : EstimatorSettings
     progress : callable, optional
         Called with the number of samples done, every `PROGRESS_EVERY`.
+    observe : callable, optional
+        Called with estimator and sample after each sample.
     """
     estimator = Estimator(model, settings)
     estimates = []
     for done, sample in enumerate(samples, start=1):
         estimates.append(estimator.step(sample))
+        if observe is not None:
+            observe(estimator, sample)
         if progress is not None and done % PROGRESS_EVERY == 0:
             progress(done)
     return EstimateTable.of(estimates)

@@ -7,10 +7,11 @@ filter: the end of a full charge, or a long rest. Both rules are off by default.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 from cangauge.errors import InputError
+from cangauge.estimation.power import PackLimits
 from cangauge.estimation.state import ReferenceState
 from cangauge.estimation.validity import Sample
 from cangauge.logs.log import TemperatureSource
@@ -110,6 +111,8 @@ class EstimatorSettings:
     full_charge : FullCharge, optional
     long_rest : LongRest, optional
         Rules for an external SoC reference; None is off.
+    limits : PackLimits
+        Limits for the possible currents and the energy left.
 
     Raises
     ------
@@ -126,6 +129,7 @@ class EstimatorSettings:
     temperature_source: TemperatureSource = "unknown"
     full_charge: FullCharge | None = None
     long_rest: LongRest | None = None
+    limits: PackLimits = field(default_factory=PackLimits)
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -145,6 +149,8 @@ class SocReference(NamedTuple):
 
     soc_pct: float
     soc_std_pct: float
+    is_by_voltage: bool = False
+    """Whether it is the inverse of the voltage model, and shares its errors."""
 
 
 class SocReferenceDetector:
@@ -186,7 +192,7 @@ class SocReferenceDetector:
         if rest is not None and math.isfinite(newton_pct):
             was, self.state.is_rested = self.state.is_rested, rest_s >= rest.after_s
             if self.state.is_rested and not was:
-                found.append(SocReference(newton_pct, rest.soc_std_pct))
+                found.append(SocReference(newton_pct, rest.soc_std_pct, is_by_voltage=True))
         return found
 
     def _becomes_full(self, rule: FullCharge, sample: Sample) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import (
@@ -185,6 +185,59 @@ class ReferenceState:
     is_rested: _Flag = False
 
 
+_HealthSums = Annotated[list[_Finite], Field(min_length=4, max_length=4)]
+_HealthPair = Annotated[list[_MaybeNan], Field(min_length=2, max_length=2)]
+
+
+@dataclass
+class ResistanceState:
+    """State of a `ResistanceEstimator`."""
+
+    __pydantic_config__: ClassVar[Any] = _NO_MORE
+    block: Annotated[list[_Finite], Field(min_length=4, max_length=4)] = field(
+        default_factory=lambda: [0.0] * 4
+    )
+    """Sums of residual and drop [V], number and time [s] of the block that is being filled."""
+    waiting: Annotated[list[_HealthPair], Field(min_length=4, max_length=4)] = field(
+        default_factory=lambda: [[math.nan] * 2 for _ in range(4)]
+    )
+    """Mean residual and drop [V] of the block that waits for its neighbour, by scale."""
+    sums: Annotated[list[_HealthSums], Field(min_length=4, max_length=4)] = field(
+        default_factory=lambda: [[0.0] * 4 for _ in range(4)]
+    )
+    """Sums of drop², drop · residual, residual² [V²] of the details, and their number, by scale."""
+
+
+@dataclass
+class HealthState:
+    """State of a `HealthEstimator`."""
+
+    __pydantic_config__: ClassVar[Any] = _NO_MORE
+    capacity_ah: Annotated[float, Field(strict=True, gt=0.0, le=LARGEST)] = 1.0
+    """Reference capacity of the filter [Ah]."""
+    x: Annotated[list[_Finite], Field(max_length=FILTER_STATES_AT_MOST)] = field(
+        default_factory=list
+    )
+    p: Annotated[
+        list[_Finite], Field(max_length=FILTER_STATES_AT_MOST * (FILTER_STATES_AT_MOST + 1) // 2)
+    ] = field(default_factory=list)
+    """Lower triangle of the covariance, by rows."""
+    is_started: _Flag = False
+    """Whether the SoC is known since the last unobserved interval."""
+    seconds: _NotNegative = 0.0
+    away_s: _NotNegative = 0.0
+    discharged_pct: _Finite = 0.0
+    moved_pct: _NotNegative = 0.0
+    gap_var_pct2: _NotNegative = 0.0
+    """Charge since the filter was propagated, as in `ChargeSinceUpdate`."""
+    sum_v: _Finite = 0.0
+    sum_drop_v: _Finite = 0.0
+    ticks: _Count = 0
+    window_s: _NotNegative = 0.0
+    """Voltages of the window that is being filled: sums [V], number and time [s]."""
+    resistance: ResistanceState = field(default_factory=ResistanceState)
+
+
 @dataclass
 class EstimatorMemory:
     """State of the `Estimator` itself; NaN: not known, or never."""
@@ -218,6 +271,11 @@ class EstimatorMemory:
     """Until when the last contradiction degrades the estimate [s]."""
     rest_since_s: _MaybeNan = math.nan
     """Since when the pack has rested [s]; NaN: it does not."""
+    level_s: _MaybeNan = math.nan
+    """When the levels were last updated [s]; NaN: never."""
+    level_residual_v: _Finite = 0.0
+    level_drop_v: _Finite = 0.0
+    """Levels of the residual, and of the predicted drop over the same time [V]."""
 
 
 class EstimatorState(BaseModel):
@@ -238,6 +296,7 @@ class EstimatorState(BaseModel):
     since: ChargeSinceUpdate
     references: ReferenceState
     memory: EstimatorMemory
+    health: HealthState
     estimate: Annotated[list[_MaybeNan], Field(min_length=7, max_length=7)]
     """Numbers of the last `Estimate`, in its order, from `time_s` to `residual_v`."""
     reasons: Annotated[int, Field(strict=True, ge=0, le=0x1FFFF)]
@@ -269,6 +328,7 @@ class EstimatorState(BaseModel):
             ("line.since_s", self.line.since_s if line else math.nan),
             ("memory.first_s", self.memory.first_s if self.memory.samples else math.nan),
             ("memory.rest_since_s", self.memory.rest_since_s),
+            ("memory.level_s", self.memory.level_s),
             ("references.full_since_s", self.references.full_since_s),
             ("clock.behind_s", self.clock.behind_s + self.clock.shift_s),
         ):

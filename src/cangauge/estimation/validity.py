@@ -98,7 +98,7 @@ REASON_WORDS: Final = {
     Reason.SOC_UNCERTAIN: "the standard deviation exceeds the limit of a valid SoC",
     Reason.DUPLICATE_SENDER: "another node sends frames with an id that is read or published here",
     Reason.MODEL_MISMATCH: "the voltages contradict the model: wrong pack, capacity or sensor",
-    Reason.TIME_UNCERTAIN: "time stamps and the monotonic clock disagree",
+    Reason.TIME_UNCERTAIN: "time stamps are irregular, or contradict the monotonic clock",
 }
 """Description of each reason, for pages and messages."""
 

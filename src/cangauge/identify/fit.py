@@ -6,11 +6,13 @@ import hashlib
 import logging
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 
+from cangauge._display import figure
+from cangauge._formatting import duration
 from cangauge._typing import FloatArray
 from cangauge._version import __version__
 from cangauge.errors import InputError
@@ -23,6 +25,7 @@ from cangauge.identify.evaluate import (
     evaluate_extended,
     slope_resistance,
 )
+from cangauge.identify.starts import Start, find_starts, given_starts
 from cangauge.identify.voltage_fit import KT, fit_voltage_model, held_out_errors, stacked
 from cangauge.inference.error_model import KNOTS_PCT, LogResidual, describe_error
 from cangauge.inference.least_squares import Solution
@@ -33,9 +36,14 @@ from cangauge.inference.rows import (
     FitRows,
     fit_rows,
     sample_log,
+    usable_delays,
 )
+from cangauge.logs.gaps import bridge_s, uncounted_gaps, usual_step_s
 from cangauge.logs.log import Log
-from cangauge.model.coulomb_counting import capacity_from_full_discharge
+from cangauge.model.coulomb_counting import (
+    capacity_from_full_discharge,
+    difference_from_reference,
+)
 from cangauge.model.effects.library import effect_entries
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import (
@@ -80,6 +88,12 @@ class Identification:
     remarks: tuple[str, ...] = ()
     effects: FittedEffects | None = None
     """Fitted effects; None if none were requested."""
+    starts: tuple[Start, ...] = ()
+    """SoC at the start of each log, and how it is known."""
+
+    def plot(self) -> Any:
+        """Return pseudo-OCV and residuals, for `bokeh.plotting.show`."""
+        return figure("fit_figure", self)
 
     def to_dict(self) -> dict[str, object]:
         """Return the object that `cangauge fit --json` prints."""
@@ -111,8 +125,11 @@ class Identification:
                     "voltage_mae_pct": item.voltage_mae_pct,
                     "soc_newton_mae_pct": item.soc_newton_mae_pct,
                     "removed": item.rows.removed,
+                    "initial_soc_pct": start.soc_pct,
+                    "initial_soc_std_pct": start.std_pct,
+                    "initial_soc_from": start.origin,
                 }
-                for item in self.fits
+                for item, start in zip(self.fits, self.starts, strict=True)
             ],
             "remarks": list(self.remarks),
         } | ({} if self.effects is None else self.effects.to_dict())
@@ -122,7 +139,7 @@ def fit(
     logs: Sequence[Log],
     *,
     capacity_ah: float | None = None,
-    initial_soc_pct: float | None = None,
+    initial_soc_pct: float | Sequence[float | None] | None = None,
     rate_hz: float = 1.0,
     delay_s: Sequence[float] = DELAYS_S,
     epsilon: float = 0.05,
@@ -139,8 +156,9 @@ def fit(
     logs : sequence of Log
     capacity_ah : float, optional
         Charge from 100 to 0 % [Ah]; by default from a log that runs from full to empty.
-    initial_soc_pct : float, optional
-        SoC at each log's first row [%]; by default its reference SoC, else 100.
+    initial_soc_pct : float, or sequence of float or None, optional
+        SoC at the first row [%], of all logs or of each; by default the log's reference SoC. Where
+        neither is known it is estimated together with the curve, if another log pins it.
     rate_hz : float
         Rate of the fit and of the model [Hz]; logs are decimated to it.
     delay_s : sequence of float
@@ -172,14 +190,18 @@ def fit(
     """
     effect_ids = parse_effect_ids([effects] if isinstance(effects, str) else effects)
     _check_logs(logs)
+    given = given_starts(initial_soc_pct, len(logs))
     if capacity_ah is None:
-        capacity_ah = capacity_from_full_discharge(logs, initial_soc_pct)
+        capacity_ah = capacity_from_full_discharge(logs, given)
     if not capacity_ah > 0.0:
         raise InputError(
             "the capacity must be positive", field="capacity_ah", value=capacity_ah,
             cure="check the sign of current: positive must discharge",
         )  # fmt: skip
-    options = FitOptions(capacity_ah, initial_soc_pct, rate_hz, tuple(delay_s), epsilon, t_ref_c)
+    usable = usable_delays(logs, delay_s)
+    options = FitOptions(capacity_ah, None, rate_hz, usable, epsilon, t_ref_c)
+    found_starts = find_starts(logs, given, options)
+    logs = found_starts.logs
     rows = [fit_rows(log, options) for log in logs]
     _LOG.debug("fitting %d rows of %d logs", sum(map(len, rows)), len(rows))
     found = None
@@ -194,6 +216,9 @@ def fit(
         held_out = found.held_out_error_v
     else:
         voltage_model, solution = fit_voltage_model(rows, options)
+        if found_starts.std_error is not None:
+            wider = np.maximum(solution.std_error, found_starts.std_error)
+            solution = replace(solution, std_error=wider)
         _LOG.debug("cross-validation")
         held_out = tuple(held_out_errors(rows, options))
         fits = tuple(evaluate(voltage_model, item) for item in rows)
@@ -225,7 +250,7 @@ def fit(
         noise=_noise(voltage_model, fits, held_out, options.rate_hz),
         effects=[] if found is None else effect_entries(found.model.effects),
         information=_information(rows, options, names, solution, found),
-        made=_made(logs, options, effect_ids, rows),
+        made=_made(logs, options, effect_ids, rows, initial_soc_pct),
     )
     return Identification(
         model=model,
@@ -242,9 +267,17 @@ def fit(
         soc_newton_mae_pct=float(np.mean(np.abs(newton_error))),
         remarks=(
             *_remarks(voltage_model, solution, rows),
+            *_remarks_on_time(logs, delay_s, usable),
+            *found_starts.remarks(),
+            *(
+                text
+                for log in found_starts.pieces
+                if (text := difference_from_reference(log, capacity_ah)) is not None
+            ),
             *(found.remarks() if found is not None else ()),
         ),
         effects=found,
+        starts=found_starts.starts,
     )
 
 
@@ -258,6 +291,17 @@ def _check_logs(logs: Sequence[Log]) -> None:
                 source=log.source or log.name,
                 cure="give a log of minutes or hours",
             )
+    by_rows: dict[bytes, Log] = {}
+    for log in logs:
+        digest = hashlib.sha256(log.current_a.tobytes() + log.voltage_v.tobytes()).digest()
+        if digest in by_rows:
+            raise InputError(
+                f"same rows as {by_rows[digest].source or by_rows[digest].name}: they would count"
+                " twice",
+                source=log.source or log.name,
+                cure="give each log once",
+            )
+        by_rows[digest] = log
     sources = {log.temperature_source for log in logs}
     if len(sources) > 1:
         raise InputError(
@@ -383,14 +427,18 @@ def _information(
 
 
 def _made(
-    logs: Sequence[Log], options: FitOptions, effect_ids: Sequence[str], rows: Sequence[FitRows]
+    logs: Sequence[Log],
+    options: FitOptions,
+    effect_ids: Sequence[str],
+    rows: Sequence[FitRows],
+    initial_soc_pct: float | Sequence[float | None] | None,
 ) -> Made:
     hashes = [_sha256(log) for log in logs]
     return Made(
         by=f"cangauge {__version__}",
         options={
             "capacity_ah": options.capacity_ah,
-            "initial_soc_pct": options.initial_soc_pct,
+            "initial_soc_pct": initial_soc_pct if isinstance(initial_soc_pct, float) else None,
             "rate_hz": options.rate_hz,
             "delay_s": list(options.delay_s),
             "epsilon": options.epsilon,
@@ -410,6 +458,29 @@ def _sha256(log: Log) -> str:
     for channel in (log.time_s, log.current_a, log.voltage_v, log.temperature_c):
         digest.update(channel.tobytes())
     return digest.hexdigest()
+
+
+def _remarks_on_time(
+    logs: Sequence[Log], delay_s: Sequence[float], usable: Sequence[float]
+) -> list[str]:
+    remarks = []
+    if len(usable) < len(delay_s):
+        left_out = ", ".join(f"{delay:g}" for delay in delay_s if delay not in usable)
+        step_s = min(usual_step_s(log.time_s) for log in logs)
+        remarks.append(
+            f"rows every {step_s:.3g} s do not tell a delay of {left_out} s from the others: left"
+            " out"
+        )
+    for log in logs:
+        gaps = uncounted_gaps(log.time_s)
+        if gaps.size:
+            longest = float(np.max(np.diff(log.time_s)[gaps]))
+            remarks.append(
+                f"{log.name}: {gaps.size} gaps of more than {bridge_s(log.time_s):.0f} s, the"
+                f" longest {duration(longest)}: no charge is counted over them (a rest); split the"
+                " log there if the pack was used"
+            )
+    return remarks
 
 
 def _remarks(model: VoltageModel, solution: Solution, rows: Sequence[FitRows]) -> list[str]:

@@ -73,7 +73,7 @@ def fit_voltage_model(
         soc, temperature, current = soc[keep], temperature[keep], current[keep]
     _check_identifiable(rows, soc, current, columns.shape)
     span = float(soc.min()), float(soc.max())
-    solution = _rising(columns, volts, block, span, options.epsilon)
+    solution = rising(columns, volts, block, span, options.epsilon)
     residual_v = volts - columns @ solution.coefficients
     # The slow error of clusters that count as independent; without an error there is no prior.
     prior_v2 = CLUSTER_S * options.rate_hz * _mean_square_of_means(residual_v, block)
@@ -85,7 +85,7 @@ def fit_voltage_model(
         row = np.zeros((1, columns.shape[1]))
         row[0, KT] = prior.row_weight
         priors.append((row, np.zeros(1)))
-    solution = _rising(columns, volts, block, span, options.epsilon, priors)
+    solution = rising(columns, volts, block, span, options.epsilon, priors)
     if prior is not None:
         solution = _with_prior_errors(solution, prior)
     x = [float(value) for value in solution.coefficients]
@@ -120,7 +120,7 @@ def _curve_rows(
     return columns, target
 
 
-def _rising(
+def rising(
     columns: FloatArray,
     volts: FloatArray,
     block: NDArray[np.intp],
@@ -128,9 +128,10 @@ def _rising(
     epsilon: float,
     priors: Sequence[tuple[FloatArray, FloatArray]] = (),
 ) -> Solution:
-    """Return the least-squares solution whose pseudo-OCV rises over a span of SoC.
+    """Return the least-squares solution whose pseudo-OCV rises over a span of SoC [%].
 
-    `priors` are further rows and their targets; each counts as a block of its own.
+    Columns beyond those of `design_matrix` may follow. `priors` are further rows and their targets;
+    each counts as a block of its own.
     """
     at_least = SLOPE_AT_LEAST * float(np.median(volts))
     grid = np.linspace(*span_pct, SLOPE_CHECKS)

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
+from cangauge.logs.gaps import usual_gap_s, usual_step_s
 from cangauge.logs.log import Log
 from cangauge.logs.resample import dequantize
 from cangauge.model.coulomb_counting import counted_soc_pct, discharged_ah
@@ -63,7 +64,7 @@ class FitOptions:
     capacity_ah: float
     """Charge from 100 to 0 % [Ah]."""
     initial_soc_pct: float | None = None
-    """SoC at each log's first row [%]; by default its reference SoC, else 100."""
+    """SoC at each log's first row [%]; by default its reference SoC."""
     rate_hz: float = 1.0
     delay_s: tuple[float, ...] = DELAYS_S
     epsilon: float = 0.05
@@ -133,26 +134,22 @@ def fit_rows(log: Log, options: FitOptions, *, gap_s: float = GAP_S) -> FitRows:
     Raises
     ------
     InputError
-        If no row is left, or the counted SoC leaves 0–100 % by more than `SOC_TOLERANCE_PCT`.
+        If no row is left, the SoC is known nowhere, or the counted SoC leaves 0–100 % by more than
+        `SOC_TOLERANCE_PCT`.
     """
     source = log.source or log.name
     capacity_ah, delay_s = options.capacity_ah, options.delay_s
     soc = counted_soc_pct(log, capacity_ah, options.initial_soc_pct)
     low, high = float(soc.min()), float(soc.max())
     if low < -SOC_TOLERANCE_PCT or high > 100.0 + SOC_TOLERANCE_PCT:
-        assumed = options.initial_soc_pct is None and log.first_soc() is None
-        start = " from an assumed start at 100 %" if assumed else ""
         raise InputError(
-            f"the SoC counted with {capacity_ah:.2f} Ah{start} runs from {high:.1f} to {low:.1f} %",
+            f"the SoC counted with {capacity_ah:.2f} Ah runs from {high:.1f} to {low:.1f} %",
             source=source,
             field="soc_pct",
             cure="check --capacity-ah, the SoC at the start (soc_pct, --initial-soc) and the sign"
             " of current (positive must discharge; see `cangauge inspect`)",
         )
-    ticks = decimate(log.time_s, options.rate_hz)
-    running = running_rows(log.time_s, log.voltage_v)[ticks]
-    full = filled_at(log.time_s, max(delay_s), log.time_s[ticks], usual_gap_s(log.time_s, gap_s))
-    keep = ticks[running & full]
+    keep, removed = usable_rows(log, delay_s, options.rate_hz, gap_s)
     if keep.size < 2:
         raise InputError(
             f"no rows are left for the fit: the log lasts {log.duration_s:.0f} s, and the first"
@@ -168,11 +165,7 @@ def fit_rows(log: Log, options: FitOptions, *, gap_s: float = GAP_S) -> FitRows:
         dequantized_c=dequantize(log).temperature_c[keep],
         soc_pct=soc[keep],
         delayed_current_a=delayed_currents(log.time_s, log.current_a, delay_s, log.time_s[keep]),
-        removed={
-            "decimation": len(log) - ticks.size,
-            "start_up_or_shut_down": int(np.sum(~running)),
-            "delay_line_filling": int(np.sum(running & ~full)),
-        },
+        removed=removed,
     )
 
 
@@ -194,9 +187,39 @@ def running_rows(time_s: FloatArray, voltage_v: FloatArray) -> NDArray[np.bool_]
     return np.asarray(np.minimum(to_next, to_last) > GUARD_S) & ~down
 
 
-def usual_gap_s(time_s: FloatArray, gap_s: float) -> float:
-    """Return the duration of a gap in a recorded log [s]: `gap_s`, at least 3 median steps."""
-    return max(gap_s, 3.0 * float(np.median(np.diff(time_s)))) if time_s.size > 1 else gap_s
+def usable_delays(logs: Sequence[Log], delay_s: Sequence[float]) -> tuple[float, ...]:
+    """Return the delays that the fastest of some logs can tell apart [s].
+
+    Between rows the current is interpolated, so that the columns of delays closer together than a
+    row depend on each other.
+
+    Parameters
+    ----------
+    logs : sequence of Log
+    delay_s : sequence of float
+        Increasing from 0 [s].
+    """
+    step_s = min(usual_step_s(log.time_s) for log in logs)
+    kept = [delay_s[0]]
+    for delay in delay_s[1:]:
+        if step_s <= delay - kept[-1] + 1e-9:
+            kept.append(delay)
+    return tuple(kept)
+
+
+def usable_rows(
+    log: Log, delay_s: Sequence[float], rate_hz: float, gap_s: float = GAP_S
+) -> tuple[NDArray[np.intp], dict[str, int]]:
+    """Return the indices of the rows of a log that take part in a fit, and the numbers removed."""
+    ticks = decimate(log.time_s, rate_hz)
+    running = running_rows(log.time_s, log.voltage_v)[ticks]
+    full = filled_at(log.time_s, max(delay_s), log.time_s[ticks], usual_gap_s(log.time_s, gap_s))
+    removed = {
+        "decimation": len(log) - ticks.size,
+        "start_up_or_shut_down": int(np.sum(~running)),
+        "delay_line_filling": int(np.sum(running & ~full)),
+    }
+    return ticks[running & full], removed
 
 
 def folds(logs: Sequence[FitRows]) -> Iterator[tuple[Mask, Mask]]:

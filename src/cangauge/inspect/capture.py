@@ -35,6 +35,8 @@ PAYLOADS: Final = 4
 """… which have at least this many different payloads: a constant one can agree by chance."""
 REPEATED_SHARE: Final = 0.02
 """Largest share of repeated counters; above it the counter is elsewhere, or there is none."""
+MIXED_SHARE: Final = 0.55
+"""The same of two senders: of two frames with one counter value, one is repeated."""
 PERIOD_TOLERANCE: Final = 0.3
 """Largest difference of a period from a preset's [-]."""
 LONG_ENOUGH_S: Final = 2.0
@@ -62,6 +64,8 @@ class IdSummary:
         "leaf" or "generic" where CRCs of that rule agree, else "".
     crc_errors, counter_jumps, frames_lost, counter_repeats : int or None
         By that rule; None without one, the last three also where its counter is elsewhere.
+    two_senders : bool
+        Whether the counters are those of two senders at times.
     """
 
     id: str
@@ -75,6 +79,7 @@ class IdSummary:
     counter_jumps: int | None
     frames_lost: int | None
     counter_repeats: int | None
+    two_senders: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,9 +277,11 @@ class _Trial:
     counter_jumps: int = 0
     frames_lost: int = 0
     counter_repeats: int = 0
+    two_senders: bool = False
 
     def take(self, data: bytes | bytearray, time_s: float) -> None:
         verdict = self.checker.check(data, time_s)
+        self.two_senders |= self.checker.suspects_second_sender
         if verdict is Verdict.CRC_WRONG:
             self.crc_errors += 1
             return
@@ -356,7 +363,9 @@ class _IdRecord:
         rule, trial = self._protection()
         counter = trial
         if trial is not None and trial.counter_repeats > REPEATED_SHARE * self.frames:
-            counter = None  # the CRC is correct, but the counter is not where the rule expects it
+            # The CRC is correct; the counter is not where the rule expects it, or there are two.
+            is_mixed = trial.two_senders and trial.counter_repeats <= MIXED_SHARE * self.frames
+            counter = trial if is_mixed else None
         return IdSummary(
             id=name,
             bus="" if channel is None else str(channel),
@@ -369,6 +378,7 @@ class _IdRecord:
             counter_jumps=None if counter is None else counter.counter_jumps,
             frames_lost=None if counter is None else counter.frames_lost,
             counter_repeats=None if counter is None else counter.counter_repeats,
+            two_senders=counter is not None and counter.two_senders,
         )
 
 

@@ -8,8 +8,10 @@ from typing import Final
 import numpy as np
 
 from cangauge._typing import FloatArray
+from cangauge.logs.gaps import uncounted_gaps
 from cangauge.logs.log import Log
 from cangauge.logs.sign import STEP_SPACING_S, charge_ah, current_steps, spaced_rows
+from cangauge.model.coulomb_counting import capacity_from_reference
 
 GAP_S: Final = 2.0
 """Longest interval that the delay line of the model bridges [s]; longer ones are gaps."""
@@ -276,6 +278,8 @@ MIN_STEPS: Final = 8
 class Charge:
     """Charge moved over a log, by trapezoids, positive current discharging.
 
+    Nothing is counted over a gap longer than `logs.gaps.bridge_s`, as in a fit.
+
     Parameters
     ----------
     discharged_ah, charged_ah : float
@@ -286,6 +290,10 @@ class Charge:
         Range of the charge state over the log [Ah].
     in_gaps_ah : float
         Absolute charge interpolated over gaps [Ah].
+    uncounted_gaps : int
+        Gaps over which nothing is counted.
+    uncounted_s : float
+        Their sum [s].
     """
 
     discharged_ah: float
@@ -293,6 +301,8 @@ class Charge:
     net_ah: float
     span_ah: float
     in_gaps_ah: float
+    uncounted_gaps: int
+    uncounted_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -346,12 +356,15 @@ def describe_charge(log: Log, gap_limit_s: float) -> Charge:
     state = charge_ah(log)
     part = np.diff(state)
     gaps = np.diff(log.time_s) > gap_limit_s
+    uncounted = uncounted_gaps(log.time_s)
     return Charge(
         discharged_ah=float(part[part > 0.0].sum()),
         charged_ah=float(np.abs(part[part < 0.0]).sum()),
         net_ah=float(state[-1]),
         span_ah=float(np.ptp(state)),
         in_gaps_ah=float(np.abs(part[gaps]).sum()),
+        uncounted_gaps=int(uncounted.size),
+        uncounted_s=float(np.diff(log.time_s)[uncounted].sum()),
     )
 
 
@@ -365,9 +378,7 @@ def describe_soc(log: Log) -> Soc | None:
     soc = log.soc_pct[known]
     capacity = None
     if np.ptp(soc) >= MIN_SOC_SPAN_PCT:
-        taken = charge_ah(log)[known]
-        slope = float(np.polyfit(soc - soc.mean(), taken, 1)[0])
-        capacity = abs(100.0 * slope)  # for either sign of current
+        capacity = abs(capacity_from_reference([log]))  # for either sign of current
     holes = np.diff(log.time_s[known])
     return Soc(
         coverage=float(known.size / len(log)),

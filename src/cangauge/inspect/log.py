@@ -7,7 +7,13 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
+from cangauge._formatting import duration
+from cangauge.errors import InputError
+from cangauge.identify.voltage_fit import SOC_SPAN_AT_LEAST_PCT
+from cangauge.inference.rows import DELAYS_S as FIT_DELAYS_S
+from cangauge.inference.rows import usable_delays, usable_rows
 from cangauge.inspect.channels import (
+    GAP_S,
     Channel,
     Charge,
     Resistance,
@@ -20,8 +26,11 @@ from cangauge.inspect.channels import (
     describe_timing,
     find_stuck,
 )
+from cangauge.logs.gaps import usual_gap_s
 from cangauge.logs.log import Log
 from cangauge.logs.sign import SignFinding, charge_ah, correlation, sign_of_current, spaced_rows
+from cangauge.model.coulomb_counting import capacity_from_full_discharge
+from cangauge.model.voltage_model import BASIS_NAMES
 
 Verdict = Literal["yes", "partly", "no"]
 
@@ -39,7 +48,9 @@ LISTED_INTERVALS: Final = 5
 DELAYS_S: Final = (10.0, 30.0, 70.0)
 """Delays of the published model [s]."""
 SLOW_S: Final = 2.0
-"""Longest median interval at which delays can be identified [s]."""
+"""Median interval from which a log is slow [s]: the delay line bridges as much."""
+FIT_RATE_HZ: Final = 1.0
+"""Rate of a fit by default [Hz]."""
 CORRELATED: Final = 0.9
 """Correlation above which two influences are hard to separate [-]."""
 TEMPERATURE_SPAN_K: Final = 3.0
@@ -116,7 +127,7 @@ class LogInspection:
 
 def inspect_log(log: Log) -> LogInspection:
     """Inspect a log; the sign of its current is one of the findings."""
-    timing = describe_timing(log.time_s)
+    timing = describe_timing(log.time_s, usual_gap_s(log.time_s, GAP_S))
     resistance = describe_resistance(log)
     channels = _channels(log, resistance)
     charge = describe_charge(log, timing.gap_limit_s)
@@ -136,9 +147,10 @@ def inspect_log(log: Log) -> LogInspection:
         abilities=(
             Ability("sign of current", "yes" if sign.sign else "no", sign.sentence),
             _voltage_curve(charge, soc),
-            _capacity(charge, soc),
+            _capacity(log, charge, soc),
             _resistance(resistance),
             _delays(log, timing),
+            _rows(log),
             _temperature(log),
             _start(log),
             _rests(log),
@@ -198,17 +210,26 @@ def _warnings(
 
 
 def _gap_warnings(timing: Timing, charge: Charge) -> list[str]:
-    limit = f"{timing.gap_limit_s:g} s"
-    if (timing.interval_median_s or 0.0) > timing.gap_limit_s:
-        slow = f"{timing.interval_median_s:.3g} s"
-        return [f"rows are {slow} apart: too slow for the delay line, which bridges {limit}"]
-    if not timing.gap_count:
-        return []
-    longest = timing.longest_gaps[0]
-    return [
-        f"{timing.gap_count} gaps of more than {limit}, the longest {longest.length_s:.4g} s at"
-        f" {longest.start_s:.1f} s; {charge.in_gaps_ah:.3g} Ah are interpolated over gaps"
-    ]
+    found = []
+    if (timing.interval_median_s or 0.0) > SLOW_S:
+        found.append(
+            f"rows are {timing.interval_median_s:.3g} s apart: shorter delays of the current cannot"
+            " be identified, and quick changes of voltage not be followed"
+        )
+    if timing.gap_count:
+        longest = timing.longest_gaps[0]
+        found.append(
+            f"{timing.gap_count} gaps of more than {timing.gap_limit_s:g} s, the longest"
+            f" {longest.length_s:.4g} s at {longest.start_s:.1f} s; {charge.in_gaps_ah:.3g} Ah are"
+            " interpolated over gaps"
+        )
+    if charge.uncounted_gaps:
+        found.append(
+            f"no charge is counted over {charge.uncounted_gaps} of them,"
+            f" {duration(charge.uncounted_s)} in all: the pack is assumed to rest; where the log's"
+            " own SoC moves over one, a fit splits the log there"
+        )
+    return found
 
 
 def _stuck_warnings(name: str, channel: Channel) -> list[str]:
@@ -225,20 +246,20 @@ def _voltage_curve(charge: Charge, soc: Soc | None) -> Ability:
     topic = "voltage curve over SoC"
     if soc is None:
         text = (
-            f"no reference SoC; the charge state spans {charge.span_ah:.3g} Ah:"
-            " the capacity and the initial SoC must be given"
+            f"no reference SoC; the charge state spans {charge.span_ah:.3g} Ah: give the capacity"
+            " and the SoC at the start, or fit it with a log that has both"
         )
         return Ability(topic, "partly", text)
     span = soc.maximum_pct - soc.minimum_pct
     covered = f"SoC covers {soc.minimum_pct:.1f} … {soc.maximum_pct:.1f} %"
     if span >= WIDE_SOC_PCT:
         return Ability(topic, "yes", covered)
-    if span >= 5.0:
+    if span >= SOC_SPAN_AT_LEAST_PCT:
         return Ability(topic, "partly", f"{covered}: only this part of the curve")
     return Ability(topic, "no", f"{covered}: too little for a curve")
 
 
-def _capacity(charge: Charge, soc: Soc | None) -> Ability:
+def _capacity(log: Log, charge: Charge, soc: Soc | None) -> Ability:
     if soc is None or soc.implied_capacity_ah is None:
         text = (
             f"no reference SoC that spans 5 %; at least {charge.span_ah:.3g} Ah, the capacity if"
@@ -247,7 +268,11 @@ def _capacity(charge: Charge, soc: Soc | None) -> Ability:
         return Ability("capacity", "no", text)
     span = soc.maximum_pct - soc.minimum_pct
     text = f"{soc.implied_capacity_ah:.4g} Ah per 100 % of reference SoC, over {span:.1f} %"
-    return Ability("capacity", "yes" if span >= WIDE_SOC_PCT else "partly", text)
+    try:
+        whole_ah = capacity_from_full_discharge([log], None)
+    except InputError:
+        return Ability("capacity", "yes" if span >= WIDE_SOC_PCT else "partly", text)
+    return Ability("capacity", "yes", f"{whole_ah:.4g} Ah: the log runs from full to empty")
 
 
 def _resistance(resistance: Resistance | None) -> Ability:
@@ -268,9 +293,13 @@ def _delays(log: Log, timing: Timing) -> Ability:
     if timing.interval_median_s is None or timing.duration_s < 10.0 * longest:
         text = f"{timing.duration_s:.0f} s is too short for delays up to {longest:.0f} s"
         return Ability(topic, "no", text)
-    if timing.interval_median_s > SLOW_S:
-        text = f"rows every {timing.interval_median_s:.3g} s are too slow for delays of 10 s"
-        return Ability(topic, "no", text)
+    usable = usable_delays([log], FIT_DELAYS_S)
+    if len(usable) < len(FIT_DELAYS_S):
+        step = f"rows every {timing.interval_median_s:.3g} s"
+        if len(usable) == 1:
+            return Ability(topic, "no", f"{step} are too slow for any delay")
+        kept = ", ".join(f"{delay:g}" for delay in usable)
+        return Ability(topic, "partly", f"{step} identify delays of {kept} s only")
     correlated = _autocorrelation(log)
     if correlated is None:
         return Ability(topic, "no", "current does not vary")
@@ -278,6 +307,23 @@ def _delays(log: Log, timing: Timing) -> Ability:
     if correlated > CORRELATED:
         return Ability(topic, "partly", f"{text}: the terms are hard to separate")
     return Ability(topic, "yes", text)
+
+
+def _rows(log: Log) -> Ability:
+    """Assess how many rows a fit would use: those behind a filled delay line."""
+    topic = "rows for a fit"
+    delay_s = usable_delays([log], FIT_DELAYS_S) if len(log) > 1 else FIT_DELAYS_S
+    kept, removed = usable_rows(log, delay_s, FIT_RATE_HZ)
+    total = kept.size + removed["start_up_or_shut_down"] + removed["delay_line_filling"]
+    needed = 4 * (len(BASIS_NAMES) + 1 + len(delay_s))
+    text = (
+        f"{kept.size} of {total} at {FIT_RATE_HZ:g} Hz; the first {max(delay_s):.0f} s, and as long"
+        f" after each gap, fill the delay line; {needed} are needed"
+    )
+    verdict: Verdict = "no" if kept.size < needed else "partly"
+    if verdict == "partly" and kept.size > 0.5 * total:
+        verdict = "yes"
+    return Ability(topic, verdict, text)
 
 
 def _autocorrelation(log: Log) -> float | None:

@@ -29,6 +29,17 @@ _FIELDS: Final = (*REQUIRED, "soc_pct", SOURCE)
 _METADATA_KEY: Final = b"cangauge.temperature_source"
 
 
+def is_canonical(names: Sequence[str]) -> bool:
+    """Return whether columns have the names of a canonical log's, possibly an incomplete one.
+
+    A temperature of another name is not a missing one: such a table is a logger's own.
+    """
+    spelled = {name.strip().lower() for name in names}
+    if "temperature_c" not in spelled and any("temperature" in n for n in spelled - {SOURCE}):
+        return False
+    return len(spelled & set(REQUIRED)) >= 2
+
+
 def find_fields(names: Sequence[str], where: str) -> dict[str, int]:
     """Return the index of each canonical column that is present.
 

@@ -6,7 +6,7 @@ both.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -24,13 +24,16 @@ from cangauge.logs.arrow import (
     describe,
     draft_from_table,
     find_fields,
+    is_canonical,
     is_text,
 )
+from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.columns import read_columns
 from cangauge.logs.draft import DraftLog
 from cangauge.logs.file_content import FileContent, delimiter_of, split_cells
+from cangauge.logs.formats import BDF_LABELS
 from cangauge.logs.log import Log
-from cangauge.logs.units import REQUIRED
+from cangauge.logs.table_columns import draft_of_arrow
 
 
 def read_parquet(content: FileContent) -> DraftLog:
@@ -47,6 +50,8 @@ def read_parquet(content: FileContent) -> DraftLog:
         file = _open_parquet(data)
         schema = file.schema_arrow
         names = schema.names
+        if not is_canonical(names):
+            return read_any_parquet(content, None)
         places = find_fields(names, source)
         _check_size(file.metadata, source)
         check_types(schema, places, source)
@@ -62,6 +67,36 @@ def read_parquet(content: FileContent) -> DraftLog:
             f"the Parquet file is cut off or damaged ({reason})", source=source, cure="export again"
         ) from error
     return draft_from_table(table, places, names, name=content.name, source=source)
+
+
+def read_any_parquet(content: FileContent, given: ColumnMap | None) -> DraftLog:
+    """Read a Parquet file with plain headings, or with the columns of the user.
+
+    Raises
+    ------
+    InputError
+        If it is damaged, or a column is not found or does not hold its quantity.
+    """
+    source = str(content.path)
+    data = pa.BufferReader(content.read())
+    try:
+        file = _open_parquet(data)
+        _check_size(file.metadata, source)
+        schema = file.schema_arrow
+        texts = [each.name for each in schema if is_text(each.type)]
+
+        def read(names: Sequence[str]) -> Any:
+            wanted = [name for name in texts if name in names]
+            table = _open_parquet(data, *wanted).read(columns=list(names))
+            table.validate(full=True)
+            return table
+
+        return draft_of_arrow(schema.names, given, name=content.name, source=source, read=read)
+    except (pa.ArrowException, OSError, ValueError) as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise InputError(
+            f"the Parquet file is cut off or damaged ({reason})", source=source, cure="export again"
+        ) from error
 
 
 def _open_parquet(data: Any, *dictionaries: str) -> Any:
@@ -93,8 +128,7 @@ def _check_size(metadata: Any, source: str) -> None:
 def is_canonical_csv(content: FileContent) -> bool:
     """Return whether the header is a canonical log's, possibly an incomplete one."""
     line = content.first_line
-    found = {name.lower() for name in split_cells(line, delimiter_of(line) or ",")}
-    return len(found & set(REQUIRED)) >= 2
+    return is_canonical(split_cells(line, delimiter_of(line) or ","))
 
 
 def read_csv(content: FileContent) -> DraftLog:
@@ -130,17 +164,32 @@ def write_log(log: Log, path: str | PathLike[str]) -> None:
     ----------
     log : Log
     path : path-like
-        `.parquet` or `.csv`.
+        `.parquet` or `.csv`; `.bdf`, `.bdf.csv` or `.bdf.parquet` for the Battery Data Format,
+        which has no SoC.
 
     Raises
     ------
     InputError
         If the suffix is another one, or the folder is absent or not writable.
     """
+    if ".bdf" in Path(path).suffixes[-2:]:
+        _write(_bdf_table(log), path)
+        return
     table = log.to_arrow()
     if Path(path).suffix.lower() == ".csv" and log.temperature_source != "unknown":
         table = table.append_column(SOURCE, [[log.temperature_source] * len(log)])
     _write(table, path)
+
+
+def _bdf_table(log: Log) -> Any:
+    place = "ambient" if log.temperature_source == "room" else "sensor"
+    columns = {
+        "time_s": log.time_s,
+        "voltage_v": log.voltage_v,
+        "current_a": 0.0 - log.current_a,  # positive charges
+        place: log.temperature_c,
+    }
+    return build_table({BDF_LABELS[name]: values for name, values in columns.items()})
 
 
 def write_table(columns: Mapping[str, Any], path: str | PathLike[str]) -> None:
@@ -163,12 +212,12 @@ def write_table(columns: Mapping[str, Any], path: str | PathLike[str]) -> None:
 
 def _write(table: Any, path: str | PathLike[str]) -> None:
     suffix = Path(path).suffix.lower()
-    if suffix not in {".parquet", ".pq", ".csv"}:
+    if suffix not in {".parquet", ".pq", ".csv", ".bdf"}:
         raise InputError(
             "unknown suffix for a table", source=path, value=suffix, cure="use .parquet or .csv"
         )
     with atomic_path(path) as part:
-        if suffix == ".csv":
+        if suffix in {".csv", ".bdf"}:
             with part.open("wb") as file:
                 file.write((",".join(table.column_names) + "\n").encode())
                 options = pacsv.WriteOptions(include_header=False, quoting_style="needed")

@@ -17,7 +17,22 @@ from cangauge.errors import InputError
 from cangauge.logs.file_content import FileContent, split_cells
 
 _MISSING: Final = pa.array(
-    ["", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "1.#qnan", "-1.#ind"]
+    [
+        "",
+        "nan",
+        "na",
+        "n/a",
+        "#n/a",
+        "null",
+        "none",
+        "-",
+        "--",
+        "1.#qnan",
+        "-1.#ind",
+        "unknown",
+        "unavailable",
+        "n.a.",
+    ]
 )
 
 
@@ -53,19 +68,20 @@ class Columns:
         InputError
             If a cell holds anything but a number.
         """
-        trimmed = pc.utf8_trim_whitespace(self.text[name])
+        trimmed = self._present(name)
         if self.decimal_comma:
-            trimmed = pc.replace_substring(trimmed, ",", ".")
-        missing = pc.is_in(pc.utf8_lower(trimmed), value_set=_MISSING)
-        trimmed = pc.if_else(missing, pa.scalar(None, pa.string()), trimmed)
+            trimmed = _with_decimal_point(trimmed)
         try:
             return np.asarray(pc.cast(trimmed, pa.float64()).to_numpy(), dtype=np.float64)
         except pa.ArrowInvalid as error:
+            bare = _without_unit(trimmed)
+            if bare is not None:
+                return np.asarray(pc.cast(bare, pa.float64()).to_numpy(), dtype=np.float64)
             row, value = next(
                 (
                     (row, value)
                     for row, value in enumerate(trimmed.to_pylist(), start=1)
-                    if value is not None and not _is_number(value)
+                    if value is not None and not is_number(value)
                 ),
                 (1, str(trimmed[0])),
             )
@@ -76,6 +92,46 @@ class Columns:
                 value=value,
                 cure="correct the cell, or leave it empty where the value is unknown",
             ) from error
+
+    def stamps(self, name: str) -> Any:
+        """Return a column as numbers, or as a pyarrow string array if its first cell is none."""
+        cells = self._present(name)
+        first = next((cell.as_py() for cell in cells if cell.is_valid), "")
+        return self.numbers(name) if is_number(first.replace(",", ".")) else cells
+
+    def _present(self, name: str) -> Any:
+        """Return the trimmed cells of a column, null where there is no value."""
+        trimmed = pc.utf8_trim_whitespace(self.text[name])
+        missing = pc.is_in(pc.utf8_lower(trimmed), value_set=_MISSING)
+        return pc.if_else(missing, pa.scalar(None, pa.string()), trimmed)
+
+
+_NUMBER_WITH_UNIT: Final = (
+    r"^(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(?P<unit>[^\d.]{1,4})$"
+)
+
+
+def _with_decimal_point(cells: Any) -> Any:
+    """Return cells with `.` as the decimal mark; the other mark separates thousands."""
+    both = pc.and_(pc.match_substring(cells, ","), pc.match_substring(cells, "."))
+    if pc.any(both).as_py():
+        last = r"^[^,]*,[^,.]*$"  # 1.234,5
+        is_comma = pc.any(pc.match_substring_regex(pc.filter(cells, both), last)).as_py()
+        cells = pc.replace_substring(cells, "." if is_comma else ",", "")
+    return pc.replace_substring(cells, ",", ".")
+
+
+def _without_unit(cells: Any) -> Any | None:
+    """Return cells without a unit that all of them carry (`53.2 V`), or None."""
+    parts = pc.extract_regex(
+        cells, r"^(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(?P<unit>\D{1,4})$"
+    )
+    if pc.any(pc.and_(pc.is_null(parts), pc.is_valid(cells))).as_py():
+        return None
+    if isinstance(parts, pa.ChunkedArray):
+        parts = parts.combine_chunks()
+    units = pc.unique(parts.field("unit"))
+    return parts.field("number") if len(pc.drop_null(units)) == 1 else None
 
 
 def read_columns(
@@ -159,8 +215,9 @@ def read_columns(
             for name, index in wanted.items()
         },
         source=str(content.path),
-        decimal_comma=delimiter != ","
-        and any(pc.any(pc.match_substring(column, ",")).as_py() for column in text.values()),
+        decimal_comma=any(
+            pc.any(pc.match_substring(column, ",")).as_py() for column in text.values()
+        ),
         remarks=tuple(remarks),
     )
 
@@ -195,7 +252,7 @@ def _remarks_on_odd_rows(
     last = skip_lines + rows + len(odd)
     remarks = []
     for row in odd:
-        closing = row.actual_columns == 1 and not _is_number(row.text)
+        closing = row.actual_columns == 1 and not is_number(row.text)
         if row.number > last - len(odd) and closing:
             remarks.append(f"closing line omitted: {row.text.strip()[:60]!r}")
         elif row.number == last and row.actual_columns < row.expected_columns:
@@ -220,7 +277,8 @@ def _no_rows(content: FileContent) -> InputError:
     )
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Return whether a text is a number."""
     try:
         float(text)
     except ValueError:

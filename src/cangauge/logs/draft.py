@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.units import REQUIRED, TemperatureSource, refuse_wrong_units
+
+Sign = Literal["charge", "discharge"]
+"""What a positive current in the file does."""
 
 MAX_INCOMPLETE: Final = 0.05
 """Largest fraction of incomplete rows to drop, in formats that allow it [-]."""
@@ -37,6 +40,10 @@ class DraftLog:
         Drop rows that lack a required value, with a remark, instead of raising.
     sign_unknown : bool
         The format does not define the sign of current.
+    negated : bool
+        The file stores discharge as negative, and the values here are inverted.
+    assumed : list of str
+        How the columns of an arbitrary table were understood, a phrase each.
     remarks : list of str
         Changes and findings of the reader.
     """
@@ -48,6 +55,8 @@ class DraftLog:
     temperature_source: TemperatureSource = "unknown"
     drop_incomplete: bool = False
     sign_unknown: bool = False
+    negated: bool = False
+    assumed: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
 
     def require(self, *fields: str, headings: Sequence[str]) -> None:
@@ -68,7 +77,14 @@ class DraftLog:
     def negate_current(self, because: str) -> None:
         """Invert the sign of the stored current, with a remark."""
         self.values["current_a"] = 0.0 - self.values["current_a"]  # no -0.0
+        self.negated = not self.negated
         self.remarks.append(f"current negated: {because}")
+
+    def state_sign(self, sign: Sign) -> None:
+        """Apply the sign that the user states: whether positive current in the file discharges."""
+        if (sign == "charge") is not self.negated:
+            self.negate_current(f"positive {sign}s in the file, as stated")
+        self.sign_unknown = False
 
     def checked(self, temperature_c: float | None = None) -> dict[str, Any]:
         """Check all values and return the arguments of `Log`.
@@ -95,6 +111,7 @@ class DraftLog:
             "source": self.source,
             "temperature_source": self.temperature_source,
             "remarks": tuple(self.remarks),
+            "assumed": tuple(self.assumed),
         }
 
     def _set_temperature(self, given_c: float | None) -> None:

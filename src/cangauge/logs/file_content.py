@@ -11,22 +11,29 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
-from typing import Final, cast
+from typing import Any, Final, cast
 
 from cangauge._io import (
     MAX_LOG_BYTES,
+    UNPACK_FREE_BYTES,
+    UNPACK_RATIO,
     bounded,
     open_unpacked,
     read_all,
     read_beginning,
 )
+from cangauge._mcap import MAGIC
 from cangauge.errors import InputError
 
+_WORKBOOK: Final = "xl/workbook.xml"
 _ZIP: Final = b"PK\x03\x04"
 _PARQUET: Final = b"PAR1"
+_MDF: Final = (b"MDF     ", b"UnFinMF ")
 _DELIMITERS: Final = ("\t", ";", ",")
 _HEAD_BYTES: Final = 64 * 1024
-_HEAD_LINES: Final = 60
+_HEAD_LINES: Final = 160
+MAX_WORKBOOK_TEXTS: Final = 64 << 20
+"""Distinct texts of a workbook [bytes]: all are held in memory, and a log holds numbers."""
 _D3_MEMBER: Final = "test data.txt"
 # An LZMA member sets the memory of its reader; no exporter writes one.
 _ZIP_METHODS: Final = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -48,7 +55,7 @@ class FileContent:
         File name without folder and suffixes (of the member, for a zip).
     head : tuple of str
         The first lines, without line ends; empty for binary content.
-    is_parquet : bool
+    is_parquet, is_mf4, is_mcap : bool
 
     Raises
     ------
@@ -67,8 +74,15 @@ class FileContent:
                 file.read(1)  # raises if the file is damaged, not empty
         if not beginning.strip():
             raise InputError("the file is empty", source=self.path, cure="check the export")
+        self._sheet: bytes | None = None
+        if beginning.startswith(_ZIP):  # not unpacked: a workbook
+            self._sheet = sheet_text(self.path)
+            beginning = self._sheet[:_HEAD_BYTES]
         self.is_parquet = beginning.startswith(_PARQUET)
-        self.head = () if self.is_parquet else _first_lines(beginning)
+        self.is_mf4 = beginning.startswith(_MDF)
+        self.is_mcap = beginning.startswith(MAGIC)
+        is_binary = self.is_parquet or self.is_mf4 or self.is_mcap
+        self.head = () if is_binary else _first_lines(beginning)
 
     @property
     def first_line(self) -> str:
@@ -83,6 +97,8 @@ class FileContent:
         InputError
             If the file is damaged, or larger than a log may be.
         """
+        if self._sheet is not None:
+            return self._sheet
         with self._open() as file:
             data = read_all(file, self.path, MAX_LOG_BYTES, "a log")
         return data if self.is_parquet else _as_utf8(data)
@@ -99,6 +115,10 @@ class FileContent:
                 kind = "zip "
                 packed = io.BytesIO(read_all(file, self.path, MAX_LOG_BYTES, "a log"))
             with zipfile.ZipFile(packed) as archive:
+                if _WORKBOOK in archive.namelist():
+                    packed.seek(0)
+                    yield io.BufferedReader(packed)
+                    return
                 member = _only_member(archive, self.path)
                 self.name = _stem(Path(member.filename).name)
                 size = packed.getbuffer().nbytes
@@ -113,6 +133,63 @@ class FileContent:
             ) from error
         except (RuntimeError, NotImplementedError) as error:  # encrypted; unknown compression
             raise InputError(f"the zip cannot be unpacked: {error}", source=self.path) from error
+
+
+def sheet_text(path: Path) -> bytes:
+    """Return the longest sheet of an Excel workbook as tab-separated text.
+
+    Raises
+    ------
+    InputError
+        If the extra is not installed, or the workbook is damaged or larger than a log may be.
+    """
+    try:
+        import openpyxl  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise InputError(
+            "reading a workbook needs openpyxl",
+            source=path,
+            cure="install the extra: pip install 'cangauge[excel]', or export the sheet as CSV",
+        ) from error
+    try:
+        _refuse_large(path)
+        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
+        texts = [_sheet_rows(sheet) for sheet in book.worksheets]
+    except InputError:
+        raise
+    except Exception as error:  # openpyxl raises whatever a damaged part provokes
+        raise InputError(
+            f"the workbook is damaged ({type(error).__name__})",
+            source=path,
+            cure="save it again, or export the sheet as CSV",
+        ) from error
+    return max(texts, key=lambda text: text.count(b"\n"), default=b"")
+
+
+def _refuse_large(path: Path) -> None:
+    """Refuse a workbook that unpacks to more than a log may hold, before it is parsed."""
+    with zipfile.ZipFile(path) as archive:
+        parts = archive.infolist()
+    unpacked = sum(part.file_size for part in parts)
+    texts = sum(part.file_size for part in parts if part.filename.endswith("sharedStrings.xml"))
+    is_dense = unpacked > max(UNPACK_FREE_BYTES, UNPACK_RATIO * path.stat().st_size)
+    if unpacked > MAX_LOG_BYTES or texts > MAX_WORKBOOK_TEXTS or is_dense:
+        raise InputError(
+            f"the workbook unpacks to {unpacked >> 20} MiB ({texts >> 20} MiB of texts), more than"
+            " a log's",
+            source=path,
+            cure="export the sheet as CSV",
+        )
+
+
+def _sheet_rows(sheet: Any) -> bytes:
+    lines = io.StringIO()
+    writer = csv.writer(lines, delimiter="\t", lineterminator="\n")
+    for row in sheet.iter_rows(values_only=True):
+        cells = ["" if cell is None else str(cell) for cell in row]
+        if any(cells):
+            writer.writerow(cells)
+    return lines.getvalue().encode()
 
 
 def delimiter_of(line: str) -> str | None:
@@ -155,8 +232,7 @@ def _only_member(archive: zipfile.ZipFile, path: Path) -> zipfile.ZipInfo:
 
 
 def _as_utf8(data: bytes) -> bytes:
-    if data.startswith(b"\xef\xbb\xbf"):
-        return data[3:]
+    data = data.removeprefix(b"\xef\xbb\xbf")
     if data[:2] in {b"\xff\xfe", b"\xfe\xff"}:  # "Unicode text" of spreadsheets
         return data.decode("utf-16", errors="replace").encode()
     try:
@@ -177,7 +253,21 @@ def _first_lines(beginning: bytes) -> tuple[str, ...]:
 
 
 def _stem(name: str) -> str:
-    for suffix in (".gz", ".zip", ".csv", ".txt", ".tsv", ".parquet", ".pq", ".dat"):
+    for suffix in (
+        ".gz",
+        ".zip",
+        ".csv",
+        ".txt",
+        ".tsv",
+        ".parquet",
+        ".pq",
+        ".dat",
+        ".xlsx",
+        ".mpt",
+        ".bdf",
+        ".mf4",
+        ".mcap",
+    ):
         if name.lower().endswith(suffix):
             name = name[: -len(suffix)]
     return name.removesuffix(" Test Data")

@@ -1,4 +1,4 @@
-"""Third-party logs: BMW i3 trips, Argonne D3 tests, exports of battery cyclers.
+"""Third-party logs: BMW i3 trips, Argonne D3 tests, exports of cyclers, Battery Data Format.
 
 Each format has a test of the file's beginning (`is_…`) and a reader (`read_…`).
 """
@@ -270,17 +270,72 @@ class _Cycler:
     """Temperature in the file name."""
     sensors: str = ""
     """Beginning of the headings of temperature sensors; their mean is taken."""
+    ambient: str = ""
+    """Heading of the room's temperature, taken where there is no sensor."""
 
 
 _BITRODE: Final = _Cycler(
     "Bitrode", "time(s)", "current(a)", "voltage(v)", "exclude", -1.0, set_point=_HPPC
 )
 _CYCLERS: Final = (
-    _Cycler("Arbin", "test_time(s)", "current(a)", "voltage(v)", "step_index", -1.0, _SIGNED),
+    _Cycler(
+        "Arbin",
+        "test_time(s)",
+        "current(a)",
+        "voltage(v)",
+        "step_index",
+        -1.0,
+        set_point=_SIGNED,
+        sensors="aux_temperature",
+    ),
     _Cycler("ESC dynamic test", "time", "current", "voltage", "disah", +1.0, _SIGNED),
     _BITRODE,
     _Cycler(
         "VisuaLCN", "total time", "current", "voltage", "amp-hours", -1.0, sensors="temperature "
+    ),
+)
+# Battery Data Format of the Battery Data Alliance (package batterydf), with its labels and its
+# machine-readable names, and the schema of the package battery-data-standard. The former does not
+# state the sign: its net capacity is charge less discharge, so that positive charges, as in the
+# latter. All columns but three are optional, and may be empty.
+_BDF: Final = "Battery Data Format"
+BDF_LABELS: Final = {
+    "time_s": "Test Time / s",
+    "current_a": "Current / A",
+    "voltage_v": "Voltage / V",
+    "sensor": "Surface Temperature T1 / degC",
+    "ambient": "Ambient Temperature / degC",
+}
+_STANDARDS: Final = (
+    _Cycler(
+        _BDF,
+        "test time / s",
+        "current / a",
+        "voltage / v",
+        "test time / s",
+        -1.0,
+        sensors="surface temperature t",
+        ambient="ambient temperature / degc",
+    ),
+    _Cycler(
+        _BDF,
+        "test_time_second",
+        "current_ampere",
+        "voltage_volt",
+        "test_time_second",
+        -1.0,
+        sensors="temperature_t",
+        ambient="ambient_temperature_celsius",
+    ),
+    _Cycler(
+        "battery-data-standard",
+        "test_time_s",
+        "current_a",
+        "voltage_v",
+        "test_time_s",
+        -1.0,
+        sensors="temperature_t",
+        ambient="ambient_temperature_deg_c",
     ),
 )
 # Bitrode also exports without a header.
@@ -296,7 +351,7 @@ def _find_cycler(content: FileContent) -> tuple[_Cycler, list[str], int] | None:
     for number, line in enumerate(content.head[:_PREAMBLE_LINES]):
         header = split_cells(line, ",")
         names = {cell.lower() for cell in header}
-        for kind in _CYCLERS:
+        for kind in (*_CYCLERS, *_STANDARDS):
             if {kind.time, kind.current, kind.voltage, kind.must_have} <= names:
                 return kind, header, number + 1
     first = split_cells(content.head[0], ",")
@@ -333,6 +388,8 @@ def read_cycler(content: FileContent) -> DraftLog:
         for index, name in enumerate(names)
         if kind.sensors and name.startswith(kind.sensors)
     }
+    if kind.ambient and kind.ambient in names:
+        sensors["ambient"] = names.index(kind.ambient)
     excludes = {"exclude": names.index("exclude")} if kind.must_have == "exclude" else {}
     columns = read_columns(
         content,
@@ -351,9 +408,7 @@ def read_cycler(content: FileContent) -> DraftLog:
     if kind.discharge_sign < 0.0:
         draft.negate_current(f"{kind.name} stores discharge as negative")
     if sensors:
-        draft.values["temperature_c"] = np.mean([columns.numbers(each) for each in sensors], axis=0)
-        draft.temperature_source = "cell"
-        draft.remarks.append(f"temperature: mean of {len(sensors)} sensors")
+        _take_sensors(draft, {name: columns.numbers(name) for name in sensors})
     elif kind.set_point is not None:
         _take_set_point(draft, list(kind.set_point.finditer(content.path.name)))
     if excludes:
@@ -363,6 +418,20 @@ def read_cycler(content: FileContent) -> DraftLog:
             draft.remarks.append(f"{excluded.sum()} rows that the cycler excludes dropped")
             draft.keep(~excluded)
     return draft
+
+
+def _take_sensors(draft: DraftLog, sensors: dict[str, FloatArray]) -> None:
+    """Take the mean of the sensors on the cell, else the room's temperature."""
+    filled = {name: values for name, values in sensors.items() if np.isfinite(values).any()}
+    ambient = filled.pop("ambient", None)
+    if filled:
+        draft.values["temperature_c"] = np.mean(list(filled.values()), axis=0)
+        draft.temperature_source = "cell"
+        draft.remarks.append(f"temperature: mean of {len(filled)} sensors")
+    elif ambient is not None:
+        draft.values["temperature_c"] = ambient
+        draft.temperature_source = "room"
+        draft.remarks.append("temperature: the room's")
 
 
 def _take_set_point(draft: DraftLog, found: Sequence[re.Match[str]]) -> None:

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from cangauge._dataframes import ArrowExport
+from cangauge._display import figure
 from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.errors import InputError
 from cangauge.logs.units import (
     REQUIRED,
     TEMPERATURE_SOURCES,
     TemperatureSource,
-    known_temperature_source,
 )
 
 __all__ = ["TEMPERATURE_SOURCES", "Log", "TemperatureSource"]
@@ -46,6 +47,8 @@ class Log(ArrowExport):
         Location of the temperature sensor.
     remarks : tuple of str
         Changes and findings of the reader ("12 duplicated time stamps dropped").
+    assumed : tuple of str
+        How the columns of an arbitrary table were understood; empty where the format defines them.
 
     Raises
     ------
@@ -80,6 +83,7 @@ class Log(ArrowExport):
     source: str = ""
     temperature_source: TemperatureSource = "unknown"
     remarks: tuple[str, ...] = field(default=())
+    assumed: tuple[str, ...] = field(default=())
 
     def __post_init__(self) -> None:
         for channel in (*REQUIRED, "soc_pct"):
@@ -130,6 +134,8 @@ class Log(ArrowExport):
         name: str = "log",
         temperature_c: float | None = None,
         temperature_source: TemperatureSource | None = None,
+        columns: Mapping[str, Any] | str | None = None,
+        sign: Literal["charge", "discharge"] | None = None,
     ) -> Self:
         """Return the log of a pandas, polars or pyarrow table.
 
@@ -141,13 +147,19 @@ class Log(ArrowExport):
         table : DataFrame or Table
             Anything with the Arrow PyCapsule interface (`__arrow_c_stream__`). Columns in any
             order and case: `time_s` [s], `current_a` [A, positive = discharge], `voltage_v` [V],
-            `temperature_c` [°C], optionally `soc_pct` [%] and `temperature_source`.
+            `temperature_c` [°C], optionally `soc_pct` [%] and `temperature_source`; or any with
+            plain headings.
         name : str
             Short name of the log.
         temperature_c : float, optional
             Constant temperature [°C], in place of a column.
         temperature_source : {"cell", "pack", "coolant", "room", "unknown"}, optional
             Location of the temperature sensor, in place of the table's own.
+        columns : mapping or str, optional
+            Columns of other names: {"current": "I[mA]:-1"} or "time=t,current=I[mA]:-1"; the
+            heading, its unit in brackets, a factor. What it leaves out is found by plain headings.
+        sign : {"charge", "discharge"}, optional
+            What a positive current in the table does.
 
         Raises
         ------
@@ -167,18 +179,17 @@ class Log(ArrowExport):
         # Deferred: pyarrow takes 0.3 s to import, and the live service needs no tables.
         import pyarrow as pa  # noqa: PLC0415
 
-        from cangauge.logs.arrow import check_types, draft_from_table, find_fields  # noqa: PLC0415
+        from cangauge.logs.read import log_of_arrow  # noqa: PLC0415
 
-        arrow = pa.table(table)
-        names = [each for each in arrow.column_names if not each.startswith("__index_level_")]
-        places = find_fields(names, name)
-        arrow = arrow.select(names)
-        check_types(arrow.schema, places, name)
-        draft = draft_from_table(arrow, places, names, name=name, source="")
-        fields = draft.checked(temperature_c)
-        if temperature_source is not None:
-            fields["temperature_source"] = known_temperature_source(temperature_source)
-        return cls(**fields)
+        log = log_of_arrow(
+            pa.table(table),
+            name=name,
+            temperature_c=temperature_c,
+            temperature_source=temperature_source,
+            columns=columns,
+            sign=sign,
+        )
+        return cls(**{each.name: getattr(log, each.name) for each in fields(log)})
 
     def to_arrow(self) -> Any:
         """Return a pyarrow.Table of the columns; missing SoC is null.
@@ -191,6 +202,10 @@ class Log(ArrowExport):
         if self.soc_pct is not None:
             columns["soc_pct"] = self.soc_pct
         return build_table(columns, self.temperature_source)
+
+    def plot(self) -> Any:
+        """Return current, voltage, temperature and SoC over time, for `bokeh.plotting.show`."""
+        return figure("log_figure", self)
 
     def __len__(self) -> int:
         """Return the number of rows."""

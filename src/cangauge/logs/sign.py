@@ -21,6 +21,7 @@ from scipy import special
 
 from cangauge._typing import FloatArray, IntArray
 from cangauge.errors import InputError
+from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log
 
 Kind = Literal["steps", "charge", "soc"]
@@ -133,7 +134,7 @@ def require_discharge_positive(log: Log) -> None:
     finding = sign_of_current(log)
     if finding.sign < 0:
         evidence = finding.strongest
-        cure = "multiply the column by -1: positive current discharges"
+        cure = "multiply the column by -1: positive current discharges (or give --sign charge)"
         if evidence.kind == "soc":
             cure += "; or, if the current is right, correct soc_pct or leave it out"
         raise InputError(
@@ -230,9 +231,8 @@ def _ranks(values: FloatArray) -> FloatArray:
 
 
 def charge_ah(log: Log) -> FloatArray:
-    """Return the charge taken out since the first row [Ah], shape (n,), by trapezoids."""
-    parts = (log.current_a[1:] + log.current_a[:-1]) * np.diff(log.time_s) / 7200.0
-    return np.concatenate(([0.0], np.cumsum(parts)))
+    """Return the charge taken out since the first row [Ah], shape (n,); see `discharged_ah`."""
+    return discharged_ah(log.time_s, log.current_a)
 
 
 def spaced_rows(time_s: FloatArray, spacing_s: float) -> IntArray:
@@ -243,14 +243,16 @@ def spaced_rows(time_s: FloatArray, spacing_s: float) -> IntArray:
     return np.concatenate(([0], np.flatnonzero(np.diff(slot) > 0.0) + 1)).astype(np.intp)
 
 
-def resolve_sign(log: Log, *, stored_sign_unknown: bool) -> Log:
+def resolve_sign(log: Log, *, stored_sign_unknown: bool, is_stated: bool = False) -> Log:
     """Check the sign of current against the data; invert it only where the format leaves it open.
 
     Parameters
     ----------
     log : Log
     stored_sign_unknown : bool
-        The format does not define the sign of current (copies from CAN).
+        The format does not define the sign of current (copies from CAN, tables of any logger).
+    is_stated : bool
+        The user states the sign.
 
     Returns
     -------
@@ -259,12 +261,27 @@ def resolve_sign(log: Log, *, stored_sign_unknown: bool) -> Log:
     """
     finding = sign_of_current(log)
     if stored_sign_unknown and finding.sign < 0:
-        text = f"current negated, sign found from the data: {finding.strongest.text}"
-        return replace(log, current_a=0.0 - log.current_a, remarks=(*log.remarks, text))
-    if stored_sign_unknown and finding.sign == 0:
-        text = "sign of current unknown and undetermined by the data: kept as stored"
+        because = finding.strongest.text
+        text = f"current negated, sign found from the data: {because}"
+        log = replace(log, current_a=0.0 - log.current_a, remarks=(*log.remarks, text))
+        return _with_assumption(log, "positive current charges, found from the data")
+    if stored_sign_unknown and finding.sign > 0:
+        return _with_assumption(log, "positive current discharges, found from the data")
+    if stored_sign_unknown:
+        text = (
+            "sign of current unknown and undetermined by the data: kept as stored (--sign charge"
+            " inverts it)"
+        )
+        log = _with_assumption(log, "positive current discharges, not confirmed by the data")
     elif finding.sign < 0:
-        text = f"current looks inverted and was kept as stored: {finding.sentence}"
+        stated = "the stated sign of current" if is_stated else "current"
+        text = f"{stated} looks inverted and was kept as {'stated' if is_stated else 'stored'}:"
+        text = f"{text} {finding.sentence}"
     else:
         return log
     return replace(log, remarks=(*log.remarks, text))
+
+
+def _with_assumption(log: Log, text: str) -> Log:
+    """Add an assumption to those of a table's columns."""
+    return replace(log, assumed=(*log.assumed, text)) if log.assumed else log

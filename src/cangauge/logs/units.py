@@ -24,29 +24,49 @@ REQUIRED: Final = ("time_s", "current_a", "voltage_v", "temperature_c")
 # Spelling (lower case, without blanks) -> (factor, offset) to the unit of the canonical log.
 _UNITS: Final[dict[str, dict[str, tuple[float, float]]]] = {
     "time_s": {
-        **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), (1.0, 0.0)),
-        **dict.fromkeys(("ms", "msec"), (1e-3, 0.0)),
-        **dict.fromkeys(("min", "minutes"), (60.0, 0.0)),
-        **dict.fromkeys(("h", "hr", "hours"), (3600.0, 0.0)),
+        **dict.fromkeys(("s", "sec", "secs", "second", "seconds", "sek", "sekunden"), (1.0, 0.0)),
+        **dict.fromkeys(("ms", "msec", "millis", "milliseconds"), (1e-3, 0.0)),
+        **dict.fromkeys(("us", "µs", "μs", "usec", "microseconds"), (1e-6, 0.0)),
+        **dict.fromkeys(("ns", "nanoseconds"), (1e-9, 0.0)),
+        **dict.fromkeys(("min", "mins", "minutes", "minuten"), (60.0, 0.0)),
+        **dict.fromkeys(("h", "hr", "hrs", "hours", "stunden"), (3600.0, 0.0)),
+        **dict.fromkeys(("d", "days"), (86400.0, 0.0)),
     },
     "current_a": {
-        **dict.fromkeys(("a", "amp", "amps"), (1.0, 0.0)),
+        **dict.fromkeys(("a", "amp", "amps", "ampere", "adc"), (1.0, 0.0)),
         "ma": (1e-3, 0.0),
+        "ka": (1e3, 0.0),
     },
     "voltage_v": {
         **dict.fromkeys(("v", "volt", "volts"), (1.0, 0.0)),
         "mv": (1e-3, 0.0),
+        "vdc": (1.0, 0.0),
+        "kv": (1e3, 0.0),
     },
     "temperature_c": {
-        **dict.fromkeys(("c", "°c", "degc", "deg c", "celsius", "\ufffdc"), (1.0, 0.0)),
+        **dict.fromkeys(
+            ("c", "°c", "degc", "deg c", "deg. c", "celsius", "grad c", "℃", "º c", "ºc", "â°c"),
+            (1.0, 0.0),
+        ),
+        **dict.fromkeys(("\ufffdc", "grad celsius", "deg_c"), (1.0, 0.0)),
         **dict.fromkeys(("k", "kelvin"), (1.0, -273.15)),
-        **dict.fromkeys(("f", "°f", "degf", "fahrenheit"), (5.0 / 9.0, -160.0 / 9.0)),
+        **dict.fromkeys(
+            ("f", "°f", "degf", "deg f", "fahrenheit", "℉", "ºf", "â°f", "\ufffdf"),
+            (5.0 / 9.0, -160.0 / 9.0),
+        ),
     },
     "soc_pct": {
-        **dict.fromkeys(("%", "per", "pct", "percent"), (1.0, 0.0)),
-        **dict.fromkeys(("1", "-"), (100.0, 0.0)),
+        **dict.fromkeys(("%", "per", "pct", "percent", "prozent"), (1.0, 0.0)),
+        **dict.fromkeys(("1", "-", "0-1", "0..1", "fraction", "ratio", "pu"), (100.0, 0.0)),
     },
 }
+
+_FOREIGN: Final = (
+    "w kw wh kwh ah mah as nm rpm km/h kmh mph hz khz pa bar mbar ohm mohm ω mω v/s a/s k/s wh/kg"
+    " ah/kg mah/g m m/s kg l deg"
+)
+FOREIGN_UNITS: Final = frozenset(_FOREIGN.split())
+"""Units of quantities that no log holds; a heading with one of them is none of its columns."""
 
 # Plausible values, from a cell of 2 V to a truck's pack of 1000 V.
 MAX_VOLTAGE_V: Final = 1500.0
@@ -69,7 +89,7 @@ FOLLOWS: Final = 0.7
 """Agreement from which a column follows the current [-]. Real drives: voltages at least 0.89,
 temperatures at most 0.01; voltages under constant current at most 0.6."""
 
-_Refuse = Callable[[str, str, float, str], InputError]
+_Refuse = Callable[..., InputError]
 
 
 def known_temperature_source(
@@ -85,6 +105,17 @@ def known_temperature_source(
             cure=f"use one of: {', '.join(TEMPERATURE_SOURCES)}",
         )
     return cast("TemperatureSource", word)
+
+
+def unit_of(field: str, unit: str) -> tuple[float, float] | None:
+    """Return (factor, offset) from a unit to the canonical one of a field; None if unknown.
+
+    Examples
+    --------
+    >>> unit_of("current_a", "mA")
+    (0.001, 0.0)
+    """
+    return _UNITS[field].get(" ".join(unit.lower().split()))
 
 
 def convert(
@@ -112,26 +143,29 @@ def convert(
     InputError
         If the unit is not known for this quantity.
     """
-    spelling = unit.strip().lower()
-    if not spelling:
+    if not unit.strip():
         return values, None
-    try:
-        factor, offset = _UNITS[field][spelling]
-    except KeyError:
+    found = unit_of(field, unit)
+    if found is None:
         raise InputError(
             f"the unit is not known for {field}",
             source=str(source),
             field=label,
             value=unit,
             cure=f"convert it to one of: {', '.join(_UNITS[field])}",
-        ) from None
+        )
+    factor, offset = found
     if (factor, offset) == (1.0, 0.0):
         return values, None
     return values * factor + offset, f"{label}: converted from {unit} to {field}"
 
 
 def refuse_wrong_units(
-    values: dict[str, FloatArray], *, source: object, labels: dict[str, str]
+    values: dict[str, FloatArray],
+    *,
+    source: object,
+    labels: dict[str, str],
+    in_seconds: bool = False,
 ) -> tuple[str, ...]:
     """Raise InputError if the values cannot be in the canonical units.
 
@@ -143,6 +177,9 @@ def refuse_wrong_units(
         `time_s`, `current_a`, `voltage_v`, `temperature_c` (finite) and optionally `soc_pct`.
     source, labels : object, dict of str to str
         File, and heading by field, for messages.
+    in_seconds : bool
+        Whether the format fixes the unit of time, as a capture's does: rows may then be as close
+        as an accelerated replay makes them.
 
     Returns
     -------
@@ -150,12 +187,15 @@ def refuse_wrong_units(
         Remarks on possible but unusual values.
     """
 
-    def refuse(field: str, problem: str, value: float, cure: str) -> InputError:
+    def refuse(field: str, problem: str, value: float, cure: str, unit: str = "") -> InputError:
+        if unit and labels.get(field, field).lower() != field:
+            quantity = field.rpartition("_")[0]
+            cure += f" (or state the unit: --columns '{quantity}={labels[field]}[{unit}]')"
         return InputError(
             problem, source=str(source), field=labels.get(field, field), value=value, cure=cure
         )
 
-    _check_time(values, refuse)
+    _check_time(values, refuse, in_seconds=in_seconds)
     # Before the voltage: a temperature below 1 °C in its place looks like kilovolts or inverted.
     _check_swapped(values, labels.get("voltage_v", "voltage_v"), refuse)
     _check_voltage(values["voltage_v"], refuse)
@@ -187,14 +227,18 @@ def follows_current(current_a: FloatArray, values: FloatArray) -> bool:
     return bool(abs(agreement) >= FOLLOWS)
 
 
-def _check_time(values: dict[str, FloatArray], refuse: _Refuse) -> None:
+def _check_time(values: dict[str, FloatArray], refuse: _Refuse, *, in_seconds: bool) -> None:
     time = values["time_s"]
     if time.size < 2:
         return
     interval = float(np.median(np.diff(time)))
     if time[0] > _EPOCH_MS:
         raise refuse(
-            "time_s", "time looks like milliseconds since 1970", float(time[0]), "divide it by 1000"
+            "time_s",
+            "time looks like milliseconds since 1970",
+            float(time[0]),
+            "divide it by 1000",
+            "ms",
         )
     far = np.flatnonzero(np.abs(time) > MAX_STAMP_S)
     if far.size:
@@ -219,13 +263,15 @@ def _check_time(values: dict[str, FloatArray], refuse: _Refuse) -> None:
             f"rows are {interval:g} apart: time looks like milliseconds",
             interval,
             "divide it by 1000 (a log with a row every 90 s or more cannot be used)",
+            "ms",
         )
-    if 0.0 < interval < 1.0 / MAX_RATE_HZ:
+    if not in_seconds and 0.0 < interval < 1.0 / MAX_RATE_HZ:
         raise refuse(
             "time_s",
             f"rows are {interval:g} apart: time looks like hours or days",
             interval,
             "convert it to seconds",
+            "h",
         )
     _check_charge(time, values["current_a"], interval, refuse)
 
@@ -246,6 +292,7 @@ def _check_charge(time: FloatArray, current: FloatArray, interval: float, refuse
             " time looks like milliseconds",
             interval,
             "divide it by 1000",
+            "ms",
         )
 
 
@@ -277,13 +324,17 @@ def _may_be_temperature(values: FloatArray) -> bool:
 def _check_voltage(voltage: FloatArray, refuse: _Refuse) -> None:
     middle = float(np.median(voltage))
     if middle > MAX_VOLTAGE_V:
-        raise refuse("voltage_v", "voltage looks like millivolts", middle, "divide it by 1000")
+        raise refuse(
+            "voltage_v", "voltage looks like millivolts", middle, "divide it by 1000", "mV"
+        )
     if middle <= 0.0:
         raise refuse(
             "voltage_v", "the median voltage is not positive", middle, "check column and polarity"
         )
     if middle < 1.0:
-        raise refuse("voltage_v", "voltage looks like kilovolts", middle, "convert it to volts")
+        raise refuse(
+            "voltage_v", "voltage looks like kilovolts", middle, "convert it to volts", "kV"
+        )
     row = int(np.argmax(np.abs(voltage)))
     if abs(voltage[row]) > MAX_VOLTAGE_V:
         raise refuse(
@@ -311,6 +362,7 @@ def _check_current(current: FloatArray, refuse: _Refuse) -> None:
         f"current exceeds {MAX_CURRENT_A:g} A in row {row + 1}: it looks like milliamperes",
         float(current[row]),
         "divide it by 1000",
+        "mA",
     )
 
 
@@ -330,7 +382,7 @@ def _check_temperature(values: dict[str, FloatArray], refuse: _Refuse) -> tuple[
             voltage_follows = follows_current(values["current_a"], values["voltage_v"])
             if not voltage_follows and _may_be_temperature(values["voltage_v"]):
                 cure += ", or exchange it with the voltage if the two are swapped"
-            raise refuse("temperature_c", "temperature looks like kelvin", middle, cure)
+            raise refuse("temperature_c", "temperature looks like kelvin", middle, cure, "K")
     if not COLDEST_C <= middle <= HOTTEST_C:
         raise refuse(
             "temperature_c", "this is not a battery's temperature in °C", middle, "convert it to °C"
@@ -359,6 +411,7 @@ def _check_soc(soc: FloatArray, refuse: _Refuse) -> None:
             "SoC looks like a fraction of 1",
             high,
             "multiply it by 100 (or leave it out if it stays below 1 %)",
+            "-",
         )
     if high > 110.0 or low < -10.0:
         value = high if high > 110.0 else low

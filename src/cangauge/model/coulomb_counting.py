@@ -12,30 +12,33 @@ from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
+from cangauge.logs.gaps import BRIDGE_S, discharged_ah, split_where_moved
 from cangauge.logs.log import Log
 
-BRIDGE_S = 60.0
-"""No charge is counted over a longer gap in the current [s]: the pack is assumed to rest."""
+__all__ = [
+    "BRIDGE_S",
+    "capacity_from_full_discharge",
+    "capacity_from_reference",
+    "counted_soc_pct",
+    "difference_from_reference",
+    "discharged_ah",
+]
 
-FULL_PCT, EMPTY_PCT = 98.0, 2.0
-"""Reference SoC at the start (at least) and end (at most) of a log with the whole capacity [%]."""
+FULL_PCT, EMPTY_PCT = 95.0, 5.0
+"""SoC at the start (at least) and end (at most) of a log from full to empty [%]."""
 
 KNEE_STEEPNESS = 5.0
 """Ratio of the voltage's slope over charge at the end of a log to that in its middle, from which a
-log without reference SoC counts as discharged to empty."""
+log without reference SoC counts as discharged to empty, …"""
 
+EMPTY_VOLTAGE = 0.88
+"""… and the largest ratio of its last voltage without current to its first. From full to empty a
+cell falls to 0.80 of its voltage (layered oxides: 4.15 to 3.3 V at rest) or 0.87 (LFP: 3.35 to
+2.9 V); over half of its charge to no less than 0.89 (4.15 to 3.7 V)."""
 
-def discharged_ah(time_s: FloatArray, current_a: FloatArray) -> FloatArray:
-    """Return the charge discharged since the first row [Ah], shape (n,), by the trapezoidal rule.
-
-    Parameters
-    ----------
-    time_s, current_a : array of shape (n,)
-        Time [s] and current [A], positive = discharge. Steps longer than `BRIDGE_S` count nothing.
-    """
-    step_s = np.diff(time_s)
-    step_ah = np.where(step_s > BRIDGE_S, 0.0, (current_a[1:] + current_a[:-1]) * step_s / 7200.0)
-    return np.concatenate(([0.0], np.cumsum(step_ah)))
+TOLD_PCT = 1.0
+"""Difference between the counted SoC and the log's own over the log from which it is reported [%]:
+the resolution of a dashboard."""
 
 
 def counted_soc_pct(log: Log, capacity_ah: float, initial_soc_pct: float | None) -> FloatArray:
@@ -48,18 +51,64 @@ def counted_soc_pct(log: Log, capacity_ah: float, initial_soc_pct: float | None)
         Charge from 100 to 0 % [Ah].
     initial_soc_pct : float, optional
         SoC at the first row [%]. By default the count starts from the first finite value of the
-        log's reference SoC; a log without reference starts at 100 %.
+        log's reference SoC.
+
+    Raises
+    ------
+    InputError
+        If the SoC is known nowhere.
     """
     out = discharged_ah(log.time_s, log.current_a)
-    row, value = _start(log, initial_soc_pct)
+    start = _start(log, initial_soc_pct)
+    if start is None:
+        raise InputError(
+            "the SoC at the start is unknown: the log states none",
+            source=log.source or log.name,
+            field="soc_pct",
+            cure="give --initial-soc P, the SoC at the first row (100 for a log from full)",
+        )
+    row, value = start
     return np.asarray(value - 100.0 * (out - out[row]) / capacity_ah)
 
 
-def _start(log: Log, initial_soc_pct: float | None) -> tuple[int, float]:
-    """Return row and value of the SoC that counting starts from [%]; 100 % if it is unknown."""
-    if initial_soc_pct is not None:
-        return 0, initial_soc_pct
-    return log.first_soc() or (0, 100.0)
+def _start(log: Log, initial_soc_pct: float | None) -> tuple[int, float] | None:
+    """Return row and value of the SoC that counting starts from [%]; None if it is unknown."""
+    return (0, initial_soc_pct) if initial_soc_pct is not None else log.first_soc()
+
+
+def difference_from_reference(log: Log, capacity_ah: float) -> str | None:
+    """Return how much the counted charge differs from the log's own SoC, in a phrase, or None.
+
+    Parameters
+    ----------
+    log : Log
+    capacity_ah : float
+        Capacity that the count uses [Ah].
+
+    Returns
+    -------
+    str or None
+        Both changes and the capacity that the log implies; None where they agree within
+        `TOLD_PCT`, or the log has no reference that moves.
+    """
+    if log.soc_pct is None:
+        return None
+    known = np.flatnonzero(np.isfinite(log.soc_pct))
+    if known.size < 2:
+        return None
+    # A start stated for the first row is no reading of the log's own.
+    out = discharged_ah(log.time_s, log.current_a)[known]
+    soc = log.soc_pct[known]
+    ends = [int(np.argmax(soc)), int(np.argmin(soc))]
+    own = float(soc[ends[0]] - soc[ends[1]])
+    counted = float(100.0 * (out[ends[1]] - out[ends[0]]) / capacity_ah)
+    if abs(counted - own) < TOLD_PCT or own < TOLD_PCT:
+        return None
+    implied = 100.0 * float(out[ends[1]] - out[ends[0]]) / own
+    return (
+        f"{log.name}: counted {counted:.1f} %, the log's own SoC says {own:.1f} %: its capacity"
+        f" would be {implied:.1f} Ah, not {capacity_ah:.1f} Ah"
+    )
 
 
 def capacity_from_reference(logs: Sequence[Log]) -> float:
@@ -71,7 +120,7 @@ def capacity_from_reference(logs: Sequence[Log]) -> float:
         If no log has a reference SoC that moves by at least 1 %.
     """
     covariance = variance = 0.0
-    for log in logs:
+    for log in [piece for whole in logs for piece in split_where_moved(whole)]:
         if log.soc_pct is None:
             continue
         known = np.isfinite(log.soc_pct)
@@ -90,21 +139,36 @@ def capacity_from_reference(logs: Sequence[Log]) -> float:
     return -100.0 * covariance / variance
 
 
-def capacity_from_full_discharge(logs: Sequence[Log], initial_soc_pct: float | None) -> float:
-    """Return the capacity from the first log that runs from full to empty [Ah].
+def capacity_from_full_discharge(
+    logs: Sequence[Log], initial_soc_pct: float | Sequence[float | None] | None
+) -> float:
+    """Return the capacity from the first log that is proven to run from full to empty [Ah].
+
+    Proof is the log's own SoC at both ends; or, for a log without, a stated start near full and a
+    voltage that ends in the knee of an empty pack, at the voltage of one.
+
+    Parameters
+    ----------
+    logs : sequence of Log
+    initial_soc_pct : float, sequence of float or None, optional
+        Stated SoC at the first row, of all logs or of each [%].
 
     Raises
     ------
     InputError
-        If no log runs from full to empty.
+        If no log is.
     """
-    for log in logs:
-        capacity = _whole_capacity_ah(log, initial_soc_pct)
-        if capacity is not None:
-            return capacity
+    if initial_soc_pct is None or isinstance(initial_soc_pct, int | float):
+        initial_soc_pct = [initial_soc_pct] * len(logs)
+    for log, initial in zip(logs, initial_soc_pct, strict=True):
+        for k, piece in enumerate(split_where_moved(log)):
+            capacity = _whole_capacity_ah(piece, initial if k == 0 else None)
+            if capacity is not None:
+                return capacity
     raise InputError(
-        f"unknown capacity: no log runs from full to empty ({FULL_PCT:.0f} % or more to"
-        f" {EMPTY_PCT:.0f} % or less)",
+        f"unknown capacity: no log is proven to run from full to empty (its own SoC from"
+        f" {FULL_PCT:.0f} % or more to {EMPTY_PCT:.0f} % or less; or --initial-soc of"
+        f" {FULL_PCT:.0f} % or more, and a voltage that ends in the knee)",
         source=logs[0].source or logs[0].name,
         field="capacity_ah",
         cure="give --capacity-ah A, or --capacity-ah from-soc for the charge per 100 % of the logs'"
@@ -113,10 +177,11 @@ def capacity_from_full_discharge(logs: Sequence[Log], initial_soc_pct: float | N
 
 
 def _whole_capacity_ah(log: Log, initial_soc_pct: float | None) -> float | None:
-    out = discharged_ah(log.time_s, log.current_a)
-    first_row, first = _start(log, initial_soc_pct)
-    if first < FULL_PCT:
+    start = _start(log, initial_soc_pct)
+    if start is None or start[1] < FULL_PCT:
         return None
+    out = discharged_ah(log.time_s, log.current_a)
+    first_row, first = start
     if log.soc_pct is not None and np.isfinite(log.soc_pct).sum() > 1:
         last_row = int(np.flatnonzero(np.isfinite(log.soc_pct))[-1])
         last = float(log.soc_pct[last_row])
@@ -144,4 +209,12 @@ def _ends_in_the_knee(log: Log, out_ah: FloatArray) -> bool:
         columns = np.column_stack([np.ones(rows.sum()), out[rows], current[rows]])
         return -float(np.linalg.lstsq(columns, volts[rows], rcond=None)[0][1])
 
-    return fall_per_ah(near_end) > KNEE_STEEPNESS * max(fall_per_ah(middle), 0.0)
+    first = out < 0.02 * total
+    ohm = -float(np.linalg.lstsq(
+        np.column_stack([np.ones(middle.sum()), out[middle], current[middle]]),
+        volts[middle], rcond=None,
+    )[0][2])  # fmt: skip
+    rest = volts + max(ohm, 0.0) * current
+    falls_to = float(np.min(rest[near_end]) / np.median(rest[first])) if first.any() else 1.0
+    is_steep = fall_per_ah(near_end) > KNEE_STEEPNESS * max(fall_per_ah(middle), 0.0)
+    return is_steep and falls_to <= EMPTY_VOLTAGE

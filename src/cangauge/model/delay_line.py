@@ -115,21 +115,20 @@ class DelayLine:
 
     def currents(self) -> list[float]:
         """Return I(t − dj) [A] for each delay, t being the newest sample's time."""
+        return [self.current_at(delay) for delay in self._delays]
+
+    def current_at(self, ago_s: float) -> float:
+        """Return I(t − `ago_s`) [A], t being the newest sample's time; see `currents`."""
         times, currents = self._times, self._currents
-        now = times[-1]
-        result = []
-        for delay in self._delays:
-            at = now - delay
-            right = bisect_right(times, at)
-            if right == 0:
-                result.append(currents[0])
-            elif right == len(times):
-                result.append(currents[-1])
-            else:
-                t0, t1 = times[right - 1], times[right]
-                c0, c1 = currents[right - 1], currents[right]
-                result.append(c0 + (c1 - c0) * (at - t0) / (t1 - t0))
-        return result
+        at = times[-1] - ago_s
+        right = bisect_right(times, at)
+        if right == 0:
+            return currents[0]
+        if right == len(times):
+            return currents[-1]
+        t0, t1 = times[right - 1], times[right]
+        c0, c1 = currents[right - 1], currents[right]
+        return c0 + (c1 - c0) * (at - t0) / (t1 - t0)
 
     @property
     def contents(self) -> tuple[list[float], list[float], float]:

@@ -6,7 +6,7 @@ import json
 import math
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 import numpy as np
 from pydantic import (
@@ -22,13 +22,15 @@ from cangauge._config import schema_error
 from cangauge._io import (
     MAX_MODEL_BYTES,
     MAX_MODEL_COLUMNS,
+    MAX_MODEL_EFFECTS,
     MAX_MODEL_ITEMS,
     read_bounded,
+    time_limit,
     write_text_atomic,
 )
 from cangauge.errors import InputError
 from cangauge.logs.log import Log, TemperatureSource
-from cangauge.model.effects.base import Pack, Signals
+from cangauge.model.effects.base import RESISTANCE_AT_LEAST, Pack, Signals
 from cangauge.model.effects.library import parse_effects
 from cangauge.model.extended import ExtendedModel, Prediction
 from cangauge.model.voltage_model import BASIS_NAMES, VoltageModel
@@ -38,11 +40,10 @@ MODEL_VERSION = 1
 MAX_CURVE_KNOTS, MAX_CURVE_FUNCTIONS = 201, 16
 _CURE = "create the file with `cangauge fit`"
 
-_Finite = Annotated[float, Field(allow_inf_nan=False)]
-_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 # Wider than any pack needs, narrow enough that no voltage overflows.
 _Value = Annotated[float, Field(ge=-1e12, le=1e12)]
+_Scale = Annotated[float, Field(ge=1e-12, le=1e12)]
 _Soc = Annotated[float, Field(ge=-10, le=110)]
 _Celsius = Annotated[float, Field(ge=-273.15, le=1000)]
 _Ampere = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -128,9 +129,9 @@ class Information(_Strict):
     """
 
     columns: Annotated[list[str], _Columns]
-    scale: Annotated[list[_Positive], _Columns]
-    root: Annotated[list[Annotated[list[_Finite], _Columns]], _Columns]
-    projected: Annotated[list[_Finite], _Columns]
+    scale: Annotated[list[_Scale], _Columns]
+    root: Annotated[list[Annotated[list[_Value], _Columns]], _Columns]
+    projected: Annotated[list[_Value], _Columns]
 
     @model_validator(mode="after")
     def _shapes(self) -> Self:
@@ -138,6 +139,9 @@ class Information(_Strict):
         lengths = [len(self.scale), len(self.projected), len(self.root), *map(len, self.root)]
         if any(length != n for length in lengths):
             raise ValueError(f"shapes differ: {n} columns need {n} × {n} numbers")
+        # RᵀR is symmetric and semidefinite for any R; R is triangular if it is a QR's.
+        if any(any(row[:place]) for place, row in enumerate(self.root)):
+            raise ValueError("root: must be upper triangular")
         return self
 
 
@@ -176,7 +180,7 @@ class Model(_Strict):
     delays_s: Annotated[list[_Delay], Field(min_length=1, max_length=64)]
     rate_hz: Annotated[float, Field(ge=1e-3, le=1e4)]
     capacity_ah: Annotated[float, Field(ge=1e-3, le=1e5)]
-    effects: Annotated[list[dict[str, object]], _Items] = []
+    effects: Annotated[list[dict[str, object]], Field(max_length=MAX_MODEL_EFFECTS)] = []
     temperature_source: TemperatureSource
     range: Ranges
     noise: ModelNoise
@@ -239,12 +243,26 @@ class Model(_Strict):
         Raises
         ------
         InputError
-            If the pseudo-OCV does not rise with SoC, an effect is unknown, or a parameter is out
-            of bounds.
+            If a coefficient is physically impossible for the pack, an effect is unknown, or a
+            parameter is out of bounds.
         """
         model = self.voltage_model()
+        _check_voltage(model)
+        _check_coefficients(model, self.capacity_ah)
+        self._check_noise(model)
         effects = parse_effects(self.effects, Pack.of(model, self.capacity_ah))
         return ExtendedModel(model, self.capacity_ah, tuple(effects))
+
+    def _check_noise(self, model: VoltageModel) -> None:
+        volts = model.pseudo_ocv_at(50.0)[0]
+        for name in ("fast_std_v", "slow_std_v", "lasting_std_v"):
+            if getattr(self.noise, name) > volts:
+                raise InputError(
+                    f"is more than the {volts:.4g} V of the pack",
+                    field=f"noise.{name}",
+                    value=getattr(self.noise, name),
+                    cure="check the value and its unit",
+                )
 
     @classmethod
     def load(cls, path: Path | str) -> Model:
@@ -256,6 +274,11 @@ class Model(_Strict):
             If the file cannot be read or does not describe a usable model; names the field.
         """
         path = Path(path)
+        with time_limit(path):
+            return cls._load(path)
+
+    @classmethod
+    def _load(cls, path: Path) -> Model:
         data = read_bounded(path, MAX_MODEL_BYTES, "a model file")
         try:
             raw = json.loads(data, parse_constant=_refuse_constant)
@@ -328,6 +351,65 @@ class Model(_Strict):
         signals = Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
         rows = np.arange(len(log))
         return self.extended_model().predict(signals, soc_pct, rows, initial_row=row)
+
+
+HIGHEST_VOLTS: Final = 1e4
+"""Largest pseudo-OCV [V]: electrical systems of vehicles and stores stay below 1.5 kV."""
+VOLTAGE_RATIO: Final = 3.0
+"""Largest ratio of the pseudo-OCV of a full pack to that of an empty one [-]: lithium cells are
+used between 2.0 and 4.4 V, lead and nickel cells over a narrower range."""
+DROP_AT_1C: Final = 1.0
+"""Largest voltage that one resistance drops at 1 C, relative to the pseudo-OCV [-]: such a pack
+could not be discharged in an hour at all. 0.02 for a Leaf, 0.3 for a small cell in the cold."""
+SLOPE_BY_TEMPERATURE: Final = 0.01
+"""Largest temperature coefficient relative to the pseudo-OCV [1/K]; 0.002 as published for a Leaf,
+0.0003 by the entropy of the cells."""
+
+
+def _check_voltage(model: VoltageModel) -> None:
+    """Raise InputError for a pseudo-OCV that no pack has; it rises, so its ends suffice."""
+    (low, high), middle = model.pseudo_ocv([*model.soc_range_pct]), model.pseudo_ocv_at(50.0)[0]
+    low, high = min(low, middle), max(high, middle)
+    if not (low > 0.0 and high <= min(HIGHEST_VOLTS, VOLTAGE_RATIO * low)):
+        raise InputError(
+            f"the pseudo-OCV of {low:.5g} … {high:.5g} V is not that of a battery",
+            field="coefficients",
+            cure="check k0 … k7 and their unit (V), or create the file with `cangauge fit`",
+        )
+
+
+def _check_coefficients(model: VoltageModel, capacity_ah: float) -> None:
+    """Raise InputError for a resistance or temperature coefficient beyond the size of the pack."""
+    pack = Pack.of(model, capacity_ah)
+    largest = DROP_AT_1C * pack.voltage_v / capacity_ah
+    for name, value in zip(
+        resistance_names(len(model.resistance_ohm)), model.resistance_ohm, strict=True
+    ):
+        if abs(value) > largest:
+            raise InputError(
+                f"must lie within ±{largest:.3g} ohm for a pack of {pack.voltage_v:.4g} V and"
+                f" {capacity_ah:.4g} Ah",
+                field=f"coefficients.{name}.value",
+                value=value,
+                cure="check the value and its unit, or the capacity",
+            )
+    # A log of constant current leaves the sign open, and there the resistances cancel.
+    (low_a, high_a), total = model.current_range_a, sum(model.resistance_ohm)
+    if total * (high_a - low_a) > RESISTANCE_AT_LEAST * pack.voltage_v:
+        raise InputError(
+            "the sum of the resistances is positive, so that discharging would raise the voltage",
+            field="coefficients",
+            value=total,
+            cure="positive current discharges, so resistances are negative",
+        )
+    steepest = SLOPE_BY_TEMPERATURE * pack.voltage_v
+    if abs(model.kt_v_per_k) > steepest:
+        raise InputError(
+            f"must lie within ±{steepest:.3g} V/K for a pack of {pack.voltage_v:.4g} V",
+            field="coefficients.kt.value",
+            value=model.kt_v_per_k,
+            cure="check the value and its unit",
+        )
 
 
 def resistance_names(number: int) -> list[str]:

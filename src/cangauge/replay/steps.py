@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import NamedTuple, Protocol
 
 import can
 import numpy as np
+from can.typechecking import Channel
 
 from cangauge.bus.captures.capture import open_capture
 from cangauge.bus.decoder import SampleDecoder
@@ -74,18 +76,18 @@ class LogSource:
 
     def __init__(self, log: Log, vehicle: Vehicle) -> None:
         self.name = log.name
-        self._log = log
+        self.log = log
         self.vehicle = vehicle
         FrameEncoder(vehicle).check_range(log)
 
     @property
     def duration_s(self) -> float:
         """Length [s]."""
-        return self._log.duration_s
+        return self.log.duration_s
 
     def steps(self, *, loop: bool) -> Iterator[Step]:
         """Yield a step per row; repetitions follow one typical step later."""
-        log = self._log
+        log = self.log
         soc_pct = np.full(len(log), math.nan) if log.soc_pct is None else log.soc_pct
         columns = (log.time_s, log.current_a, log.voltage_v, log.temperature_c, soc_pct)
         rows = list(zip(*(column.tolist() for column in columns), strict=True))
@@ -160,17 +162,19 @@ class CaptureSource:
         """Yield the frames to send, stamped with log time."""
         self.dropped = 0
         ids = self._ids
-        clock: ReceiveTime | ReplayClock = ReceiveTime()
+        clock: ReplayClock | None = None
         if any(is_clock(message, ids.replay_clock) for message in self._messages()):
             clock = ReplayClock(ids.replay_clock)
-        own = {ids.soc_estimate, ids.soc_detail, ids.replay_clock}
+        # The stamps of two buses can be of two adapters.
+        stamps: defaultdict[Channel | None, ReceiveTime] = defaultdict(ReceiveTime)
+        own = {*ids.published, ids.replay_clock}
         for message in self._messages():
-            time_s = clock.time_of(message)
+            time_s = (clock or stamps[message.channel]).time_of(message)
             is_own = message.arbitration_id in own and not message.is_extended_id
             if time_s is None or is_own or message.is_error_frame:
                 self.dropped += 1
                 continue
-            if clock.beginnings:
+            if clock is not None and clock.beginnings:
                 raise InputError(
                     "holds several consecutive replays",
                     source=self._path,

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from cangauge._formatting import number
 from cangauge._typing import FloatArray
-from cangauge.inference.rows import usual_gap_s
+from cangauge.logs.gaps import usual_gap_s
 from cangauge.model.delay_line import GAP_S
 from cangauge.service.offline import Recorded
 

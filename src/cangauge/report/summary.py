@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from html import escape
 from typing import Any, Final
 
 from cangauge._formatting import number, significant, span
@@ -167,3 +168,38 @@ def parameters_text(parameters: dict[str, dict[str, Any]], separator: str = ", "
 def percent_span(low: float, high: float) -> str:
     """Return a range of fractions in %."""
     return span(100.0 * low, 100.0 * high, 0, "%")
+
+
+SHOWN_IN_NOTEBOOK: Final = 5
+
+
+def diagnosis_html(found: Diagnosis) -> str:
+    """Return a diagnosis as a compact HTML block: verdict, sizes, probabilities, caveats.
+
+    Parameters
+    ----------
+    found : Diagnosis
+    """
+    texts = [headline(found), found.summary, open_question(found), next_step(found)]
+    paragraphs = [f"<p>{escape(text)}</p>" for text in texts[1:] if text]
+    by_effect = {str(item["effect"]): item for item in found.candidates}
+    ordered = sorted(found.verdict.probabilities.items(), key=lambda item: -item[1])
+    rows = []
+    for name, probability in ordered[:SHOWN_IN_NOTEBOOK]:
+        item = by_effect.get(name)
+        parameters = parameters_text(item["parameters"]) if item and item["parameters"] else ""
+        error = number(item["rmse_v"] if item else None, 2, "V")
+        cells = (name, number(probability, 2), error, parameters)
+        tag = "th" if name == found.verdict.cause else "td"
+        rows.append("".join(f"<{tag} style='text-align:left'>{escape(c)}</{tag}>" for c in cells))
+    head = "".join(
+        f"<th style='text-align:left'>{text}</th>"
+        for text in ("cause", "probability", "error with it, held out", "parameters")
+    )
+    table = "".join(f"<tr>{row}</tr>" for row in (head, *rows))
+    caveats = "".join(f"<li>{escape(text)}</li>" for text in found.caveats)
+    limits = f"<details><summary>What these logs cannot show</summary><ul>{caveats}</ul></details>"
+    return (
+        f"<div><h4>{escape(texts[0])}</h4>{''.join(paragraphs)}<table>{table}</table>"
+        f"{limits if caveats else ''}</div>"
+    )

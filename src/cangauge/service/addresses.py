@@ -8,6 +8,7 @@ owner and group.
 from __future__ import annotations
 
 import ipaddress
+import logging
 import os
 import re
 import socket
@@ -18,7 +19,11 @@ from os import PathLike
 from pathlib import Path
 from typing import Final
 
+from cangauge._io import open_regular
+from cangauge._logging import emit
 from cangauge.errors import InputError
+
+_LOG = logging.getLogger(__name__)
 
 TOKEN_VARIABLE: Final = "CANGAUGE_HTTP_TOKEN"  # noqa: S105 - the variable's name, no secret
 LOOPBACK: Final = "127.0.0.1"
@@ -126,19 +131,21 @@ def read_token(path: str | PathLike[str] | None, environment: Mapping[str, str])
     if path is None:
         given = environment.get(TOKEN_VARIABLE)
         return None if given is None else _checked(given, TOKEN_VARIABLE)
+    with open_regular(path) as file:
+        rights = os.fstat(file.fileno()).st_mode
+        data = file.read(LONGEST_TOKEN + 2)
+    if rights & (stat.S_IROTH | stat.S_IWOTH):
+        emit(
+            _LOG,
+            logging.WARNING,
+            "http.token_exposed",
+            f"{path}: every user of this machine can read or change this token: chmod 600 it",
+            path=str(path),
+        )
     try:
-        with Path(path).open("rb") as file:
-            content = file.read(LONGEST_TOKEN + 2).decode("utf-8")
-    except FileNotFoundError as error:
-        raise InputError(
-            "no such file", source=path, field="http_token_file", cure="check the path"
-        ) from error
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or "not UTF-8 text"
-        raise InputError(
-            f"cannot be read: {reason}", source=path, field="http_token_file"
-        ) from error
-    return _checked(content, str(path))
+        return _checked(data.decode("utf-8"), str(path))
+    except UnicodeDecodeError as error:
+        raise InputError("not UTF-8 text", source=path, field="http_token_file") from error
 
 
 def _checked(content: str, source: str) -> str:

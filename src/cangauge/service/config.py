@@ -47,6 +47,7 @@ from cangauge.bus.publish import FrameIds
 from cangauge.bus.time_source import TimeSourceName
 from cangauge.bus.vehicle import PRESETS, Vehicle
 from cangauge.errors import InputError
+from cangauge.estimation.power import PackLimits
 from cangauge.estimation.settings import (
     VALID_STD_PCT,
     EstimatorSettings,
@@ -140,6 +141,16 @@ class IdsConfig(_Strict):
     replay_clock: int = _key(
         0x5AF, "Id of REPLAY_CLOCK.", "ID", "--replay-clock-id", ge=0, le=0x7FF, needs_restart=True
     )
+    soc_health: int = _key(0x5A2, "Id of SOC_HEALTH.", "ID", "--soc-health-id", ge=0, le=0x7FF)
+    soc_power: int = _key(0x5A3, "Id of SOC_POWER.", "ID", "--soc-power-id", ge=0, le=0x7FF)
+    soc_cells: int = _key(
+        0x5A4,
+        "Id of SOC_CELLS, sent where the vehicle gives cell voltages.",
+        "ID",
+        "--soc-cells-id",
+        ge=0,
+        le=0x7FF,
+    )
 
 
 class ChecksConfig(_Strict):
@@ -169,6 +180,51 @@ class LongRestConfig(_Strict):
     )
     soc_std_pct: FiniteFloat = _key(
         2.0, "Standard deviation of the SoC by its voltage.", unit="%", ge=0.01, le=100.0
+    )
+
+
+class LimitsConfig(_Strict):
+    """Limits for the possible currents and the energy left; see `PackLimits`."""
+
+    min_voltage_v: FiniteFloat | None = _key(
+        None,
+        "Lowest pack voltage.",
+        unit="V",
+        default_text="the pseudo-OCV at the lower end of the identified SoC",
+        ge=0.0,
+        le=1e4,
+    )
+    max_voltage_v: FiniteFloat | None = _key(
+        None,
+        "Highest pack voltage.",
+        unit="V",
+        default_text="the pseudo-OCV at the upper end of the identified SoC",
+        ge=0.0,
+        le=1e4,
+    )
+    max_discharge_a: FiniteFloat | None = _key(
+        None,
+        "Largest discharge current.",
+        unit="A",
+        default_text="the largest that the model was identified on",
+        ge=0.0,
+        le=1e4,
+    )
+    max_charge_a: FiniteFloat | None = _key(
+        None,
+        "Largest charge current, positive.",
+        unit="A",
+        default_text="the largest that the model was identified on",
+        ge=0.0,
+        le=1e4,
+    )
+    cutoff_soc_pct: FiniteFloat | None = _key(
+        None,
+        "SoC at which the energy ends; it also ends at the lowest voltage.",
+        unit="%",
+        default_text="the lower end of the identified SoC",
+        ge=0.0,
+        le=100.0,
     )
 
 
@@ -288,10 +344,11 @@ class RunConfig(_Strict):
     )
     record: str | None = _key(
         None,
-        "Record the received frames (.log, .csv, .blf, .mf4): `cangauge estimate` on them gives"
-        " the live numbers, bit for bit. A kill loses the last half second, or a whole part of an"
-        " .mf4. A full disk costs frames of the recording, never the estimate. An existing"
-        " recording is kept: the next run is FILE-0001, FILE-0002, …",
+        "Record the received frames (.log, .csv, .blf, .mf4, .mcap): `cangauge estimate` on them"
+        " gives the live numbers, bit for bit; an .mcap also holds the estimates. A kill loses the"
+        " last half second, the last 64 KiB of an .mcap, or a whole part of an .mf4. A full disk"
+        " costs frames of the recording, never the estimate. An existing recording is kept: the"
+        " next run is FILE-0001, FILE-0002, …",
         "FILE",
         needs_restart=True,
         is_path=True,
@@ -374,6 +431,7 @@ class RunConfig(_Strict):
     )
     full_charge: FullChargeConfig | None = _key(None, "Set the SoC when the pack is full.")
     long_rest: LongRestConfig | None = _key(None, "Correct the SoC by the voltage of long rests.")
+    limits: LimitsConfig = _key(LimitsConfig(), "Limits of the possible currents.")
     http: str | None = _key(
         None,
         "Serve /status, /healthz and /metrics (extra `metrics`) there, e.g. 127.0.0.1:9464. An"
@@ -445,6 +503,7 @@ class RunConfig(_Strict):
                 temperature_source=self.temperature_source or "unknown",
                 full_charge=None if full is None else FullCharge(**full.model_dump()),
                 long_rest=None if rest is None else LongRest(**rest.model_dump()),
+                limits=PackLimits(**self.limits.model_dump()),
             ),
             time_source=self.time_source,
             ids=FrameIds(**self.ids.model_dump()),

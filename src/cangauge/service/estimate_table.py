@@ -40,19 +40,20 @@ _PLAIN_CSV: Final = pacsv.WriteOptions(include_header=False, quoting_style="none
 _BLOCK_ROWS: Final = 4096
 _ROW_BYTES: Final = 400
 """Memory of a row in Python objects [bytes], roughly."""
-_CLOSE_WITHIN_S: Final = 30.0
+_CLOSE_WITHIN_S: Final = 3.0
+"""Time limit for writing the rest at the end [s]: blocks of rows are written while it runs."""
 _LOG = logging.getLogger(__name__)
 
 
-def require_table_suffix(output: Path) -> None:
+def require_table_suffix(output: Path, option: str = "--output") -> None:
     """Raise InputError unless the file is named .csv or .parquet."""
     if output.suffix.lower() not in {".csv", ".parquet"}:
         raise InputError(
             "the suffix is neither .csv nor .parquet",
             source=output,
-            field="--output",
+            field=option,
             value=output.suffix,
-            cure="name it .csv or .parquet",
+            cure="name it .csv or .parquet (`cangauge estimate` also writes .mcap)",
         )
 
 
@@ -132,6 +133,7 @@ class EstimateWriter:
         self._names: dict[int, str] = {}
         self._stack = ExitStack()
         self._sink: Any = None
+        self._part = self._path
         self._writer = AsyncWriter(
             "cangauge-table", max_waiting_bytes=64 << 20, on_error=self._abandon
         )
@@ -139,7 +141,7 @@ class EstimateWriter:
         self.failed = False
 
     def __enter__(self) -> Self:
-        part = self._stack.enter_context(atomic_path(self._path))
+        part = self._part = self._stack.enter_context(atomic_path(self._path))
         if self._path.suffix.lower() == ".csv":
             file = self._stack.enter_context(part.open("wb"))
             _write_header(file)
@@ -158,7 +160,11 @@ class EstimateWriter:
             self._submit()
             self._writer.submit(lambda: None if self.failed else self._sink.close())
         if self._writer.close(_CLOSE_WITHIN_S):
+            # The thread may hang in the file, and whatever else closes it would hang as well.
             self._abandon(TimeoutError("the disk is too slow"))
+            with suppress(OSError):
+                self._part.unlink()
+            return
         if kind is None and not self.failed:
             self._stack.__exit__(None, None, None)
             return

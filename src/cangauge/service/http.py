@@ -15,6 +15,7 @@ import logging
 import socket
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -36,9 +37,15 @@ if TYPE_CHECKING:
 MAX_HEADER_BYTES: Final = 8192
 MAX_BODY_BYTES: Final = 1024
 MAX_CLIENTS: Final = 32
-"""Most simultaneous connections; further ones are closed, to save file descriptors."""
+"""Most simultaneous connections, to save file descriptors. A further one takes the place of the
+slowest of the peer that has most: whoever holds many places cannot keep a health probe out."""
+ACCEPTS_PER_TURN: Final = 16
+"""Connections accepted before others are served."""
+EXHAUSTED_S: Final = 1.0
+"""Pause of accepting after the system had no descriptor or memory left [s]."""
 REQUEST_WITHIN_S: Final = 3.0
 """Time limit for receiving a request [s]."""
+_EXHAUSTED: Final = {errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM}
 CLOSE_WITHIN_S: Final = 0.3
 """Time limit for the thread to end [s]; it is a daemon."""
 
@@ -151,30 +158,77 @@ class Endpoint:
     async def _serve(self) -> None:
         self._done = asyncio.Event()
         self._loop = asyncio.get_running_loop()
-        for server, sockets in self._servers:
-            server.add_sockets(sockets)
+        doors = [_Door(server, each) for server, sockets in self._servers for each in sockets]
+        for door in doors:
+            door.open()
         await self._done.wait()
-        for server, _ in self._servers:
-            server.stop()
+        for door in doors:
+            door.close()
 
 
 class _Server(HTTPServer):
     """Limit the number of simultaneous connections."""
 
     def initialize(self, *args: Any, **kwargs: Any) -> None:
-        self._clients = 0
+        self._clients: dict[IOStream, str] = {}  # with their peers, the oldest first
         super().initialize(*args, **kwargs)
 
     def handle_stream(self, stream: IOStream, address: Any) -> None:
-        if self._clients >= MAX_CLIENTS:
-            stream.close()
-            return
-        self._clients += 1
+        if len(self._clients) >= MAX_CLIENTS:
+            self.drop_slowest()
+        self._clients[stream] = str(address[0]) if isinstance(address, tuple) else ""
         super().handle_stream(stream, address)
 
-    def on_close(self, server_conn: object) -> None:
-        self._clients -= 1
+    def drop_slowest(self) -> bool:
+        """Close the oldest connection of the peer that has most; return False if there is none."""
+        if not self._clients:
+            return False
+        [(crowd, _)] = Counter(self._clients.values()).most_common(1)
+        slowest = next(stream for stream, peer in self._clients.items() if peer == crowd)
+        del self._clients[slowest]
+        slowest.close()
+        return True
+
+    def on_close(self, server_conn: Any) -> None:
+        self._clients.pop(server_conn.stream, None)
         super().on_close(server_conn)
+
+
+class _Door:
+    """Accept the connections of a listening socket.
+
+    tornado's own loop would accept again at once, forever, while no descriptor is left.
+    """
+
+    def __init__(self, server: _Server, listening: socket.socket) -> None:
+        self._server = server
+        self._listening = listening
+        self._loop = asyncio.get_running_loop()
+
+    def open(self) -> None:
+        self._loop.add_reader(self._listening, self._accept)
+
+    def close(self) -> None:
+        self._loop.remove_reader(self._listening)
+
+    def _accept(self) -> None:
+        for _ in range(ACCEPTS_PER_TURN):
+            try:
+                connection, address = self._listening.accept()
+            except BlockingIOError:
+                return
+            except OSError as error:
+                if error.errno in _EXHAUSTED:
+                    text = f"no connection can be accepted: {error.strerror}"
+                    emit(_LOG, logging.WARNING, "http.exhausted", f"{text}; the estimate continues")
+                    if self._server.drop_slowest():
+                        continue
+                    self.close()
+                    self._loop.call_later(EXHAUSTED_S, self.open)
+                return  # or the client went away
+            connection.setblocking(False)
+            stream = IOStream(connection, max_buffer_size=self._server.max_buffer_size)
+            self._server.handle_stream(stream, address)
 
 
 def _open_tcp(http: HttpAddress) -> list[socket.socket]:

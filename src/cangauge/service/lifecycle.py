@@ -6,9 +6,12 @@ the available packages need a C library or are unmaintained.
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import socket
+import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -16,10 +19,17 @@ from types import FrameType
 from typing import Final, Self
 
 from cangauge._formatting import printable
+from cangauge._logging import emit
 
 NOTIFY_SOCKET: Final = "NOTIFY_SOCKET"
 PINGS_PER_TIMEOUT: Final = 4
 """Watchdog pings per time-out of systemd."""
+END_WITHIN_S: Final = 6.0
+"""Longest time from SIGTERM to the end [s]: what is written at the end has 5 s, and the systemd
+unit kills after 10 s."""
+_MOST_DIGITS: Final = 20
+_LAST_LINE_S: Final = 0.2
+_LOG = logging.getLogger(__name__)
 
 
 @contextmanager
@@ -45,6 +55,48 @@ def stop_on_signals() -> Iterator[Callable[[], bool]]:
     finally:
         for kind in kinds:
             signal.signal(kind, before[kind])
+
+
+@contextmanager
+def deadline_after_signal(within_s: float = END_WITHIN_S) -> Iterator[None]:
+    """End the process a while after SIGINT or SIGTERM if the block has not ended by itself.
+
+    Nothing that can hang (a disk, a pipe whose reader has stopped) must keep a service from ending.
+    For the main thread of a command; the exit code is then 1.
+
+    Parameters
+    ----------
+    within_s : float
+        Time from the signal to that end [s].
+    """
+    if sys.platform == "win32":  # it has no wake-up by a pipe
+        yield
+        return
+    signals, wakeup = os.pipe()
+    os.set_blocking(wakeup, False)
+    before = signal.set_wakeup_fd(wakeup, warn_on_full_buffer=False)
+    is_over = threading.Event()
+
+    def watch() -> None:
+        with os.fdopen(signals, "rb", buffering=0) as received:
+            while (new := received.read(64)) and not {signal.SIGINT, signal.SIGTERM} & {*new}:
+                pass
+        if not is_over.wait(within_s):
+            # Whatever hangs may hang this line as well.
+            line = f"ended after {within_s:g} s, although something still hangs"
+            args = (_LOG, logging.ERROR, "service.hanging", line)
+            last = threading.Thread(target=emit, args=args, daemon=True)
+            last.start()
+            last.join(_LAST_LINE_S)
+            os._exit(1)
+
+    threading.Thread(target=watch, name="cangauge-deadline", daemon=True).start()
+    try:
+        yield
+    finally:
+        is_over.set()
+        signal.set_wakeup_fd(before)
+        os.close(wakeup)  # ends the thread, which owns the other end
 
 
 class _Hangups:
@@ -137,7 +189,8 @@ class Notifier:
             return cls()
         for_us = given.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         microseconds = given.get("WATCHDOG_USEC", "")
-        watched = for_us and microseconds.isdecimal() and int(microseconds) > 0
+        is_number = microseconds.isdecimal() and len(microseconds) < _MOST_DIGITS
+        watched = for_us and is_number and int(microseconds) > 0
         return cls(address, int(microseconds) / 1e6 if watched else None)
 
     @property
@@ -157,9 +210,14 @@ class Notifier:
         """Reset the watchdog; call it from the receive loop only, which it supervises."""
         self._send("WATCHDOG=1")
 
-    def reloading(self) -> None:
-        """Report the start of a reload; `ready` ends it."""
-        self._send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
+    def reloading(self, within_s: float) -> None:
+        """Report the start of a reload, which may take this time [s]; `ready` ends it."""
+        began_us = time.monotonic_ns() // 1000
+        self._send("RELOADING=1", f"MONOTONIC_USEC={began_us}", _extension(within_s))
+
+    def extend(self, within_s: float) -> None:
+        """Ask for this time until the next report [s], where systemd's own would be shorter."""
+        self._send(_extension(within_s))
 
     def stopping(self, status: str = "stopping") -> None:
         """Report that the service stops."""
@@ -180,6 +238,10 @@ class Notifier:
             # systemd restarts, or its queue is full: later datagrams will arrive, or the watchdog
             # acts.
             return
+
+
+def _extension(within_s: float) -> str:
+    return f"EXTEND_TIMEOUT_USEC={round(1e6 * within_s)}"
 
 
 def _line(text: str) -> str:

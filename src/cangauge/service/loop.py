@@ -1,8 +1,9 @@
 """The service's loop: receive frames, hand them to the pipeline, send its frames.
 
-Only the loop reads a clock, a monotonic one: to publish periodically and to detect stale input. It
-also saves checkpoints, reloads the configuration, reports frames lost in the receive queue, and
-detects another sender of the same ids, which would make the published SoC jump between two values.
+Only the loop reads a clock, a monotonic one: to publish periodically, to detect stale input, and
+to replace time stamps that cannot be true. It also saves checkpoints, reloads the configuration,
+reports frames lost in the receive queue, and detects another sender of the same ids, which would
+make the published SoC jump between two values.
 """
 
 from __future__ import annotations
@@ -21,10 +22,17 @@ from can.typechecking import CanFilter
 
 from cangauge._logging import emit
 from cangauge.bus.connection import BusConnection
+from cangauge.bus.decoder import SUSPECTED_FOR_S
 from cangauge.bus.publish import ESTIMATE_EVERY_S, FrameIds, standard_filter
-from cangauge.bus.time_source import is_clock
+from cangauge.bus.time_source import (
+    DRIVER_TOLERANCE_S,
+    KERNEL_TOLERANCE_S,
+    StampLimiter,
+    is_clock,
+    steady_s,
+)
 from cangauge.errors import CangaugeError
-from cangauge.estimation.validity import Estimate
+from cangauge.estimation.validity import Estimate, Reason
 from cangauge.service.pipeline import Pipeline
 
 _LOG = logging.getLogger(__name__)
@@ -42,6 +50,9 @@ SEND_WITHIN_S: Final = 0.1
 """Longest time that a frame waits for room in the transmit queue [s]: until the next one is due.
 The loop itself never waits: a full queue (no other node on the bus) costs frames, not the
 estimate."""
+
+SAID_FROM_S: Final = 1.0
+"""Smallest step of the stamps' clock that is logged [s]; smaller ones are its drift."""
 
 STEPS_KEPT: Final = 4096
 """Latest steps whose durations enter the median."""
@@ -196,7 +207,13 @@ class _Loop:
         # With receive stamps REPLAY_CLOCK is no input; it is received once, for a warning.
         self._ignores_clock = pipeline.settings.time_source == "receive"
         self._expects_clock = self._ignores_clock
-        self._stamps_are_wall_time = port.capabilities.stamps == "kernel"
+        self._stamps = _limiter(port)
+        self._stamps_are_arrival = port.capabilities.stamps != "driver"
+        # The receive queue was empty at some time after the first; the latest turn received at the
+        # second.
+        self._drained_s = self._received_s = steady_s()
+        self._shift_s = 0.0
+        self._reported: set[str] = set()
         self._foreign_ids: frozenset[int] = frozenset()
         self._set_filters()
         self.began_s = time.monotonic()
@@ -226,8 +243,12 @@ class _Loop:
         # Reading the clock may be a system call: once per turn, and again after samples.
         self._now_s = time.monotonic()
         before = self._pipeline.samples
+        received_s = steady_s()
         if messages:
-            self._process(messages)
+            self._process(messages, received_s)
+        if self._port.is_drained:
+            self._drained_s = self._received_s
+        self._received_s = received_s
         late_s = 0.0 if self._pipeline.samples != before else LATE_S
         if self._now_s >= self._beat_s + late_s:
             self._beat()
@@ -243,15 +264,16 @@ class _Loop:
             self._write_row()
             self._send(frames)
 
-    def _process(self, messages: list[can.Message]) -> None:
+    def _process(self, messages: list[can.Message], now_s: float) -> None:
         pipeline, record, table = self._pipeline, self._outputs.record, self._outputs.table
-        before, stamp_s = pipeline.samples, math.nan
-        for message in messages:
+        before, taken, stamp_s = pipeline.samples, pipeline.taken, math.nan
+        stamps = [message.timestamp for message in messages]
+        lag_s = now_s - self._stamps.limit(messages, self._drained_s, now_s)
+        for message, received_s in zip(messages, stamps, strict=True):
             if message.arbitration_id in self._foreign_ids and self._is_foreign(message):
                 continue
             if record is not None:
                 record.write(message)
-            received_s = message.timestamp
             if not pipeline.handle(message):
                 continue
             stamp_s = received_s
@@ -261,11 +283,14 @@ class _Loop:
                 self._send(frames)
                 self._beat_s = self._now_s + ESTIMATE_EVERY_S
         if pipeline.samples != before:
-            self._note_samples(pipeline.samples - before, stamp_s)
+            self._sample_s = self._now_s
+        if pipeline.taken != taken:
+            self._note_samples(pipeline.taken - taken, stamp_s, lag_s)
 
     def _is_foreign(self, message: can.Message) -> bool:
         """Handle a frame with an id that is not the vehicle's; return False if it is input."""
         if self.duplicates.handle(message, self._now_s):
+            self._port.foreign = self.duplicates.frames
             return True
         if self._ignores_clock and is_clock(message, self._pipeline.settings.ids.replay_clock):
             if self._expects_clock:
@@ -282,11 +307,10 @@ class _Loop:
             return True
         return False
 
-    def _note_samples(self, samples: int, stamp_s: float) -> None:
+    def _note_samples(self, samples: int, stamp_s: float, lag_s: float) -> None:
         before_s, self._now_s = self._now_s, time.monotonic()
-        self._sample_s, step_s = self._now_s, (self._now_s - before_s) / samples
-        lag_s = max(time.time() - stamp_s, 0.0) if self._stamps_are_wall_time else 0.0
-        self._came_s = self._now_s - lag_s
+        step_s = (self._now_s - before_s) / samples
+        self._came_s = before_s - lag_s if self._stamps_are_arrival else before_s
         self.step_s.append(step_s)
         if self._outputs.stepped is not None:
             self._outputs.stepped(stamp_s, step_s, self._came_s)
@@ -299,10 +323,45 @@ class _Loop:
     def _beat(self) -> None:
         silent_s = self._now_s - self._came_s
         is_stale = silent_s > max(self._settings.timeout_s, self._pipeline.least_timeout_s)
-        self._send(self._pipeline.heartbeat(is_stale=is_stale, silent_s=silent_s))
+        reasons = self._report_findings()
+        self._send(self._pipeline.heartbeat(is_stale=is_stale, silent_s=silent_s, reasons=reasons))
         # Stay on the clock's grid; skip beats missed while the process was suspended.
         missed = max(math.floor((self._now_s - self._beat_s) / ESTIMATE_EVERY_S), 0)
         self._beat_s += (missed + 1) * ESTIMATE_EVERY_S
+
+    def _report_findings(self) -> Reason:
+        """Log what is new about time and other senders; return the reasons to publish."""
+        stamps, reasons, found = self._stamps, Reason.NONE, {}
+        if stamps.shift_s != self._shift_s:
+            step_s, self._shift_s = self._shift_s - stamps.shift_s, stamps.shift_s
+            self._pipeline.stamp_shift_s = stamps.shift_s
+            if abs(step_s) >= SAID_FROM_S:
+                emit(
+                    _LOG,
+                    logging.WARNING,
+                    "bus.clock_set",
+                    f"the clock of the time stamps was set by {step_s:+.1f} s; bus time goes on"
+                    " by the monotonic clock",
+                    step_s=step_s,
+                )
+        if stamps.is_uncertain(steady_s()):
+            reasons |= Reason.TIME_UNCERTAIN
+            found["bus.time_uncertain"] = (
+                "the time stamps of the frames contradict the monotonic clock; the time of"
+                " receiving is used instead"
+            )
+        if self.duplicates.is_active(self._now_s):
+            reasons |= Reason.DUPLICATE_SENDER
+        for name in self._pipeline.decoder.two_sender_messages:
+            found[f"bus.two_senders {name}"] = (
+                f"two senders use the id of {name}: its frames are refused until one of them"
+                " stops; is somebody else on the bus? (If one sender sends it more often than"
+                " the DBC states, give its shortest period_s in the map file)"
+            )
+        for event in found.keys() - self._reported:
+            emit(_LOG, logging.WARNING, event.split()[0], found[event], limit=event)
+        self._reported = set(found)
+        return reasons
 
     def _send(self, frames: list[can.Message]) -> None:
         for frame in frames:
@@ -328,6 +387,13 @@ class _Loop:
             wanted.append(standard_filter(clock_id))
         self._foreign_ids = self.duplicates.ids | ({clock_id} if self._ignores_clock else set())
         self._port.set_filters(wanted)
+
+
+def _limiter(port: BusConnection) -> StampLimiter:
+    """Return the limiter for the stamps of a bus."""
+    if port.capabilities.stamps == "driver":
+        return StampLimiter(DRIVER_TOLERANCE_S)
+    return StampLimiter(KERNEL_TOLERANCE_S, time.time() - steady_s())
 
 
 class Housekeeping:
@@ -409,17 +475,21 @@ class DuplicateSenderDetector:
         self._echoes = echoes
         self._sent: deque[tuple[int, bytes]] = deque(maxlen=_SENT_KEPT)
         self._seen_s: deque[float] = deque(maxlen=DUPLICATE_FRAMES)
-        self._quiet_until_s = -math.inf
+        self._quiet_until_s = self._active_until_s = -math.inf
         self.watch(ids)
 
     def watch(self, ids: FrameIds) -> None:
         """Watch for these ids from now on."""
-        self.ids = frozenset({ids.soc_estimate, ids.soc_detail})
+        self.ids = frozenset(ids.published)
 
     @property
     def filters(self) -> list[CanFilter]:
         """Filters for the frames to be received."""
         return [standard_filter(each) for each in sorted(self.ids)]
+
+    def is_active(self, now_s: float) -> bool:
+        """Return whether another sender was proven lately, at a monotonic time [s]."""
+        return now_s < self._active_until_s
 
     def note_sent(self, message: can.Message) -> None:
         """Record an own frame, whose echo may be received."""
@@ -457,6 +527,8 @@ class DuplicateSenderDetector:
         is_proven = (
             len(self._seen_s) == DUPLICATE_FRAMES and now_s - self._seen_s[0] <= DUPLICATE_WITHIN_S
         )
+        if is_proven:
+            self._active_until_s = now_s + SUSPECTED_FOR_S
         if is_proven and now_s >= self._quiet_until_s:
             self._quiet_until_s = now_s + DUPLICATE_WARN_EVERY_S
             emit(
@@ -464,7 +536,8 @@ class DuplicateSenderDetector:
                 logging.WARNING,
                 "bus.duplicate_sender",
                 f"another node on this bus sends 0x{frame_id:X}, which this service publishes:"
-                " is a second service running? Give one of them other ids (--soc-estimate-id,"
-                " --soc-detail-id)",
+                " is a second service running? Give one of them other ids ([ids], or"
+                " --soc-estimate-id, --soc-detail-id, --soc-health-id, --soc-power-id,"
+                " --soc-cells-id)",
                 always=True,
             )

@@ -36,6 +36,7 @@ _BUS_HELP: Final = {
     "unsent": "Frames dropped since the transmit queue stayed full.",
     "queue_drops": "Frames that the kernel dropped since the receive queue was full.",
     "losses": "Losses of the bus; each is followed by reconnecting.",
+    "foreign": "Frames from another sender with ids that this service sends.",
 }
 
 
@@ -72,6 +73,7 @@ class _SnapshotCollector(Collector):
         snapshot, now_s = self._latest(), self._clock()
         yield from _about(snapshot, now_s)
         yield from _estimate(snapshot, now_s)
+        yield from _report(snapshot)
         yield from _frames(snapshot)
         yield _histogram(
             "cangauge_latency_seconds",
@@ -104,6 +106,11 @@ def _about(snapshot: Snapshot, now_s: float) -> Iterator[Metric]:
     yield build
     yield GaugeMetricFamily(
         "cangauge_start_time_seconds", "Start time, seconds since 1970.", identity.began_s
+    )
+    yield GaugeMetricFamily(
+        "cangauge_config_last_reload_successful",
+        "0 if the latest configuration was refused and the one before it is in use.",
+        not snapshot.config.problem,
     )
     yield GaugeMetricFamily(
         "cangauge_loop_age_seconds",
@@ -152,6 +159,59 @@ def _estimate(snapshot: Snapshot, now_s: float) -> Iterator[Metric]:
     for name in reason_ids(~Reason.NONE):
         reasons.add_metric([name], float(name in held))
     yield reasons
+
+
+def _report(snapshot: Snapshot) -> Iterator[Metric]:
+    if snapshot.report is None:
+        return
+    health, power, cells = snapshot.report
+    for name, text, value in (
+        ("capacity_ah", "Charge from 100 to 0 % [Ah].", health.capacity_ah),
+        ("capacity_std_ah", "Standard deviation of the capacity [Ah].", health.capacity_std_ah),
+        ("resistance_ratio", "Resistance relative to the model's.", health.resistance_ratio),
+        ("resistance_std", "Standard deviation of that ratio.", health.resistance_std),
+        (
+            "current_offset_amperes",
+            "Offset of the current sensor, measured minus true.",
+            health.offset_a,
+        ),
+        (
+            "discharge_amperes",
+            "Discharge current possible for 10 s.",
+            power.discharge_a,
+        ),
+        ("discharge_std_amperes", "Its standard deviation.", power.discharge_std_a),
+        ("charge_amperes", "Charge current possible for 10 s, positive.", power.charge_a),
+        ("charge_std_amperes", "Its standard deviation.", power.charge_std_a),
+        ("energy_watt_hours", "Energy left to the cut-off [Wh].", power.energy_wh),
+        ("energy_std_watt_hours", "Its standard deviation [Wh].", power.energy_std_wh),
+    ):
+        yield GaugeMetricFamily(f"cangauge_{name}", text, value)
+    if cells is None:
+        return
+    weakest = math.nan if cells.weakest < 0 else cells.weakest
+    for name, text, value in (
+        ("cells", "Cells whose voltage is known.", cells.cells),
+        ("weakest_cell", "Number of the cell with the least SoC.", weakest),
+        ("weakest_soc_percent", "Its state of charge [%].", cells.soc_pct),
+        ("weakest_soc_std_percent", "Standard deviation of that [%].", cells.soc_std_pct),
+        (
+            "cell_spread_percent",
+            "SoC of the strongest cell less that of the weakest [%].",
+            cells.spread_pct,
+        ),
+        (
+            "cell_sum_error_volts",
+            "Pack voltage less the sum of the cells.",
+            cells.sum_error_v,
+        ),
+        (
+            "cell_sum_differs",
+            "1 while they differ by more than both sensors allow.",
+            float(cells.is_sum_wrong),
+        ),
+    ):
+        yield GaugeMetricFamily(f"cangauge_{name}", text, value)
 
 
 def _frames(snapshot: Snapshot) -> Iterator[Metric]:

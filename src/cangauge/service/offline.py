@@ -6,24 +6,28 @@ same bit for bit.
 
 from __future__ import annotations
 
+import math
 import time
 from array import array
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final, Literal, cast
+from typing import Any, Final, Literal, Self, cast
 
 import can
 import numpy as np
 from can.typechecking import Channel
 
 from cangauge._typing import FloatArray
-from cangauge.bus.publish import FrameIds
+from cangauge.bus.publish import NO_REPORT, FrameIds, PackReport
 from cangauge.bus.recording import open_vehicle_capture
 from cangauge.bus.time_source import REPLAY_CLOCK_ID, TimeSourceName, is_clock
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
+from cangauge.estimation.cells import CellEstimator, CellReport
+from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.health import Health
 from cangauge.estimation.offline import (
     EstimateTable,
     Scores,
@@ -32,9 +36,12 @@ from cangauge.estimation.offline import (
     initial_soc_of,
     score,
 )
+from cangauge.estimation.power import Power
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Estimate, Reason, reason_name, reason_names
+from cangauge.estimation.validity import Estimate, Reason, Sample, reason_name, reason_names
+from cangauge.logs.cells import CellColumns
 from cangauge.logs.log import Log
+from cangauge.model.coulomb_counting import difference_from_reference
 from cangauge.model.model_file import Model
 from cangauge.service.pipeline import FrameCounts, Pipeline, PipelineSettings
 
@@ -109,6 +116,92 @@ class RecordedCapture:
 
 Recorded = Log | RecordedCapture
 
+PACK_EVERY_S: Final = 1.0
+"""Interval of the rows of health, power and cells [s]."""
+
+
+class PackHistory:
+    """Health, power and cells of a recording: once a second, and at the end.
+
+    Parameters
+    ----------
+    keeps_rows : bool
+        Keep a row at the first sample of each second, for `columns`.
+    cells : CellColumns, optional
+        Cell voltages of a log, by its rows.
+
+    Attributes
+    ----------
+    report : PackReport or None
+        At the end; None without a sample.
+    """
+
+    def __init__(self, *, keeps_rows: bool = False, cells: CellColumns | None = None) -> None:
+        self.report: PackReport | None = None
+        self._keeps_rows = keeps_rows
+        self._cells = cells
+        self._estimator: Estimator | None = None
+        self._cell_estimator: CellEstimator | None = None
+        self._row = 0
+        self._due_s = -math.inf
+        self._rows: list[tuple[float, PackReport]] = []
+
+    def observe(self, estimator: Estimator, sample: Sample) -> None:
+        """Take a sample of a log, and the estimator after it."""
+        self._estimator = estimator
+        if self._cells is not None:
+            if self._cell_estimator is None:
+                self._cell_estimator = CellEstimator(
+                    estimator.voltage_model, self._cells.count, self._cells.first
+                )
+            if self._cell_estimator.is_due(sample.time_s):
+                volts = self._cells.voltage_v[self._row].tolist()
+                tick = estimator.pack_tick(sample)
+                self._cell_estimator.update(tick, volts, [0.0] * len(volts))
+        self._row += 1
+        self.add(sample.time_s, self._report)
+
+    def add(self, time_s: float, report: Callable[[], PackReport]) -> None:
+        """Keep the report of a sample's time [s], if its second has begun."""
+        if self._keeps_rows and not self._due_s - PACK_EVERY_S <= time_s < self._due_s:
+            self._due_s = time_s + PACK_EVERY_S
+            self._rows.append((time_s, report()))
+
+    def finish(self, report: Callable[[], PackReport] | None = None) -> Self:
+        """Take the report of the end; return self."""
+        if report is not None:
+            self.report = report()
+        elif self._estimator is not None:
+            self.report = self._report()
+        return self
+
+    @property
+    def columns(self) -> dict[str, FloatArray]:
+        """The rows as columns: time_s, health, power and, where known, cells; NaN: unknown."""
+        found: dict[str, list[float]] = {"time_s": [time_s for time_s, _ in self._rows]}
+        reports = [report for _, report in self._rows]
+        for place, name in enumerate(Health._fields):
+            found[name] = [report.health[place] for report in reports]
+        for place, name in enumerate(Power._fields):
+            found[name] = [report.power[place] for report in reports]
+        cells = [report.cells for report in reports if report.cells is not None]
+        if cells:
+            for place, name in enumerate(CellReport._fields):
+                found[f"cell_{name}"] = [float(each[place]) for each in cells]
+        columns = {name: np.array(values, dtype=np.float64) for name, values in found.items()}
+        if "cell_weakest" in columns:
+            weakest = columns["cell_weakest"]
+            columns["cell_weakest"] = np.where(weakest < 0.0, np.nan, weakest)
+        return columns
+
+    def _report(self) -> PackReport:
+        estimator, cells = self._estimator, self._cell_estimator
+        if estimator is None:
+            raise ValueError("no sample yet")
+        return PackReport(
+            estimator.health, estimator.power(), None if cells is None else cells.report
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class RecordedEstimate:
@@ -128,6 +221,8 @@ class RecordedEstimate:
         Source of the initial SoC.
     capture_data : dict
         Time source and frame counts of a capture.
+    pack : PackHistory
+        Health, power and cells.
     """
 
     recorded: Recorded
@@ -137,6 +232,7 @@ class RecordedEstimate:
     settings: EstimatorSettings = field(default_factory=EstimatorSettings)
     origin: Origin = "voltage"
     capture_data: dict[str, Any] = field(default_factory=dict)
+    pack: PackHistory = field(default_factory=PackHistory)
 
     @property
     def reason_shares(self) -> dict[str, float]:
@@ -164,6 +260,12 @@ class RecordedEstimate:
                 f" the samples. Check that {self.model.name} is the model of this pack and that its"
                 " capacity is right."
             )
+        if isinstance(self.recorded, Log):
+            capacity_ah = self.settings.capacity_ah or self.model.capacity_ah
+            difference = difference_from_reference(self.recorded, capacity_ah)
+            found.extend([] if difference is None else [f"{difference}."])
+        if self.pack.report is not None:
+            found += [f"{notice[:1].upper()}{notice[1:]}." for notice in self.pack.report.notices]
         return found
 
     def to_dict(self) -> dict[str, Any]:
@@ -177,6 +279,7 @@ class RecordedEstimate:
             "capacity_ah": settings.capacity_ah or self.model.capacity_ah,
             "max_gap_s": settings.gap_s,
             "reasons": self.reason_shares,
+            **(NO_REPORT if self.pack.report is None else self.pack.report.to_dict()),
             **self.capture_data,
         }
 
@@ -188,6 +291,7 @@ def estimate_recorded_log(
     *,
     soc_from_log: bool = True,
     gap_from_log: bool = True,
+    pack: PackHistory | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> RecordedEstimate:
     """Estimate a log.
@@ -202,6 +306,8 @@ def estimate_recorded_log(
         Begin from the log's first reference SoC, counted back to its first row, if it has one.
     gap_from_log : bool
         Lengthen the gap for a slow log, to three of its usual steps.
+    pack : PackHistory, optional
+        Collects health, power and cells.
     progress : callable, optional
         Called with the number of samples done.
 
@@ -219,8 +325,9 @@ def estimate_recorded_log(
         settings = replace(settings, initial_soc_pct=start_pct)
     if gap_from_log:
         settings = replace(settings, gap_s=gap_of(log))
-    table, scores = estimate_log(log, model, settings, progress)
-    return RecordedEstimate(log, table, scores, model, settings, origin)
+    history = PackHistory() if pack is None else pack
+    table, scores = estimate_log(log, model, settings, progress, history.observe)
+    return RecordedEstimate(log, table, scores, model, settings, origin, pack=history.finish())
 
 
 def estimate_recorded_capture(
@@ -229,6 +336,7 @@ def estimate_recorded_capture(
     model: Model,
     settings: EstimatorSettings,
     *,
+    keeps_pack: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> RecordedEstimate:
     """Estimate a capture, bit for bit as the service does.
@@ -243,7 +351,9 @@ def estimate_recorded_capture(
     """
     if settings.temperature_source == "unknown":
         settings = replace(settings, temperature_source=vehicle.temperature_source)
-    found = estimate_capture(path, vehicle, model, settings, progress=progress)
+    found = estimate_capture(
+        path, vehicle, model, settings, keeps_pack=keeps_pack, progress=progress
+    )
     recording = RecordedCapture(
         time_s=_unwrapped(found.time_s),
         current_a=found.current_a,
@@ -264,6 +374,7 @@ def estimate_recorded_capture(
         settings=settings,
         origin="voltage" if settings.initial_soc_pct is None else "given",
         capture_data={"time_source": found.time_source, "frames": asdict(found.counts)},
+        pack=found.pack,
     )
 
 
@@ -319,6 +430,8 @@ class CaptureEstimate:
         Computing time [s].
     remarks : tuple of str
         Notes for the user.
+    pack : PackHistory
+        Health, power and cells.
     """
 
     table: EstimateTable
@@ -331,6 +444,7 @@ class CaptureEstimate:
     time_source: TimeSourceName
     seconds: float
     remarks: tuple[str, ...]
+    pack: PackHistory
 
 
 def estimate_capture(
@@ -341,6 +455,7 @@ def estimate_capture(
     *,
     time_source: TimeSourceName | Literal["auto"] = "auto",
     clock_id: int = REPLAY_CLOCK_ID,
+    keeps_pack: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> CaptureEstimate:
     """Estimate a capture, bit for bit as the service does with the same frames.
@@ -355,6 +470,8 @@ def estimate_capture(
         "auto": the replay clock if the capture holds one, else the receive stamps.
     clock_id : int
         REPLAY_CLOCK's id.
+    keeps_pack : bool
+        Keep health, power and cells of each second (`pack.columns`), not only of the end.
     progress : callable, optional
         Called with the number of frames read, every `PROGRESS_EVERY`.
 
@@ -381,7 +498,9 @@ def estimate_capture(
         bus = buses.get(message.channel)
         if bus is None:
             chosen = PipelineSettings(settings or EstimatorSettings(), source, ids)
-            bus = buses[message.channel] = _Bus(Pipeline(vehicle, model, chosen, publishes=False))
+            history = PackHistory(keeps_rows=keeps_pack)
+            pipeline = Pipeline(vehicle, model, chosen, publishes=False)
+            bus = buses[message.channel] = _Bus(pipeline, history)
         bus.handle(message)
         if progress is not None and number % PROGRESS_EVERY == 0:
             progress(number)
@@ -409,6 +528,7 @@ def estimate_capture(
         time_source=source,
         seconds=time.perf_counter() - began,
         remarks=(*capture.info.remarks, *_remarks(source, counts, len(found))),
+        pack=best.pack.finish(best.pipeline.report),
     )
 
 
@@ -417,6 +537,7 @@ class _Bus:
     """One of the buses in a capture; each has its own pipeline."""
 
     pipeline: Pipeline
+    pack: PackHistory
     estimates: list[Estimate] = field(default_factory=list)
     # Time, current, voltage, temperature and the vehicle's own SoC of every sample.
     values: array[float] = field(default_factory=lambda: array("d"))
@@ -436,6 +557,7 @@ class _Bus:
             self.estimates.append(self.pipeline.latest)
             self.values.extend(self.pipeline.latest_sample)
             self.values.append(self.pipeline.decoder.reference_soc_pct)
+            self.pack.add(self.pipeline.latest_sample.time_s, self.pipeline.report)
 
 
 def _remarks(time_source: TimeSourceName, counts: FrameCounts, buses: int) -> list[str]:

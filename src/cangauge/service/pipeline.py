@@ -14,11 +14,18 @@ import can
 from can.typechecking import CanFilter
 
 from cangauge.bus.decoder import SampleDecoder
-from cangauge.bus.plausibility import MISSED_AT_LEAST, Pack
-from cangauge.bus.publish import ACKNOWLEDGE_EVERY, FrameIds, SocPublisher, standard_filter
+from cangauge.bus.plausibility import MISSED_AT_LEAST, MISSED_UNTIL_OLD, Pack
+from cangauge.bus.publish import (
+    ACKNOWLEDGE_EVERY,
+    FrameIds,
+    PackReport,
+    SocPublisher,
+    standard_filter,
+)
 from cangauge.bus.time_source import ReplayClock, TimeSourceName, is_clock, time_source
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
+from cangauge.estimation.cells import CellEstimator
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.state import EstimatorState
@@ -106,9 +113,15 @@ class Pipeline:
     estimator : Estimator
     samples : int
         Samples handed to the estimator, refused ones included, over all logs.
+    taken : int
+        Samples that the estimator took: only these make an estimate fresh.
+    stamp_shift_s : float
+        Part of the frames' stamps that their clock does not have, since it was set [s].
     latest_sample : Sample or None
     published : Estimate
         The estimate in the frames made last.
+    cells : CellEstimator or None
+        Where the vehicle gives cell voltages.
 
     Raises
     ------
@@ -140,7 +153,9 @@ class Pipeline:
         self._pack = _pack_of(model, self.settings.estimator.capacity_ah)
         self.decoder = SampleDecoder(vehicle, self._pack)
         self.estimator = Estimator(model, _with_source(self.settings.estimator, vehicle))
-        self.samples = 0
+        self.samples = self.taken = 0
+        self._refused = 0  # in a row
+        self.stamp_shift_s = 0.0
         self.latest_sample: Sample | None = None
         self.published = NOTHING_YET
         # Computed when read: the estimator's latest estimate (None before the first sample, or
@@ -148,6 +163,8 @@ class Pipeline:
         self._estimated: Estimate | None = None
         self._latest = NOTHING_YET
         self._is_behind = False
+        self.cells = self._new_cells()
+        self._report: tuple[int, PackReport] | None = None
 
     # --- frames → estimates
 
@@ -179,7 +196,7 @@ class Pipeline:
         if self._publisher is None:
             return []
         self.published = self.latest
-        return self._publisher.beat(self.published, self.samples, 0.0)
+        return self._publisher.beat(self.published, self.samples, 0.0, self.report)
 
     @property
     def latest(self) -> Estimate:
@@ -193,6 +210,14 @@ class Pipeline:
         """Return the latest estimate with the signal health at the latest wanted frame."""
         self._evaluate()
         return self._with_health(self.decoder.now_s)
+
+    def report(self) -> PackReport:
+        """Return health, power and cells after the latest sample; computed once a sample."""
+        if self._report is None or self._report[0] != self.samples:
+            cells = None if self.cells is None else self.cells.report
+            report = PackReport(self.estimator.health, self.estimator.power(), cells)
+            self._report = self.samples, report
+        return self._report[1]
 
     @property
     def counts(self) -> FrameCounts:
@@ -226,9 +251,11 @@ class Pipeline:
         if not self._is_replay or self._publisher is None:
             return []
         self.published = self.latest
-        return self._publisher.publish(self.published, self.samples)
+        return self._publisher.publish(self.published, self.samples, self.report)
 
-    def heartbeat(self, *, is_stale: bool, silent_s: float = 0.0) -> list[can.Message]:
+    def heartbeat(
+        self, *, is_stale: bool, silent_s: float = 0.0, reasons: Reason = Reason.NONE
+    ) -> list[can.Message]:
         """Return the frames due every `publish.ESTIMATE_EVERY_S`.
 
         Parameters
@@ -236,8 +263,11 @@ class Pipeline:
         is_stale : bool
             No sample within the service's time-out: the latest estimate becomes invalid.
         silent_s : float
-            Time since the latest sample came in, by the loop's monotonic clock [s]. With receive
-            stamps, a silence longer than the current's own time-out is stale as well.
+            Time since the latest sample that the estimator took came in, by the loop's monotonic
+            clock [s]. With receive stamps, a silence longer than the current's own time-out is
+            stale as well.
+        reasons : Reason
+            Findings of the loop itself, about time and other senders.
         """
         if self._publisher is None:
             return []
@@ -245,11 +275,18 @@ class Pipeline:
         if not self._is_replay:
             is_stale = is_stale or silent_s > self.decoder.health["current"].timeout_s
         if is_stale and self.samples:
-            reasons = estimate.reasons | Reason.INPUT_STALE
+            reasons |= Reason.INPUT_STALE
+        if reasons:
+            reasons |= estimate.reasons
             estimate = estimate._replace(status=status_of(reasons), reasons=reasons)
+        if estimate.status is Status.INVALID:
+            # No charge is counted; the last estimate grows old.
+            missing_pct = self.estimator.uncounted_std_pct(silent_s)
+            std_pct = math.hypot(estimate.soc_std_pct, missing_pct)
+            estimate = estimate._replace(soc_std_pct=std_pct)
         self.published = estimate
         age_s = silent_s if self.samples else math.nan
-        return self._publisher.beat(estimate, self.samples, age_s)
+        return self._publisher.beat(estimate, self.samples, age_s, self.report)
 
     @property
     def least_timeout_s(self) -> float:
@@ -300,13 +337,22 @@ class Pipeline:
             self._earlier_counts, self._untimed = self.counts, 0
             self.vehicle, self._pack = vehicle or self.vehicle, pack
             self.decoder = SampleDecoder(self.vehicle, pack)
+            self.cells = self._new_cells()
+        self._report = None
         self.settings = settings
         if self._publisher is not None:
             self._publisher.ids = settings.ids
 
     def snapshot(self) -> EstimatorState | None:
-        """Return the estimator's state; None while no SoC is known."""
-        return self.estimator.snapshot() if math.isfinite(self.latest.soc_pct) else None
+        """Return the estimator's state; None while no SoC is known.
+
+        It refers to the stamps as their clock makes them now: after a restart they come so.
+        """
+        if not math.isfinite(self.latest.soc_pct):
+            return None
+        state = self.estimator.snapshot()
+        state.clock.shift_s += self.stamp_shift_s
+        return state
 
     def restore(self, state: EstimatorState, age_s: float = 0.0) -> Estimate:
         """Continue from a state (see `Estimator.restore`); it is stale until a sample comes.
@@ -323,6 +369,7 @@ class Pipeline:
             self._time.resume(latest.time_s)
         reasons = latest.reasons | Reason.INPUT_STALE
         self._latest = latest._replace(status=Status.INVALID, reasons=reasons)
+        self._report = None
         self._is_behind = False
         return self._latest
 
@@ -342,8 +389,29 @@ class Pipeline:
     def _estimate(self, sample: Sample) -> None:
         self.samples += 1
         self.latest_sample = sample
-        self.estimator.update(sample)
+        estimator = self.estimator
+        estimator.update(sample)
+        if estimator.is_refused:
+            self._refused += 1
+        else:
+            self.taken += 1
+            self._refused = 0
         self._is_behind = True
+        if self.cells is not None and self.cells.is_due(sample.time_s):
+            self._follow_cells(self.cells, sample)
+
+    def _new_cells(self) -> CellEstimator | None:
+        signals = self.vehicle.cells
+        if signals is None:
+            return None
+        return CellEstimator(self.estimator.voltage_model, signals.count, signals.first)
+
+    def _follow_cells(self, cells: CellEstimator, sample: Sample) -> None:
+        """Hand the cell voltages that came in since the last second to their estimator."""
+        if self.decoder.cells is not None:
+            volts, times = self.decoder.cells.take(sample.time_s)
+            changes = self.estimator.current_changes(sample.time_s, times)
+            cells.update(self.estimator.pack_tick(sample), volts, changes)
 
     def _evaluate(self) -> Estimate:
         """Compute the estimate of the latest sample, unless that is done."""
@@ -357,7 +425,8 @@ class Pipeline:
         """Return the latest estimate, marked by the health of the signals at bus time `now_s`.
 
         A single voltage that failed or has not come yet is not missing; several consecutive ones
-        are, or one that is too old.
+        are, or one that is too old. Samples that are refused one after the other do not make an
+        estimate fresh.
         """
         estimate = self._latest if self._estimated is None else self._estimated
         reasons = estimate.reasons
@@ -365,6 +434,10 @@ class Pipeline:
             reasons &= ~Reason.VOLTAGE_MISSING
         if missing := self.decoder.reasons(now_s):
             reasons |= missing
+        if self._time.is_uncertain:
+            reasons |= Reason.TIME_UNCERTAIN
+        if self._refused >= MISSED_UNTIL_OLD:
+            reasons |= Reason.INPUT_STALE
         if reasons == estimate.reasons:
             return estimate
         return estimate._replace(reasons=reasons, status=status_of(reasons))
@@ -379,6 +452,7 @@ class Pipeline:
             self._publisher.restart()
         self.decoder = SampleDecoder(self.vehicle, self._pack)
         self.estimator = Estimator(self.model, self.estimator.settings)
+        self.cells = self._new_cells()
         self._estimated = None
 
 
@@ -408,16 +482,15 @@ def _with_source(settings: EstimatorSettings, vehicle: Vehicle) -> EstimatorSett
 
 
 def _check_ids(vehicle: Vehicle, ids: FrameIds) -> None:
-    published = {
-        ids.soc_estimate: "soc_estimate",
-        ids.soc_detail: "soc_detail",
-        ids.replay_clock: "replay_clock",
-    }
-    for signal in vehicle.signals:
-        if not signal.is_extended and signal.arbitration_id in published:
+    published = ids.published | {ids.replay_clock: "replay_clock"}
+    used = {signal.key: signal.message for signal in vehicle.signals}
+    if vehicle.cells is not None:
+        used |= {group.key: group.message for group in vehicle.cells.groups}
+    for key, message in used.items():  # the key of an extended id is no standard id
+        if key in published:
             raise InputError(
-                f"{signal.message} of {vehicle.name} has this id",
-                field=f"ids.{published[signal.arbitration_id]}",
-                value=f"0x{signal.arbitration_id:X}",
+                f"{message} of {vehicle.name} has this id",
+                field=f"ids.{published[key]}",
+                value=f"0x{key:X}",
                 cure="choose another one",
             )

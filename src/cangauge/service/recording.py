@@ -1,11 +1,13 @@
 """Record the received frames, so that `estimate` on the recording reproduces the live numbers.
 
 Formats are those that keep whole microseconds: candump text (.log) and python-can's CSV, either
-also gzipped, Vector BLF and ASAM MF4. ASC and TRC shift or round time stamps.
+also gzipped, Vector BLF, ASAM MF4 and MCAP, which holds samples and estimates too. ASC and TRC
+shift or round time stamps.
 
 The receive loop only formats frames into memory; a thread writes. A killed service loses the
-frames of the last `HAND_OVER_S`, or the whole part of an .mf4, which is written at its end. A power
-cut can also lose the data written in the last `SYNC_EVERY_S`.
+frames of the last `HAND_OVER_S`, the last `MCAP_CHUNK_BYTES` of an .mcap, or the whole part of an
+.mf4, which is written at its end. A power cut can also lose the data written in the last
+`SYNC_EVERY_S`.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import gzip
 import io
 import logging
 import os
+import stat
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,12 +28,16 @@ from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, Self, cast
 
 import can
 
-from cangauge._io import FULL, check_writable, refuse_foreign
+from cangauge._io import FOR_GROUP, FULL, check_writable, refuse_foreign
 from cangauge._logging import emit
+from cangauge._mcap import FRAME, McapTopics
 from cangauge.bus.captures.files import all_parts, part_path, run_path
+from cangauge.bus.captures.mcap import frame_content, frame_topic
 from cangauge.bus.time_source import whole_us
 from cangauge.errors import InputError
+from cangauge.estimation.validity import Estimate, Sample
 from cangauge.service.async_writer import AsyncWriter
+from cangauge.service.estimate_mcap import write_estimate
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
@@ -49,6 +56,9 @@ CLOSE_WITHIN_S: Final = 0.6
 """Time limit for writing the rest at the end [s]."""
 MF4_PART_S: Final = 300.0
 """Default duration of an .mf4 part [s]: the format is safe on disk only when it is complete."""
+
+MCAP_CHUNK_BYTES: Final = 64 * 1024
+"""Content of a chunk before compression [bytes]: 350 frames, or 0.2 s of a busy bus."""
 
 _NOT_SYNCED: Final = frozenset({errno.EINVAL, errno.ENOTSUP, errno.EROFS})
 _LOG = logging.getLogger(__name__)
@@ -123,7 +133,8 @@ class Recorder:
     Parameters
     ----------
     path : path-like
-        `.log` or `.csv`, or either with `.gz`; `.blf` and `.mf4`, which are always in parts.
+        `.log` or `.csv`, or either with `.gz`; `.mcap`; `.blf` and `.mf4`, which are always in
+        parts.
     limits : RecordLimits, optional
         By default one file, unless it exists and is not empty.
     clock : callable
@@ -207,6 +218,24 @@ class Recorder:
         self._new_frames += 1
         if self._file is not None and self._file.waiting >= HAND_OVER_BYTES:
             self._hand_over(self._clock())
+
+    @property
+    def keeps_estimates(self) -> bool:
+        """Whether the format has a place for samples and estimates."""
+        return self._kind == ".mcap"
+
+    def write_estimate(self, sample: Sample, soc_pct: float, estimate: Estimate) -> None:
+        """Record a sample and the estimate after it, at the stamp of the latest frame.
+
+        Parameters
+        ----------
+        sample : Sample
+        soc_pct : float
+            The vehicle's own SoC [%]; NaN if unknown.
+        estimate : Estimate
+        """
+        if isinstance(self._writer, _Mcap):
+            self._writer.write_estimate(sample, soc_pct, estimate)
 
     def tick(self, now_s: float) -> None:
         """Hand frames to the writing thread, and sync the file, when due (monotonic time [s])."""
@@ -313,12 +342,12 @@ class _Disk:
         self.lost_frames = 0
 
     def begin(self, path: Path) -> None:
-        """Begin a new file, replacing an existing one."""
+        """Begin a new file; only an empty one is replaced."""
 
         def begin() -> None:
             self._close_file()
             refuse_foreign(path)  # the names of parts are known before they begin
-            self._file = io.FileIO(path, "w")
+            self._file = io.FileIO(_created(path), "w")
             self._end = self._at = 0
 
         self.writer.submit(begin)
@@ -385,6 +414,17 @@ class _Disk:
             limit="record.state",
             lost_frames=self.lost_frames,
         )
+
+
+def _created(path: Path) -> int:
+    """Return the descriptor of a new or empty file or a device; never of another recording."""
+    flags = os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC
+    file = os.open(path, flags, FOR_GROUP)
+    found = os.fstat(file)
+    if stat.S_ISFIFO(found.st_mode) or found.st_size:
+        os.close(file)
+        raise FileExistsError(errno.EEXIST, "exists already, and is not replaced", str(path))
+    return file
 
 
 @dataclass(slots=True)
@@ -479,7 +519,8 @@ class RecordBuffer(io.RawIOBase):
 
 # --- Formats
 
-EXACT_FORMATS: Final = (".log", ".csv", ".blf", ".mf4")
+EXACT_FORMATS: Final = (".log", ".csv", ".blf", ".mf4", ".mcap")
+_PACKABLE: Final = (".log", ".csv")
 PACKED: Final = ".gz"
 _EARLIEST_S: Final = 631_152_000.0
 """1990: earliest start that python-can writes into a BLF header [s since 1970]."""
@@ -511,16 +552,18 @@ def _record_format(path: Path) -> str:
     suffixes = [suffix.lower() for suffix in path.suffixes]
     packed = suffixes[-1:] == [PACKED]
     kind = "".join(suffixes[-2:-1] if packed else suffixes[-1:])
-    if kind not in EXACT_FORMATS or (packed and kind in IN_PARTS_ONLY):
+    if kind not in EXACT_FORMATS or (packed and kind not in _PACKABLE):
         raise InputError(
             "this format is unknown, or does not keep time stamps to the microsecond",
             source=path,
             field="--record",
             value="".join(suffixes),
-            cure="name a .log (candump), .csv, .blf or .mf4 file",
+            cure="name a .log (candump), .csv, .blf, .mf4 or .mcap file",
         )
     if kind == ".mf4":
         _need_asammdf(path)
+    if kind == ".mcap":
+        McapTopics(io.BytesIO(), path)  # raises if the package is not installed
     return kind + PACKED if packed else kind
 
 
@@ -539,6 +582,8 @@ def _frame_writer(kind: str, file: RecordBuffer, start_s: float) -> _FrameWriter
         return _Blf(file, start_s)
     if kind == ".mf4":
         return _Mf4(file)
+    if kind == ".mcap":
+        return _Mcap(file)
     return _Text(kind, file)
 
 
@@ -596,6 +641,27 @@ class _Blf(can.BLFWriter):
         self.file.seek(0)
         self._write_header(end)
         self.file.seek(end)
+
+
+class _Mcap:
+    """MCAP with frames, samples and estimates."""
+
+    def __init__(self, file: RecordBuffer) -> None:
+        self._topics = McapTopics(file, None, MCAP_CHUNK_BYTES)
+        self._latest_s = 0.0
+
+    def write(self, message: can.Message) -> None:
+        self._latest_s = message.timestamp
+        self._topics.write(frame_topic(message), FRAME, message.timestamp, frame_content(message))
+
+    def write_estimate(self, sample: Sample, soc_pct: float, estimate: Estimate) -> None:
+        write_estimate(self._topics, self._latest_s, sample, soc_pct, estimate)
+
+    def flush(self) -> None:
+        """Do nothing: a chunk is written when it is full."""
+
+    def stop(self) -> None:
+        self._topics.finish()
 
 
 class _Mf4:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
 import threading
@@ -10,27 +9,31 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cangauge._formatting import number
-from cangauge._io import check_writable
+from cangauge._io import READ_WITHIN_S, check_writable, refuse_pipe, sole_writer
 from cangauge._logging import emit
+from cangauge.bus.publish import NO_REPORT
 from cangauge.bus.reconnect import ReconnectingBus
-from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimation.validity import reason_names
-from cangauge.model.model_file import Model
+from cangauge.estimation.validity import Estimate, reason_names
 from cangauge.service.addresses import default_path, has_unix_sockets
 from cangauge.service.config import RunConfig, config_keys, load_config
 from cangauge.service.http import Endpoint
 from cangauge.service.lifecycle import Notifier, note_hangups, stop_on_signals
 from cangauge.service.loop import LoopSettings, Outputs, RunSummary, serve
 from cangauge.service.pipeline import Pipeline
+from cangauge.service.reading import START_S, BackgroundReader, Reading
 from cangauge.service.recording import Recorder
 from cangauge.service.state import StateKeeper, check_state_path
 from cangauge.service.status import Identity, Monitor, Snapshot
+
+if TYPE_CHECKING:
+    from cangauge.service.estimate_table import EstimateWriter
 
 _LOG = logging.getLogger(__name__)
 
@@ -42,9 +45,6 @@ class Service:
     ----------
     config : RunConfig or path-like, optional
         Configuration, or its TOML file.
-    read : callable, optional
-        Returns the configuration for a reload; may raise InputError. By default the file is read
-        again.
     **options
         Keys of the configuration, which take precedence over the file.
 
@@ -72,26 +72,28 @@ class Service:
     def __init__(
         self,
         config: RunConfig | str | PathLike[str] | None = None,
-        *,
-        read: Callable[[], RunConfig] | None = None,
         **options: Any,
     ) -> None:
-        if isinstance(config, RunConfig):
-            loaded = config
-            self._read = read or (lambda: loaded)
-        else:
-            path = config
-            self._read = read or (lambda: load_config(path, options))
-            loaded = self._read()
-        self.config = loaded
+        self._read = (
+            partial(RunConfig.model_copy, config)
+            if isinstance(config, RunConfig)
+            else partial(load_config, config, options)
+        )
+        self.config = loaded = self._read()
         if loaded.output is not None:
             _check_output(Path(loaded.output), Path(loaded.model))
+        if loaded.record is not None:
+            refuse_pipe(loaded.record)
         self._state = loaded.state_settings(os.environ)
         if self._state is not None:
             check_state_path(self._state.path)
-        vehicle = loaded.load_vehicle()
-        self._vehicle_key = _vehicle_key(loaded, vehicle)
-        self.pipeline = Pipeline(vehicle, Model.load(loaded.model), loaded.pipeline_settings())
+        self._reader = BackgroundReader(self._read)
+        notifier = Notifier.from_environment()
+        notifier.extend(READ_WITHIN_S)
+        notifier.close()
+        reading = Reading.of(partial(RunConfig.model_copy, loaded))
+        self._vehicle_key = reading.vehicle_key
+        self.pipeline = Pipeline(reading.vehicle, reading.model, loaded.pipeline_settings())
         self._address = loaded.address()
         self._stop = threading.Event()
         self._reload = threading.Event()
@@ -129,11 +131,14 @@ class Service:
                 hung_up = stack.enter_context(note_hangups())
                 stop = lambda: signalled() or self._stop.is_set()  # noqa: E731
                 hangup = lambda: hung_up() or self._take_reload()  # noqa: E731
+            for owned in self._written_while_running():
+                stack.enter_context(sole_writer(owned))
+            stack.callback(self._reader.close)
             port = stack.enter_context(ReconnectingBus(self._address, pipeline.filters))
             port.open(wait=config.wait_for_bus)
             recorder = table = keeper = None
             if self._state is not None:
-                keeper = stack.enter_context(StateKeeper(self._state, pipeline))
+                keeper = stack.enter_context(StateKeeper(self._state, pipeline, port.name))
             if config.record is not None:
                 recorder = stack.enter_context(Recorder(config.record, config.record_limits()))
             if config.output is not None:
@@ -144,10 +149,10 @@ class Service:
             monitor = stack.enter_context(self._supervised(port, recorder))
             outputs = Outputs(
                 record=recorder,
-                table=None if table is None else table.add,
+                table=self._rows(table, recorder),
                 show=self._each_turn(monitor, recorder),
                 checkpoint=None if keeper is None else keeper.checkpoint,
-                reload=lambda: self._reload_for(monitor) if hangup() else None,
+                reload=lambda: self._poll_reload(monitor, wanted=hangup()),
                 stepped=monitor.stepped,
                 sent=monitor.sent,
             )
@@ -172,10 +177,11 @@ class Service:
         return _summary_json(pipeline, port, summary) | {"state": config.state} | written
 
     def reconfigure(self) -> LoopSettings | None:
-        """Reload the configuration and apply it as a whole; the SoC continues.
+        """Read the configuration again in this process and apply it; the SoC continues.
 
-        Model, vehicle, method, capacity, gaps, time-outs and published ids change at once. The
-        initial SoC is ignored, since the SoC is known. Other keys need a restart, which is logged.
+        `run` does the same on SIGHUP or `reload`, but reads in another process meanwhile. Model,
+        vehicle, method, capacity, gaps, time-outs and published ids change at once. The initial
+        SoC is ignored, since the SoC is known. Other keys need a restart, which is logged.
 
         Returns
         -------
@@ -183,41 +189,79 @@ class Service:
             Those of the new configuration; None if it is invalid, and the old one stays.
         """
         try:
-            config = self._read()
-            vehicle, model = config.load_vehicle(), Model.load(config.model)
-            key = _vehicle_key(config, vehicle)
-            settings = config.pipeline_settings()
-            started = self.pipeline.settings
-            ids = replace(settings.ids, replay_clock=started.ids.replay_clock)
-            self.pipeline.reconfigure(
-                None if key == self._vehicle_key else vehicle,
-                model,
-                replace(settings, ids=ids, time_source=started.time_source),
-            )
-        except (InputError, OSError) as error:  # OSError: a file disappeared meanwhile
-            text = f"new configuration refused, the old one stays: {error}"
-            emit(_LOG, logging.WARNING, "config.refused", text)
+            return self._apply(Reading.of(self._read))
+        except InputError as error:
+            _log_refusal(error)
             return None
-        self._vehicle_key = key
-        _log_changes(self.config, config)
-        self.config = config
-        return config.loop_settings()
+
+    def _apply(self, new: Reading) -> LoopSettings:
+        """Use another configuration as a whole; raise InputError if it does not fit."""
+        settings, started = new.config.pipeline_settings(), self.pipeline.settings
+        ids = replace(settings.ids, replay_clock=started.ids.replay_clock)
+        self.pipeline.reconfigure(
+            None if new.vehicle_key == self._vehicle_key else new.vehicle,
+            new.model,
+            replace(settings, ids=ids, time_source=started.time_source),
+        )
+        self._vehicle_key = new.vehicle_key
+        _log_changes(self.config, new.config)
+        self.config = new.config
+        return new.config.loop_settings()
+
+    def _written_while_running(self) -> list[Path]:
+        """Return the files of which each belongs to one service only."""
+        state = None if self._state is None else self._state.path
+        given = (state, self.config.record, self.config.output, self.config.unix_path())
+        return [Path(path) for path in given if path is not None]
 
     def _take_reload(self) -> bool:
         wanted = self._reload.is_set()
         self._reload.clear()
         return wanted
 
-    def _reload_for(self, monitor: Monitor) -> LoopSettings | None:
-        with monitor.reloading():
-            settings = self.reconfigure()
+    def _poll_reload(self, monitor: Monitor, *, wanted: bool) -> LoopSettings | None:
+        """Begin to read on request; apply what was read since the last call."""
+        if wanted:
+            self._reader.request()
+            monitor.reload_begins(READ_WITHIN_S + START_S)
+        result = self._reader.poll()
+        if result is None:
+            return None
+        settings = None
+        if isinstance(result, Reading):
+            try:
+                settings = self._apply(result)
+            except InputError as error:
+                result = error
+        if isinstance(result, InputError):
+            _log_refusal(result)
+        else:
             monitor.identity = replace(
                 monitor.identity,
                 vehicle=self.pipeline.vehicle.name,
                 model=self.config.model,
                 method=self.pipeline.settings.estimator.method,
             )
+        if not self._reader.is_reading:
+            monitor.reload_ends(str(result) if isinstance(result, InputError) else "")
         return settings
+
+    def _rows(
+        self, table: EstimateWriter | None, recorder: Recorder | None
+    ) -> Callable[[float, Estimate], None] | None:
+        """Return what takes each sample's estimate: the table, the recording, both or none."""
+        if recorder is None or not recorder.keeps_estimates:
+            return None if table is None else table.add
+        pipeline = self.pipeline
+
+        def add(time_s: float, estimate: Estimate) -> None:
+            if table is not None:
+                table.add(time_s, estimate)
+            if pipeline.latest_sample is not None:
+                soc_pct = pipeline.decoder.reference_soc_pct
+                recorder.write_estimate(pipeline.latest_sample, soc_pct, estimate)
+
+        return add
 
     def _each_turn(self, monitor: Monitor, recorder: Recorder | None) -> Callable[[float], None]:
         def turn(now_s: float) -> None:
@@ -267,15 +311,13 @@ def _check_output(output: Path, model: Path) -> None:
         raise InputError(
             "this output is also an input", source=output, cure="name another file for it"
         )
+    refuse_pipe(output)
     check_writable(output)
 
 
-def _vehicle_key(config: RunConfig, vehicle: Vehicle) -> tuple[object, ...]:
-    """Return the identity of a vehicle: its options, and the content of its files."""
-    files = [*vehicle.dbc_files, *([config.map] if config.map is not None else [])]
-    contents = tuple(hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in files)
-    chosen = (config.messages, config.rules, config.checks)
-    return (config.vehicle, config.temperature, config.pair_within_s, chosen, *contents)
+def _log_refusal(error: InputError) -> None:
+    text = f"new configuration refused, the old one stays: {error}"
+    emit(_LOG, logging.WARNING, "config.refused", text)
 
 
 def _log_changes(old: RunConfig, new: RunConfig) -> None:
@@ -310,7 +352,16 @@ def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None
     http = config.http_address()
     if unix_path is None and http is None:
         return
-    endpoint = Endpoint(lambda: monitor.latest, unix_path=unix_path, http=http)
+    try:
+        endpoint = Endpoint(lambda: monitor.latest, unix_path=unix_path, http=http)
+    except InputError as error:
+        if config.status_socket != "auto" or error.field != "status_socket":
+            raise
+        emit(_LOG, logging.WARNING, "status.unavailable", f"no status socket: {error}")
+        if http is None:
+            return
+        unix_path = None
+        endpoint = Endpoint(lambda: monitor.latest, http=http)
     stack.enter_context(endpoint)
     if unix_path is not None:
         emit(_LOG, logging.DEBUG, "status.listening", f"status at {unix_path}", path=str(unix_path))
@@ -393,4 +444,5 @@ def _summary_json(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary
             "reasons": reason_names(int(latest.reasons)),
         },
         "soc_reference_pct": pipeline.decoder.reference_soc_pct,
+        **(pipeline.report().to_dict() if pipeline.samples else NO_REPORT),
     }

@@ -28,7 +28,7 @@ from typing import Annotated, Any, Final, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from cangauge._formatting import duration, number
-from cangauge._io import open_regular, refuse_foreign, write_text_atomic
+from cangauge._io import PRIVATE, open_regular, refuse_foreign, write_text_atomic
 from cangauge._logging import emit
 from cangauge.errors import CangaugeError, InputError
 from cangauge.estimation.state import EstimatorState
@@ -58,6 +58,7 @@ FUTURE_S: Final = 60.0
 
 REFUSED_SUFFIX: Final = ".refused"
 
+_LONGEST_NAME: Final = 200
 _OWN_NAMES: Final = frozenset({FILE_NAME, FILE_NAME + REFUSED_SUFFIX})
 _BEGINNING_BYTES: Final = 64
 _BEGINNING: Final = re.compile(rb'\s*\{\s*"format"\s*:\s*"' + STATE_FORMAT.encode() + rb'"')
@@ -153,6 +154,8 @@ class StateKeeper:
     ----------
     settings : StateSettings
     pipeline : Pipeline
+    bus : str
+        Interface and channel: the state of another bus is refused.
     wall_s : callable
         Unix time [s].
     """
@@ -161,10 +164,12 @@ class StateKeeper:
         self,
         settings: StateSettings,
         pipeline: Pipeline,
+        bus: str = "",
         *,
         wall_s: Callable[[], float] = time.time,
     ) -> None:
         self.settings = settings
+        self._bus = bus[:_LONGEST_NAME]
         self._pipeline = pipeline
         self._model = pipeline.model
         self._fingerprint = model_fingerprint(pipeline.model)
@@ -209,7 +214,9 @@ class StateKeeper:
             saved_s=self._wall_s(),
             boot_id=self._boot_id,
             model=self._fingerprint,
-            model_name=self._model.name[:200],
+            model_name=self._model.name[:_LONGEST_NAME],
+            bus=self._bus,
+            vehicle=self._pipeline.vehicle.name[:_LONGEST_NAME],
             time_source=self._pipeline.settings.time_source,
             estimator=state,
         )
@@ -244,13 +251,16 @@ class StateKeeper:
 
     def _checked_age(self, content: StateContent) -> float:
         """Return the least age of the state [s]; NaN if it is unknown."""
-        path = self.settings.path
-        if content.model != self._fingerprint:
-            raise InputError(
-                f"of another model ({content.model_name})",
-                source=path,
-                field="content.model",
-            )
+        path, vehicle = self.settings.path, self._pipeline.vehicle.name[:_LONGEST_NAME]
+        for field, is_other, owner in (
+            ("model", content.model != self._fingerprint, content.model_name),
+            ("vehicle", content.vehicle != vehicle, content.vehicle),
+            ("bus", content.bus != self._bus, content.bus),
+        ):
+            if is_other:
+                raise InputError(
+                    f"of another {field} ({owner})", source=path, field=f"content.{field}"
+                )
         time_source = self._pipeline.settings.time_source
         if content.time_source != time_source:
             raise InputError(
@@ -304,7 +314,8 @@ class StateKeeper:
                     each.unlink()
 
     def _write(self, content: StateContent) -> None:
-        write_text_atomic(self.settings.path, state_text(content))
+        _refuse_no_state(self.settings.path)  # it may have been swapped: a pipe would never end
+        write_text_atomic(self.settings.path, state_text(content), PRIVATE)
 
     def _log_decision(self) -> None:
         verdict = self._pipeline.estimator.filter.verdict
@@ -354,7 +365,10 @@ class StateContent(BaseModel):
     """Boot of the machine that it belongs to; None if unknown."""
     model: Hash
     """Fingerprint of the model."""
-    model_name: Annotated[str, Field(max_length=200)]
+    model_name: Annotated[str, Field(max_length=_LONGEST_NAME)]
+    bus: Annotated[str, Field(max_length=_LONGEST_NAME)]
+    """Interface and channel."""
+    vehicle: Annotated[str, Field(max_length=_LONGEST_NAME)]
     time_source: Annotated[str, Field(max_length=32)]
     estimator: EstimatorState
 

@@ -10,9 +10,8 @@ import logging
 import math
 import time
 from bisect import bisect_left
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
 from cangauge._formatting import number
@@ -21,6 +20,7 @@ from cangauge._version import __version__
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.decoder import FrameStatistics
 from cangauge.bus.plausibility import MessageStatistics
+from cangauge.bus.publish import NO_REPORT, PackReport
 from cangauge.estimation.validity import Estimate, Reason, Sample, Status, reason_name, reason_names
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline
@@ -40,7 +40,10 @@ RATE_OVER_S: Final = 2.0
 CLOCKS_APART_S: Final = 60.0
 """A receive stamp further than this from the wall clock belongs to another clock [s]."""
 
-BUS_COUNTS: Final = ("garbled", "error_frames", "unsent", "queue_drops", "losses")
+REPORT_EVERY_S: Final = 1.0
+"""Interval of health, power and cells in the snapshots [s]."""
+
+BUS_COUNTS: Final = ("garbled", "error_frames", "unsent", "queue_drops", "losses", "foreign")
 """Counts of a bus to report, where it has them."""
 
 _NO_REJECTS: Final = frozenset({"wanted", "counter_jumps", "frames_lost"})
@@ -131,6 +134,22 @@ class Identity:
 
 
 @dataclass(frozen=True, slots=True)
+class ConfigState:
+    """Result of the latest reload of the configuration.
+
+    Parameters
+    ----------
+    reloading : bool
+        A new one is being read; the old one is in use meanwhile.
+    problem : str
+        Why the latest one was refused; "" if it is in use.
+    """
+
+    reloading: bool = False
+    problem: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Snapshot:
     """The state of the service at one moment.
 
@@ -163,6 +182,9 @@ class Snapshot:
         Time from receive stamp to published SoC; processing time of the frame that completes a
         sample.
     record : RecordState or None
+    config : ConfigState
+    report : PackReport or None
+        Health, power and cells, of the last second; None before the first sample.
     """
 
     identity: Identity
@@ -184,6 +206,8 @@ class Snapshot:
     latency: HistogramCounts
     step: HistogramCounts
     record: RecordState | None
+    config: ConfigState
+    report: PackReport | None = None
 
     def is_stuck(self, now_s: float) -> bool:
         """Return whether the receive loop is stuck at a monotonic time [s]."""
@@ -257,6 +281,8 @@ def as_json(snapshot: Snapshot, now_s: float) -> dict[str, Any]:
             "voltage_v": _finite(sample.voltage_v),
             "temperature_c": _finite(sample.temperature_c),
         },
+        **NO_REPORT,
+        **({} if snapshot.report is None else snapshot.report.to_dict()),
         "samples": snapshot.samples,
         "samples_per_s": _finite(snapshot.samples_per_s),
         "frames": {
@@ -269,6 +295,10 @@ def as_json(snapshot: Snapshot, now_s: float) -> dict[str, Any]:
         "bus_up": snapshot.bus_up,
         "bus_counts": dict(snapshot.bus),
         "bus_trouble": snapshot.bus_trouble or None,
+        "config": {
+            "reloading": snapshot.config.reloading,
+            "problem": snapshot.config.problem or None,
+        },
         "latency": _durations(snapshot.latency),
         "step": _durations(snapshot.step),
         "record": None
@@ -344,6 +374,10 @@ class Monitor:
         self._rate = 0.0
         self._rate_from = (now_s, 0)
         self._status: Status | None = None
+        self._config = ConfigState()
+        self._report: PackReport | None = None
+        self._report_due_s = now_s
+        self._had_notices = False
         self.latest = self._snapshot(now_s)
 
     def stepped(self, stamp_s: float, step_s: float, came_s: float) -> None:
@@ -372,14 +406,16 @@ class Monitor:
         if 0.0 <= latency_s < CLOCKS_APART_S:
             self._latency.add(latency_s)
 
-    @contextmanager
-    def reloading(self) -> Iterator[None]:
-        """Report a reload to systemd while the block runs."""
-        self._notifier.reloading()
-        try:
-            yield
-        finally:
-            self._notifier.ready(_status_line(self.latest))
+    def reload_begins(self, within_s: float) -> None:
+        """Report a reload that may take this time [s]; `reload_ends` ends it."""
+        self._config = replace(self._config, reloading=True)
+        self._notifier.reloading(within_s)
+
+    def reload_ends(self, problem: str) -> None:
+        """Report the end of a reload; `problem` is why it was refused, "" if it was not."""
+        self._config = ConfigState(problem=problem)
+        refused = f"; new configuration REFUSED: {problem}" if problem else ""
+        self._notifier.ready(_status_line(self.latest) + refused)
 
     def turn(self, now_s: float) -> bool:
         """Record a turn of the loop (monotonic time [s]); return whether `latest` is new."""
@@ -388,6 +424,7 @@ class Monitor:
         self._due_s = now_s + SHOW_EVERY_S
         self.latest = snapshot = self._snapshot(now_s)
         self._log_status(snapshot)
+        self._log_notices(snapshot)
         ping_every_s = self._notifier.ping_every_s
         if ping_every_s is not None and now_s >= self._ping_s:
             self._ping_s = now_s + ping_every_s - SHOW_EVERY_S
@@ -404,6 +441,9 @@ class Monitor:
         if now_s - since_s >= RATE_OVER_S:
             self._rate = (samples - before) / (now_s - since_s)
             self._rate_from = (now_s, samples)
+        if samples and now_s >= self._report_due_s:
+            self._report_due_s = now_s + REPORT_EVERY_S
+            self._report = pipeline.report()
         statistics = pipeline.decoder.statistics
         rejects = _rejects(statistics)
         return Snapshot(
@@ -426,7 +466,17 @@ class Monitor:
             latency=self._latency.copy(),
             step=self._step.copy(),
             record=None if self._record is None else self._record.state,
+            config=self._config,
+            report=self._report,
         )
+
+    def _log_notices(self, snapshot: Snapshot) -> None:
+        """Log the notices once when they appear."""
+        notices = [] if snapshot.report is None else snapshot.report.notices
+        if notices and not self._had_notices:
+            for notice in notices:
+                emit(_LOG, logging.WARNING, "cells.sum_differs", notice)
+        self._had_notices = bool(notices)
 
     def _log_status(self, snapshot: Snapshot) -> None:
         estimate = snapshot.estimate

@@ -6,6 +6,9 @@ import http.client
 import json
 import os
 import socket
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, cast
 from urllib.parse import urlsplit
@@ -77,7 +80,12 @@ def fetch_status(endpoint: str, token_file: Path | None = None) -> dict[str, Any
             headers["Authorization"] = f"Bearer {token}"
     else:
         connection = _UnixConnection(endpoint)
+    timer: threading.Timer | None = None
     try:
+        connection.connect()
+        # The time-out of the socket is one of each read: a server could answer byte by byte.
+        timer = threading.Timer(ANSWER_WITHIN_S, _shut_down, (connection.sock,))
+        timer.start()
         connection.request("GET", "/status", headers=headers)
         response = connection.getresponse()
         body = response.read(LARGEST_ANSWER)
@@ -85,11 +93,18 @@ def fetch_status(endpoint: str, token_file: Path | None = None) -> dict[str, Any
         reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
         raise NotRunningError(f"{endpoint}: no service answers: {reason}") from error
     finally:
+        if timer is not None:
+            timer.cancel()
         connection.close()
     if response.status != http.client.OK:
         answer = " ".join(body[:200].decode("utf-8", "replace").split())
         raise CangaugeError(f"{endpoint}: refused ({response.status}): {answer}")
     return _content(body, endpoint)
+
+
+def _shut_down(connected: socket.socket) -> None:
+    with suppress(OSError):
+        connected.shutdown(socket.SHUT_RDWR)
 
 
 def _http(endpoint: str) -> http.client.HTTPConnection:
@@ -127,4 +142,107 @@ def _content(body: bytes, endpoint: str) -> dict[str, Any]:
         raise CangaugeError(f"{endpoint}: the answer is not a status of cangauge") from error
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise CangaugeError(f"{endpoint}: the answer is not a status of this release of cangauge")
+    for problem in _misfits(content, _SHAPE, ""):
+        raise CangaugeError(f"{endpoint}: the answer is not a status of cangauge:{problem}")
     return cast("dict[str, Any]", content)
+
+
+_Number = (int, float, type(None))
+_Durations: Final = {"count": int, "p50_at_most_s": _Number, "p99_at_most_s": _Number}
+_SHAPE: Final[dict[str, Any]] = {
+    **dict.fromkeys(("version", "bus", "vehicle", "model", "method", "time_source", "status"), str),
+    "reasons": [str],
+    "uptime_s": (int, float),
+    "loop_stuck": bool,
+    "estimate": dict.fromkeys(
+        ("soc_pct", "soc_std_pct", "soc_newton_pct", "soc_coulomb_pct", "residual_v"), _Number
+    ),
+    "sample": (
+        None,
+        dict.fromkeys(("age_s", "current_a", "voltage_v", "temperature_c"), _Number),
+    ),
+    "samples": int,
+    "samples_per_s": _Number,
+    "frames": {"received": int, "used": int, "lost": int},
+    "rejects": {"": int},
+    "bus_counts": {"": int},
+    "bus_trouble": (str, type(None)),
+    "config": {"reloading": bool, "problem": (str, type(None))},
+    "health": (
+        None,
+        dict.fromkeys(
+            ("capacity_ah", "capacity_std_ah", "resistance_ratio", "resistance_std", "offset_a"),
+            _Number,
+        ),
+    ),
+    "power": (
+        None,
+        dict.fromkeys(
+            (
+                "discharge_a",
+                "discharge_std_a",
+                "charge_a",
+                "charge_std_a",
+                "energy_wh",
+                "energy_std_wh",
+            ),
+            _Number,
+        ),
+    ),
+    "cells": (
+        None,
+        {
+            "weakest": (int, type(None)),
+            "cells": int,
+            **dict.fromkeys(
+                ("soc_pct", "soc_std_pct", "spread_pct", "sum_error_v", "sum_std_v"), _Number
+            ),
+        },
+    ),
+    "notices": [str],
+    "latency": _Durations,
+    "step": _Durations,
+    "record": (
+        None,
+        {
+            "path": str,
+            "frames": int,
+            "lost_frames": int,
+            "written_bytes": int,
+            "problem": (str, type(None)),
+        },
+    ),
+}
+"""What `cangauge status` needs of an answer: types by key, of every item of a list, of every value
+of an object whose keys may be any (""); a pair with None may be null."""
+_LARGEST: Final = 1e18
+
+
+def _misfits(value: Any, shape: Any, place: str) -> Iterator[str]:
+    """Yield where a value differs from a shape."""
+    if isinstance(shape, tuple) and shape[0] is None:
+        if value is not None:
+            yield from _misfits(value, shape[1], place)
+    elif isinstance(shape, list | dict):
+        if not isinstance(value, type(shape)):
+            yield f"{place} has a wrong type"
+            return
+        for key, of_key in _items(value, shape):
+            if isinstance(value, dict) and key not in value:
+                yield f"{place} {key} is missing"
+            else:
+                yield from _misfits(value[key], of_key, f"{place} {key}")
+    elif not isinstance(value, shape) or (isinstance(value, bool) and shape is not bool):
+        yield f"{place} has a wrong type"
+    elif isinstance(value, int) and abs(value) > _LARGEST:
+        yield f"{place} is too large"
+
+
+def _items(value: Any, shape: Any) -> Iterator[tuple[Any, Any]]:
+    """Yield each key or index that a list or an object must have, with its shape."""
+    if isinstance(shape, list):
+        yield from ((index, shape[0]) for index in range(len(value)))
+    elif "" in shape:
+        yield from ((key, shape[""]) for key in value)
+    else:
+        yield from shape.items()

@@ -19,7 +19,7 @@ from typing import Any, Final
 
 from cangauge._resources import THREADS
 
-COMMAND: Final = (sys.executable, "-m", "cangauge.validation.worker")
+COMMAND: Final = (sys.executable, "-P", "-m", "cangauge.validation.worker")
 TIMEOUT_S: Final = 600.0
 """A longer diagnosis is stopped and counts as crashed [s]."""
 

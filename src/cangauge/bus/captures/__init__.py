@@ -2,5 +2,16 @@
 
 from cangauge.bus.captures.capture import Capture, is_capture, open_capture, read_capture
 from cangauge.bus.captures.files import CaptureInfo, Stamps
+from cangauge.bus.captures.reader import BinaryReader, CaptureReader, LineReader
 
-__all__ = ["Capture", "CaptureInfo", "Stamps", "is_capture", "open_capture", "read_capture"]
+__all__ = [
+    "BinaryReader",
+    "Capture",
+    "CaptureInfo",
+    "CaptureReader",
+    "LineReader",
+    "Stamps",
+    "is_capture",
+    "open_capture",
+    "read_capture",
+]

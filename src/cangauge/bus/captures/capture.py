@@ -11,17 +11,10 @@ from typing import Final
 import can
 from can.typechecking import Channel
 
-from cangauge._io import MAX_BUSES, MAX_IDLE_LINES, MAX_STAMP_S
-from cangauge.bus.captures.files import CaptureInfo, LineStream, Stamps, parts_of_run, read_head
-from cangauge.bus.captures.readers import (
-    DAMAGE,
-    LIBRARY_FORMATS,
-    TEXT_FORMATS,
-    LibraryFormat,
-    Parser,
-    TextFormat,
-    library_messages,
-)
+from cangauge._io import MAX_BUSES
+from cangauge.bus.captures.files import CaptureInfo, Stamps, parts_of_run, read_head
+from cangauge.bus.captures.reader import CaptureReader
+from cangauge.bus.captures.registry import reader_of
 from cangauge.errors import InputError
 
 CLOCK_ID: Final = 0x1DB
@@ -29,14 +22,10 @@ CLOCK_ID: Final = 0x1DB
 CLOCK_PERIOD_S: Final = 0.010
 """… one each period [s]."""
 
-FEW_MALFORMED: Final = 100
-"""A file with more malformed lines than this, and than frames, is refused."""
-_HEAD_LINES: Final = 400
-
 KNOWN_CAPTURES: Final = (
-    "candump (log, and screen output), CRTD, Vector ASC and BLF, PEAK TRC, ASAM MF4,"
-    " python-can's CSV, tab-separated tables, and text of seconds, id, length, bytes; each may be"
-    " gzipped"
+    "candump (log, and screen output), CRTD, SavvyCAN's GVRET CSV, CAN Hacker and CARBUS traces,"
+    " Vector ASC and BLF, PEAK TRC, PCAP and PCAPNG, ASAM MF4, MCAP, python-can's CSV,"
+    " tab-separated tables, and text of seconds, id, length, bytes; each may be gzipped"
 )
 _CURE: Final = f"known are: {KNOWN_CAPTURES}"
 
@@ -51,7 +40,7 @@ class Capture:
     Parameters
     ----------
     path : Path
-    kind : TextFormat or LibraryFormat
+    kind : type of CaptureReader
     clock : tuple of int and float
         Id of the frames that count time where there are no stamps, and their period [s].
     parts : sequence of Path
@@ -61,7 +50,7 @@ class Capture:
     def __init__(
         self,
         path: Path,
-        kind: TextFormat | LibraryFormat,
+        kind: type[CaptureReader],
         clock: tuple[int, float],
         parts: Sequence[Path] = (),
     ) -> None:
@@ -69,43 +58,47 @@ class Capture:
         self._parts = parts or (path,)
         self._kind = kind
         self._clock = clock
-        self._reset()
-
-    def _reset(self) -> None:
-        self._frames = 0
-        self._malformed = 0
-        self._first_malformed: int | None = None
-        self._cut_off = False
-        self._remarks: list[str] = []
+        self._readers: list[CaptureReader] = []
 
     @property
     def stamps(self) -> Stamps:
         """Resolution of the time stamps."""
-        return self._kind.stamps if isinstance(self._kind, TextFormat) else "us"
+        return self._readers[0].stamps if self._readers else self._kind.stamps
 
     @property
     def info(self) -> CaptureInfo:
         """Findings of the latest iteration; complete after its end."""
+        readers = self._readers
+        firsts = (each.first_malformed for each in readers)
         return CaptureInfo(
             format=self._kind.name,
             stamps=self.stamps,
-            frames=self._frames,
-            malformed=self._malformed,
-            first_malformed=self._first_malformed,
-            cut_off=self._cut_off,
-            remarks=(*self._stamp_remarks(), *self._remarks),
+            frames=sum(each.frames for each in readers),
+            malformed=sum(each.malformed for each in readers),
+            first_malformed=next((first for first in firsts if first is not None), None),
+            cut_off=any(each.cut_off for each in readers),
+            remarks=tuple(self._remarks()),
         )
 
-    def _stamp_remarks(self) -> list[str]:
+    def _remarks(self) -> Iterator[str]:
         if self.stamps == "ms":
-            return ["time stamps are whole milliseconds"]
-        if self.stamps == "none":
+            yield "time stamps are whole milliseconds"
+        elif self.stamps == "none":
             number, period_s = self._clock
-            return [
+            yield (
                 "no time stamps: time is counted from 0 by frames of"
                 f" 0x{number:X}, one every {1000.0 * period_s:g} ms"
-            ]
-        return []
+            )
+        yield from dict.fromkeys(chain.from_iterable(each.remarks for each in self._readers))
+        for reader in self._readers:
+            if reader.malformed:
+                first = (
+                    "" if reader.first_malformed is None else f" (first: {reader.first_malformed})"
+                )
+                yield f"{reader.malformed} malformed {reader.unit} skipped{first}"
+        if any(each.cut_off for each in self._readers):
+            frames = sum(each.frames for each in self._readers)
+            yield f"the file is cut off after {frames} frames"
 
     def __iter__(self) -> Iterator[can.Message]:
         """Yield the messages in the file's order.
@@ -116,17 +109,10 @@ class Capture:
             If the file cannot be read, holds no frames or mostly malformed lines (names the
             first), or has neither stamps nor frames of the clock's id.
         """
-        self._reset()
-        if isinstance(self._kind, TextFormat):
-            kind = self._kind
-            messages: Iterator[can.Message] = chain.from_iterable(
-                self._text(kind, part) for part in self._parts
-            )
-            if kind.stamps == "none":
-                messages = self._count_time(messages)
-        else:
-            library = self._kind
-            messages = chain.from_iterable(self._library(library, part) for part in self._parts)
+        self._readers = []
+        messages: Iterator[can.Message] = chain.from_iterable(map(self._read, self._parts))
+        if self._kind.stamps == "none":
+            messages = self._count_time(messages)
         channels: set[Channel | None] = set()
         for message in messages:
             if message.channel not in channels:
@@ -138,66 +124,10 @@ class Capture:
             yield message
         self._finish()
 
-    def _text(self, kind: TextFormat, path: Path) -> Iterator[can.Message]:
-        lines = LineStream(path)
-        parse: Parser | None = None
-        idle = 0
-        for line in lines:
-            if parse is None:
-                parse = kind.parser(line)
-                if parse is None:
-                    raise _unknown(path)
-            if not line.endswith("\n") and not kind.states_length and line.strip():
-                # The last line may have lost bytes, and its format does not show it.
-                self._cut_off = True
-                self._skip(lines.number)
-                continue
-            try:
-                message = parse(line)
-            except (ValueError, OverflowError):
-                self._skip(lines.number)
-                continue
-            if message is None:
-                idle += 1
-                if idle > MAX_IDLE_LINES:
-                    raise InputError(
-                        f"{MAX_IDLE_LINES} lines in a row hold no frame",
-                        source=self.path,
-                        value=f"up to line {lines.number}",
-                        cure="remove them",
-                    )
-                continue
-            idle = 0
-            if not abs(message.timestamp) <= MAX_STAMP_S:
-                self._skip(lines.number)
-                continue
-            self._frames += 1
-            yield message
-        if lines.cut_off:
-            self._cut_off = True
-
-    def _library(self, kind: LibraryFormat, path: Path) -> Iterator[can.Message]:
-        try:
-            for message in library_messages(kind, path):
-                if not (message.is_fd or message.is_remote_frame or message.is_error_frame) and (
-                    len(message.data) != message.dlc
-                ):
-                    self._skip(None)
-                    continue
-                if not abs(message.timestamp) <= MAX_STAMP_S:
-                    self._skip(None)
-                    continue
-                self._frames += 1
-                yield message
-        except DAMAGE as error:
-            self._cut_off = True
-            # An empty last part, begun just before a power cut, does not invalidate the others.
-            if not self._frames and path == self._parts[-1]:
-                raise InputError(
-                    f"the {kind.name} file is damaged ({type(error).__name__}: {error})",
-                    source=path,
-                    cure="record or fetch it again",
-                ) from error
+    def _read(self, path: Path) -> Iterator[can.Message]:
+        with self._kind(path) as reader:
+            self._readers.append(reader)
+            yield from reader.messages()
 
     def _count_time(self, messages: Iterator[can.Message]) -> Iterator[can.Message]:
         number, period_s = self._clock
@@ -207,39 +137,23 @@ class Capture:
                 ticks += 1
             message.timestamp = max(ticks - 1, 0) * period_s
             yield message
-        if self._frames and not ticks:
+        if not ticks and any(each.frames for each in self._readers):
             raise InputError(
                 f"no time stamps, and no frames of 0x{number:X} to count time by",
                 source=self.path,
                 cure="record it with stamps, for instance by candump -l",
             )
 
-    def _skip(self, line: int | None) -> None:
-        self._malformed += 1
-        if self._first_malformed is None:
-            self._first_malformed = line
-        if self._malformed > FEW_MALFORMED and self._malformed > self._frames:
-            raise self._junk()
-
-    def _junk(self) -> InputError:
-        where = "" if self._first_malformed is None else f", the first is {self._first_malformed}"
-        return InputError(
-            f"{self._malformed} lines are no frames of {self._kind.name}{where},"
-            f" and only {self._frames} are",
-            source=self.path,
-            cure="record or export it again",
-        )
-
     def _finish(self) -> None:
-        if not self._frames:
+        # An empty last part, begun just before a power cut, does not invalidate the others.
+        if not any(each.frames for each in self._readers):
+            last = self._readers[-1]
+            if last.damage is not None:
+                raise last.damaged()
             raise InputError("the capture holds no frames", source=self.path, cure=_CURE)
-        if self._malformed > self._frames:
-            raise self._junk()
-        if self._malformed:
-            first = "" if self._first_malformed is None else f" (first: {self._first_malformed})"
-            self._remarks.append(f"{self._malformed} malformed lines skipped{first}")
-        if self._cut_off:
-            self._remarks.append(f"the file is cut off after {self._frames} frames")
+        for reader in self._readers:
+            if reader.malformed > reader.frames:
+                raise reader.junk()
 
 
 def find_capture(
@@ -261,7 +175,7 @@ def find_capture(
     """
     path = Path(path)
     parts = parts_of_run(path)
-    kinds = (_recognise(read_head(part)) for part in parts or [path])
+    kinds = (reader_of(read_head(part)) for part in parts or [path])
     kind = next((each for each in kinds if each is not None), None)
     return None if kind is None else Capture(path, kind, clock, parts)
 
@@ -295,32 +209,6 @@ def is_capture(path: str | PathLike[str]) -> bool:
         return find_capture(path) is not None
     except InputError:
         return False
-
-
-def _recognise(head: bytes) -> TextFormat | LibraryFormat | None:
-    for kind in LIBRARY_FORMATS:
-        if kind.matches(head):
-            return kind
-    lines = head.decode("latin-1").split("\n")[:_HEAD_LINES]
-    if len(lines) > 1:
-        lines = lines[:-1]  # the last one may be cut
-    scores = {text.name: _score(text, lines) for text in TEXT_FORMATS}
-    best = max(TEXT_FORMATS, key=lambda text: scores[text.name])
-    return best if scores[best.name] > 0 else None
-
-
-def _score(kind: TextFormat, lines: list[str]) -> int:
-    """Return the number of lines that are frames; 0 if most are malformed."""
-    parse = kind.parser(lines[0])
-    if parse is None:
-        return 0
-    frames = malformed = 0
-    for line in lines:
-        try:
-            frames += parse(line) is not None
-        except (ValueError, OverflowError):
-            malformed += 1
-    return frames if frames > malformed else 0
 
 
 def _unknown(path: Path) -> InputError:

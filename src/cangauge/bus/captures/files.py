@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+from typing import IO, TYPE_CHECKING, Any, Final, Literal, NamedTuple, cast
 
 from cangauge._io import MAX_CAPTURE_BYTES, MAX_LINE, open_unpacked, read_beginning
 
@@ -133,30 +133,43 @@ def read_head(path: Path) -> bytes:
         return read_beginning(file, _HEAD_BYTES)
 
 
+def head_lines(head: bytes) -> list[str]:
+    """Return the whole lines of the beginning of a text, without line ends."""
+    text = head.decode("latin-1").replace("\r\n", "\n").replace("\r", "\n")
+    lines = text.split("\n")
+    return lines[:-1] if len(lines) > 1 else lines  # the last one may be cut
+
+
 class LineStream:
-    """The lines of a text file.
+    """The lines of a text, with line feeds as line ends; a line beyond `MAX_LINE` in pieces.
+
+    Parameters
+    ----------
+    file : file object
+        Binary or text.
 
     Attributes
     ----------
-    number : int
-        Of the latest line, from 1.
     cut_off : bool
         Whether the file broke off (a truncated or damaged gzip).
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self.number = 0
+    def __init__(self, file: IO[Any]) -> None:
         self.cut_off = False
+        self._text: IO[str]
+        if isinstance(file, io.TextIOBase):
+            self._text = cast("IO[str]", file)
+            return
+        salvage = _Salvage(cast("io.BufferedIOBase", file), self)
+        self._text = io.TextIOWrapper(io.BufferedReader(salvage), "latin-1", newline=None)
 
     def __iter__(self) -> Iterator[str]:
-        """Yield the lines with their line ends; a line beyond `MAX_LINE` comes in pieces."""
-        with open_bytes(self._path) as raw:
-            salvage = _Salvage(raw, self)
-            text = io.TextIOWrapper(io.BufferedReader(salvage), "latin-1", newline="\n")
-            while line := text.readline(MAX_LINE):
-                self.number += 1
-                yield line
+        while line := self._text.readline(MAX_LINE):
+            yield line
+
+    def close(self) -> None:
+        """Close the file."""
+        self._text.close()
 
 
 class _Salvage(io.RawIOBase):
@@ -168,6 +181,10 @@ class _Salvage(io.RawIOBase):
 
     def readable(self) -> bool:
         return True
+
+    def close(self) -> None:
+        self._raw.close()
+        super().close()
 
     def readinto(self, buffer: WriteableBuffer, /) -> int:
         view = memoryview(buffer)

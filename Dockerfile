@@ -1,0 +1,19 @@
+# docker build -t cangauge . && docker run --rm --network host -v "$PWD:/data" cangauge run --help
+FROM python:3.13-slim AS build
+WORKDIR /src
+COPY pyproject.toml README.md LICENSE ./
+COPY src src
+COPY dbc dbc
+COPY replay replay
+RUN python -m venv /opt/cangauge && /opt/cangauge/bin/pip install --no-cache-dir '.[metrics,mf4]'
+
+FROM python:3.13-slim
+COPY --from=build /opt/cangauge /opt/cangauge
+ENV PATH=/opt/cangauge/bin:$PATH \
+    OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 PYTHONUNBUFFERED=1
+# CAN sockets of the host's network namespace need no privileges.
+RUN useradd --create-home --uid 1000 cangauge
+USER cangauge
+WORKDIR /data
+ENTRYPOINT ["cangauge"]
+CMD ["--help"]

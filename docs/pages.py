@@ -1,0 +1,196 @@
+"""Pages of the site that are made from the code: commands, frames, effects. A hook of mkdocs.
+
+`mkdocs build --strict` calls `on_files`; nothing that it makes is committed, so that no page can
+differ from the code.
+"""
+
+from __future__ import annotations
+
+import html
+import inspect
+import re
+from pathlib import Path
+from typing import Any
+
+import cantools
+import numpy as np
+import typer
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from typer.main import get_command
+
+from cangauge.cli.app import COMMANDS, LazyGroup, app
+from cangauge.estimation.validity import REASON_WORDS, reason_name
+from cangauge.model.effects.library import LIBRARY
+from cangauge.validation import simulate
+
+ROOT = Path(__file__).parent.parent
+OUTSIDE_LINK = re.compile(
+    r"\[([^\]]*)\]\((?:\.\./)+(?:src|dbc|replay|contrib|examples|benchmarks|tests|[A-Z]+\.md)[^)]*\)"
+)
+"""A link to a file of the repository that is no page of the site."""
+
+# A drive of half an hour with stops, regeneration and a rest; the equation itself as the plant.
+DRIVE: dict[str, Any] = {"seed": 5, "drive": 3, "hours": 0.5, "plant": "equation"}
+STRUCTURE = {"ocv_shape", "inner_temperature"}
+"""Effects that are structure of a pack: never named as a cause, and no fault of the simulator."""
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the generated pages."""
+    for path, text in (
+        ("reference/commands.md", commands_page()),
+        ("reference/frames.md", frames_page()),
+        ("explanation/effects.md", effects_page()),
+    ):
+        files.append(File.generated(config, path, content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: MkDocsConfig, files: Files) -> str:
+    """Turn links to files of the repository into their names: the site does not hold them."""
+    del page, config, files
+    return OUTSIDE_LINK.sub(r"\1", markdown)
+
+
+def commands_page() -> str:
+    """Return the reference of the commands, from their help."""
+    group = get_command(app)
+    assert isinstance(group, LazyGroup)
+    parts = [
+        "# Commands",
+        "Every command has `-h` with the text below, and `--json` for one JSON object on stdout."
+        " Exit codes: 0 done, 1 failed, 2 bad usage or input, 130 stopped by Ctrl-C.",
+    ]
+    for name in COMMANDS:
+        command = group.get_command(None, name)
+        text = inspect.cleandoc(command.help or "")
+        text = re.sub(r"^#+ (.+)$", r"**\1**", text, flags=re.MULTILINE)
+        parts += [f"## cangauge {name}", text]
+        rows = ["| Option | Value | Default | Meaning |", "| --- | --- | --- | --- |"]
+        context = typer.Context(command, info_name=name)
+        rows.extend(_option_row(parameter) for parameter in command.get_params(context))
+        parts.append("\n".join(rows))
+    return "\n\n".join(parts) + "\n"
+
+
+def _option_row(parameter: Any) -> str:
+    if parameter.param_type_name == "argument":
+        metavar = (parameter.metavar or parameter.name).upper()
+        names, value = f"`{metavar}`", "one or more" if parameter.nargs != 1 else ""
+        if parameter.required:
+            value = f"{value}, required".lstrip(", ")
+    else:
+        names = ", ".join(f"`{name}`" for name in (*parameter.opts, *parameter.secondary_opts))
+        value = "" if parameter.is_flag else str(parameter.metavar or "").strip("<>")
+    default = parameter.default
+    shown = "" if default in (None, False, (), []) or parameter.required else str(default)
+    text = " ".join((getattr(parameter, "help", "") or "").split())
+    return "| " + " | ".join(_cell(each) for each in (names, value, shown, text)) + " |"
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|")
+
+
+def frames_page() -> str:
+    """Return the reference of the published frames, from their DBC."""
+    database = cantools.database.load_file(ROOT / "dbc" / "soc_estimate.dbc")
+    parts = ["# Frames", "Published frames and the replay clock, from `dbc/soc_estimate.dbc`."]
+    parts.append(_comment())
+    for message in sorted(database.messages, key=lambda each: each.frame_id):
+        period = f", every {message.cycle_time} ms" if message.cycle_time else ""
+        parts += [
+            f"## {message.name} 0x{message.frame_id:X}{period}",
+            str(message.comment or ""),
+        ]
+        rows = [
+            "| Signal | Start bit | Bits | Step | Range | Unit | Meaning |",
+            "| --- | --- | --- | --- | --- | --- | --- |",
+        ]
+        for signal in message.signals:
+            limits = f"{signal.minimum:.9g} … {signal.maximum:.9g}"
+            cells = (
+                f"`{signal.name}`", f"{signal.start}", f"{signal.length}", f"{signal.scale:g}",
+                limits, signal.unit or "",
+                "Bits, see below." if signal.name == "reason" else str(signal.comment or ""),
+            )  # fmt: skip
+            rows.append("| " + " | ".join(_cell(cell) for cell in cells) + " |")
+        parts.append("\n".join(rows))
+    rows = ["| Bit | Reason | Meaning |", "| --- | --- | --- |"]
+    rows += [
+        f"| {int(reason).bit_length() - 1} | {reason_name(reason)} | {_cell(words)} |"
+        for reason, words in REASON_WORDS.items()
+    ]
+    parts += ["## Reasons", "A bit is set while its reason applies.", "\n".join(rows)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _comment() -> str:
+    """Return the comment on the whole database, which cantools does not keep."""
+    text = (ROOT / "dbc" / "soc_estimate.dbc").read_text(encoding="utf-8")
+    found = re.search(r'^CM_ "([^"]*)";', text, re.MULTILINE)
+    return found.group(1) if found else ""
+
+
+def effects_page() -> str:
+    """Return the effects with equation, source, and a drawing of what each does to the voltage."""
+    parts = [
+        "# The effects and their signatures",
+        "An effect is a signature at the terminals: what the measured voltage shows beyond the"
+        " model's. Each drawing is half an hour of the same simulated drive: the current above"
+        " (discharge upwards), the voltage that the effect adds below, free of sensor noise."
+        " `cangauge twin --effect ID` simulates it, `cangauge gap` looks for it.",
+    ]
+    family = ""
+    for effect in sorted(LIBRARY.values(), key=lambda each: (each.family, each.id)):
+        if effect.family != family:
+            family = effect.family
+            parts.append(f"## {family.replace('_', ' ').capitalize()}")
+        parts += [
+            f"### {effect.id}",
+            inspect.cleandoc(type(effect).__doc__ or ""),
+            f"**Signature.** {effect.signature}",
+            f"```text\n{effect.equation}\n```",
+            f"**Told apart by** {effect.separated_by}",
+            f"**Source.** {effect.source}",
+        ]
+        if effect.id not in STRUCTURE:
+            parts.append(signature_svg(effect.id))
+    return "\n\n".join(parts) + "\n"
+
+
+def signature_svg(effect_id: str) -> str:
+    """Return a drawing of the current and of the gap that an effect opens, as SVG."""
+    recording = simulate(f"{effect_id}:gap_v=1.0", **DRIVE).recording
+    minutes = recording.log.time_s / 60.0
+    width, upper, lower, left = 640, 60, 110, 56
+    step = max(1, minutes.size // 900)
+    parts = [
+        f'<svg viewBox="0 0 {width} {upper + lower + 44}" role="img" class="signature"'
+        f' aria-label="Voltage that {html.escape(effect_id)} adds during a drive"'
+        ' style="max-width:100%;font:11px sans-serif" fill="currentColor">'
+    ]
+    for top, height, values, unit, colour in (
+        (6, upper, recording.log.current_a, "A", "#7a7a7a"),
+        (upper + 18, lower, recording.gap_v, "V", "#0072b2"),
+    ):
+        low, high = min(0.0, float(np.min(values))), max(0.0, float(np.max(values)))
+        span = (high - low) or 1.0
+        x = left + (width - left - 8) * minutes[::step] / float(minutes[-1])
+        y = top + height * (high - values[::step]) / span
+        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
+        zero = top + height * high / span
+        parts += [
+            f'<line x1="{left}" x2="{width - 8}" y1="{zero:.1f}" y2="{zero:.1f}"'
+            ' stroke="currentColor" stroke-opacity=".35"/>',
+            f'<polyline fill="none" stroke="{colour}" stroke-width="1.2" points="{points}"/>',
+            f'<text x="{left - 6}" y="{top + 9}" text-anchor="end">{high:.3g} {unit}</text>',
+            f'<text x="{left - 6}" y="{top + height}" text-anchor="end">{low:.3g} {unit}</text>',
+        ]
+    bottom = upper + lower + 36
+    for minute in range(0, int(minutes[-1]) + 1, 10):
+        at = left + (width - left - 8) * minute / float(minutes[-1])
+        parts.append(f'<text x="{at:.0f}" y="{bottom}" text-anchor="middle">{minute} min</text>')
+    parts.append("</svg>")
+    return "".join(parts)

@@ -1,0 +1,91 @@
+"""Gaps of a recorded log: what counts as one, over which charge is counted, where to split.
+
+The usual step of a log is its median: a logger that writes a row every 30 s has no gap of 30 s.
+Over a gap up to `bridge_s` charge is interpolated; over a longer one nothing is counted, since the
+pack may have rested, or been charged or driven.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from cangauge._typing import FloatArray
+from cangauge.logs.log import Log
+
+BRIDGE_S: Final = 60.0
+"""No charge is counted over a longer gap in the current [s]: the pack is assumed to rest."""
+
+USUAL_STEPS: Final = 3.0
+"""A step is a gap, whatever its length, above this many usual steps [-]: two rows lost."""
+
+MOVED_PCT: Final = 1.0
+"""Change of a log's own SoC over an uncounted gap from which the pack was used in it [%]: the
+resolution of a dashboard."""
+
+PIECE_S: Final = 300.0
+"""Shortest piece of a split log that is kept [s]: the delay line fills for 70 s of it."""
+
+
+def usual_step_s(time_s: FloatArray) -> float:
+    """Return the median time between rows [s]; 0 for a single row."""
+    return float(np.median(np.diff(time_s))) if time_s.size > 1 else 0.0
+
+
+def usual_gap_s(time_s: FloatArray, gap_s: float) -> float:
+    """Return the duration of a gap in a recorded log [s]: `gap_s`, at least 3 usual steps."""
+    return max(gap_s, USUAL_STEPS * usual_step_s(time_s))
+
+
+def bridge_s(time_s: FloatArray) -> float:
+    """Return the longest step over which charge is counted [s]."""
+    return usual_gap_s(time_s, BRIDGE_S)
+
+
+def discharged_ah(time_s: FloatArray, current_a: FloatArray) -> FloatArray:
+    """Return the charge discharged since the first row [Ah], shape (n,), by the trapezoidal rule.
+
+    Parameters
+    ----------
+    time_s, current_a : array of shape (n,)
+        Time [s] and current [A], positive = discharge. Steps longer than `bridge_s` count nothing.
+    """
+    step_s = np.diff(time_s)
+    step_ah = (current_a[1:] + current_a[:-1]) * step_s / 7200.0
+    step_ah = np.where(step_s > bridge_s(time_s), 0.0, step_ah)
+    return np.concatenate(([0.0], np.cumsum(step_ah)))
+
+
+def uncounted_gaps(time_s: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+    """Return the row before each gap over which nothing is counted."""
+    return np.flatnonzero(np.diff(time_s) > bridge_s(time_s))
+
+
+def split_where_moved(log: Log) -> list[Log]:
+    """Split a log at the uncounted gaps over which its own SoC moved: it was charged or driven.
+
+    Each piece begins with its own SoC. A log without SoC, and one that rested, stays whole.
+
+    Returns
+    -------
+    list of Log
+        In order; pieces shorter than `PIECE_S` are left out.
+    """
+    if log.soc_pct is None:
+        return [log]
+    known = np.flatnonzero(np.isfinite(log.soc_pct))
+    cuts = [0]
+    for row in uncounted_gaps(log.time_s).tolist():
+        before, after = known[known <= row], known[known > row]
+        if before.size and after.size:
+            moved = float(log.soc_pct[after[0]] - log.soc_pct[before[-1]])
+            if abs(moved) >= MOVED_PCT:
+                cuts.append(row + 1)
+    if len(cuts) == 1:
+        return [log]
+    ends = [*cuts[1:], len(log)]
+    pieces = [log.rows(slice(first, last)) for first, last in zip(cuts, ends, strict=True)]
+    kept = [(k, piece) for k, piece in enumerate(pieces, start=1) if piece.duration_s >= PIECE_S]
+    return [replace(piece, name=f"{log.name} part {k}") for k, piece in kept] or [log]

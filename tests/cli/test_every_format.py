@@ -1,0 +1,47 @@
+"""Commands that take a log or capture take every format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from cangauge.bus.vehicle import Vehicle
+from cangauge.logs.read import read_log
+from cangauge.replay.steps import CaptureSource
+from fuzzing import corpus
+from live import in_process, leaf_model_path
+
+CAPTURES = [name for name in corpus.capture_files() if name != "x.mf4"]
+LOGS = ["samples.mcap", "x.bdf.csv", "bds.csv", "signals.mf4"]
+
+
+@pytest.mark.parametrize("name", CAPTURES)
+def test_captures(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(corpus.capture_files()[name])
+    car = ("--vehicle", "leaf_aze0")
+    inspected = in_process("inspect", path, *car, "--json")
+    assert (inspected.code, inspected.json["frames"]) == (0, len(corpus.leaf_frames()))
+    output = tmp_path / "soc.csv"
+    estimated = in_process("estimate", path, *car, "-m", leaf_model_path(), "-o", output, "--json")
+    assert (estimated.code, estimated.json["rows"]) == (0, corpus.ROWS), estimated.err
+    source = CaptureSource(path, Vehicle.load("leaf_aze0"))
+    assert sum(len(step.frames) for step in source.steps(loop=False)) == len(corpus.leaf_frames())
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_logs(tmp_path: Path, name: str) -> None:
+    files = corpus.log_files() | {"signals.mf4": corpus.mf4_signals()}
+    content = files[name]
+    if content is None:
+        pytest.skip("asammdf is not installed")
+    path = tmp_path / name
+    path.write_bytes(content)
+    assert len(read_log(path)) == corpus.ROWS
+    inspected = in_process("inspect", path, "--json")
+    assert (inspected.code, inspected.json["rows"]) == (0, corpus.ROWS), inspected.err
+    output = tmp_path / "soc.mcap"
+    estimated = in_process("estimate", path, "-m", leaf_model_path(), "-o", output, "--json")
+    assert (estimated.code, estimated.json["rows"]) == (0, corpus.ROWS), estimated.err
+    assert len(read_log(output)) == corpus.ROWS

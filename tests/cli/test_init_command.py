@@ -1,0 +1,153 @@
+"""`cangauge init`: files that decode the car, refusals, choices, known vehicles and a DBC."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import can
+import pytest
+
+from cangauge.bus.captures.capture import open_capture
+from cangauge.bus.open import bus_address, open_bus
+from cangauge.bus.recording import capture_to_log
+from cangauge.bus.vehicle import Vehicle
+from cangauge.service.config import load_config
+from drive_captures import CARS, capture
+
+
+def init(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "cangauge", "init", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+        stdin=subprocess.DEVNULL,
+    )
+
+
+@pytest.fixture(scope="module")
+def mitsubishi(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("captures") / "drive.log"
+    car = next(each for each in CARS if each.name == "mitsubishi")
+    with can.CanutilsLogWriter(path) as writer:
+        for message in capture(car):
+            message.channel = "can0"
+            writer.on_message_received(message)
+    return path
+
+
+def test_an_unclear_pair_exits_with_one_and_names_three(mitsubishi: Path, tmp_path: Path) -> None:
+    done = init(mitsubishi, "-o", tmp_path / "car")
+    assert done.returncode == 1
+    assert "1) 0x373 23|16@0+" in done.stderr
+    assert "--choose current=1 --choose voltage=1" in done.stderr
+    assert not list((tmp_path / "car").glob("*"))
+
+
+def test_chosen_candidates_make_files_that_decode(mitsubishi: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "car"
+    choice = ("--choose", "current=1", "--choose", "voltage=1")
+    done = init(mitsubishi, "-o", folder, *choice, "--json")
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert result["method"] == "physics"
+    assert len(result["candidates"]["current"]) == 3
+    assert result["proof"]["samples"] > 5900
+    log = capture_to_log(mitsubishi, Vehicle.load(map=folder / "car.toml"))
+    assert 280.0 < log.voltage_v.min() < log.voltage_v.max() < 350.0
+    assert log.current_a.max() - log.current_a.min() > 200.0
+    config = load_config(folder / "run.toml")
+    assert Path(str(config.map)).name == "car.toml"
+    again = init(mitsubishi, "-o", folder, *choice)
+    assert again.returncode == 2
+    assert "--force" in again.stderr
+    assert init(mitsubishi, "-o", folder, *choice, "--force").returncode == 0
+
+
+def test_a_dbc_gives_signals_by_name(mitsubishi: Path, tmp_path: Path) -> None:
+    (tmp_path / "car.dbc").write_text(
+        'VERSION "1"\nNS_ :\nBS_:\nBU_: V\nBO_ 883 BMS_Status: 8 V\n'
+        ' SG_ PackCurrent : 23|16@0+ (0.01,-327.68) [0|0] "A" V\n'
+        ' SG_ PackVoltage : 39|16@0+ (0.1,0) [0|0] "V" V\n'
+        ' SG_ MaxChargeCurrent : 7|8@0+ (1,0) [0|0] "A" V\n'
+        ' SG_ MinCellVoltage : 15|8@0+ (0.02,0) [0|0] "V" V\n'
+    )
+    maps = ("--map", tmp_path / "map.toml", "--config", tmp_path / "run.toml")
+    done = init(mitsubishi, "--dbc", tmp_path / "car.dbc", *maps, "--json")
+    assert done.returncode == 0, done.stderr
+    chosen = json.loads(done.stdout)["candidates"]
+    assert chosen["current"][0]["signal"] == "PackCurrent"
+    assert chosen["voltage"][0]["signal"] == "PackVoltage"
+    car = Vehicle.load(map=tmp_path / "map.toml")
+    assert car.current.codec.name == "PackCurrent"
+
+
+def test_nothing_to_look_at_is_refused(tmp_path: Path) -> None:
+    done = init("-o", tmp_path)
+    assert done.returncode == 2
+    assert "give a capture" in done.stderr
+    assert init("x.log").returncode == 2
+    wrong = init("x.log", "-o", tmp_path, "--choose", "speed=1")
+    assert "not ROLE=N" in wrong.stderr
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(
+    ("name", "preset"),
+    [
+        ("leaf_can/EV-CANeplus2.log.gz", "leaf_ze1_polled"),
+        ("leaf_can/62kWh-Battery-only-EVcan.txt.gz", "leaf_ze1"),
+        ("leaf_can/10bars.csv.gz", "leaf_ze0"),
+        ("can_captures/bmw_i3_startcharge_gvret.csv.gz", "bmw_i3"),
+    ],
+)
+def test_known_vehicles_are_recognised(
+    shared_data: Path, tmp_path: Path, name: str, preset: str
+) -> None:
+    done = init(shared_data / name, "-o", tmp_path, "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["vehicle"] == preset
+    config = load_config(tmp_path / "run.toml")
+    assert config.load_vehicle().name == Vehicle.load(preset, temperature_c=20.0).name
+
+
+def test_a_live_bus_is_listened_to(mitsubishi: Path, tmp_path: Path) -> None:
+    port = 20_000 + (os.getpid() + 311) % 20_000
+    bus = ("--interface", "udp_multicast", "--bus-option", f"port={port}")
+    options = ("-o", tmp_path / "car", "--seconds", "8", "--json")
+    choice = ("--choose", "current=1", "--choose", "voltage=1")
+    arguments = [*bus, *options, *choice]
+    command = [sys.executable, "-m", "cangauge", "init", *map(str, arguments)]
+    stop = threading.Event()
+
+    def send() -> None:
+        with open_bus(bus_address("udp_multicast", options={"port": port}), []) as sender:
+            began_s, frames = time.monotonic(), list(open_capture(mitsubishi))
+            while not stop.is_set():
+                for frame in frames:
+                    wait_s = began_s + frame.timestamp / 4.0 - time.monotonic()
+                    if stop.wait(max(wait_s, 0.0)):
+                        return
+                    sender.send(frame)
+                began_s = time.monotonic()
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL
+        )
+    finally:
+        stop.set()
+        thread.join()
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["proof"]["samples"] > 500
+    config = load_config(tmp_path / "car" / "run.toml")
+    assert config.interface == "udp_multicast"
+    assert config.bus_options == {"port": port}

@@ -1,0 +1,233 @@
+"""One service under attack by its files, its clients and its signals: frames go on, and it ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+from cangauge.bus.encoder import FrameEncoder
+from cangauge.bus.vehicle import Vehicle
+from cangauge.errors import CangaugeError
+from cangauge.estimation.validity import Sample
+from cangauge.service.state import FILE_NAME
+from cangauge.service.status_client import fetch_status
+from faults.large_dbc import write_large_dbc
+from live import Command, leaf_model_path, waits
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+GROUP = "239.74.163.81"
+PORT = 46_000 + os.getpid() % 900
+LONGEST_GAP_S = 0.6
+"""Between two SOC frames, on a busy machine [s]; they are sent every 0.1 s."""
+
+
+class Target:
+    """A service with all its files, a car that sends, and a listener."""
+
+    def __init__(self, folder: Path) -> None:
+        self.config, self.state = folder / "run.toml", folder / "state" / FILE_NAME
+        self.recordings, self.socket = folder / "recordings", folder / "status.sock"
+        for each in (self.state.parent, self.recordings):
+            each.mkdir()
+        self.good = (
+            f'model = "{leaf_model_path()}"\ninterface = "udp_multicast"\nchannel = "{GROUP}"\n'
+            f'initial_soc = 80\nstate = "state/{FILE_NAME}"\nstate_every_s = 0.1\n'
+            f'record = "recordings/r.log"\nrecord_part_s = 1\nstatus_socket = "{self.socket}"\n'
+            f'http = "127.0.0.1:{PORT}"\n[bus_options]\nport = {PORT}\n'
+        )
+        self.config.write_text(self.good)
+        self.service = Command("run", "--config", self.config)
+        self.seen_s: list[float] = []
+        self._over = threading.Event()
+        self._threads = [threading.Thread(target=each) for each in (self._drive, self._listen)]
+        for thread in self._threads:
+            thread.start()
+        assert waits(lambda: len(self.seen_s) > 3, 30.0)
+
+    def _drive(self) -> None:
+        encoder, number = FrameEncoder(Vehicle.load("generic")), 0
+        with can.Bus(interface="udp_multicast", channel=GROUP, port=PORT) as bus:
+            while not self._over.wait(0.05):
+                number += 1
+                sample = Sample(0.05 * number, 10.0 + number % 5, 380.0 - 0.1 * (number % 7), 25.0)
+                for frame in encoder.encode(sample):
+                    bus.send(frame)
+
+    def _listen(self) -> None:
+        with can.Bus(interface="udp_multicast", channel=GROUP, port=PORT) as bus:
+            while not self._over.is_set():
+                message = bus.recv(0.1)
+                if message is not None and message.arbitration_id == 0x5A0:
+                    self.seen_s.append(time.monotonic())
+
+    def close(self) -> None:
+        self._over.set()
+        for thread in self._threads:
+            thread.join()
+        self.service.process.kill()
+
+    def holds(self, attack: str, seconds: float = 0.4) -> None:
+        """Check that frames come during and after an attack."""
+        began_s = time.monotonic()
+        time.sleep(seconds)
+        assert self.service.process.poll() is None, attack
+        recent = [each for each in self.seen_s if each >= began_s - LONGEST_GAP_S]
+        gaps = [b - a for a, b in zip(recent, [*recent[1:], time.monotonic()], strict=True)]
+        assert max(gaps, default=9.0) < LONGEST_GAP_S, attack
+
+    def status(self) -> dict[str, Any]:
+        return fetch_status(str(self.socket))
+
+    def children(self) -> list[int]:
+        text = Path(f"/proc/{self.service.process.pid}/task").glob("*/children")
+        return [int(each) for path in text for each in path.read_text().split()]
+
+
+@pytest.fixture
+def target(tmp_path: Path) -> Iterator[Target]:
+    target = Target(tmp_path)
+    yield target
+    target.close()
+
+
+def removed(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def sparse(path: Path) -> None:
+    with path.open("wb") as file:
+        file.truncate(10 << 30)
+
+
+SWAPS: dict[str, Callable[[Path], object]] = {
+    "folder": Path.mkdir,
+    "pipe": os.mkfifo,
+    "link to itself": lambda path: path.symlink_to(path),
+    "link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
+    "10 GB": sparse,
+    "nothing": lambda _: None,
+    "a text": lambda path: path.write_text("x = 1\n"),
+}
+CONFIGS = {
+    "deep": "x = " + "[" * 30_000,
+    "deep tables": "".join("[" + ".".join("a" * n) + "]\n" for n in range(2, 30)) * 30,
+    "long key": "a" + ".a" * 20_000 + " = 1\n",
+    "many keys": "".join(f"k{n} = 1\n" for n in range(6_000)),
+    "a million keys": "".join(f"k{n} = 1\n" for n in range(1_000_000)),
+    "long number": "timeout_s = " + "9" * 60_000,
+    "escapes": 'vehicle = "\\u001b[2J\\u0000\\n"\n',
+    "binary": "\x00\x01",
+}
+JUNK = {
+    "endless headers": b"GET /status HTTP/1.1\r\n" + b"X: y\r\n" * 200_000,
+    "long header": b"GET /status HTTP/1.1\r\nX: " + b"y" * 2_000_000,
+    "long path": b"GET /" + b"a" * 2_000_000,
+    "pipelined": b"GET /healthz HTTP/1.1\r\n\r\n" * 3_000,
+    "endless chunks": b"POST /status HTTP/1.1\r\nTransfer-Encoding: chunked\r\n\r\n"
+    + b"1\r\nx\r\n" * 100_000,
+    "huge length": b"POST /status HTTP/1.1\r\nContent-Length: 99999999999999999999\r\n\r\n",
+    "negative length": b"POST /status HTTP/1.1\r\nContent-Length: -5\r\n\r\nxxxxx",
+    "TLS": b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(500),
+    "HTTP/2": b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes(100),
+    "zeros": bytes(1_000_000),
+    "other host": b"GET http://evil.example/status HTTP/1.1\r\nHost: evil.example\r\n\r\n",
+}
+
+
+def test_frames_go_on_under_attack(target: Target, tmp_path: Path) -> None:
+    assert waits(target.state.exists, 10.0)
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+
+    for name, swap in SWAPS.items():
+        removed(target.state)
+        with suppress(FileExistsError):  # the service was quicker
+            swap(target.state)
+        target.holds(f"state: {name}", 0.25)
+    removed(target.state)
+    shutil.rmtree(target.state.parent)
+    target.holds("state's folder removed", 0.25)
+    target.state.parent.mkdir()
+    assert waits(target.state.exists, 5.0)
+
+    for number in range(2, 60):
+        name = target.recordings / f"r-0001-{number:06d}.log"
+        if not name.exists():
+            (os.mkfifo if number % 2 else lambda path: path.symlink_to(victim))(name)
+    target.holds("names of later parts taken", 1.3)
+    assert victim.read_text() == "precious"
+    assert target.status()["record"]["problem"]
+
+    for name, junk in JUNK.items():
+        for family, address in (
+            (socket.AF_INET, ("127.0.0.1", PORT)),
+            (socket.AF_UNIX, str(target.socket)),
+        ):
+            with socket.socket(family) as client, suppress(OSError):
+                client.settimeout(0.5)
+                client.connect(address)
+                client.sendall(junk)
+        target.holds(f"client: {name}", 0.05)
+    assert target.status()["running"]
+
+    for _ in range(200):
+        target.service.process.send_signal(signal.SIGHUP)
+        time.sleep(0.002)
+    target.holds("hangups", 0.3)
+    assert len(target.children()) <= 1
+    assert waits(lambda: not target.status()["config"]["reloading"], 20.0)
+
+    target.service.process.send_signal(signal.SIGHUP)
+    assert waits(lambda: bool(target.children()), 5.0)
+    for child in target.children():
+        os.kill(child, signal.SIGKILL)
+    assert waits(lambda: bool(target.status()["config"]["problem"]), 10.0)
+    assert "status -9" in target.status()["config"]["problem"]
+    target.holds("killed while it reads", 0.1)
+
+    write_large_dbc(tmp_path, 3.0)
+    large = 'dbc = "large.dbc"\nmap = "map.toml"\n[bus_options]'
+    target.config.write_text(target.good.replace("[bus_options]", large))
+    target.service.process.send_signal(signal.SIGHUP)
+    assert waits(lambda: bool(target.children()), 5.0)
+    target.holds("a large DBC", 0.3)
+    left = target.children()
+    target.service.process.terminate()
+    ended = target.service.end(5.0)
+    assert ended.code == 0, ended.err
+    assert "Traceback" not in ended.err
+    assert waits(lambda: not any(Path(f"/proc/{each}").exists() for each in left), 5.0)
+
+
+@pytest.mark.parametrize("name", [*SWAPS, *CONFIGS])
+def test_a_hostile_configuration_is_refused_in_bounds(tmp_path: Path, name: str) -> None:
+    """As the process of a reload reads it."""
+    from cangauge.service.config import load_config  # noqa: PLC0415
+
+    path = tmp_path / "run.toml"
+    if name in SWAPS:
+        SWAPS[name](path)
+    else:
+        path.write_text(CONFIGS[name])
+    began_s = time.process_time()
+    with pytest.raises(CangaugeError) as caught:
+        load_config(path, {"model": "m.json"}).load_vehicle()
+    assert time.process_time() - began_s < 2.0
+    assert str(caught.value).isprintable()
+    json.dumps(caught.value.to_dict())

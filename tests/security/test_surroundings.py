@@ -1,0 +1,95 @@
+"""Streams, environment and working folder of a command: odd ones cost neither result nor safety."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from cangauge.bus.captures.mf4 import Mf4Reader
+from cangauge.service.config import RunConfig
+from cangauge.service.reading import BackgroundReader, Reading
+from live import COMMAND, leaf_model_path, waits
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs a Unix shell")
+RUN = ("run", "-m", leaf_model_path(), "--interface", "virtual", "--channel", "a", "--duration",
+       "0.1")  # fmt: skip
+
+
+def shell(
+    arguments: tuple[object, ...], redirection: str, env: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["/bin/sh", "-c", f'"$@" {redirection}', "", sys.executable, "-c", COMMAND]
+        + [str(each) for each in arguments],
+        capture_output=True, text=True, timeout=60.0, check=False, env=env, errors="replace",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("arguments", "redirection", "code", "line"),
+    [
+        (("status", "--endpoint", "/absent", "--json"), ">&-", 1, "error: stdout is closed"),
+        (("status", "--endpoint", "/absent", "--json"), ">/dev/full", 1, "error: stdout: No space"),
+        (("status", "--endpoint", "/absent"), "<&- >&- 2>&-", 1, ""),
+        (("status", "--absent"), "<&- >&- 2>&-", 2, ""),
+        (("status", "--help"), ">/dev/full", 1, "error: stdout: No space"),
+        (("status", "--help"), "| true", 0, ""),
+    ],
+)
+def test_closed_and_full_streams(
+    arguments: tuple[str, ...], redirection: str, code: int, line: str
+) -> None:
+    ended = shell(arguments, redirection)
+    assert ended.returncode == code
+    assert ended.stderr.startswith(line)
+    assert "Traceback" not in ended.stderr
+    assert len(ended.stderr.splitlines()) <= 1
+
+
+def test_no_file_takes_the_number_of_a_closed_stream(tmp_path: Path) -> None:
+    ended = shell((*RUN, "--record", tmp_path / "r.log", "--json"), "<&- >&- 2>&-")
+    assert ended.returncode == 1  # the result could not be printed
+    assert (tmp_path / "r.log").read_bytes() == b""
+
+
+def test_odd_environments(tmp_path: Path) -> None:
+    long = str(tmp_path / ("x" * 200))
+    environment = {
+        "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "COLUMNS": "-5",
+        "TERM": "nonsense", "TMPDIR": "/absent", "XDG_RUNTIME_DIR": long,
+        "NOTIFY_SOCKET": "/" + long,
+        "WATCHDOG_USEC": "9" * 6000, "STATE_DIRECTORY": "::", "OMP_NUM_THREADS": "many",
+    }  # fmt: skip
+    ended = shell((*RUN, "--json"), "", environment)
+    assert ended.returncode == 0, ended.stderr
+    assert "status.unavailable" in ended.stderr
+    helped = shell(("status", "--help"), "", environment)
+    assert helped.returncode == 0, helped.stderr
+    assert "\\xb1" in helped.stdout  # "±" in words that this locale has
+
+
+def test_modules_in_the_working_folder_are_not_imported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever supplies a folder of logs must not supply code."""
+    trap = f"open({str(tmp_path / 'taken')!r}, 'w').close()\nraise SystemExit(9)\n"
+    folder = tmp_path / "downloads"
+    folder.mkdir()
+    for name in ("struct", "numpy", "can", "asammdf", "pickle", "cangauge", "contextlib"):
+        (folder / f"{name}.py").write_text(trap)
+    (folder / "x.mf4").write_bytes(b"MDF     4.10    " + bytes(1000))
+    monkeypatch.chdir(folder)
+    reader = BackgroundReader(partial(RunConfig, model=str(leaf_model_path())))
+    reader.request()
+    results: list[object] = []
+    assert waits(lambda: bool(results.append(reader.poll()) or results[-1]), 30.0)  # type: ignore[func-returns-value] # collects
+    assert isinstance(results[-1], Reading), results[-1]
+    with pytest.raises(Exception):  # noqa: B017, PT011 - asammdf may be missing
+        list(Mf4Reader(folder / "x.mf4"))
+    assert not (tmp_path / "taken").exists()
+    assert os.listdir(folder)  # noqa: PTH208 - it is still there

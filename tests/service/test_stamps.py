@@ -1,0 +1,240 @@
+"""A live service whose frames have impossible stamps: time, freshness, and the recording."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from random import Random
+
+import can
+import pytest
+
+from cangauge.bus.backend import BackendCapabilities
+from cangauge.bus.connection import BusConnection
+from cangauge.bus.encoder import FrameEncoder
+from cangauge.bus.open import BusAddress, open_bus
+from cangauge.bus.publish import SocEstimate, SocReader
+from cangauge.bus.recording import capture_samples
+from cangauge.bus.time_source import ClockFrames, ReceiveTime
+from cangauge.bus.vehicle import Vehicle
+from cangauge.estimation.offline import samples_of
+from cangauge.estimation.validity import Reason, Sample, Status
+from cangauge.service.loop import LoopSettings
+from cangauge.service.offline import estimate_capture
+from cangauge.service.pipeline import Pipeline, PipelineSettings
+from cangauge.service.recording import Recorder
+from live import Service, leaf_model, short_log, virtual_port, virtual_service, waits
+
+KERNEL = BackendCapabilities("kernel", echoes=False, has_error_classes=False)
+PACE_S = 0.02
+
+
+class RestampedBus:
+    """A virtual bus whose stamps are changed."""
+
+    protocol = can.CanProtocol.CAN_20
+
+    def __init__(self, channel: str, stamp: Callable[[float], float]) -> None:
+        self._bus = open_bus(BusAddress("virtual", channel))
+        self._stamp = stamp
+        self.set_filters, self.send = self._bus.set_filters, self._bus.send
+        self.shutdown = self._bus.shutdown
+
+    def recv(self, timeout: float | None) -> can.Message | None:
+        message = self._bus.recv(timeout)
+        if message is not None:
+            message.timestamp = self._stamp(message.timestamp)
+        return message
+
+    def fileno(self) -> int:
+        raise NotImplementedError
+
+
+def run(
+    channel: str, stamp: Callable[[float], float], seconds: float, path: Path
+) -> tuple[Service, list[SocEstimate]]:
+    """Feed a service in real time; return it and its published estimates."""
+    reader, found = SocReader(), []
+    pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
+    bus = RestampedBus(channel, stamp)
+    port = BusConnection(bus, "restamped", KERNEL)  # type: ignore[arg-type] # has what is used
+    samples = iter(samples_of(short_log(seconds, 1.0 / PACE_S)))
+    with (
+        Recorder(path) as recorder,
+        virtual_port(channel) as car,
+        Service(port, pipeline, LoopSettings(), recorder) as service,
+    ):
+        encoder, due_s = FrameEncoder(Vehicle.load("generic")), time.monotonic()
+        for sample in samples:
+            for frame in encoder.encode(sample):
+                car.send(frame)
+            due_s += PACE_S
+            while (message := car.receive(max(due_s - time.monotonic(), 0.0))) is not None:
+                if isinstance(estimate := reader.read(message), SocEstimate):
+                    found.append(estimate)
+        assert waits(lambda: pipeline.samples >= round(seconds / PACE_S))
+    return service, found
+
+
+def assert_recording_agrees(path: Path, service: Service) -> None:
+    recorded = estimate_capture(path, Vehicle.load("generic"), leaf_model())
+    assert recorded.table.soc_pct.tolist() == [each.soc_pct for _, each in service.rows]
+    assert recorded.table.reasons.tolist() == [int(each.reasons) for _, each in service.rows]
+    assert recorded.time_s.tolist() == [time_s for time_s, _ in service.rows]
+
+
+@pytest.mark.parametrize("kind", ["still", "random"])
+def test_impossible_stamps_are_replaced_and_reported(kind: str, tmp_path: Path) -> None:
+    rng = Random(1)  # noqa: S311 - must be repeatable
+    began_s = time.time()
+
+    def stamp(true_s: float) -> float:
+        if kind == "still":
+            return min(true_s, began_s + 0.5)
+        return true_s + rng.uniform(-0.9, 0.9)
+
+    service, published = run(f"stamps-{kind}", stamp, 4.0, tmp_path / "bus.log")
+    taken = service.pipeline.taken
+    assert taken > 0.9 * service.pipeline.samples
+    times = [time_s for time_s, _ in service.rows]
+    assert times[-1] - times[0] == pytest.approx(4.0, abs=0.3)
+    assert max(each.age_s for each in published if each.age_s == each.age_s) <= 1.0
+    last = published[-1]
+    assert last.reasons & Reason.TIME_UNCERTAIN
+    assert last.status is Status.DEGRADED
+    assert not last.reasons & Reason.INPUT_STALE
+    assert sum("contradict the monotonic clock" in line for line in service.warnings) == 1
+    assert_recording_agrees(tmp_path / "bus.log", service)
+
+
+def test_clock_set_in_mid_drive_costs_nothing(tmp_path: Path) -> None:
+    set_s = time.time() + 1.0
+
+    def stamp(true_s: float) -> float:
+        return true_s if true_s < set_s else true_s + 86_400.0
+
+    service, published = run("stamps-set", stamp, 3.5, tmp_path / "bus.log")
+    times = [time_s for time_s, _ in service.rows]
+    assert times[-1] - times[0] == pytest.approx(3.5, abs=0.3)
+    assert all(two > one for one, two in pairwise(times))
+    reasons = published[-1].reasons
+    assert not reasons & (Reason.TIME_UNCERTAIN | Reason.CURRENT_GAP | Reason.INPUT_STALE)
+    assert any("was set by +86400.0 s" in line for line in service.warnings)
+    assert_recording_agrees(tmp_path / "bus.log", service)
+    # A state refers to the stamps as they come after a restart.
+    state = service.pipeline.snapshot()
+    assert state is not None
+    later = Pipeline(Vehicle.load("generic"), leaf_model())
+    later.restore(state, 1.0)
+    later._estimate(Sample(time.time() + 86_401.0, 1.0, 380.0, 20.0))
+    assert later.taken == 1
+    assert not later.latest.reasons & Reason.CURRENT_GAP
+
+
+def test_samples_that_are_refused_do_not_make_it_fresh() -> None:
+    reader = SocReader()
+    settings = PipelineSettings(time_source="replay-clock")
+    loop = LoopSettings(timeout_s=0.3)
+    found: list[SocEstimate] = []
+    with (
+        virtual_port("standing") as car,
+        virtual_service("standing", settings, loop) as service,
+    ):
+        encoder, clock = FrameEncoder(Vehicle.load("generic")), ClockFrames()
+        for number, sample in enumerate(samples_of(short_log(4.0, 20.0))):
+            car.send(clock.at(min(round(sample.time_s * 1e6), 1_000_000)))
+            for frame in encoder.encode(sample):
+                car.send(frame)
+            time.sleep(0.01 if number < 20 else 0.03)
+        while (message := car.receive(0.0)) is not None:
+            if isinstance(estimate := reader.read(message), SocEstimate):
+                found.append(estimate)
+        assert service.pipeline.samples > service.pipeline.taken + 30
+    assert found[-1].status is Status.INVALID
+    assert found[-1].reasons & Reason.INPUT_STALE
+    assert found[-1].age_s >= 1.0
+
+
+def test_uncertainty_grows_while_no_charge_is_counted() -> None:
+    pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
+    encoder = FrameEncoder(Vehicle.load("generic"))
+    for sample in samples_of(short_log(100.0)):
+        for each in encoder.encode(sample):
+            pipeline.handle(each)
+    published = []
+    for silent_s in (0.0, 1.0, 10.0, 60.0):
+        pipeline.heartbeat(is_stale=silent_s > 0.5, silent_s=silent_s)
+        published.append(pipeline.published.soc_std_pct)
+    assert published[0] == pipeline.latest.soc_std_pct
+    assert published == sorted(published)
+    # A minute of the drive's mean square current.
+    assert published[-1] > published[0] + 0.1
+    pipeline.heartbeat(is_stale=False)
+    assert pipeline.published.soc_std_pct == published[0]
+
+
+def frame(time_s: float) -> can.Message:
+    return can.Message(timestamp=time_s, arbitration_id=0x401, is_extended_id=False)
+
+
+def test_irregular_stamps_of_a_capture_do_not_speed_time_up() -> None:
+    rng, source = Random(1), ReceiveTime()  # noqa: S311 - must be repeatable
+    times = []
+    for number in range(6000):
+        time_s = source.time_of(frame(1e9 + 0.1 * number + rng.uniform(-0.9, 0.9)))
+        assert time_s is not None
+        times.append(time_s)
+    assert max(times) - min(times) == pytest.approx(600.0, abs=3.0)
+    assert source.is_uncertain
+
+
+def capture_of(path: Path, buses: dict[str, Callable[[float], float]]) -> Path:
+    """Write a minute of a drive as received on several buses, each with its own stamps."""
+    encoder, lines = FrameEncoder(Vehicle.load("generic")), []
+    for sample in samples_of(short_log(60.0)):
+        for each in encoder.encode(sample):
+            for bus, stamp in buses.items():
+                time_s, data = 1e9 + stamp(sample.time_s), each.data.hex().upper()
+                lines.append(f"({time_s:.6f}) {bus} {each.arbitration_id:03X}#{data}\n")
+    path.write_text("".join(lines))
+    return path
+
+
+def test_two_adapters_in_a_capture_are_no_irregularity(tmp_path: Path) -> None:
+    buses = {"can0": lambda time_s: time_s, "can1": lambda time_s: time_s - 3.0}
+    path = capture_of(tmp_path / "two.log", buses)
+    found = estimate_capture(path, Vehicle.load("generic"), leaf_model())
+    assert not (found.table.reasons & Reason.TIME_UNCERTAIN).any()
+    assert found.time_s[-1] - found.time_s[0] == pytest.approx(59.9)
+    read = capture_samples(path, Vehicle.load("generic"))
+    assert not any("irregular" in each for each in read.remarks)
+    assert read.time_s[-1] - read.time_s[0] == pytest.approx(59.9)
+
+
+def test_irregular_stamps_of_a_capture_are_named(tmp_path: Path) -> None:
+    rng = Random(1)  # noqa: S311 - must be repeatable
+    path = capture_of(tmp_path / "one.log", {"can0": lambda s: s + rng.uniform(-0.9, 0.9)})
+    found = estimate_capture(path, Vehicle.load("generic"), leaf_model())
+    assert found.table.reasons[-1] & Reason.TIME_UNCERTAIN
+    assert found.time_s[-1] - found.time_s[0] == pytest.approx(60.0, abs=2.0)
+    remarks = capture_samples(path, Vehicle.load("generic")).remarks
+    assert any("irregular" in each for each in remarks)
+
+
+def test_one_set_clock_in_a_capture_is_no_irregularity() -> None:
+    source = ReceiveTime()
+    for number in range(3000):
+        by_s = -5.0 if number > 1000 else 0.0
+        by_s -= 0.5 if number > 2000 else 0.0
+        source.time_of(frame(1e9 + 0.1 * number + by_s))
+        assert not source.is_uncertain
+
+
+@pytest.mark.parametrize("stamp_s", [float("nan"), float("inf"), float("-inf"), 1e300])
+def test_stamp_that_is_no_time_is_the_latest_one(stamp_s: float) -> None:
+    source = ReceiveTime()
+    assert source.time_of(frame(stamp_s)) == 0.0
+    source.time_of(frame(5.0))
+    assert source.time_of(frame(stamp_s)) == 5.0
