@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cangauge.identify.noise import describe_noise
 
 from cangauge.errors import InputError
 from cangauge.identify.delays import search_delays

@@ -1,21 +1,21 @@
 """Extended Kalman filter of the voltage model and Coulomb counting, and its measurement noise.
 
-The state x = (S, o, b, l, g, a, r, c1 … ck) is the SoC S [%], the current sensor's offset o [A]
+The state x = (S, o, b, l, g, a, c1 … ck) is the SoC S [%], the current sensor's offset o [A]
 (measured = true + o), a slow and a lasting error of the voltage b and l [V], the relative error g
 of the charge per % SoC (true capacity = C/(1 + g)), and standard normal amplitudes of the model's
-own errors: of the temperature coefficient (a), of the resistance over temperature (r), and of the
-principal functions φ of the pseudo-OCV's error (c).
+own errors: of the temperature coefficient (a) and of the principal functions φ of the pseudo-OCV's
+error (c).
 
     S ← S − (1 + g)·ΔQ + 100/(3600·C)·o·Δt,   ΔQ the counted charge [%]
-    U = OCV(S) + kt·(T − T_r) + Σ Rj·(I(t − dj) − o) + b + l + a·σ_kt·(T − T̄) + r·σ_R·(T − T̄)·D
-        + Σ ck·φk(S) + fast error
+    U = OCV(S) + kt·(T − T_r) + Σ Rj·(I(t − dj) − o) + b + l + a·σ_kt·(T − T̄) + Σ ck·φk(S)
+        + fast error
 
 b and l are Gauss–Markov processes; all sizes come from the identification's error model
 (`inference.error_model`). The lasting error l may be another after the time and the charge of a
 log, the errors it was identified on. b starts with the polarization that the usual current would
 have left from before the first sample.
 
-a, r and c are *considered*: the filter keeps their covariance with the other states, so that the
+a and c are *considered*: the filter keeps their covariance with the other states, so that the
 SoC's standard deviation contains the error of the curve wherever the SoC moves, but does not learn
 them: from one drive the shape of a curve cannot be told from errors of the charge, and a filter
 that tries believes a wrong shape more than a wrong level (Schmidt–Kalman filter; Jazwinski,
@@ -85,10 +85,13 @@ ITERATIONS_AT_MOST = 8
 """A correction by more than this [%] is repeated, linearized at its own result (iterated extended
 Kalman filter; Jazwinski 1970, ch. 8.3), at most so often."""
 
+LASTING_TIME_S = 7200.0
+"""Time constant of a lasting error whose logs are not known [s]: they are seldom longer."""
+
 ROUNDING = 1e-6
 """Tolerance of a covariance's correlations."""
 
-SOC, OFFSET, SLOW, LASTING, CAPACITY, KT, RESISTANCE = range(7)
+SOC, OFFSET, SLOW, LASTING, CAPACITY, KT = range(6)
 """Index of each state; the curve's functions follow."""
 
 LEARNED: Final = 5
@@ -133,8 +136,6 @@ class MeasurementNoise:
         curve = model.noise.curve
         self._mean_c = voltage_model.t_ref_c if curve is None else curve.temperature_c
         self._kt_std = 0.0 if curve is None else curve.kt_std_v_per_k
-        self._resistance_std = 0.0 if curve is None else curve.resistance_std
-        self._resistance_std_per_k = 0.0 if curve is None else curve.resistance_std_per_k
         self._usual_a = USUAL_CURRENT_C_RATE * capacity_ah
         # All samples of one filling delay line share the same unknown currents.
         self._shared_by = max(voltage_model.delay_s[-1] * model.rate_hz, 1.0)
@@ -170,12 +171,6 @@ class MeasurementNoise:
         outside_v = outside * (min(temperature_c - cold, 0.0) + max(temperature_c - hot, 0.0))
         return math.sqrt(variance), self._kt_std * (temperature_c - self._mean_c) + outside_v
 
-    def resistance_std(self, temperature_c: float) -> float:
-        """Return the signed relative deviation of the resistance at a temperature [°C]."""
-        if math.isnan(temperature_c):
-            return self._resistance_std * TEMPERATURE_STD_K
-        return self._resistance_std * (temperature_c - self._mean_c)
-
     def _filling_var_v2(self, filled_var_v2: float, filled_s: float) -> float:
         """Return the error's variance while the delay line fills [V²].
 
@@ -202,9 +197,7 @@ class Measurement(NamedTuple):
     std_v: float
     """Standard deviation of the fast error [V]."""
     kt_std_v: float
-    resistance_std_v: float
-    """Effect of one standard deviation of the temperature coefficient, and of the resistance's
-    change with temperature, signed [V]."""
+    """Signed effect of one standard deviation of the temperature coefficient [V]."""
 
 
 class CurveFunctions:
@@ -256,8 +249,6 @@ class SocEkf:
 
     Attributes
     ----------
-    log_likelihood : float
-        Of the last voltage, given all before it.
     was_outlier : bool
         Whether the last voltage was down-weighted as an outlier.
     """
@@ -278,9 +269,8 @@ class SocEkf:
         self._offset_std_a = OFFSET_STD_PER_AH * capacity_ah
         self._mean_innovation_v = 0.0
         self._mean_seconds = 0.0
-        self.log_likelihood = 0.0
         self.was_outlier = False
-        self._size = RESISTANCE + 1 + self._functions.number
+        self._size = KT + 1 + self._functions.number
         self._x: list[float] = []
         self._p: list[list[float]] = []
 
@@ -416,8 +406,6 @@ class SocEkf:
         self.was_outlier = innovation**2 > OUTLIER_SIGMAS**2 * (of_state + fast_v2)
         if self.was_outlier:
             fast_v2 = max(fast_v2, innovation**2 - of_state)
-        total = of_state + fast_v2
-        self.log_likelihood = -0.5 * (innovation**2 / total + math.log(total))
         self._correct(jacobian, spread, innovation, of_state, fast_v2)
         self._clip_soc()
         return is_contradicted
@@ -427,7 +415,7 @@ class SocEkf:
         ocv_v, slope = self._curve.pseudo_ocv_at(soc_pct)
         jacobian = [
             slope, -self._steady_ohm, 1.0, 1.0, 0.0, measurement.kt_std_v,
-            measurement.resistance_std_v, *self._functions.at(soc_pct),
+            *self._functions.at(soc_pct),
         ]  # fmt: skip
         return jacobian, ocv_v + measurement.without_ocv_v - self._steady_ohm * self._x[OFFSET]
 
@@ -537,6 +525,19 @@ class SocEkf:
     def offset_a(self) -> float:
         """Estimated offset of the current sensor [A]."""
         return self._x[OFFSET]
+
+    @property
+    def bias_v(self) -> float:
+        """Estimated error of the voltage in time, slow and lasting [V]."""
+        return self._x[SLOW] + self._x[LASTING]
+
+    @property
+    def strain(self) -> float:
+        """Largest of offset, lasting bias and capacity error, in prior standard deviations."""
+        x = self._x
+        lasting_std = math.sqrt(self._lasting_var)
+        lasting = abs(x[LASTING]) / lasting_std if lasting_std > 0.0 else 0.0
+        return max(abs(x[OFFSET]) / self._offset_std_a, abs(x[CAPACITY]) / CAPACITY_STD, lasting)
 
     def summary(self, counted_s: float) -> tuple[float, float, float]:
         """Return SoC, its standard deviation, and the charge that the offset adds in a time [%]."""

@@ -15,6 +15,7 @@ from cangauge.errors import InputError
 from cangauge.estimation.cells import PackTick
 from cangauge.estimation.counting import CoulombCounter, EstimatorClock
 from cangauge.estimation.ekf import (
+    CAPACITY_STD,
     UNKNOWN_SOC_STD_PCT,
     CurveFunctions,
     Measurement,
@@ -62,6 +63,10 @@ REST_S = 600.0
 CONTRADICTED_S = 300.0
 """How long a lasting contradiction, or a restart of the filter, degrades the estimate [s]."""
 
+MISMATCH_SIGMAS = 3.0
+"""Offset, lasting bias or capacity beyond this many of the standard deviations that were assumed
+for them, which one pack in 400 exceeds by chance: model and pack disagree."""
+
 AGREES_PCT = 1e-6
 """Rounding error allowed between a state's last estimate and its filter or count [%]."""
 
@@ -73,6 +78,8 @@ class Estimator:
     ----------
     model : Model
     settings : EstimatorSettings, optional
+    ekf_type : type, optional
+        Implementation of the Kalman filter; by default that of `settings.filter`.
 
     Attributes
     ----------
@@ -98,9 +105,15 @@ class Estimator:
     80
     """
 
-    def __init__(self, model: Model, settings: EstimatorSettings | None = None) -> None:
+    def __init__(
+        self,
+        model: Model,
+        settings: EstimatorSettings | None = None,
+        ekf_type: type[SocEkf] | None = None,
+    ) -> None:
         self.model = model
         self.settings = settings or EstimatorSettings()
+        make_ekf = ekf_type or _ekf_type(self.settings)
         extended = model.extended_model()
         self._voltage_model = extended.model
         self._online = extended.online(self.settings.capacity_ah)
@@ -109,7 +122,7 @@ class Estimator:
         self._curve = self._online if self._has_effects else self._voltage_model
         self.capacity_ah = self._online.capacity_ah
         self.filter = HypothesisFilter(
-            lambda: SocEkf(self._curve, self._online.steady_ohm, self.capacity_ah, model.noise)
+            lambda: make_ekf(self._curve, self._online.steady_ohm, self.capacity_ah, model.noise)
         )
         self._counter = CoulombCounter(self.capacity_ah, self.settings.gap_s)
         self._clock = EstimatorClock()
@@ -265,6 +278,11 @@ class Estimator:
             self.health,
         )
 
+    @property
+    def time_s(self) -> float:
+        """The estimator's own time at the latest sample [s]: it always increases."""
+        return self._clock.state.last_s
+
     def _process(self, sample: Sample) -> None:
         """Count the charge of a corrected sample, and use its voltage where that is due."""
         memory, since = self._memory, self._since
@@ -335,10 +353,9 @@ class Estimator:
         newton = soc_from_ocv(self._curve, sample.voltage_v - without_ocv_v, guess_pct)
         memory.newton_pct, memory.newton_inside = newton
         std_v, kt_std_v = self._noise.at(memory.temperature_c, self._line)
-        resistance_std_v = self._noise.resistance_std(memory.temperature_c) * self._drop_v()
         slope = self._curve.pseudo_ocv_at(memory.newton_pct)[1]
         curve_std_v = self._functions.std_v(memory.newton_pct)
-        error_v = math.hypot(std_v, self._bias_std_v, curve_std_v, kt_std_v, resistance_std_v)
+        error_v = math.hypot(std_v, self._bias_std_v, curve_std_v, kt_std_v)
         memory.newton_std_pct = min(error_v / slope, UNKNOWN_SOC_STD_PCT)
         if math.isnan(memory.coulomb_start_pct):
             # No initial SoC: start from the voltage's with a wide prior, from which the filter
@@ -352,10 +369,13 @@ class Estimator:
                 memory.newton_pct,
                 std_v,
                 kt_std_v,
-                resistance_std_v,
             )
             if self.filter.update(measurement, since):
                 memory.contradicted_until_s = sample.time_s + CONTRADICTED_S
+            ekf = self.filter.likelier
+            memory.bias_pct = min(abs(ekf.bias_v) / slope, UNKNOWN_SOC_STD_PCT)
+            if ekf.strain > MISMATCH_SIGMAS or self._has_other_capacity():
+                memory.mismatch_until_s = sample.time_s + CONTRADICTED_S
         tick = self._voltage_tick(sample, without_ocv_v)
         self._health.use(tick, since.seconds)
         self._follow_level(tick, sample.time_s)
@@ -396,11 +416,6 @@ class Estimator:
             self._delayed_a = self._line.currents()
             self._without_ocv_v = self._voltage_model.offset_at(temperature_c, self._delayed_a)
         return self._without_ocv_v
-
-    def _drop_v(self) -> float:
-        """Return the voltage drop of the mean of the delayed currents [V]."""
-        currents = self._line.currents()
-        return self._online.steady_ohm * sum(currents) / len(currents)
 
     def _start(self, soc_pct: float, std_pct: float) -> None:
         """Start counting, and the filter where it is used, from a SoC [%]."""
@@ -465,7 +480,19 @@ class Estimator:
             return math.nan, math.nan
         if method == "coulomb":
             return _clip(self._coulomb_pct()), self._coulomb_std_pct()
-        return self.filter.soc_after(self._since)
+        soc_pct, std_pct = self.filter.soc_after(self._since)
+        if self._clock.state.last_s < memory.mismatch_until_s:
+            # A model that does not fit: as uncertain as its inputs disagree.
+            counted_pct = _clip(self._coulomb_pct()) - soc_pct
+            std_pct = math.hypot(std_pct, memory.bias_pct, counted_pct)
+        return soc_pct, std_pct
+
+    def _has_other_capacity(self) -> bool:
+        """Return whether the learned capacity is beyond what the filter allows for, surely."""
+        health = self._health.health
+        difference_ah = abs(health.capacity_ah - self.capacity_ah)
+        allowed_ah = max(health.capacity_std_ah, CAPACITY_STD * self.capacity_ah)
+        return difference_ah > MISMATCH_SIGMAS * allowed_ah
 
     def _coulomb_pct(self) -> float:
         """Return the SoC by counting alone [%], not clipped; NaN until counting has started."""
@@ -499,6 +526,8 @@ class Estimator:
             reasons |= Reason.VOLTAGE_OUTSIDE_MODEL
         if sample.time_s < memory.contradicted_until_s:
             reasons |= Reason.INNOVATION_LARGE
+        if sample.time_s < memory.mismatch_until_s:
+            reasons |= Reason.MODEL_MISMATCH
         outside = outside_model(self._voltage_model, soc_pct, sample)
         return reasons | outside if outside else reasons
 
@@ -614,6 +643,15 @@ class Estimator:
                 f" and count, {soc_pct:g} ± {std_pct:g} %",
                 field="estimate",
             )
+
+
+def _ekf_type(settings: EstimatorSettings) -> type[SocEkf]:
+    if settings.filter == "reference":
+        # filterpy is slow to import, and only a check needs it.
+        from cangauge.estimation.reference_filter import ReferenceEkf  # noqa: PLC0415
+
+        return ReferenceEkf
+    return SocEkf
 
 
 def _clip(soc_pct: float) -> float:

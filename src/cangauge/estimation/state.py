@@ -269,6 +269,10 @@ class EstimatorMemory:
     """Until when the last gap in the current degrades the estimate [s]."""
     contradicted_until_s: _MaybeNan = math.nan
     """Until when the last contradiction degrades the estimate [s]."""
+    mismatch_until_s: _MaybeNan = math.nan
+    """Until when evidence that model and pack disagree counts [s]."""
+    bias_pct: _NotNegative = 0.0
+    """Bias of the voltage model in SoC [%]."""
     rest_since_s: _MaybeNan = math.nan
     """Since when the pack has rested [s]; NaN: it does not."""
     level_s: _MaybeNan = math.nan

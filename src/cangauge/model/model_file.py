@@ -75,7 +75,7 @@ class Ranges(_Strict):
 
 
 class CurveNoise(_Strict):
-    """Error of pseudo-OCV, temperature coefficient and resistances (`inference.error_model`)."""
+    """Error of pseudo-OCV and temperature coefficient (`inference.error_model`)."""
 
     soc_pct: Annotated[list[_Soc], Field(min_length=2, max_length=MAX_CURVE_KNOTS)]
     """Increasing knots."""
@@ -88,10 +88,6 @@ class CurveNoise(_Strict):
     """Mean temperature of the logs."""
     kt_std_v_per_k: _Volts
     """Standard deviation of kt."""
-    resistance_std: _NotNegative
-    """Relative standard deviation of the resistance to a lasting current."""
-    resistance_std_per_k: _NotNegative
-    """Standard deviation of the resistance's relative change with temperature."""
 
     @model_validator(mode="after")
     def _shapes(self) -> Self:
