@@ -1,13 +1,13 @@
 """Extended Kalman filter of the voltage model and Coulomb counting, and its measurement noise.
 
-The state x = (S, o, b, l, g, a, r, c1 … ck) is the SoC S [%], the current sensor's offset o [A]
+The state x = (S, o, b, l, g, a, c1 … ck) is the SoC S [%], the current sensor's offset o [A]
 (measured = true + o), a slow and a lasting error of the voltage b and l [V], the relative error g
 of the charge per % SoC (true capacity = C/(1 + g)), and standard normal amplitudes of the model's
-own errors: of the temperature coefficient (a), of the resistance over temperature (r), and of the
-principal functions φ of the pseudo-OCV's error (c).
+own errors: of the temperature coefficient (a), and of the principal functions φ of the pseudo-OCV's
+error (c).
 
     S ← S − (1 + g)·ΔQ + 100/(3600·C)·o·Δt,   ΔQ the counted charge [%]
-    U = OCV(S) + kt·(T − T_r) + Σ Rj·(I(t − dj) − o) + b + l + a·σ_kt·(T − T̄) + r·σ_R·(T − T̄)·D
+    U = OCV(S) + kt·(T − T_r) + Σ Rj·(I(t − dj) − o) + b + l + a·σ_kt·(T − T̄)
         + Σ ck·φk(S) + fast error
 
 b and l are Gauss–Markov processes; all sizes come from the identification's error model
@@ -15,7 +15,11 @@ b and l are Gauss–Markov processes; all sizes come from the identification's e
 log, the errors it was identified on. b starts with the polarization that the usual current would
 have left from before the first sample.
 
-a, r and c are *considered*: the filter keeps their covariance with the other states, so that the
+The error of the resistance over temperature adds its variance to b. It is no state: a filter that
+takes it for the same part of the drop throughout reads the SoC from how the voltage follows the
+load.
+
+a and c are *considered*: the filter keeps their covariance with the other states, so that the
 SoC's standard deviation contains the error of the curve wherever the SoC moves, but does not learn
 them: from one drive the shape of a curve cannot be told from errors of the charge, and a filter
 that tries believes a wrong shape more than a wrong level (Schmidt–Kalman filter; Jazwinski,
@@ -88,7 +92,7 @@ Kalman filter; Jazwinski 1970, ch. 8.3), at most so often."""
 ROUNDING = 1e-6
 """Tolerance of a covariance's correlations."""
 
-SOC, OFFSET, SLOW, LASTING, CAPACITY, KT, RESISTANCE = range(7)
+SOC, OFFSET, SLOW, LASTING, CAPACITY, KT = range(6)
 """Index of each state; the curve's functions follow."""
 
 LEARNED: Final = 5
@@ -133,8 +137,7 @@ class MeasurementNoise:
         curve = model.noise.curve
         self._mean_c = voltage_model.t_ref_c if curve is None else curve.temperature_c
         self._kt_std = 0.0 if curve is None else curve.kt_std_v_per_k
-        self._resistance_std = 0.0 if curve is None else curve.resistance_std
-        self._resistance_std_per_k = 0.0 if curve is None else curve.resistance_std_per_k
+        self._resistance_std = 0.0 if curve is None else curve.resistance_std_per_k
         self._usual_a = USUAL_CURRENT_C_RATE * capacity_ah
         # All samples of one filling delay line share the same unknown currents.
         self._shared_by = max(voltage_model.delay_s[-1] * model.rate_hz, 1.0)
@@ -202,9 +205,9 @@ class Measurement(NamedTuple):
     std_v: float
     """Standard deviation of the fast error [V]."""
     kt_std_v: float
+    """Effect of one standard deviation of the temperature coefficient, signed [V]."""
     resistance_std_v: float
-    """Effect of one standard deviation of the temperature coefficient, and of the resistance's
-    change with temperature, signed [V]."""
+    """That of the resistance's change with temperature [V]."""
 
 
 class CurveFunctions:
@@ -256,8 +259,6 @@ class SocEkf:
 
     Attributes
     ----------
-    log_likelihood : float
-        Of the last voltage, given all before it.
     was_outlier : bool
         Whether the last voltage was down-weighted as an outlier.
     """
@@ -278,9 +279,8 @@ class SocEkf:
         self._offset_std_a = OFFSET_STD_PER_AH * capacity_ah
         self._mean_innovation_v = 0.0
         self._mean_seconds = 0.0
-        self.log_likelihood = 0.0
         self.was_outlier = False
-        self._size = RESISTANCE + 1 + self._functions.number
+        self._size = KT + 1 + self._functions.number
         self._x: list[float] = []
         self._p: list[list[float]] = []
 
@@ -392,8 +392,10 @@ class SocEkf:
             Whether a lasting contradiction made the SoC unknown again.
         """
         fast_v2 = measurement.std_v**2
+        forgotten = -math.expm1(-2.0 * seconds / self._slow_time_s)
+        self._p[SLOW][SLOW] += measurement.resistance_std_v**2 * forgotten
         jacobian, unbiased_v = self._linearized(measurement, self._x[SOC])
-        if self._is_contradicted(measurement.voltage_v - unbiased_v, jacobian, fast_v2, seconds):
+        if self._is_contradicted(measurement, unbiased_v, jacobian, seconds):
             offset_a, offset_var = self._x[OFFSET], self._p[OFFSET][OFFSET]
             self.start(self._x[SOC], UNKNOWN_SOC_STD_PCT)
             self._x[OFFSET], self._p[OFFSET][OFFSET] = offset_a, offset_var
@@ -416,8 +418,6 @@ class SocEkf:
         self.was_outlier = innovation**2 > OUTLIER_SIGMAS**2 * (of_state + fast_v2)
         if self.was_outlier:
             fast_v2 = max(fast_v2, innovation**2 - of_state)
-        total = of_state + fast_v2
-        self.log_likelihood = -0.5 * (innovation**2 / total + math.log(total))
         self._correct(jacobian, spread, innovation, of_state, fast_v2)
         self._clip_soc()
         return is_contradicted
@@ -427,7 +427,7 @@ class SocEkf:
         ocv_v, slope = self._curve.pseudo_ocv_at(soc_pct)
         jacobian = [
             slope, -self._steady_ohm, 1.0, 1.0, 0.0, measurement.kt_std_v,
-            measurement.resistance_std_v, *self._functions.at(soc_pct),
+            *self._functions.at(soc_pct),
         ]  # fmt: skip
         return jacobian, ocv_v + measurement.without_ocv_v - self._steady_ohm * self._x[OFFSET]
 
@@ -545,17 +545,16 @@ class SocEkf:
         return x[SOC], std_pct, self._pct_per_as * counted_s * x[OFFSET]
 
     def _is_contradicted(
-        self, unbiased_v: float, jacobian: list[float], fast_v2: float, seconds: float
+        self, measurement: Measurement, unbiased_v: float, jacobian: list[float], seconds: float
     ) -> bool:
         """Return whether the mean error of the prediction contradicts state and error model.
 
         Parameters
         ----------
+        measurement : Measurement
         unbiased_v : float
-            Measured less predicted voltage, without the errors that the filter attributes [V].
+            Predicted voltage, without the errors that the filter attributes [V].
         jacobian : list of float
-        fast_v2 : float
-            Variance of the fast error [V²].
         seconds : float
             Time since the last voltage [s].
         """
@@ -565,14 +564,16 @@ class SocEkf:
             return False
         weight = math.exp(-seconds / PERSISTENT_S)
         self._mean_innovation_v *= weight
-        self._mean_innovation_v += (1.0 - weight) * unbiased_v
+        self._mean_innovation_v += (1.0 - weight) * (measurement.voltage_v - unbiased_v)
         self._mean_seconds += seconds
         if self._mean_seconds < PERSISTENT_S:
             return False
         of_model = jacobian[KT:]
         mean_var = self._slow_var + self._lasting_var + sum(map(mul, of_model, of_model))
         mean_var += jacobian[SOC] ** 2 * self._p[SOC][SOC]
-        mean_var += fast_v2 * seconds / (2.0 * PERSISTENT_S)
+        mean_var += measurement.resistance_std_v**2 + measurement.std_v**2 * seconds / (
+            2.0 * PERSISTENT_S
+        )
         seen = 1.0 - math.exp(-self._mean_seconds / PERSISTENT_S)
         mean = self._mean_innovation_v / seen
         return bool(mean**2 > PERSISTENT_SIGMAS**2 * mean_var)

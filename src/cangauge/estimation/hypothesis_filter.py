@@ -7,16 +7,16 @@ There are two hypotheses in two cases:
 - After an initial SoC was given: the first hypothesis accepts it, the second rejects it and starts
   from the first voltage.
 
-Each hypothesis has its own filter, and both use every voltage. The second knows less: what the first
-knows more is its prior alone. If the first is right, the difference of their SoCs has therefore the
-variance P2 − P1 (Hausman, Econometrica 46 (1978) 1251), and with it the odds are those of the two
-priors given all voltages (Savage–Dickey ratio; Verdinelli, Wasserman, J. Am. Stat. Assoc. 90 (1995)
-614). Likelihoods summed over voltages would count an error that lasts, such as that of the curve, as
-new evidence each second. The output is the mean
-weighted by the odds; the spread between the hypotheses is part of its standard deviation. The SoC
-therefore moves toward the likelier hypothesis as evidence grows, without a jump. Once the odds are
-clear the other hypothesis is dropped; if they stay unclear the two are merged. A rejected initial
-SoC has no influence on the result.
+Each hypothesis has its own filter, and both use every voltage. The second knows less: what the
+first knows more is its prior alone. If the first is right, the difference of their SoCs has
+therefore the variance P2 − P1 (Hausman, Econometrica 46 (1978) 1251), and with it the odds are
+those of the two priors given all voltages (Savage–Dickey ratio; Verdinelli, Wasserman, J. Am. Stat.
+Assoc. 90 (1995) 614). Likelihoods summed over voltages would count an error that lasts, such as
+that of the curve, as new evidence each second. The output is the mean weighted by the odds; the
+spread between the hypotheses is part of its standard deviation. The SoC therefore moves toward the
+likelier hypothesis as evidence grows, without a jump. Once the odds are clear the other hypothesis
+is dropped; if they stay unclear the two are merged. A rejected initial SoC has no influence on the
+result.
 """
 
 from __future__ import annotations

@@ -333,7 +333,6 @@ def _noise(
             functions_v=curve.function_v.tolist(),
             temperature_c=curve.temperature_c,
             kt_std_v_per_k=curve.kt_std_v_per_k,
-            resistance_std=curve.resistance_std,
             resistance_std_per_k=curve.resistance_std_per_k,
         ),
         voltage_mae_pct=100.0 * float(np.mean(np.abs(errors[known]) / volts[known])),

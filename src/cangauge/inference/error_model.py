@@ -128,8 +128,6 @@ class CurveError:
     """Mean temperature of the logs [°C]."""
     kt_std_v_per_k: float
     """Standard deviation of the temperature coefficient [V/K]."""
-    resistance_std: float
-    """Relative standard deviation of the resistance to a lasting current."""
     resistance_std_per_k: float
     """Standard deviation of the resistance's relative change with temperature [1/K]."""
 
@@ -356,7 +354,6 @@ def describe_error(
         principal_functions(second[:m, :m]),
         mean_c,
         math.sqrt(second[m, m]),
-        math.sqrt(float(second[m + 2 :, m + 2 :].sum())) / total_ohm,
         math.sqrt(second[m + 1, m + 1]),
     )
 

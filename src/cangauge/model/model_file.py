@@ -87,8 +87,6 @@ class CurveNoise(_Strict):
     """Mean temperature of the logs."""
     kt_std_v_per_k: _Volts
     """Standard deviation of kt."""
-    resistance_std: _NotNegative
-    """Relative standard deviation of the resistance to a lasting current."""
     resistance_std_per_k: _NotNegative
     """Standard deviation of the resistance's relative change with temperature."""
 
