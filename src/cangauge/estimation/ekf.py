@@ -3,17 +3,21 @@
 The state x = (S, o, b, l, g, a, c1 … ck) is the SoC S [%], the current sensor's offset o [A]
 (measured = true + o), a slow and a lasting error of the voltage b and l [V], the relative error g
 of the charge per % SoC (true capacity = C/(1 + g)), and standard normal amplitudes of the model's
-own errors: of the temperature coefficient (a) and of the principal functions φ of the pseudo-OCV's
+own errors: of the temperature coefficient (a), and of the principal functions φ of the pseudo-OCV's
 error (c).
 
     S ← S − (1 + g)·ΔQ + 100/(3600·C)·o·Δt,   ΔQ the counted charge [%]
-    U = OCV(S) + kt·(T − T_r) + Σ Rj·(I(t − dj) − o) + b + l + a·σ_kt·(T − T̄) + Σ ck·φk(S)
-        + fast error
+    U = OCV(S) + kt·(T − T_r) + Σ Rj·(I(t − dj) − o) + b + l + a·σ_kt·(T − T̄)
+        + Σ ck·φk(S) + fast error
 
 b and l are Gauss–Markov processes; all sizes come from the identification's error model
 (`inference.error_model`). The lasting error l may be another after the time and the charge of a
 log, the errors it was identified on. b starts with the polarization that the usual current would
 have left from before the first sample.
+
+The error of the resistance over temperature adds its variance to b. It is no state: a filter that
+takes it for the same part of the drop throughout reads the SoC from how the voltage follows the
+load.
 
 a and c are *considered*: the filter keeps their covariance with the other states, so that the
 SoC's standard deviation contains the error of the curve wherever the SoC moves, but does not learn
@@ -136,6 +140,7 @@ class MeasurementNoise:
         curve = model.noise.curve
         self._mean_c = voltage_model.t_ref_c if curve is None else curve.temperature_c
         self._kt_std = 0.0 if curve is None else curve.kt_std_v_per_k
+        self._resistance_std = 0.0 if curve is None else curve.resistance_std_per_k
         self._usual_a = USUAL_CURRENT_C_RATE * capacity_ah
         # All samples of one filling delay line share the same unknown currents.
         self._shared_by = max(voltage_model.delay_s[-1] * model.rate_hz, 1.0)
@@ -171,6 +176,12 @@ class MeasurementNoise:
         outside_v = outside * (min(temperature_c - cold, 0.0) + max(temperature_c - hot, 0.0))
         return math.sqrt(variance), self._kt_std * (temperature_c - self._mean_c) + outside_v
 
+    def resistance_std(self, temperature_c: float) -> float:
+        """Return the signed relative deviation of the resistance at a temperature [°C]."""
+        if math.isnan(temperature_c):
+            return self._resistance_std * TEMPERATURE_STD_K
+        return self._resistance_std * (temperature_c - self._mean_c)
+
     def _filling_var_v2(self, filled_var_v2: float, filled_s: float) -> float:
         """Return the error's variance while the delay line fills [V²].
 
@@ -197,7 +208,9 @@ class Measurement(NamedTuple):
     std_v: float
     """Standard deviation of the fast error [V]."""
     kt_std_v: float
-    """Signed effect of one standard deviation of the temperature coefficient [V]."""
+    """Effect of one standard deviation of the temperature coefficient, signed [V]."""
+    resistance_std_v: float
+    """That of the resistance's change with temperature [V]."""
 
 
 class CurveFunctions:
@@ -271,8 +284,8 @@ class SocEkf:
         self._mean_seconds = 0.0
         self.was_outlier = False
         self._size = KT + 1 + self._functions.number
-        self._x: list[float] = []
-        self._p: list[list[float]] = []
+        self._x = [0.0] * self._size
+        self._p = [[0.0] * self._size for _ in range(self._size)]
 
     def start(self, soc_pct: float, soc_std_pct: float) -> None:
         """Restart from a SoC with its standard deviation [%]."""
@@ -382,8 +395,10 @@ class SocEkf:
             Whether a lasting contradiction made the SoC unknown again.
         """
         fast_v2 = measurement.std_v**2
+        forgotten = -math.expm1(-2.0 * seconds / self._slow_time_s)
+        self._p[SLOW][SLOW] += measurement.resistance_std_v**2 * forgotten
         jacobian, unbiased_v = self._linearized(measurement, self._x[SOC])
-        if self._is_contradicted(measurement.voltage_v - unbiased_v, jacobian, fast_v2, seconds):
+        if self._is_contradicted(measurement, unbiased_v, jacobian, seconds):
             offset_a, offset_var = self._x[OFFSET], self._p[OFFSET][OFFSET]
             self.start(self._x[SOC], UNKNOWN_SOC_STD_PCT)
             self._x[OFFSET], self._p[OFFSET][OFFSET] = offset_a, offset_var
@@ -546,17 +561,16 @@ class SocEkf:
         return x[SOC], std_pct, self._pct_per_as * counted_s * x[OFFSET]
 
     def _is_contradicted(
-        self, unbiased_v: float, jacobian: list[float], fast_v2: float, seconds: float
+        self, measurement: Measurement, unbiased_v: float, jacobian: list[float], seconds: float
     ) -> bool:
         """Return whether the mean error of the prediction contradicts state and error model.
 
         Parameters
         ----------
+        measurement : Measurement
         unbiased_v : float
-            Measured less predicted voltage, without the errors that the filter attributes [V].
+            Predicted voltage, without the errors that the filter attributes [V].
         jacobian : list of float
-        fast_v2 : float
-            Variance of the fast error [V²].
         seconds : float
             Time since the last voltage [s].
         """
@@ -566,14 +580,16 @@ class SocEkf:
             return False
         weight = math.exp(-seconds / PERSISTENT_S)
         self._mean_innovation_v *= weight
-        self._mean_innovation_v += (1.0 - weight) * unbiased_v
+        self._mean_innovation_v += (1.0 - weight) * (measurement.voltage_v - unbiased_v)
         self._mean_seconds += seconds
         if self._mean_seconds < PERSISTENT_S:
             return False
         of_model = jacobian[KT:]
         mean_var = self._slow_var + self._lasting_var + sum(map(mul, of_model, of_model))
         mean_var += jacobian[SOC] ** 2 * self._p[SOC][SOC]
-        mean_var += fast_v2 * seconds / (2.0 * PERSISTENT_S)
+        mean_var += measurement.resistance_std_v**2 + measurement.std_v**2 * seconds / (
+            2.0 * PERSISTENT_S
+        )
         seen = 1.0 - math.exp(-self._mean_seconds / PERSISTENT_S)
         mean = self._mean_innovation_v / seen
         return bool(mean**2 > PERSISTENT_SIGMAS**2 * mean_var)

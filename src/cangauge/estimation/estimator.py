@@ -353,9 +353,11 @@ class Estimator:
         newton = soc_from_ocv(self._curve, sample.voltage_v - without_ocv_v, guess_pct)
         memory.newton_pct, memory.newton_inside = newton
         std_v, kt_std_v = self._noise.at(memory.temperature_c, self._line)
+        drop_v = sum(self._delayed_a) / len(self._delayed_a) * self._online.steady_ohm
+        resistance_std_v = self._noise.resistance_std(memory.temperature_c) * drop_v
         slope = self._curve.pseudo_ocv_at(memory.newton_pct)[1]
         curve_std_v = self._functions.std_v(memory.newton_pct)
-        error_v = math.hypot(std_v, self._bias_std_v, curve_std_v, kt_std_v)
+        error_v = math.hypot(std_v, self._bias_std_v, curve_std_v, kt_std_v, resistance_std_v)
         memory.newton_std_pct = min(error_v / slope, UNKNOWN_SOC_STD_PCT)
         if math.isnan(memory.coulomb_start_pct):
             # No initial SoC: start from the voltage's with a wide prior, from which the filter
@@ -369,6 +371,7 @@ class Estimator:
                 memory.newton_pct,
                 std_v,
                 kt_std_v,
+                resistance_std_v,
             )
             if self.filter.update(measurement, since):
                 memory.contradicted_until_s = sample.time_s + CONTRADICTED_S

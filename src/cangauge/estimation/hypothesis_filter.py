@@ -41,9 +41,9 @@ the odds stay."""
 
 LOG_ODDS_AT_MOST = 50.0
 
-WRONG_LOG_ODDS = -math.log(100.0)
-"""Prior log odds that a given SoC is wrong, such as one of another pack or day: an assumption. It
-sets the size from which an initial error is attributed to the given SoC, not to the model."""
+WRONG_LOG_ODDS = -math.log(19.0)
+"""Prior log odds that a given SoC is wrong, such as one of another pack, day or scale: an
+assumption, one in twenty, as two standard deviations hold at most 95 % of the starts."""
 
 OPEN_AT_MOST_S = 900.0
 """Time with voltages after which undecided hypotheses are merged [s]."""

@@ -377,6 +377,7 @@ def _noise(
             functions_v=curve.function_v.tolist(),
             temperature_c=curve.temperature_c,
             kt_std_v_per_k=curve.kt_std_v_per_k,
+            resistance_std_per_k=curve.resistance_std_per_k,
         ),
         voltage_mae_pct=100.0 * float(np.mean(np.abs(errors[known]) / volts[known])),
         voltage_rmse_v=float(np.sqrt(np.mean(errors[known] ** 2))),

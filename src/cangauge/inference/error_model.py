@@ -128,6 +128,8 @@ class CurveError:
     """Mean temperature of the logs [°C]."""
     kt_std_v_per_k: float
     """Standard deviation of the temperature coefficient [V/K]."""
+    resistance_std_per_k: float
+    """Standard deviation of the resistance's relative change with temperature [1/K]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,6 +354,7 @@ def describe_error(
         principal_functions(second[:m, :m]),
         mean_c,
         math.sqrt(second[m, m]),
+        math.sqrt(second[m + 1, m + 1]),
     )
 
 

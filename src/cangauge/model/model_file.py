@@ -88,6 +88,8 @@ class CurveNoise(_Strict):
     """Mean temperature of the logs."""
     kt_std_v_per_k: _Volts
     """Standard deviation of kt."""
+    resistance_std_per_k: _NotNegative
+    """Standard deviation of the resistance's relative change with temperature."""
 
     @model_validator(mode="after")
     def _shapes(self) -> Self:
