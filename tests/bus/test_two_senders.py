@@ -249,23 +249,25 @@ def test_remarks_and_inspection_name_the_second_sender(tmp_path: Path) -> None:
 
 
 @pytest.mark.real
-def test_real_captures_have_one_sender_a_message(shared_data: Path) -> None:
-    for path in sorted((shared_data / "leaf_can").iterdir()):
+@pytest.mark.parametrize("folder", ["leaf_can", "can_captures"])
+def test_real_captures_have_one_sender_a_message(shared_data: Path, folder: str) -> None:
+    vehicle = LEAF if folder == "leaf_can" else Vehicle.load("bmw_i3", temperature_c=20.0)
+    for path in sorted((shared_data / folder).iterdir()):
         frames = [
             each
-            for each in open_vehicle_capture(path, LEAF)
-            if each.arbitration_id in LEAF.wanted_ids
+            for each in open_vehicle_capture(path, vehicle)
+            if each.arbitration_id in vehicle.wanted_ids
         ]
         for batch_s in (0.0, 0.02, 0.1):
             decoders: dict[object, SampleDecoder] = {}
             for each in frames:
                 time_s = each.timestamp
                 each.timestamp = math.ceil(time_s / batch_s) * batch_s if batch_s else time_s
-                decoders.setdefault(each.channel, SampleDecoder(LEAF)).handle(each)
+                decoders.setdefault(each.channel, SampleDecoder(vehicle)).handle(each)
                 each.timestamp = time_s
             refused = {each.statistics.two_senders for each in decoders.values()}
-            assert refused == {0}, f"{path.name} in batches of {batch_s} s"
-        if len(frames) < 1000:
+            assert refused <= {0}, f"{path.name} in batches of {batch_s} s"
+        if folder == "can_captures" or len(frames) < 1000:
             assert not any(each.two_senders for each in inspect_capture(path).ids), path.name
 
 

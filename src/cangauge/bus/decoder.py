@@ -409,8 +409,8 @@ class SampleDecoder:
             key |= EXTENDED
         route = self._routes.get(key)
         if route is None and self._by_pgn and key & EXTENDED:
-            route = self._routes.get(self._by_pgn.get(key & pgn_mask(key), 0))
-        elif route is None and key in self._replies:
+            route = self._routes.get(self._by_pgn.get(key & pgn_mask(key), -1))
+        if route is None and key in self._replies:
             route, message = self._reply(key, message)
         payload = None if route is None else self._accept(route, message)
         if route is None or payload is None:

@@ -178,12 +178,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     if isinstance(TableOptions(columns, sign, map_file).open(log_path), Capture):
         if (vehicle, dbc, map_file) == (None, None, None):
             raise capture_without_vehicle(log_path)
-        if smooth:
-            raise InputError(
-                "smooths a log, not a capture", field="--smooth", value=log_path,
-                cure="write the capture's samples first: `cangauge estimate … -o samples.mcap`,"
-                " or give a log",
-            )  # fmt: skip
+        _refuse_smoothing(log_path, smooth=smooth)
         car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature)
         source = known_temperature_source(temperature_source) or "unknown"
         settings = replace(settings, temperature_source=source)
@@ -254,6 +249,14 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
 def _write_pack(done: RecordedEstimate, pack: Path | None) -> None:
     if pack is not None:
         write_table(done.pack.columns, pack)
+
+
+def _refuse_smoothing(capture: Path, *, smooth: bool) -> None:
+    if smooth:
+        raise InputError(
+            "smooths a log, not a capture", field="--smooth", value=capture,
+            cure="give a log: the capture's samples are written by `-o samples.mcap`",
+        )  # fmt: skip
 
 
 def _filter(given: str, *, smooth: bool) -> Filter:

@@ -64,8 +64,8 @@ CONTRADICTED_S = 300.0
 """How long a lasting contradiction, or a restart of the filter, degrades the estimate [s]."""
 
 MISMATCH_SIGMAS = 3.0
-"""Offset, lasting bias or capacity beyond this many of the standard deviations that were assumed
-for them, which one pack in 400 exceeds by chance: model and pack disagree."""
+"""Offset, bias or learned capacity beyond this many of the standard deviations assumed for them:
+model and pack disagree. By chance one pack in 400 is beyond."""
 
 AGREES_PCT = 1e-6
 """Rounding error allowed between a state's last estimate and its filter or count [%]."""
@@ -484,7 +484,7 @@ class Estimator:
         if method == "coulomb":
             return _clip(self._coulomb_pct()), self._coulomb_std_pct()
         soc_pct, std_pct = self.filter.soc_after(self._since)
-        if self._clock.state.last_s < memory.mismatch_until_s:
+        if self._counter.state.time_s < memory.mismatch_until_s:
             # A model that does not fit: as uncertain as its inputs disagree.
             counted_pct = _clip(self._coulomb_pct()) - soc_pct
             std_pct = math.hypot(std_pct, memory.bias_pct, counted_pct)
@@ -507,7 +507,9 @@ class Estimator:
         moved_pct = counter.moved_pct - memory.coulomb_moved_pct
         return count_std_pct(self.capacity_ah, memory.coulomb_var_pct2, hours, moved_pct)
 
-    def _reasons(self, sample: Sample, soc_pct: float, std_pct: float) -> Reason:
+    def _reasons(  # noqa: C901 - one line a reason
+        self, sample: Sample, soc_pct: float, std_pct: float
+    ) -> Reason:
         # Operations on flags are slow, and usually none is set. Comparisons with NaN are false.
         memory = self._memory
         reasons = self._permanent_reasons
@@ -624,6 +626,7 @@ class Estimator:
     def _start_from(self, state: EstimatorState) -> None:
         """Start from the SoC of another estimator, if it knew one."""
         coulomb_pct = state.estimate[4]
+        self._memory.mismatch_until_s, self._memory.bias_pct = math.nan, 0.0
         if not (math.isnan(state.soc_pct) or math.isnan(state.soc_std_pct)):
             self._start(state.soc_pct, min(state.soc_std_pct, UNKNOWN_SOC_STD_PCT))
         elif not math.isnan(coulomb_pct):

@@ -22,6 +22,8 @@ from pydantic import (
     model_validator,
 )
 
+from cangauge.estimation.validity import Reason
+
 LARGEST = 1e12
 """Upper bound of times [s], voltages, charges and counters in a state."""
 
@@ -130,6 +132,8 @@ class EkfState:
     """Running mean of the innovation [V]."""
     mean_seconds: _NotNegative
     """Time that it covers [s]."""
+    outside_v2: _NotNegative = 0.0
+    """Variance of the lasting error outside the identified temperatures [V²]."""
 
 
 Verdict = Literal["", "open", "parked", "moved", "unclear"]
@@ -270,8 +274,8 @@ class EstimatorMemory:
     contradicted_until_s: _MaybeNan = math.nan
     """Until when the last contradiction degrades the estimate [s]."""
     mismatch_until_s: _MaybeNan = math.nan
-    """Until when evidence that model and pack disagree counts [s]."""
-    bias_pct: _NotNegative = 0.0
+    """Until when the evidence that model and pack disagree lasts [s]."""
+    bias_pct: _Finite = 0.0
     """Bias of the voltage model in SoC [%]."""
     rest_since_s: _MaybeNan = math.nan
     """Since when the pack has rested [s]; NaN: it does not."""
@@ -303,7 +307,7 @@ class EstimatorState(BaseModel):
     health: HealthState
     estimate: Annotated[list[_MaybeNan], Field(min_length=7, max_length=7)]
     """Numbers of the last `Estimate`, in its order, from `time_s` to `residual_v`."""
-    reasons: Annotated[int, Field(strict=True, ge=0, le=0x1FFFF)]
+    reasons: Annotated[int, Field(strict=True, ge=0, lt=2 * max(Reason))]
 
     @model_validator(mode="after")
     def _check_estimate(self) -> Self:

@@ -75,6 +75,7 @@ class Reason(enum.IntFlag):
     SOC_UNCERTAIN = 1 << 16
     DUPLICATE_SENDER = 1 << 17
     MODEL_MISMATCH = 1 << 18
+    """Offset, bias or capacity are beyond what was assumed for them."""
     TIME_UNCERTAIN = 1 << 19
 
 
@@ -97,7 +98,7 @@ REASON_WORDS: Final = {
     Reason.CURRENT_MISSING: "no plausible current within its time-out: charge is not counted",
     Reason.SOC_UNCERTAIN: "the standard deviation exceeds the limit of a valid SoC",
     Reason.DUPLICATE_SENDER: "another node sends frames with an id that is read or published here",
-    Reason.MODEL_MISMATCH: "the voltages contradict the model: wrong pack, capacity or sensor",
+    Reason.MODEL_MISMATCH: "offset, bias or capacity do not fit the model: run `cangauge gap`",
     Reason.TIME_UNCERTAIN: "time stamps are irregular, or contradict the monotonic clock",
 }
 """Description of each reason, for pages and messages."""

@@ -85,7 +85,7 @@ def fit_voltage_model(
         row = np.zeros((1, columns.shape[1]))
         row[0, KT] = prior.row_weight
         priors.append((row, np.zeros(1)))
-    solution = rising(columns, volts, block, span, options.epsilon, priors)
+    solution = rising(columns, volts, block, span, options.epsilon, priors=priors)
     if prior is not None:
         solution = _with_prior_errors(solution, prior)
     x = [float(value) for value in solution.coefficients]
@@ -126,6 +126,7 @@ def rising(
     block: NDArray[np.intp],
     span_pct: tuple[float, float],
     epsilon: float,
+    *,
     priors: Sequence[tuple[FloatArray, FloatArray]] = (),
 ) -> Solution:
     """Return the least-squares solution whose pseudo-OCV rises over a span of SoC [%].

@@ -172,7 +172,7 @@ class BackgroundReader:
 def _limit_resources() -> None:
     """Leave processor and memory to the service, as far as the system allows."""
     with contextlib.suppress(OSError, AttributeError):
-        os.nice(19)
+        os.setpriority(os.PRIO_PROCESS, 0, 19)
     with contextlib.suppress(OSError):  # whom the kernel ends first when memory is short
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
     if sys.platform == "win32":
@@ -197,8 +197,10 @@ def _main() -> None:
         result = Reading.of(read, within_s)
     except InputError as error:
         result = error
-    except OSError as error:
-        result = InputError(f"cannot be read: {error}", cure="try again")
+    except MemoryError:
+        raise  # the parent names the cure
+    except Exception as error:  # noqa: BLE001 - of any library that reads a file
+        result = InputError(f"cannot be read: {error!r}", cure="try again, or check the files")
     pickle.dump(result, answer)
     answer.flush()
 
