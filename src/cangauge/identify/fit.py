@@ -207,7 +207,7 @@ def fit(
     found = None
     if effect_ids:
         # With effects, cross-validation tests kt too, so its tight prior is not used.
-        plain, _ = fit_voltage_model(rows, options, with_kt_prior=False)
+        plain, _ = fit_voltage_model(rows, options, with_priors=False)
         sampled = [sample_log(log, options) for log in logs]
         found = fit_effects(ExtendedModel(plain, capacity_ah), sampled, effect_ids)
     if found is not None and found.model.effects:
@@ -395,7 +395,7 @@ def _information(
     """Return the square root of the information of the rows on the coefficients.
 
     The columns of the effects come first in the triangular factor, so that they are marginalised.
-    The prior row of kt is included.
+    The priors of kt and of the pseudo-OCV are included.
     """
     if found is None or not found.model.effects:
         columns, volts, _ = stacked(rows, options)
@@ -415,7 +415,11 @@ def _information(
         weight = found.linear.kt_weight
     prior_row = np.zeros(table.shape[1])
     prior_row[first + KT] = weight / scale[KT]
-    root = np.linalg.qr(np.vstack([table, prior_row])).R[first:, first:]
+    prior_rows = [prior_row]
+    if solution.curve_prior is not None:
+        of_curve, target = solution.curve_prior
+        prior_rows.append(np.column_stack([of_curve / scale, target]))
+    root = np.linalg.qr(np.vstack([table, *prior_rows])).R[first:, first:]
     n = columns.shape[1]
     return Information(
         columns=list(names),

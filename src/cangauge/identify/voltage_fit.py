@@ -45,7 +45,7 @@ def fit_voltage_model(
     options: FitOptions,
     keep: Mask | None = None,
     *,
-    with_kt_prior: bool = True,
+    with_priors: bool = True,
 ) -> tuple[VoltageModel, Solution]:
     """Fit the coefficients by least squares with a rising pseudo-OCV.
 
@@ -55,8 +55,9 @@ def fit_voltage_model(
     options : FitOptions
     keep : array of bool, optional
         Rows of all logs, in order, to fit; all by default.
-    with_kt_prior : bool
-        Whether to use the prior on kt (`least_squares.kt_prior`).
+    with_priors : bool
+        Whether to use the priors on the pseudo-OCV (`error_model.curve_prior`) and on kt
+        (`least_squares.kt_prior`).
 
     Raises
     ------
@@ -75,19 +76,18 @@ def fit_voltage_model(
     span = float(soc.min()), float(soc.max())
     solution = rising(columns, volts, block, span, options.epsilon)
     residual_v = volts - columns @ solution.coefficients
-    # The slow error of clusters that count as independent; without an error there is no prior.
-    prior_v2 = CLUSTER_S * options.rate_hz * _mean_square_of_means(residual_v, block)
-    priors = [_curve_rows(float(np.median(volts)), prior_v2, columns.shape[1], options.epsilon)]
-    prior = None
-    if with_kt_prior:
+    if with_priors:
+        # The slow error of clusters that count as independent; without an error there is no prior.
+        prior_v2 = CLUSTER_S * options.rate_hz * _mean_square_of_means(residual_v, block)
+        curve = _curve_rows(float(np.median(volts)), prior_v2, columns.shape[1], options.epsilon)
         lengths = np.bincount(number, minlength=len(rows)).tolist()
         prior = kt_prior(columns, residual_v, volts, lengths, KT)
         row = np.zeros((1, columns.shape[1]))
         row[0, KT] = prior.row_weight
-        priors.append((row, np.zeros(1)))
-    solution = rising(columns, volts, block, span, options.epsilon, priors=priors)
-    if prior is not None:
-        solution = _with_prior_errors(solution, prior)
+        priors = [curve, (row, np.zeros(1))]
+        found = rising(columns, volts, block, span, options.epsilon, priors=priors)
+        found = replace(found, constrained=solution.constrained, curve_prior=curve)
+        solution = _with_prior_errors(found, prior)
     x = [float(value) for value in solution.coefficients]
     return VoltageModel(
         ocv_v=tuple(x[: len(BASIS_NAMES)]),
@@ -165,7 +165,7 @@ def _with_prior_errors(solution: Solution, prior: KtPrior) -> Solution:
 
 
 def held_out_errors(
-    rows: Sequence[FitRows], options: FitOptions, *, with_kt_prior: bool = True
+    rows: Sequence[FitRows], options: FitOptions, *, with_priors: bool = True
 ) -> list[FloatArray]:
     """Return the held-out errors of each log's rows [V], shape (m,) each.
 
@@ -192,7 +192,7 @@ def held_out_errors(
                 raise  # a log that identifies a model does so without one of its blocks
             refused = error
             continue
-        model, _ = fit_voltage_model(rows, options, training, with_kt_prior=with_kt_prior)
+        model, _ = fit_voltage_model(rows, options, training, with_priors=with_priors)
         lo, hi = model.soc_range_pct
         seen = held_out & (soc > lo - 1.0) & (soc < hi + 1.0)
         errors[seen] = volts[seen] - model.voltage(soc[seen], temperature[seen], delayed[seen])
