@@ -29,7 +29,13 @@ import numpy as np
 
 from cangauge.errors import InputError
 from cangauge.estimation.counting import moved_log_odds, moved_std_pct
-from cangauge.estimation.ekf import UNKNOWN_SOC_STD_PCT, Measurement, SocEkf
+from cangauge.estimation.ekf import (
+    HIGHEST_PCT,
+    LOWEST_PCT,
+    UNKNOWN_SOC_STD_PCT,
+    Measurement,
+    SocEkf,
+)
 from cangauge.estimation.state import ChargeSinceUpdate, EkfState, HypothesisFilterState, Verdict
 
 CLEAR_LOG_ODDS = math.log(1000.0)
@@ -220,9 +226,11 @@ class HypothesisFilter:
             If a hypothesis is not a valid filter with a SoC within 0–100 %.
         """
         filters = [self._restored(each) for each in state.hypotheses]
-        if not all(each.is_valid() for each in filters):
+        if not all(
+            each.is_valid() and LOWEST_PCT <= each.soc_pct <= HIGHEST_PCT for each in filters
+        ):
             raise InputError(
-                "not a positive semidefinite covariance, or a SoC outside 0–100 %",
+                f"not a valid filter, or a SoC outside {LOWEST_PCT:g} … {HIGHEST_PCT:g} %",
                 field="filter.hypotheses",
             )
         self._filters = filters
