@@ -142,13 +142,11 @@ def test_invalid_covariance_restarts_the_filter() -> None:
     samples = drive(60.0, 55.0, 0.0)
     for sample in samples[:600]:
         estimator.step(sample)
-    filter_ = estimator.filter._filters[0]._ekf
-    filter_.P[0, 0] = -1.0
+    estimator.filter._filters[0]._p[0][0] = -1.0
     found = estimator.step(samples[600])
     assert found.reasons & Reason.INNOVATION_LARGE
     assert estimator.snapshot().memory.resets == 1
-    filter_ = estimator.filter._filters[0]._ekf
-    filter_.x[2, 0] = math.nan
+    estimator.filter._filters[0]._x[2] = math.nan
     assert estimator.step(samples[601]).soc_pct == pytest.approx(found.soc_pct, abs=10.0)
     assert estimator.snapshot().memory.resets == 2
     for sample in samples[602:]:
