@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping
+import os
+from collections.abc import Iterator, MutableMapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -54,3 +56,18 @@ def one_thread(environment: MutableMapping[str, str]) -> None:
     """
     for name in THREADS:
         environment.setdefault(name, "1")
+
+
+@contextmanager
+def single_threaded() -> Iterator[None]:
+    """Start processes with one BLAS thread each: there is one process per core already."""
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

@@ -36,6 +36,7 @@ VALID = {
     "replay": ["absent.csv"],
     "inspect": ["absent.csv"],
     "twin": ["-o", "absent/out.csv"],
+    "packs-check": ["--data", "absent"],
 }
 
 

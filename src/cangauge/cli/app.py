@@ -29,6 +29,7 @@ COMMANDS: Final = {
     "estimate": "Estimate the state of charge of a recorded log or capture, offline.",
     "gap": "Diagnose the gap between a model and logs: size, place, probable cause.",
     "gap-check": "Measure how often `gap` finds the right cause, on withheld causes.",
+    "packs-check": "Measure the SoC errors, and their σ, on recorded packs.",
     "run": "Estimate the state of charge from a bus, and publish it there.",
     "status": "Show the state of a running service: SoC ± standard deviation [%], frames, delays.",
     "replay": "Play a recorded log or capture on a bus.",

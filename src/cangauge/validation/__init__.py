@@ -12,6 +12,11 @@ scores the answers::
     score        labels and answers → figures; `tables` prints them
     final_seeds  seeds of the published figures
 
+The estimator's bench on recorded packs is apart from it::
+
+    packs        recorded packs; models from few logs, and the other logs estimated by them
+    packs_score  errors, σ and targets; the tables
+
 The public names are those of the twin, loaded on first use.
 """
 

@@ -10,10 +10,8 @@ import hashlib
 import itertools
 import json
 import multiprocessing
-import os
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 
 from cangauge._io import write_text_atomic
-from cangauge._resources import THREADS
+from cangauge._resources import single_threaded
 from cangauge.errors import InputError
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
@@ -134,7 +132,7 @@ def draw_all(
         path.mkdir(parents=True, exist_ok=True)
     labels: list[Label] = []
     with (
-        _single_threaded(),
+        single_threaded(),
         ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool,
     ):
         running = [pool.submit(draw_group, group, place, withheld, data) for group in groups]
@@ -412,18 +410,3 @@ def _pool_errors(errors: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         }
         for group, logs in groups.items()
     }
-
-
-@contextmanager
-def _single_threaded() -> Iterator[None]:
-    """Start processes with one BLAS thread each: there is one process per core already."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

@@ -148,9 +148,17 @@ def recorded_set(name: str, data: Path | None, seed: int) -> RecordedSet:
     )
 
 
+def is_folder(path: Path) -> bool:
+    """Whether there is such a folder; a name too long for the file system names none."""
+    try:
+        return path.is_dir()
+    except OSError:
+        return False
+
+
 def folder_of(name: str, data: Path | None) -> Path:
     """Return the folder of one set of recorded logs; raise InputError if it does not exist."""
-    if data is None or not (data / name).is_dir():
+    if data is None or not is_folder(data / name):
         raise InputError(
             f"no folder {name} of recorded logs",
             field="--data",
