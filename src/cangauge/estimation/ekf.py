@@ -12,8 +12,8 @@ error (c).
 
 b and l are Gauss–Markov processes; all sizes come from the identification's error model
 (`inference.error_model`). The lasting error l may be another after the time and the charge of a
-log, the errors it was identified on. b starts with the polarization that the usual current would
-have left from before the first sample.
+log, the errors it was identified on. What the current before the first sample left behind, in the
+delay line or in an effect, is noise of the voltages that share it (`MeasurementNoise`).
 
 The error of the resistance over temperature adds its variance to b. It is no state: a filter that
 takes it for the same part of the drop throughout reads the SoC from how the voltage follows the
@@ -44,11 +44,15 @@ import numpy as np
 from cangauge.errors import InputError
 from cangauge.estimation.state import EkfState
 from cangauge.model.delay_line import DelayLine
+from cangauge.model.extended import OnlineExtendedModel
 from cangauge.model.model_file import Model, ModelNoise, effective_error_std_v
-from cangauge.model.voltage_model import Curve, VoltageModel
+from cangauge.model.voltage_model import Curve
 
 USUAL_CURRENT_C_RATE = 1.0 / 3.0
 """Size of a current before the first sample [1/h]: 20 A at 60 Ah."""
+
+MEMORY_TIMES = 10.0
+"""Time constants after which an earlier current is forgotten."""
 
 TEMPERATURE_STD_K = 10.0
 """Standard deviation of a temperature that is not measured [K]."""
@@ -126,22 +130,24 @@ class MeasurementNoise:
 
     Parameters
     ----------
-    voltage_model : VoltageModel
     model : Model
         Its noise and rate.
-    capacity_ah : float
-        Charge from 100 to 0 % [Ah].
+    online : OnlineExtendedModel
+        The same with its effects.
     """
 
-    def __init__(self, voltage_model: VoltageModel, model: Model, capacity_ah: float) -> None:
-        self._model = voltage_model
+    def __init__(self, model: Model, online: OnlineExtendedModel) -> None:
+        voltage_model = self._model = online.model
         self._fast_std_v = effective_error_std_v(model.noise, 1.0 / model.rate_hz)
         self._nominal_v = voltage_model.pseudo_ocv_at(50.0)[0]
         curve = model.noise.curve
         self._mean_c = voltage_model.t_ref_c if curve is None else curve.temperature_c
         self._kt_std = 0.0 if curve is None else curve.kt_std_v_per_k
         self._resistance_std = 0.0 if curve is None else curve.resistance_std_per_k
-        self._usual_a = USUAL_CURRENT_C_RATE * capacity_ah
+        self._usual_a = USUAL_CURRENT_C_RATE * online.capacity_ah
+        self._rate_hz = model.rate_hz
+        self._memory = online.memory
+        self._memory_s = MEMORY_TIMES * max((tau_s for _, tau_s in self._memory), default=0.0)
         # All samples of one filling delay line share the same unknown currents.
         self._shared_by = max(voltage_model.delay_s[-1] * model.rate_hz, 1.0)
 
@@ -169,6 +175,8 @@ class MeasurementNoise:
         filled_s = line.filled_s
         if not filled_s >= model.delay_s[-1]:
             variance = self._filling_var_v2(variance, filled_s)
+        if filled_s < self._memory_s:
+            variance += self._start_var_v2(filled_s)
         if math.isnan(temperature_c):
             return math.sqrt(variance), abs(model.kt_v_per_k) * TEMPERATURE_STD_K
         cold, hot = model.temperature_range_c
@@ -195,6 +203,23 @@ class MeasurementNoise:
             if delay > filled_s
         )
         return (filled_var_v2 + (unknown_ohm * self._usual_a) ** 2) * self._shared_by
+
+    def _start_var_v2(self, known_s: float) -> float:
+        """Return the variance from currents before the first, in the effects' memory [V²].
+
+        As while the line fills: each sample gets the variance of all within the time constant.
+
+        Parameters
+        ----------
+        known_s : float
+            Time that the current is known for [s].
+        """
+        return sum(
+            (ohm * self._usual_a) ** 2
+            * math.exp(-2.0 * known_s / tau_s)
+            * max(tau_s * self._rate_hz, 1.0)
+            for ohm, tau_s in self._memory
+        )
 
 
 class Measurement(NamedTuple):
@@ -277,7 +302,6 @@ class SocEkf:
         self._slow_time_s = noise.slow_time_s
         self._lasting_time_s = noise.lasting_time_s
         self._lasting_pct = noise.lasting_soc_pct
-        self._start_var = (steady_ohm * USUAL_CURRENT_C_RATE * capacity_ah) ** 2
         self._lasting_var = noise.lasting_std_v**2
         self._offset_std_a = OFFSET_STD_PER_AH * capacity_ah
         self._mean_innovation_v = 0.0
@@ -292,7 +316,7 @@ class SocEkf:
         size = self._size
         self._x = [soc_pct, *[0.0] * (size - 1)]
         variances = [
-            soc_std_pct**2, self._offset_std_a**2, self._slow_var + self._start_var,
+            soc_std_pct**2, self._offset_std_a**2, self._slow_var,
             self._lasting_var, CAPACITY_STD**2, *[1.0] * (size - LEARNED),
         ]  # fmt: skip
         self._p = [[0.0] * k + [variances[k]] + [0.0] * (size - 1 - k) for k in range(size)]

@@ -128,7 +128,7 @@ class Estimator:
         self._clock = EstimatorClock()
         self._line = DelayLine(self._voltage_model.delay_s, gap_s=self.settings.gap_s)
         self._references = SocReferenceDetector(self.settings.full_charge, self.settings.long_rest)
-        self._noise = MeasurementNoise(self._voltage_model, model, self.capacity_ah)
+        self._noise = MeasurementNoise(model, self._online)
         self._bias_std_v = math.hypot(model.noise.slow_std_v, model.noise.lasting_std_v)
         self._functions = CurveFunctions(model.noise)
         self._nominal_v = self._voltage_model.pseudo_ocv_at(50.0)[0]

@@ -17,6 +17,10 @@ spread between the hypotheses is part of its standard deviation. The SoC therefo
 likelier hypothesis as evidence grows, without a jump. Once the odds are clear the other hypothesis
 is dropped; if they stay unclear the two are merged. A rejected initial SoC has no influence on the
 result.
+
+A mixture of a narrow and a wide hypothesis is no normal distribution: what is improbable and far
+away makes up most of its variance. The standard deviation stated is therefore half the half-width
+of the interval about the mean that contains as much as two of a normal distribution's.
 """
 
 from __future__ import annotations
@@ -47,9 +51,15 @@ the odds stay."""
 
 LOG_ODDS_AT_MOST = 50.0
 
-WRONG_LOG_ODDS = -math.log(19.0)
+TWO_SIGMA = math.erf(math.sqrt(2.0))
+"""Probability within two standard deviations of a normal distribution: 95.45 %."""
+
+WIDTH_TO_PCT = 1e-9
+"""Accuracy of the half-width of a mixture [%]."""
+
+WRONG_LOG_ODDS = -math.log(99.0)
 """Prior log odds that a given SoC is wrong, such as one of another pack, day or scale: an
-assumption, one in twenty, as two standard deviations hold at most 95 % of the starts."""
+assumption, one in a hundred."""
 
 OPEN_AT_MOST_S = 900.0
 """Time with voltages after which undecided hypotheses are merged [s]."""
@@ -176,8 +186,9 @@ class HypothesisFilter:
         if len(self._filters) > 1:
             first, second = (each.summary(counted_s) for each in self._filters)
             soc_pct, _, offset_pct = map(self._mean, zip(first, second, strict=True))
-            spread = [std**2 + (soc - soc_pct) ** 2 for soc, std, _ in (first, second)]
-            std_pct = math.sqrt(self._mean(spread))
+            std_pct = self._stated_std_pct(
+                [(abs(soc - soc_pct), std) for soc, std, _ in (first, second)]
+            )
         soc_pct -= since.discharged_pct - offset_pct
         since_var_pct2 = since.gap_var_pct2 + since.unseen_var_pct2
         if since.away_s:
@@ -262,6 +273,29 @@ class HypothesisFilter:
     def _second_probability(self) -> float:
         return 1.0 / (1.0 + math.exp(-self._log_odds))
 
+    def _stated_std_pct(self, hypotheses: Sequence[tuple[float, float]]) -> float:
+        """Return half of the half-width that contains `TWO_SIGMA` of the probability [%].
+
+        Parameters
+        ----------
+        hypotheses : sequence of two pairs of floats
+            Distance from the mean, and standard deviation, of each [%].
+        """
+        low, width = 0.0, 0.0
+        high = max(away + 3.0 * std for away, std in hypotheses)
+        step = high
+        # Newton's method, halving the bracket where it would leave it.
+        while abs(step) > WIDTH_TO_PCT:
+            inside = [_within(width, away, std) for away, std in hypotheses]
+            missing = TWO_SIGMA - self._mean([share for share, _ in inside])
+            low, high = (width, high) if missing > 0.0 else (low, width)
+            density = self._mean([density for _, density in inside])
+            following = width + missing / density if density > 0.0 else math.inf
+            if not low < following < high:
+                following = 0.5 * (low + high)
+            step, width = following - width, following
+        return 0.5 * width
+
     def _mean(self, values: Sequence[float]) -> float:
         second = self._second_probability()
         return (1.0 - second) * values[0] + second * values[1]
@@ -299,6 +333,14 @@ class HypothesisFilter:
         self._filters = [self._restored(merged)]
         if self.verdict == "open":
             self.verdict = verdict
+
+
+def _within(width: float, away: float, std: float) -> tuple[float, float]:
+    """Return the probability of ±width of a normal distribution with mean `away`, and its slope."""
+    scale = max(std, WIDTH_TO_PCT) * math.sqrt(2.0)
+    low, high = (-width - away) / scale, (width - away) / scale
+    density = (math.exp(-(low**2)) + math.exp(-(high**2))) / (scale * math.sqrt(math.pi))
+    return 0.5 * (math.erf(high) - math.erf(low)), density
 
 
 def _bounded(log_odds: float) -> float:

@@ -80,6 +80,7 @@ RESISTANCE_STD_PER_K: Final = 0.03
 """Prior standard deviation of the resistance's relative change with temperature [1/K]: 20–30 kJ/mol
 of activation energy give 2.7–4 % per K (Waag, Käbitz, Sauer, Appl. Energy 102 (2013) 885)."""
 
+MEAN_PART = 0.0
 CURVE_FROM_S: Final = 100.0
 """Shortest stretch of time whose voltage says something of the curve [s]: over shorter ones, and
 the 70 s of the delayed currents, polarization of the same sign as a slope is larger."""
@@ -356,7 +357,7 @@ def describe_error(
     error = fit_time_error(likelihood.log_likelihood, usual_v, voltage_v)
     mean, covariance = likelihood.posterior(error)
     # A mean that the model does not contain is an error, too.
-    second = covariance + np.outer(mean, mean)
+    second = covariance + MEAN_PART * np.outer(mean, mean)
     return error, CurveError(
         KNOTS_PCT,
         principal_functions(second[:m, :m]),
