@@ -53,7 +53,7 @@ def test_smoothed_soc_ends_at_the_filter_and_is_closer_before(model: Model) -> N
     assert np.array_equal(plain.soc_pct, table.soc_pct)
     assert table.soc_smooth_pct[-1] == pytest.approx(table.soc_pct[-1], abs=1e-6)
     assert np.all(table.soc_smooth_std_pct <= table.soc_std_pct + 1e-6)
-    early = slice(0, 300)
+    early = slice(0, 70)
     error = [
         np.abs(each - log.soc_pct)[early].mean() for each in (table.soc_smooth_pct, table.soc_pct)
     ]

@@ -566,6 +566,11 @@ class SocEkf:
         return self._x[OFFSET]
 
     @property
+    def offset_std_a(self) -> float:
+        """Standard deviation of that offset [A]."""
+        return math.sqrt(max(self._p[OFFSET][OFFSET], 0.0))
+
+    @property
     def bias_v(self) -> float:
         """Estimated error of the voltage in time, slow and lasting [V]."""
         return self._x[SLOW] + self._x[LASTING]

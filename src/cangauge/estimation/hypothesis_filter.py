@@ -211,6 +211,11 @@ class HypothesisFilter:
         return self._mean([each.offset_a for each in self._filters])
 
     @property
+    def offset_std_a(self) -> float:
+        """Standard deviation of that offset, under the likelier hypothesis [A]."""
+        return self.likelier.offset_std_a
+
+    @property
     def likelier(self) -> SocEkf:
         """Filter of the likelier hypothesis."""
         return self._filters[int(len(self._filters) > 1 and self._log_odds > 0.0)]

@@ -260,7 +260,10 @@ class _JointFit:
         table = np.hstack([columns, of_starts])
         span = float(soc.min()), float(soc.max())
         lengths = [len(item) for item in rows]
-        solution, _ = rising_with_priors(table, volts, block, span, options, lengths=lengths)
+        # Only the logs' overlap may determine a start, not what curves usually look like.
+        solution, _ = rising_with_priors(
+            table, volts, block, span, options, lengths=lengths, with_curve=False
+        )
         std_pct = solution.std_error[n:]
         # The least squares does not model an error that lasts as long as a log and shifts its whole
         # voltage. Residuals averaged over five minutes show how large those that last are.

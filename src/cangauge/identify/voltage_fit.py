@@ -152,6 +152,7 @@ def rising_with_priors(
     options: FitOptions,
     *,
     lengths: Sequence[int],
+    with_curve: bool = True,
 ) -> tuple[Solution, KtPrior]:
     """Return the least-squares solution with the priors on kt and on the pseudo-OCV.
 
@@ -167,16 +168,20 @@ def rising_with_priors(
     options : FitOptions
     lengths : sequence of int
         Rows of each log.
+    with_curve : bool
+        Whether to use the prior on the pseudo-OCV.
     """
     plain = _rising(columns, volts, block, span_pct, options.epsilon)
     residual_v = volts - columns @ plain.coefficients
     # The slow error of clusters that count as independent; without an error there is no prior.
     prior_v2 = CLUSTER_S * options.rate_hz * _mean_square_of_means(residual_v, block)
-    curve = _curve_rows(float(np.median(volts)), prior_v2, columns.shape[1], options.epsilon)
+    curve = None
+    if with_curve:
+        curve = _curve_rows(float(np.median(volts)), prior_v2, columns.shape[1], options.epsilon)
     of_kt = kt_prior(columns, residual_v, volts, lengths, KT)
     row = np.zeros((1, columns.shape[1]))
     row[0, KT] = of_kt.row_weight
-    priors = [curve, (row, np.zeros(1))]
+    priors = [(row, np.zeros(1))] if curve is None else [curve, (row, np.zeros(1))]
     solution = _rising(columns, volts, block, span_pct, options.epsilon, priors=priors)
     return replace(solution, constrained=plain.constrained, curve_prior=curve), of_kt
 

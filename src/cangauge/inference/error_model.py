@@ -80,7 +80,6 @@ RESISTANCE_STD_PER_K: Final = 0.03
 """Prior standard deviation of the resistance's relative change with temperature [1/K]: 20–30 kJ/mol
 of activation energy give 2.7–4 % per K (Waag, Käbitz, Sauer, Appl. Energy 102 (2013) 885)."""
 
-MEAN_PART = 0.0
 CURVE_FROM_S: Final = 100.0
 """Shortest stretch of time whose voltage says something of the curve [s]: over shorter ones, and
 the 70 s of the delayed currents, polarization of the same sign as a slope is larger."""
@@ -355,15 +354,14 @@ def describe_error(
     residual_v = np.concatenate([log.residual_v for log in logs])
     usual_v = max(float(np.sqrt(np.mean(residual_v**2))), 1e-6 * voltage_v)
     error = fit_time_error(likelihood.log_likelihood, usual_v, voltage_v)
-    mean, covariance = likelihood.posterior(error)
-    # A mean that the model does not contain is an error, too.
-    second = covariance + MEAN_PART * np.outer(mean, mean)
+    # The fit holds the same priors: its curve is about the mean, which is not counted again.
+    covariance = likelihood.posterior(error)[1]
     return error, CurveError(
         KNOTS_PCT,
-        principal_functions(second[:m, :m]),
+        principal_functions(covariance[:m, :m]),
         mean_c,
-        math.sqrt(second[m, m]),
-        math.sqrt(second[m + 1, m + 1]),
+        math.sqrt(covariance[m, m]),
+        math.sqrt(covariance[m + 1, m + 1]),
     )
 
 
