@@ -7,8 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from cangauge.estimation.ekf import UNKNOWN_SOC_STD_PCT, Measurement, SocEkf
+from cangauge.estimation.ekf import UNKNOWN_SOC_STD_PCT, SocEkf
 from cangauge.estimation.hypothesis_filter import WRONG_LOG_ODDS, HypothesisFilter
+from cangauge.estimation.measurement_noise import Measurement
 from cangauge.estimation.state import ChargeSinceUpdate
 from cangauge.model.model_file import CurveNoise, ModelNoise
 

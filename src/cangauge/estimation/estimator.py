@@ -14,17 +14,10 @@ from operator import mul
 from cangauge.errors import InputError
 from cangauge.estimation.cells import PackTick
 from cangauge.estimation.counting import CoulombCounter, EstimatorClock
-from cangauge.estimation.ekf import (
-    CAPACITY_STD,
-    UNKNOWN_SOC_STD_PCT,
-    CurveFunctions,
-    Measurement,
-    MeasurementNoise,
-    SocEkf,
-    count_std_pct,
-)
+from cangauge.estimation.ekf import CAPACITY_STD, UNKNOWN_SOC_STD_PCT, SocEkf, count_std_pct
 from cangauge.estimation.health import Health, HealthEstimator, VoltageTick
 from cangauge.estimation.hypothesis_filter import HypothesisFilter
+from cangauge.estimation.measurement_noise import CurveFunctions, Measurement, MeasurementNoise
 from cangauge.estimation.power import LEVEL_MEMORY_S, PackNow, Power, PowerModel
 from cangauge.estimation.settings import (
     EstimatorSettings,

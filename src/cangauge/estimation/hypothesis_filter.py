@@ -33,13 +33,8 @@ import numpy as np
 
 from cangauge.errors import InputError
 from cangauge.estimation.counting import moved_log_odds, moved_std_pct
-from cangauge.estimation.ekf import (
-    HIGHEST_PCT,
-    LOWEST_PCT,
-    UNKNOWN_SOC_STD_PCT,
-    Measurement,
-    SocEkf,
-)
+from cangauge.estimation.ekf import HIGHEST_PCT, LOWEST_PCT, UNKNOWN_SOC_STD_PCT, SocEkf
+from cangauge.estimation.measurement_noise import Measurement
 from cangauge.estimation.state import ChargeSinceUpdate, EkfState, HypothesisFilterState, Verdict
 
 CLEAR_LOG_ODDS = math.log(1000.0)
