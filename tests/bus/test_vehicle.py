@@ -75,7 +75,8 @@ def test_every_preset_loads_and_wants_its_three_signals(name: str) -> None:
     else:
         assert vehicle.fixed_temperature_c == temperature_c
         assert vehicle.temperature_source == "unknown"
-    assert set(vehicle.messages) == {signal.key for signal in vehicle.signals}
+    cells = () if vehicle.cells is None else vehicle.cells.keys
+    assert set(vehicle.messages) == {*(signal.key for signal in vehicle.signals), *cells}
     assert len(vehicle.filters) == len(vehicle.wanted_ids)
     assert vehicle.pair_within_s == 0.020
 

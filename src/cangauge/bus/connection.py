@@ -28,6 +28,7 @@ from cangauge.bus.backend import (
     pending_frames,
     queue_drops,
 )
+from cangauge.bus.polling import PollCounts
 from cangauge.errors import CangaugeError
 
 SEND_WITHIN_S: Final = 1.0
@@ -73,6 +74,8 @@ class BusConnection:
         Whether the receive queue was empty after the latest call that received.
     foreign : int
         Frames from another sender with ids that the service sends; counted by its loop.
+    polls : PollCounts or None
+        What came of the loop's requests; None if it sends none.
     """
 
     def __init__(
@@ -94,6 +97,7 @@ class BusConnection:
         self.unsent = 0
         self.is_drained = False
         self.foreign = 0
+        self.polls: PollCounts | None = None
         self._posted: deque[tuple[float, can.Message]] = deque()
         self._dropped_before: int | None = None
         if bus is not None:

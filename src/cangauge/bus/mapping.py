@@ -66,6 +66,7 @@ A map file in TOML, for any car with a DBC::
     [messages.Reply_6104]
     isotp = true                    # a reply over ISO-TP; its id in the DBC is 0x7BB6104 for a
                                     # reply 61 04 … on 0x7BB. Others poll it: nothing is sent
+    request_id = 0x79B              # … unless the service's configuration has [poll]
 
     [rules.my_rule]
     polynomial = 0x2F
@@ -300,6 +301,8 @@ class MessageMap(_Strict):
         Whether its PGN identifies it: from any source address, at any priority.
     isotp : bool
         Whether it is a reply over ISO-TP, with the id of `isotp.reply_key` in the DBC.
+    request_id : int, optional
+        Standard id on which the service may ask for this reply.
     period_s : float, optional
         Frame period [s].
     data_id, data_id_list, data_id_mode, header_byte, protected_bytes
@@ -313,6 +316,7 @@ class MessageMap(_Strict):
     protection: str | None = None
     j1939: bool = False
     isotp: bool = False
+    request_id: Annotated[int, Field(ge=0, le=0x7FF)] | None = None
     period_s: _Positive | None = None
     data_id: Annotated[int, Field(ge=0, lt=1 << 32)] | None = None
     data_id_list: (

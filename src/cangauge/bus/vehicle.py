@@ -49,6 +49,7 @@ from cangauge.bus.mapping import (
     VehicleMap,
 )
 from cangauge.bus.plausibility import DEFAULTS, SignalChecks
+from cangauge.bus.polling import PollTarget
 from cangauge.bus.protection import Protection
 from cangauge.errors import InputError, closest
 from cangauge.logs.log import TemperatureSource
@@ -171,6 +172,8 @@ class MessageProtection(NamedTuple):
     """Over ISO-TP."""
     by_pgn: bool = False
     """From any source address (J1939)."""
+    request_id: int | None = None
+    """On which the reply may be asked for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -323,6 +326,15 @@ class Vehicle:
         keys = dict.fromkeys((*(signal.key for signal in self.signals), *cells))
         replies = {key for key in keys if self.messages[key].is_reply}
         return tuple(dict.fromkeys(reply_id(key) if key in replies else key for key in keys))
+
+    @property
+    def poll_targets(self) -> list[PollTarget]:
+        """The replies that may be asked for."""
+        return [
+            PollTarget(each.request_id, reply_id(key), (key >> 8 & 0xFF, key & 0xFF))
+            for key, each in self.messages.items()
+            if each.is_reply and each.request_id is not None
+        ]
 
     @property
     def filters(self) -> list[CanFilter]:
@@ -499,7 +511,7 @@ class _Binder:
             each, source = stated.get(key, (MessageMap(), self._source))
             period_s = _cycle_s(message) if each.period_s is None else each.period_s
             rule = each.rule(message, rules, source=source)
-            found[key] = MessageProtection(rule, period_s, each.isotp, each.j1939)
+            found[key] = MessageProtection(rule, period_s, each.isotp, each.j1939, each.request_id)
         return found
 
     def _message_key(self, name: str) -> int:
@@ -563,14 +575,28 @@ class Preset:
         return binder.vehicle(temperature_c, pair_within_s)
 
 
+POLLED_TIMEOUT_S: Final = 60.0
+"""Age at which a polled value is old [s]: a few rounds of a tester that asks every 10 to 20 s."""
+
+
 def _polled(leaf: Preset) -> Preset:
     """Return a Leaf whose temperature comes in replies of its battery that a tester polls."""
-    temperature = TemperatureMap(message="LBC_04", signal="probe_1_c", timeout_s=60.0)
-    messages = {**leaf.mapping.messages, "LBC_04": MessageMap(isotp=True)}
+    temperature = TemperatureMap(message="LBC_04", signal="probe_1_c", timeout_s=POLLED_TIMEOUT_S)
+    reply = MessageMap(isotp=True, request_id=0x79B)
+    messages = {**leaf.mapping.messages, "LBC_04": reply, "LBC_02": reply}
     mapping = leaf.mapping.model_copy(
-        update={"temperature": temperature, "temperature_source": "pack", "messages": messages}
+        update={
+            "temperature": temperature,
+            "temperature_source": "pack",
+            "messages": messages,
+            "cells": CellsMap(
+                count=96, signal="CELL_{n:02d}", message="LBC_02", timeout_s=POLLED_TIMEOUT_S
+            ),
+        }
     )
-    about = "Nissan Leaf 40/62 kWh whose battery a tester polls: temperature from its replies"
+    about = (
+        "Nissan Leaf 40/62 kWh whose battery a tester polls: temperature and cells from its replies"
+    )
     return dataclasses.replace(leaf, about=about, mapping=mapping)
 
 

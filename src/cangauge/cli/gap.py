@@ -25,7 +25,9 @@ from cangauge.cli.options import (
     within,
 )
 from cangauge.cli.output import emit_json, note, print_table, progress_shown
+from cangauge.cli.simulator import SimulatorOptions, corrected_path, write_corrected
 from cangauge.diagnosis import NONE, UNKNOWN, Diagnosis, diagnose
+from cangauge.diagnosis.simulator import SimulatorDiagnosis, diagnose_simulator
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import difference_from_reference
@@ -42,7 +44,12 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
         list[Path],
         typer.Argument(metavar="LOG", help="Logs to diagnose; one cause is sought for all."),
     ],
-    model: Annotated[Path, typer.Option("-m", "--model", metavar="MODEL", help="Model file.")],
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            "-m", "--model", metavar="MODEL", help="Model file; not needed for a simulator."
+        ),
+    ] = None,
     reference: Annotated[
         list[Path] | None,
         typer.Option(
@@ -69,6 +76,31 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
         Path | None,
         typer.Option(metavar="MODEL", help="Write the model, extended by the cause, to this file."),
     ] = None,
+    simulated: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HEADING",
+            help="Column of every log with a simulator's voltage for the same current and"
+            " temperature: what it misses is diagnosed, in place of a model's gap.",
+        ),
+    ] = None,
+    simulator: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MODULE:FUNCTION",
+            help="The same by a Python function, also FILE.py:FUNCTION, called with time [s],"
+            " current [A, positive = discharge], temperature [°C], SoC of the first row [%]; it"
+            " returns the voltage [V].",
+        ),
+    ] = None,
+    corrected: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="With a simulator: write each LOG with its simulated and corrected voltage to"
+            " FOLDER/NAME.corrected.csv.",
+        ),
+    ] = None,
     vehicle: VehicleOption = None,
     dbc: DbcOption = None,
     map_file: MapOption = None,
@@ -91,14 +123,19 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     --------
     `cangauge gap cold1.csv cold2.csv -m pack.json --reference mild1.csv --reference mild2.csv
     --reference mild3.csv --report gap.html --extended cold.json`
+
+    `cangauge gap day1.csv --simulated "V sim [V]" --capacity-ah 60 --reference good1.csv
+    --reference good2.csv --reference good3.csv --corrected .`
     """
     given = list(reference or [])
+    options = SimulatorOptions(simulated, simulator, columns, temperature)
     _refuse_common(logs, given)
-    check_outputs([report, extended], [*logs, *given, model])
-    model_file = Model.load(model)
+    outputs = [] if corrected is None else [corrected_path(log, corrected) for log in logs]
+    check_outputs([report, extended, *outputs], [*logs, *given, *([model] if model else [])])
+    model_file = _model(model, options, corrected)
     within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
     within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
-    if capacity_ah is not None:
+    if capacity_ah is not None and model_file is not None:
         model_file = model_file.model_copy(update={"capacity_ah": capacity_ah})
 
     def read(path: Path) -> Log:
@@ -116,11 +153,44 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
 
     diagnosed = [_long_enough(read(path)) for path in logs]
     references = [read(path) for path in given]
-    for log in (*diagnosed, *references):
-        if (difference := difference_from_reference(log, model_file.capacity_ah)) is not None:
-            note(f"warning: {difference}")
+    if model_file is not None:
+        _note_differences([*diagnosed, *references], model_file.capacity_ah)
+    of_simulator = None
     with progress_shown("cangauge.diagnosis"):
-        found = diagnose(diagnosed, model_file, references, initial_soc_pct=initial_soc)
+        if model_file is not None and not options.are_given:
+            found = diagnose(diagnosed, model_file, references, initial_soc_pct=initial_soc)
+        else:
+            of_simulator = diagnose_simulator(
+                [options.run(*each, initial_soc) for each in zip(diagnosed, logs, strict=True)],
+                [options.run(*each, None) for each in zip(references, given, strict=True)],
+                model=model_file,
+                capacity_ah=capacity_ah,
+            )
+            found = of_simulator.diagnosis
+    _write(found, model, report, extended)
+    if of_simulator is not None and corrected is not None:
+        write_corrected(of_simulator, logs, corrected)
+    if json_output:
+        result = found.to_dict(None if extended is None else str(extended))
+        result |= {} if of_simulator is None else {"simulator": of_simulator.to_dict()}
+        emit_json(result | {"assumed": assumed_of([*diagnosed, *references])})
+        return
+    _show(found)
+    if of_simulator is not None:
+        _show_simulator(of_simulator)
+    for written in filter(None, (extended, report, *outputs)):
+        note(f"wrote {written}")
+
+
+def _note_differences(logs: list[Log], capacity_ah: float) -> None:
+    for log in logs:
+        if (difference := difference_from_reference(log, capacity_ah)) is not None:
+            note(f"warning: {difference}")
+
+
+def _write(
+    found: Diagnosis, model: Path | None, report: Path | None, extended: Path | None
+) -> None:
     texts = {}
     if extended is not None:
         texts[extended] = found.extended_model.to_json()
@@ -129,16 +199,22 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
         from cangauge.report.diagnosis import gap_report  # noqa: PLC0415
         from cangauge.report.page import InputFile  # noqa: PLC0415
 
-        texts[report] = gap_report(found, InputFile.of_model(model_file, model))
+        texts[report] = gap_report(found, InputFile.of_model(found.model, model))
     write_texts_atomic(texts)
-    if json_output:
-        result = found.to_dict(None if extended is None else str(extended))
-        emit_json(result | {"assumed": assumed_of([*diagnosed, *references])})
-        return
-    _show(found)
-    for written in (extended, report):
-        if written is not None:
-            note(f"wrote {written}")
+
+
+def _model(path: Path | None, options: SimulatorOptions, corrected: Path | None) -> Model | None:
+    """Return the given model; None for a simulator without one."""
+    if corrected is not None and not options.are_given:
+        raise InputError(
+            "needs a simulator", field="--corrected", value=str(corrected),
+            cure="give --simulated or --simulator; a model is corrected by --extended",
+        )  # fmt: skip
+    if path is None and not options.are_given:
+        raise InputError(
+            "no model", field="--model", cure="give the model file, or --simulated or --simulator"
+        )
+    return None if path is None else Model.load(path)
 
 
 def _refuse_common(logs: list[Path], references: list[Path]) -> None:
@@ -197,3 +273,19 @@ def _show(found: Diagnosis) -> None:
         typer.echo("What these logs cannot show:")
     for sentence in found.caveats:
         typer.echo(printable(f"- {sentence}"))
+
+
+def _show_simulator(found: SimulatorDiagnosis) -> None:
+    if found.correction:
+        typer.echo(found.correction)
+    rows = [
+        [
+            str(each["name"]),
+            number(each["simulated_rmse_v"], 3),
+            number(each["corrected_rmse_v"], 3),
+        ]
+        for each in found.errors()
+    ]
+    print_table(
+        "Measured less simulated voltage", ["<log", "RMS as it is [V]", "corrected [V]"], rows
+    )

@@ -188,6 +188,19 @@ def _limit(text: str, default_text: str, *, unit: str, le: float = 1e4) -> Any:
     return _key(None, text, unit=unit, default_text=default_text, ge=0.0, le=le)
 
 
+class PollConfig(_Strict):
+    """Requests for replies over ISO-TP; see `Poller`."""
+
+    every_s: FiniteFloat = _key(
+        10.0,
+        "Interval between requests for the same reply. One is sent at a time; without an answer"
+        " the interval doubles, up to a minute; while another tester asks, none is sent.",
+        unit="s",
+        ge=1.0,
+        le=3600.0,
+    )
+
+
 class LimitsConfig(_Strict):
     """Limits for the possible currents and the energy left; see `PackLimits`."""
 
@@ -422,6 +435,9 @@ class RunConfig(_Strict):
     full_charge: FullChargeConfig | None = _key(None, "Set the SoC when the pack is full.")
     long_rest: LongRestConfig | None = _key(None, "Correct the SoC by the voltage of long rests.")
     limits: LimitsConfig = _key(LimitsConfig(), "Limits of the possible currents.")
+    poll: PollConfig | None = _key(
+        None, "Ask the battery controller for its replies over ISO-TP: the service then sends."
+    )
     http: str | None = _key(
         None,
         "Serve /status, /healthz and /metrics (extra `metrics`) there, e.g. 127.0.0.1:9464. An"
@@ -534,7 +550,28 @@ class RunConfig(_Strict):
             duration_s=self.duration_s,
             until_idle_s=self.until_idle_s,
             checkpoint_every_s=self.state_every_s,
+            poll_every_s=None if self.poll is None else self.poll.every_s,
         )
+
+    def check_poll(self, vehicle: Vehicle) -> None:
+        """Raise InputError if `[poll]` is given where nothing can be asked for."""
+        if self.poll is None:
+            return
+        problem = cure = ""
+        if not vehicle.poll_targets:
+            problem = f"no reply of the vehicle {vehicle.name} can be asked for"
+            cure = (
+                "use the preset leaf_ze1_polled for a Leaf of 40 or 62 kWh, or state isotp = true"
+                " and request_id for a message of the map file; or remove [poll]"
+            )
+        elif self.time_source == "replay-clock":
+            problem = "a replay has no battery that answers"
+            cure = "remove [poll], or time_source"
+        elif self.bus_options.get("listen_only"):
+            problem = "a bus that only listens sends no requests"
+            cure = "remove listen_only from [bus_options], or [poll]"
+        if problem:
+            raise InputError(problem, source=self._file, field="poll", cure=cure)
 
 
 _PATHS: Final = tuple(

@@ -23,6 +23,7 @@ from can.typechecking import CanFilter
 from cangauge._logging import emit
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.decoder import SUSPECTED_FOR_S
+from cangauge.bus.polling import Poller
 from cangauge.bus.publish import ESTIMATE_EVERY_S, FrameIds, standard_filter
 from cangauge.bus.time_source import (
     DRIVER_TOLERANCE_S,
@@ -93,12 +94,15 @@ class LoopSettings:
         End after this time; end after a silence of this length that follows samples [s].
     checkpoint_every_s : float
         Interval of checkpoints [s].
+    poll_every_s : float, optional
+        Ask for the vehicle's replies over ISO-TP every so often [s].
     """
 
     timeout_s: float = 2.0
     duration_s: float | None = None
     until_idle_s: float | None = None
     checkpoint_every_s: float = CHECKPOINT_EVERY_S
+    poll_every_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -203,6 +207,8 @@ class _Loop:
         self.duplicates = DuplicateSenderDetector(
             pipeline.settings.ids, echoes=port.capabilities.echoes
         )
+        self._asked = OwnEchoes(echoes=port.capabilities.echoes)
+        self._poller = self._make_poller()
         self.housekeeping = Housekeeping(port, outputs.checkpoint, settings.checkpoint_every_s)
         # With receive stamps REPLAY_CLOCK is no input; it is received once, for a warning.
         self._ignores_clock = pipeline.settings.time_source == "receive"
@@ -252,6 +258,8 @@ class _Loop:
         late_s = 0.0 if self._pipeline.samples != before else LATE_S
         if self._now_s >= self._beat_s + late_s:
             self._beat()
+        if self._poller is not None:
+            self._ask(self._poller.due(self._now_s))
         if self._now_s >= self._housekeeping_s:
             self._housekeeping_s = self._now_s + HOUSEKEEPING_EVERY_S
             self._run_housekeeping()
@@ -274,6 +282,8 @@ class _Loop:
                 continue
             if record is not None:
                 record.write(message)
+            if self._poller is not None and message.arbitration_id in self._poller.reply_ids:
+                self._ask(self._poller.take(message, self._now_s))
             if not pipeline.handle(message):
                 continue
             stamp_s = received_s
@@ -291,6 +301,13 @@ class _Loop:
         """Handle a frame with an id that is not the vehicle's; return False if it is input."""
         if self.duplicates.handle(message, self._now_s):
             self._port.foreign = self.duplicates.frames
+            return True
+        poller = self._poller
+        if poller is not None and message.arbitration_id in poller.request_ids:
+            if message.is_extended_id:
+                return False
+            if not self._asked.take(message):
+                poller.note_other_tester(self._now_s)
             return True
         if self._ignores_clock and is_clock(message, self._pipeline.settings.ids.replay_clock):
             if self._expects_clock:
@@ -370,10 +387,23 @@ class _Loop:
         if frames and self._outputs.sent is not None:
             self._outputs.sent()
 
+    def _make_poller(self) -> Poller | None:
+        every_s, targets = self._settings.poll_every_s, self._pipeline.vehicle.poll_targets
+        poller = None if every_s is None or not targets else Poller(targets, every_s)
+        self._port.polls = None if poller is None else poller.counts
+        return poller
+
+    def _ask(self, frame: can.Message | None) -> None:
+        """Send a request or a flow control, if there is one."""
+        if frame is not None:
+            self._asked.note_sent(frame)
+            self._port.post(frame, SEND_WITHIN_S)
+
     def _run_housekeeping(self) -> None:
         self.housekeeping.run(self._now_s)
         if self._outputs.reload is not None and (settings := self._outputs.reload()) is not None:
             self._settings = settings
+            self._poller = self._make_poller()
             self.housekeeping.every_s = settings.checkpoint_every_s
             self.duplicates.watch(self._pipeline.settings.ids)
             self._set_filters()
@@ -386,6 +416,9 @@ class _Loop:
         if self._expects_clock:
             wanted.append(standard_filter(clock_id))
         self._foreign_ids = self.duplicates.ids | ({clock_id} if self._ignores_clock else set())
+        if self._poller is not None:
+            self._foreign_ids |= self._poller.request_ids
+            wanted += map(standard_filter, sorted(self._poller.request_ids))
         self._port.set_filters(wanted)
 
 
@@ -452,6 +485,36 @@ class Housekeeping:
             emit(_LOG, logging.WARNING, "state.not_saved", f"the state could not be saved: {error}")
 
 
+class OwnEchoes:
+    """Tell own frames that a bus returns from those of others.
+
+    Parameters
+    ----------
+    echoes : bool
+        Whether the bus returns own frames (see `BackendCapabilities`).
+    """
+
+    def __init__(self, *, echoes: bool) -> None:
+        self._echoes = echoes
+        self._sent: deque[tuple[int, bytes]] = deque(maxlen=_SENT_KEPT)
+
+    def note_sent(self, message: can.Message) -> None:
+        """Record an own frame, whose echo may be received."""
+        if self._echoes:
+            self._sent.append((message.arbitration_id, bytes(message.data)))
+
+    def take(self, message: can.Message) -> bool:
+        """Return whether a received frame is the echo of an own one, which is then forgotten."""
+        frame = (message.arbitration_id, bytes(message.data))
+        if frame not in self._sent:
+            return False
+        # Each echo comes once and in order; skipped ones are lost. So identical frames of another
+        # sender are detected as well: as surplus echoes.
+        while self._sent.popleft() != frame:
+            pass
+        return True
+
+
 class DuplicateSenderDetector:
     """Detect frames with this service's ids from another sender.
 
@@ -472,8 +535,7 @@ class DuplicateSenderDetector:
 
     def __init__(self, ids: FrameIds, *, echoes: bool) -> None:
         self.frames = 0
-        self._echoes = echoes
-        self._sent: deque[tuple[int, bytes]] = deque(maxlen=_SENT_KEPT)
+        self._echoes = OwnEchoes(echoes=echoes)
         self._seen_s: deque[float] = deque(maxlen=DUPLICATE_FRAMES)
         self._quiet_until_s = self._active_until_s = -math.inf
         self.watch(ids)
@@ -493,8 +555,7 @@ class DuplicateSenderDetector:
 
     def note_sent(self, message: can.Message) -> None:
         """Record an own frame, whose echo may be received."""
-        if self._echoes:
-            self._sent.append((message.arbitration_id, bytes(message.data)))
+        self._echoes.note_sent(message)
 
     def handle(self, message: can.Message, now_s: float) -> bool:
         """Return whether a received frame has an own id, and hence is not input.
@@ -507,18 +568,8 @@ class DuplicateSenderDetector:
         """
         if message.arbitration_id not in self.ids or message.is_extended_id:
             return False
-        if not self._is_echo(message):
+        if not self._echoes.take(message):
             self._count(message.arbitration_id, now_s)
-        return True
-
-    def _is_echo(self, message: can.Message) -> bool:
-        frame = (message.arbitration_id, bytes(message.data))
-        if frame not in self._sent:
-            return False
-        # Each echo comes once and in order; skipped ones are lost. So identical frames of another
-        # sender are detected as well: as surplus echoes.
-        while self._sent.popleft() != frame:
-            pass
         return True
 
     def _count(self, frame_id: int, now_s: float) -> None:

@@ -233,6 +233,13 @@ def _frames(snapshot: Snapshot) -> Iterator[Metric]:
     for name, value in snapshot.bus.items():
         text = _BUS_HELP.get(name, name.replace("_", " "))
         yield CounterMetricFamily(f"cangauge_bus_{name}", text, value)
+    if snapshot.polls is not None:
+        yield _by_label(
+            "cangauge_polls",
+            "Requests over ISO-TP, and what came of them.",
+            "kind",
+            snapshot.polls,
+        )
     yield GaugeMetricFamily(
         "cangauge_bus_up", "0 while the bus is lost or its controller is bus-off.", snapshot.bus_up
     )

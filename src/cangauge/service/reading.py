@@ -62,6 +62,7 @@ class Reading:
         with time_limit("the configuration and its files", within_s):
             config = read()
             vehicle, model = config.load_vehicle(), Model.load(config.model)
+            config.check_poll(vehicle)
             try:
                 return cls(config, vehicle, model, _vehicle_key(config, vehicle))
             except OSError as error:  # a file disappeared meanwhile

@@ -185,6 +185,8 @@ class Snapshot:
     config : ConfigState
     report : PackReport or None
         Health, power and cells, of the last second; None before the first sample.
+    polls : mapping, optional
+        Requests over ISO-TP and what came of them; None if none are sent.
     """
 
     identity: Identity
@@ -208,6 +210,7 @@ class Snapshot:
     record: RecordState | None
     config: ConfigState
     report: PackReport | None = None
+    polls: Mapping[str, int] | None = None
 
     def is_stuck(self, now_s: float) -> bool:
         """Return whether the receive loop is stuck at a monotonic time [s]."""
@@ -295,6 +298,7 @@ def as_json(snapshot: Snapshot, now_s: float) -> dict[str, Any]:
         "bus_up": snapshot.bus_up,
         "bus_counts": dict(snapshot.bus),
         "bus_trouble": snapshot.bus_trouble or None,
+        "polls": None if snapshot.polls is None else dict(snapshot.polls),
         "config": {
             "reloading": snapshot.config.reloading,
             "problem": snapshot.config.problem or None,
@@ -468,6 +472,7 @@ class Monitor:
             record=None if self._record is None else self._record.state,
             config=self._config,
             report=self._report,
+            polls=_poll_counts(self._port),
         )
 
     def _log_notices(self, snapshot: Snapshot) -> None:
@@ -511,6 +516,11 @@ def _rejects(statistics: FrameStatistics) -> dict[str, int]:
         name: sum(int(getattr(each, name)) for each in statistics.messages.values())
         for name in _REJECTS
     }
+
+
+def _poll_counts(port: BusConnection) -> dict[str, int] | None:
+    counts = getattr(port, "polls", None)
+    return None if counts is None else counts.to_dict()
 
 
 def _bus_counts(port: BusConnection) -> dict[str, int]:

@@ -1,0 +1,134 @@
+"""Requests over ISO-TP: one at a time, no faster than stated, less often without an answer."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import can
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cangauge.bus.polling import (
+    OTHER_TESTER_S,
+    PENDING_WITHIN_S,
+    REPLY_WITHIN_S,
+    SLOWEST_S,
+    Poller,
+    PollTarget,
+)
+from cangauge.bus.vehicle import Vehicle
+from polled_battery import CELLS, PROBES
+
+PROBES_OF_LEAF = PollTarget(0x79B, 0x7BB, (0x61, 0x04))
+CELLS_OF_LEAF = PollTarget(0x79B, 0x7BB, (0x61, 0x02))
+
+
+def reply(data: bytes) -> can.Message:
+    return can.Message(arbitration_id=0x7BB, is_extended_id=False, data=data)
+
+
+def answer(poller: Poller, payload: bytes, now_s: float) -> can.Message | None:
+    """Give a reply of several frames; return the flow control."""
+    first = bytes([0x10 | len(payload) >> 8, len(payload) & 0xFF]) + payload[:6]
+    control = poller.take(reply(first), now_s)
+    for n, at in enumerate(range(6, len(payload), 7), 1):
+        assert poller.take(reply(bytes([0x20 | n & 15]) + payload[at : at + 7]), now_s) is None
+    return control
+
+
+def test_a_reply_is_asked_for_and_continued() -> None:
+    poller = Poller([PROBES_OF_LEAF], every_s=5.0)
+    request = poller.due(0.0)
+    assert request is not None
+    assert (request.arbitration_id, bytes(request.data[:3])) == (0x79B, b"\x02\x21\x04")
+    control = answer(poller, PROBES, 0.1)
+    assert control is not None
+    assert (control.arbitration_id, bytes(control.data[:3])) == (0x79B, b"\x30\x00\x00")
+    assert poller.due(5.0) is None
+    assert poller.due(5.2) is not None
+    assert (poller.counts.requests, poller.counts.answers) == (2, 1)
+
+
+def test_a_reply_to_somebody_else_gets_no_flow_control() -> None:
+    poller = Poller([PROBES_OF_LEAF], every_s=5.0)
+    assert answer(poller, CELLS, 0.0) is None  # nothing asked yet
+    assert poller.due(0.1) is not None
+    assert answer(poller, CELLS, 0.2) is None
+    assert poller.counts.answers == 0
+
+
+@given(
+    st.lists(
+        st.tuples(st.floats(0.0, 3.0), st.sampled_from(["wait", "answer", "negative", "other"])),
+        max_size=60,
+    )
+)
+def test_one_request_at_a_time_and_never_too_often(steps: list[tuple[float, str]]) -> None:
+    poller = Poller([PROBES_OF_LEAF, CELLS_OF_LEAF], every_s=2.0)
+    now_s, asked_s, ended, quiet_s = 0.0, {}, True, -1.0
+    for step_s, act in steps:
+        now_s += step_s
+        request = poller.due(now_s)
+        if request is not None:
+            group = request.data[2]
+            assert now_s >= quiet_s
+            assert ended or now_s - max(asked_s.values()) >= REPLY_WITHIN_S
+            assert now_s - asked_s.get(group, -9.0) >= 2.0
+            asked_s[group], ended = now_s, False
+        if act == "other":
+            poller.note_other_tester(now_s)
+            quiet_s, ended = now_s + OTHER_TESTER_S, True
+        elif act != "wait" and not ended:
+            last = max(asked_s, key=lambda group: asked_s[group])
+            if act == "answer":
+                answer(poller, PROBES if last == 4 else CELLS, now_s)
+            else:
+                poller.take(reply(b"\x03\x7f\x21\x11"), now_s)
+            ended = True
+
+
+def test_silence_doubles_the_interval_until_an_answer() -> None:
+    poller = Poller([PROBES_OF_LEAF], every_s=2.0)
+    asked = [tenth / 10.0 for tenth in range(4000) if poller.due(tenth / 10.0) is not None]
+    waits = [later - before for before, later in pairwise(asked)]
+    assert waits[0] < waits[1] < waits[2]
+    assert SLOWEST_S <= max(waits) <= SLOWEST_S + REPLY_WITHIN_S + 0.2
+    assert poller.counts.unanswered >= len(asked) - 1
+    again_s = next(at / 10.0 for at in range(4000, 5000) if poller.due(at / 10.0))
+    answer(poller, PROBES, again_s + 0.1)
+    assert poller.due(again_s + 2.2) is not None
+
+
+def test_a_pending_response_is_waited_for() -> None:
+    poller = Poller([PROBES_OF_LEAF], every_s=2.0)
+    assert poller.due(0.0) is not None
+    assert poller.take(reply(b"\x03\x7f\x21\x78"), 0.5) is None
+    assert poller.due(0.5 + PENDING_WITHIN_S - 0.1) is None
+    answer(poller, PROBES, 0.5 + PENDING_WITHIN_S - 0.05)
+    assert (poller.counts.answers, poller.counts.negative, poller.counts.unanswered) == (1, 0, 0)
+
+
+def test_requests_stop_while_another_tester_asks() -> None:
+    poller = Poller([PROBES_OF_LEAF], every_s=2.0)
+    assert poller.due(0.0) is not None
+    poller.note_other_tester(0.2)
+    assert poller.is_paused(1.0)
+    assert all(poller.due(0.2 + 0.1 * k) is None for k in range(int(10 * OTHER_TESTER_S)))
+    assert poller.due(0.3 + OTHER_TESTER_S) is not None
+
+
+@given(st.lists(st.tuples(st.binary(max_size=8), st.floats(0.0, 2.0)), max_size=40))
+def test_any_frames_are_survived(frames: list[tuple[bytes, float]]) -> None:
+    poller, now_s = Poller([PROBES_OF_LEAF], every_s=1.0), 0.0
+    for data, step_s in frames:
+        now_s += step_s
+        poller.due(now_s)
+        control = poller.take(reply(data), now_s)
+        assert control is None or control.data[0] == 0x30
+    asks = [poller.due(now_s + wait_s) for wait_s in (PENDING_WITHIN_S, 2.0 * SLOWEST_S)]
+    assert any(ask is not None for ask in asks)
+
+
+def test_the_leaf_has_two_replies_to_ask_for() -> None:
+    assert set(Vehicle.load("leaf_ze1_polled").poll_targets) == {PROBES_OF_LEAF, CELLS_OF_LEAF}
+    assert Vehicle.load("leaf_ze1", temperature_c=20.0).poll_targets == []

@@ -1,0 +1,111 @@
+"""`cangauge gap` with a simulator in the model's place: column, function, files, refusals."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cangauge.cli.simulator import load_function
+from cangauge.logs.canonical import write_table
+from cangauge.model.published import CAPACITY_AH
+from synthetic import synthetic_log
+
+Run = Callable[..., object]
+
+SIMULATOR = f"""
+import numpy as np
+
+def simulate(time_s, current_a, temperature_c, initial_soc_pct):
+    out_ah = np.cumsum(current_a * np.diff(time_s, prepend=time_s[0])) / 3600.0
+    soc = initial_soc_pct - 100.0 * out_ah / {CAPACITY_AH}
+    return 330.0 + 0.55 * soc - 0.12 * current_a
+
+def broken(time_s, current_a, temperature_c, initial_soc_pct):
+    raise ValueError("no such cell")
+"""
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three drives that the simulator explains, and one with 5 V too many."""
+    folder = tmp_path_factory.mktemp("drives")
+    (folder / "cell.py").write_text(SIMULATOR, encoding="utf-8")
+    simulate = load_function(f"{folder / 'cell.py'}:simulate")
+    for seed, extra_v in ((11, 0.0), (12, 0.0), (13, 0.0), (21, 5.0)):
+        log = synthetic_log(hours=0.6, start_pct=85.0, end_pct=65.0, seed=seed)
+        simulated_v = simulate(log.time_s, log.current_a, log.temperature_c, 85.0)
+        noise_v = np.random.default_rng(seed).normal(0.0, 0.3, len(log))
+        log = replace(log, voltage_v=simulated_v + noise_v + extra_v)
+        name = "trip" if extra_v else f"good{seed}"
+        columns = {
+            "Time [s]": log.time_s, "Current [A]": log.current_a, "Voltage [V]": log.voltage_v,
+            "Temperature [°C]": log.temperature_c, "SoC [%]": log.soc_pct,
+            "U model [V]": simulated_v,
+        }  # fmt: skip
+        write_table(columns, folder / f"{name}.csv")
+    return folder
+
+
+def given(drives: Path) -> list[object]:
+    references = sorted(drives.glob("good*.csv"))
+    words: list[object] = [drives / "trip.csv", "--capacity-ah", CAPACITY_AH]
+    return words + [word for path in references for word in ("--reference", path)]
+
+
+def test_a_column_is_diagnosed_and_corrected(run: Run, drives: Path, tmp_path: Path) -> None:
+    ran = run(
+        "gap", *given(drives), "--simulated", "U model [V]", "--sign", "discharge",
+        "--corrected", tmp_path, "--json",
+    )  # fmt: skip
+    assert ran.code == 0, ran.err
+    found = json.loads(ran.out)
+    cause = found["cause"]
+    assert {"voltage_offset", "voltage_gain"} & {cause["verdict"], *cause["ambiguous_with"]}
+    (errors,) = found["simulator"]["logs"]
+    assert errors["simulated_rmse_v"] == pytest.approx(5.0, abs=0.1)
+    assert errors["corrected_rmse_v"] < 0.4
+    assert "measured voltage" in found["simulator"]["correction"]
+    with (tmp_path / "trip.corrected.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    gap_v = [float(row["voltage_v"]) - float(row["corrected_v"]) for row in rows]
+    assert np.sqrt(np.mean(np.square(gap_v))) == pytest.approx(errors["corrected_rmse_v"], rel=1e-6)
+
+
+def test_a_function_gives_the_same_as_its_column(run: Run, drives: Path) -> None:
+    words = [*given(drives), "--sign", "discharge", "--json"]
+    by_column = run("gap", *words, "--simulated", "U model [V]")
+    by_function = run("gap", *words, "--simulator", f"{drives / 'cell.py'}:simulate")
+    assert by_column.code == by_function.code == 0, by_function.err
+    column, function = (json.loads(ran.out) for ran in (by_column, by_function))
+    assert function["cause"]["verdict"] == column["cause"]["verdict"]
+    assert function["gap"]["baseline_rmse_v"] == pytest.approx(
+        column["gap"]["baseline_rmse_v"], rel=1e-3
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        ([], "--model"),
+        (["--simulated", "U modell"], "no column has this heading"),
+        (["--simulated", "U model [V]", "--simulator", "a:b"], "two simulators"),
+        (["--simulator", "nowhere_at_all:simulate"], "cannot be imported"),
+        (["--simulator", "cell.py:other"], "no function other"),
+        (["--simulator", "cell.py:broken"], "no such cell"),
+        (["--simulator", "cell.py"], "MODULE:FUNCTION"),
+        (["--corrected", "."], "needs a simulator"),
+    ],
+)
+def test_what_cannot_be_simulated_is_refused(
+    run: Run, drives: Path, words: list[str], problem: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(drives)
+    ran = run("gap", *given(drives), "--sign", "discharge", *words)
+    assert ran.code == 2
+    assert problem in " ".join(ran.err.split())

@@ -1,0 +1,86 @@
+"""A service that polls a battery controller on a bus; refusals of `[poll]`."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+from cangauge.bus.open import BusAddress, bus_address
+from cangauge.errors import InputError
+from cangauge.service.config import load_config
+from cangauge.service.reading import Reading
+from live import leaf_model_path, waits
+from polled_battery import (
+    NEGATIVE,
+    PENDING,
+    SILENT,
+    Battery,
+    polling_service,
+    temperature_and_cells_come,
+)
+
+
+def test_temperature_and_cells_are_polled_over_udp() -> None:
+    port = 20_000 + (os.getpid() + 6007) % 20_000
+    temperature_and_cells_come(bus_address("udp_multicast", options={"port": port}))
+
+
+@pytest.mark.parametrize("manner", [NEGATIVE, PENDING, SILENT])
+def test_a_battery_that_does_not_answer_costs_nothing(manner: str) -> None:
+    address = BusAddress("virtual", f"polled {manner}")
+    with Battery(address, manner) as battery, polling_service(address) as service:
+        polls = service.port.polls
+        assert polls is not None
+        wanted = {NEGATIVE: "negative", PENDING: "answers", SILENT: "unanswered"}[manner]
+        assert waits(lambda: getattr(polls, wanted) >= 2, 8.0)
+        before = len(battery.requests)
+        battery.manner = ""
+        assert waits(lambda: polls.answers >= (4 if manner == PENDING else 2), 12.0)
+        assert len(battery.requests) - before <= 8
+        assert battery.early == 0
+    assert service.error is None
+
+
+def test_another_tester_pauses_the_requests() -> None:
+    address = BusAddress("virtual", "two testers")
+    with Battery(address) as battery, polling_service(address) as service:
+        polls = service.port.polls
+        assert polls is not None
+        assert waits(lambda: polls.answers >= 2)
+        battery.ask(4)
+        assert waits(lambda: polls.other_tester >= 1)
+        time.sleep(0.3)
+        requests = polls.requests
+        time.sleep(1.5)
+        assert polls.requests == requests
+        assert service.pipeline.decoder.health["temperature"].value_at(time.time()) == 20.0
+
+
+def read(tmp_path: Path, text: str) -> Reading:
+    path = tmp_path / "service.toml"
+    path.write_text(f'model = "{leaf_model_path()}"\n{text}', encoding="utf-8")
+    return Reading.of(lambda: load_config(path))
+
+
+def test_polling_is_off_unless_configured(tmp_path: Path) -> None:
+    assert read(tmp_path, 'vehicle = "leaf_ze1_polled"').config.loop_settings().poll_every_s is None
+    found = read(tmp_path, 'vehicle = "leaf_ze1_polled"\n[poll]\nevery_s = 20\n')
+    assert found.config.loop_settings().poll_every_s == 20.0
+    assert read(tmp_path, 'vehicle = "leaf_ze1_polled"\n[poll]').config.poll is not None
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ('vehicle = "leaf_ze1"\ntemperature = 20\n[poll]', "leaf_ze1_polled"),
+        ('vehicle = "leaf_ze1_polled"\n[poll]\nevery_s = 0.1', "every_s"),
+        ('vehicle = "leaf_ze1_polled"\ntime_source = "replay-clock"\n[poll]', "replay"),
+        ('vehicle = "leaf_ze1_polled"\nbus_options = {listen_only = true}\n[poll]', "listen_only"),
+    ],
+)
+def test_polling_that_cannot_work_is_refused(tmp_path: Path, text: str, problem: str) -> None:
+    with pytest.raises(InputError, match=problem):
+        read(tmp_path, text)
