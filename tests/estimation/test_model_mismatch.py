@@ -39,7 +39,7 @@ class Judged:
     is_flagged: NDArray[np.bool_]
     is_valid: NDArray[np.bool_]
     is_covered: NDArray[np.bool_]
-    error_pct: NDArray[np.float64]
+    std_pct: NDArray[np.float64]
 
 
 def judge(log: Log, model: Model, **settings: Any) -> Judged:
@@ -51,7 +51,7 @@ def judge(log: Log, model: Model, **settings: Any) -> Judged:
         is_flagged=(table.reasons[late] & Reason.MODEL_MISMATCH) != 0,
         is_valid=table.status[late] == Status.VALID,
         is_covered=error_pct <= 2.0 * table.soc_std_pct[late],
-        error_pct=error_pct,
+        std_pct=table.soc_std_pct[late],
     )
 
 
@@ -68,7 +68,7 @@ def test_a_stuck_temperature_widens_the_deviation(model: Model, day: Log) -> Non
     stuck = replace(day, temperature_c=np.full_like(day.temperature_c, -40.0))
     found = judge(stuck, model)
     assert not found.is_valid.any()
-    assert found.error_pct.max() > 10.0
+    assert found.std_pct.min() > 10.0
     assert found.is_covered.all()
 
 

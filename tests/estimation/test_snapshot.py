@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from typing import Any
@@ -182,17 +183,17 @@ def test_state_of_another_model_is_refused() -> None:
         Estimator(extended_by(["current_offset", "fast_polarization"])).restore(state)
 
 
-_STATE = None
+@functools.cache
+def _state_after(samples: int) -> str:
+    estimator = Estimator(extended_by(["time_skew", "hysteresis", "slow_diffusion"]))
+    for sample in EVENTFUL[:samples]:
+        estimator.step(sample)
+    return json.dumps(estimator.snapshot().model_dump(mode="json"))
 
 
-def state_of_a_drive() -> dict[str, Any]:
-    global _STATE  # noqa: PLW0603 - made once, it takes half a second
-    if _STATE is None:
-        estimator = Estimator(extended_by(["time_skew", "hysteresis", "slow_diffusion"]))
-        for sample in EVENTFUL[:465]:
-            estimator.step(sample)
-        _STATE = estimator.snapshot().model_dump(mode="json")
-    return json.loads(json.dumps(_STATE))
+def state_of_a_drive(samples: int = 465) -> dict[str, Any]:
+    """Return the state with two hypotheses; with one before the unobserved interval at 451."""
+    return json.loads(_state_after(samples))
 
 
 def places(data: Any, here: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
@@ -254,7 +255,8 @@ def test_damaged_state_is_refused_or_harmless(changes: list[tuple[Any, Any]]) ->
     ],
 )
 def test_state_contradicting_its_estimate_is_refused(place: tuple[Any, ...]) -> None:
-    data = state_of_a_drive()
+    # Beside a wider hypothesis the standard deviation of the narrow one does not show.
+    data = state_of_a_drive(440 if "p" in place else 465)
     at = data
     for key in place[:-1]:
         at = at[key]

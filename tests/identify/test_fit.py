@@ -10,7 +10,6 @@ import pytest
 from cangauge.errors import InputError
 from cangauge.identify.delays import search_delays
 from cangauge.identify.fit import common_name, fit
-from cangauge.identify.noise import describe_noise
 from cangauge.inference.least_squares import solve
 from cangauge.inference.rows import FitOptions
 from cangauge.logs.log import Log
@@ -146,29 +145,6 @@ def test_delay_search_finds_the_true_delays() -> None:
     found = search_delays([log], FitOptions(capacity_ah=CAPACITY_AH))
     assert found.delay_s == (0.0, 20.0, 100.0)
     assert found.held_out_rmse_v == pytest.approx(0.3, rel=0.1)
-
-
-def test_noise_is_split_into_fast_and_slow() -> None:
-    rng = np.random.default_rng(5)
-    logs = []
-    for _ in range(40):
-        slow = np.zeros(3000)
-        for k in range(1, 3000):
-            slow[k] = slow[k - 1] * np.exp(-1.0 / 300.0) + rng.normal() * np.sqrt(2.0 / 300.0)
-        logs.append((np.arange(3000.0), slow + rng.normal(0.0, 0.5, 3000)))
-    noise = describe_noise(logs, 1.0)
-    assert noise.fast_std_v == pytest.approx(0.5, rel=0.15)
-    assert noise.slow_std_v == pytest.approx(1.0, rel=0.2)
-    assert noise.lasting_std_v < 0.4
-
-
-@pytest.mark.parametrize("rate_hz", [1.0, 0.5, 0.1])
-def test_white_noise_is_white_at_every_rate(rate_hz: float) -> None:
-    rng = np.random.default_rng(3)
-    logs = [(np.arange(4000.0) / rate_hz, rng.normal(0.0, 0.5, 4000)) for _ in range(3)]
-    noise = describe_noise(logs, rate_hz)
-    assert noise.fast_std_v == pytest.approx(0.5, rel=0.1)
-    assert noise.fast_time_s < 0.15 / rate_hz  # well below the row interval
 
 
 def test_an_indispensable_log_is_not_held_out() -> None:

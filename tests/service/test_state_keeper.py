@@ -416,7 +416,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "another soc": (edited("estimator", "estimate", 1, value=33.0), "the last estimate"),
     "later than the latest": (edited("estimator", "memory", "rest_since_s", value=1e11),
                               "later than"),
-    "filter beyond": (edited("estimator", "filter", "hypotheses", 0, "x", 0, value=-3.0),
+    "filter beyond": (edited("estimator", "filter", "hypotheses", 0, "x", 0, value=-13.0),
                       "filter.hypotheses"),
     "no covariance": (edited("estimator", "filter", "hypotheses", 0, "p", 0, 0, value=-1.0),
                       "filter.hypotheses"),

@@ -39,7 +39,7 @@ from cangauge.cli.options import (
 )
 from cangauge.cli.output import console, emit_json, note, print_table, save_figures
 from cangauge.errors import InputError
-from cangauge.estimation.settings import VALID_STD_PCT, EstimatorSettings, Method
+from cangauge.estimation.settings import VALID_STD_PCT, EstimatorSettings, Filter, Method
 from cangauge.logs.canonical import write_table
 from cangauge.logs.cells import read_cells
 from cangauge.model.delay_line import GAP_S
@@ -77,6 +77,23 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
             " (newton), or counting alone (coulomb).",
         ),
     ] = "ekf",
+    filter_: Annotated[
+        str,
+        typer.Option(
+            "--filter",
+            metavar="own|reference",
+            help="Arithmetic of the Kalman filter: our own, or filterpy's (reference), slower, to"
+            " check it.",
+        ),
+    ] = "own",
+    smooth: Annotated[
+        bool,
+        typer.Option(
+            "--smooth",
+            help="Add soc_smooth_pct and soc_smooth_std_pct: the best SoC given the whole log"
+            " (Rauch–Tung–Striebel), and its standard deviation [%].",
+        ),
+    ] = False,
     initial_soc: Annotated[
         str | None,
         typer.Option(
@@ -148,6 +165,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     require_table_suffix(pack or Path("pack.csv"), option="--pack")
     settings = EstimatorSettings(
         method=_method(method),
+        filter=_filter(filter_, smooth=smooth),
         initial_soc_pct=_initial_soc(initial_soc),
         initial_soc_std_pct=within(
             initial_soc_std, 0.0, 100.0, option="--initial-soc-std", unit="%"
@@ -162,6 +180,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     if isinstance(TableOptions(columns, sign, map_file).open(log_path), Capture):
         if (vehicle, dbc, map_file) == (None, None, None):
             raise capture_without_vehicle(log_path)
+        _refuse_smoothing(log_path, smooth=smooth)
         car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature)
         source = known_temperature_source(temperature_source) or "unknown"
         settings = replace(settings, temperature_source=source)
@@ -193,6 +212,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
                 gap_from_log=max_gap_s is None,
                 pack=PackHistory(keeps_rows=pack is not None, cells=cells),
                 progress=progress,
+                smooth=smooth,
             )
         if max_gap_s is None and done.settings.gap_s > GAP_S:
             note(
@@ -232,6 +252,25 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
 def _write_pack(done: RecordedEstimate, pack: Path | None) -> None:
     if pack is not None:
         write_table(done.pack.columns, pack)
+
+
+def _refuse_smoothing(capture: Path, *, smooth: bool) -> None:
+    if smooth:
+        raise InputError(
+            "smooths a log, not a capture", field="--smooth", value=capture,
+            cure="give a log: the capture's samples are written by `-o samples.mcap`",
+        )  # fmt: skip
+
+
+def _filter(given: str, *, smooth: bool) -> Filter:
+    for name in get_args(Filter):
+        if given == name:
+            if smooth and given != "own":
+                raise InputError("is not smoothed", field="--filter", cure="leave it out")
+            return name  # type: ignore[no-any-return]
+    raise InputError(
+        "not a known filter", field="--filter", value=given, cure="use own or reference"
+    )
 
 
 def _method(given: str) -> Method:

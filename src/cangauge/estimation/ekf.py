@@ -1,46 +1,50 @@
-"""Extended Kalman filter of the voltage model and Coulomb counting, and its measurement noise.
+"""Extended Kalman filter of the voltage model and Coulomb counting.
 
-The state x = (S, o, b, l) is the SoC S [%], the current sensor's offset o [A] (measured = true +
-o), and the voltage model's bias in a slow part b and a lasting part l [V]. The biases are
-first-order Gauss–Markov processes, sized on held-out data. Because they are states, the standard
-deviation of S stops falling where the voltage carries no more information: an error that lasts as
-long as a trip does not average out.
+The state x = (S, o, b, l, g, a, c1 … ck) is the SoC S [%], the current sensor's offset o [A]
+(measured = true + o), a slow and a lasting error of the voltage b and l [V], the relative error g
+of the charge per % SoC (true capacity = C/(1 + g)), and standard normal amplitudes of the model's
+own errors: of the temperature coefficient (a), and of the principal functions φ of the pseudo-OCV's
+error (c).
 
-    S ← S − a·(i − o)·Δt,   a = 100/(3600·C)
-    U = OCV(S) + kt·(T − T_r) + Σ Rj·(I(t − dj) − o) + b + l + fast error
+    S ← S − (1 + g)·ΔQ + 100/(3600·C)·o·Δt,   ΔQ the counted charge [%]
+    U = OCV(S) + kt·(T − T_r) + Σ Rj·(I(t − dj) − o) + b + l + a·σ_kt·(T − T̄)
+        + Σ ck·φk(S) + fast error
+
+b and l are Gauss–Markov processes; all sizes come from the identification's error model
+(`inference.error_model`). The lasting error l may be another after the time and the charge of a
+log, the errors it was identified on. What the current before the first sample left behind, in the
+delay line or in an effect, is noise of the voltages that share it (`measurement_noise`).
+
+The error of the resistance over temperature adds its variance to b. It is no state: a filter that
+takes it for the same part of the drop throughout reads the SoC from how the voltage follows the
+load.
+
+a and c are *considered*: the filter keeps their covariance with the other states, so that the
+SoC's standard deviation contains the error of the curve wherever the SoC moves, but does not learn
+them: from one drive the shape of a curve cannot be told from errors of the charge, and a filter
+that tries believes a wrong shape more than a wrong level (Schmidt–Kalman filter; Jazwinski,
+Stochastic Processes and Filtering Theory, 1970, ch. 8.4). A correction by more than `LINEAR_PCT`
+is iterated (ibid., ch. 8.3).
 
 References
 ----------
-Plett, Extended Kalman filtering for battery management systems, J. Power Sources 134 (2004); the
-filter's arithmetic is filterpy's `ExtendedKalmanFilter`.
+Plett, Extended Kalman filtering for battery management systems, J. Power Sources 134 (2004).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Sequence
+from operator import mul
+from typing import Final
 
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
 
 from cangauge.errors import InputError
+from cangauge.estimation.measurement_noise import CurveFunctions, Measurement
 from cangauge.estimation.state import EkfState
-from cangauge.model.delay_line import DelayLine
-from cangauge.model.model_file import Model, ModelNoise, effective_error_std_v
-from cangauge.model.voltage_model import Curve, VoltageModel
-
-USUAL_CURRENT_C_RATE = 1.0 / 3.0
-"""Size of a current before the first sample [1/h]: 20 A at 60 Ah."""
-
-TEMPERATURE_STD_K = 10.0
-"""Standard deviation of a temperature that is not measured [K]."""
-
-OUTSIDE_SLOPE_ERROR = 0.5
-"""Relative error of the straight line's slope outside the identified SoC."""
-
-OUTSIDE_TEMPERATURE_V_PER_K = 1e-3
-"""Relative error of the voltage per K outside the identified temperatures (0.36 V/K for a Leaf)."""
+from cangauge.model.model_file import ModelNoise
+from cangauge.model.voltage_model import Curve
 
 OFFSET_STD_PER_AH = 0.025
 """Prior standard deviation of the current offset, per Ah of capacity [A/Ah] (1.5 A at 60 Ah)."""
@@ -48,11 +52,8 @@ OFFSET_STD_PER_AH = 0.025
 OFFSET_WALK_PER_SQRT_H = 0.1
 """Random walk of the offset, in prior standard deviations per √hour."""
 
-CAPACITY_STD = 0.03
+CAPACITY_STD = 0.05
 """Relative standard deviation of the capacity: cells age and cool."""
-
-CAPACITY_SPAN_PCT = 30.0
-"""SoC travel over which a capacity error builds up in one direction [%]."""
 
 UNKNOWN_SOC_STD_PCT = 30.0
 """Standard deviation of an unknown SoC [%] (uniform over 0–100: 29 %)."""
@@ -66,19 +67,29 @@ PERSISTENT_SIGMAS = 4.5
 OUTLIER_SIGMAS = 5.0
 """For a single innovation beyond this the measurement noise is raised to its size."""
 
-SLOW_SPAN_PCT = 3.0
-LASTING_SPAN_PCT = 8.0
-"""SoC travel over which each bias decorrelates [%]. The error of the fitted curve varies with SoC;
-with a constant bias the filter would slide along the curve until its shape fits."""
+RESTED_BIAS = 0.6
+"""The slow error after a long rest, in units of its standard deviation while driving."""
+
+LOWEST_PCT, HIGHEST_PCT = -10.0, 110.0
+"""Bounds of the SoC inside the filter [%]. The estimate is within 0–100; the filter is not, or at
+an end of the curve it would attribute what the clipped SoC cannot explain to its other states."""
+
+LINEAR_PCT = 1.0
+ITERATIONS_AT_MOST = 8
+"""A correction by more than this [%] is repeated, linearized at its own result (iterated extended
+Kalman filter; Jazwinski 1970, ch. 8.3), at most so often."""
 
 LASTING_TIME_S = 7200.0
-"""Time constant of the lasting bias [s]; the logs that it is identified on are seldom longer."""
-
-RESTED_BIAS = 0.6
-"""The bias after a long rest, in units of its standard deviation while driving."""
+"""Time constant of a lasting error whose logs are not known [s]: they are seldom longer."""
 
 ROUNDING = 1e-6
 """Tolerance of a covariance's correlations."""
+
+SOC, OFFSET, SLOW, LASTING, CAPACITY, KT = range(6)
+"""Index of each state; the curve's functions follow."""
+
+LEARNED: Final = 5
+"""Number of states that the voltage corrects; the others are considered."""
 
 
 def count_std_pct(
@@ -97,106 +108,13 @@ def count_std_pct(
     """
     pct_per_as = 100.0 / (3600.0 * capacity_ah)
     offset_pct = OFFSET_STD_PER_AH * capacity_ah * 3600.0 * hours * pct_per_as
-    capacity_pct2 = CAPACITY_STD**2 * CAPACITY_SPAN_PCT * moved_pct
-    return math.sqrt(start_var_pct2 + offset_pct**2 + capacity_pct2)
-
-
-class MeasurementNoise:
-    """Fast error of the voltages that the filter uses; the slow errors are states of the filter.
-
-    Parameters
-    ----------
-    voltage_model : VoltageModel
-    model : Model
-        Its noise and rate.
-    capacity_ah : float
-        Charge from 100 to 0 % [Ah].
-    """
-
-    def __init__(self, voltage_model: VoltageModel, model: Model, capacity_ah: float) -> None:
-        self._model = voltage_model
-        self._nominal_v = voltage_model.pseudo_ocv_at(50.0)[0]
-        self._fast_std_v = effective_error_std_v(model.noise, 1.0 / model.rate_hz)
-        self._usual_a = USUAL_CURRENT_C_RATE * capacity_ah
-        # All samples of one filling delay line share the same unknown currents.
-        self._shared_by = max(voltage_model.delay_s[-1] * model.rate_hz, 1.0)
-
-    def at(self, temperature_c: float, line: DelayLine) -> tuple[Callable[[float], float], float]:
-        """Return the standard deviation of a voltage over the SoC, and that of a lasting error.
-
-        The voltage is less certain while the delay line fills, without a temperature, and outside
-        the range that the model was identified on.
-
-        Parameters
-        ----------
-        temperature_c : float
-            Last known temperature [°C]; NaN if there was none.
-        line : DelayLine
-            The current up to the sample.
-
-        Returns
-        -------
-        std_v : callable
-            From the SoC [%], NaN for an unknown one, to the fast error's standard deviation [V].
-        outside_std_v : float
-            Standard deviation of the error outside the identified temperatures [V]. It lasts as
-            long as the temperature does, and does not average out.
-        """
-        model = self._model
-        variance = self._fast_std_v**2
-        filled_s = line.filled_s
-        if not filled_s >= model.delay_s[-1]:
-            variance = self._filling_var_v2(variance, filled_s)
-        beyond_k = 0.0
-        if math.isnan(temperature_c):
-            variance += (model.kt_v_per_k * TEMPERATURE_STD_K) ** 2
-        else:
-            cold, hot = model.temperature_range_c
-            beyond_k = max(cold - temperature_c, temperature_c - hot, 0.0)
-        low, high = model.soc_range_pct
-        outside_v = OUTSIDE_TEMPERATURE_V_PER_K * self._nominal_v * beyond_k
-
-        def std_v(soc_pct: float) -> float:
-            is_known = not math.isnan(soc_pct)
-            beyond_pct = max(low - soc_pct, soc_pct - high, 0.0) if is_known else 0.0
-            if beyond_pct == 0.0:
-                return math.sqrt(variance)
-            slope = model.pseudo_ocv_at(soc_pct)[1]
-            return math.sqrt(variance + (OUTSIDE_SLOPE_ERROR * slope * beyond_pct) ** 2)
-
-        return std_v, outside_v
-
-    def _filling_var_v2(self, filled_var_v2: float, filled_s: float) -> float:
-        """Return the error's variance while the delay line fills [V²].
-
-        Each sample gets the variance of all that share the unknown currents, so that together
-        they carry the information of one.
-        """
-        model = self._model
-        unknown_ohm = sum(
-            abs(resistance)
-            for resistance, delay in zip(model.resistance_ohm, model.delay_s, strict=True)
-            if delay > filled_s
-        )
-        return (filled_var_v2 + (unknown_ohm * self._usual_a) ** 2) * self._shared_by
-
-
-class Measurement(NamedTuple):
-    """One measured voltage with the terms of its prediction."""
-
-    voltage_v: float
-    without_ocv_v: float
-    """Predicted voltage less the pseudo-OCV, at the measured currents [V]."""
-    soc_pct: float
-    """SoC by inverse of the voltage model [%]."""
-    std_v: Callable[[float], float]
-    """Standard deviation of the fast error [V] as a function of the SoC [%]."""
-    outside_std_v: float = 0.0
-    """Standard deviation of the lasting error outside the identified temperatures [V]."""
+    return math.sqrt(start_var_pct2 + offset_pct**2 + (CAPACITY_STD * moved_pct) ** 2)
 
 
 class SocEkf:
     """Extended Kalman filter; state and equations are in the module's docstring.
+
+    Plain floats: twelve states are too few for arrays to pay.
 
     Parameters
     ----------
@@ -207,12 +125,10 @@ class SocEkf:
     capacity_ah : float
         Charge from 100 to 0 % [Ah].
     noise : ModelNoise
-        Size and time constants of the model's biases.
+        Error model of the voltage.
 
     Attributes
     ----------
-    log_likelihood : float
-        Of the last voltage, given all before it.
     was_outlier : bool
         Whether the last voltage was down-weighted as an outlier.
     """
@@ -221,26 +137,31 @@ class SocEkf:
         self, curve: Curve, steady_ohm: float, capacity_ah: float, noise: ModelNoise
     ) -> None:
         self._curve = curve
+        self._functions = CurveFunctions(noise)
         self._pct_per_as = 100.0 / (3600.0 * capacity_ah)
         self._steady_ohm = steady_ohm
         self._slow_var = noise.slow_std_v**2
         self._slow_time_s = noise.slow_time_s
+        self._lasting_time_s = noise.lasting_time_s
+        self._lasting_pct = noise.lasting_soc_pct
         self._lasting_var = noise.lasting_std_v**2
         self._offset_std_a = OFFSET_STD_PER_AH * capacity_ah
-        self._outside_var = 0.0
         self._mean_innovation_v = 0.0
         self._mean_seconds = 0.0
-        self.log_likelihood = 0.0
         self.was_outlier = False
-        self._ekf = ExtendedKalmanFilter(dim_x=4, dim_z=1, dim_u=1)
-        self._ekf.B = np.array([[1.0], [0.0], [0.0], [0.0]])
+        self._size = KT + 1 + self._functions.number
+        self._x = [0.0] * self._size
+        self._p = [[0.0] * self._size for _ in range(self._size)]
 
     def start(self, soc_pct: float, soc_std_pct: float) -> None:
         """Restart from a SoC with its standard deviation [%]."""
-        self._ekf.x = np.array([[soc_pct], [0.0], [0.0], [0.0]])
-        self._ekf.P = np.diag(
-            [soc_std_pct**2, self._offset_std_a**2, self._slow_var, self._lasting_var]
-        )
+        size = self._size
+        self._x = [soc_pct, *[0.0] * (size - 1)]
+        variances = [
+            soc_std_pct**2, self._offset_std_a**2, self._slow_var,
+            self._lasting_var, CAPACITY_STD**2, *[1.0] * (size - LEARNED),
+        ]  # fmt: skip
+        self._p = [[0.0] * k + [variances[k]] + [0.0] * (size - 1 - k) for k in range(size)]
         self._reset_innovations()
 
     def predict(
@@ -264,24 +185,72 @@ class SocEkf:
         away_s : float
             Part of the time in which no charge was counted, and hence no offset [s].
         """
-        slow_kept = math.exp(-seconds / self._slow_time_s - moved_pct / SLOW_SPAN_PCT)
-        lasting_kept = math.exp(-seconds / LASTING_TIME_S - moved_pct / LASTING_SPAN_PCT)
-        # What was learned outside the identified temperatures fades as the lasting bias does.
-        self._outside_var *= lasting_kept**2
-        offset_walk = OFFSET_WALK_PER_SQRT_H * self._offset_std_a
-        ekf = self._ekf
-        ekf.F = np.diag([1.0, 1.0, slow_kept, lasting_kept])
-        ekf.F[0, 1] = self._pct_per_as * (seconds - away_s)
-        ekf.Q = np.diag(
-            [
-                CAPACITY_STD**2 * CAPACITY_SPAN_PCT * moved_pct + gap_var_pct2,
-                offset_walk**2 * seconds / 3600.0,
+        slow_kept = math.exp(-seconds / self._slow_time_s)
+        lasting_kept = math.exp(-seconds / self._lasting_time_s - moved_pct / self._lasting_pct)
+        self._propagate(
+            discharged_pct,
+            (self._pct_per_as * (seconds - away_s), -discharged_pct),
+            (slow_kept, lasting_kept),
+            (
+                gap_var_pct2,
+                (OFFSET_WALK_PER_SQRT_H * self._offset_std_a) ** 2 * seconds / 3600.0,
                 self._slow_var * (1.0 - slow_kept**2),
                 self._lasting_var * (1.0 - lasting_kept**2),
-            ]
+            ),
         )
-        ekf.predict(u=np.array([[-discharged_pct]]))
         self._clip_soc()
+
+    def _propagate(
+        self,
+        discharged_pct: float,
+        by_offset_and_capacity: tuple[float, float],
+        kept: tuple[float, float],
+        noise: tuple[float, float, float, float],
+    ) -> None:
+        """Propagate state and covariance: x ← F·x − charge, P ← F·P·Fᵀ + Q.
+
+        Parameters
+        ----------
+        discharged_pct : float
+            Counted charge [%].
+        by_offset_and_capacity : pair of float
+            Change of the SoC with offset [%/A] and capacity error [%].
+        kept : pair of float
+            Part of the slow and of the lasting error that is kept.
+        noise : four floats
+            Variances added to SoC [%²], offset [A²], slow and lasting error [V²].
+        """
+        x, p = self._x, self._p
+        by_offset, by_capacity = by_offset_and_capacity
+        slow_kept, lasting_kept = kept
+        x[SOC] += by_offset * x[OFFSET] + by_capacity * x[CAPACITY] - discharged_pct
+        x[SLOW] *= slow_kept
+        x[LASTING] *= lasting_kept
+        first = [
+            a + by_offset * b + by_capacity * c
+            for a, b, c in zip(p[SOC], p[OFFSET], p[CAPACITY], strict=True)
+        ]
+        first[SOC] += by_offset * first[OFFSET] + by_capacity * first[CAPACITY]
+        first[SLOW] *= slow_kept
+        first[LASTING] *= lasting_kept
+        p[SOC] = first
+        for k, factor in ((SLOW, slow_kept), (LASTING, lasting_kept)):
+            row = [factor * value for value in p[k]]
+            row[SLOW] *= slow_kept
+            row[LASTING] *= lasting_kept
+            p[k] = row
+        # The scaled rows were scaled twice where they cross; set the columns from the rows.
+        slow, lasting = p[SLOW], p[LASTING]
+        slow[LASTING] = lasting[SLOW]
+        slow[SOC], lasting[SOC] = first[SLOW], first[LASTING]
+        for k in range(1, len(p)):
+            row = p[k]
+            row[SOC] = first[k]
+            row[SLOW], row[LASTING] = slow[k], lasting[k]
+        first[SOC] += noise[0]
+        p[OFFSET][OFFSET] += noise[1]
+        slow[SLOW] += noise[2]
+        lasting[LASTING] += noise[3]
 
     def update(self, measurement: Measurement, seconds: float) -> bool:
         """Update with one voltage, `seconds` after the last one [s].
@@ -291,69 +260,108 @@ class SocEkf:
         bool
             Whether a lasting contradiction made the SoC unknown again.
         """
-        ekf = self._ekf
-        outside_var = measurement.outside_std_v**2
-        if outside_var > self._outside_var:
-            ekf.P[3, 3] += outside_var - self._outside_var
-            self._outside_var = outside_var
-        soc_pct = float(ekf.x[0, 0])
-        std_v = measurement.std_v(soc_pct)
-        ocv_v, slope = self._curve.pseudo_ocv_at(soc_pct)
-        predicted_v = self._predicted_v(measurement, ocv_v)
-        is_contradicted = self._is_contradicted(measurement, predicted_v, slope, std_v, seconds)
-        if is_contradicted:
-            ekf.x[2:, 0] = 0.0
-            ekf.P = np.diag(
-                [
-                    UNKNOWN_SOC_STD_PCT**2,
-                    float(ekf.P[1, 1]),
-                    self._slow_var,
-                    self._lasting_var + self._outside_var,
-                ]
-            )
-            self._reset_innovations()
-            predicted_v = self._predicted_v(measurement, ocv_v)
-        jacobian = np.array([[slope, -self._steady_ohm, 1.0, 1.0]])
-        innovation = measurement.voltage_v - predicted_v
-        spread = float((jacobian @ ekf.P @ jacobian.T)[0, 0])
-        variance = std_v**2
-        self.was_outlier = innovation**2 > OUTLIER_SIGMAS**2 * (spread + variance)
+        fast_v2 = measurement.std_v**2
+        forgotten = -math.expm1(-2.0 * seconds / self._slow_time_s)
+        self._p[SLOW][SLOW] += measurement.resistance_std_v**2 * forgotten
+        jacobian, unbiased_v = self._linearized(measurement, self._x[SOC])
+        if self._is_contradicted(measurement, unbiased_v, jacobian, seconds):
+            offset_a, offset_var = self._x[OFFSET], self._p[OFFSET][OFFSET]
+            self.start(self._x[SOC], UNKNOWN_SOC_STD_PCT)
+            self._x[OFFSET], self._p[OFFSET][OFFSET] = offset_a, offset_var
+            is_contradicted = True
+        else:
+            is_contradicted = False
+        start_pct = at_pct = self._x[SOC]
+        for _ in range(ITERATIONS_AT_MOST):
+            innovation = measurement.voltage_v - unbiased_v
+            innovation -= sum(map(mul, jacobian[SLOW:], self._x[SLOW:]))
+            spread = [sum(map(mul, row, jacobian)) for row in self._p]
+            of_state = max(sum(map(mul, spread, jacobian)), 0.0)
+            corrected_pct = start_pct + spread[SOC] / (of_state + fast_v2) * innovation
+            corrected_pct = min(max(corrected_pct, LOWEST_PCT), HIGHEST_PCT)
+            if abs(corrected_pct - at_pct) < LINEAR_PCT:
+                break
+            at_pct = corrected_pct
+            jacobian, unbiased_v = self._linearized(measurement, at_pct)
+            unbiased_v += jacobian[SOC] * (start_pct - at_pct)
+        self.was_outlier = innovation**2 > OUTLIER_SIGMAS**2 * (of_state + fast_v2)
         if self.was_outlier:
-            variance = max(variance, innovation**2 - spread)
-        total = spread + variance
-        self.log_likelihood = -0.5 * (innovation**2 / total + math.log(total))
-        ekf.update(
-            np.array([[measurement.voltage_v]]),
-            lambda _: jacobian,
-            lambda _: np.array([[predicted_v]]),
-            R=variance,
-        )
+            fast_v2 = max(fast_v2, innovation**2 - of_state)
+        self._correct(jacobian, spread, innovation, of_state, fast_v2)
         self._clip_soc()
         return is_contradicted
 
+    def _linearized(self, measurement: Measurement, soc_pct: float) -> tuple[list[float], float]:
+        """Return the Jacobian at a SoC, and the voltage without the model's errors [V]."""
+        ocv_v, slope = self._curve.pseudo_ocv_at(soc_pct)
+        jacobian = [
+            slope, -self._steady_ohm, 1.0, 1.0, 0.0, measurement.kt_std_v,
+            *self._functions.at(soc_pct),
+        ]  # fmt: skip
+        return jacobian, ocv_v + measurement.without_ocv_v - self._steady_ohm * self._x[OFFSET]
+
     def correct(self, soc_pct: float, std_pct: float) -> None:
         """Update with an external SoC reference and its standard deviation [%]."""
-        jacobian = np.array([[1.0, 0.0, 0.0, 0.0]])
-        self._ekf.update(np.array([[soc_pct]]), lambda _: jacobian, lambda x: x[:1], R=std_pct**2)
+        jacobian = [1.0, *[0.0] * (self._size - 1)]
+        spread = [row[SOC] for row in self._p]
+        self._correct(jacobian, spread, soc_pct - self._x[SOC], spread[SOC], std_pct**2)
         self._clip_soc()
 
+    def _correct(
+        self,
+        jacobian: Sequence[float],  # noqa: ARG002 - of the reference filter
+        spread: list[float],
+        innovation: float,
+        of_state: float,
+        variance: float,
+    ) -> None:
+        """Correct state and covariance by one measurement.
+
+        Parameters
+        ----------
+        jacobian : sequence of float
+            H, of the measurement by the state.
+        spread : list of float
+            P·Hᵀ.
+        innovation : float
+        of_state, variance : float
+            H·P·Hᵀ, and the variance of the measurement.
+        """
+        x, p = self._x, self._p
+        total = of_state + variance
+        learned = LEARNED
+        for k in range(learned):
+            gain = spread[k] / total
+            x[k] += gain * innovation
+            p[k] = [a - gain * b for a, b in zip(p[k], spread, strict=True)]
+        for k in range(1, learned):
+            row = p[k]
+            for j in range(k):
+                row[j] = p[j][k]
+        for k in range(learned, len(p)):
+            p[k][:learned] = [p[j][k] for j in range(learned)]
+
     def shrink_bias(self) -> None:
-        """Reduce the slow bias after a long rest, in which slow polarisation has decayed."""
-        ekf = self._ekf
+        """Reduce the slow error after a long rest, in which slow polarization has decayed."""
         limit = RESTED_BIAS**2 * self._slow_var
-        shrink = math.sqrt(limit / ekf.P[2, 2]) if ekf.P[2, 2] > limit else 1.0
-        ekf.x[2, 0] *= shrink
-        ekf.P[2, :] *= shrink
-        ekf.P[:, 2] *= shrink
+        p = self._p
+        if p[SLOW][SLOW] <= limit:
+            return
+        shrink = math.sqrt(limit / p[SLOW][SLOW])
+        self._x[SLOW] *= shrink
+        p[SLOW] = [shrink * value for value in p[SLOW]]
+        for row in p:
+            row[SLOW] *= shrink
+        for k, row in enumerate(p):
+            row[SLOW] = p[SLOW][k]
 
     def snapshot(self) -> EkfState:
         """Return a copy of the state."""
         return EkfState(
-            self._ekf.x[:, 0].tolist(),
-            self._ekf.P.tolist(),
+            list(self._x),
+            [list(row) for row in self._p],
             self._mean_innovation_v,
             self._mean_seconds,
-            self._outside_var,
         )
 
     def restore(self, state: EkfState) -> None:
@@ -362,98 +370,104 @@ class SocEkf:
         Raises
         ------
         InputError
-            If it has another number of variables.
+            If it has another number of variables, or its covariance is not semidefinite.
         """
-        ekf = self._ekf
-        size = ekf.dim_x
+        size = self._size
         if [len(state.x), *map(len, state.p)] != [size] * (size + 1) or len(state.p) != size:
             raise InputError(f"not a filter of {size} states", field="filter.hypotheses")
-        ekf.x = np.array(state.x).reshape(size, 1)
-        ekf.P = np.array(state.p)
-        self._mean_innovation_v = state.mean_innovation_v
-        self._mean_seconds = state.mean_seconds
-        self._outside_var = state.outside_v2
-
-    def is_valid(self) -> bool:
-        """Return whether state and covariance are finite, and the covariance semidefinite."""
-        covariance = self._ekf.P
+        covariance = np.array(state.p)
         variance = np.diag(covariance)
-        if not (np.isfinite(covariance).all() and (variance >= 0.0).all()):
-            return False
         scale = np.sqrt(np.where(variance > 0.0, variance, 1.0))
         correlation = covariance / np.outer(scale, scale)
-        # Called after every voltage: `np.allclose` takes four times as long as the eigenvalues.
-        if np.abs(correlation - correlation.T).max() > ROUNDING:
-            return False
-        is_definite = bool(np.linalg.eigvalsh(correlation)[0] > -ROUNDING)
-        return is_definite and bool(np.all(np.isfinite(self._ekf.x)))
+        if (
+            not (variance >= 0.0).all()
+            or np.abs(correlation - correlation.T).max() > ROUNDING
+            or not np.linalg.eigvalsh(correlation)[0] > -ROUNDING
+        ):
+            raise InputError("not a positive semidefinite covariance", field="filter.hypotheses")
+        self._x = list(state.x)
+        self._p = [list(row) for row in state.p]
+        self._mean_innovation_v = state.mean_innovation_v
+        self._mean_seconds = state.mean_seconds
+
+    def is_valid(self) -> bool:
+        """Return whether the state is finite, and no variance negative."""
+        return all(
+            row[k] >= 0.0 and abs(value) < math.inf
+            for k, (row, value) in enumerate(zip(self._p, self._x, strict=True))
+        )
 
     @property
     def soc_pct(self) -> float:
         """State of charge [%], within 0–100."""
-        return float(self._ekf.x[0, 0])
+        return self._x[SOC]
 
     @property
     def offset_a(self) -> float:
         """Estimated offset of the current sensor [A]."""
-        return float(self._ekf.x[1, 0])
+        return self._x[OFFSET]
+
+    @property
+    def offset_std_a(self) -> float:
+        """Standard deviation of that offset [A]."""
+        return math.sqrt(max(self._p[OFFSET][OFFSET], 0.0))
 
     @property
     def bias_v(self) -> float:
-        """Estimated bias of the voltage model [V]."""
-        return float(self._ekf.x[2, 0] + self._ekf.x[3, 0])
+        """Estimated error of the voltage in time, slow and lasting [V]."""
+        return self._x[SLOW] + self._x[LASTING]
 
     @property
     def strain(self) -> float:
-        """Larger of offset and bias, in their standard deviations before the first voltage."""
-        bias_var = self._slow_var + self._lasting_var + self._outside_var
-        bias = abs(self.bias_v) / math.sqrt(bias_var) if bias_var > 0.0 else 0.0
-        return max(abs(self.offset_a) / self._offset_std_a, bias)
+        """Largest of offset, lasting bias and capacity error, in prior standard deviations."""
+        x = self._x
+        lasting_std = math.sqrt(self._lasting_var)
+        lasting = abs(x[LASTING]) / lasting_std if lasting_std > 0.0 else 0.0
+        return max(abs(x[OFFSET]) / self._offset_std_a, abs(x[CAPACITY]) / CAPACITY_STD, lasting)
 
     def summary(self, counted_s: float) -> tuple[float, float, float]:
         """Return SoC, its standard deviation, and the charge that the offset adds in a time [%]."""
-        x = self._ekf.x
-        std_pct = math.sqrt(max(float(self._ekf.P[0, 0]), 0.0))
-        return float(x[0, 0]), std_pct, self._pct_per_as * counted_s * float(x[1, 0])
-
-    def _predicted_v(self, measurement: Measurement, ocv_v: float) -> float:
-        x = self._ekf.x
-        volts = ocv_v + (measurement.without_ocv_v - self._steady_ohm * float(x[1, 0]))
-        return volts + float(x[2, 0] + x[3, 0])
+        x = self._x
+        std_pct = math.sqrt(max(self._p[SOC][SOC], 0.0))
+        return x[SOC], std_pct, self._pct_per_as * counted_s * x[OFFSET]
 
     def _is_contradicted(
-        self,
-        measurement: Measurement,
-        predicted_v: float,
-        slope: float,
-        std_v: float,
-        seconds: float,
+        self, measurement: Measurement, unbiased_v: float, jacobian: list[float], seconds: float
     ) -> bool:
-        """Return whether the mean innovation, biases excluded, contradicts state and model."""
-        ekf = self._ekf
+        """Return whether the mean error of the prediction contradicts state and error model.
+
+        Parameters
+        ----------
+        measurement : Measurement
+        unbiased_v : float
+            Predicted voltage, without the errors that the filter attributes [V].
+        jacobian : list of float
+        seconds : float
+            Time since the last voltage [s].
+        """
         if seconds > PERSISTENT_S:
             # After an interval without voltages, earlier innovations carry no information.
             self._reset_innovations()
             return False
-        bias_v = float(ekf.x[2, 0] + ekf.x[3, 0])
-        unbiased_v = predicted_v - bias_v
         weight = math.exp(-seconds / PERSISTENT_S)
         self._mean_innovation_v *= weight
         self._mean_innovation_v += (1.0 - weight) * (measurement.voltage_v - unbiased_v)
         self._mean_seconds += seconds
         if self._mean_seconds < PERSISTENT_S:
             return False
-        mean_var = (
-            self._slow_var + self._lasting_var + self._outside_var + slope**2 * float(ekf.P[0, 0])
+        of_model = jacobian[KT:]
+        mean_var = self._slow_var + self._lasting_var + sum(map(mul, of_model, of_model))
+        mean_var += jacobian[SOC] ** 2 * self._p[SOC][SOC]
+        mean_var += measurement.resistance_std_v**2 + measurement.std_v**2 * seconds / (
+            2.0 * PERSISTENT_S
         )
-        mean_var += std_v**2 * seconds / (2.0 * PERSISTENT_S)
         seen = 1.0 - math.exp(-self._mean_seconds / PERSISTENT_S)
         mean = self._mean_innovation_v / seen
-        return mean**2 > PERSISTENT_SIGMAS**2 * mean_var
+        return bool(mean**2 > PERSISTENT_SIGMAS**2 * mean_var)
 
     def _reset_innovations(self) -> None:
         self._mean_innovation_v = 0.0
         self._mean_seconds = 0.0
 
     def _clip_soc(self) -> None:
-        self._ekf.x[0, 0] = min(max(float(self._ekf.x[0, 0]), 0.0), 100.0)
+        self._x[SOC] = min(max(self._x[SOC], LOWEST_PCT), HIGHEST_PCT)

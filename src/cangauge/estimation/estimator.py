@@ -14,16 +14,10 @@ from operator import mul
 from cangauge.errors import InputError
 from cangauge.estimation.cells import PackTick
 from cangauge.estimation.counting import CoulombCounter, EstimatorClock
-from cangauge.estimation.ekf import (
-    CAPACITY_STD,
-    UNKNOWN_SOC_STD_PCT,
-    Measurement,
-    MeasurementNoise,
-    SocEkf,
-    count_std_pct,
-)
+from cangauge.estimation.ekf import CAPACITY_STD, UNKNOWN_SOC_STD_PCT, SocEkf, count_std_pct
 from cangauge.estimation.health import Health, HealthEstimator, VoltageTick
 from cangauge.estimation.hypothesis_filter import HypothesisFilter
+from cangauge.estimation.measurement_noise import CurveFunctions, Measurement, MeasurementNoise
 from cangauge.estimation.power import LEVEL_MEMORY_S, PackNow, Power, PowerModel
 from cangauge.estimation.settings import (
     EstimatorSettings,
@@ -77,6 +71,8 @@ class Estimator:
     ----------
     model : Model
     settings : EstimatorSettings, optional
+    ekf_type : type, optional
+        Implementation of the Kalman filter; by default that of `settings.filter`.
 
     Attributes
     ----------
@@ -102,9 +98,15 @@ class Estimator:
     80
     """
 
-    def __init__(self, model: Model, settings: EstimatorSettings | None = None) -> None:
+    def __init__(
+        self,
+        model: Model,
+        settings: EstimatorSettings | None = None,
+        ekf_type: type[SocEkf] | None = None,
+    ) -> None:
         self.model = model
         self.settings = settings or EstimatorSettings()
+        make_ekf = ekf_type or _ekf_type(self.settings)
         extended = model.extended_model()
         self._voltage_model = extended.model
         self._online = extended.online(self.settings.capacity_ah)
@@ -113,14 +115,15 @@ class Estimator:
         self._curve = self._online if self._has_effects else self._voltage_model
         self.capacity_ah = self._online.capacity_ah
         self.filter = HypothesisFilter(
-            lambda: SocEkf(self._curve, self._online.steady_ohm, self.capacity_ah, model.noise)
+            lambda: make_ekf(self._curve, self._online.steady_ohm, self.capacity_ah, model.noise)
         )
         self._counter = CoulombCounter(self.capacity_ah, self.settings.gap_s)
         self._clock = EstimatorClock()
         self._line = DelayLine(self._voltage_model.delay_s, gap_s=self.settings.gap_s)
         self._references = SocReferenceDetector(self.settings.full_charge, self.settings.long_rest)
-        self._noise = MeasurementNoise(self._voltage_model, model, self.capacity_ah)
+        self._noise = MeasurementNoise(model, self._online)
         self._bias_std_v = math.hypot(model.noise.slow_std_v, model.noise.lasting_std_v)
+        self._functions = CurveFunctions(model.noise)
         self._nominal_v = self._voltage_model.pseudo_ocv_at(50.0)[0]
         self._health = HealthEstimator(
             self._curve,
@@ -268,6 +271,11 @@ class Estimator:
             self.health,
         )
 
+    @property
+    def time_s(self) -> float:
+        """The estimator's own time at the latest sample [s]: it always increases."""
+        return self._clock.state.last_s
+
     def _process(self, sample: Sample) -> None:
         """Count the charge of a corrected sample, and use its voltage where that is due."""
         memory, since = self._memory, self._since
@@ -337,12 +345,13 @@ class Estimator:
         guess_pct = 50.0 if math.isnan(memory.newton_pct) else memory.newton_pct
         newton = soc_from_ocv(self._curve, sample.voltage_v - without_ocv_v, guess_pct)
         memory.newton_pct, memory.newton_inside = newton
-        std_v_at, outside_std_v = self._noise.at(memory.temperature_c, self._line)
-        std_v = std_v_at(self.filter.soc_pct if self._is_filtering else memory.newton_pct)
+        std_v, kt_std_v = self._noise.at(memory.temperature_c, self._line)
+        drop_v = sum(self._delayed_a) / len(self._delayed_a) * self._online.steady_ohm
+        resistance_std_v = self._noise.resistance_std(memory.temperature_c) * drop_v
         slope = self._curve.pseudo_ocv_at(memory.newton_pct)[1]
-        memory.newton_std_pct = min(
-            math.hypot(std_v, self._bias_std_v, outside_std_v) / slope, UNKNOWN_SOC_STD_PCT
-        )
+        curve_std_v = self._functions.std_v(memory.newton_pct)
+        error_v = math.hypot(std_v, self._bias_std_v, curve_std_v, kt_std_v, resistance_std_v)
+        memory.newton_std_pct = min(error_v / slope, UNKNOWN_SOC_STD_PCT)
         if math.isnan(memory.coulomb_start_pct):
             # No initial SoC: start from the voltage's with a wide prior, from which the filter
             # learns how SoC and bias share what the voltage cannot separate.
@@ -350,7 +359,12 @@ class Estimator:
             memory.coulomb_var_pct2 = memory.newton_std_pct**2
         if self._is_filtering:
             measurement = Measurement(
-                sample.voltage_v, without_ocv_v, memory.newton_pct, std_v_at, outside_std_v
+                sample.voltage_v,
+                without_ocv_v,
+                memory.newton_pct,
+                std_v,
+                kt_std_v,
+                resistance_std_v,
             )
             if self.filter.update(measurement, since):
                 memory.contradicted_until_s = sample.time_s + CONTRADICTED_S
@@ -628,6 +642,15 @@ class Estimator:
                 f" and count, {soc_pct:g} ± {std_pct:g} %",
                 field="estimate",
             )
+
+
+def _ekf_type(settings: EstimatorSettings) -> type[SocEkf]:
+    if settings.filter == "reference":
+        # filterpy is slow to import, and only a check needs it.
+        from cangauge.estimation.reference_filter import ReferenceEkf  # noqa: PLC0415
+
+        return ReferenceEkf
+    return SocEkf
 
 
 def _clip(soc_pct: float) -> float:

@@ -7,13 +7,20 @@ There are two hypotheses in two cases:
 - After an initial SoC was given: the first hypothesis accepts it, the second rejects it and starts
   from the first voltage.
 
-Each hypothesis has its own filter. Both use every voltage, and the likelihoods of the voltages
-update the odds between them (static multiple-model estimator; Bar-Shalom, Li, Kirubarajan,
-Estimation with Applications to Tracking and Navigation, 2001, ch. 11.6). The output is the mean
-weighted by the odds; the spread between the hypotheses is part of its standard deviation. The SoC
-therefore moves toward the likelier hypothesis as evidence grows, without a jump. Once the odds are
-clear the other hypothesis is dropped; if they stay unclear the two are merged. A rejected initial
-SoC has no influence on the result.
+Each hypothesis has its own filter, and both use every voltage. The second knows less: what the
+first knows more is its prior alone. If the first is right, the difference of their SoCs has
+therefore the variance P2 − P1 (Hausman, Econometrica 46 (1978) 1251), and with it the odds are
+those of the two priors given all voltages (Savage–Dickey ratio; Verdinelli, Wasserman, J. Am. Stat.
+Assoc. 90 (1995) 614). Likelihoods summed over voltages would count an error that lasts, such as
+that of the curve, as new evidence each second. The output is the mean weighted by the odds; the
+spread between the hypotheses is part of its standard deviation. The SoC therefore moves toward the
+likelier hypothesis as evidence grows, without a jump. Once the odds are clear the other hypothesis
+is dropped; if they stay unclear the two are merged. A rejected initial SoC has no influence on the
+result.
+
+A mixture of a narrow and a wide hypothesis is no normal distribution: what is improbable and far
+away makes up most of its variance. The standard deviation stated is therefore half the half-width
+of the interval about the mean that contains as much as two of a normal distribution's.
 """
 
 from __future__ import annotations
@@ -26,17 +33,28 @@ import numpy as np
 
 from cangauge.errors import InputError
 from cangauge.estimation.counting import moved_log_odds, moved_std_pct
-from cangauge.estimation.ekf import UNKNOWN_SOC_STD_PCT, Measurement, SocEkf
+from cangauge.estimation.ekf import HIGHEST_PCT, LOWEST_PCT, UNKNOWN_SOC_STD_PCT, SocEkf
+from cangauge.estimation.measurement_noise import Measurement
 from cangauge.estimation.state import ChargeSinceUpdate, EkfState, HypothesisFilterState, Verdict
 
 CLEAR_LOG_ODDS = math.log(1000.0)
 """Beyond this the less likely hypothesis is dropped."""
 
+FORGOTTEN = 0.01
+"""Below this part of the second's variance the first hypothesis knows no more than the second, and
+the odds stay."""
+
 LOG_ODDS_AT_MOST = 50.0
 
-WRONG_LOG_ODDS = -math.log(1000.0)
-"""Prior log odds that a given SoC is wrong, such as one of another pack or day: an assumption. It
-sets the size from which an initial error is attributed to the given SoC, not to the model."""
+TWO_SIGMA = math.erf(math.sqrt(2.0))
+"""Probability within two standard deviations of a normal distribution: 95.45 %."""
+
+WIDTH_TO_PCT = 1e-9
+"""Accuracy of the half-width of a mixture [%]."""
+
+WRONG_LOG_ODDS = -math.log(99.0)
+"""Prior log odds that a given SoC is wrong, such as one of another pack, day or scale: an
+assumption, one in a hundred."""
 
 OPEN_AT_MOST_S = 900.0
 """Time with voltages after which undecided hypotheses are merged [s]."""
@@ -68,6 +86,8 @@ class HypothesisFilter:
         self._filters = [make_ekf()]
         self._is_untested = False
         self._log_odds = 0.0
+        self._prior_log_odds = 0.0
+        self._wide_std_pct = UNKNOWN_SOC_STD_PCT
         self._open_s = 0.0
         self._outlier_s = 0.0
         self.verdict: Verdict = ""
@@ -87,9 +107,11 @@ class HypothesisFilter:
         variances = [parked_var_pct2, parked_var_pct2]
         if since.away_s:
             self._merge("unclear")
-            self._add(self._restored(self._filters[0].snapshot()), moved_log_odds(since.away_s))
+            moved_pct = moved_std_pct(since.away_s)
+            moved = self._restored(self._filters[0].snapshot())
+            self._add(moved, moved_log_odds(since.away_s), moved_pct)
             self.verdict = "open"
-            variances[1] = since.gap_var_pct2 + moved_std_pct(since.away_s) ** 2
+            variances[1] = since.gap_var_pct2 + moved_pct**2
         for each, variance in zip(self._filters, variances, strict=False):
             each.predict(
                 since.seconds, since.discharged_pct, since.moved_pct, variance, since.away_s
@@ -108,7 +130,7 @@ class HypothesisFilter:
             if len(self._filters) == 1:
                 rejecting = self._make_ekf()
                 rejecting.start(measurement.soc_pct, UNKNOWN_SOC_STD_PCT)
-                self._add(rejecting, WRONG_LOG_ODDS)
+                self._add(rejecting, WRONG_LOG_ODDS, UNKNOWN_SOC_STD_PCT)
         first, second = self._filters[0], self._filters[-1]
         is_contradicted = is_second_contradicted = first.update(measurement, since.seconds)
         if second is not first:
@@ -119,13 +141,12 @@ class HypothesisFilter:
             self._outlier_s = 0.0
         if second is first:
             return is_contradicted
-        change = second.log_likelihood - first.log_likelihood
-        self._log_odds = _bounded(self._log_odds + change)
+        self._log_odds = self._odds_of_second()
         self._open_s += since.seconds - since.away_s
         if is_contradicted != is_second_contradicted:
             return self._decide(int(is_contradicted))
         # The prior odds against a wrong initial SoC alone must not count as a clear decision.
-        prior = 0.0 if self.verdict == "open" else WRONG_LOG_ODDS
+        prior = 0.0 if self.verdict == "open" else self._prior_log_odds
         is_clear = self._log_odds > CLEAR_LOG_ODDS or self._log_odds < prior - CLEAR_LOG_ODDS
         if is_contradicted or is_clear:
             return self._decide(int(self._log_odds > 0.0), is_contradicted=is_contradicted)
@@ -160,8 +181,9 @@ class HypothesisFilter:
         if len(self._filters) > 1:
             first, second = (each.summary(counted_s) for each in self._filters)
             soc_pct, _, offset_pct = map(self._mean, zip(first, second, strict=True))
-            spread = [std**2 + (soc - soc_pct) ** 2 for soc, std, _ in (first, second)]
-            std_pct = math.sqrt(self._mean(spread))
+            std_pct = self._stated_std_pct(
+                [(abs(soc - soc_pct), std) for soc, std, _ in (first, second)]
+            )
         soc_pct -= since.discharged_pct - offset_pct
         since_var_pct2 = since.gap_var_pct2 + since.unseen_var_pct2
         if since.away_s:
@@ -184,6 +206,11 @@ class HypothesisFilter:
         return self._mean([each.offset_a for each in self._filters])
 
     @property
+    def offset_std_a(self) -> float:
+        """Standard deviation of that offset, under the likelier hypothesis [A]."""
+        return self.likelier.offset_std_a
+
+    @property
     def likelier(self) -> SocEkf:
         """Filter of the likelier hypothesis."""
         return self._filters[int(len(self._filters) > 1 and self._log_odds > 0.0)]
@@ -197,6 +224,8 @@ class HypothesisFilter:
             self._open_s,
             self._outlier_s,
             self.verdict,
+            self._prior_log_odds,
+            self._wide_std_pct,
         )
 
     def restore(self, state: HypothesisFilterState) -> None:
@@ -208,14 +237,18 @@ class HypothesisFilter:
             If a hypothesis is not a valid filter with a SoC within 0–100 %.
         """
         filters = [self._restored(each) for each in state.hypotheses]
-        if not all(each.is_valid() and 0.0 <= each.soc_pct <= 100.0 for each in filters):
+        if not all(
+            each.is_valid() and LOWEST_PCT <= each.soc_pct <= HIGHEST_PCT for each in filters
+        ):
             raise InputError(
-                "not a positive semidefinite covariance, or a SoC outside 0–100 %",
+                f"not a valid filter, or a SoC outside {LOWEST_PCT:g} … {HIGHEST_PCT:g} %",
                 field="filter.hypotheses",
             )
         self._filters = filters
         self._is_untested = state.is_untested
         self._log_odds = _bounded(state.log_odds)
+        self._prior_log_odds = _bounded(state.prior_log_odds)
+        self._wide_std_pct = state.wide_std_pct
         self._open_s = state.open_s
         self._outlier_s = state.outlier_s
         self.verdict = state.verdict
@@ -225,17 +258,53 @@ class HypothesisFilter:
         ekf.restore(state)
         return ekf
 
+    def _odds_of_second(self) -> float:
+        """Return the log odds of the second hypothesis against the first, given all voltages."""
+        (soc1_pct, std1_pct, _), (soc2_pct, std2_pct, _) = (
+            each.summary(0.0) for each in self._filters
+        )
+        more_pct2 = std2_pct**2 - std1_pct**2
+        if more_pct2 <= FORGOTTEN * std2_pct**2:
+            return self._log_odds
+        square = (soc2_pct - soc1_pct) ** 2 / more_pct2
+        ratio = self._wide_std_pct * math.sqrt(more_pct2) / std2_pct**2
+        return _bounded(self._prior_log_odds + 0.5 * square - math.log(ratio))
+
     def _second_probability(self) -> float:
         return 1.0 / (1.0 + math.exp(-self._log_odds))
+
+    def _stated_std_pct(self, hypotheses: Sequence[tuple[float, float]]) -> float:
+        """Return half of the half-width that contains `TWO_SIGMA` of the probability [%].
+
+        Parameters
+        ----------
+        hypotheses : sequence of two pairs of floats
+            Distance from the mean, and standard deviation, of each [%].
+        """
+        low, width = 0.0, 0.0
+        high = max(away + 3.0 * std for away, std in hypotheses)
+        step = high
+        # Newton's method, halving the bracket where it would leave it.
+        while abs(step) > WIDTH_TO_PCT:
+            inside = [_within(width, away, std) for away, std in hypotheses]
+            missing = TWO_SIGMA - self._mean([share for share, _ in inside])
+            low, high = (width, high) if missing > 0.0 else (low, width)
+            density = self._mean([density for _, density in inside])
+            following = width + missing / density if density > 0.0 else math.inf
+            if not low < following < high:
+                following = 0.5 * (low + high)
+            step, width = following - width, following
+        return 0.5 * width
 
     def _mean(self, values: Sequence[float]) -> float:
         second = self._second_probability()
         return (1.0 - second) * values[0] + second * values[1]
 
-    def _add(self, ekf: SocEkf, log_odds: float) -> None:
-        """Open a second hypothesis."""
+    def _add(self, ekf: SocEkf, log_odds: float, wide_std_pct: float) -> None:
+        """Open a second hypothesis, with its prior and standard deviation of the SoC [%]."""
         self._filters.append(ekf)
-        self._log_odds = log_odds
+        self._log_odds = self._prior_log_odds = log_odds
+        self._wide_std_pct = wide_std_pct
         self._open_s = 0.0
 
     def _decide(self, accepted: int, *, is_contradicted: bool = False) -> bool:
@@ -264,6 +333,14 @@ class HypothesisFilter:
         self._filters = [self._restored(merged)]
         if self.verdict == "open":
             self.verdict = verdict
+
+
+def _within(width: float, away: float, std: float) -> tuple[float, float]:
+    """Return the probability of ±width of a normal distribution with mean `away`, and its slope."""
+    scale = max(std, WIDTH_TO_PCT) * math.sqrt(2.0)
+    low, high = (-width - away) / scale, (width - away) / scale
+    density = (math.exp(-(low**2)) + math.exp(-(high**2))) / (scale * math.sqrt(math.pi))
+    return 0.5 * (math.erf(high) - math.erf(low)), density
 
 
 def _bounded(log_odds: float) -> float:

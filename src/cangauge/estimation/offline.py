@@ -21,6 +21,7 @@ from cangauge.estimation.settings import (
     LongRest,
     Method,
 )
+from cangauge.estimation.smoothing import RecordingEkf, Smoother
 from cangauge.estimation.validity import Estimate, Sample, Status, reason_names
 from cangauge.logs.gaps import usual_gap_s
 from cangauge.logs.log import Log
@@ -36,6 +37,9 @@ LONGEST_GAP_S = 3600.0
 
 NUMBERS = Estimate._fields[:7]
 """Columns of numbers, from `time_s` to `residual_v`."""
+
+SMOOTH_NUMBERS = ("soc_smooth_pct", "soc_smooth_std_pct")
+"""Further columns of a smoothed log."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +80,8 @@ class EstimateTable(ArrowExport):
         `Status` and `Reason` bits.
     scores : Scores, optional
         Errors against the log's reference SoC, from `estimate`.
+    soc_smooth_pct, soc_smooth_std_pct : array of shape (n,), optional
+        State of charge given the whole log, and its standard deviation [%], if asked for.
     """
 
     time_s: FloatArray
@@ -88,6 +94,8 @@ class EstimateTable(ArrowExport):
     status: NDArray[np.int64]
     reasons: NDArray[np.int64]
     scores: Scores | None = None
+    soc_smooth_pct: FloatArray | None = None
+    soc_smooth_std_pct: FloatArray | None = None
 
     @classmethod
     def of(cls, estimates: Iterable[Estimate]) -> EstimateTable:
@@ -114,6 +122,10 @@ class EstimateTable(ArrowExport):
         """Return the number of samples."""
         return int(self.time_s.size)
 
+    @property
+    def _numbers(self) -> tuple[str, ...]:
+        return NUMBERS if self.soc_smooth_pct is None else (*NUMBERS, *SMOOTH_NUMBERS)
+
     def to_arrow(self) -> Any:
         """Return a pyarrow.Table of the columns; unknown is null, status and reasons are words."""
         import pyarrow as pa  # noqa: PLC0415 - slow to import, and not needed to estimate
@@ -121,7 +133,7 @@ class EstimateTable(ArrowExport):
         words = {code: reason_names(code) for code in np.unique(self.reasons).tolist()}
         return pa.table(
             {
-                **{name: pa.array(getattr(self, name), from_pandas=True) for name in NUMBERS},
+                **{name: pa.array(getattr(self, name), from_pandas=True) for name in self._numbers},
                 "status": [Status(code).name.lower() for code in self.status.tolist()],
                 "reasons": [words[code] for code in self.reasons.tolist()],
             }
@@ -140,6 +152,7 @@ def estimate(
     gap_s: float | None = None,
     full_charge: FullCharge | None = None,
     long_rest: LongRest | None = None,
+    smooth: bool = False,
 ) -> EstimateTable:
     """Estimate the state of charge at every sample of a log.
 
@@ -164,6 +177,8 @@ def estimate(
     full_charge : FullCharge, optional
     long_rest : LongRest, optional
         Rules for an external SoC reference.
+    smooth : bool
+        Add the best SoC given the whole log, with its standard deviation.
 
     Returns
     -------
@@ -200,7 +215,7 @@ def estimate(
         full_charge=full_charge,
         long_rest=long_rest,
     )
-    table, scores = estimate_log(log, model, settings)
+    table, scores = estimate_log(log, model, settings, smooth=smooth)
     return replace(table, scores=scores)
 
 
@@ -228,10 +243,12 @@ def estimate_log(
     settings: EstimatorSettings,
     progress: Callable[[int], None] | None = None,
     observe: Callable[[Estimator, Sample], None] | None = None,
+    *,
+    smooth: bool = False,
 ) -> tuple[EstimateTable, Scores]:
     """Estimate a log with given settings, and score it; see `run_estimator` and `score`."""
     began = time.perf_counter()
-    table = run_estimator(samples_of(log), model, settings, progress, observe)
+    table = run_estimator(samples_of(log), model, settings, progress, observe, smooth=smooth)
     return table, score(table, log, time.perf_counter() - began)
 
 
@@ -247,6 +264,8 @@ def run_estimator(
     settings: EstimatorSettings,
     progress: Callable[[int], None] | None = None,
     observe: Callable[[Estimator, Sample], None] | None = None,
+    *,
+    smooth: bool = False,
 ) -> EstimateTable:
     """Return the estimates of all samples, in order.
 
@@ -259,16 +278,25 @@ def run_estimator(
         Called with the number of samples done, every `PROGRESS_EVERY`.
     observe : callable, optional
         Called with estimator and sample after each sample.
+    smooth : bool
+        Add the smoothed SoC (`smoothing`), which takes a few kB of memory for each voltage used.
     """
-    estimator = Estimator(model, settings)
+    smoother = Smoother() if smooth else None
+    estimator = Estimator(model, settings, None if smoother is None else RecordingEkf)
     estimates = []
     for done, sample in enumerate(samples, start=1):
         estimates.append(estimator.step(sample))
         if observe is not None:
             observe(estimator, sample)
+        if smoother is not None:
+            smoother.observe(estimator)
         if progress is not None and done % PROGRESS_EVERY == 0:
             progress(done)
-    return EstimateTable.of(estimates)
+    table = EstimateTable.of(estimates)
+    if smoother is None:
+        return table
+    soc_pct, std_pct = smoother.soc(estimator, table.soc_pct, table.soc_std_pct)
+    return replace(table, soc_smooth_pct=soc_pct, soc_smooth_std_pct=std_pct)
 
 
 def score(table: EstimateTable, log: Log, seconds: float = 0.0) -> Scores:

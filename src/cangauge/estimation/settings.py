@@ -19,6 +19,9 @@ from cangauge.model.delay_line import GAP_S
 
 Method = Literal["ekf", "newton", "coulomb"]
 
+Filter = Literal["own", "reference"]
+"""Arithmetic of the Kalman filter: our plain floats, or filterpy's to check them."""
+
 VALID_STD_PCT = 1.5
 """Largest standard deviation of a valid SoC [%]: 19 of 20 such SoC lie within 3 %.
 
@@ -96,6 +99,8 @@ class EstimatorSettings:
     ----------
     method : {"ekf", "newton", "coulomb"}
         Method whose SoC is published.
+    filter : {"own", "reference"}
+        Arithmetic of the Kalman filter: our plain floats, or filterpy's, slower, to check them.
     initial_soc_pct : float, optional
         SoC at the first sample [%]; by default found from the first voltages.
     initial_soc_std_pct : float
@@ -121,6 +126,7 @@ class EstimatorSettings:
     """
 
     method: Method = "ekf"
+    filter: Filter = "own"
     initial_soc_pct: float | None = None
     initial_soc_std_pct: float = 1.0
     valid_std_pct: float = VALID_STD_PCT

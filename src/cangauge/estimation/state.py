@@ -156,6 +156,10 @@ class HypothesisFilterState:
     outlier_s: _NotNegative
     """Time for which every voltage has been an outlier [s]."""
     verdict: Verdict
+    prior_log_odds: _Finite = 0.0
+    """Log odds of the second hypothesis before any voltage."""
+    wide_std_pct: _NotNegative = 0.0
+    """Prior standard deviation of the SoC under the second hypothesis [%]."""
 
 
 @dataclass

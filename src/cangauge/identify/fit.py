@@ -25,9 +25,9 @@ from cangauge.identify.evaluate import (
     evaluate_extended,
     slope_resistance,
 )
-from cangauge.identify.noise import describe_noise
 from cangauge.identify.starts import Start, find_starts, given_starts
 from cangauge.identify.voltage_fit import KT, fit_voltage_model, held_out_errors, stacked
+from cangauge.inference.error_model import KNOTS_PCT, LogResidual, describe_error
 from cangauge.inference.least_squares import Solution
 from cangauge.inference.rows import (
     DELAYS_S,
@@ -48,6 +48,7 @@ from cangauge.model.effects.library import effect_entries
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import (
     Coefficient,
+    CurveNoise,
     Information,
     Made,
     Model,
@@ -206,7 +207,7 @@ def fit(
     found = None
     if effect_ids:
         # With effects, cross-validation tests kt too, so its tight prior is not used.
-        plain, _ = fit_voltage_model(rows, options, with_kt_prior=False)
+        plain, _ = fit_voltage_model(rows, options, with_priors=False)
         sampled = [sample_log(log, options) for log in logs]
         found = fit_effects(ExtendedModel(plain, capacity_ah), sampled, effect_ids)
     if found is not None and found.model.effects:
@@ -246,7 +247,7 @@ def fit(
             temperature_c=voltage_model.temperature_range_c,
             current_a=voltage_model.current_range_a,
         ),
-        noise=_noise(fits, held_out, options.rate_hz),
+        noise=_noise(voltage_model, fits, held_out, options.rate_hz),
         effects=[] if found is None else effect_entries(found.model.effects),
         information=_information(rows, options, names, solution, found),
         made=_made(logs, options, effect_ids, rows, initial_soc_pct),
@@ -337,33 +338,47 @@ def _unit(name: str) -> Literal["V", "V/K", "ohm"]:
 
 
 def _noise(
-    fits: Sequence[LogFit], held_out_error_v: Sequence[FloatArray], rate_hz: float
+    voltage_model: VoltageModel,
+    fits: Sequence[LogFit],
+    held_out_error_v: Sequence[FloatArray],
+    rate_hz: float,
 ) -> ModelNoise:
     errors = np.concatenate(held_out_error_v)
     volts = np.concatenate([item.rows.voltage_v for item in fits])
     known = np.isfinite(errors)
-    whole_logs = len(fits) >= LOGS_AT_LEAST
     if not known.any():
         errors = np.concatenate([item.residual_v for item in fits])
         known = np.isfinite(errors)
         judged_on = "the rows of the fit itself (too short a log to hold any out)"
-    elif whole_logs:
+    elif len(fits) >= LOGS_AT_LEAST:
         judged_on = "whole logs left out in turn"
     else:
         judged_on = "interleaved blocks of 240 s left out in turn"
-    # Held-out blocks are short and far apart, which hides the duration of an error: the residual of
-    # the whole log shows it.
-    shown = held_out_error_v if whole_logs else [item.residual_v for item in fits]
-    noise = describe_noise(
+    time_error, curve = describe_error(
         [
-            (item.rows.time_s[finite], values[finite])
-            for item, values in zip(fits, shown, strict=True)
-            if (finite := np.isfinite(values)).any()
+            LogResidual(
+                item.residual_v,
+                item.rows.soc_pct,
+                item.rows.temperature_c,
+                item.rows.delayed_current_a,
+            )
+            for item in fits
         ],
+        voltage_model.pseudo_ocv(KNOTS_PCT),
+        voltage_model.resistance_ohm,
         rate_hz,
     )
     return ModelNoise(
-        **vars(noise),
+        **vars(time_error),
+        lasting_time_s=float(np.mean([np.ptp(item.rows.time_s) for item in fits])),
+        lasting_soc_pct=float(np.mean([np.ptp(item.rows.soc_pct) for item in fits])),
+        curve=CurveNoise(
+            soc_pct=curve.soc_pct.tolist(),
+            functions_v=curve.function_v.tolist(),
+            temperature_c=curve.temperature_c,
+            kt_std_v_per_k=curve.kt_std_v_per_k,
+            resistance_std_per_k=curve.resistance_std_per_k,
+        ),
         voltage_mae_pct=100.0 * float(np.mean(np.abs(errors[known]) / volts[known])),
         voltage_rmse_v=float(np.sqrt(np.mean(errors[known] ** 2))),
         judged_on=judged_on,
@@ -380,7 +395,7 @@ def _information(
     """Return the square root of the information of the rows on the coefficients.
 
     The columns of the effects come first in the triangular factor, so that they are marginalised.
-    The prior row of kt is included.
+    The priors of kt and of the pseudo-OCV are included.
     """
     if found is None or not found.model.effects:
         columns, volts, _ = stacked(rows, options)
@@ -400,7 +415,11 @@ def _information(
         weight = found.linear.kt_weight
     prior_row = np.zeros(table.shape[1])
     prior_row[first + KT] = weight / scale[KT]
-    root = np.linalg.qr(np.vstack([table, prior_row])).R[first:, first:]
+    prior_rows = [prior_row]
+    if solution.curve_prior is not None:
+        of_curve, target = solution.curve_prior
+        prior_rows.append(np.column_stack([of_curve / scale, target]))
+    root = np.linalg.qr(np.vstack([table, *prior_rows])).R[first:, first:]
     n = columns.shape[1]
     return Information(
         columns=list(names),

@@ -21,31 +21,33 @@ SCALES: Final = 10
 """Number of scales: stretches of 2, 4, … 512 rows, then all longer ones and the log's mean."""
 
 
-def haar_transform(columns: FloatArray) -> list[FloatArray]:
+def haar_transform(columns: FloatArray, scales: int = SCALES) -> list[FloatArray]:
     """Return the Haar transform of columns, one array per scale, the finest first.
 
     Parameters
     ----------
     columns : array of shape (n, k)
         Rows in order of time.
+    scales : int
+        Number of scales; the last row of the last one belongs to the log's mean.
 
     Returns
     -------
     list of arrays
-        `SCALES` arrays of shape (n_j, k) with Σ n_j = n. The transform is orthonormal: sums of
+        `scales` arrays of shape (n_j, k) with Σ n_j = n. The transform is orthonormal: sums of
         squares and products are those of the rows.
     """
     n = columns.shape[0]
     total = np.zeros((n + 1, columns.shape[1]))
     np.cumsum(columns, axis=0, out=total[1:])
-    differences, counts = _differences(n)
+    differences, counts = _differences(n, scales)
     coefficients = np.empty_like(total[1:])
     coefficients[:-1] = differences @ total
     coefficients[-1] = total[-1] / np.sqrt(n)
     return np.split(coefficients, np.cumsum(counts)[:-1])
 
 
-def _differences(n: int) -> tuple[sparse.csr_array, NDArray[np.intp]]:
+def _differences(n: int, scales: int) -> tuple[sparse.csr_array, NDArray[np.intp]]:
     """Return the matrix from cumulative sums to coefficients, and the number per scale.
 
     The matrix, shape (n − 1, n + 1), holds the finest scale first and omits the log's mean.
@@ -63,14 +65,14 @@ def _differences(n: int) -> tuple[sparse.csr_array, NDArray[np.intp]]:
         stretches.append(np.stack([first, middle, end]))
         edges = np.unique(np.concatenate((edges, middle)))
     first, middle, end = np.hstack([np.zeros((3, 0), dtype=np.intp), *stretches])
-    scale = np.minimum(np.rint(np.log2(end - first)).astype(np.intp) - 1, SCALES - 1)
+    scale = np.minimum(np.rint(np.log2(end - first)).astype(np.intp) - 1, scales - 1)
     order = np.argsort(scale, kind="stable")
     first, middle, end = first[order], middle[order], end[order]
     left, right = (middle - first).astype(float), (end - middle).astype(float)
     gain = np.sqrt(left * right / (left + right))
     weights = np.concatenate((gain / left, -gain / left - gain / right, gain / right))
     at = (np.tile(np.arange(first.size), 3), np.concatenate((first, middle, end)))
-    counts = np.bincount(scale, minlength=SCALES)
+    counts = np.bincount(scale, minlength=scales)
     counts[-1] += 1  # the mean
     return sparse.csr_array((weights, at), shape=(first.size, n + 1)), counts
 

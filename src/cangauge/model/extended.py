@@ -250,6 +250,11 @@ class OnlineExtendedModel:
         """Whether there are no effects, so that nothing needs correcting or advancing."""
         return not self._effects
 
+    @property
+    def memory(self) -> list[tuple[float, float]]:
+        """Resistance [Ω] and time constant [s] of the effects' voltages from earlier currents."""
+        return [element for effect in self._effects for element in effect.memory]
+
     def initial_soc_pct(self, assumed_pct: float) -> float:
         """Return the SoC at which to start for an assumed one, within 0–100 [%]."""
         return min(max(self._extended.counting(assumed_pct).initial_soc_pct, 0.0), 100.0)

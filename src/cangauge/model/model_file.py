@@ -37,6 +37,7 @@ from cangauge.model.voltage_model import BASIS_NAMES, VoltageModel
 
 MODEL_FORMAT = "cangauge-model"
 MODEL_VERSION = 1
+MAX_CURVE_KNOTS, MAX_CURVE_FUNCTIONS = 201, 16
 _CURE = "create the file with `cangauge fit`"
 
 _NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -73,14 +74,45 @@ class Ranges(_Strict):
     current_a: tuple[_Ampere, _Ampere]
 
 
+class CurveNoise(_Strict):
+    """Error of pseudo-OCV and temperature coefficient (`inference.error_model`)."""
+
+    soc_pct: Annotated[list[_Soc], Field(min_length=2, max_length=MAX_CURVE_KNOTS)]
+    """Increasing knots."""
+    functions_v: Annotated[
+        list[Annotated[list[_Value], Field(max_length=MAX_CURVE_KNOTS)]],
+        Field(max_length=MAX_CURVE_FUNCTIONS),
+    ]
+    """Independent functions of the curve's error, of standard deviation 1, at the knots."""
+    temperature_c: _Celsius
+    """Mean temperature of the logs."""
+    kt_std_v_per_k: _Volts
+    """Standard deviation of kt."""
+    resistance_std_per_k: _NotNegative
+    """Standard deviation of the resistance's relative change with temperature."""
+
+    @model_validator(mode="after")
+    def _shapes(self) -> Self:
+        if any(high <= low for low, high in pairwise(self.soc_pct)):
+            raise ValueError("soc_pct must increase")
+        if any(len(function) != len(self.soc_pct) for function in self.functions_v):
+            raise ValueError(f"each function needs {len(self.soc_pct)} values, one per soc_pct")
+        return self
+
+
 class ModelNoise(_Strict):
-    """Voltage error of the model on held-out data, in parts of different duration."""
+    """Voltage error of the model, in parts of different duration, and the error of the curve."""
 
     fast_std_v: _Volts
     fast_time_s: _Seconds
     slow_std_v: _Volts
     slow_time_s: Annotated[float, Field(gt=0, le=1e9)]
     lasting_std_v: _Volts
+    lasting_time_s: Annotated[float, Field(gt=0, le=1e9)] = 7200.0
+    lasting_soc_pct: Annotated[float, Field(gt=0, le=1e3)] = 8.0
+    """Mean duration and SoC span of the logs: beyond, the lasting error may be another."""
+    curve: CurveNoise | None = None
+    """None: not known, so only the lasting part covers it."""
     voltage_mae_pct: _NotNegative
     voltage_rmse_v: _Volts
     judged_on: str

@@ -53,6 +53,7 @@ from cangauge.estimation.power import PackLimits
 from cangauge.estimation.settings import (
     VALID_STD_PCT,
     EstimatorSettings,
+    Filter,
     FullCharge,
     LongRest,
     Method,
@@ -348,6 +349,11 @@ class RunConfig(_Strict):
         " counting (coulomb).",
         "ekf|newton|coulomb",
     )
+    filter: Filter = _key(
+        "own",
+        "Arithmetic of the Kalman filter: our own, or filterpy's (reference), slower, to check it.",
+        "own|reference",
+    )
     initial_soc: Annotated[FiniteFloat | None, BeforeValidator(_none_for_auto)] = _key(
         None,
         "SoC at the first sample, or auto: by the first voltages.",
@@ -558,6 +564,7 @@ class RunConfig(_Strict):
         return PipelineSettings(
             estimator=EstimatorSettings(
                 method=self.method,
+                filter=self.filter,
                 initial_soc_pct=self.initial_soc,
                 initial_soc_std_pct=self.initial_soc_std,
                 valid_std_pct=self.valid_std,

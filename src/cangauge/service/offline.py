@@ -293,6 +293,7 @@ def estimate_recorded_log(
     gap_from_log: bool = True,
     pack: PackHistory | None = None,
     progress: Callable[[int], None] | None = None,
+    smooth: bool = False,
 ) -> RecordedEstimate:
     """Estimate a log.
 
@@ -310,6 +311,8 @@ def estimate_recorded_log(
         Collects health, power and cells.
     progress : callable, optional
         Called with the number of samples done.
+    smooth : bool
+        Add the smoothed SoC.
 
     Raises
     ------
@@ -326,7 +329,7 @@ def estimate_recorded_log(
     if gap_from_log:
         settings = replace(settings, gap_s=gap_of(log))
     history = PackHistory() if pack is None else pack
-    table, scores = estimate_log(log, model, settings, progress, history.observe)
+    table, scores = estimate_log(log, model, settings, progress, history.observe, smooth=smooth)
     return RecordedEstimate(log, table, scores, model, settings, origin, pack=history.finish())
 
 

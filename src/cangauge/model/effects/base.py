@@ -344,6 +344,9 @@ class OnlineEffect:
 
     lags: Sequence[LowPass] = ()
 
+    memory: Sequence[tuple[float, float]] = ()
+    """Resistance [Ω] and time constant [s] of voltages from earlier currents, 0 at the start."""
+
     def correct(self, reading: Reading) -> Sequence[Reading]:
         """Return the corrected readings that are complete.
 

@@ -34,6 +34,7 @@ class _OnlineRc(OnlineEffect):
 
     def __init__(self, elements: Sequence[tuple[float, float]], activation_k: float) -> None:
         self._ohm = [ohm for ohm, _ in elements]
+        self.memory = elements
         self._activation_k = activation_k
         self.lags = [LowPass(tau_s, 0.0, rest_s=BRIDGE_S) for _, tau_s in elements]
 

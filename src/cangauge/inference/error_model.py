@@ -1,0 +1,469 @@
+"""Error model of the voltage: fast, slow, lasting, and the error of the curve itself.
+
+The measured voltage of log l at time t is
+
+    U = model + e(S) + (T − T̄)·a + (T − T̄)·D·b + Σj I(t − dj)·rj + w_l + z(t) + v(t)
+
+with the error e of the pseudo-OCV over SoC, the errors a of the temperature coefficient, b of the
+resistance over temperature and rj of the resistances (D is the model's drop), and three errors in
+time: w lasts as long as a log, z is slow and v fast (Gauss–Markov processes). e, a, b and rj are
+the same in all logs and have physical priors. The sizes and time constants of v, z and w maximise
+the restricted likelihood: that of the residuals with e, a, b and rj integrated out (Patterson,
+Thompson, Biometrika 58 (1971) 545). It is computed in a Haar transform of each log, whose
+coefficients of one time scale have about equal variance and little correlation (Wornell, Proc.
+IEEE 81 (1993) 1428), from the scales' normal equations alone.
+
+Few logs show a lasting error badly, and one log not at all. The variances of the slow and the
+lasting part are therefore posterior means over a grid, with half-normal priors: with few logs they
+are wide.
+
+The posterior covariance of e is wide where no log has been, whatever the residuals are. Its leading
+principal functions are what the estimator carries.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from cangauge._typing import FloatArray
+from cangauge.inference.time_scales import haar_transform
+
+SCALES: Final = 14
+"""Time scales: stretches of 2, 4, … 16,384 rows; longer ones count as the last."""
+
+KNOTS_PCT: Final = np.concatenate((np.arange(0.0, 15.0, 2.5), np.arange(15.0, 101.0, 5.0)))
+"""SoC between which the error of the curve is interpolated [%]; closer near empty, at the knee."""
+
+PART_STD: Final = 0.003
+"""Prior standard deviation of the slow and of the lasting error, relative to the voltage: the
+accuracy of a vehicle's voltage sensor."""
+
+LEVEL_STD: Final = 0.2
+"""Prior standard deviation of the curve's level, relative to the voltage: not known."""
+
+SLOPE_MEAN, SLOPE_STD = 1.5e-3, 1.0e-3
+"""Prior mean and standard deviation of the curve's slope, relative to the voltage [1/%]. Cells of
+NMC, NCA and LMO rise by 0.1–0.3 % of their voltage per % SoC, LFP by 0.01–0.05 % (open-circuit
+voltages in Plett, Battery Management Systems I, 2015, ch. 2)."""
+
+RESOLUTION: Final = 1e-4
+"""Least standard deviation of the fast error, relative to the voltage: that of a voltage reported
+in steps of 0.1 V at 360 V is 0.8e-4."""
+
+SLOPE_SPAN_PCT: Final = 20.0
+"""SoC over which the slope decorrelates [%]: the width of the features of a pseudo-OCV (phases of
+graphite, plateaus)."""
+
+KNEE_STD, KNEE_SPAN_PCT = 0.08, 5.0
+"""Prior standard deviation of the knee at empty, relative to the voltage, and the SoC over which it
+fades and bends [%]: a cell falls by 0.3 V in the last 5 %."""
+
+FINE_STD: Final = 5e-4
+"""Prior standard deviation of features narrower than the knots, relative to the voltage."""
+
+KT_STD_PER_K: Final = 2.5e-4
+"""Prior standard deviation of the temperature coefficient's error, relative to the voltage [1/K]:
+1 mV/K per cell, a few times the entropic coefficient."""
+
+RESISTANCE_STD: Final = 0.3
+"""Prior relative standard deviation of the resistances' error."""
+
+RESISTANCE_STD_PER_K: Final = 0.03
+"""Prior standard deviation of the resistance's relative change with temperature [1/K]: 20–30 kJ/mol
+of activation energy give 2.7–4 % per K (Waag, Käbitz, Sauer, Appl. Energy 102 (2013) 885)."""
+
+CURVE_FROM_S: Final = 100.0
+"""Shortest stretch of time whose voltage says something of the curve [s]: over shorter ones, and
+the 70 s of the delayed currents, polarization of the same sign as a slope is larger."""
+
+FUNCTIONS_AT_MOST: Final = 5
+EXPLAINED: Final = 0.98
+"""Principal functions of the curve's error: as many as explain this part of its variance on average
+over SoC; the rest is added to each so that no variance is lost."""
+
+GRID: Final = np.geomspace(0.05, 6.0, 13)
+"""Grid of the standard deviations of slow and lasting error, relative to their prior's."""
+
+FAST_TIME_S: Final = (0.0, 30.0)
+SLOW_TIME_S: Final = (60.0, 600.0)
+"""Bounds of the time constants [s]: the delay line covers 70 s, trips last half an hour. That of
+the slow part has a log-normal prior between them (±2σ), for logs that show no slow error."""
+
+
+@dataclass(frozen=True)
+class TimeError:
+    """Parts of the voltage error in time."""
+
+    fast_std_v: float
+    """Standard deviation of the fast part [V]."""
+    fast_time_s: float
+    """Time constant of the fast part [s]; 0 if white."""
+    slow_std_v: float
+    """Standard deviation of the slow part [V]."""
+    slow_time_s: float
+    """Time constant of the slow part [s]."""
+    lasting_std_v: float
+    """Standard deviation of the part that lasts as long as a log [V]."""
+
+    @property
+    def independent_v2(self) -> float:
+        """Variance with which rows of 1 Hz count as independent for slow quantities [V²]."""
+        return self.fast_std_v**2 * (1.0 + 2.0 * self.fast_time_s) + self.slow_std_v**2 * (
+            1.0 + 2.0 * self.slow_time_s
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class CurveError:
+    """Error of the curve over SoC and temperature."""
+
+    soc_pct: FloatArray
+    """Knots, shape (m,) [%]."""
+    function_v: FloatArray
+    """Principal functions: independent, with standard deviation 1, shape (k, m) [V]."""
+    temperature_c: float
+    """Mean temperature of the logs [°C]."""
+    kt_std_v_per_k: float
+    """Standard deviation of the temperature coefficient [V/K]."""
+    resistance_std_per_k: float
+    """Standard deviation of the resistance's relative change with temperature [1/K]."""
+
+
+@dataclass(frozen=True, eq=False)
+class LogResidual:
+    """Residual of one log with what the model's errors depend on; arrays of shape (n,)."""
+
+    residual_v: FloatArray
+    """Measured minus predicted voltage [V]."""
+    soc_pct: FloatArray
+    temperature_c: FloatArray
+    delayed_current_a: FloatArray
+    """Shape (n, delays) [A]."""
+
+
+class RestrictedLikelihood:
+    """Restricted likelihood of the errors in time, from normal equations by time scale.
+
+    Parameters
+    ----------
+    tables : sequence of arrays of shape (n, p + 1)
+        Columns of the shared errors, and the residual [V], of each log in order of time.
+    prior_mean : array of shape (p,)
+    prior_precision : array of shape (p, p)
+    rate_hz : float
+        Rate of the rows.
+    """
+
+    def __init__(
+        self,
+        tables: Sequence[FloatArray],
+        prior_mean: FloatArray,
+        prior_precision: FloatArray,
+        rate_hz: float,
+    ) -> None:
+        self._rate_hz = rate_hz
+        self._prior = prior_precision
+        self._rows = np.array([len(table) for table in tables], dtype=np.float64)
+        transforms = [haar_transform(table, SCALES) for table in tables]
+        self._means = np.array([each[-1][-1] for each in transforms])
+        by_scale = [
+            np.vstack([each[j][: -1 if j == SCALES - 1 else None] for each in transforms])
+            for j in range(SCALES)
+        ]
+        self._counts = np.array([len(item) for item in by_scale], dtype=np.float64)
+        self._products = np.array([item.T @ item for item in by_scale])
+        # Only the residual's own squares count at scales that the delayed currents explain.
+        fast = 2.0 ** np.arange(1, SCALES + 1) < CURVE_FROM_S * rate_hz
+        self._products[fast, :-1, :] = 0.0
+        self._products[fast, :, :-1] = 0.0
+        # Relative to the prior mean.
+        self._prior_mean = prior_mean
+        shift = np.eye(prior_mean.size + 1)
+        shift[:-1, -1] = -prior_mean
+        self._means = self._means @ shift
+        self._products[~fast] = shift.T @ self._products[~fast] @ shift
+
+    def variances(self, error: TimeError) -> tuple[FloatArray, FloatArray]:
+        """Return the variances of the coefficients of each scale, and of each log's mean [V²]."""
+        fast, slow = error.fast_time_s * self._rate_hz, error.slow_time_s * self._rate_hz
+        scale_v2 = haar_variances(error.fast_std_v**2, fast) + haar_variances(
+            error.slow_std_v**2, slow
+        )
+        mean_v2 = error.lasting_std_v**2 * self._rows
+        for variance, rows in ((error.fast_std_v**2, fast), (error.slow_std_v**2, slow)):
+            mean_v2 = mean_v2 + variance * variance_of_sum(self._rows, rows) / self._rows
+        return scale_v2, mean_v2
+
+    def normal_equations(self, error: TimeError) -> FloatArray:
+        """Return the weighted normal equations with the residual, shape (p + 1, p + 1)."""
+        scale_v2, mean_v2 = self.variances(error)
+        total = np.tensordot(1.0 / scale_v2, self._products, axes=1)
+        return np.asarray(total + (self._means.T / mean_v2) @ self._means)
+
+    def log_likelihood(self, error: TimeError) -> float:
+        """Return the restricted log likelihood, up to a constant."""
+        scale_v2, mean_v2 = self.variances(error)
+        total = self.normal_equations(error)
+        root = np.linalg.cholesky(self._prior + total[:-1, :-1])
+        explained = np.linalg.solve(root, total[:-1, -1])
+        return -0.5 * float(
+            self._counts @ np.log(scale_v2)
+            + np.sum(np.log(mean_v2))
+            + 2.0 * np.sum(np.log(np.diag(root)))
+            + total[-1, -1]
+            - explained @ explained
+        )
+
+    def posterior(self, error: TimeError) -> tuple[FloatArray, FloatArray]:
+        """Return mean (p,) and covariance (p, p) of the shared errors.
+
+        All scales get the variance of the slowest one: a faster error is correlated with the
+        current, and looks like a slope of the curve. This is the information of least squares,
+        with one independent row per correlation time.
+        """
+        scale_v2, mean_v2 = self.variances(error)
+        slowest_v2 = float(scale_v2[-1])
+        total = np.sum(self._products, axis=0) / slowest_v2
+        total += (self._means.T / np.maximum(mean_v2, slowest_v2)) @ self._means
+        covariance = np.linalg.inv(self._prior + total[:-1, :-1])
+        return self._prior_mean + covariance @ total[:-1, -1], covariance
+
+
+def fit_time_error(
+    log_likelihood: Callable[[TimeError], float], usual_v: float, voltage_v: float
+) -> TimeError:
+    """Return the errors in time: the fast part by maximum, slow and lasting by posterior mean.
+
+    Parameters
+    ----------
+    log_likelihood : callable
+    usual_v : float
+        Root mean square of the residuals [V]: where the search starts.
+    voltage_v : float
+        Of the pack [V], for the priors.
+    """
+    prior_v = PART_STD * voltage_v
+
+    def error_at(x: FloatArray) -> TimeError:
+        fast, slow, lasting = (usual_v * math.exp(float(value)) for value in x[:3])
+        fast = max(fast, RESOLUTION * voltage_v)
+        low, high = SLOW_TIME_S
+        return TimeError(
+            fast,
+            FAST_TIME_S[1] / (1.0 + math.exp(-float(x[3]))),
+            slow,
+            low * (high / low) ** (1.0 / (1.0 + math.exp(-float(x[4])))),
+            lasting,
+        )
+
+    def log_prior(error: TimeError) -> float:
+        low, high = SLOW_TIME_S
+        times = math.log(error.slow_time_s**2 / (low * high)) / math.log(high / low)
+        square = (error.slow_std_v / prior_v) ** 2 + (error.lasting_std_v / prior_v) ** 2
+        return -0.5 * (square + (2.0 * times) ** 2)
+
+    def objective(x: FloatArray) -> float:
+        if np.abs(x).max() > 12.0:
+            return 1e300
+        error = error_at(x)
+        return -log_likelihood(error) - log_prior(error)
+
+    starts = [np.array([-1.0, slow, slow, -2.0, 0.0]) for slow in (-1.0, 0.0)]
+    found = min(
+        (
+            minimize(
+                objective, start, method="Nelder-Mead",
+                options={
+                    "maxiter": 600, "xatol": 1e-2, "fatol": 1e-2,
+                    "initial_simplex": np.vstack([start, start + np.eye(5)]),
+                },
+            )
+            for start in starts
+        ),
+        key=lambda item: float(item.fun),
+    )  # fmt: skip
+    best = error_at(found.x)
+    grid = prior_v * GRID
+    # Prior in log steps of the grid: the density over σ times σ.
+    trials = [
+        TimeError(best.fast_std_v, best.fast_time_s, slow, best.slow_time_s, lasting)
+        for slow, lasting in itertools.product(grid, grid)
+    ]
+    log_weight = np.array(
+        [
+            log_likelihood(item) + log_prior(item)
+            + math.log(item.slow_std_v * item.lasting_std_v)
+            for item in trials
+        ]
+    )  # fmt: skip
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    slow_v2 = float(weight @ [item.slow_std_v**2 for item in trials])
+    lasting_v2 = float(weight @ [item.lasting_std_v**2 for item in trials])
+    return TimeError(
+        best.fast_std_v,
+        best.fast_time_s,
+        math.sqrt(slow_v2),
+        best.slow_time_s,
+        math.sqrt(lasting_v2),
+    )
+
+
+def describe_error(
+    logs: Sequence[LogResidual],
+    ocv_v: FloatArray,
+    resistance_ohm: Sequence[float],
+    rate_hz: float,
+) -> tuple[TimeError, CurveError]:
+    """Return the error model of a fitted model.
+
+    Parameters
+    ----------
+    logs : sequence of LogResidual
+    ocv_v : array of shape (m,)
+        The model's pseudo-OCV at `KNOTS_PCT` [V].
+    resistance_ohm : sequence of float
+        Rj [Ω], negative.
+    rate_hz : float
+        Rate of the rows.
+    """
+    voltage_v = float(np.mean(ocv_v))
+    mean_c = float(np.mean(np.concatenate([log.temperature_c for log in logs])))
+    tables = [
+        np.column_stack([_columns(log, mean_c, resistance_ohm), log.residual_v]) for log in logs
+    ]
+    prior = np.zeros((tables[0].shape[1] - 1,) * 2)
+    m = KNOTS_PCT.size
+    curve_mean, curve_covariance = curve_prior(voltage_v)
+    prior_mean = np.zeros(len(prior))
+    prior_mean[:m] = curve_mean - ocv_v
+    prior[:m, :m] = np.linalg.inv(curve_covariance)
+    total_ohm = abs(sum(resistance_ohm)) or 1e-3
+    scales = [KT_STD_PER_K * voltage_v, RESISTANCE_STD_PER_K]
+    scales += [RESISTANCE_STD * total_ohm] * len(resistance_ohm)
+    prior[np.arange(m, len(prior)), np.arange(m, len(prior))] = np.array(scales) ** -2.0
+    likelihood = RestrictedLikelihood(tables, prior_mean, prior, rate_hz)
+    residual_v = np.concatenate([log.residual_v for log in logs])
+    usual_v = max(float(np.sqrt(np.mean(residual_v**2))), 1e-6 * voltage_v)
+    error = fit_time_error(likelihood.log_likelihood, usual_v, voltage_v)
+    # The fit holds the same priors: its curve is about the mean, which is not counted again.
+    covariance = likelihood.posterior(error)[1]
+    return error, CurveError(
+        KNOTS_PCT,
+        principal_functions(covariance[:m, :m]),
+        mean_c,
+        math.sqrt(covariance[m, m]),
+        math.sqrt(covariance[m + 1, m + 1]),
+    )
+
+
+def curve_prior(voltage_v: float, soc_pct: FloatArray = KNOTS_PCT) -> tuple[FloatArray, FloatArray]:
+    """Return the prior mean [V] and covariance [V²] of a pseudo-OCV.
+
+    Level, slope and knee are independent. The slope is a Gaussian process over SoC with a squared
+    exponential covariance; its integral is the curve.
+
+    Parameters
+    ----------
+    voltage_v : float
+        Of the pack [V].
+    soc_pct : array of shape (m,)
+        Increasing SoC [%].
+    """
+    step_pct = np.diff(soc_pct)
+    middle = 0.5 * (soc_pct[1:] + soc_pct[:-1])
+    apart = (middle[:, None] - middle) / SLOPE_SPAN_PCT
+    of_steps = (SLOPE_STD * voltage_v) ** 2 * np.exp(-0.5 * apart**2)
+    integral = np.vstack([np.zeros(middle.size), np.tri(middle.size)]) * step_pct
+    knee = KNEE_STD * voltage_v * np.exp(-soc_pct / KNEE_SPAN_PCT)
+    apart = (soc_pct[:, None] - soc_pct) / KNEE_SPAN_PCT
+    # The level is that of the middle of the curve.
+    centre = np.eye(soc_pct.size)
+    centre[:, soc_pct.size // 2] -= 1.0
+    prior = centre @ (integral @ of_steps @ integral.T) @ centre.T
+    prior += (LEVEL_STD * voltage_v) ** 2 + np.outer(knee, knee) * np.exp(-0.5 * apart**2)
+    prior[np.diag_indices_from(prior)] += (FINE_STD * voltage_v) ** 2
+    mean = voltage_v * (1.0 + SLOPE_MEAN * (soc_pct - soc_pct[soc_pct.size // 2]))
+    return mean, prior
+
+
+def curve_prior_rows(voltage_v: float, variance_v2: float) -> tuple[FloatArray, FloatArray]:
+    """Return the prior of a pseudo-OCV as rows of least squares.
+
+    Parameters
+    ----------
+    voltage_v : float
+        Of the pack [V].
+    variance_v2 : float
+        Variance that makes rows of the fit independent [V²].
+
+    Returns
+    -------
+    weight : array of shape (m, m)
+        Times the curve at `KNOTS_PCT` gives
+    target : array of shape (m,)
+        up to errors of the rows' own variance.
+    """
+    mean, prior = curve_prior(voltage_v)
+    weight = math.sqrt(variance_v2) * np.linalg.inv(np.linalg.cholesky(prior))
+    return weight, weight @ mean
+
+
+def principal_functions(covariance: FloatArray) -> FloatArray:
+    """Return functions F with FᵀF close to a covariance, and equal to it on the diagonal.
+
+    The principal components of the correlation; those left out are made up for by scaling.
+    """
+    std = np.sqrt(np.diag(covariance))
+    value, vector = np.linalg.eigh(covariance / np.outer(std, std))
+    value, vector = np.maximum(value[::-1], 0.0), vector[:, ::-1]
+    explained = np.cumsum(value) / value.sum()
+    number = min(int(np.searchsorted(explained, EXPLAINED)) + 1, FUNCTIONS_AT_MOST)
+    functions = (vector[:, :number] * np.sqrt(value[:number])).T
+    return np.asarray(functions / np.linalg.norm(functions, axis=0) * std)
+
+
+def haar_variances(variance_v2: float, rows: float) -> FloatArray:
+    """Return the variance of the Haar coefficients of an exponentially correlated error.
+
+    Parameters
+    ----------
+    variance_v2 : float
+        Its variance [V²].
+    rows : float
+        Correlation length in rows; 0 is white.
+
+    Returns
+    -------
+    array of shape (SCALES,)
+    """
+    half = 2.0 ** np.arange(SCALES)
+    sums = 4.0 * variance_of_sum(half, rows) - variance_of_sum(2.0 * half, rows)
+    return np.asarray(variance_v2 * sums / (2.0 * half))
+
+
+def variance_of_sum(n: NDArray[np.floating[Any]], rows: float) -> FloatArray:
+    """Return the variance of a sum of n rows of unit variance, correlated over `rows` rows."""
+    kept = math.exp(-1.0 / rows) if rows > 1e-3 else 0.0
+    return n * (1.0 + kept) / (1.0 - kept) - 2.0 * kept * (1.0 - kept**n) / (1.0 - kept) ** 2
+
+
+def _columns(log: LogResidual, mean_c: float, resistance_ohm: Sequence[float]) -> FloatArray:
+    """Return knots of the curve, kt, resistance over temperature, and resistances."""
+    soc = np.clip(log.soc_pct, KNOTS_PCT[0], KNOTS_PCT[-1])
+    at = np.clip(np.searchsorted(KNOTS_PCT, soc, side="right") - 1, 0, KNOTS_PCT.size - 2)
+    part = (soc - KNOTS_PCT[at]) / (KNOTS_PCT[at + 1] - KNOTS_PCT[at])
+    hats = np.zeros((soc.size, KNOTS_PCT.size))
+    row = np.arange(soc.size)
+    hats[row, at], hats[row, at + 1] = 1.0 - part, part
+    warmer_k = log.temperature_c - mean_c
+    drop_v = log.delayed_current_a @ np.array(resistance_ohm)
+    return np.column_stack([hats, warmer_k, warmer_k * drop_v, log.delayed_current_a])
