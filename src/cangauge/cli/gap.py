@@ -25,7 +25,7 @@ from cangauge.cli.options import (
     within,
 )
 from cangauge.cli.output import emit_json, note, print_table, progress_shown
-from cangauge.diagnosis import NONE, UNKNOWN, Diagnosis, diagnose
+from cangauge.diagnosis import ALARM_BELOW, NONE, UNKNOWN, Diagnosis, diagnose
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import difference_from_reference
@@ -69,6 +69,14 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
         Path | None,
         typer.Option(metavar="MODEL", help="Write the model, extended by the cause, to this file."),
     ] = None,
+    alarm: Annotated[
+        float,
+        typer.Option(
+            "--alarm",
+            metavar="P",
+            help="Report a fault where the probability of none is at most this.",
+        ),
+    ] = ALARM_BELOW,
     vehicle: VehicleOption = None,
     dbc: DbcOption = None,
     map_file: MapOption = None,
@@ -81,8 +89,9 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
 ) -> None:
     """Diagnose the gap between a model and logs: size, place, probable cause.
 
-    The verdict is an effect, `none` (no significant gap) or `unknown` (a gap without a likely cause
-    in the library), with its probability; the documentation states how often it is right. Give at
+    The verdict is the most probable of `none`, the effects and `unknown` (a gap without a likely
+    cause in the library); the alarm is the probability of `none` alone, and the 90 % set names the
+    answers to reckon with. The documentation states how often each is right. Give at
     least three references, better more; without any, the error stated in the model file counts as
     normal. A log needs 10 minutes, better an hour, with changing load and SoC. Positive current
     discharges.
@@ -97,6 +106,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     check_outputs([report, extended], [*logs, *given, model])
     model_file = Model.load(model)
     within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
+    within(alarm, 0.0, 1.0, option="--alarm", unit="")
     within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
     if capacity_ah is not None:
         model_file = model_file.model_copy(update={"capacity_ah": capacity_ah})
@@ -120,7 +130,9 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
         if (difference := difference_from_reference(log, model_file.capacity_ah)) is not None:
             note(f"warning: {difference}")
     with progress_shown("cangauge.diagnosis"):
-        found = diagnose(diagnosed, model_file, references, initial_soc_pct=initial_soc)
+        found = diagnose(
+            diagnosed, model_file, references, initial_soc_pct=initial_soc, alarm_below=alarm
+        )
     texts = {}
     if extended is not None:
         texts[extended] = found.extended_model.to_json()
