@@ -32,13 +32,14 @@ from scipy.optimize import minimize
 from cangauge._typing import FloatArray
 from cangauge.diagnosis import classifier
 from cangauge.diagnosis.classifier import (
-    AMBIGUOUS_FROM,
-    GAP_BELOW,
-    NAMED_FROM,
+    Classification,
     Comparison,
     compare_effects,
+    stated_probabilities,
+    with_outside_prior,
 )
 from cangauge.diagnosis.problem import build_problem
+from cangauge.diagnosis.verdict import ALARM_BELOW, credible_set
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.validation.score import LEAST_GAP
@@ -213,51 +214,60 @@ def minimum_of(loss: Callable[[FloatArray], tuple[float, FloatArray]], size: int
 
 
 def print_cross_validation(cases: Sequence[Case]) -> None:
-    """Print the verdicts on packs held out of the fit."""
+    """Print the answers on packs held out of the fit."""
     packs = sorted({case.pack for case in cases})
     folds = np.random.default_rng(1).integers(FOLDS, size=len(packs))
     fold_of = dict(zip(packs, folds.tolist(), strict=True))
-    by_protocol: dict[str, list[tuple[str, ...]]] = {}
-    stated: list[tuple[float, bool]] = []
+    by_protocol: dict[str, list[tuple[str, dict[str, float]]]] = {}
     for fold in range(FOLDS):
         training = [case for case in cases if fold_of[case.pack] != fold]
         effect_weights = fit_effect_weights(training)
         presence_weights = fit_presence_weights(training, effect_weights)
         for case in (case for case in cases if fold_of[case.pack] == fold):
-            names, shares, features = ranked(case, effect_weights)
-            logits = np.array([0.0, *(presence_weights @ features)])
-            none, best, _ = np.exp(logits - logits.max()) / np.exp(logits - logits.max()).sum()
-            verdict = names[0] if best >= NAMED_FROM else "unknown"
-            verdict = verdict if none < GAP_BELOW else "none"
-            pair = names[1] if shares[1] >= AMBIGUOUS_FROM * shares[0] > shares[2] else ""
-            stated.append((best, names[0] == case.truth))
-            by_protocol.setdefault(case.protocol, []).append(
-                (case.truth, verdict, names[0], pair, "confident" if best >= 0.5 else "")
-            )
-    print(
-        f"{'':28s}cases  named  pairs  ranked  unknown  confidently wrong  confident of named"
-        "  false alarms"
-    )
+            stated = answer(case, effect_weights, presence_weights)
+            right = case.truth if case.truth in stated else "unknown"
+            by_protocol.setdefault(case.protocol, []).append((right, stated))
+    print(f"{'':28s}cases  top 1  alarms  false alarms  set holds  set size  p of truth  log score")
     for protocol, rows in sorted(by_protocol.items()):
-        faulty = [row for row in rows if row[0] != "none"]
-        healthy = [row for row in rows if row[0] == "none"]
-        named = [row for row in faulty if row[1] == row[0]]
-        shares_of = [
-            share([row[1] == row[0] for row in faulty]),
-            share([row[1] == row[0] or (row[1] == row[2] and row[3] == row[0]) for row in faulty]),
-            share([row[2] == row[0] for row in faulty]),
-            share([row[1] == "unknown" for row in faulty]),
-            share([bool(row[4]) and row[1] == row[2] != row[0] for row in faulty]),
-            share([bool(row[4]) for row in named]),
-            share([row[1] != "none" for row in healthy]),
-        ]
-        print(f"{protocol:28s}{len(rows):5d}", *(f"{each:>7s}" for each in shares_of))
-    stated.sort()
-    for number, group in enumerate(np.array_split(np.array(stated), 8)):
+        print(f"{protocol:28s}{len(rows):5d}", *(f"{each:>7s}" for each in shares_of(rows)))
+    everything = [row for rows in by_protocol.values() for row in rows]
+    largest = sorted(
+        (max(p.values()), max(p, key=p.__getitem__) == right) for right, p in everything
+    )
+    for number, group in enumerate(np.array_split(np.array(largest), 8)):
         print(
             f"octile {number + 1}: stated {group[:, 0].mean():.2f},"
             f" correct {group[:, 1].mean():.2f}"
         )
+
+
+def answer(
+    case: Case, effect_weights: FloatArray, presence_weights: FloatArray
+) -> dict[str, float]:
+    """Return the probabilities of all answers by some weights."""
+    effects, shares = classifier.rank_effects(case.comparison, effect_weights)
+    features = classifier.presence_features(case.comparison, effects[0], float(shares[0]))
+    logits = np.array([0.0, *(presence_weights @ features)])
+    none, best, _ = np.exp(logits - logits.max()) / np.exp(logits - logits.max()).sum()
+    found = Classification(effects, shares, float(none), float(best))
+    return with_outside_prior(stated_probabilities(found))
+
+
+def shares_of(rows: Sequence[tuple[str, dict[str, float]]]) -> list[str]:
+    """Return the figures of a protocol as texts."""
+    faulty = [row for row in rows if row[0] != "none"]
+    healthy = [row for row in rows if row[0] == "none"]
+    sets = [credible_set(stated) for _, stated in rows]
+    of_truth = np.array([stated[right] for right, stated in rows])
+    return [
+        share([max(stated, key=stated.__getitem__) == right for right, stated in faulty]),
+        share([stated["none"] <= ALARM_BELOW for _, stated in faulty]),
+        share([stated["none"] <= ALARM_BELOW for _, stated in healthy]),
+        share([right in found for (right, _), found in zip(rows, sets, strict=True)]),
+        f"{np.mean([len(found) for found in sets]):.1f}",
+        f"{of_truth.mean():.2f}",
+        f"{np.log(np.maximum(of_truth, 1e-6)).mean():.2f}",
+    ]
 
 
 def share(flags: Sequence[bool]) -> str:

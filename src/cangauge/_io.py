@@ -9,6 +9,7 @@ from __future__ import annotations
 import bz2
 import errno
 import gzip
+import hashlib
 import io
 import os
 import secrets
@@ -617,3 +618,11 @@ def _create_beside(target: Path, *, shown: str | PathLike[str], rights: int = 0o
         )
         raise InputError(problem, source=shown, cure=cure) from error
     return part
+
+
+def file_sha256(path: str | Path) -> str | None:
+    """Return the SHA-256 of a file's bytes in hexadecimal; None if it is not a file."""
+    if not path or not Path(path).is_file():
+        return None
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -73,6 +73,14 @@ def test_text_gives_verdict_candidates_and_caveats(run: Run, made: Path, days: P
     assert {"unknown", "none"} <= table
 
 
+def test_the_alarm_is_a_choice_of_the_user(run: Run, made: Path, days: Path) -> None:
+    given = ("gap", days / "good11.parquet", "-m", made / "model.json", "--json")
+    never, always = (json.loads(run(*given, "--alarm", alarm).out)["cause"] for alarm in ("0", "1"))
+    assert (never["detected"], always["detected"]) == (False, True)
+    assert never["verdict"] == always["verdict"]
+    assert run(*given, "--alarm", "2").code == 2
+
+
 def test_a_log_that_is_its_own_reference_is_refused(run: Run, made: Path, days: Path) -> None:
     ran = run(
         "gap", days / "trip.csv", "-m", made / "model.json", *references(days),

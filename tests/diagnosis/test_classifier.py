@@ -10,7 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge.diagnosis.bayes_factors import Score
-from cangauge.diagnosis.classifier import Comparison, EffectFeatures, classify
+from cangauge.diagnosis.classifier import (
+    TRAINED_OUTSIDE,
+    Comparison,
+    EffectFeatures,
+    classify,
+    stated_probabilities,
+    with_outside_prior,
+)
 
 REFERENCE_V, BASELINE_V, EXCESS, EXPECTED_V = 0.5, 1.5, 1000.0, 0.6
 
@@ -111,3 +118,26 @@ def test_a_gap_too_small_for_volts_is_judged_by_its_excess() -> None:
     assert seen.explained(seen.effects[0]) == pytest.approx((1.5**2 - 0.75**2) / (1.5**2 - 0.5**2))
     unseen = comparison(effect("cause", 50.0, 0.5, 250.0), baseline_v=0.52)
     assert unseen.explained(unseen.effects[0]) == pytest.approx(0.75)
+
+
+@given(comparisons(), st.floats(0.01, 0.99))
+def test_the_prior_of_unknown_causes_moves_no_odds_within(
+    given_: Comparison, outside: float
+) -> None:
+    before = stated_probabilities(classify(given_))
+    after = with_outside_prior(before, outside)
+    assert sum(after.values()) == pytest.approx(1.0)
+    effects = [name for name in before if name not in {"none", "unknown"}]
+    for name in effects:
+        assert after[name] * before[effects[0]] == pytest.approx(
+            before[name] * after[effects[0]], abs=1e-12
+        )
+    same = with_outside_prior(before, TRAINED_OUTSIDE)
+    assert same == pytest.approx(before)
+
+
+def test_a_rarer_unknown_cause_needs_more_evidence() -> None:
+    before = stated_probabilities(classify(comparison(effect("cause", 5.0, 1.3, 800.0))))
+    rare, common = (with_outside_prior(before, outside) for outside in (0.05, 0.6))
+    assert rare["unknown"] < before["unknown"] < common["unknown"]
+    assert rare["cause"] > common["cause"]

@@ -11,10 +11,10 @@ import pytest
 from days import asymmetric, day, late, more_amperes, more_volts, resistance_step
 
 from cangauge.diagnosis import Diagnosis, diagnose
-from cangauge.diagnosis.classifier import decide
 from cangauge.diagnosis.cross_validation import soc_mae_pct
 from cangauge.diagnosis.extended_model import extended_model_file
 from cangauge.diagnosis.problem import build_problem
+from cangauge.diagnosis.verdict import decide
 from cangauge.errors import InputError
 from cangauge.estimation.offline import estimate_log
 from cangauge.estimation.settings import EstimatorSettings
@@ -151,15 +151,25 @@ def test_the_extended_model_runs_in_the_estimator(
 
 def test_json_has_the_keys_of_the_contract(offset: Diagnosis) -> None:
     found = json.loads(json.dumps(offset.to_dict("better.json")))
-    assert found["schema"] == 1
+    assert found["schema"] == 2
     assert {
         "baseline_rmse_v", "extended_rmse_v", "floor_sensor_v", "floor_explainable_v",
         "closed_fraction", "closed_fraction_ci", "baseline_soc_mae_pct", "extended_soc_mae_pct",
     } == set(found["gap"])  # fmt: skip
-    assert {"verdict", "probability", "ambiguous_with", "accepted", "candidates"} <= set(
-        found["cause"]
-    )
     cause = found["cause"]
+    assert {
+        "detected", "verdict", "probability", "probability_none", "probability_unknown", "family",
+        "family_probability", "credible_set", "ambiguous_with", "accepted", "candidates",
+    } <= set(cause)  # fmt: skip
+    assert cause["detected"] is (cause["probability_none"] <= 0.02)
+    assert cause["credible_set"][0] == cause["verdict"]
+    assert cause["family_probability"] >= cause["probability"]
+    assert set(found["ceiling"]) == {"isolable_from", "probability_of_best"}
+    assert set(found["ceiling"]["isolable_from"]) == {
+        item["effect"] for item in cause["candidates"]
+    } - {cause["verdict"]}
+    assert len(found["inputs"]["references"]) == 3
+    assert len(found["inputs"]["model"]["sha256"]) == 64
     probabilities = [item["probability"] for item in cause["candidates"]]
     answers = [*probabilities, cause["probability_unknown"], cause["probability_none"]]
     assert sum(answers) == pytest.approx(1.0)

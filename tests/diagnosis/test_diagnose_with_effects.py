@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from cangauge.diagnosis import diagnose
-from cangauge.diagnosis.classifier import decide
 from cangauge.diagnosis.design_matrix import design_matrix
 from cangauge.diagnosis.problem import build_problem, with_wider_range
+from cangauge.diagnosis.verdict import decide
 from cangauge.identify.fit import fit
 from cangauge.inference.linearized import residual
 from cangauge.inference.rows import FitOptions, sample_log

@@ -10,8 +10,8 @@ import pytest
 from days import late, more_amperes, more_resistance, more_volts, short_day
 
 from cangauge.diagnosis import Verdict, diagnose
-from cangauge.diagnosis.classifier import decide
 from cangauge.diagnosis.problem import DiagnosisProblem, build_problem
+from cangauge.diagnosis.verdict import decide
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from synthetic import synthetic_log

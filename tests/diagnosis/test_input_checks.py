@@ -10,9 +10,9 @@ import pytest
 from days import asymmetric, day, late, more_resistance, resistance_step
 
 from cangauge.diagnosis import Diagnosis, diagnose
-from cangauge.diagnosis.classifier import decide
 from cangauge.diagnosis.input_checks import MAX_OUTLIERS, check_inputs, without_outliers
 from cangauge.diagnosis.problem import build_problem
+from cangauge.diagnosis.verdict import decide
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model

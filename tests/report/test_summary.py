@@ -2,22 +2,36 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from cangauge.report.summary import headline, next_step, parameters_text, rounded
+from cangauge.diagnosis import Ceiling, Verdict
+from cangauge.report.summary import (
+    headline,
+    next_step,
+    open_question,
+    parameters_text,
+    rounded,
+)
 
 
 def diagnosis(
-    cause: str, parameters: dict[str, Any], alike: tuple[str, ...] = ()
+    cause: str,
+    parameters: dict[str, Any],
+    alike: tuple[str, ...] = (),
+    none: float = 0.01,
+    ceiling: Ceiling | None = None,
 ) -> SimpleNamespace:
-    """Return as much of a diagnosis as a headline needs."""
-    chances = {cause: 0.6} | dict.fromkeys(alike, 0.3)
+    """Return as much of a diagnosis as its sentences need."""
+    chances = {cause: 0.6} | dict.fromkeys(alike, 0.3) | {"none": none}
     return SimpleNamespace(
-        verdict=SimpleNamespace(cause=cause, ambiguous_with=alike, probabilities=chances),
+        verdict=Verdict(cause, chances, (), (), 0.9, ceiling=ceiling),
         candidates=[{"effect": cause, "parameters": parameters}],
+        problem=SimpleNamespace(references=()),
+        baseline_rmse_v=2.0,
     )
 
 
@@ -29,14 +43,14 @@ def one(name: str, value: float, ci: tuple[float, float] | None) -> dict[str, An
     ("cause", "parameters", "expected"),
     [
         ("voltage_offset", one("offset_v", 2.71, (2.08, 3.31)),
-         "The voltage reads 2.7 (2.1 … 3.3) V too high: voltage_offset (probability 0.60)."),
+         "The voltage reads 2.7 (2.1 … 3.3) V too high: voltage_offset (60 %)."),
         ("current_gain", one("gain_pct", -3.0, (-4.0, -2.0)),
-         "The current reads 3.0 (2.0 … 4.0) % too low: current_gain (probability 0.60)."),
+         "The current reads 3.0 (2.0 … 4.0) % too low: current_gain (60 %)."),
         # The offset is what to add to the assumed value.
         ("initial_soc", one("offset_pct", -5.0, None),
-         "The assumed initial SoC is 5.0 % too high: initial_soc (probability 0.60)."),
+         "The assumed initial SoC is 5.0 % too high: initial_soc (60 %)."),
         ("hysteresis", one("half_width_v", 2.0, None),
-         "The most likely cause is hysteresis (probability 0.60)."),
+         "The most likely cause is hysteresis (60 %)."),
         ("none", {}, ""),
     ],
 )  # fmt: skip
@@ -48,8 +62,25 @@ def test_headline_begins_with_the_size(
 
 def test_inseparable_causes_share_a_probability() -> None:
     found = diagnosis("voltage_offset", one("offset_v", 2.7, None), ("voltage_gain",))
-    assert "voltage_offset or voltage_gain (probability 0.90 together)" in headline(found)
+    assert "voltage_offset or voltage_gain (together 90 %)." in headline(found)
     assert next_step(found).startswith("To separate these causes: ")
+
+
+def test_a_name_without_an_alarm_says_so() -> None:
+    found = diagnosis("voltage_offset", one("offset_v", 2.7, None), none=0.2)
+    assert "No alarm: the probability that there is no fault is 20 %." in headline(found)
+
+
+def test_the_size_that_would_be_separable_is_given() -> None:
+    """Three nats separate; evidence grows with the square of the size."""
+    unclear = Ceiling({"capacity": math.log(20.0) / 4.0, "hysteresis": 50.0}, 0.7)
+    found = diagnosis("current_offset", one("offset_a", 1.5, None), ceiling=unclear)
+    text = open_question(found)
+    assert "cannot tell current_offset from capacity below 3.0" in text
+    assert "70 % of cases" in text
+    clear = Ceiling({"capacity": 30.0}, 1.0)
+    found = diagnosis("current_offset", one("offset_a", 1.5, None), ceiling=clear)
+    assert not open_question(found)
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from cangauge.cli.options import (
 )
 from cangauge.cli.output import emit_json, note, print_table, progress_shown, save_figures
 from cangauge.cli.simulator import SimulatorOptions, corrected_path, write_corrected
-from cangauge.diagnosis import NONE, UNKNOWN, Diagnosis, diagnose
+from cangauge.diagnosis import ALARM_BELOW, NONE, UNKNOWN, Diagnosis, diagnose
 from cangauge.diagnosis.simulator import SimulatorDiagnosis, diagnose_simulator
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
@@ -102,6 +102,14 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
             " FOLDER/NAME.corrected.csv.",
         ),
     ] = None,
+    alarm: Annotated[
+        float,
+        typer.Option(
+            "--alarm",
+            metavar="P",
+            help="Report a fault where the probability of none is at most this.",
+        ),
+    ] = ALARM_BELOW,
     vehicle: VehicleOption = None,
     dbc: DbcOption = None,
     map_file: MapOption = None,
@@ -115,8 +123,9 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
 ) -> None:
     """Diagnose the gap between a model and logs: size, place, probable cause.
 
-    The verdict is an effect, `none` (no significant gap) or `unknown` (a gap without a likely cause
-    in the library), with its probability; the documentation states how often it is right. Give at
+    The verdict is the most probable of `none`, the effects and `unknown` (a gap without a likely
+    cause in the library); the alarm is the probability of `none` alone, and the 90 % set names the
+    answers to reckon with. The documentation states how often each is right. Give at
     least three references, better more; without any, the error stated in the model file counts as
     normal. A log needs 10 minutes, better an hour, with changing load and SoC. Positive current
     discharges.
@@ -136,6 +145,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     check_outputs([report, extended, *outputs], [*logs, *given, *([model] if model else [])])
     model_file = _model(model, options, corrected)
     within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
+    within(alarm, 0.0, 1.0, option="--alarm", unit="")
     within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
     if capacity_ah is not None and model_file is not None:
         model_file = model_file.model_copy(update={"capacity_ah": capacity_ah})
@@ -160,13 +170,20 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     of_simulator = None
     with progress_shown("cangauge.diagnosis"):
         if model_file is not None and not options.are_given:
-            found = diagnose(diagnosed, model_file, references, initial_soc_pct=initial_soc)
+            found = diagnose(
+                diagnosed,
+                model_file,
+                references,
+                initial_soc_pct=initial_soc,
+                alarm_below=alarm,
+            )
         else:
             of_simulator = diagnose_simulator(
                 [options.run(*each, initial_soc) for each in zip(diagnosed, logs, strict=True)],
                 [options.run(*each, None) for each in zip(references, given, strict=True)],
                 model=model_file,
                 capacity_ah=capacity_ah,
+                alarm_below=alarm,
             )
             found = of_simulator.diagnosis
     _write(found, model, report, extended)

@@ -16,7 +16,8 @@ linear_gaussian     normal equations of logs; posterior of the amplitudes
 error_model         error of healthy logs by time scale, prior scales, overdispersion
 structure           structure that the references need, and the model with it
 bayes_factors       Bayes factor of every effect against no effect
-classifier          effect features → probabilities → verdict
+classifier          effect features → probabilities of `none`, every effect and `unknown`
+verdict             probabilities → verdict, alarm, credible set, family; ceiling
 cross_validation    errors on held-out rows, closed fraction, SoC error
 extended_model      refined amplitudes, change points; the extended model file
 error_breakdown     shares of the error, worst segments, maps
@@ -26,7 +27,7 @@ caveats             limits of what the logs can show
 The method is described in docs/diagnosis.md.
 """
 
-from cangauge.diagnosis.classifier import NONE, UNKNOWN, Verdict
+from cangauge.diagnosis.classifier import NONE, UNKNOWN
 from cangauge.diagnosis.cross_validation import rms
 from cangauge.diagnosis.diagnose import LIKELY, Diagnosis, diagnose
 from cangauge.diagnosis.error_breakdown import (
@@ -41,14 +42,17 @@ from cangauge.diagnosis.error_breakdown import (
     error_map,
     segment_signals,
 )
+from cangauge.diagnosis.verdict import ALARM_BELOW, Ceiling, Verdict
 
 __all__ = [
+    "ALARM_BELOW",
     "LIKELY",
     "MIN_BIN_ROWS",
     "NONE",
     "SEGMENTS",
     "SEGMENT_S",
     "UNKNOWN",
+    "Ceiling",
     "Diagnosis",
     "ErrorMap",
     "ErrorShare",

@@ -99,16 +99,28 @@ def _score(posterior: Posterior, chosen: tuple[int, ...]) -> Score | None:
 def _log_bayes_factor(
     gradient: FloatArray, curvature: FloatArray, prior: FloatArray, bounds: FloatArray
 ) -> float:
-    """Return ln of the Bayes factor of amplitudes with this prior precision against none."""
+    """Return ln of the Bayes factor of amplitudes with this prior precision against none.
+
+    The integral over one amplitude is bounded, as is its prior. Over two it is that of a normal
+    distribution, since mixtures whose mode is out of bounds are left out.
+    """
     total = curvature + prior
     occam = 0.5 * float(np.linalg.slogdet(np.linalg.solve(prior, total))[1])
-    if gradient.size == 1 and np.any(bounds == 0.0):  # one sign only: half-normal prior
-        sign = 1.0 if bounds[0, 0] == 0.0 else -1.0
-        root = float(np.sqrt(total[0, 0]))
-        at = sign * float(gradient[0]) / root
-        return 0.5 * at**2 - occam + float(np.log(2.0) + log_ndtr(at))
-    best = np.clip(np.linalg.solve(total, gradient), bounds[:, 0], bounds[:, 1])
-    return float(gradient @ best - 0.5 * best @ total @ best) - occam
+    mode = np.linalg.solve(total, gradient)
+    unbounded = 0.5 * float(gradient @ mode) - occam
+    if gradient.size > 1:
+        return unbounded
+    within = _log_mass((bounds[0] - mode) * np.sqrt(total[0, 0]))
+    return unbounded + within - _log_mass(bounds[0] * np.sqrt(prior[0, 0]))
+
+
+def _log_mass(limits: FloatArray) -> float:
+    """Return ln of the standard normal probability between two limits, exact in the tails too."""
+    low, high = limits.tolist()
+    if low > 0.0:
+        low, high = -high, -low
+    upper, lower = log_ndtr(high), log_ndtr(low)
+    return float(upper + np.log1p(-np.exp(lower - upper)))
 
 
 def _log_mean(values: Sequence[float]) -> float:

@@ -1,4 +1,4 @@
-"""From Bayes factors to a verdict: an effect, `none` or `unknown`, with probabilities.
+"""From Bayes factors to the probabilities of `none`, of every effect and of `unknown`.
 
 A Bayes factor is exact only if the pack obeys the model and its error is that of the references. On
 real packs an effect may have the most evidence and yet leave most of the gap unexplained. Each
@@ -16,7 +16,7 @@ development cases; none of them is part of a release's check.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,13 +24,12 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.bayes_factors import (
     Score,
-    condition_on,
     excess_chi_square,
     expected_mean_square_v2,
     mean_square_v2,
     scores,
 )
-from cangauge.diagnosis.linear_gaussian import Posterior, marginalize
+from cangauge.diagnosis.linear_gaussian import marginalize
 from cangauge.diagnosis.problem import DiagnosisProblem
 
 NONE, UNKNOWN = "none", "unknown"
@@ -72,30 +71,16 @@ is unknown: with fewer than two references, or beyond their temperatures."""
 MIN_EXPLAINED = 0.4
 """Part of the gap that a named effect must explain there."""
 
-LARGE_GAP = 1.5
-"""RMSE relative to the references' from which there is a gap, explained or not."""
-
 PROBABILITY_CAP = 0.45
 """Largest probability of any effect there: less than an even chance."""
 
-GAP_BELOW, GAP_IN_SEVERAL_BELOW, SEVERAL_LOGS = 0.1, 0.2, 3
-"""There is a gap if P(none) is below the first; below the second for three and more logs that share
-a cause, since healthy logs deviate in different ways: of 107 healthy groups of three or four logs
-two were below it."""
-
-NAMED_FROM = 0.2
-"""Probability from which the best effect is named."""
-
-AMBIGUOUS_FROM = 0.5
-"""Probability, relative to the best, from which another effect is ambiguous with it."""
+OUTSIDE_LIBRARY, TRAINED_OUTSIDE = 0.25, 0.75 / 1.75
+"""Prior probability that a fault is none of the library's: assumed (one in four; a judgement, not
+fitted), and in the fit of the weights, which repeats each case without its cause with the weight
+0.75 (`benchmarks/classifier_weights.py`)."""
 
 LIBRARY_AT_MOST = 0.9
 """Largest part of "another cause" that other effects of the library take."""
-
-SECOND_MIN_LOG_BAYES, SECOND_MIN_PART, MAX_CAUSES = 12.0, 0.05, 2
-"""Log Bayes factor that a further cause needs in addition to those accepted, also relative to the
-first's: the misfit of a large cause's shape resembles a second cause. Chosen on development cases:
-of 14 false second causes nine were below, of five true ones one."""
 
 TEMPERATURE_EFFECTS = ("resistance_temperature",)
 EXPECTED_FACTOR = 1.6
@@ -296,62 +281,44 @@ def presence_features(comparison: Comparison, best: EffectFeatures, share: float
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
-    """Cause of the gap, with probabilities."""
+class Probabilities:
+    """The posterior over all answers, and the evidence behind it."""
 
-    cause: str
-    """Effect, `none` (no significant gap) or `unknown` (a gap without a likely effect)."""
-    probability: float
-    ambiguous_with: tuple[str, ...]
-    """Other effects with a similar probability."""
-    accepted: tuple[Score, ...]
-    """The named cause, and a second one if the logs show it; empty without a named cause."""
-    candidates: tuple[Score, ...]
-    """All effects, best first."""
-    probabilities: dict[str, float]
-    """Of each effect, of `none` and of `unknown`; they sum to 1."""
+    effects: tuple[EffectFeatures, ...]
+    """All effects, most probable first."""
+    of: dict[str, float]
+    """Probability of every effect, of `none` and of `unknown`; they sum to 1."""
     explained: float
     """Part of the gap that the best effect explains (0–1)."""
 
 
-def decide(problem: DiagnosisProblem) -> Verdict:
-    """Return the verdict on the diagnosed logs."""
+def probabilities(problem: DiagnosisProblem) -> Probabilities:
+    """Return the probabilities of `none`, of every effect and of `unknown`."""
     comparison = compare_effects(problem)
     found = classify(comparison)
     if not problem.covered:
         found = _prefer_expected(found, TEMPERATURE_EFFECTS)
-    best = found.effects[0]
-    explained = comparison.explained(best)
-    if problem.error.overdispersion:
-        several = len(problem.diagnosed) >= SEVERAL_LOGS
-        is_gap = found.none < (GAP_IN_SEVERAL_BELOW if several else GAP_BELOW)
-        named = is_gap and found.best >= NAMED_FROM
-    else:
+    explained = comparison.explained(found.effects[0])
+    stated = with_outside_prior(stated_probabilities(found))
+    if not problem.error.overdispersion:
         visible = comparison.max_log_bayes >= MIN_LOG_BAYES
-        explains = visible and explained >= MIN_EXPLAINED
-        # No name where `none` or `unknown` is more likely than all effects together.
-        before = _probabilities(found)
-        in_library = 1.0 - before[UNKNOWN] - before[NONE]
-        named = explains and in_library >= max(before[UNKNOWN], before[NONE])
-        found = _capped(found, named=explains)
-        large = comparison.baseline_rmse_v >= LARGE_GAP * comparison.reference_rmse_v
-        is_gap = named or (visible and large)
-    probabilities = _probabilities(found)
-    candidates = tuple(each.score for each in found.effects)
-    cause = UNKNOWN if is_gap else NONE
-    ambiguous: tuple[str, ...] = ()
-    accepted: tuple[Score, ...] = ()
-    if named:
-        cause = best.score.effect_id
-        ambiguous = tuple(
-            score.effect_id
-            for score, share in zip(candidates[1:], found.shares[1:], strict=True)
-            if share >= AMBIGUOUS_FROM * found.shares[0]
-        )
-        accepted = _causes(problem.posterior, best.score, ambiguous)
-    return Verdict(
-        cause, probabilities[cause], ambiguous, accepted, candidates, probabilities, explained
-    )
+        stated = _capped(stated, visible=visible and explained >= MIN_EXPLAINED)
+    return Probabilities(found.effects, stated, explained)
+
+
+def with_outside_prior(
+    stated: Mapping[str, float], outside: float = OUTSIDE_LIBRARY
+) -> dict[str, float]:
+    """Return the probabilities for another prior of faults outside the library.
+
+    Bayes' rule with changed priors (Saerens, Latinne, Decaestecker, Neural Computation 14 (2002)
+    21); the prior of `none` stays.
+    """
+    of_library = (1.0 - outside) / (1.0 - TRAINED_OUTSIDE)
+    factors = {NONE: 1.0, UNKNOWN: outside / TRAINED_OUTSIDE}
+    weighted = {name: p * factors.get(name, of_library) for name, p in stated.items()}
+    total = sum(weighted.values())
+    return {name: value / total for name, value in weighted.items()}
 
 
 def _prefer_expected(found: Classification, expected: Sequence[str]) -> Classification:
@@ -371,18 +338,27 @@ def _prefer_expected(found: Classification, expected: Sequence[str]) -> Classifi
     return replace(found, effects=tuple(found.effects[k] for k in order), shares=shares)
 
 
-def _capped(found: Classification, *, named: bool) -> Classification:
-    """Cap the probability of the best effect where overdispersion is unknown."""
-    if not named:
-        none = max(found.none, 1.0 - PROBABILITY_CAP)
-        return replace(found, none=none, best=min(found.best, 0.5 * (1.0 - none)))
-    best = min(found.best, PROBABILITY_CAP)
-    # The remainder is assigned to `none`: healthy logs may have the same features.
-    none = found.none + found.best - best
-    return replace(found, best=best, none=min(none, 0.5 * (1.0 - best)))
+def _capped(stated: Mapping[str, float], *, visible: bool) -> dict[str, float]:
+    """Cap the probability of an effect where overdispersion is unknown.
+
+    Healthy logs may have the same features, so the excess goes to `none`, at most to half of what
+    the cap leaves, then to `unknown`. Without a visible effect `none` takes what the cap leaves.
+    """
+    capped = dict(stated)
+    if not visible:
+        none = max(stated[NONE], 1.0 - PROBABILITY_CAP)
+        rest = (1.0 - none) / max(1.0 - stated[NONE], 1e-12)
+        return {name: none if name == NONE else rest * p for name, p in stated.items()}
+    best = max(stated.keys() - {NONE, UNKNOWN}, key=lambda name: stated[name])
+    excess = max(stated[best] - PROBABILITY_CAP, 0.0)
+    to_none = min(excess, max(0.5 * (1.0 - PROBABILITY_CAP) - stated[NONE], 0.0))
+    capped[best] -= excess
+    capped[NONE] += to_none
+    capped[UNKNOWN] += excess - to_none
+    return capped
 
 
-def _probabilities(found: Classification) -> dict[str, float]:
+def stated_probabilities(found: Classification) -> dict[str, float]:
     """Return the probability of every effect, of `none` and of `unknown`.
 
     The probability of another cause is divided among the other effects by their shares; the
@@ -393,25 +369,10 @@ def _probabilities(found: Classification) -> dict[str, float]:
     total = float(others.sum())
     if total > LIBRARY_AT_MOST * another:
         others = others * LIBRARY_AT_MOST * another / total
-    probabilities = {
+    stated = {
         each.score.effect_id: float(probability)
         for each, probability in zip(found.effects, [found.best, *others], strict=True)
     }
-    probabilities[UNKNOWN] = max(another - float(others.sum()), 0.0)
-    probabilities[NONE] = found.none
-    return probabilities
-
-
-def _causes(posterior: Posterior, best: Score, ambiguous: Sequence[str]) -> tuple[Score, ...]:
-    """Return the best effect, and a second cause if the logs show one."""
-    accepted = [best]
-    needed = max(SECOND_MIN_LOG_BAYES, SECOND_MIN_PART * best.log_bayes_factor)
-    while len(accepted) < MAX_CAUSES:
-        rest = scores(
-            condition_on(posterior, [k for score in accepted for k in score.candidates]),
-            leave_out=[*(score.effect_id for score in accepted), *ambiguous],
-        )
-        if not rest or rest[0].log_bayes_factor < needed:
-            break
-        accepted.append(rest[0])
-    return tuple(accepted)
+    stated[UNKNOWN] = max(another - float(others.sum()), 0.0)
+    stated[NONE] = found.none
+    return stated

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from cangauge._display import figure, html
+from cangauge._io import file_sha256
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.caveats import (
     extension_caveat,
@@ -23,8 +25,6 @@ from cangauge.diagnosis.classifier import (
     NONE,
     TEMPERATURE_EFFECTS,
     UNKNOWN,
-    Verdict,
-    decide,
 )
 from cangauge.diagnosis.cross_validation import (
     Fold,
@@ -36,6 +36,7 @@ from cangauge.diagnosis.cross_validation import (
     rms,
     soc_mae_pct,
 )
+from cangauge.diagnosis.design_matrix import DesignMatrix
 from cangauge.diagnosis.error_breakdown import (
     ErrorShare,
     LogErrors,
@@ -50,6 +51,7 @@ from cangauge.diagnosis.extended_model import (
     parameters_of,
 )
 from cangauge.diagnosis.problem import DiagnosisProblem, build_problem
+from cangauge.diagnosis.verdict import ALARM_BELOW, Verdict, decide
 from cangauge.errors import InputError
 from cangauge.inference.linearized import residual
 from cangauge.logs.log import Log
@@ -139,6 +141,8 @@ class Diagnosis:
             if has_references and self.baseline_rmse_v > self.floor_v:
                 sizes += f"; {self.extended_rmse_v:.2f} V with the structure of the references"
             error = "reference error" if has_references else "error stated in the model file"
+            if verdict.detected:
+                return f"A fault is likely, though no single cause is more so than none ({sizes})."
             return (
                 f"No significant gap beyond the {error} ({sizes})."
                 f" P(no fault) = {verdict.probability:.2f}."
@@ -150,7 +154,7 @@ class Diagnosis:
             )
         ambiguous = ""
         if verdict.ambiguous_with:
-            ambiguous = f", not distinguishable from {', '.join(verdict.ambiguous_with)}"
+            ambiguous = f", with {', '.join(verdict.ambiguous_with)} in the 90 % set"
         worse = ", worse than without it" if self.extended_rmse_v > self.baseline_rmse_v else ""
         text = (
             f"{verdict.cause} (probability {verdict.probability:.2f}{ambiguous}): gap of {sizes};"
@@ -208,6 +212,20 @@ class Diagnosis:
             )
         ]
 
+    def _inputs(self) -> dict[str, Any]:
+        """Return what was compared: model, logs and references, with the hashes of their files."""
+
+        def described(matrices: Sequence[DesignMatrix]) -> list[dict[str, Any]]:
+            logs = [matrix.sampled.log for matrix in matrices]
+            return [{"name": log.name, "sha256": file_sha256(log.source)} for log in logs]
+
+        text = self.model.to_json().encode()
+        return {
+            "model": {"name": self.model.name, "sha256": hashlib.sha256(text).hexdigest()},
+            "logs": described(self.problem.diagnosed),
+            "references": described(self.problem.references),
+        }
+
     def to_dict(
         self, extended_model: str | None = None, *, soc_error: bool = True
     ) -> dict[str, Any]:
@@ -222,7 +240,7 @@ class Diagnosis:
         """
         verdict = self.verdict
         return {
-            "schema": 1,
+            "schema": 2,
             "gap": {
                 "baseline_rmse_v": self.baseline_rmse_v,
                 "extended_rmse_v": self.extended_rmse_v,
@@ -236,10 +254,14 @@ class Diagnosis:
             "where": [share.to_dict() for share in self.error_breakdown],
             "worst_moments": [segment.to_dict() for segment in self.worst_segments],
             "cause": {
+                "detected": verdict.detected,
                 "verdict": verdict.cause,
                 "probability": verdict.probability,
-                "probability_unknown": verdict.probabilities[UNKNOWN],
                 "probability_none": verdict.probabilities[NONE],
+                "probability_unknown": verdict.probabilities[UNKNOWN],
+                "family": verdict.family,
+                "family_probability": verdict.family_probability,
+                "credible_set": list(verdict.credible_set),
                 "ambiguous_with": list(verdict.ambiguous_with),
                 "explained_fraction": verdict.explained,
                 "accepted": [
@@ -252,7 +274,9 @@ class Diagnosis:
                 ],
                 "candidates": list(self.candidates),
             },
+            "ceiling": None if verdict.ceiling is None else verdict.ceiling.to_dict(),
             "observability": list(self.observability),
+            "inputs": self._inputs(),
             "limits": self.caveats,
             "extended_model": extended_model,
         }
@@ -265,6 +289,7 @@ def diagnose(
     *,
     leave_out: Sequence[str] = (),
     initial_soc_pct: float | None = None,
+    alarm_below: float = ALARM_BELOW,
 ) -> Diagnosis:
     """Diagnose the gap between a model and logs.
 
@@ -282,6 +307,8 @@ def diagnose(
     initial_soc_pct : float, optional
         SoC at the first row of each diagnosed log, instead of the log's own [%]; where neither is
         known it is found from the voltage.
+    alarm_below : float
+        A fault is reported where `none` is at most this probable (0–1).
 
     Returns
     -------
@@ -325,7 +352,7 @@ def diagnose(
             cure="give a log of at least 10 min, better half an hour with changing load and SoC",
         )
     _LOG.info("classifying the effects")
-    verdict = decide(problem)
+    verdict = decide(problem, alarm_below)
     _LOG.info("cross-validating")
     errors = held_out_errors(problem, held_out, [score.effect_id for score in verdict.accepted])
     _LOG.info("refining the extended model")

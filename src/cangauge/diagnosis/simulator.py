@@ -17,6 +17,7 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.cross_validation import rms
 from cangauge.diagnosis.diagnose import Diagnosis, diagnose
+from cangauge.diagnosis.verdict import ALARM_BELOW
 from cangauge.errors import InputError
 from cangauge.identify.fit import fit
 from cangauge.identify.starts import with_start
@@ -162,6 +163,7 @@ def diagnose_simulator(
     *,
     model: Model | None = None,
     capacity_ah: float | None = None,
+    alarm_below: float = ALARM_BELOW,
 ) -> SimulatorDiagnosis:
     """Diagnose the difference between measured voltages and those of a simulator.
 
@@ -175,6 +177,8 @@ def diagnose_simulator(
         Voltage model of the simulator; by default identified on its output in all runs.
     capacity_ah : float, optional
         The simulator's charge from 100 to 0 % [Ah]; by default from a run from full to empty.
+    alarm_below : float
+        As of `diagnose`.
 
     Returns
     -------
@@ -192,6 +196,9 @@ def diagnose_simulator(
         model = model.model_copy(update={"capacity_ah": capacity_ah})
     errors = [run.simulated.voltage_v - model.predict(run.log).voltage_v for run in runs]
     diagnosis = diagnose(
-        [run.on(model) for run in runs], model, [run.on(model) for run in references]
+        [run.on(model) for run in runs],
+        model,
+        [run.on(model) for run in references],
+        alarm_below=alarm_below,
     )
     return SimulatorDiagnosis(diagnosis, tuple(runs), rms(np.concatenate(errors)))

@@ -23,7 +23,7 @@ from cangauge.report.page import (
 )
 from cangauge.validation.plan import EFFECTS
 from cangauge.validation.score import CRASHED, LEAST_GAP, NONE, UNKNOWN
-from cangauge.validation.tables import entries_of, limits, measured, percent
+from cangauge.validation.tables import entries_of, limits, measured, percent, posterior_entries
 
 _SHADES: Final = ("#ffffff", "#deebf7", "#c6dbef", "#9ecae1", "#6baed6", "#4292c6", "#2171b5")
 _ROW_PX: Final = 22
@@ -95,7 +95,8 @@ def _targets(rows: Sequence[Result]) -> Block:
 
 def _protocol(items: Result) -> list[Block]:
     rows = [[label, percent(item), str(item["of"])] for label, item in entries_of(items)]
-    blocks: list[Block] = [Table(["", "share (95 %)", "cases"], rows)]
+    rows += [[label, text, str(cases)] for label, text, cases in posterior_entries(items)]
+    blocks: list[Block] = [Table(["", "value (95 %)", "cases"], rows)]
     if items.get("below_range"):
         blocks.append(
             Paragraph(

@@ -20,6 +20,7 @@ from bokeh.resources import Resources
 from bokeh.themes import Theme
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from cangauge._io import file_sha256
 from cangauge._version import __version__
 from cangauge.model.model_file import Model
 from cangauge.report.charts import MAX_POINTS
@@ -87,10 +88,7 @@ class InputFile:
     @classmethod
     def of_path(cls, role: str, name: str, path: str | Path) -> InputFile:
         """Hash the file at `path`, if it is one."""
-        if not path or not Path(path).is_file():
-            return cls(role, name)
-        with Path(path).open("rb") as file:
-            return cls(role, name, hashlib.file_digest(file, "sha256").hexdigest())
+        return cls(role, name, file_sha256(path))
 
     @classmethod
     def of_model(cls, model: Model, path: Path | None = None) -> InputFile:

@@ -70,15 +70,21 @@ def search_rows(found: FittedEffects) -> tuple[list[str], Rows]:
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """Return size and cause of the gap in one sentence; "" if no cause is named."""
+    """Return size and cause of the gap, and how sure the alarm is; "" if no cause is named."""
     verdict = diagnosis.verdict
     if verdict.cause in {NONE, UNKNOWN}:
         return ""
     names = [verdict.cause, *verdict.ambiguous_with]
-    together = sum(verdict.probabilities[name] for name in names)
-    causes = f"{' or '.join(names)} (probability {together:.2f}{' together' if names[1:] else ''})"
+    percent = 100.0 * sum(verdict.probabilities[name] for name in names)
+    together = "together " if names[1:] else ""
+    causes = f"{', '.join(names[:-1])} or {names[-1]}" if names[1:] else names[0]
+    causes += f" ({together}{percent:.0f} %)"
     size = _size(diagnosis)
-    return f"{size}: {causes}." if size else f"The most likely cause is {causes}."
+    first = f"{size}: {causes}." if size else f"The most likely cause is {causes}."
+    if verdict.detected:
+        return first
+    none = 100.0 * verdict.probabilities[NONE]
+    return f"{first} No alarm: the probability that there is no fault is {none:.0f} %."
 
 
 def _size(diagnosis: Diagnosis) -> str:
@@ -137,11 +143,43 @@ def open_question(diagnosis: Diagnosis) -> str:
             f"{verdict.cause} is the most likely cause, but its probability is only"
             f" {verdict.probability:.2f}: do not act on it alone."
         )
-    if verdict.ambiguous_with:
-        sentences.append(
-            f"These logs cannot separate {verdict.cause} from {', '.join(verdict.ambiguous_with)}."
-        )
+    sentences += _separability(diagnosis)
     return " ".join(sentences)
+
+
+def _separability(diagnosis: Diagnosis) -> list[str]:
+    """Return from which size on the verdict is separable from its nearest rival, and the ceiling.
+
+    Only where that is more than the size found.
+    """
+    verdict = diagnosis.verdict
+    if verdict.ceiling is None:
+        return []
+    rival, part = next(iter(verdict.ceiling.parts_needed().items()), ("", 0.0))
+    best = 100.0 * verdict.ceiling.probability_of_best
+    if part <= 1.0:
+        return []
+    at = _main_amount(diagnosis)
+    if not math.isfinite(part):
+        limit = "at any size"
+    elif at is None:
+        limit = f"below {part:.1f} times the size found"
+    else:
+        limit = f"below {significant(part * abs(at[0]), 2)} {at[1]}"
+    return [
+        f"These logs cannot tell {verdict.cause} from {rival} {limit}: at the size found the best"
+        f" method would name the right one in {best:.0f} % of cases."
+    ]
+
+
+def _main_amount(diagnosis: Diagnosis) -> tuple[float, str] | None:
+    """Return value and unit of the verdict's main parameter; None if it has no single number."""
+    cause = diagnosis.verdict.cause
+    parameters: dict[str, Any] = next(
+        item["parameters"] for item in diagnosis.candidates if item["effect"] == cause
+    )
+    item = parameters.get(_SIZES[cause][0]) if cause in _SIZES else None
+    return None if item is None else (item["value"], item["unit"].replace("ohm", "Ω"))
 
 
 def _invisible(diagnosis: Diagnosis) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
@@ -26,6 +26,9 @@ LEAST_GAP: Final = 0.45
 _CONFIDENT: Final = 0.5
 _GAP_EDGES: Final = (0.0, 0.5, 1.0, 2.0, 5.5)
 _PROBABILITY_BINS: Final = 10
+_LEAST_PROBABILITY: Final = 1e-3
+"""A smaller probability of the truth counts as this in the log score, as one miss would decide it
+otherwise."""
 _RESAMPLES: Final = 2000
 _ROUNDING: Final = 1e-9
 """Relative rounding between the units of the twin and of the effects library."""
@@ -136,6 +139,13 @@ class Outcome:
         An effect, `none`, `unknown` or `crashed`.
     probability : float
         Stated probability of the verdict; 0 for a crash.
+    detected : bool
+        Whether there was an alarm.
+    probability_of_truth : float
+        Stated probability of the correct answer; 0 for a crash.
+    credible_set : tuple of str
+    ceiling : float, optional
+        Probability that an ideal observer would name the right effect, if the verdict is true.
     ambiguous_with, accepted, ranked : tuple of str
     closed : dict of str to float
         Closed fraction of the squared gap, by the floor it is counted from.
@@ -153,6 +163,10 @@ class Outcome:
     gap_in_floors: float | None
     verdict: str
     probability: float
+    detected: bool = False
+    probability_of_truth: float = 0.0
+    credible_set: tuple[str, ...] = ()
+    ceiling: float | None = None
     ambiguous_with: tuple[str, ...] = ()
     accepted: tuple[str, ...] = ()
     ranked: tuple[str, ...] = ()
@@ -224,6 +238,10 @@ class Outcome:
             "verdict": self.verdict,
             "right": self.strict,
             "probability": self.probability,
+            "detected": self.detected,
+            "probability_of_truth": self.probability_of_truth,
+            "credible_set": list(self.credible_set),
+            "ceiling": self.ceiling,
             "ambiguous_with": list(self.ambiguous_with),
             "accepted": list(self.accepted),
             "ranked": list(self.ranked[:5]),
@@ -254,16 +272,23 @@ def outcome_of(task: Task, label: Mapping[str, Any], answer: Mapping[str, Any]) 
     ranked = [item["effect"] for item in cause["candidates"]]
     if verdict in ranked:
         ranked = [verdict, *(effect for effect in ranked if effect != verdict)]
-    return Outcome(
+    ceiling = answer["result"]["ceiling"]
+    stated = {item["effect"]: float(item["probability"]) for item in cause["candidates"]}
+    stated |= {name: float(cause[f"probability_{name}"]) for name in (NONE, UNKNOWN)}
+    outcome = Outcome(
         **about,
         verdict=verdict,
         probability=float(cause["probability"]),
+        detected=bool(cause["detected"]),
+        credible_set=tuple(cause["credible_set"]),
+        ceiling=None if ceiling is None else float(ceiling["probability_of_best"]),
         ambiguous_with=tuple(cause["ambiguous_with"]),
         accepted=tuple(item["effect"] for item in cause["accepted"]),
         ranked=tuple(ranked),
         closed=_closed(gap, label, verdict),
         intervals=_intervals(cause, label),
     )
+    return replace(outcome, probability_of_truth=stated.get(outcome.right, 0.0))
 
 
 def _gap_in_floors(label: Mapping[str, Any]) -> float | None:
@@ -347,7 +372,7 @@ def _protocol(everything: Sequence[Outcome]) -> Figures:
         result["coverage"] = _coverage(closed_set)
     if healthy:
         result["healthy"] = {
-            "false_alarms": share([i.verdict != NONE for i in healthy]),
+            "false_alarms": share([i.detected or i.verdict == CRASHED for i in healthy]),
             "named_an_effect": share([i.names_effect for i in healthy]),
         }
     if unnamed:
@@ -363,6 +388,7 @@ def _protocol(everything: Sequence[Outcome]) -> Figures:
     if controls:
         # The cause is still in the library: does removing another effect change the verdict?
         result["decoys"] = share([i.strict for i in controls])
+    result["posterior"] = _posterior([i for i in items if len(i.truth) < 2 and i.in_range])
     result["confusion"] = confusion(items)
     result["cost"] = _cost(items)
     return result
@@ -375,7 +401,7 @@ def _accuracy(items: Sequence[Outcome]) -> Figures:
     correct = [item for item in items if item.strict]
     return {
         "cases": len(items),
-        "detected": rate(lambda i: i.verdict not in {NONE, CRASHED}),
+        "detected": rate(lambda i: i.detected),
         "top1": rate(lambda i: i.strict),
         "top1_pair": rate(lambda i: i.within_pair),
         "top2": rate(lambda i: i.within_two),
@@ -396,6 +422,21 @@ def _accuracy(items: Sequence[Outcome]) -> Figures:
     }
 
 
+def _posterior(items: Sequence[Outcome]) -> Figures:
+    """Return how good the stated probabilities are: proper scores, and the credible set.
+
+    The log score is ln of the probability of the correct answer, at least `_LEAST_PROBABILITY`.
+    """
+    of_truth = np.maximum([i.probability_of_truth for i in items], _LEAST_PROBABILITY)
+    return {
+        "probability_of_truth": bootstrapped([i.probability_of_truth for i in items], np.mean),
+        "log_score": bootstrapped(np.log(of_truth).tolist(), np.mean),
+        "set_covers": share([i.right in i.credible_set for i in items]),
+        "set_size": bootstrapped([float(len(i.credible_set)) for i in items], np.mean),
+        "ceiling": bootstrapped([i.ceiling for i in items if i.ceiling is not None], np.mean),
+    }
+
+
 def _closed_share(items: Iterable[Outcome], floor: str) -> list[float]:
     return [i.closed[floor] for i in items if i.closed is not None and floor in i.closed]
 
@@ -407,7 +448,7 @@ def _by_gap(items: Sequence[Outcome]) -> list[Figures]:
         result.append(
             {
                 "gap_in_floors": [low, high],
-                "detected": share([i.verdict not in {NONE, CRASHED} for i in there]),
+                "detected": share([i.detected for i in there]),
                 "top1": share([i.strict for i in there]),
                 "top1_pair": share([i.within_pair for i in there]),
             }

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from cangauge._formatting import NONE_KNOWN, number
+from cangauge._formatting import NONE_KNOWN, number, span
 from cangauge.validation.score import LEAST_GAP
 
 
@@ -147,7 +147,7 @@ def judge_targets(result: Mapping[str, Any]) -> list[dict[str, Any]]:
 Entry = tuple[str, Mapping[str, Any]]
 
 ACCURACY: Final = (
-    ("detected", "gap detected"),
+    ("detected", "alarm"),
     ("top1", "top 1"),
     ("top1_pair", "top 1, ambiguous pairs counted"),
     ("top2", "top 2"),
@@ -172,6 +172,25 @@ def percent(item: Mapping[str, Any] | None) -> str:
     return f"{100.0 * item['value']:.0f} % ({100.0 * low:.0f}–{100.0 * high:.0f})"
 
 
+POSTERIOR: Final = (
+    ("probability_of_truth", "mean probability of the truth", 2),
+    ("log_score", "log score [nats]", 2),
+    ("set_size", "answers in the 90 % set", 1),
+    ("ceiling", "ceiling of named effects: ideal observer right", 2),
+)
+
+
+def posterior_entries(items: Mapping[str, Any]) -> Iterator[tuple[str, str, int]]:
+    """Yield label, value with its 95 % interval, and cases of each figure of the posterior."""
+    found = items["posterior"]
+    yield "truth in the 90 % set", percent(found["set_covers"]), found["set_covers"]["of"]
+    for key, label, decimals in POSTERIOR:
+        if found[key]["of"]:
+            low, high = found[key]["ci"]
+            text = f"{number(found[key]['value'], decimals)} ({span(low, high, decimals)})"
+            yield label, text, found[key]["of"]
+
+
 def entries_of(items: Mapping[str, Any]) -> Iterator[Entry]:
     """Yield label and figure of each line of a protocol's table."""
     if "effects" in items:
@@ -187,7 +206,7 @@ def entries_of(items: Mapping[str, Any]) -> Iterator[Entry]:
         if items["coverage"]["all"]["of"]:
             yield "coverage of the parameter intervals", items["coverage"]["all"]
     if "healthy" in items:
-        yield "healthy: false alarms", items["healthy"]["false_alarms"]
+        yield "healthy: alarms", items["healthy"]["false_alarms"]
         yield "healthy: effect named", items["healthy"]["named_an_effect"]
     if "open_set" in items:
         yield "cause not in the library: unknown", items["open_set"]["unknown"]
@@ -257,6 +276,8 @@ def _print_protocol(name: str, items: Mapping[str, Any], console: Console) -> No
     table = _table(f"{name}: {items['cases']} diagnoses", "", "share (95 %)", "cases")
     for label, item in entries_of(items):
         table.add_row(label, percent(item), str(item["of"]))
+    for label, text, cases in posterior_entries(items):
+        table.add_row(label, text, str(cases))
     console.print(table)
     if items.get("below_range"):
         console.print(

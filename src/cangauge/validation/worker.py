@@ -6,7 +6,8 @@ answer a line to stdout:
     {"model": PATH, "logs": [PATH…], "references": [PATH…], "leave_out": [EFFECT…],
      "extended": PATH or null}
 
-    {"seconds": s, "peak_mib": MiB or null, "result": {"gap": …, "cause": …}}  or  {"error": text}
+    {"seconds": s, "peak_mib": MiB or null, "result": {"gap": …, "cause": …, "ceiling": …}}
+    or  {"error": text}
 
 It diagnoses as `cangauge gap` does and returns the part of its JSON that is scored.
 """
@@ -26,7 +27,7 @@ from cangauge.diagnosis import diagnose
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 
-_SCORED = ("gap", "cause")
+_SCORED = ("gap", "cause", "ceiling")
 
 
 def answer(request: dict[str, Any]) -> dict[str, Any]:
