@@ -354,14 +354,15 @@ def describe_error(
     residual_v = np.concatenate([log.residual_v for log in logs])
     usual_v = max(float(np.sqrt(np.mean(residual_v**2))), 1e-6 * voltage_v)
     error = fit_time_error(likelihood.log_likelihood, usual_v, voltage_v)
-    # The fit holds the same priors: its curve is about the mean, which is not counted again.
-    covariance = likelihood.posterior(error)[1]
+    mean, covariance = likelihood.posterior(error)
+    # A mean that the model does not contain is an error, too.
+    second = covariance + np.outer(mean, mean)
     return error, CurveError(
         KNOTS_PCT,
-        principal_functions(covariance[:m, :m]),
+        principal_functions(second[:m, :m]),
         mean_c,
-        math.sqrt(covariance[m, m]),
-        math.sqrt(covariance[m + 1, m + 1]),
+        math.sqrt(second[m, m]),
+        math.sqrt(second[m + 1, m + 1]),
     )
 
 
