@@ -1,4 +1,4 @@
-"""Eight kinds of files, each from file to SoC plot in at most three commands.
+"""Eleven kinds of files, each from file to SoC plot in at most three commands.
 
     pip install 'cangauge[mf4,mcap]' scapy batterydf
     python examples/own_data.py FOLDER
@@ -191,6 +191,41 @@ def write_bdf(log: cangauge.Log, path: Path) -> None:
     )
 
 
+def write_table(
+    log: cangauge.Log, path: Path, headings: Sequence[str], scale: Sequence[float], **style: Any
+) -> None:
+    """Write time, current, voltage, temperature and SoC by pandas, under a logger's headings."""
+    import pandas as pd
+
+    assert log.soc_pct is not None
+    columns = (log.time_s, -log.current_a, log.voltage_v, log.temperature_c, log.soc_pct)
+    table = {
+        name: factor * values for name, factor, values in zip(headings, scale, columns, strict=True)
+    }
+    pd.DataFrame(table).to_csv(path, index=False, **style)
+
+
+def write_german(log: cangauge.Log, path: Path) -> None:
+    """Write a German export: semicolons, decimal commas, Windows-1252."""
+    names = ["Messzeit [min]", "Batteriestrom [A]", "Batteriespannung [V]",
+             "Zelltemperatur [°C]", "Ladezustand [%]"]  # fmt: skip
+    style = {"sep": ";", "decimal": ",", "encoding": "cp1252"}
+    write_table(log, path, names, [1 / 60, 1.0, 1.0, 1.0, 1.0], **style)
+
+
+def write_utf16(log: cangauge.Log, path: Path) -> None:
+    """Write tab-separated UTF-16 without a BOM."""
+    names = ["Time (s)", "Current (A)", "Voltage (V)", "Temperature (°C)", "SOC (0-1)"]
+    style = {"sep": "\t", "encoding": "utf-16-le"}
+    write_table(log, path, names, [1.0, 1.0, 1.0, 1.0, 0.01], **style)
+
+
+def write_bzip2(log: cangauge.Log, path: Path) -> None:
+    """Write Neware's headings, packed by bzip2."""
+    names = ["Test_Time(s)", "Cur(mA)", "Vol(mV)", "T_batt", "SOC"]
+    write_table(log, path, names, [1.0, 1e3, 1e3, 1.0, 1.0], compression="bz2")
+
+
 KINDS = {
     "MF4 signals": Kind(write_mf4, ".mf4", []),
     "PCAP": Kind(write_pcap, ".pcap", ["--vehicle", "generic"]),
@@ -198,6 +233,9 @@ KINDS = {
     "SavvyCAN GVRET": Kind(write_gvret, ".csv", ["--vehicle", "leaf_aze0"]),
     "CARBUS trace": Kind(write_carbus, ".trc", ["--map", "mycar.toml"]),
     "MCAP": Kind(write_mcap, ".mcap", ["--columns", "soc=/battery percentage"]),
+    "German CSV": Kind(write_german, ".csv", []),
+    "UTF-16 text": Kind(write_utf16, ".txt", []),
+    "CSV in bzip2": Kind(write_bzip2, ".csv.bz2", []),
     "Battery Data Format": Kind(write_bdf, ".bdf.csv", [], ["--initial-soc", "100"]),
 }
 ARBIN = "Arbin export"
