@@ -38,7 +38,6 @@ def answer(
         "seconds": 2.0,
         "peak_mib": 200.0,
         "result": {
-            "ceiling": None,
             "gap": {
                 "baseline_rmse_v": rmse[0],
                 "extended_rmse_v": rmse[1],
@@ -47,21 +46,22 @@ def answer(
             "cause": {
                 "verdict": verdict,
                 "probability": probability,
-                "probability_none": probability if verdict == "none" else 0.01,
-                "probability_unknown": probability if verdict == "unknown" else 0.05,
                 "detected": verdict != "none",
+                "probability_none": probability if verdict == "none" else 0.0,
+                "probability_unknown": probability if verdict == "unknown" else 0.0,
                 "credible_set": [verdict, *ambiguous],
                 "ambiguous_with": list(ambiguous),
                 "accepted": [{"effect": verdict}],
                 "candidates": [
                     {
                         "effect": effect,
-                        "probability": probability if effect == verdict else 0.02,
+                        "probability": probability if effect == verdict else 0.0,
                         "parameters": parameters or {},
                     }
                     for effect in order
                 ],
             },
+            "ceiling": None,
         },
     }
 
@@ -109,11 +109,10 @@ def test_crash_is_wrong_and_listed() -> None:
     assert [item["error"] for item in result["crashed"]] == ["boom", "b"]
 
 
-def test_alarms_on_healthy_logs_are_false() -> None:
+def test_any_verdict_but_none_is_a_false_alarm() -> None:
     answers = [answer("none"), answer("none"), answer("unknown"), answer("capacity")]
-    answers[-1]["result"]["cause"]["detected"] = False
     healthy = figures(*(outcome(label(), item) for item in answers))["healthy"]
-    assert healthy["false_alarms"]["hits"] == 1
+    assert healthy["false_alarms"]["hits"] == 2
     assert healthy["named_an_effect"]["hits"] == 1
 
 
