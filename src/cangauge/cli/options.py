@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sized
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -101,8 +102,12 @@ def _drawable(folder: Path | None) -> Path | None:
             value=str(folder),
             cure="pip install 'cangauge[figures]'",
         )
-    if folder.exists() and not folder.is_dir():
-        raise InputError("is a file", field="--figures", value=str(folder), cure="name a folder")
+    if not os.path.isdir(folder):  # noqa: PTH112 - False, not an error, for a name too long
+        if os.path.exists(folder):  # noqa: PTH110 - likewise
+            raise InputError(
+                "is a file", field="--figures", value=str(folder), cure="name a folder"
+            )
+        check_writable(folder)
     return folder
 
 
