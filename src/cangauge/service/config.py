@@ -446,6 +446,13 @@ class RunConfig(_Strict):
         needs_restart=True,
         is_path=True,
     )
+    dashboard: str | None = _key(
+        None,
+        "Serve the live page there, e.g. 127.0.0.1:8642. An address beyond loopback needs a token,"
+        " as with --http.",
+        "HOST:PORT",
+        needs_restart=True,
+    )
     status_socket: str = _key(
         "auto",
         "Unix socket for `cangauge status`; auto: in the user's runtime folder.",
@@ -512,6 +519,12 @@ class RunConfig(_Strict):
     def http_address(self) -> HttpAddress | None:
         """Return the address of HTTP, None without; may raise InputError."""
         return None if self.http is None else http_address(self.http, self.http_token_file)
+
+    def dashboard_address(self) -> HttpAddress | None:
+        """Return the address of the live page, None without; may raise InputError."""
+        if self.dashboard is None:
+            return None
+        return http_address(self.dashboard, self.http_token_file, field="dashboard")
 
     def unix_path(self) -> Path | None:
         """Return the path of the unix socket, if one is given."""
