@@ -50,8 +50,8 @@ CHARTS: Final = {
         "State of charge [%] with its band of ±2σ",
         (
             Line("soc_newton_pct", "by voltage (Newton)", ORANGE),
-            Line("soc_coulomb_pct", "by counting", GREEN, "dashed"),
             Line("soc_pct", "estimate"),
+            Line("soc_coulomb_pct", "by counting", GREEN, "dashed"),
         ),
         "@soc_pct{0.00} % (@soc_low_pct{0.0} to @soc_high_pct{0.0} %),"
         " voltage @soc_newton_pct{0.0} %, counting @soc_coulomb_pct{0.0} %",
@@ -82,6 +82,10 @@ CHARTS: Final = {
 }  # fmt: skip
 
 
+WIDE: Final = frozenset({"soc", "status"})
+"""Figures over the whole width, one below the other."""
+
+
 def chart_parts() -> tuple[str, dict[str, str]]:
     """Return the script that draws the figures, and an HTML element for each by its name."""
     rows = ColumnDataSource({name: [] for name in COLUMNS}, name="rows")
@@ -103,7 +107,8 @@ def _plot(name: str, height: int, shared: Range1d, **options: Any) -> Any:
     plot = figure(
         name=name, height=height, sizing_mode="stretch_width", x_axis_type="datetime",
         x_range=shared, tools="", toolbar_location=None, background_fill_color=None,
-        border_fill_color=None, min_border_left=64, min_border_right=12, **options,
+        border_fill_color=None, min_border_left=88 if name in WIDE else 60, min_border_right=12,
+        **options,
     )  # fmt: skip
     plot.xaxis.formatter = DatetimeTickFormatter(
         seconds=_CLOCK, minsec=_CLOCK, minutes="%H:%M", hourmin="%H:%M", hours="%H:%M"

@@ -22,6 +22,8 @@ SIGNIFICANT: Final = 3.0
 LEAST_ROWS: Final = 600
 """Rows below which no comparison is shown: 10 min at one a second, as for `cangauge gap`."""
 LOG_NAME: Final = "cangauge-last-hour.csv"
+REFERENCE: Final = "GOOD.csv"
+"""Stands for a log without a fault, which the reader puts in its place."""
 LOG_COLUMNS: Final = ("time_s", "current_a", "voltage_v", "temperature_c")
 
 
@@ -37,6 +39,12 @@ def comparison(history: History) -> dict[str, Any]:
     """
     model = "" if history.status is None else str(history.status["model"])
     command = f"cangauge gap {LOG_NAME} -m {shlex.quote(str(Path(model).absolute()))}"
+    try:
+        file = _model(model, Path(model).stat().st_mtime_ns)
+    except (CangaugeError, OSError) as error:
+        file, problem = None, str(error)
+    if file is not None and file.information is None:
+        command += f" --reference {REFERENCE}"  # else an error of the model is no sign of a cause
     result: dict[str, Any] = {"command": command, "log": LOG_NAME, "scales": []}
     rows = history.spans["1h"].rows()
     status = column(rows, "status")
@@ -46,11 +54,9 @@ def comparison(history: History) -> dict[str, Any]:
     if residual_mv.size < LEAST_ROWS:
         minutes = math.ceil((LEAST_ROWS - residual_mv.size) / 60.0)
         return result | {"verdict": f"Too few samples yet: wait {minutes} min more."}
-    try:
-        noise = _noise(model, Path(model).stat().st_mtime_ns)
-    except (CangaugeError, OSError) as error:
-        return result | {"verdict": f"The model cannot be read: {error}"}
-    scales = _scales(residual_mv, noise)
+    if file is None:
+        return result | {"verdict": f"The model cannot be read: {problem}"}
+    scales = _scales(residual_mv, file.noise)
     return result | {"scales": scales, "verdict": _verdict(scales)}
 
 
@@ -72,8 +78,8 @@ def last_hour(history: History) -> str:
 
 
 @lru_cache(maxsize=1)
-def _noise(model: str, changed_ns: int) -> ModelNoise:  # noqa: ARG001 - read again once changed
-    return Model.load(model).noise
+def _model(path: str, changed_ns: int) -> Model:  # noqa: ARG001 - read again once changed
+    return Model.load(path)
 
 
 def _scales(residual_mv: FloatArray, noise: ModelNoise) -> list[dict[str, Any]]:

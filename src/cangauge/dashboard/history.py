@@ -135,6 +135,9 @@ class History:
         """Add a status: the object of `/status`."""
         now_s = self._clock()
         self.status, self._received_s = status, now_s
+        rate = _number(status["samples_per_s"])
+        if _age_s(status) <= SILENT_AFTER_S and rate > 0.0:
+            self._interval_s = 1.0 / rate
         row = self._row(status, now_s)
         self.hour.add(row)
         for span in self.spans.values():
@@ -157,10 +160,7 @@ class History:
             found.append("The service hangs: restart it.")
         if not status["bus_up"]:
             found.append(f"The bus is lost: {status['bus_trouble'] or 'no reason known'}.")
-        age_s = _number((status["sample"] or {}).get("age_s"))
-        rate = _number(status["samples_per_s"])
-        if age_s <= SILENT_AFTER_S and rate > 0.0:
-            self._interval_s = 1.0 / rate
+        age_s = _age_s(status)
         if age_s > max(SILENT_AFTER_S, SILENT_INTERVALS * self._interval_s):
             found.append(f"The bus is silent: no sample for {age_s:.1f} s.")
         elif status["sample"] is None:
@@ -194,7 +194,7 @@ class History:
             counts.popleft()
         first_s, first_frames, first_rejects = counts[0]
         seconds = now_s - first_s
-        if seconds <= 0.0:
+        if seconds < 0.5 * RATE_OVER_S:
             return math.nan, math.nan
         return (frames - first_frames) / seconds, (rejects - first_rejects) / seconds
 
@@ -213,6 +213,10 @@ def shown_columns(rows: FloatArray) -> dict[str, list[float | None]]:
             strict=True,
         )
     }  # fmt: skip
+
+
+def _age_s(status: Mapping[str, Any]) -> float:
+    return _number((status["sample"] or {}).get("age_s"))
 
 
 def _number(value: object) -> float:

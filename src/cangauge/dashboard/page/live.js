@@ -1,6 +1,7 @@
 "use strict";
 // Ask ten times a second for what is new, and show it. `FACTS` and the figures come from charts.js.
 (() => {
+  Bokeh.set_log_level("error");  // it warns of each figure without data
   const EVERY_MS = 100, GIVE_UP_MS = 700, CHANGES = 12;
   const at = id => document.getElementById(id);
   const dark = matchMedia("(prefers-color-scheme: dark)");
@@ -27,11 +28,11 @@
       "SoC by counting": num(estimate.soc_coulomb_pct, 2, "%"),
       "Current": num(sample.current_a, 2, "A"),
       "Voltage": num(sample.voltage_v, 2, "V"),
-      "Voltage by the model": num(estimate.voltage_model_v, 2, "V"),
+      "Model voltage": num(estimate.voltage_model_v, 2, "V"),
       "Residual": num(scaled(estimate.residual_v, 1e3), 0, "mV"),
       "Temperature": num(sample.temperature_c, 1, "°C"),
       "Capacity": pm(health?.capacity_ah, health?.capacity_std_ah, 1, "Ah"),
-      "Resistance": pm(health?.resistance_ratio, health?.resistance_std, 2, "× model"),
+      "Resistance, to model": pm(health?.resistance_ratio, health?.resistance_std, 2, "×"),
       "Current offset": pm(health?.offset_a, health?.offset_std_a, 2, "A"),
       "Discharge for 10 s": pm(power?.discharge_a, power?.discharge_std_a, 0, "A"),
       "Charge for 10 s": pm(power?.charge_a, power?.charge_std_a, 0, "A"),
@@ -42,7 +43,7 @@
       } : {}),
       "Frames": num(latest.frames_per_s, 0, "/s"),
       "Rejects": `${counts} (${num(latest.rejects_per_s, 1, "/s")})`,
-      "Latency, 99 % at most": num(latest.latency_ms, 1, "ms"),
+      "Latency (99 % below)": num(latest.latency_ms, 1, "ms"),
       ...(record ? { "Recording": record.problem ?? `${num(record.written_bytes / 1e6, 1)} MB, ${record.lost_frames} lost` } : {}),
     };
   }
@@ -126,7 +127,7 @@
   // After a restart of the service its rows go on from those already shown.
   function isContinued(answer) {
     const times = rows.data.time_ms;
-    return key !== "" && key.split("-")[0] !== answer.key.split("-")[0] && times.length > 0 && times.at(-1) < answer.columns.time_ms[0];
+    return key !== "" && key.split("-")[0] !== answer.key.split("-")[0] && times.length > 0 && !(answer.columns.time_ms[0] <= times.at(-1));
   }
 
   async function ask() {
@@ -246,7 +247,11 @@
     if (!drawn || !drawn.is_idle) { setTimeout(begin, 30); return; }
     figures = drawn.roots();
     [rows, runs, time] = ["rows", "runs", "time"].map(name => drawn.get_model_by_name(name));
-    if (matchMedia("(pointer: coarse)").matches) for (const figure of figures) figure.toolbar.active_drag = null;
+    for (const figure of figures) {
+      // A finger scrolls the page; the buttons zoom.
+      if (matchMedia("(pointer: coarse)").matches) figure.toolbar.active_drag = null;
+      if (matchMedia("(max-width: 600px)").matches) figure.below[0].ticker.desired_num_ticks = 3;
+    }
     paint();
     controls();
     poll();
