@@ -2,12 +2,12 @@
 // Ask ten times a second for what is new, and show it. `FACTS` and the figures come from charts.js.
 (() => {
   Bokeh.set_log_level("error");  // it warns of each figure without data
-  const EVERY_MS = 100, GIVE_UP_MS = 700, CHANGES = 12;
+  const EVERY_MS = 100, GIVE_UP_MS = 700, CHANGES = 12, PIXELS = 1000;
   const at = id => document.getElementById(id);
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const SPANS_MS = { "10min": 6e5, "1h": 3.6e6, all: Infinity };
   let span = "10min", key = "", added = 0, width_ms = SPANS_MS[span], paused = false, moving = false;
-  let figures, rows, runs, time, answered_ms = performance.now();
+  let figures, rows, runs, time, answered_ms = performance.now(), drawn_ms = 0;
 
   const num = (value, digits, unit = "") =>
     typeof value === "number" ? `${value.toFixed(digits)}${unit && " " + unit}` : "–";
@@ -131,14 +131,16 @@
   }
 
   async function ask() {
-    const query = paused ? "" : `?span=${span}&key=${key}&after=${added}`, asked = span;
+    // The figures are drawn again once the picture has moved by about a pixel; the tiles each time.
+    const isDue = performance.now() - drawn_ms >= (time.end - time.start) / PIXELS;
+    const query = paused || (!isDue && key) ? "" : `?span=${span}&key=${key}&after=${added}`, asked = span;
     try {
       const answer = await fetch(`/rows${query}`, { signal: AbortSignal.timeout(GIVE_UP_MS) });
       if (answer.status === 401) { location.assign("/enter"); return; }
       if (!answer.ok) throw new Error(String(answer.status));
       const content = await answer.json();
       answered_ms = performance.now();
-      if (content.columns && asked === span && !paused) take(content);
+      if (content.columns && asked === span && !paused) { take(content); drawn_ms = answered_ms; }
       if (content.status) {
         show(content.status, content.latest);
       }
