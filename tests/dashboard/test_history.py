@@ -53,6 +53,7 @@ def test_a_clock_set_back_does_not_stop_the_rows() -> None:
 def test_rates_are_those_of_the_last_second() -> None:
     history = driven(5.0, Clock())
     assert history.latest()["frames_per_s"] == pytest.approx(20.0, rel=0.1)
+    assert history.latest()["latency_ms"] == pytest.approx(2.0)
     assert history.latest()["residual_mv"] == pytest.approx(100.0)
     assert history.latest()["soc_newton_pct"] is None
 

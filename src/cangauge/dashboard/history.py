@@ -22,7 +22,7 @@ SILENT_AFTER_S: Final = 0.7
 SILENT_INTERVALS: Final = 3.0
 """The same on a bus whose samples come seldom, in intervals of the samples."""
 RATE_OVER_S: Final = 1.0
-"""Averaging time of frames and rejects per second [s]."""
+"""Averaging time of rates and latency [s]."""
 
 COLUMNS: Final = {
     "time_ms": 0,
@@ -122,7 +122,7 @@ class History:
         self._clock = clock
         self._received_s = -math.inf
         self._interval_s = ROW_EVERY_S
-        self._counts: deque[tuple[float, int, int]] = deque(maxlen=64)
+        self._counts: deque[tuple[float, ...]] = deque(maxlen=64)
         self.status: dict[str, Any] | None = None
         self.hour = Span(ROW_EVERY_S, 36_000)
         self.spans = {
@@ -180,23 +180,34 @@ class History:
         values["soc_low_pct"] = values["soc_pct"] - two_sigma
         values["soc_high_pct"] = values["soc_pct"] + two_sigma
         values["residual_mv"] = 1e3 * _number(estimate["residual_v"])
-        values["frames_per_s"], values["rejects_per_s"] = self._rates(status, now_s)
-        values["latency_ms"] = 1e3 * _number(status["latency"]["p99_at_most_s"])
+        values |= self._rates(status)
         values["status"] = _STATUS[status["status"]]
         values["reasons"] = float(sum(_REASON[each] for each in status["reasons"]))
         return np.array(list(values.values()))
 
-    def _rates(self, status: Mapping[str, Any], now_s: float) -> tuple[float, float]:
-        frames, rejects = int(status["frames"]["received"]), sum(status["rejects"].values())
+    def _rates(self, status: Mapping[str, Any]) -> dict[str, float]:
+        """Return frames and rejects per second and the mean latency, of the last second."""
+        latency = status["latency"]
         counts = self._counts
-        counts.append((now_s, frames, rejects))
-        while len(counts) > 2 and now_s - counts[1][0] >= RATE_OVER_S:
+        counts.append(
+            (
+                float(status["uptime_s"]),
+                float(status["frames"]["received"]),
+                float(sum(status["rejects"].values())),
+                float(latency["count"]),
+                float(latency["count"] * (latency["mean_s"] or 0.0)),
+            )
+        )
+        while len(counts) > 2 and counts[-1][0] - counts[1][0] >= RATE_OVER_S:
             counts.popleft()
-        first_s, first_frames, first_rejects = counts[0]
-        seconds = now_s - first_s
+        seconds, frames, rejects, published, latency_s = np.subtract(counts[-1], counts[0]).tolist()
         if seconds < 0.5 * RATE_OVER_S:
-            return math.nan, math.nan
-        return (frames - first_frames) / seconds, (rejects - first_rejects) / seconds
+            return {}
+        return {
+            "frames_per_s": frames / seconds,
+            "rejects_per_s": rejects / seconds,
+            "latency_ms": 1e3 * latency_s / published if published else math.nan,
+        }
 
 
 def column(rows: FloatArray, name: str) -> FloatArray:

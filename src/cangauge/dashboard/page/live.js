@@ -9,10 +9,11 @@
   let span = "10min", key = "", added = 0, width_ms = SPANS_MS[span], paused = false, moving = false;
   let figures, rows, runs, time, answered_ms = performance.now(), drawn_ms = 0;
 
+  const fixed = (value, digits) => value.toFixed(digits).replace("-", "−");
   const num = (value, digits, unit = "") =>
-    typeof value === "number" ? `${value.toFixed(digits)}${unit && " " + unit}` : "–";
+    typeof value === "number" ? `${fixed(value, digits)}${unit && " " + unit}` : "–";
   const pm = (value, std, digits, unit) =>
-    typeof value === "number" ? `${value.toFixed(digits)} ± ${num(std, digits)} ${unit}` : "–";
+    typeof value === "number" ? `${fixed(value, digits)} ± ${num(std, digits)} ${unit}` : "–";
   const scaled = (value, factor) => (typeof value === "number" ? value * factor : null);
   const words = bits => Object.entries(FACTS.reasons).filter(([bit]) => bits & bit).map(([, text]) => text);
   // bokeh's axes show UTC: local time is drawn by moving the stamps.
@@ -34,8 +35,8 @@
       "Capacity": pm(health?.capacity_ah, health?.capacity_std_ah, 1, "Ah"),
       "Resistance, to model": pm(health?.resistance_ratio, health?.resistance_std, 2, "×"),
       "Current offset": pm(health?.offset_a, health?.offset_std_a, 2, "A"),
-      "Discharge for 10 s": pm(power?.discharge_a, power?.discharge_std_a, 0, "A"),
-      "Charge for 10 s": pm(power?.charge_a, power?.charge_std_a, 0, "A"),
+      "Discharge for 10 s": pm(power?.discharge_a, power?.discharge_std_a, 1, "A"),
+      "Charge for 10 s": pm(power?.charge_a, power?.charge_std_a, 1, "A"),
       "Energy left": pm(scaled(power?.energy_wh, 1e-3), scaled(power?.energy_std_wh, 1e-3), 2, "kWh"),
       ...(cells ? {
         "Weakest cell": cells.weakest === null ? "not told apart" : `number ${cells.weakest} of ${cells.cells}`,
@@ -43,7 +44,8 @@
       } : {}),
       "Frames": num(latest.frames_per_s, 0, "/s"),
       "Rejects": `${counts} (${num(latest.rejects_per_s, 1, "/s")})`,
-      "Latency (99 % below)": num(latest.latency_ms, 1, "ms"),
+      "Latency": num(latest.latency_ms, 2, "ms"),
+      "Latency, 99 % below": num(scaled(status.latency.p99_at_most_s, 1e3), 1, "ms"),
       ...(record ? { "Recording": record.problem ?? `${num(record.written_bytes / 1e6, 1)} MB, ${record.lost_frames} lost` } : {}),
     };
   }
@@ -163,6 +165,7 @@
         const content = await (await fetch("/comparison")).json();
         put(at("verdict"), content.verdict);
         put(at("command"), content.command);
+        at("table").hidden = content.scales.length === 0;
         at("scales").replaceChildren(...content.scales.map(scale => {
           const row = document.createElement("tr");
           const signs = [scale.above && "above", scale.growing && "growing"].filter(Boolean).join(", ");
