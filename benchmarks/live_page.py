@@ -105,8 +105,8 @@ def frames() -> Iterator[None]:
 
 
 @contextmanager
-def chromium() -> Iterator[int]:
-    """Open the page in headless Chromium; yield its process."""
+def chromium() -> Iterator[Any]:
+    """Open the page in headless Chromium; yield its driver."""
     from selenium import webdriver  # noqa: PLC0415 - an extra of development
 
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
@@ -119,7 +119,7 @@ def chromium() -> Iterator[int]:
         )
         driver.get(f"http://127.0.0.1:{PAGE_PORT}/")
         try:
-            yield driver.service.process.pid
+            yield driver
         finally:
             driver.quit()
 
@@ -162,7 +162,7 @@ def measure(case: str, seconds: float) -> dict[str, Any]:
                 stack.enter_context(fetcher())
             time.sleep(10.0)
             if viewers:
-                groups["browser"] = children(viewers[0])
+                groups["browser"] = children(viewers[0].service.process.pid)
             before = {name: cpu_s(each) for name, each in groups.items()}
             began = time.monotonic()
             time.sleep(seconds)

@@ -42,6 +42,7 @@ def status(
             "voltage_v": 380.0 + residual_v,
             "temperature_c": 20.0,
         },
+        "samples": int(10 * (time_s - age_s)),
         "samples_per_s": 10.0,
         "frames": {"received": int(20 * time_s)},
         "rejects": {"crc_errors": 0},

@@ -62,7 +62,7 @@ def test_a_silent_bus_is_said_within_a_second() -> None:
     clock = Clock()
     history = driven(2.0, clock)
     assert history.troubles() == []
-    history.add(status(2.0, age_s=0.9))
+    history.add(status(2.8, age_s=0.9, samples=history.status["samples"]))
     assert history.troubles() == ["The bus is silent: no sample for 0.9 s."]
 
 
@@ -71,8 +71,13 @@ def test_a_slow_bus_is_not_called_silent() -> None:
     history = driven(4.0, clock, samples_per_s=1.0)
     history.add(status(4.0, age_s=0.99, samples_per_s=1.0))
     assert history.troubles() == []
-    history.add(status(4.0, age_s=3.5, samples_per_s=0.0))
+    history.add(status(7.5, age_s=3.5, samples=history.status["samples"], samples_per_s=0.0))
     assert "silent" in history.troubles()[0]
+
+
+def test_samples_that_waited_are_no_silence() -> None:
+    history = driven(4.0, Clock(), age_s=6.0)
+    assert history.troubles() == []
 
 
 def test_a_service_that_stops_is_said_within_a_second() -> None:

@@ -122,6 +122,8 @@ class History:
         self._clock = clock
         self._received_s = -math.inf
         self._interval_s = ROW_EVERY_S
+        self._samples = 0
+        self._sample_s = 0.0
         self._counts: deque[tuple[float, ...]] = deque(maxlen=64)
         self.status: dict[str, Any] | None = None
         self.hour = Span(ROW_EVERY_S, 36_000)
@@ -135,6 +137,8 @@ class History:
         """Add a status: the object of `/status`."""
         now_s = self._clock()
         self.status, self._received_s = status, now_s
+        if status["samples"] != self._samples:
+            self._samples, self._sample_s = status["samples"], status["uptime_s"]
         rate = _number(status["samples_per_s"])
         if _age_s(status) <= SILENT_AFTER_S and rate > 0.0:
             self._interval_s = 1.0 / rate
@@ -160,7 +164,8 @@ class History:
             found.append("The service hangs: restart it.")
         if not status["bus_up"]:
             found.append(f"The bus is lost: {status['bus_trouble'] or 'no reason known'}.")
-        age_s = _age_s(status)
+        # A sample may be old because it waited: the service then works through what has come.
+        age_s = min(_age_s(status), status["uptime_s"] - self._sample_s)
         if age_s > max(SILENT_AFTER_S, SILENT_INTERVALS * self._interval_s):
             found.append(f"The bus is silent: no sample for {age_s:.1f} s.")
         elif status["sample"] is None:
@@ -177,8 +182,8 @@ class History:
         }
         two_sigma = 2.0 * _number(estimate["soc_std_pct"])
         values["time_ms"] = 1e3 * now_s
-        values["soc_low_pct"] = values["soc_pct"] - two_sigma
-        values["soc_high_pct"] = values["soc_pct"] + two_sigma
+        values["soc_low_pct"] = max(values["soc_pct"] - two_sigma, 0.0)
+        values["soc_high_pct"] = min(values["soc_pct"] + two_sigma, 100.0)
         values["residual_mv"] = 1e3 * _number(estimate["residual_v"])
         values |= self._rates(status)
         values["status"] = _STATUS[status["status"]]

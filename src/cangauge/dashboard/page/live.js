@@ -2,7 +2,7 @@
 // Ask ten times a second for what is new, and show it. `FACTS` and the figures come from charts.js.
 (() => {
   Bokeh.set_log_level("error");  // it warns of each figure without data
-  const EVERY_MS = 100, GIVE_UP_MS = 700, CHANGES = 12, PIXELS = 1000;
+  const EVERY_MS = 100, GIVE_UP_MS = 700, CHANGES = 12, PIXELS = 500;
   const at = id => document.getElementById(id);
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const SPANS_MS = { "10min": 6e5, "1h": 3.6e6, all: Infinity };
@@ -133,7 +133,7 @@
   }
 
   async function ask() {
-    // The figures are drawn again once the picture has moved by about a pixel; the tiles each time.
+    // The figures are drawn again once the picture has moved by about two pixels; the tiles each time.
     const isDue = performance.now() - drawn_ms >= (time.end - time.start) / PIXELS;
     const query = paused || (!isDue && key) ? "" : `?span=${span}&key=${key}&after=${added}`, asked = span;
     try {
