@@ -63,6 +63,8 @@ def run_command(
     `cangauge run --config car.toml --record drive.log -o soc.parquet`
 
     `cangauge run --config car.toml --state /var/lib/cangauge`
+
+    `cangauge run --config car.toml --dashboard 8642`  (the live page at http://127.0.0.1:8642/)
     """
     given = config_values(options)
     loaded = load_config(config, given)

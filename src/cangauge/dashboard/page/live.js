@@ -169,8 +169,8 @@
         at("scales").replaceChildren(...content.scales.map(scale => {
           const row = document.createElement("tr");
           const signs = [scale.above && "above", scale.growing && "growing"].filter(Boolean).join(", ");
-          for (const text of [scale.seconds, num(scale.rms_mv, 0), num(scale.floor_mv, 0),
-            num(scale.rms_mv / scale.floor_mv, 2), num(scale.growth, 2), signs]) {
+          for (const text of [scale.seconds, signs, num(scale.rms_mv, 0), num(scale.floor_mv, 0),
+            num(scale.rms_mv / scale.floor_mv, 2), num(scale.growth, 2)]) {
             row.append(Object.assign(document.createElement("td"), { textContent: text }));
           }
           return row;
