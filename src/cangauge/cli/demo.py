@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 import time
@@ -28,6 +29,7 @@ from cangauge.model.published import SOC_NEWTON_MAE_PCT, VOLTAGE_MAE_PCT
 from cangauge.replay.steps import quantization_bound
 from cangauge.report.estimate import estimate_report
 from cangauge.report.fit import fit_report
+from cangauge.service.addresses import LOOPBACK
 from cangauge.service.estimate_table import read_estimates
 from cangauge.service.offline import RecordedEstimate
 
@@ -47,7 +49,7 @@ def demo_command(
 
     The shipped log is a reconstruction of the published 2012 Leaf test, computed from its equation,
     not a recording of a car. The bus is vcan0 if it exists, else UDP multicast on this machine.
-    Takes about half a minute.
+    Takes about half a minute. The live page is served meanwhile, at the address printed.
 
     Examples
     --------
@@ -73,8 +75,11 @@ def demo_command(
     identification.model.save(model_path)
     write_text_atomic(fit_page, fit_report(identification))
     note("2/4  replay another 2.6 h on the bus at full speed, and estimate its SoC live")
+    port = _free_port() if os.name == "posix" else None
+    if port is not None:
+        note(f"     see it while it plays: http://{LOOPBACK}:{port}/")
     played = shared_file("replay", PLAYED)
-    seconds = _play(model_path, played, live_path)
+    seconds = _play(model_path, played, live_path, port)
     note("3/4  compare live with offline and with the reference")
     log, model = read_log(played), identification.model
     table = read_estimates(live_path)
@@ -99,7 +104,13 @@ def demo_command(
     _show(result)
 
 
-def _play(model: Path, log: Path, live: Path) -> float:
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        return int(probe.getsockname()[1])
+
+
+def _play(model: Path, log: Path, live: Path, port: int | None) -> float:
     """Replay a log to the service, each in its own process; return the duration [s]."""
     bus = ["--interface", "socketcan", "--channel", "vcan0"]
     if not has_socketcan("vcan0"):
@@ -109,6 +120,7 @@ def _play(model: Path, log: Path, live: Path) -> float:
     service = [
         *cangauge, "run", *bus, "-m", str(model), "--time-source", "replay-clock",
         "--temperature-source", "room", "--until-idle", str(IDLE_S), "--output", str(live),
+        *([] if port is None else ["--dashboard", str(port)]),
     ]  # fmt: skip
     began = time.monotonic()
     with subprocess.Popen(  # noqa: S603 - our own commands

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Final, Self
@@ -63,6 +63,8 @@ def run_command(
     `cangauge run --config car.toml --record drive.log -o soc.parquet`
 
     `cangauge run --config car.toml --state /var/lib/cangauge`
+
+    `cangauge run --config car.toml --dashboard 8642`  (the live page at http://127.0.0.1:8642/)
     """
     given = config_values(options)
     loaded = load_config(config, given)
@@ -70,8 +72,13 @@ def run_command(
         stack.enter_context(logging_to(loaded.log_format, loaded.log_level))
         stack.enter_context(_failures_logged(loaded.log_format))
         service = Service(config, **given)
-        if console.is_terminal:
-            service.on_status = stack.enter_context(LiveLine(console)).show
+        shown_on = [stack.enter_context(LiveLine(console)).show] if console.is_terminal else []
+        if (address := loaded.dashboard_address()) is not None:
+            # bokeh is slow to import, and few services serve the page.
+            from cangauge.dashboard.launch import LivePage  # noqa: PLC0415
+
+            shown_on.append(stack.enter_context(LivePage(address)).show)
+        service.on_status = _each(shown_on)
         # Everything loaded so far lives until exit. Garbage collection of it would pause the loop,
         # and destroying it would delay the exit by a second.
         gc.freeze()
@@ -79,6 +86,14 @@ def run_command(
         result = service.run()
         if json_output:
             emit_json(result)
+
+
+def _each(shown_on: Sequence[Callable[[Snapshot], None]]) -> Callable[[Snapshot], None]:
+    def show(snapshot: Snapshot) -> None:
+        for each in shown_on:
+            each(snapshot)
+
+    return show
 
 
 @contextmanager

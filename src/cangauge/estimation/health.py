@@ -132,6 +132,7 @@ class Health(NamedTuple):
     resistance_std: float
     offset_a: float
     """Offset of the current sensor, measured minus true [A]."""
+    offset_std_a: float = math.nan
 
 
 class VoltageTick(NamedTuple):
@@ -260,6 +261,7 @@ class HealthEstimator:
             ratio[0],
             ratio[1],
             float(self._x[_O]),
+            math.sqrt(float(self._p[_O, _O])),
         )
 
     def snapshot(self) -> HealthState:

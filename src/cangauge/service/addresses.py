@@ -59,6 +59,7 @@ def http_address(
     text: str,
     token_file: str | PathLike[str] | None = None,
     environment: Mapping[str, str] | None = None,
+    field: str = "http",
 ) -> HttpAddress:
     """Return the address and its token; an address beyond loopback needs one.
 
@@ -69,6 +70,8 @@ def http_address(
     token_file : path-like, optional
         By default the environment variable `TOKEN_VARIABLE`, if there is one.
     environment : mapping, optional
+    field : str
+        Key of the address, for messages.
 
     Raises
     ------
@@ -76,12 +79,12 @@ def http_address(
         If the address is invalid, the token cannot be read or is too short, or the address is
         not loopback and there is no token.
     """
-    host, port = _host_and_port(text)
+    host, port = _host_and_port(text, field)
     token = read_token(token_file, os.environ if environment is None else environment)
     if token is None and not is_loopback_name(host):
         raise InputError(
             "this address is reachable from the network, and there is no token",
-            field="http",
+            field=field,
             value=text,
             cure=f"put a token into a file for --http-token-file or into {TOKEN_VARIABLE},"
             f" or listen on {LOOPBACK}:{port}",
@@ -100,7 +103,7 @@ def is_loopback_name(host: str) -> bool:
         return False
 
 
-def _host_and_port(text: str) -> tuple[str, int]:
+def _host_and_port(text: str, field: str) -> tuple[str, int]:
     host, colon, port = text.strip().rpartition(":")
     if not colon:
         host = LOOPBACK
@@ -114,7 +117,7 @@ def _host_and_port(text: str) -> tuple[str, int]:
     if not 0 <= number <= 65535:
         raise InputError(
             "not an address HOST:PORT with an IP address or localhost",
-            field="http",
+            field=field,
             value=text,
             cure=f"write it as {LOOPBACK}:9464",
         )

@@ -515,6 +515,13 @@ class RunConfig(_Strict):
         is_path=True,
     )
     mqtt: MqttConfig | None = _key(None, "MQTT broker that takes the state (extra `mqtt`).")
+    dashboard: str | None = _key(
+        None,
+        "Serve the live page there, e.g. 127.0.0.1:8642. An address beyond loopback needs a token,"
+        " as with --http.",
+        "HOST:PORT",
+        needs_restart=True,
+    )
     status_socket: str = _key(
         "auto",
         "Unix socket for `cangauge status`; auto: in the user's runtime folder.",
@@ -601,6 +608,12 @@ class RunConfig(_Strict):
                 "is missing", field="mqtt.user", cure="name the user whose password is given"
             )
         return MqttSettings(**given, password=password)
+
+    def dashboard_address(self) -> HttpAddress | None:
+        """Return the address of the live page, None without; may raise InputError."""
+        if self.dashboard is None:
+            return None
+        return http_address(self.dashboard, self.http_token_file, field="dashboard")
 
     def unix_path(self) -> Path | None:
         """Return the path of the unix socket, if one is given."""

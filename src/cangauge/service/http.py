@@ -97,7 +97,7 @@ class Endpoint:
         # An optional dependency: the import raises the error if it is missing.
         from cangauge.service.metrics import Exposition  # noqa: PLC0415
 
-        sockets = _open_tcp(http)
+        sockets = open_tcp(http)
         self.port = int(sockets[0].getsockname()[1])
         self._add(_application(latest, Exposition(latest), http), sockets)
 
@@ -231,14 +231,15 @@ class _Door:
             self._server.handle_stream(stream, address)
 
 
-def _open_tcp(http: HttpAddress) -> list[socket.socket]:
+def open_tcp(http: HttpAddress, field: str = "http") -> list[socket.socket]:
+    """Return listening sockets; raise InputError, with this field, if they cannot be bound."""
     try:
         return bind_sockets(http.port, http.host)
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(
             f"cannot be bound: {reason}",
-            field="http",
+            field=field,
             value=str(http),
             cure="in use by another service? Choose another port"
             if getattr(error, "errno", None) == errno.EADDRINUSE
@@ -291,7 +292,7 @@ class _Page(RequestHandler):
             # Against DNS rebinding: a web page could otherwise read this under another name.
             if not is_loopback_name(self.request.host_name):
                 self._refuse(403, "request this by a loopback address")
-        elif not _has_token(self.request.headers.get("Authorization", ""), token):
+        elif not has_token(self.request.headers.get("Authorization", ""), token):
             self.set_header("WWW-Authenticate", "Bearer")
             self._refuse(401, "a bearer token is required")
             emit(
@@ -350,7 +351,8 @@ class _Nothing(_Page):
             self._refuse(404, "available: /status, /healthz, /metrics")
 
 
-def _has_token(header: str, token: str) -> bool:
+def has_token(header: str, token: str) -> bool:
+    """Return whether an Authorization header bears the token; takes the same time for each."""
     scheme, _, given = header.partition(" ")
     same = hmac.compare_digest(given.strip().encode("utf-8", "replace"), token.encode("utf-8"))
     return same and scheme.lower() == "bearer"

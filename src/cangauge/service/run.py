@@ -30,7 +30,7 @@ from cangauge.service.pipeline import Pipeline
 from cangauge.service.reading import START_S, BackgroundReader, Reading
 from cangauge.service.recording import Recorder
 from cangauge.service.state import StateKeeper, check_state_path
-from cangauge.service.status import Identity, Monitor, Snapshot
+from cangauge.service.status import PAGE_EVERY_S, SHOW_EVERY_S, Identity, Monitor, Snapshot
 
 if TYPE_CHECKING:
     from cangauge.service.estimate_table import EstimateWriter
@@ -55,7 +55,7 @@ class Service:
     pipeline : Pipeline
         The estimator.
     on_status : callable or None
-        Takes a `Snapshot` four times a second while the service runs.
+        Takes a `Snapshot` four times a second while the service runs; ten times with a live page.
 
     Raises
     ------
@@ -289,7 +289,12 @@ class Service:
             notifier = Notifier.from_environment()
             stack.callback(notifier.close)
             monitor = Monitor(
-                self.pipeline, port, identity=identity, notifier=notifier, record=recorder
+                self.pipeline,
+                port,
+                identity=identity,
+                notifier=notifier,
+                record=recorder,
+                show_every_s=SHOW_EVERY_S if config.dashboard is None else PAGE_EVERY_S,
             )
             _serve_status(config, monitor, stack)
             _publish_mqtt(config, monitor, stack)

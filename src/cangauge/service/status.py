@@ -33,6 +33,8 @@ STUCK_S: Final = 2.0
 """Age of a snapshot above which the receive loop counts as stuck, and its SoC as stale [s]."""
 SHOW_EVERY_S: Final = 0.25
 """Interval of the snapshots [s]."""
+PAGE_EVERY_S: Final = 0.1
+"""The same while the live page is served [s]: that of SOC_ESTIMATE."""
 NOTIFY_EVERY_S: Final = 1.0
 """Interval of status lines to systemd [s]."""
 RATE_OVER_S: Final = 2.0
@@ -344,6 +346,8 @@ class Monitor:
     record : Recorder, optional
     clock : callable
         Monotonic time [s].
+    show_every_s : float
+        Interval of the snapshots [s].
 
     Attributes
     ----------
@@ -362,7 +366,9 @@ class Monitor:
         notifier: Notifier,
         record: Recorder | None = None,
         clock: Callable[[], float] = time.monotonic,
+        show_every_s: float = SHOW_EVERY_S,
     ) -> None:
+        self._show_every_s = show_every_s
         self._pipeline = pipeline
         self._port = port
         self.identity = identity
@@ -425,13 +431,13 @@ class Monitor:
         """Record a turn of the loop (monotonic time [s]); return whether `latest` is new."""
         if now_s < self._due_s:
             return False
-        self._due_s = now_s + SHOW_EVERY_S
+        self._due_s = now_s + self._show_every_s
         self.latest = snapshot = self._snapshot(now_s)
         self._log_status(snapshot)
         self._log_notices(snapshot)
         ping_every_s = self._notifier.ping_every_s
         if ping_every_s is not None and now_s >= self._ping_s:
-            self._ping_s = now_s + ping_every_s - SHOW_EVERY_S
+            self._ping_s = now_s + ping_every_s - self._show_every_s
             self._notifier.ping()
         if self._notifier.active and now_s >= self._notify_s:
             self._notify_s = now_s + NOTIFY_EVERY_S

@@ -1,0 +1,266 @@
+"use strict";
+// Ask ten times a second for what is new, and show it. `FACTS` and the figures come from charts.js.
+(() => {
+  Bokeh.set_log_level("error");  // it warns of each figure without data
+  const EVERY_MS = 100, GIVE_UP_MS = 700, CHANGES = 12, PIXELS = 500;
+  const at = id => document.getElementById(id);
+  const dark = matchMedia("(prefers-color-scheme: dark)");
+  const SPANS_MS = { "10min": 6e5, "1h": 3.6e6, all: Infinity };
+  let span = "10min", key = "", added = 0, width_ms = SPANS_MS[span], paused = false, moving = false;
+  let figures, rows, runs, time, answered_ms = performance.now(), drawn_ms = 0;
+
+  const fixed = (value, digits) => value.toFixed(digits).replace("-", "−");
+  const num = (value, digits, unit = "") =>
+    typeof value === "number" ? `${fixed(value, digits)}${unit && " " + unit}` : "–";
+  const pm = (value, std, digits, unit) =>
+    typeof value === "number" ? `${fixed(value, digits)} ± ${num(std, digits)} ${unit}` : "–";
+  const scaled = (value, factor) => (typeof value === "number" ? value * factor : null);
+  const words = bits => Object.entries(FACTS.reasons).filter(([bit]) => bits & bit).map(([, text]) => text);
+  // bokeh's axes show UTC: local time is drawn by moving the stamps.
+  const SHIFT_MS = -6e4 * new Date().getTimezoneOffset();
+  const clock = ms => new Date(ms).toISOString().slice(11, 19);
+  const put = (element, text) => { if (element.textContent !== text) element.textContent = text; };
+
+  function tiles(status, latest) {
+    const { estimate, health, power, cells, record } = status, sample = status.sample ?? {};
+    const counts = Object.values(status.rejects).reduce((sum, count) => sum + count, 0);
+    return {
+      "SoC by voltage": num(estimate.soc_newton_pct, 2, "%"),
+      "SoC by counting": num(estimate.soc_coulomb_pct, 2, "%"),
+      "Current": num(sample.current_a, 2, "A"),
+      "Voltage": num(sample.voltage_v, 2, "V"),
+      "Model voltage": num(estimate.voltage_model_v, 2, "V"),
+      "Residual": num(scaled(estimate.residual_v, 1e3), 0, "mV"),
+      "Temperature": num(sample.temperature_c, 1, "°C"),
+      "Capacity": pm(health?.capacity_ah, health?.capacity_std_ah, 1, "Ah"),
+      "Resistance, to model": pm(health?.resistance_ratio, health?.resistance_std, 2, "×"),
+      "Current offset": pm(health?.offset_a, health?.offset_std_a, 2, "A"),
+      "Discharge for 10 s": pm(power?.discharge_a, power?.discharge_std_a, 1, "A"),
+      "Charge for 10 s": pm(power?.charge_a, power?.charge_std_a, 1, "A"),
+      "Energy left": pm(scaled(power?.energy_wh, 1e-3), scaled(power?.energy_std_wh, 1e-3), 2, "kWh"),
+      ...(cells ? {
+        "Weakest cell": cells.weakest === null ? "not told apart" : `number ${cells.weakest} of ${cells.cells}`,
+        "SoC of that cell": pm(cells.soc_pct, cells.soc_std_pct, 1, "%"),
+      } : {}),
+      "Frames": num(latest.frames_per_s, 0, "/s"),
+      "Rejects": `${counts} (${num(latest.rejects_per_s, 1, "/s")})`,
+      "Latency": num(latest.latency_ms, 2, "ms"),
+      "Latency, 99 % below": num(scaled(status.latency.p99_at_most_s, 1e3), 1, "ms"),
+      ...(record ? { "Recording": record.problem ?? `${num(record.written_bytes / 1e6, 1)} MB, ${record.lost_frames} lost` } : {}),
+    };
+  }
+
+  function show(status, latest) {
+    put(at("place"), `${status.vehicle} on ${status.bus}`);
+    put(at("soc"), pm(status.estimate.soc_pct, status.estimate.soc_std_pct, 2, "%"));
+    put(at("state"), status.status);
+    at("state").dataset.status = status.status;
+    put(at("reasons"), words(latest.reasons).join("; "));
+    const wanted = Object.entries(tiles(status, latest)), list = at("tiles");
+    if (list.children.length !== wanted.length) {
+      list.replaceChildren(...wanted.map(([name]) => {
+        const tile = document.createElement("div");
+        tile.append(document.createElement("dt"), document.createElement("dd"));
+        tile.firstChild.textContent = name;
+        return tile;
+      }));
+    }
+    wanted.forEach(([name, text], index) => {
+      put(list.children[index].firstChild, name);
+      put(list.children[index].lastChild, text);
+    });
+  }
+
+  function trouble(texts) {
+    // The seconds in a text change all the time: read aloud once only.
+    put(at("troubles"), texts.join(" "));
+    document.querySelector("main").classList.toggle("old", texts.length > 0);
+  }
+
+  // Stretches of one status and reasons, and the list of the latest changes.
+  function extend(columns, fresh) {
+    const found = fresh ? [] : runs.data.left.map((_, index) =>
+      Object.fromEntries(Object.entries(runs.data).map(([name, values]) => [name, values[index]])));
+    columns.time_ms.forEach((ms, index) => {
+      const status = FACTS.statuses[columns.status[index]], text = words(columns.reasons[index]).join("; ") || "no reason";
+      const last = found.at(-1);
+      if (last && last.status === status && last.words === text) { last.right = ms; return; }
+      if (last) last.right = ms;
+      found.push({ left: ms, right: ms, status, colour: FACTS.colours[status], words: text });
+    });
+    const kept = found.filter(run => !rows.data.time_ms.length || run.right >= rows.data.time_ms[0]).slice(-2000);
+    const isLonger = kept.length !== runs.data.left.length || fresh;
+    runs.data = Object.fromEntries(["left", "right", "status", "colour", "words"].map(name => [name, kept.map(run => run[name])]));
+    if (!isLonger) return;
+    at("changes").replaceChildren(...kept.slice(-CHANGES).reverse().map(run => {
+      const item = document.createElement("li");
+      item.textContent = `${clock(run.left)} ${run.status}` + (run.words === "no reason" ? "" : `: ${run.words}`);
+      return item;
+    }));
+  }
+
+  function setRange(start, end) {
+    moving = true;
+    time.setv({ start, end });
+    moving = false;
+  }
+
+  function follow() {
+    const times = rows.data.time_ms;
+    if (!times.length || paused) return;
+    const end = times.at(-1), first = times[0];
+    setRange(Math.max(end - width_ms, Math.min(first, end - 1e4)), end);
+  }
+
+  function take(answer) {
+    const columns = answer.columns;
+    for (const values of Object.values(columns)) {
+      values.forEach((value, index) => { if (value === null) values[index] = NaN; });
+    }
+    columns.time_ms = columns.time_ms.map(ms => ms + SHIFT_MS);
+    const fresh = answer.key !== key && !isContinued(answer);
+    if (fresh) rows.data = columns;
+    else if (columns.time_ms.length) rows.stream(columns, FACTS.rows_at_most[span]);
+    key = answer.key;
+    added = answer.added;
+    if (fresh || columns.time_ms.length) { extend(columns, fresh); follow(); }
+  }
+
+  // After a restart of the service its rows go on from those already shown.
+  function isContinued(answer) {
+    const times = rows.data.time_ms;
+    return key !== "" && key.split("-")[0] !== answer.key.split("-")[0] && times.length > 0 && !(answer.columns.time_ms[0] <= times.at(-1));
+  }
+
+  async function ask() {
+    // The figures are drawn again once the picture has moved by about two pixels; the tiles each time.
+    const isDue = performance.now() - drawn_ms >= (time.end - time.start) / PIXELS;
+    const query = paused || (!isDue && key) ? "" : `?span=${span}&key=${key}&after=${added}`, asked = span;
+    try {
+      const answer = await fetch(`/rows${query}`, { signal: AbortSignal.timeout(GIVE_UP_MS) });
+      if (answer.status === 401) { location.assign("/enter"); return; }
+      if (!answer.ok) throw new Error(String(answer.status));
+      const content = await answer.json();
+      answered_ms = performance.now();
+      if (content.columns && asked === span && !paused) { take(content); drawn_ms = answered_ms; }
+      if (content.status) {
+        show(content.status, content.latest);
+      }
+      trouble(content.troubles);
+    } catch {
+      const seconds = (performance.now() - answered_ms) / 1e3;
+      if (1e3 * seconds > GIVE_UP_MS) trouble([`The service does not answer for ${seconds.toFixed(0)} s. The values are old.`]);
+    }
+  }
+
+  async function poll() {
+    const began = performance.now();
+    if (!document.hidden) await ask();
+    setTimeout(poll, Math.max(EVERY_MS - (performance.now() - began), 20));
+  }
+
+  async function compare() {
+    if (!at("gap").hidden) {
+      try {
+        const content = await (await fetch("/comparison")).json();
+        put(at("verdict"), content.verdict);
+        put(at("command"), content.command);
+        at("table").hidden = content.scales.length === 0;
+        at("scales").replaceChildren(...content.scales.map(scale => {
+          const row = document.createElement("tr");
+          const signs = [scale.above && "above", scale.growing && "growing"].filter(Boolean).join(", ");
+          for (const text of [scale.seconds, signs, num(scale.rms_mv, 0), num(scale.floor_mv, 0),
+            num(scale.rms_mv / scale.floor_mv, 2), num(scale.growth, 2)]) {
+            row.append(Object.assign(document.createElement("td"), { textContent: text }));
+          }
+          return row;
+        }));
+      } catch { put(at("verdict"), "The service does not answer."); }
+    }
+    setTimeout(compare, 2000);
+  }
+
+  function paint() {
+    const ink = dark.matches ? "#d5dce6" : "#333d4a", line = dark.matches ? "#333d49" : "#dfe4ea";
+    const blue = dark.matches ? "#56b4e9" : "#0072b2";
+    for (const figure of figures) {
+      for (const part of [...figure.above, ...figure.below, ...figure.left, ...figure.center]) {
+        if (part.type.endsWith("Axis")) part.setv({ major_label_text_color: ink, axis_line_color: ink, major_tick_line_color: ink });
+        if (part.type === "Grid") part.setv({ grid_line_color: line });
+        if (part.type === "Legend") part.setv({ label_text_color: ink });
+      }
+      figure.outline_line_color = line;
+      for (const { glyph } of figure.renderers) {
+        if (["#0072b2", "#56b4e9"].includes(glyph.line_color?.value)) glyph.line_color = { value: blue };
+      }
+    }
+  }
+
+  function setPaused(wanted) {
+    paused = wanted;
+    at("pause").setAttribute("aria-pressed", String(paused));
+    put(at("pause"), paused ? "Resume" : "Pause");
+    if (!paused) { width_ms = SPANS_MS[span]; follow(); }
+  }
+
+  function move(scale, shift) {
+    const width = time.end - time.start, end = time.end + shift * width;
+    setPaused(true);
+    const middle = end - width / 2;
+    setRange(middle - scale * width / 2, middle + scale * width / 2);
+  }
+
+  function choose(tab) {
+    for (const each of document.querySelectorAll("[role=tab]")) {
+      const chosen = each === tab;
+      each.setAttribute("aria-selected", String(chosen));
+      each.tabIndex = chosen ? 0 : -1;
+      at(each.getAttribute("aria-controls")).hidden = !chosen;
+    }
+    tab.focus();
+  }
+
+  function controls() {
+    for (const radio of document.querySelectorAll("[name=span]")) {
+      radio.addEventListener("change", () => { span = radio.value; key = ""; added = 0; setPaused(false); });
+    }
+    at("pause").addEventListener("click", () => setPaused(!paused));
+    at("in").addEventListener("click", () => move(0.5, 0));
+    at("out").addEventListener("click", () => move(2, 0));
+    at("back").addEventListener("click", () => move(1, -0.5));
+    at("forth").addEventListener("click", () => move(1, 0.5));
+    at("csv").addEventListener("click", () => {
+      at("csv").href = `/range.csv?span=${span}&from=${time.start - SHIFT_MS}&to=${time.end - SHIFT_MS}`;
+    });
+    const tabs = [...document.querySelectorAll("[role=tab]")];
+    tabs.forEach((tab, index) => {
+      tab.addEventListener("click", () => choose(tab));
+      tab.addEventListener("keydown", event => {
+        if (event.key === "ArrowRight" || event.key === "ArrowLeft") choose(tabs[1 - index]);
+      });
+    });
+    at("copy").addEventListener("click", async () => {
+      try { await navigator.clipboard.writeText(at("command").textContent); put(at("copied"), "Copied."); }
+      catch { put(at("copied"), "The browser refuses: select the command and copy it."); }
+    });
+    time.change.connect(() => { if (!moving && !paused) setPaused(true); });
+    dark.addEventListener("change", paint);
+  }
+
+  function begin() {
+    const drawn = Bokeh.documents[0];
+    if (!drawn || !drawn.is_idle) { setTimeout(begin, 30); return; }
+    figures = drawn.roots();
+    [rows, runs, time] = ["rows", "runs", "time"].map(name => drawn.get_model_by_name(name));
+    for (const figure of figures) {
+      // A finger scrolls the page; the buttons zoom.
+      if (matchMedia("(pointer: coarse)").matches) figure.toolbar.active_drag = null;
+      if (matchMedia("(max-width: 600px)").matches) figure.below[0].ticker.desired_num_ticks = 3;
+    }
+    paint();
+    controls();
+    poll();
+    compare();
+  }
+  begin();
+})();

@@ -1,0 +1,320 @@
+"""The live page in a real browser, over a real service on a bus."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import importlib.util
+import io
+import json
+import shutil
+import socket
+import tempfile
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Self
+
+import cantools
+import pytest
+
+from cangauge._resources import shared_file
+from cangauge.bus.encoder import FrameEncoder
+from cangauge.bus.open import BusAddress, bus_address, open_bus
+from cangauge.bus.vehicle import Vehicle
+from cangauge.estimation.validity import Sample
+from live import Command, leaf_model_path, waits
+
+CHROMIUM, DRIVER = (
+    next(filter(None, map(shutil.which, names)), None)
+    for names in (("chromium", "chromium-browser", "google-chrome"), ("chromedriver",))
+)
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        CHROMIUM is None or DRIVER is None, reason="needs chromium and chromedriver"
+    ),
+]
+webdriver = pytest.importorskip("selenium.webdriver", reason="needs selenium")
+
+GROUP = "239.74.163.91"
+CURRENT_A, VOLTAGE_V, TEMPERATURE_C = 12.5, 378.2, 23.0
+ARGUMENTS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+    "--window-size=1280,1000",
+)  # fmt: skip
+
+
+TIMES_MS = "return Bokeh.documents[0].get_model_by_name('rows').data.time_ms"
+
+
+def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class Car:
+    """Sends one steady sample ten times a second while it drives."""
+
+    def __init__(self, address: BusAddress) -> None:
+        self._bus = open_bus(address)
+        self._end, self.drives = threading.Event(), threading.Event()
+        self.drives.set()
+        self._thread = threading.Thread(target=self._run)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end.set()
+        self._thread.join()
+        self._bus.shutdown()
+
+    def _run(self) -> None:
+        encoder = FrameEncoder(Vehicle.load("generic"))
+        while not self._end.wait(0.1):
+            if self.drives.is_set():
+                sample = Sample(time.time(), CURRENT_A, VOLTAGE_V, TEMPERATURE_C)
+                for frame in encoder.encode(sample):
+                    self._bus.send(frame)
+
+
+class Bench:
+    """A car, a service with its page, and where they are."""
+
+    def __init__(self) -> None:
+        self.address = bus_address("udp_multicast", GROUP, {"port": free_port(socket.SOCK_DGRAM)})
+        self.port = free_port()
+        self.url = f"http://127.0.0.1:{self.port}/"
+        self.car = Car(self.address)
+
+    def start(self) -> None:
+        self._service = Command(
+            "run", "-m", leaf_model_path(), "--interface", "udp_multicast", "--channel", GROUP,
+            "--bus-option", f"port={self.address.options['port']}", "--status-socket", "off",
+            "--initial-soc", "75", "--dashboard", self.port,
+        )  # fmt: skip
+        self._service.wait_for("listening on")
+
+    def stop(self) -> None:
+        self._service.process.terminate()
+        self._service.end()
+
+
+@pytest.fixture(scope="module")
+def bench() -> Iterator[Bench]:
+    bench = Bench()
+    with bench.car:
+        bench.start()
+        yield bench
+        bench.stop()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        options = webdriver.ChromeOptions()
+        options.binary_location = str(CHROMIUM)
+        for argument in (*ARGUMENTS, f"--user-data-dir={folder}"):
+            options.add_argument(argument)
+        options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+        driver = webdriver.Chrome(
+            options=options, service=webdriver.ChromeService(executable_path=DRIVER)
+        )
+        try:
+            yield driver
+        finally:
+            driver.quit()
+
+
+@pytest.fixture
+def page(bench: Bench, browser: Any) -> Any:
+    """The browser on a fresh page that shows values."""
+    browser.get(bench.url)
+    assert waits(lambda: tile(browser, "Current") == f"{CURRENT_A:.2f} A", 20.0)
+    return browser
+
+
+def text(browser: Any, name: str) -> str:
+    return str(browser.execute_script(f"return document.getElementById('{name}').textContent"))
+
+
+def tile(browser: Any, name: str) -> str | None:
+    found: str | None = browser.execute_script(
+        "return [...document.querySelectorAll('#tiles > div')]"
+        ".find(tile => tile.firstChild.textContent === arguments[0])?.lastChild.textContent",
+        name,
+    )
+    return found
+
+
+def published(bench: Bench) -> dict[str, Any]:
+    """Return the signals of the next SOC_ESTIMATE on the bus."""
+    database = cantools.database.load_file(shared_file("dbc", "soc_estimate.dbc"))
+    message = database.get_message_by_name("SOC_ESTIMATE")
+    bus = open_bus(bench.address)
+    try:
+        while True:
+            frame = bus.recv(2.0)
+            assert frame is not None, "no SOC_ESTIMATE"
+            if frame.arbitration_id == message.frame_id:
+                decoded: dict[str, Any] = message.decode(bytes(frame.data))
+                return decoded
+    finally:
+        bus.shutdown()
+
+
+def is_shown(browser: Any, words: str, seconds: float = 5.0) -> bool:
+    return waits(lambda: words in text(browser, "troubles"), seconds)
+
+
+def faults(browser: Any) -> list[str]:
+    """Return the serious faults of accessibility that axe-core finds."""
+    source = Path(str(importlib.util.find_spec("axe_core_python").origin)).parent / "axe.min.js"
+    browser.execute_script(source.read_text(encoding="utf-8"))
+    result = browser.execute_async_script(
+        "axe.run(document, {resultTypes: ['violations']}).then(arguments[0])"
+    )
+    assert len(result["passes"]) > 10
+    return [
+        f"{each['id']}: {[node['html'][:80] for node in each['nodes']]}"
+        for each in result["violations"]
+        if each["impact"] in {"serious", "critical"}
+    ]
+
+
+def test_the_page_shows_what_the_bus_carries(bench: Bench, page: Any) -> None:
+    assert tile(page, "Voltage") == f"{VOLTAGE_V:.2f} V"
+    assert tile(page, "Temperature") == f"{TEMPERATURE_C:.1f} °C"
+    frame = published(bench)
+    soc, std = map(float, text(page, "soc").removesuffix(" %").split(" ± "))
+    # Half a step of the frame and of the text; ten more samples may have come in between.
+    assert soc == pytest.approx(frame["soc_pct"], abs=0.005 + 0.005 + 0.02)
+    assert std == pytest.approx(frame["soc_std_pct"], abs=0.025 + 0.005 + 0.01)
+    assert text(page, "state") == str(frame["status"])
+    drawn = page.execute_script(
+        "const rows = Bokeh.documents[0].get_model_by_name('rows').data;"
+        "return ['current_a', 'voltage_v', 'soc_pct'].map(name => rows[name].at(-1))"
+    )
+    assert drawn[:2] == [CURRENT_A, VOLTAGE_V]
+    assert drawn[2] == pytest.approx(soc, abs=0.03)
+
+
+def test_the_values_come_ten_times_a_second(page: Any) -> None:
+    count = (
+        "return performance.getEntriesByType('resource')"
+        ".filter(each => each.name.includes('/rows')).length"
+    )
+    page.execute_script("performance.clearResourceTimings()")
+    began = time.monotonic()
+    time.sleep(2.0)
+    assert page.execute_script(count) / (time.monotonic() - began) > 5.0
+
+
+def test_a_silent_bus_is_shown_within_a_second(bench: Bench, page: Any) -> None:
+    bench.car.drives.clear()
+    try:
+        page.execute_script(
+            "new MutationObserver(() => { window.first ??= "
+            "document.getElementById('troubles').textContent || undefined; })"
+            ".observe(document.getElementById('troubles'), {childList: true})"
+        )
+        assert is_shown(page, "The bus is silent: no sample for")
+        first_s = float(page.execute_script("return window.first").split(" for ")[1].split(" ")[0])
+        assert first_s <= 1.0
+    finally:
+        bench.car.drives.set()
+    assert waits(lambda: text(page, "troubles") == "", 10.0)
+
+
+def test_pause_span_zoom_and_tabs_by_keyboard(page: Any) -> None:
+    keys = importlib.import_module("selenium.webdriver.common.keys").Keys
+    by_id = lambda name: page.find_element("id", name)  # noqa: E731
+    by_id("pause").send_keys(keys.ENTER)
+    assert text(page, "pause") == "Resume"
+    added = f"{TIMES_MS}.length"
+    before = page.execute_script(added)
+    time.sleep(0.5)
+    assert page.execute_script(added) == before
+    width = "const r = Bokeh.documents[0].get_model_by_name('time'); return r.end - r.start"
+    whole = page.execute_script(width)
+    by_id("in").send_keys(keys.ENTER)
+    assert page.execute_script(width) == pytest.approx(whole / 2.0)
+    by_id("pause").send_keys(keys.ENTER)
+    assert waits(lambda: page.execute_script(added) > before)
+    page.find_element("css selector", "[value='10min']").send_keys(keys.ARROW_RIGHT)
+    assert waits(lambda: 0 < page.execute_script(added) < before)
+    by_id("tab-live").send_keys(keys.ARROW_RIGHT)
+    assert by_id("gap").is_displayed()
+    assert not by_id("live").is_displayed()
+    assert waits(lambda: text(page, "command").startswith("cangauge gap cangauge-last-hour.csv"))
+
+
+def test_the_range_shown_is_downloaded(bench: Bench, page: Any) -> None:
+    page.execute_script(
+        "document.getElementById('csv').addEventListener('click', e => e.preventDefault())"
+    )
+    page.find_element("id", "csv").click()
+    link = page.find_element("id", "csv").get_attribute("href")
+    with urllib.request.urlopen(link) as answer:  # noqa: S310 - our own page
+        rows = list(csv.DictReader(io.StringIO(answer.read().decode())))
+    assert len(rows) > 10
+    assert {row["current_a"] for row in rows[-5:]} == {str(CURRENT_A)}
+    assert rows[-1]["status"] in {"valid", "degraded"}
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_no_serious_fault(page: Any, scheme: str) -> None:
+    feature = {"name": "prefers-color-scheme", "value": scheme}
+    page.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
+    assert faults(page) == []
+    page.find_element("id", "tab-gap").click()
+    assert faults(page) == []
+
+
+def test_four_viewers_see_the_same(bench: Bench, page: Any) -> None:
+    first = page.current_window_handle
+    for _ in range(3):
+        page.switch_to.new_window("window")
+        page.get(bench.url)
+    handles = page.window_handles
+    assert len(handles) == 4
+    for handle in handles:
+        page.switch_to.window(handle)
+        assert waits(lambda: tile(page, "Voltage") == f"{VOLTAGE_V:.2f} V", 10.0)
+    for handle in handles:
+        page.switch_to.window(handle)
+        if handle != first:
+            page.close()
+    page.switch_to.window(first)
+
+
+def test_no_error_and_no_request_leaves_the_machine(bench: Bench, page: Any) -> None:
+    assert [each for each in page.get_log("browser") if each["level"] == "SEVERE"] == []
+    asked = [
+        message["params"]["request"]["url"]
+        for each in page.get_log("performance")
+        if (message := json.loads(each["message"])["message"])["method"]
+        == "Network.requestWillBeSent"
+    ]
+    assert len(asked) > 20
+    own = (bench.url, "data:", "blob:", "chrome:")
+    assert [url for url in asked if not url.startswith(own)] == []
+
+
+def test_an_open_page_survives_a_restart(bench: Bench, page: Any) -> None:
+    before = page.execute_script(TIMES_MS)
+    bench.stop()
+    assert is_shown(page, "The service does not answer")
+    bench.start()
+    assert waits(lambda: text(page, "troubles") == "", 20.0)
+    assert tile(page, "Current") == f"{CURRENT_A:.2f} A"
+    assert waits(lambda: page.execute_script(TIMES_MS)[-1] > before[-1] + 500.0)
+    after = page.execute_script(TIMES_MS)
+    assert after[: len(before)] == before
+    assert after == sorted(after)

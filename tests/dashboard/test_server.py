@@ -1,0 +1,192 @@
+"""Access to the live page, and its process."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import socket
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from cangauge.bus.vehicle import Vehicle
+from cangauge.dashboard.launch import LivePage
+from cangauge.errors import InputError
+from cangauge.service.addresses import http_address
+from cangauge.service.config import load_config
+from cangauge.service.lifecycle import Notifier
+from cangauge.service.pipeline import Pipeline
+from cangauge.service.status import Identity, Monitor, Snapshot
+from live import LoggedLines, leaf_model, leaf_model_path, waits
+
+TOKEN = "a-token-of-some-length"  # noqa: S105 - made up
+
+
+def snapshot() -> Snapshot:
+    identity = Identity(
+        bus="virtual x",
+        vehicle="generic",
+        model=str(leaf_model_path()),
+        method="ekf",
+        time_source="receive",
+        began_s=1.7e9,
+    )
+    pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
+    return Monitor(pipeline, object(), identity=identity, notifier=Notifier()).latest  # type: ignore[arg-type] # a port without counts
+
+
+def get(page: LivePage, path: str, **options: Any) -> tuple[int, dict[str, str], bytes]:
+    """Return code, headers and body."""
+    connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=20.0)
+    try:
+        connection.request(options.pop("method", "GET"), path, **options)
+        answer = connection.getresponse()
+        return answer.status, dict(answer.getheaders()), answer.read()
+    finally:
+        connection.close()
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[LivePage]:
+    with LivePage(http_address("127.0.0.1:0", None, {})) as page:
+        page.show(snapshot())
+        yield page
+
+
+@pytest.fixture(scope="module")
+def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LivePage]:
+    file = tmp_path_factory.mktemp("token") / "token"
+    file.write_text(TOKEN)
+    file.chmod(0o600)
+    with LivePage(http_address("127.0.0.1:0", file, {})) as page:
+        page.show(snapshot())
+        yield page
+
+
+def test_the_latest_status_is_served(page: LivePage) -> None:
+    assert waits(lambda: json.loads(get(page, "/rows")[2])["status"] is not None)
+    content = json.loads(get(page, "/rows?span=10min")[2])
+    assert content["status"]["bus"] == "virtual x"
+    assert content["added"] == len(content["columns"]["time_ms"]) == 1
+    again = json.loads(get(page, f"/rows?span=10min&key={content['key']}&after=1")[2])
+    assert again["is_known"]
+    assert again["columns"]["time_ms"] == []
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/rows?span=nonsense&after=x",
+        "/rows?span=10min&key=x&after=-1e400",
+        "/range.csv?from=nan&to=x",
+        "/comparison",
+        "/cangauge-last-hour.csv",
+    ],
+)
+def test_odd_questions_are_answered(page: LivePage, path: str) -> None:
+    assert get(page, path)[0] == 200
+
+
+@pytest.mark.parametrize("path", ["/files/server.py", "/files/..", "/nothing", "/files/"])
+def test_nothing_else_is_served(page: LivePage, path: str) -> None:
+    assert get(page, path)[0] == 404
+
+
+def test_a_page_under_another_name_is_refused(page: LivePage) -> None:
+    assert get(page, "/rows", headers={"Host": "evil.example"})[0] == 403
+    assert get(page, "/", headers={"Host": "evil.example"})[0] == 403
+
+
+def test_the_page_allows_no_content_from_elsewhere(page: LivePage) -> None:
+    code, headers, body = get(page, "/")
+    assert code == 200
+    assert headers["Content-Security-Policy"].startswith("default-src 'none'; script-src 'self';")
+    assert b"http://" not in body
+    assert b"https://" not in body
+
+
+def test_a_slow_viewer_does_not_hold_the_others(page: LivePage) -> None:
+    with socket.create_connection(("127.0.0.1", page.port)) as slow:
+        slow.sendall(b"GET /files/bokeh.min.js HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        began = time.monotonic()
+        for _ in range(20):
+            page.show(snapshot_of(page))
+            assert get(page, "/rows?span=10min")[0] == 200
+        assert time.monotonic() - began < 10.0
+
+
+def snapshot_of(page: LivePage) -> Snapshot:
+    assert page._latest is not None
+    return replace(page._latest, made_s=time.monotonic())
+
+
+@pytest.mark.parametrize("path", ["/rows", "/range.csv", "/comparison", "/cangauge-last-hour.csv"])
+def test_a_token_is_needed(guarded: LivePage, path: str) -> None:
+    assert get(guarded, path)[0] == 401
+    assert get(guarded, path, headers={"Cookie": "cangauge=guess"})[0] == 401
+    assert get(guarded, path, headers={"Authorization": f"Bearer {TOKEN}"})[0] == 200
+
+
+def test_the_browser_is_asked_for_the_token(guarded: LivePage) -> None:
+    code, headers, _ = get(guarded, "/")
+    assert (code, headers["Location"]) == (302, "/enter")
+    form = {"Content-Type": "application/x-www-form-urlencoded"}
+    code, headers, _ = get(guarded, "/enter", method="POST", body="token=wrong", headers=form)
+    assert code == 401
+    assert "Set-Cookie" not in headers
+    code, headers, _ = get(guarded, "/enter", method="POST", body=f"token={TOKEN}", headers=form)
+    assert code == 302
+    cookie = headers["Set-Cookie"]
+    assert TOKEN not in cookie
+    assert "HttpOnly" in cookie
+    assert "SameSite=Strict" in cookie
+    assert get(guarded, "/rows", headers={"Cookie": cookie.split(";")[0]})[0] == 200
+
+
+def test_the_cookie_outlives_a_restart(guarded: LivePage) -> None:
+    form = {"Content-Type": "application/x-www-form-urlencoded"}
+    _, headers, _ = get(guarded, "/enter", method="POST", body=f"token={TOKEN}", headers=form)
+    cookie = headers["Set-Cookie"].split(";")[0]
+    with LivePage(replace(guarded._address, port=0)) as other:
+        assert get(other, "/rows", headers={"Cookie": cookie})[0] == 200
+
+
+def test_an_address_in_use_is_refused(page: LivePage) -> None:
+    with pytest.raises(InputError, match=r"dashboard.*in use"):
+        LivePage(http_address(f"127.0.0.1:{page.port}", None, {}, "dashboard"))
+
+
+def test_beyond_loopback_needs_a_token(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CANGAUGE_HTTP_TOKEN", raising=False)
+    config = load_config(None, {"model": "m.json", "dashboard": "0.0.0.0:8642"})
+    with pytest.raises(InputError, match=r"dashboard.*reachable from the network"):
+        config.dashboard_address()
+
+
+def test_a_page_that_dies_leaves_the_service_alone() -> None:
+    with (
+        LoggedLines("cangauge.dashboard") as lines,
+        LivePage(http_address("127.0.0.1:0", None, {})) as page,
+    ):
+        latest = snapshot()
+        page._process.kill()
+        page._process.wait()
+        longest_s = 0.0
+        for _ in range(50):
+            began = time.perf_counter()
+            page.show(latest)
+            longest_s = max(longest_s, time.perf_counter() - began)
+            time.sleep(0.002)
+        assert longest_s < 0.05
+        assert any("no longer served" in line for line in lines.lines)
+
+
+def test_the_process_ends_with_the_service() -> None:
+    with LivePage(http_address("127.0.0.1:0", None, {})) as page:
+        process = page._process
+    assert process.returncode is not None
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.1", page.port), 1.0)
