@@ -1,6 +1,6 @@
 """Eleven kinds of files, each from file to SoC plot in at most three commands.
 
-    pip install 'cangauge[mf4,mcap]' scapy batterydf
+    pip install 'cangauge[mf4,mcap]' scapy batterydf pandas
     python examples/own_data.py FOLDER
 
 Makes each file by a tool of its kind, where that is installed, and takes one real export from the
