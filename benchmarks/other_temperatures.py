@@ -80,7 +80,7 @@ def evaluated(
         rows = [fit_rows(log, options) for log in training]
         try:
             two = [
-                fit_voltage_model(rows, options, with_priors=with_prior)[0]
+                fit_voltage_model(rows, options, with_kt_prior=with_prior)[0]
                 for with_prior in (False, True)
             ]
         except InputError:  # SoC range too small

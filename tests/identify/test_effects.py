@@ -257,8 +257,8 @@ def test_held_out_errors_come_from_fits_without_the_row(monkeypatch: pytest.Monk
     assert seen.max() == 1
     assert seen.mean() > 0.5
     rows = [item.rows for item in logs]
-    plain, _ = fit_voltage_model(rows, OPTIONS, with_priors=False)
-    expected = np.concatenate(held_out_errors(rows, OPTIONS, with_priors=False))
+    plain, _ = fit_voltage_model(rows, OPTIONS, with_kt_prior=False)
+    expected = np.concatenate(held_out_errors(rows, OPTIONS, with_kt_prior=False))
     found = validation.errors(ExtendedModel(plain, CAPACITY_AH)).error_v
     np.testing.assert_allclose(found, expected, atol=1e-6)
 

@@ -60,7 +60,7 @@ def test_slow_model_errors_are_not_attributed_to_temperature() -> None:
     log = synthetic_log(noise_v=0.2, model=WITHOUT_KT)
     log = diffusing(at_temperature(log, warming(log, 4.0), WITHOUT_KT))
     rows = [fit_rows(log, OPTIONS)]
-    plain, _ = fit_voltage_model(rows, OPTIONS, with_priors=False)
+    plain, _ = fit_voltage_model(rows, OPTIONS, with_kt_prior=False)
     found = fit([log], capacity_ah=CAPACITY_AH)
     assert abs(plain.kt_v_per_k) > 0.2
     assert abs(found.voltage_model.kt_v_per_k) < 0.5 * abs(plain.kt_v_per_k)
@@ -117,5 +117,7 @@ def test_kt_of_one_drive_of_real_cells_holds_in_the_cold(shared_data: Path) -> N
         volts = everywhere.voltage(row.soc_pct, row.temperature_c, row.delayed_current_a)
         return float(np.sqrt(np.mean((row.voltage_v - volts) ** 2)))
 
-    plain, held = (fit_voltage_model(rows, options, with_priors=held)[0] for held in (False, True))
+    plain, held = (
+        fit_voltage_model(rows, options, with_kt_prior=held)[0] for held in (False, True)
+    )
     assert missed_v(held) < 0.5 * missed_v(plain)

@@ -207,7 +207,7 @@ def fit(
     found = None
     if effect_ids:
         # With effects, cross-validation tests kt too, so its tight prior is not used.
-        plain, _ = fit_voltage_model(rows, options, with_priors=False)
+        plain, _ = fit_voltage_model(rows, options, with_kt_prior=False)
         sampled = [sample_log(log, options) for log in logs]
         found = fit_effects(ExtendedModel(plain, capacity_ah), sampled, effect_ids)
     if found is not None and found.model.effects:
@@ -415,11 +415,7 @@ def _information(
         weight = found.linear.kt_weight
     prior_row = np.zeros(table.shape[1])
     prior_row[first + KT] = weight / scale[KT]
-    prior_rows = [prior_row]
-    if solution.curve_prior is not None:
-        of_curve, target = solution.curve_prior
-        prior_rows.append(np.column_stack([of_curve / scale, target]))
-    root = np.linalg.qr(np.vstack([table, *prior_rows])).R[first:, first:]
+    root = np.linalg.qr(np.vstack([table, prior_row])).R[first:, first:]
     n = columns.shape[1]
     return Information(
         columns=list(names),

@@ -22,7 +22,7 @@ from scipy import optimize
 from cangauge._formatting import significant
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.identify.voltage_fit import fit_voltage_model, rising_with_priors, stacked
+from cangauge.identify.voltage_fit import fit_voltage_model, rising_with_kt_prior, stacked
 from cangauge.inference.rows import FitOptions, FitRows, fit_rows
 from cangauge.logs.gaps import split_where_moved
 from cangauge.logs.log import Log
@@ -261,9 +261,7 @@ class _JointFit:
         span = float(soc.min()), float(soc.max())
         lengths = [len(item) for item in rows]
         # Only the logs' overlap may determine a start, not what curves usually look like.
-        solution, _ = rising_with_priors(
-            table, volts, block, span, options, lengths=lengths, with_curve=False
-        )
+        solution, _ = rising_with_kt_prior(table, volts, block, span, options, lengths=lengths)
         std_pct = solution.std_error[n:]
         # The least squares does not model an error that lasts as long as a log and shifts its whole
         # voltage. Residuals averaged over five minutes show how large those that last are.

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.inference.error_model import KNOTS_PCT, curve_prior_rows
 from cangauge.inference.least_squares import CLUSTER_S, KtPrior, Solution, kt_prior, solve
 from cangauge.inference.linearized import SLOPE_CHECKS
 from cangauge.inference.rows import (
@@ -45,7 +44,7 @@ def fit_voltage_model(
     options: FitOptions,
     keep: Mask | None = None,
     *,
-    with_priors: bool = True,
+    with_kt_prior: bool = True,
 ) -> tuple[VoltageModel, Solution]:
     """Fit the coefficients by least squares with a rising pseudo-OCV.
 
@@ -55,9 +54,8 @@ def fit_voltage_model(
     options : FitOptions
     keep : array of bool, optional
         Rows of all logs, in order, to fit; all by default.
-    with_priors : bool
-        Whether to use the priors on the pseudo-OCV (`error_model.curve_prior`) and on kt
-        (`least_squares.kt_prior`).
+    with_kt_prior : bool
+        Whether to use the prior on kt (`least_squares.kt_prior`).
 
     Raises
     ------
@@ -74,9 +72,11 @@ def fit_voltage_model(
         soc, temperature, current = soc[keep], temperature[keep], current[keep]
     _check_identifiable(rows, soc, current, columns.shape)
     span = float(soc.min()), float(soc.max())
-    if with_priors:
+    if with_kt_prior:
         lengths = np.bincount(number, minlength=len(rows)).tolist()
-        solution, prior = rising_with_priors(columns, volts, block, span, options, lengths=lengths)
+        solution, prior = rising_with_kt_prior(
+            columns, volts, block, span, options, lengths=lengths
+        )
         solution = _with_prior_errors(solution, prior)
     else:
         solution = _rising(columns, volts, block, span, options.epsilon)
@@ -92,24 +92,6 @@ def fit_voltage_model(
         temperature_range_c=(float(temperature.min()), float(temperature.max())),
         current_range_a=(float(current.min()), float(current.max())),
     ), solution
-
-
-def _mean_square_of_means(values: FloatArray, block: NDArray[np.intp]) -> float:
-    """Return the mean square of the blocks' means, weighted by their rows."""
-    count = np.bincount(block)
-    total = np.bincount(block, values)
-    seen = count > 0
-    return float(np.sum(total[seen] ** 2 / count[seen]) / values.size)
-
-
-def _curve_rows(
-    voltage_v: float, variance_v2: float, size: int, epsilon: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return the prior of the pseudo-OCV as columns, shape (m, size), and target, shape (m,)."""
-    weight, target = curve_prior_rows(voltage_v, variance_v2)
-    columns = np.zeros((target.size, size))
-    columns[:, : len(BASIS_NAMES)] = weight @ ocv_basis(KNOTS_PCT, epsilon)
-    return columns, target
 
 
 def _rising(
@@ -144,7 +126,7 @@ def _rising(
     return solution
 
 
-def rising_with_priors(
+def rising_with_kt_prior(
     columns: FloatArray,
     volts: FloatArray,
     block: NDArray[np.intp],
@@ -152,9 +134,8 @@ def rising_with_priors(
     options: FitOptions,
     *,
     lengths: Sequence[int],
-    with_curve: bool = True,
 ) -> tuple[Solution, KtPrior]:
-    """Return the least-squares solution with the priors on kt and on the pseudo-OCV.
+    """Return the least-squares solution with a rising pseudo-OCV and the prior on kt.
 
     Parameters
     ----------
@@ -168,22 +149,16 @@ def rising_with_priors(
     options : FitOptions
     lengths : sequence of int
         Rows of each log.
-    with_curve : bool
-        Whether to use the prior on the pseudo-OCV.
     """
     plain = _rising(columns, volts, block, span_pct, options.epsilon)
     residual_v = volts - columns @ plain.coefficients
-    # The slow error of clusters that count as independent; without an error there is no prior.
-    prior_v2 = CLUSTER_S * options.rate_hz * _mean_square_of_means(residual_v, block)
-    curve = None
-    if with_curve:
-        curve = _curve_rows(float(np.median(volts)), prior_v2, columns.shape[1], options.epsilon)
     of_kt = kt_prior(columns, residual_v, volts, lengths, KT)
     row = np.zeros((1, columns.shape[1]))
     row[0, KT] = of_kt.row_weight
-    priors = [(row, np.zeros(1))] if curve is None else [curve, (row, np.zeros(1))]
-    solution = _rising(columns, volts, block, span_pct, options.epsilon, priors=priors)
-    return replace(solution, constrained=plain.constrained, curve_prior=curve), of_kt
+    solution = _rising(
+        columns, volts, block, span_pct, options.epsilon, priors=[(row, np.zeros(1))]
+    )
+    return replace(solution, constrained=plain.constrained), of_kt
 
 
 def _with_prior_errors(solution: Solution, prior: KtPrior) -> Solution:
@@ -199,7 +174,7 @@ def _with_prior_errors(solution: Solution, prior: KtPrior) -> Solution:
 
 
 def held_out_errors(
-    rows: Sequence[FitRows], options: FitOptions, *, with_priors: bool = True
+    rows: Sequence[FitRows], options: FitOptions, *, with_kt_prior: bool = True
 ) -> list[FloatArray]:
     """Return the held-out errors of each log's rows [V], shape (m,) each.
 
@@ -226,7 +201,7 @@ def held_out_errors(
                 raise  # a log that identifies a model does so without one of its blocks
             refused = error
             continue
-        model, _ = fit_voltage_model(rows, options, training, with_priors=with_priors)
+        model, _ = fit_voltage_model(rows, options, training, with_kt_prior=with_kt_prior)
         lo, hi = model.soc_range_pct
         seen = held_out & (soc > lo - 1.0) & (soc < hi + 1.0)
         errors[seen] = volts[seen] - model.voltage(soc[seen], temperature[seen], delayed[seen])

@@ -396,28 +396,6 @@ def curve_prior(voltage_v: float, soc_pct: FloatArray = KNOTS_PCT) -> tuple[Floa
     return mean, prior
 
 
-def curve_prior_rows(voltage_v: float, variance_v2: float) -> tuple[FloatArray, FloatArray]:
-    """Return the prior of a pseudo-OCV as rows of least squares.
-
-    Parameters
-    ----------
-    voltage_v : float
-        Of the pack [V].
-    variance_v2 : float
-        Variance that makes rows of the fit independent [V²].
-
-    Returns
-    -------
-    weight : array of shape (m, m)
-        Times the curve at `KNOTS_PCT` gives
-    target : array of shape (m,)
-        up to errors of the rows' own variance.
-    """
-    mean, prior = curve_prior(voltage_v)
-    weight = math.sqrt(variance_v2) * np.linalg.inv(np.linalg.cholesky(prior))
-    return weight, weight @ mean
-
-
 def principal_functions(covariance: FloatArray) -> FloatArray:
     """Return functions F with FᵀF close to a covariance, and equal to it on the diagonal.
 

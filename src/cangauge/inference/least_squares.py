@@ -69,8 +69,6 @@ class Solution:
     """Whether a bound is active: the plain solution's pseudo-OCV falls."""
     kt_prior: KtPrior | None = None
     """Prior on the temperature coefficient, if one was used."""
-    curve_prior: tuple[FloatArray, FloatArray] | None = None
-    """Rows (m, p) and target (m,) of the prior on the pseudo-OCV, if one was used."""
 
     def first(self, number: int) -> Solution:
         """Return the solution restricted to the first coefficients."""
