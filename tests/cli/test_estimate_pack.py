@@ -28,7 +28,10 @@ from cangauge.service.pipeline import Pipeline
 from cells_bus import ALL_CELLS, CAR, CELLS_DBC, CELLS_ON_BUS, all_cell_frames
 
 Run = Callable[..., object]
-HEALTH = ["capacity_ah", "capacity_std_ah", "resistance_ratio", "resistance_std", "offset_a"]
+HEALTH = [
+    "capacity_ah", "capacity_std_ah", "resistance_ratio", "resistance_std", "offset_a",
+    "offset_std_a",
+]  # fmt: skip
 POWER = ["discharge_a", "discharge_std_a", "charge_a", "charge_std_a", "energy_wh", "energy_std_wh"]
 
 
@@ -63,7 +66,7 @@ def test_a_log_with_cell_columns(run: Run, made: Path, tmp_path: Path, suffix: s
     assert found["cells"]["cells"] == CELLS_ON_BUS
     assert found["notices"] == []
     columns = pa.parquet.read_table(pack)
-    assert columns.column_names[:12] == ["time_s", *HEALTH, *POWER]
+    assert columns.column_names[:13] == ["time_s", *HEALTH, *POWER]
     assert columns["cell_weakest"].to_pylist()[-1] == 12
     # The last row is that of the last second.
     assert columns["capacity_ah"].to_pylist()[-1] == found["health"]["capacity_ah"]

@@ -67,7 +67,8 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LivePage]:
 
 
 def test_the_latest_status_is_served(page: LivePage) -> None:
-    assert waits(lambda: json.loads(get(page, "/rows")[2])["status"] is not None)
+    # The process may still be starting.
+    assert waits(lambda: json.loads(get(page, "/rows")[2])["status"] is not None, 20.0)
     content = json.loads(get(page, "/rows?span=10min")[2])
     assert content["status"]["bus"] == "virtual x"
     assert content["added"] == len(content["columns"]["time_ms"]) == 1
