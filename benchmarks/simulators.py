@@ -27,6 +27,7 @@ from rich.table import Table
 from cangauge.diagnosis.cross_validation import rms
 from cangauge.diagnosis.simulator import Run, diagnose_simulator
 from cangauge.identify.fit import fit
+from cangauge.identify.starts import with_start
 from cangauge.inference.rows import decimate
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
@@ -152,7 +153,7 @@ def simulated(log: Log, simulator: Simulator, fault: Injected = FAULTS[0]) -> Ru
     start_pct = START_PCT + fault.start_pct
     volts = simulator(given, start_pct, fault.capacity_factor)
     keep = np.isfinite(volts)
-    return Run.started(given.rows(keep), volts[keep], start_pct)
+    return Run(with_start(given.rows(keep), start_pct), volts[keep])
 
 
 @dataclass(frozen=True)

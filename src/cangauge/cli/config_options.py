@@ -11,7 +11,8 @@ import typer
 
 from cangauge.bus.open import parse_bus_options
 from cangauge.errors import InputError
-from cangauge.service.config import ConfigKey, config_keys
+from cangauge.service.config import config_keys
+from cangauge.service.config_tables import ConfigKey
 
 _KEYS: Final = {key.name: key for key in config_keys() if key.option}
 _TYPES: Final[Mapping[str, type]] = {"number": float, "true or false": bool}

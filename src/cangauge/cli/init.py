@@ -319,8 +319,8 @@ def _by_physics(
         comments=(
             f"Found by physics in {findings.duration_s:.0f} s of frames: {findings.fields} numbers"
             f" of {findings.streams} ids.",
-            "Bits do not tell factors: compare voltage and current with a meter or the car's",
-            "display, and correct factor and offset in the DBC.",
+            "The bits do not determine the factors: compare voltage and current with a",
+            "meter or the car's display, and correct factor and offset in the DBC.",
             *findings.remarks,
             *([f"Slow and plausible as a temperature: {', '.join(hints)}."] if hints else []),
         ),

@@ -6,12 +6,12 @@ import os
 import sys
 import time
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 
 from cangauge._formatting import number, printable
+from cangauge.cli.options import EndpointOption, TokenFileOption
 from cangauge.cli.output import print_table
 from cangauge.cli.status import USABLE, status_rows
 from cangauge.errors import CangaugeError, InputError
@@ -23,21 +23,8 @@ LINE_EVERY_S: Final = 1.0
 
 
 def monitor_command(
-    endpoint: Annotated[
-        str | None,
-        typer.Option(
-            metavar="PATH|URL",
-            help="Unix socket of the service, or http://HOST:PORT. Default: the service running on"
-            " this machine.",
-        ),
-    ] = None,
-    token_file: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="File with the bearer token of an HTTP endpoint; or in CANGAUGE_HTTP_TOKEN.",
-        ),
-    ] = None,
+    endpoint: EndpointOption = None,
+    token_file: TokenFileOption = None,
     once: Annotated[
         bool, typer.Option("--once", help="Print one snapshot as text, and exit.")
     ] = False,

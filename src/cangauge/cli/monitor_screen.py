@@ -45,7 +45,7 @@ _WORDS: Final = {
     reason_name(reason).replace(" ", "_"): words for reason, words in REASON_WORDS.items()
 }
 _HELP: Final = """\
-p      pause: the screen stands still, the history goes on
+p      pause the display; recording of the history continues
 r      range of the charts: 1 min, 10 min, 1 h, all
 ?      this help; Escape closes it
 q      quit; the service is not touched

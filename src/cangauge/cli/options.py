@@ -79,6 +79,23 @@ SignOption = Annotated[
         " found from the data.",
     ),
 ]
+EndpointOption = Annotated[
+    str | None,
+    typer.Option(
+        "--endpoint",
+        metavar="PATH|URL",
+        help="Unix socket of the service, or http://HOST:PORT. Default: the service running on this"
+        " machine.",
+    ),
+]
+TokenFileOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--token-file",
+        metavar="FILE",
+        help="File with the bearer token of an HTTP endpoint; or in CANGAUGE_HTTP_TOKEN.",
+    ),
+]
 JsonOption = Annotated[
     bool,
     typer.Option("--json", help="Print exactly one JSON object on stdout, also for an error."),

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from cangauge.diagnosis.simulator import Run, SimulatorDiagnosis
+from cangauge.diagnosis.simulator import Run, SimulatorDiagnosis, start_of
 from cangauge.errors import InputError
+from cangauge.identify.starts import with_start
 from cangauge.logs.canonical import write_table
 from cangauge.logs.column_map import ColumnMap, ColumnSpec
 from cangauge.logs.log import Log
@@ -78,15 +79,11 @@ class SimulatorOptions:
         InputError
             If the column or function is missing, or the voltages do not fit the log.
         """
-        known = log.first_soc()
-        start_pct = initial_soc_pct if known is None or initial_soc_pct is not None else known[1]
+        if initial_soc_pct is not None:
+            log = with_start(log, initial_soc_pct)
         if self.column is not None:
-            volts = self._of_column(log, path)
-        elif start_pct is None:
-            return Run(log, np.zeros(len(log)))  # raises: the SoC is unknown
-        else:
-            volts = self._of_function(log, start_pct)
-        return Run(log, volts) if start_pct is None else Run.started(log, volts, start_pct)
+            return Run(log, self._of_column(log, path))
+        return Run(log, self._of_function(log, start_of(log)))
 
     def _of_column(self, log: Log, path: Path) -> Any:
         specs = dict(ColumnMap.of(self.columns or {}, "--columns").specs)

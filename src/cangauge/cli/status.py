@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
 import typer
 
 from cangauge._formatting import NONE_KNOWN, duration, number
-from cangauge.cli.options import JsonOption
+from cangauge.cli.options import EndpointOption, JsonOption, TokenFileOption
 from cangauge.cli.output import emit_json, print_table
 from cangauge.errors import CangaugeError
 from cangauge.service.status_client import NotRunningError, fetch_status, find_socket
@@ -17,21 +16,8 @@ USABLE: Final = frozenset({"valid", "degraded"})
 
 
 def status_command(
-    endpoint: Annotated[
-        str | None,
-        typer.Option(
-            metavar="PATH|URL",
-            help="Unix socket of the service, or http://HOST:PORT. Default: the service running on"
-            " this machine.",
-        ),
-    ] = None,
-    token_file: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="File with the bearer token of an HTTP endpoint; or in CANGAUGE_HTTP_TOKEN.",
-        ),
-    ] = None,
+    endpoint: EndpointOption = None,
+    token_file: TokenFileOption = None,
     json_output: JsonOption = False,
 ) -> None:
     """Show the state of a running service: SoC ± standard deviation [%], frames, delays.

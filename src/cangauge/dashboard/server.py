@@ -58,8 +58,8 @@ class Site:
         self.history = history
         self.token = token
         self.id = secrets.token_hex(8)
-        """Tells viewers that rows are counted anew, after a restart."""
-        # The same after a restart, so that an open page goes on; tells nothing about the token.
+        """Key of this run; another one means that the row numbers start again."""
+        # The same after a restart, so that an open page stays logged in; does not reveal the token.
         self.pass_word = "" if token is None else _cookie_of(token)
         environment = Environment(
             loader=PackageLoader("cangauge.dashboard", "page"),

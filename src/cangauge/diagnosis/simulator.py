@@ -20,7 +20,6 @@ from cangauge.diagnosis.diagnose import Diagnosis, diagnose
 from cangauge.diagnosis.verdict import ALARM_BELOW
 from cangauge.errors import InputError
 from cangauge.identify.fit import fit
-from cangauge.identify.starts import with_start
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 
@@ -36,6 +35,25 @@ CORRECTIONS: Final = {
 }
 """Effect → what to change in the simulator's inputs or parameters, or in the measurement. The
 others add a voltage, by the equation in the model file."""
+
+
+def start_of(log: Log) -> float:
+    """Return the SoC that a simulation of a log starts from [%].
+
+    Raises
+    ------
+    InputError
+        If the log has no reference SoC.
+    """
+    first = log.first_soc()
+    if first is None:
+        raise InputError(
+            "unknown SoC at the start of the simulation",
+            source=log.source or log.name,
+            field="soc_pct",
+            cure="give a log with soc_pct, or the initial SoC",
+        )
+    return first[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,19 +94,8 @@ class Run:
                 value=float(volts[bad[0]]),
                 cure="end the log before the simulator stops, or simulate it whole",
             )
-        if self.log.first_soc() is None:
-            raise InputError(
-                "unknown SoC at the start of the simulation",
-                source=where,
-                field="soc_pct",
-                cure="give a log with soc_pct, or the initial SoC",
-            )
+        start_of(self.log)
         object.__setattr__(self, "simulated_v", volts)
-
-    @classmethod
-    def started(cls, log: Log, simulated_v: FloatArray, initial_soc_pct: float) -> Run:
-        """Return the run of a log without a reference SoC, started at `initial_soc_pct` [%]."""
-        return cls(with_start(log, initial_soc_pct), simulated_v)
 
     @property
     def simulated(self) -> Log:

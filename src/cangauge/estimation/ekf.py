@@ -21,7 +21,7 @@ load.
 
 a and c are *considered*: the filter keeps their covariance with the other states, so that the
 SoC's standard deviation contains the error of the curve wherever the SoC moves, but does not learn
-them: from one drive the shape of a curve cannot be told from errors of the charge, and a filter
+them: from one drive the shape of a curve is not separable from errors of the charge, and a filter
 that tries believes a wrong shape more than a wrong level (Schmidt–Kalman filter; Jazwinski,
 Stochastic Processes and Filtering Theory, 1970, ch. 8.4). A correction by more than `LINEAR_PCT`
 is iterated (ibid., ch. 8.3).
@@ -76,8 +76,8 @@ an end of the curve it would attribute what the clipped SoC cannot explain to it
 
 LINEAR_PCT = 1.0
 ITERATIONS_AT_MOST = 8
-"""A correction by more than this [%] is repeated, linearized at its own result (iterated extended
-Kalman filter; Jazwinski 1970, ch. 8.3), at most so often."""
+"""A correction by more than the first [%] is repeated, linearized at its own result, up to the
+second number of times (iterated extended Kalman filter; Jazwinski 1970, ch. 8.3)."""
 
 LASTING_TIME_S = 7200.0
 """Time constant of a lasting error whose logs are not known [s]: they are seldom longer."""

@@ -260,8 +260,9 @@ class _JointFit:
         table = np.hstack([columns, of_starts])
         span = float(soc.min()), float(soc.max())
         lengths = [len(item) for item in rows]
-        # Only the logs' overlap may determine a start, not what curves usually look like.
-        solution, _ = rising_with_kt_prior(table, volts, block, span, options, lengths=lengths)
+        solution, _ = rising_with_kt_prior(
+            table, volts, block, span, options.epsilon, lengths=lengths
+        )
         std_pct = solution.std_error[n:]
         # The least squares does not model an error that lasts as long as a log and shifts its whole
         # voltage. Residuals averaged over five minutes show how large those that last are.

@@ -75,7 +75,7 @@ def fit_voltage_model(
     if with_kt_prior:
         lengths = np.bincount(number, minlength=len(rows)).tolist()
         solution, prior = rising_with_kt_prior(
-            columns, volts, block, span, options, lengths=lengths
+            columns, volts, block, span, options.epsilon, lengths=lengths
         )
         solution = _with_prior_errors(solution, prior)
     else:
@@ -100,20 +100,14 @@ def _rising(
     block: NDArray[np.intp],
     span_pct: tuple[float, float],
     epsilon: float,
-    *,
-    priors: Sequence[tuple[FloatArray, FloatArray]] = (),
 ) -> Solution:
     """Return the least-squares solution whose pseudo-OCV rises over a span of SoC [%].
 
-    Columns beyond those of `design_matrix` may follow. `priors` are further rows and their targets;
-    each counts as a block of its own.
+    Columns beyond those of `design_matrix` may follow.
     """
     at_least = SLOPE_AT_LEAST * float(np.median(volts))
     grid = np.linspace(*span_pct, SLOPE_CHECKS)
     between = np.linspace(*span_pct, SLOPE_POINTS)
-    for more, target in priors:
-        columns, volts = np.vstack([columns, more]), np.append(volts, target)
-        block = np.append(block, block.max() + 1 + np.arange(target.size))
     for _ in range(REFINED_AT_MOST):
         bounds = np.zeros((grid.size, columns.shape[1]))
         bounds[:, : len(BASIS_NAMES)] = ocv_basis_slope(grid, epsilon)
@@ -131,7 +125,7 @@ def rising_with_kt_prior(
     volts: FloatArray,
     block: NDArray[np.intp],
     span_pct: tuple[float, float],
-    options: FitOptions,
+    epsilon: float,
     *,
     lengths: Sequence[int],
 ) -> tuple[Solution, KtPrior]:
@@ -146,19 +140,22 @@ def rising_with_kt_prior(
         Block of correlated rows that each row belongs to.
     span_pct : pair of float
         SoC over which the pseudo-OCV rises [%].
-    options : FitOptions
+    epsilon : float
     lengths : sequence of int
         Rows of each log.
     """
-    plain = _rising(columns, volts, block, span_pct, options.epsilon)
-    residual_v = volts - columns @ plain.coefficients
-    of_kt = kt_prior(columns, residual_v, volts, lengths, KT)
-    row = np.zeros((1, columns.shape[1]))
-    row[0, KT] = of_kt.row_weight
+    solution = _rising(columns, volts, block, span_pct, epsilon)
+    prior = kt_prior(columns, volts - columns @ solution.coefficients, volts, lengths, KT)
+    row = np.zeros(columns.shape[1])
+    row[KT] = prior.row_weight
     solution = _rising(
-        columns, volts, block, span_pct, options.epsilon, priors=[(row, np.zeros(1))]
+        np.vstack([columns, row]),
+        np.append(volts, 0.0),
+        np.append(block, block.max() + 1),
+        span_pct,
+        epsilon,
     )
-    return replace(solution, constrained=plain.constrained), of_kt
+    return solution, prior
 
 
 def _with_prior_errors(solution: Solution, prior: KtPrior) -> Solution:

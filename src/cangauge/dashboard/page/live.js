@@ -39,7 +39,7 @@
       "Charge for 10 s": pm(power?.charge_a, power?.charge_std_a, 1, "A"),
       "Energy left": pm(scaled(power?.energy_wh, 1e-3), scaled(power?.energy_std_wh, 1e-3), 2, "kWh"),
       ...(cells ? {
-        "Weakest cell": cells.weakest === null ? "not told apart" : `number ${cells.weakest} of ${cells.cells}`,
+        "Weakest cell": cells.weakest === null ? "not distinguishable" : `number ${cells.weakest} of ${cells.cells}`,
         "SoC of that cell": pm(cells.soc_pct, cells.soc_std_pct, 1, "%"),
       } : {}),
       "Frames": num(latest.frames_per_s, 0, "/s"),
