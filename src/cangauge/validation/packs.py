@@ -497,6 +497,7 @@ def _judge(task: _Task) -> _Done:
         capacity = task.pack.capacity_ah or capacity_from_reference(task.training)
         model = fit(task.training, capacity_ah=capacity, effects=task.effects).model
         plain = fit(task.training, capacity_ah=capacity).model if task.effects else model
+        model.extended_model()  # refuses coefficients that no pack has
     except InputError as error:
         return _Done(failure=Failure(task.pack.name, task.size, task.split, str(error)))
     fit_seconds = time.perf_counter() - began
