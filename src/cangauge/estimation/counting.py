@@ -71,7 +71,7 @@ def parked_std_pct(seconds: float, rms_pct_per_s: float) -> float:
     """
     drain_pct = min(DRAIN_PCT_PER_HOUR * seconds / 3600.0, DRAIN_AT_MOST_PCT)
     use_pct = min(rms_pct_per_s * min(seconds, USE_S), MOVED_STD_AT_MOST_PCT)
-    return math.hypot(drain_pct, use_pct)
+    return math.sqrt(drain_pct * drain_pct + use_pct * use_pct)
 
 
 def moved_std_pct(seconds: float) -> float:
@@ -145,10 +145,10 @@ class CoulombCounter:
         # At the start of a drive the mean square lags: the currents at the ends of the gap bound it
         # from below.
         mean_square_a2 = state.mean_square_a2
-        state.mean_square_a2 = kept * state.mean_square_a2 + (1.0 - kept) * current_a**2
+        state.mean_square_a2 = kept * state.mean_square_a2 + (1.0 - kept) * (current_a * current_a)
         if seconds > self._bridge_s:
             away_pct = min(AWAY_PCT_PER_HOUR * seconds / 3600.0, AWAY_AT_MOST_PCT)
-            rms_a = math.sqrt(max(mean_square_a2, last_a**2))
+            rms_a = math.sqrt(max(mean_square_a2, last_a * last_a))
             parked_pct = parked_std_pct(seconds, rms_a * self._pct_per_as)
             return ChargeStep(seconds, 0.0, away_pct, seconds, parked_pct)
         state.counted_s += seconds
@@ -157,7 +157,7 @@ class CoulombCounter:
         state.moved_pct += abs(out_pct)
         if seconds <= self._gap_s:
             return ChargeStep(seconds, out_pct, 0.0)
-        rms_a = math.sqrt(max(mean_square_a2, 0.5 * (current_a**2 + last_a**2)))
+        rms_a = math.sqrt(max(mean_square_a2, 0.5 * (current_a * current_a + last_a * last_a)))
         return ChargeStep(seconds, out_pct, rms_a * seconds * self._pct_per_as)
 
     def uncounted_std_pct(self, seconds: float) -> float:
@@ -165,7 +165,7 @@ class CoulombCounter:
         state = self.state
         if math.isnan(state.time_s):
             return 0.0
-        rms_a = math.sqrt(max(state.mean_square_a2, state.current_a**2))
+        rms_a = math.sqrt(max(state.mean_square_a2, state.current_a * state.current_a))
         return min(rms_a * seconds * self._pct_per_as, MOVED_STD_AT_MOST_PCT)
 
     def restore(self, state: CounterState) -> None:

@@ -27,6 +27,7 @@ from typing import ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
 
+from cangauge._arithmetic import total
 from cangauge._typing import FloatArray
 from cangauge.model.coulomb_counting import BRIDGE_S, discharged_ah
 from cangauge.model.delay_line import delayed_currents
@@ -87,10 +88,10 @@ class Pack:
             voltage_v=volts,
             capacity_ah=capacity_ah,
             resistance_ohm=max(
-                abs(sum(model.resistance_ohm)), RESISTANCE_AT_LEAST * volts / capacity_ah
+                abs(total(model.resistance_ohm)), RESISTANCE_AT_LEAST * volts / capacity_ah
             ),
             cells=max(1, round(volts / 3.7)),
-            temperature_c=min(max(0.5 * sum(model.temperature_range_c), coldest), hottest),
+            temperature_c=min(max(0.5 * total(model.temperature_range_c), coldest), hottest),
         )
 
 

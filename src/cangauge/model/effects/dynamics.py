@@ -8,6 +8,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
+from cangauge._arithmetic import total
 from cangauge._typing import FloatArray
 from cangauge.model.coulomb_counting import BRIDGE_S
 from cangauge.model.effects.base import Effect, OnlineEffect, Pack, PackState, Parameter, Values
@@ -52,7 +53,7 @@ class _OnlineRc(OnlineEffect):
         self._set_volts(1.0)  # the temperature comes with the next sample
 
     def _set_volts(self, colder: float) -> None:
-        self.volts = sum(
+        self.volts = total(
             -ohm * colder * lag.value for ohm, lag in zip(self._ohm, self.lags, strict=True)
         )
 
@@ -162,7 +163,7 @@ def _elements(values: Values) -> list[tuple[float, float]]:
     """Return resistance [Ω] and time constant [s] of each element, the slowest first."""
     weights = [(values["spread"] / RESISTANCE_RATIO) ** k for k in range(ELEMENTS)]
     return [
-        (values["ohm"] * weight / sum(weights), values["tau_s"] / TAU_RATIO**k)
+        (values["ohm"] * weight / total(weights), values["tau_s"] / TAU_RATIO**k)
         for k, weight in enumerate(weights)
         if weight > 0.0
     ]

@@ -8,6 +8,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
+from cangauge._arithmetic import total
 from cangauge._typing import FloatArray
 from cangauge.model.coulomb_counting import BRIDGE_S
 from cangauge.model.effects.base import (
@@ -204,9 +205,10 @@ class _OcvShapeOnline(OnlineEffect):
 
     def extra_voltage(self, soc_pct: float) -> float:
         soc = min(max(soc_pct, 0.0), 100.0)
-        return sum(
-            height * math.exp(-0.5 * ((soc - centre) / width) ** 2)
+        return total(
+            height * math.exp(-0.5 * away * away)
             for height, centre, width in self._bumps
+            for away in ((soc - centre) / width,)
         )
 
 

@@ -124,7 +124,8 @@ class _CoreTemperatureOnline(OnlineEffect):
 
     def correct(self, reading: Reading) -> Sequence[Reading]:
         time_s, current_a, voltage_v, temperature_c = reading
-        above = self._above.step(time_s, (current_a / self._capacity_ah) ** 2)
+        rate = current_a / self._capacity_ah
+        above = self._above.step(time_s, rate * rate)
         core = temperature_c + self._rise_k * above
         if self._late and not math.isnan(temperature_c):
             core += self._late * (self._followed.step(time_s, temperature_c) - temperature_c)
