@@ -319,11 +319,14 @@ static void update_with_voltage(cg_estimator *self, const cg_sample *sample, cg_
         cg_resistance_std(model, memory->temperature_c) * (mean_a * model->steady_ohm);
     (void)cg_pseudo_ocv(self, memory->newton_pct, &slope);
     cg_curve_functions(model, memory->newton_pct, functions_v);
-    const cg_real bias_v2 = cg_square(model->slow_std_v) + cg_square(model->lasting_std_v);
-    const cg_real curve_v2 = cg_dot(functions_v, functions_v, 0, model->functions);
-    const cg_real error_v =
-        cg_sqrt(cg_square(seen.std_v) + bias_v2 + curve_v2 + cg_square(seen.kt_std_v) +
-                cg_square(seen.resistance_std_v));
+    const cg_real part_v[5] = {
+        seen.std_v,
+        cg_sqrt(cg_square(model->slow_std_v) + cg_square(model->lasting_std_v)),
+        cg_sqrt(cg_dot(functions_v, functions_v, 0, model->functions)),
+        seen.kt_std_v,
+        seen.resistance_std_v,
+    };
+    const cg_real error_v = cg_sqrt(cg_dot(part_v, part_v, 0, 5));
     memory->newton_std_pct = cg_min(error_v / slope, R(CG_UNKNOWN_SOC_STD_PCT));
     if (isnan(memory->coulomb_start_pct)) {
         start(self, memory->newton_pct, R(CG_UNKNOWN_SOC_STD_PCT));
@@ -691,6 +694,7 @@ static void forget(cg_state *state)
     state->clock.behind_s = (cg_time)NAN;
     state->counter.time_s = (cg_time)NAN;
     state->filter.hypotheses = 1;
+    state->filter.wide_std_pct = R(CG_UNKNOWN_SOC_STD_PCT);
     state->memory.tick = -1;
     state->memory.temperature_c = nan;
     state->memory.newton_pct = nan;

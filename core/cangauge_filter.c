@@ -142,9 +142,9 @@ static bool ekf_is_contradicted(cg_ekf *ekf, const cg_model *model, const cg_mea
     }
     cg_real mean_var = cg_square(model->slow_std_v) + cg_square(model->lasting_std_v) +
                        cg_dot(jacobian, jacobian, CG_X_KT, cg_states(model));
-    mean_var += cg_square(jacobian[CG_X_SOC]) * ekf->p[CG_X_SOC][CG_X_SOC];
-    mean_var += cg_square(seen->resistance_std_v) +
-                (cg_square(seen->std_v) * seconds / (R(2.0) * R(PERSISTENT_S)));
+    mean_var += (cg_square(jacobian[CG_X_SOC]) * ekf->p[CG_X_SOC][CG_X_SOC]) +
+                cg_square(seen->resistance_std_v);
+    mean_var += cg_square(seen->std_v) * seconds / (R(2.0) * R(PERSISTENT_S));
     const cg_real known = R(1.0) - cg_exp(-ekf->mean_seconds / R(PERSISTENT_S));
     const cg_real mean = ekf->mean_innovation_v / known;
     return cg_square(mean) > (cg_square(R(PERSISTENT_SIGMAS)) * mean_var);
@@ -323,7 +323,74 @@ static void filter_open(cg_filter *filter, cg_real log_odds, cg_real wide_std_pc
     filter->open_s = R(0.0);
 }
 
-/* Replace two hypotheses by one with their weighted mean and spread. */
+static cg_real soc_std_pct(const cg_ekf *ekf)
+{
+    return cg_sqrt(cg_max(ekf->p[CG_X_SOC][CG_X_SOC], R(0.0)));
+}
+
+/* Probability of +-width of a normal distribution with a mean, and its slope. */
+static cg_real within(cg_real width, cg_real away, cg_real std, cg_real *density)
+{
+    const cg_real scale = cg_max(std, R(NARROWEST_PCT)) * R(SQRT_2);
+    const cg_real low = (-width - away) / scale;
+    const cg_real high = (width - away) / scale;
+    *density = (cg_exp(-(low * low)) + cg_exp(-(high * high))) / (scale * R(SQRT_PI));
+    return R(0.5) * (cg_erf(high) - cg_erf(low));
+}
+
+/* Half of the half-width that contains as much of two hypotheses as two sigma of a normal one. */
+static cg_real stated_std_pct(const cg_filter *filter, const cg_real *away, const cg_real *std)
+{
+    cg_real low = R(0.0);
+    cg_real width = R(0.0);
+    cg_real high = cg_max(away[0] + (R(3.0) * std[0]), away[1] + (R(3.0) * std[1]));
+    cg_real step = high;
+    for (int32_t k = 0; (k < WIDTH_STEPS_AT_MOST) && (cg_fabs(step) > R(CG_CLOSE_PCT)); ++k) {
+        cg_real density[2];
+        const cg_real one = within(width, away[0], std[0], &density[0]);
+        const cg_real other = within(width, away[1], std[1], &density[1]);
+        const cg_real missing = R(TWO_SIGMA) - mean_of(filter, one, other);
+        if (missing > R(0.0)) {
+            low = width;
+        } else {
+            high = width;
+        }
+        const cg_real slope = mean_of(filter, density[0], density[1]);
+        cg_real following = (slope > R(0.0)) ? (width + (missing / slope)) : R(INFINITY);
+        if (!((low < following) && (following < high))) {
+            following = R(0.5) * (low + high);
+        }
+        step = following - width;
+        width = following;
+    }
+    return R(0.5) * width;
+}
+
+/* SoC, its standard deviation and the charge that the offset adds, of one or two hypotheses. */
+typedef struct {
+    cg_real soc_pct;
+    cg_real std_pct;
+    cg_real offset_pct;
+} mixture;
+
+static mixture mix(const cg_filter *filter, cg_real pct_per_a)
+{
+    const cg_ekf *one = &filter->ekf[0];
+    const cg_ekf *other = &filter->ekf[1];
+    mixture mixed = {one->x[CG_X_SOC], soc_std_pct(one), pct_per_a * one->x[CG_X_OFFSET]};
+    if (filter->hypotheses > 1) {
+        const cg_real std[2] = {mixed.std_pct, soc_std_pct(other)};
+        mixed.soc_pct = mean_of(filter, one->x[CG_X_SOC], other->x[CG_X_SOC]);
+        mixed.offset_pct =
+            mean_of(filter, mixed.offset_pct, pct_per_a * other->x[CG_X_OFFSET]);
+        const cg_real away[2] = {cg_fabs(one->x[CG_X_SOC] - mixed.soc_pct),
+                                 cg_fabs(other->x[CG_X_SOC] - mixed.soc_pct)};
+        mixed.std_pct = stated_std_pct(filter, away, std);
+    }
+    return mixed;
+}
+
+/* Replace two hypotheses by one with their mean, covariance, and the deviation stated. */
 static void filter_merge(cg_filter *filter, int32_t size)
 {
     if (filter->hypotheses == 1) {
@@ -331,23 +398,30 @@ static void filter_merge(cg_filter *filter, int32_t size)
     }
     cg_ekf *one = &filter->ekf[0];
     const cg_ekf *other = &filter->ekf[1];
-    const cg_real second = second_probability(filter);
-    const cg_real first = R(1.0) - second;
+    const cg_real std_pct = mix(filter, R(0.0)).std_pct;
     cg_real from_one[CG_STATES];
     cg_real from_other[CG_STATES];
     for (int32_t k = 0; k < size; ++k) {
-        const cg_real x = (first * one->x[k]) + (second * other->x[k]);
+        const cg_real x = mean_of(filter, one->x[k], other->x[k]);
         from_one[k] = one->x[k] - x;
         from_other[k] = other->x[k] - x;
         one->x[k] = x;
     }
     for (int32_t k = 0; k < size; ++k) {
         for (int32_t j = 0; j < size; ++j) {
-            one->p[k][j] = (first * (one->p[k][j] + (from_one[k] * from_one[j]))) +
-                           (second * (other->p[k][j] + (from_other[k] * from_other[j])));
+            one->p[k][j] = mean_of(filter, one->p[k][j] + (from_one[k] * from_one[j]),
+                                   other->p[k][j] + (from_other[k] * from_other[j]));
         }
     }
-    if (second > R(0.5)) {
+    const cg_real variance = one->p[CG_X_SOC][CG_X_SOC];
+    const cg_real scale = (variance > R(0.0)) ? (std_pct / cg_sqrt(variance)) : R(1.0);
+    for (int32_t k = 0; k < size; ++k) {
+        one->p[CG_X_SOC][k] = scale * one->p[CG_X_SOC][k];
+    }
+    for (int32_t k = 0; k < size; ++k) {
+        one->p[k][CG_X_SOC] *= scale;
+    }
+    if (filter->log_odds > R(0.0)) {
         one->mean_innovation_v = other->mean_innovation_v;
         one->mean_seconds = other->mean_seconds;
     }
@@ -388,11 +462,6 @@ void cg_filter_predict(cg_filter *filter, const cg_model *model, const cg_since 
     if (filter->hypotheses > 1) {
         ekf_predict(&filter->ekf[1], model, since, second_var_pct2);
     }
-}
-
-static cg_real soc_std_pct(const cg_ekf *ekf)
-{
-    return cg_sqrt(cg_max(ekf->p[CG_X_SOC][CG_X_SOC], R(0.0)));
 }
 
 /* Log odds of the second hypothesis, given all voltages (Savage-Dickey ratio). */
@@ -467,70 +536,21 @@ bool cg_filter_is_lost(const cg_filter *filter, int32_t size)
     return false;
 }
 
-/* Probability of +-width of a normal distribution with a mean, and its slope. */
-static cg_real within(cg_real width, cg_real away, cg_real std, cg_real *density)
-{
-    const cg_real scale = cg_max(std, R(NARROWEST_PCT)) * R(SQRT_2);
-    const cg_real low = (-width - away) / scale;
-    const cg_real high = (width - away) / scale;
-    *density = (cg_exp(-(low * low)) + cg_exp(-(high * high))) / (scale * R(SQRT_PI));
-    return R(0.5) * (cg_erf(high) - cg_erf(low));
-}
-
-/* Half of the half-width that contains as much of two hypotheses as two sigma of a normal one. */
-static cg_real stated_std_pct(const cg_filter *filter, const cg_real *away, const cg_real *std)
-{
-    cg_real low = R(0.0);
-    cg_real width = R(0.0);
-    cg_real high = cg_max(away[0] + (R(3.0) * std[0]), away[1] + (R(3.0) * std[1]));
-    cg_real step = high;
-    for (int32_t k = 0; (k < WIDTH_STEPS_AT_MOST) && (cg_fabs(step) > R(CG_CLOSE_PCT)); ++k) {
-        cg_real density[2];
-        const cg_real one = within(width, away[0], std[0], &density[0]);
-        const cg_real other = within(width, away[1], std[1], &density[1]);
-        const cg_real missing = R(TWO_SIGMA) - mean_of(filter, one, other);
-        if (missing > R(0.0)) {
-            low = width;
-        } else {
-            high = width;
-        }
-        const cg_real slope = mean_of(filter, density[0], density[1]);
-        cg_real following = (slope > R(0.0)) ? (width + (missing / slope)) : R(INFINITY);
-        if (!((low < following) && (following < high))) {
-            following = R(0.5) * (low + high);
-        }
-        step = following - width;
-        width = following;
-    }
-    return R(0.5) * width;
-}
-
 /* SoC after the charge counted since the last update, and its standard deviation. */
 cg_real cg_filter_soc(const cg_estimator *self, cg_real *std_pct)
 {
     const cg_filter *filter = &self->state.filter;
     const cg_since *since = &self->state.since;
-    const cg_real counted = cg_pct_per_as(self->model) * (since->seconds - since->away_s);
-    const cg_ekf *one = &filter->ekf[0];
-    const cg_ekf *other = &filter->ekf[1];
-    cg_real soc_pct = one->x[CG_X_SOC];
-    cg_real stated_pct = soc_std_pct(one);
-    cg_real offset_pct = counted * one->x[CG_X_OFFSET];
-    if (filter->hypotheses > 1) {
-        soc_pct = mean_of(filter, one->x[CG_X_SOC], other->x[CG_X_SOC]);
-        offset_pct = mean_of(filter, offset_pct, counted * other->x[CG_X_OFFSET]);
-        const cg_real away[2] = {cg_fabs(one->x[CG_X_SOC] - soc_pct), cg_fabs(other->x[CG_X_SOC] - soc_pct)};
-        const cg_real std[2] = {stated_pct, soc_std_pct(other)};
-        stated_pct = stated_std_pct(filter, away, std);
-    }
-    soc_pct -= since->discharged_pct - offset_pct;
+    const cg_real counted_s = since->seconds - since->away_s;
+    const mixture mixed = mix(filter, cg_pct_per_as(self->model) * counted_s);
+    const cg_real soc_pct = mixed.soc_pct - (since->discharged_pct - mixed.offset_pct);
     cg_real var_pct2 = since->gap_var_pct2 + since->unseen_var_pct2;
     if (since->away_s != R(0.0)) {
         const cg_real odds = cg_exp(moved_log_odds(since->away_s));
         const cg_real moved_pct = moved_std_pct(since->away_s);
         var_pct2 += odds / (R(1.0) + odds) * cg_square(moved_pct);
     }
-    *std_pct = cg_sqrt(cg_square(stated_pct) + var_pct2);
+    *std_pct = cg_sqrt(cg_square(mixed.std_pct) + var_pct2);
     return cg_clip_soc(soc_pct);
 }
 

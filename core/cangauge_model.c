@@ -463,7 +463,7 @@ static cg_real ocv_shape_v(const cg_real *height_v, cg_real soc_pct)
     cg_real volts = R(0.0);
     for (int32_t k = 0; k < BUMPS; ++k) {
         const cg_real away = (soc - CENTRES_PCT[k]) / WIDTHS_PCT[k];
-        volts += height_v[k] * cg_exp(R(-0.5) * (away * away));
+        volts += height_v[k] * cg_exp(R(-0.5) * away * away);
     }
     return volts;
 }

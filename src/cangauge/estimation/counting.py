@@ -114,6 +114,8 @@ class CoulombCounter:
     ----------
     state : CounterState
         Charge counted so far, and the last sample.
+    is_restored : bool
+        Whether no sample has come since the state was restored.
     """
 
     def __init__(self, capacity_ah: float, gap_s: float) -> None:
@@ -121,7 +123,7 @@ class CoulombCounter:
         self._gap_s = gap_s
         # Of a slow log the usual step may exceed a minute; as offline (`logs.gaps.bridge_s`).
         self._bridge_s = max(BRIDGE_S, gap_s)
-        self._is_restored = False
+        self.is_restored = False
         self.state = CounterState()
 
     def step(self, time_s: float, current_a: float) -> ChargeStep:
@@ -135,10 +137,10 @@ class CoulombCounter:
             return ChargeStep(0.0, 0.0, 0.0)
         seconds = time_s - last_s
         across_a = 0.5 * (current_a + last_a)
-        if self._is_restored and seconds > self._gap_s:
+        if self.is_restored and seconds > self._gap_s:
             held = HELD_S / seconds * -math.expm1(-0.5 * seconds / HELD_S)
             across_a = state.mean_a + held * (current_a + last_a - 2.0 * state.mean_a)
-        self._is_restored = False
+        self.is_restored = False
         kept = math.exp(-seconds / MEAN_MEMORY_S)
         state.mean_a = kept * state.mean_a + (1.0 - kept) * current_a
         kept = math.exp(-seconds / MEAN_SQUARE_MEMORY_S)
@@ -168,10 +170,10 @@ class CoulombCounter:
         rms_a = math.sqrt(max(state.mean_square_a2, state.current_a * state.current_a))
         return min(rms_a * seconds * self._pct_per_as, MOVED_STD_AT_MOST_PCT)
 
-    def restore(self, state: CounterState) -> None:
+    def restore(self, state: CounterState, *, is_restored: bool = True) -> None:
         """Continue from a state after a restart; the counter works on it."""
         self.state = state
-        self._is_restored = True
+        self.is_restored = is_restored
 
 
 LATEST_S = 1e11

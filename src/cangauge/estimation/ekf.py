@@ -390,6 +390,10 @@ class SocEkf:
             or not np.linalg.eigvalsh(correlation)[0] > -ROUNDING
         ):
             raise InputError("not a positive semidefinite covariance", field="filter.hypotheses")
+        self.resume(state)
+
+    def resume(self, state: EkfState) -> None:
+        """Continue from a state that this filter had."""
         self._x = list(state.x)
         self._p = [list(row) for row in state.p]
         self._mean_innovation_v = state.mean_innovation_v

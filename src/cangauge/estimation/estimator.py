@@ -43,7 +43,7 @@ from cangauge.estimation.validity import (
 from cangauge.model.delay_line import DelayLine
 from cangauge.model.effects.base import Reading
 from cangauge.model.model_file import Model, effective_error_std_v
-from cangauge.model.voltage_model import TEMPERATURE_MARGIN_K, VoltageModel, soc_from_ocv
+from cangauge.model.voltage_model import TEMPERATURE_MARGIN_K, Curve, VoltageModel, soc_from_ocv
 
 __all__ = ["Estimator", "EstimatorSettings"]
 
@@ -111,8 +111,7 @@ class Estimator:
         self._voltage_model = extended.model
         self._online = extended.online(self.settings.capacity_ah)
         self._has_effects = not self._online.plain
-        # Without effects the voltage model gives the same numbers with half the calls.
-        self._curve = self._online if self._has_effects else self._voltage_model
+        self._curve = self._make_curve()
         self.capacity_ah = self._online.capacity_ah
         self.filter = HypothesisFilter(
             lambda: make_ekf(self._curve, self._online.steady_ohm, self.capacity_ah, model.noise)
@@ -158,6 +157,11 @@ class Estimator:
         if self.settings.initial_soc_pct is not None:
             soc_pct = self._online.initial_soc_pct(self.settings.initial_soc_pct)
             self._start(soc_pct, self.settings.initial_soc_std_pct)
+
+    def _make_curve(self) -> Curve:
+        """Return the pseudo-OCV with effects; the compiled estimator has its own."""
+        # Without effects the voltage model gives the same numbers with half the calls.
+        return self._online if self._has_effects else self._voltage_model
 
     def step(self, sample: Sample) -> Estimate:
         """Process one sample and return the estimate after it; see `update`."""

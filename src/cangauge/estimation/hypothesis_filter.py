@@ -253,7 +253,14 @@ class HypothesisFilter:
                 f"not a valid filter, or a SoC outside {LOWEST_PCT:g} … {HIGHEST_PCT:g} %",
                 field="filter.hypotheses",
             )
-        self._filters = filters
+        self.resume(state)
+
+    def resume(self, state: HypothesisFilterState) -> None:
+        """Continue from a state that this filter had."""
+        self._filters = []
+        for each in state.hypotheses:
+            self._filters.append(self._make_ekf())
+            self._filters[-1].resume(each)
         self._is_untested = state.is_untested
         self._log_odds = _bounded(state.log_odds)
         self._prior_log_odds = _bounded(state.prior_log_odds)

@@ -14,6 +14,7 @@ from cangauge.model.coulomb_counting import BRIDGE_S
 from cangauge.model.effects.base import (
     LAG,
     WITHIN_C,
+    CoreForm,
     Effect,
     OnlineEffect,
     OnlineInteriorEffect,
@@ -70,6 +71,9 @@ class _HysteresisOnline(OnlineEffect):
         self._travel_as = travel_as
         self._last: tuple[float, float] | None = None
         self._state = 0.0
+
+    def core_form(self) -> CoreForm:
+        return CoreForm("hysteresis", (self._half_width_v, self._travel_as))
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         if self._last is not None and time_s - self._last[0] <= BRIDGE_S:
@@ -147,6 +151,10 @@ class _EntropicCoefficientOnline(OnlineInteriorEffect):
         self._t_ref_c = t_ref_c
         self._warmer = 0.0
 
+    def core_form(self) -> CoreForm:
+        values = (self._level, self._slope, self._curve, self._t_ref_c)
+        return CoreForm("entropic", values, (self.interior.tau_s,))
+
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         low, high = WITHIN_C
         interior_c = self.interior.step(time_s, temperature_c)
@@ -202,6 +210,9 @@ class _OcvShapeOnline(OnlineEffect):
 
     def __init__(self, heights_v: list[float]) -> None:
         self._bumps = tuple(zip(heights_v, CENTRES_PCT, WIDTHS_PCT, strict=True))
+
+    def core_form(self) -> CoreForm:
+        return CoreForm("ocv_shape", tuple(height for height, _, _ in self._bumps))
 
     def extra_voltage(self, soc_pct: float) -> float:
         soc = min(max(soc_pct, 0.0), 100.0)
@@ -259,6 +270,9 @@ class _WeakCellOnline(OnlineEffect):
         self._fraction = fraction
         self._ahead = 1.0 / (1.0 - deficit_pct / 100.0)
         self._model = model
+
+    def core_form(self) -> CoreForm:
+        return CoreForm("weak_cell", (self._fraction, self._ahead))
 
     def extra_voltage(self, soc_pct: float) -> float:
         weak = 100.0 - (100.0 - soc_pct) * self._ahead
