@@ -15,8 +15,9 @@ Assoc. 90 (1995) 614). Likelihoods summed over voltages would count an error tha
 that of the curve, as new evidence each second. The output is the mean weighted by the odds; the
 spread between the hypotheses is part of its standard deviation. The SoC therefore moves toward the
 likelier hypothesis as evidence grows, without a jump. Once the odds are clear the other hypothesis
-is dropped; if they stay unclear the two are merged, which changes neither SoC nor σ. A rejected
-initial SoC has no influence on the result.
+is dropped; if they stay unclear, both are kept until they know the same. Merged while they know
+different things, the same voltages would count again for their mean. A rejected initial SoC has no
+influence on the result.
 
 A mixture of a narrow and a wide hypothesis is no normal distribution: what is improbable and far
 away makes up most of its variance. The standard deviation stated is therefore half the half-width
@@ -45,8 +46,8 @@ CLEAR_LOG_ODDS = math.log(1000.0)
 """Beyond this the less likely hypothesis is dropped."""
 
 FORGOTTEN = 0.01
-"""Below this part of the second's variance the first hypothesis knows no more than the second, and
-the odds stay."""
+"""Below this part of the second's variance the first hypothesis knows no more than the second: the
+two have become one."""
 
 LOG_ODDS_AT_MOST = 50.0
 
@@ -59,9 +60,6 @@ WIDTH_TO_PCT = 1e-9
 WRONG_LOG_ODDS = -math.log(99.0)
 """Prior log odds that a given SoC is wrong, such as one of another pack, day or scale: an
 assumption, one in a hundred."""
-
-OPEN_AT_MOST_S = 900.0
-"""Time with voltages after which undecided hypotheses are merged [s]."""
 
 DIVERGED_S = 180.0
 """Time without a voltage that is not an outlier, after which the filter counts as lost [s]."""
@@ -92,7 +90,6 @@ class HypothesisFilter:
         self._log_odds = 0.0
         self._prior_log_odds = 0.0
         self._wide_std_pct = UNKNOWN_SOC_STD_PCT
-        self._open_s = 0.0
         self._outlier_s = 0.0
         self.verdict: Verdict = ""
 
@@ -145,8 +142,7 @@ class HypothesisFilter:
             self._outlier_s = 0.0
         if second is first:
             return is_contradicted
-        self._log_odds = self._odds_of_second()
-        self._open_s += since.seconds - since.away_s
+        is_forgotten = self._weigh()
         if is_contradicted != is_second_contradicted:
             return self._decide(int(is_contradicted))
         # The prior odds against a wrong initial SoC alone must not count as a clear decision.
@@ -154,7 +150,7 @@ class HypothesisFilter:
         is_clear = self._log_odds > CLEAR_LOG_ODDS or self._log_odds < prior - CLEAR_LOG_ODDS
         if is_contradicted or is_clear:
             return self._decide(int(self._log_odds > 0.0), is_contradicted=is_contradicted)
-        if self._open_s > OPEN_AT_MOST_S:
+        if is_forgotten:
             self._merge("unclear")
         return False
 
@@ -230,7 +226,6 @@ class HypothesisFilter:
             [each.snapshot() for each in self._filters],
             self._is_untested,
             self._log_odds,
-            self._open_s,
             self._outlier_s,
             self.verdict,
             self._prior_log_odds,
@@ -258,7 +253,6 @@ class HypothesisFilter:
         self._log_odds = _bounded(state.log_odds)
         self._prior_log_odds = _bounded(state.prior_log_odds)
         self._wide_std_pct = state.wide_std_pct
-        self._open_s = state.open_s
         self._outlier_s = state.outlier_s
         self.verdict = state.verdict
 
@@ -267,19 +261,23 @@ class HypothesisFilter:
         ekf.restore(state)
         return ekf
 
-    def _odds_of_second(self) -> float:
-        """Return the log odds of the second hypothesis against the first, given all voltages."""
+    def _weigh(self) -> bool:
+        """Set the odds from all voltages; return whether the first knows no more than the second.
+
+        The odds then stay what they were.
+        """
         (soc1_pct, std1_pct, _), (soc2_pct, std2_pct, _) = (
             each.summary(0.0) for each in self._filters
         )
         second_pct2 = std2_pct * std2_pct
         more_pct2 = second_pct2 - std1_pct * std1_pct
         if more_pct2 <= FORGOTTEN * second_pct2:
-            return self._log_odds
+            return True
         apart_pct = soc2_pct - soc1_pct
         square = apart_pct * apart_pct / more_pct2
         ratio = self._wide_std_pct * math.sqrt(more_pct2) / second_pct2
-        return _bounded(self._prior_log_odds + 0.5 * square - math.log(ratio))
+        self._log_odds = _bounded(self._prior_log_odds + 0.5 * square - math.log(ratio))
+        return False
 
     def _second_probability(self) -> float:
         return 1.0 / (1.0 + math.exp(-self._log_odds))
@@ -316,7 +314,6 @@ class HypothesisFilter:
         self._filters.append(ekf)
         self._log_odds = self._prior_log_odds = log_odds
         self._wide_std_pct = wide_std_pct
-        self._open_s = 0.0
 
     def _decide(self, accepted: int, *, is_contradicted: bool = False) -> bool:
         """Keep one hypothesis; return whether this changes the SoC assumed so far."""
