@@ -127,7 +127,7 @@ class EkfState:
         list[Annotated[list[_Finite], Field(max_length=FILTER_STATES_AT_MOST)]],
         Field(max_length=FILTER_STATES_AT_MOST),
     ]
-    """Covariance, by rows."""
+    """Covariance of the learned states with all states, by rows."""
     mean_innovation_v: _Finite
     """Running mean of the innovation [V]."""
     mean_seconds: _NotNegative
