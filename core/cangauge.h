@@ -221,10 +221,11 @@ typedef struct {
     cg_real unseen_var_pct2;
 } cg_since;
 
-/* State and covariance: SoC, current offset, slow and lasting error, capacity, curve's errors. */
+/* SoC, current offset, slow and lasting error, capacity, and the curve's errors. Covariance of the
+ * learned states with all; the others have variance 1 and no covariance among each other. */
 typedef struct {
     cg_real x[CG_STATES];
-    cg_real p[CG_STATES][CG_STATES];
+    cg_real p[CG_LEARNED][CG_STATES];
     cg_real mean_innovation_v;
     cg_real mean_seconds;
     bool was_outlier;
@@ -240,7 +241,7 @@ typedef struct {
     cg_real log_odds;
     cg_real prior_log_odds;
     cg_real wide_std_pct;
-    cg_real open_s;
+    cg_real stated_pct; /* standard deviation of two hypotheses; NAN until it is needed */
     cg_real outlier_s;
     bool is_untested;
 } cg_filter;
