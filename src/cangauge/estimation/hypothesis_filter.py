@@ -15,9 +15,9 @@ Assoc. 90 (1995) 614). Likelihoods summed over voltages would count an error tha
 that of the curve, as new evidence each second. The output is the mean weighted by the odds; the
 spread between the hypotheses is part of its standard deviation. The SoC therefore moves toward the
 likelier hypothesis as evidence grows, without a jump. Once the odds are clear the other hypothesis
-is dropped; if they stay unclear, both are kept until they know the same. Merged while they know
-different things, the same voltages would count again for their mean. A rejected initial SoC has no
-influence on the result.
+is dropped, and also once it no longer counts in the result. Until then both are kept: merged while
+they know different things, the same voltages would count again for their mean. A rejected initial
+SoC has no influence on the result.
 
 A mixture of a narrow and a wide hypothesis is no normal distribution: what is improbable and far
 away makes up most of its variance. The standard deviation stated is therefore half the half-width
@@ -46,8 +46,12 @@ CLEAR_LOG_ODDS = math.log(1000.0)
 """Beyond this the less likely hypothesis is dropped."""
 
 FORGOTTEN = 0.01
-"""Below this part of the second's variance the first hypothesis knows no more than the second: the
-two have become one."""
+"""Below this part of the second's variance the first hypothesis knows no more than the second, and
+the odds stay."""
+
+NEGLIGIBLE = 0.02
+"""The less likely hypothesis is dropped where the variance of both differs by less than this part
+from that of the other: σ changes by less than 1 %."""
 
 LOG_ODDS_AT_MOST = 50.0
 
@@ -150,17 +154,15 @@ class HypothesisFilter:
             self._outlier_s = 0.0
         if second is first:
             return is_contradicted
-        is_forgotten = self._weigh()
+        is_open = self._weigh()
         if is_contradicted != is_second_contradicted:
             return self._decide(int(is_contradicted))
         # The prior odds against a wrong initial SoC alone must not count as a clear decision.
         prior = 0.0 if self.verdict == "open" else self._prior_log_odds
         is_clear = self._log_odds > CLEAR_LOG_ODDS or self._log_odds < prior - CLEAR_LOG_ODDS
-        if is_contradicted or is_clear:
-            return self._decide(int(self._log_odds > 0.0), is_contradicted=is_contradicted)
-        if is_forgotten:
-            self._merge("unclear")
-        return False
+        if is_open and not (is_contradicted or is_clear):
+            return False
+        return self._decide(int(self._log_odds > 0.0), is_contradicted=is_contradicted)
 
     def correct(self, soc_pct: float, std_pct: float) -> None:
         """Update with an external SoC reference and its standard deviation [%]."""
@@ -281,22 +283,22 @@ class HypothesisFilter:
         return ekf
 
     def _weigh(self) -> bool:
-        """Set the odds from all voltages; return whether the first knows no more than the second.
-
-        The odds then stay what they were.
-        """
+        """Set the odds from all voltages; return whether the less likely one still counts."""
         (soc1_pct, std1_pct, _), (soc2_pct, std2_pct, _) = (
             each.summary(0.0) for each in self._filters
         )
-        second_pct2 = std2_pct * std2_pct
-        more_pct2 = second_pct2 - std1_pct * std1_pct
-        if more_pct2 <= FORGOTTEN * second_pct2:
-            return True
+        first_pct2, second_pct2 = std1_pct * std1_pct, std2_pct * std2_pct
+        more_pct2 = second_pct2 - first_pct2
         apart_pct = soc2_pct - soc1_pct
-        square = apart_pct * apart_pct / more_pct2
-        ratio = self._wide_std_pct * math.sqrt(more_pct2) / second_pct2
-        self._log_odds = _bounded(self._prior_log_odds + 0.5 * square - math.log(ratio))
-        return False
+        if more_pct2 > FORGOTTEN * second_pct2:
+            square = apart_pct * apart_pct / more_pct2
+            ratio = self._wide_std_pct * math.sqrt(more_pct2) / second_pct2
+            self._log_odds = _bounded(self._prior_log_odds + 0.5 * square - math.log(ratio))
+        second = self._second_probability()
+        spread_pct2 = (1.0 - second) * second * apart_pct * apart_pct
+        if second > 0.5:
+            return abs(spread_pct2 - (1.0 - second) * more_pct2) > NEGLIGIBLE * second_pct2
+        return abs(spread_pct2 + second * more_pct2) > NEGLIGIBLE * first_pct2
 
     def _second_probability(self) -> float:
         return 1.0 / (1.0 + math.exp(-self._log_odds))
@@ -332,6 +334,7 @@ class HypothesisFilter:
     def _add(self, ekf: SocEkf, log_odds: float, wide_std_pct: float) -> None:
         """Open a second hypothesis, with its prior and standard deviation of the SoC [%]."""
         self._filters.append(ekf)
+        self._stated_pct = math.nan
         self._log_odds = self._prior_log_odds = log_odds
         self._wide_std_pct = wide_std_pct
 
