@@ -561,7 +561,7 @@ bool cg_update(cg_estimator *self, const cg_sample *sample)
     cg_correct(self, &now, 0, skew);
     if (skew < model->effects) {
         cg_skew_push(self->skew, &now);
-        is_ready = cg_skew_pop(self->skew, model->effect[skew].value[0], newest_s, &now);
+        is_ready = cg_skew_pop(self->skew, model->skew_s, newest_s, &now);
     }
     if (!is_ready) {
         state->latest.time_s = stamp_s;
@@ -574,7 +574,7 @@ bool cg_update(cg_estimator *self, const cg_sample *sample)
         state->pending_stamp_s = stamp_s;
         state->is_pending = true;
         is_ready = (skew < model->effects) &&
-                   cg_skew_pop(self->skew, model->effect[skew].value[0], newest_s, &now);
+                   cg_skew_pop(self->skew, model->skew_s, newest_s, &now);
     }
     return true;
 }

@@ -50,7 +50,7 @@ typedef enum {
     CG_NO_EFFECT = 0, /* or one that changes the count only */
     CG_CURRENT_SENSOR, /* offset, gain */
     CG_VOLTAGE_SENSOR, /* offset, gain */
-    CG_TIME_SKEW, /* skew_s */
+    CG_TIME_SKEW, /* `skew_s` of the model */
     CG_TEMPERATURE_LAG, /* ahead; lag: smoothing */
     CG_CORE_TEMPERATURE, /* rise_k, late, capacity_ah; lags: Joule heat, temperature */
     CG_RESISTANCE_TEMPERATURE, /* share, activation_k, delayed, reference_per_k, ohm; lag: interior */
@@ -113,6 +113,7 @@ typedef struct {
     /* effects, in the order of their application */
     int32_t effects;
     cg_effect effect[CG_EFFECTS];
+    cg_time skew_s; /* of CG_TIME_SKEW: how late the time stamps of the current are */
     int32_t memories; /* RC elements of effects: what currents before the first sample left */
     cg_real memory_ohm[CG_MEMORIES];
     cg_real memory_tau_s[CG_MEMORIES];

@@ -19,6 +19,7 @@
 /* hypotheses */
 #define CLEAR_LOG_ODDS 6.907755278982137 /* ln 1000 */
 #define FORGOTTEN 0.01
+#define NEGLIGIBLE 0.02
 #define LOG_ODDS_AT_MOST 50.0
 #define TWO_SIGMA 0.9544997361036416 /* erf(sqrt 2) */
 #define NARROWEST_PCT 1e-9
@@ -327,6 +328,7 @@ void cg_filter_start(cg_filter *filter, const cg_model *model, cg_real soc_pct, 
 static void filter_open(cg_filter *filter, cg_real log_odds, cg_real wide_std_pct)
 {
     filter->hypotheses = 2;
+    filter->stated_pct = CG_NAN;
     filter->ekf[1].was_outlier = false;
     filter->log_odds = log_odds;
     filter->prior_log_odds = log_odds;
@@ -478,21 +480,25 @@ void cg_filter_predict(cg_filter *filter, const cg_model *model, const cg_since 
     }
 }
 
-/* Set the log odds from all voltages (Savage-Dickey ratio). Whether the first knows no more than the
- * second; the odds then stay. */
+/* Set the log odds from all voltages (Savage-Dickey ratio). Whether the less likely still counts. */
 static bool weigh(cg_filter *filter)
 {
-    const cg_real std1_pct = soc_std_pct(&filter->ekf[0]);
-    const cg_real std2_pct = soc_std_pct(&filter->ekf[1]);
-    const cg_real more_pct2 = cg_square(std2_pct) - cg_square(std1_pct);
-    if (more_pct2 <= (R(FORGOTTEN) * cg_square(std2_pct))) {
-        return true;
-    }
+    const cg_real first_pct2 = cg_square(soc_std_pct(&filter->ekf[0]));
+    const cg_real second_pct2 = cg_square(soc_std_pct(&filter->ekf[1]));
+    const cg_real more_pct2 = second_pct2 - first_pct2;
     const cg_real apart_pct = filter->ekf[1].x[CG_X_SOC] - filter->ekf[0].x[CG_X_SOC];
-    const cg_real square = cg_square(apart_pct) / more_pct2;
-    const cg_real ratio = filter->wide_std_pct * cg_sqrt(more_pct2) / cg_square(std2_pct);
-    filter->log_odds = bounded(filter->prior_log_odds + (R(0.5) * square) - cg_log(ratio));
-    return false;
+    if (more_pct2 > (R(FORGOTTEN) * second_pct2)) {
+        const cg_real square = cg_square(apart_pct) / more_pct2;
+        const cg_real ratio = filter->wide_std_pct * cg_sqrt(more_pct2) / second_pct2;
+        filter->log_odds = bounded(filter->prior_log_odds + (R(0.5) * square) - cg_log(ratio));
+    }
+    const cg_real second = second_probability(filter);
+    const cg_real first = R(1.0) - second;
+    const cg_real spread_pct2 = first * second * apart_pct * apart_pct;
+    if (second > R(0.5)) {
+        return cg_fabs(spread_pct2 - (first * more_pct2)) > (R(NEGLIGIBLE) * second_pct2);
+    }
+    return cg_fabs(spread_pct2 + (second * more_pct2)) > (R(NEGLIGIBLE) * first_pct2);
 }
 
 /* Update with one voltage. Whether it shows that the SoC was wrong until now. */
@@ -522,7 +528,7 @@ bool cg_filter_update(cg_estimator *self, const cg_measurement *seen, const cg_s
     if (filter->hypotheses == 1) {
         return is_contradicted;
     }
-    const bool is_forgotten = weigh(filter);
+    const bool is_open = weigh(filter);
     if (is_contradicted != is_second_contradicted) {
         return filter_decide(filter, is_contradicted, false);
     }
@@ -530,13 +536,10 @@ bool cg_filter_update(cg_estimator *self, const cg_measurement *seen, const cg_s
         (filter->verdict == (int32_t)CG_OPEN) ? R(0.0) : filter->prior_log_odds;
     const bool is_clear = (filter->log_odds > R(CLEAR_LOG_ODDS)) ||
                           (filter->log_odds < (prior - R(CLEAR_LOG_ODDS)));
-    if (is_contradicted || is_clear) {
-        return filter_decide(filter, filter->log_odds > R(0.0), is_contradicted);
+    if (is_open && !(is_contradicted || is_clear)) {
+        return false;
     }
-    if (is_forgotten) {
-        filter_merge(filter, cg_states(self->model));
-    }
-    return false;
+    return filter_decide(filter, filter->log_odds > R(0.0), is_contradicted);
 }
 
 bool cg_filter_is_lost(const cg_filter *filter)

@@ -96,7 +96,7 @@ cg_real cg_newton(const cg_estimator *self, cg_real ocv_v, cg_real guess_pct, bo
 int32_t cg_skew_of(const cg_model *model);
 void cg_correct(cg_estimator *self, cg_sample *sample, int32_t from, int32_t to);
 void cg_skew_push(cg_skew *skew, const cg_sample *sample);
-bool cg_skew_pop(cg_skew *skew, cg_real skew_s, cg_time now_s, cg_sample *sample);
+bool cg_skew_pop(cg_skew *skew, cg_time skew_s, cg_time now_s, cg_sample *sample);
 void cg_advance(cg_estimator *self, const cg_sample *sample, cg_real temperature_c);
 
 /* noise of a voltage */

@@ -57,6 +57,7 @@ static const field MODEL[] = {
     LIST(cg_model, knot_pct, 'd', CG_KNOTS),
     LIST(cg_model, function_v, 'd', CG_KNOTS * CG_FUNCTIONS),
     NUMBER(cg_model, effects, 'i'),
+    NUMBER(cg_model, skew_s, 'd'),
     NUMBER(cg_model, memories, 'i'),
     LIST(cg_model, memory_ohm, 'd', CG_MEMORIES),
     LIST(cg_model, memory_tau_s, 'd', CG_MEMORIES),
