@@ -28,6 +28,7 @@ from cangauge.diagnosis import (
     rms,
     segment_signals,
 )
+from cangauge.diagnosis.next_test import NextSteps, Plan
 from cangauge.model.effects.library import LIBRARY
 from cangauge.report.charts import (
     BLACK,
@@ -66,6 +67,7 @@ from cangauge.report.summary import (
     open_question,
     parameters_text,
     percent_span,
+    plan_rows,
 )
 
 _SHOWN_CANDIDATES: Final = 8
@@ -86,7 +88,9 @@ _SHADES: Final = tuple(Viridis256[::-1])
 """Light for a small error, dark for a large one."""
 
 
-def gap_report(diagnosis: Diagnosis, model: InputFile | None = None) -> str:
+def gap_report(
+    diagnosis: Diagnosis, model: InputFile | None = None, steps: NextSteps | None = None
+) -> str:
     """Return the diagnosis as one self-contained HTML page.
 
     Parameters
@@ -94,11 +98,15 @@ def gap_report(diagnosis: Diagnosis, model: InputFile | None = None) -> str:
     diagnosis : Diagnosis
     model : InputFile, optional
         The diagnosed model, to name it on the page.
+    steps : NextSteps, optional
+        A test that was added to the diagnosis, and the next one.
     """
-    return render(gap_page(diagnosis, model))
+    return render(gap_page(diagnosis, model, steps))
 
 
-def gap_page(diagnosis: Diagnosis, model: InputFile | None = None) -> Page:
+def gap_page(
+    diagnosis: Diagnosis, model: InputFile | None = None, steps: NextSteps | None = None
+) -> Page:
     """Return the report's content (see `gap_report`); `figures` holds the bokeh figures."""
     problem = diagnosis.problem
     logs = [matrix.sampled.log for matrix in problem.diagnosed]
@@ -117,6 +125,8 @@ def gap_page(diagnosis: Diagnosis, model: InputFile | None = None) -> Page:
         Section("What these logs can show", [_observability(diagnosis)]),
         Section("Method", [Bullets(_method(diagnosis))]),
     ]
+    if steps is not None and steps.plan is not None:
+        sections.insert(3, Section("The next test", _next_test(steps.plan)))
     caveats = [text for text in (open_question(diagnosis), *diagnosis.caveats) if text]
     if caveats:
         sections.insert(0, Section("What these logs cannot show", [Bullets(caveats)]))
@@ -137,6 +147,30 @@ def gap_page(diagnosis: Diagnosis, model: InputFile | None = None) -> Page:
         ],
         banners=reconstruction_banners(*(text for log in logs for text in (log.name, log.source))),
     )
+
+
+def _next_test(plan: Plan) -> list[Block]:
+    """Return the proposed test, its profile, and what each test is expected to show."""
+    best = plan.best.profile
+    plot = new_figure(("time", "current"), "@y{0.0} A<br>at @x{0} s", units=("s", "A"), height=220)
+    add_zero(plot)
+    add_line(plot, "current", best.time_s, best.current_a, Pen(BLUE, width=1.4, in_legend=False))
+    return [
+        Paragraph(plan.sentence),
+        Figure(
+            f"Proposed test: {best.name}",
+            plot,
+            f"From {number(best.start_soc_pct, 0, '%')} to"
+            f" {number(float(best.soc_pct[-1]), 0, '%')} SoC, from"
+            f" {number(best.start_c, 0, '°C')}. Positive current discharges.",
+        ),
+        Table(
+            *plan_rows(plan),
+            note="P(true one): expected probability of the true cause, averaged over the 90 % set."
+            " A cause's own column: its expected probability where it is the true one. Under the"
+            " linear model, which flatters.",
+        ),
+    ]
 
 
 def _extended_name(diagnosis: Diagnosis) -> str:

@@ -6,8 +6,9 @@ import math
 from html import escape
 from typing import Any, Final
 
-from cangauge._formatting import number, significant, span
+from cangauge._formatting import NONE_KNOWN, number, significant, span
 from cangauge.diagnosis import LIKELY, NONE, UNKNOWN, Diagnosis
+from cangauge.diagnosis.next_test import Plan
 from cangauge.identify.effect_search import FittedEffects
 from cangauge.model.effects.library import LIBRARY
 
@@ -206,6 +207,28 @@ def parameters_text(parameters: dict[str, dict[str, Any]], separator: str = ", "
 def percent_span(low: float, high: float) -> str:
     """Return a range of fractions in %."""
     return span(100.0 * low, 100.0 * high, 0, "%")
+
+
+PLAN_TITLE: Final = "Next test: expected probability of each cause where it is the true one"
+
+
+def plan_rows(plan: Plan) -> tuple[list[str], Rows]:
+    """Return headings and rows: the tests, best first, and the probabilities without any."""
+    rows = [
+        [
+            test.profile.name,
+            number(test.profile.start_soc_pct, 0),
+            number(test.profile.start_c, 0),
+            number(test.information_nats, 2),
+            number(test.probability, 2),
+            *(number(test.expected[cause], 2) for cause in plan.causes),
+        ]
+        for test in plan.tests
+    ]
+    now = [number(plan.before[cause], 2) for cause in plan.causes]
+    rows.append(["without a test", *[NONE_KNOWN] * 3, number(plan.probability, 2), *now])
+    headings = ["<test", "from SoC [%]", "from [°C]", "information [nats]", "P(true one)"]
+    return [*headings, *plan.causes], rows
 
 
 SHOWN_IN_NOTEBOOK: Final = 5
