@@ -40,7 +40,7 @@ def test_plan_goes_to_text_file_json_and_page(
     run: Run, command: list[object], tmp_path: Path
 ) -> None:
     profile, page = tmp_path / "test.csv", tmp_path / "gap.html"
-    ran = run(*command, "--plan-file", profile, "--limits", "current=-30:60,minutes=15",
+    ran = run(*command, "--plan-file", profile, "--limits", "current=0:60,minutes=10",
               "--report", page, "--json")  # fmt: skip
     assert ran.code == 0
     found = json.loads(ran.out)["plan"]
@@ -51,10 +51,11 @@ def test_plan_goes_to_text_file_json_and_page(
     assert gained == sorted(gained, reverse=True)
     assert found["probability_expected"] >= found["probability_now"] - 0.02
     lines = profile.read_text(encoding="utf-8").splitlines()
-    assert len(lines) == 2 + 15 * 60
+    assert len(lines) == 2 + 10 * 60
     assert f"start at {found['start_soc_pct']:.0f} % SoC" in lines[1]
     currents = [float(line.split(",")[1]) for line in lines[1:]]
-    assert -30.0 <= min(currents) <= max(currents) <= 60.0
+    assert min(currents) == 0.0
+    assert max(currents) <= 60.0
 
 
 def test_added_test_tells_what_it_changed(run: Run, command: list[object], tmp_path: Path) -> None:

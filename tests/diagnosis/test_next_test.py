@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cangauge.diagnosis.hypotheses import Hypotheses
@@ -73,6 +73,7 @@ def test_more_of_what_cannot_separate_them_does_not_help() -> None:
     assert same.information_nats < 0.3 * apart.information_nats
 
 
+@settings(max_examples=30)
 @given(
     discharge_a=st.floats(1.0, 400.0),
     charge_a=st.floats(0.0, 300.0),

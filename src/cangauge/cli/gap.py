@@ -131,8 +131,8 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
         typer.Option(
             metavar="NAME=LOW:HIGH,…",
             help="Limits of that test: current=-60:120 (A), soc=20:90 (%), temperature=5:30 (°C at"
-            " the start), minutes=20. Default: the model's currents, the references' SoC and"
-            " temperatures, 20 minutes.",
+            " the start), minutes=20. Default: what the references usually show, and 20"
+            " minutes.",
         ),
     ] = None,
     add_test: Annotated[

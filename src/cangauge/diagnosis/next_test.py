@@ -175,7 +175,7 @@ def plan_test(problem: DiagnosisProblem, verdict: Verdict, limits: Limits | None
     verdict : Verdict
         On the same problem.
     limits : Limits, optional
-        By default those of the model and the references.
+        By default what the references usually show.
 
     Raises
     ------

@@ -21,6 +21,9 @@ from cangauge.model.effects.base import WITHIN_C, Pack
 MINUTES = 20.0
 """Duration of a test by default [min]."""
 
+RARE = 0.02
+"""Part of the references' rows whose current or SoC counts as unusual, on either side."""
+
 SUSTAINED_C = 1.0
 """Largest current of minutes [C-rate]; the limits of the logs are those of seconds."""
 
@@ -63,21 +66,20 @@ class Limits:
 
     @classmethod
     def of(cls, problem: DiagnosisProblem) -> Limits:
-        """Return the currents and SoC that the model was identified on, where the references were.
+        """Return what the references usually show: all but `RARE` of their rows on either side.
 
-        Beyond the references' SoC and temperatures the error of the model is not known, so that a
-        test there shows little.
+        Beyond that the error of the model is not known, so that a test there shows little. Without
+        references it is what the diagnosed logs show.
         """
-        model = problem.given.model
         logs = [each.sampled.rows for each in problem.references or problem.diagnosed]
-        soc = np.concatenate([rows.soc_pct for rows in logs])
+        usual = (RARE, 1.0 - RARE)
+        current = np.concatenate([rows.delayed_current_a[:, 0] for rows in logs])
+        soc = np.quantile(np.concatenate([rows.soc_pct for rows in logs]), usual)
         temperature = np.concatenate([rows.temperature_c for rows in logs])
-        low, high = model.soc_range_pct
-        low, high = max(low, float(soc.min())), min(high, float(soc.max()))
         return cls(
-            discharge_a=max(model.current_range_a[1], 0.0),
-            charge_a=max(-model.current_range_a[0], 0.0),
-            soc_pct=(low, high) if low < high else model.soc_range_pct,
+            discharge_a=max(float(np.quantile(current, usual[1])), 0.0),
+            charge_a=max(-float(np.quantile(current, usual[0])), 0.0),
+            soc_pct=(float(soc[0]), float(soc[1])),
             temperature_c=(float(temperature.min()), float(temperature.max())),
         )
 
@@ -271,7 +273,7 @@ LIBRARY_OF_TESTS: Final = {
 
 
 def library_of_tests(limits: Limits, pack: Pack, *, usual_c: float, lead_s: float) -> list[Profile]:
-    """Return the tests that the limits allow: each from a high, a middle and a low SoC.
+    """Return the tests that the limits allow: each from a high and a low SoC.
 
     Parameters
     ----------
@@ -310,7 +312,7 @@ def library_of_tests(limits: Limits, pack: Pack, *, usual_c: float, lead_s: floa
         current, comments = _sampled([Step(lead_s, 0.0, RESTING)], repeated, limits.minutes)
         used = 100.0 * float(discharged_ah(np.arange(float(current.size)), current).max())
         lowest = min(low + used / pack.capacity_ah, high)
-        starts = sorted({high, 0.5 * (high + lowest), lowest}, reverse=True)
+        starts = sorted({high, lowest}, reverse=True)
         wanted = _Wanted(name, current, tuple(comments), start_c)
         found += [wanted.within(limits, pack, start_pct) for start_pct in starts]
     return found
