@@ -12,6 +12,7 @@ resistance step is left out: it happens once, and not again in every test.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 import time
@@ -109,18 +110,20 @@ def drive_of(profile: Profile, seed: int) -> Drive:
     )
 
 
-def outcomes(seed: int, minutes: float) -> Iterator[Outcome | None]:
+def outcomes(seed: int, minutes: float, skip: int) -> Iterator[Outcome | None]:
     """Yield an outcome for each case that is ambiguous after its first log, None for others."""
     rng = np.random.default_rng([seed, 20])
     order: list[str] = []
-    while True:
-        pack = Pack.draw(2 * int(rng.integers(2**30)))
-        for _ in range(CASES_PER_PACK):
+    for first in itertools.count(0, CASES_PER_PACK):
+        pack_seed = 2 * int(rng.integers(2**30))
+        pack = None if first + CASES_PER_PACK <= skip else Pack.draw(pack_seed)
+        for number in range(first, first + CASES_PER_PACK):
             order = order or [str(name) for name in rng.permutation(EFFECTS)
                               if name != NOT_REPEATED]  # fmt: skip
             case_seed, effect = 2 * int(rng.integers(2**30)), order.pop()
-            case = draw_case(case_seed, [effect], pack.scenario, pack.options)
-            yield outcome_of(pack, case, effect, minutes)
+            if pack is not None and number >= skip:
+                case = draw_case(case_seed, [effect], pack.scenario, pack.options)
+                yield outcome_of(pack, case, effect, minutes)
 
 
 def outcome_of(pack: Pack, case: DrawnCase, truth: str, minutes: float) -> Outcome | None:
@@ -177,15 +180,15 @@ def main() -> int:
     parser.add_argument("--cases", type=int, default=30, help="ambiguous cases")
     parser.add_argument("--seed", type=int, default=2)
     parser.add_argument("--minutes", type=float, default=20.0)
-    parser.add_argument("--keep", type=Path, help="add the outcomes to those in this file")
+    parser.add_argument("--keep", type=Path, help="continue the outcomes in this file")
     given = parser.parse_args()
     results: list[Outcome | None] = []
     if given.keep is not None and given.keep.exists():
         lines = given.keep.read_text(encoding="utf-8").splitlines()
         results = [item and Outcome(**item) for item in map(json.loads, lines)]
-    began, wanted = time.perf_counter(), sum(map(bool, results)) + given.cases
-    found = outcomes(given.seed, given.minutes)
-    while sum(map(bool, results)) < wanted:
+    began = time.perf_counter()
+    found = outcomes(given.seed, given.minutes, skip=len(results))
+    while sum(map(bool, results)) < given.cases:
         results.append(next(found))
         line = json.dumps(results[-1] and asdict(results[-1]))
         print(f"{time.perf_counter() - began:.0f} s: {line}", file=sys.stderr, flush=True)

@@ -262,44 +262,57 @@ class Outcomes:
     @classmethod
     def of(cls, now: Posterior, causes: Sequence[str], rng: np.random.Generator) -> Outcomes:
         """Draw amplitudes of each cause, its shapes and widths by their evidence."""
-        size = now.gradient.size
-        drawn = {}
-        evidence = log_evidence(now.hypotheses, now.gradient[None], now.curvature)
+        size, drawn = now.gradient.size, {NONE: np.zeros((DRAWS, now.gradient.size))}
+        of_all = evidence(now.hypotheses, now.gradient[None], now.curvature)
         for cause in causes:
-            values = np.zeros((DRAWS, size))
-            if cause != NONE:
-                pieces = evidence[cause]
-                weights = np.exp([piece.log_bayes[0] for piece in pieces]
-                                 - logsumexp([piece.log_bayes[0] for piece in pieces]))  # fmt: skip
-                chosen = rng.choice(len(pieces), size=DRAWS, p=weights / weights.sum())
-                for row, k in enumerate(chosen):
-                    piece = pieces[k]
-                    amplitude = rng.multivariate_normal(piece.mode[0], piece.covariance)
-                    bounds = now.hypotheses.candidates[piece.candidate].bounds
-                    values[row, piece.at] = np.clip(amplitude, bounds[:, 0], bounds[:, 1])
-            drawn[cause] = values
-        return cls(drawn, rng.standard_normal((DRAWS, size)))
+            if cause == NONE:
+                continue
+            pieces = [
+                (piece, width, place)
+                for piece in of_all
+                for place in piece.places(cause)
+                for width in range(len(PRIOR_WIDTHS))
+            ]
+            logs = np.array([piece.log_bayes[width, place, 0] for piece, width, place in pieces])
+            chosen = rng.choice(len(pieces), size=DRAWS, p=np.exp(logs - logsumexp(logs)))
+            drawn[cause] = np.zeros((DRAWS, size))
+            for row, k in enumerate(chosen):
+                piece, width, place = pieces[k]
+                drawn[cause][row, piece.at[place]] = piece.drawn(width, place, rng)
+        return cls({cause: drawn[cause] for cause in causes}, rng.standard_normal((DRAWS, size)))
 
 
 @dataclass(frozen=True, eq=False)
-class Piece:
-    """Evidence for one candidate at one width of its prior, for n gradients."""
+class Evidence:
+    """Evidence for K candidates of k amplitudes each, for n gradients, at W widths of the prior."""
 
-    candidate: int
+    effect_ids: tuple[str, ...]
     at: Indices
+    """Their amplitudes, shape (K, k)."""
+    bounds: FloatArray
+    """Shape (K, k, 2)."""
     log_bayes: FloatArray
-    """Against no effect, shape (n,)."""
+    """Against no effect, shape (W, K, n)."""
     mode: FloatArray
-    """Shape (n, amplitudes of the candidate)."""
+    """Shape (W, K, n, k)."""
     covariance: FloatArray
+    """Shape (W, K, k, k)."""
+
+    def places(self, effect_id: str) -> list[int]:
+        """Return the candidates of an effect."""
+        return [k for k, name in enumerate(self.effect_ids) if name == effect_id]
+
+    def drawn(self, width: int, place: int, rng: np.random.Generator) -> FloatArray:
+        """Draw amplitudes of a candidate from its posterior for the first gradient."""
+        covariance = self.covariance[width, place]
+        amplitude = rng.multivariate_normal(self.mode[width, place, 0], covariance)
+        return np.asarray(np.clip(amplitude, *self.bounds[place].T))
 
 
-def log_evidence(
+def evidence(
     hypotheses: Hypotheses, gradients: FloatArray, curvature: FloatArray
-) -> dict[str, list[Piece]]:
-    """Return the evidence for every cause, piece by piece, for many gradients at once.
-
-    The evidence of a cause is the mean over its pieces, which are equally probable.
+) -> list[Evidence]:
+    """Return the evidence for all candidates that can be a cause, for many gradients at once.
 
     Parameters
     ----------
@@ -307,32 +320,33 @@ def log_evidence(
     gradients : array of shape (n, amplitudes)
     curvature : array of shape (amplitudes, amplitudes)
     """
-    found: dict[str, list[Piece]] = {}
-    for k, candidate in enumerate(hypotheses.candidates):
-        if not candidate.effect.is_cause:
-            continue
-        at = hypotheses.amplitudes_of([k])
-        gradient = gradients[:, at]
-        for width in PRIOR_WIDTHS:
-            prior = prior_precision(candidate.bounds) / width**2
-            total = curvature[np.ix_(at, at)] + prior
-            covariance = np.asarray(np.linalg.inv(total), dtype=np.float64)
-            mode = gradient @ covariance
-            occam = 0.5 * float(np.linalg.slogdet(np.linalg.solve(prior, total))[1])
-            log_bayes = 0.5 * np.sum(gradient * mode, axis=1) - occam
-            if at.size == 1:
-                bounds = candidate.bounds[0]
-                log_bayes += _log_mass((bounds - mode) * math.sqrt(total[0, 0]))
-                log_bayes -= _log_mass(bounds[None] * math.sqrt(prior[0, 0]))
-            found.setdefault(candidate.effect.id, []).append(
-                Piece(k, at, log_bayes, mode, covariance)
-            )
+    causes = [k for k, each in enumerate(hypotheses.candidates) if each.effect.is_cause]
+    by_size: dict[int, list[int]] = {}
+    for k in causes:
+        by_size.setdefault(len(hypotheses.candidates[k].amplitudes), []).append(k)
+    widths = np.array(PRIOR_WIDTHS)[:, None, None, None]
+    found = []
+    for size, chosen in by_size.items():
+        at = np.stack([hypotheses.amplitudes_of([k]) for k in chosen])
+        bounds = np.stack([hypotheses.candidates[k].bounds for k in chosen])
+        prior = np.stack([prior_precision(each) for each in bounds]) / widths**2
+        total = curvature[at[:, :, None], at[:, None, :]] + prior
+        covariance = np.asarray(np.linalg.inv(total), dtype=np.float64)
+        gradient = gradients[:, at].transpose(1, 0, 2)
+        mode = gradient @ covariance
+        occam = 0.5 * (np.linalg.slogdet(total)[1] - np.linalg.slogdet(prior)[1])
+        log_bayes = 0.5 * np.sum(gradient * mode, axis=-1) - occam[..., None]
+        if size == 1:
+            log_bayes += _log_mass((bounds[:, 0, None] - mode) * np.sqrt(total[..., :1, 0, None]))
+            log_bayes -= _log_mass(bounds[:, 0, None] * np.sqrt(prior[..., :1, 0, None]))
+        ids = tuple(hypotheses.candidates[k].effect.id for k in chosen)
+        found.append(Evidence(ids, at, bounds, log_bayes, mode, covariance))
     return found
 
 
 def _log_mass(limits: FloatArray) -> FloatArray:
-    """Return ln of the standard normal probability between limits, shape (n, 2), in tails too."""
-    low, high = limits[:, 0], limits[:, 1]
+    """Return ln of the standard normal probability between limits, shape (…, 2), in tails too."""
+    low, high = limits[..., 0], limits[..., 1]
     low, high = np.where(low > 0.0, (-high, -low), (low, high))
     lower, upper = log_ndtr(low), log_ndtr(high)
     return np.asarray(upper + np.log1p(-np.exp(lower - upper)))
@@ -352,15 +366,19 @@ def expected_of(
     names = list(before)
     at_present = _by_cause(now.hypotheses, now.gradient[None], now.curvature, names)
     information, expected = 0.0, {}
-    for cause, weight in _weights(before, [*simulated.amplitudes]).items():
-        gradients = now.gradient + simulated.amplitudes[cause] @ added + noise
-        gained = _by_cause(now.hypotheses, gradients, now.curvature + added, names) - at_present
-        logs = gained + np.log([max(before[name], 1e-300) for name in names])
-        logs -= logsumexp(logs, axis=1, keepdims=True)
-        of_cause = logs[:, names.index(cause)]
+    weights = _weights(before, [*simulated.amplitudes])
+    gradients = np.concatenate(
+        [now.gradient + a @ added + noise for a in simulated.amplitudes.values()]
+    )
+    gained = _by_cause(now.hypotheses, gradients, now.curvature + added, names) - at_present
+    logs = gained + np.log([max(before[name], 1e-300) for name in names])
+    logs -= logsumexp(logs, axis=1, keepdims=True)
+    for (cause, weight), drawn in zip(
+        weights.items(), logs.reshape(-1, DRAWS, len(names)), strict=True
+    ):
+        of_cause = drawn[:, names.index(cause)]
         expected[cause] = float(np.mean(np.exp(of_cause)))
         information += weight * float(np.mean(of_cause - math.log(before[cause])))
-    weights = _weights(before, [*expected])
     probability = sum(weight * expected[cause] for cause, weight in weights.items())
     return PlannedTest(profile, information, expected, float(probability))
 
@@ -368,13 +386,19 @@ def expected_of(
 def _by_cause(
     hypotheses: Hypotheses, gradients: FloatArray, curvature: FloatArray, names: Sequence[str]
 ) -> FloatArray:
-    """Return the log evidence of each answer, shape (n, answers); 0 for `none`."""
-    evidence = log_evidence(hypotheses, gradients, curvature)
+    """Return the log evidence of each answer, shape (n, answers); 0 for `none`.
+
+    That of a cause is the mean over its candidates and widths, which are equally probable.
+    """
+    pieces: dict[str, list[FloatArray]] = {}
+    for each in evidence(hypotheses, gradients, curvature):
+        for name in set(each.effect_ids):
+            of_effect = each.log_bayes[:, each.places(name)]
+            pieces.setdefault(name, []).extend(of_effect.reshape(-1, len(gradients)))
     columns = [
         np.zeros(len(gradients))
         if name == NONE
-        else logsumexp([piece.log_bayes for piece in evidence[name]], axis=0)
-        - math.log(len(evidence[name]))
+        else logsumexp(pieces[name], axis=0) - math.log(len(pieces[name]))
         for name in names
     ]
     return np.column_stack(columns)
