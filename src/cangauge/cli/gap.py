@@ -229,7 +229,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
         result |= next_test.to_dict(steps)
         emit_json(result | {"assumed": assumed_of([*diagnosed, *references])})
         return
-    _show(found)
+    _show(found, "" if steps.plan else next_step(found))
     if of_simulator is not None:
         _show_simulator(of_simulator)
     show_tests(steps)
@@ -320,12 +320,12 @@ def _long_enough(log: Log) -> Log:
     return log
 
 
-def _show(found: Diagnosis) -> None:
+def _show(found: Diagnosis, next_words: str) -> None:
     for sentence in (
         headline(found),
         found.summary,
         open_question(found),
-        next_step(found),
+        next_words,
     ):
         if sentence:
             typer.echo(printable(sentence))
