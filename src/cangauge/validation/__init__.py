@@ -12,6 +12,10 @@ scores the answers::
     score        labels and answers → figures; `tables` prints them
     final_seeds  seeds of the published figures
 
+The diagnosis on one's own healthy logs injects the same faults::
+
+    own_logs     every effect injected into logs of one pack, each left out in turn
+
 The estimator's bench on recorded packs is apart from it::
 
     packs        recorded packs; models from few logs, and the other logs estimated by them
