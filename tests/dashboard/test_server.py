@@ -20,7 +20,7 @@ from cangauge.service.config import load_config
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.status import Identity, Monitor, Snapshot
-from live import LoggedLines, leaf_model, leaf_model_path, waits
+from live import LoggedLines, in_process, leaf_model, leaf_model_path, waits
 
 TOKEN = "a-token-of-some-length"  # noqa: S105 - made up
 
@@ -153,6 +153,61 @@ def test_the_cookie_outlives_a_restart(guarded: LivePage) -> None:
     cookie = headers["Set-Cookie"].split(";")[0]
     with LivePage(replace(guarded._address, port=0)) as other:
         assert get(other, "/rows", headers={"Cookie": cookie})[0] == 200
+
+
+def asked_for(page: LivePage, body: str, **headers: str) -> int:
+    """Return the code of a request for a recording."""
+    kind = {"Content-Type": "application/json"}
+    return get(page, "/recording", method="POST", body=body, headers=kind | headers)[0]
+
+
+def test_a_viewer_asks_for_a_recording_and_its_end() -> None:
+    asked: list[bool] = []
+    with LivePage(http_address("127.0.0.1:0", None, {}), asked.append) as page:
+        own = f"http://127.0.0.1:{page.port}"
+        assert asked_for(page, '{"active": true}', Origin=own) == 202
+        assert asked_for(page, '{"active": false}') == 202
+        assert waits(lambda: asked == [True, False])
+
+
+@pytest.mark.parametrize(
+    ("body", "headers", "code"),
+    [
+        ('{"active": true}', {"Origin": "https://evil.example"}, 403),
+        ('{"active": true}', {"Origin": "http://127.0.0.1:1"}, 403),
+        ('{"active": true}', {"Origin": "null"}, 403),
+        ('{"active": true}', {"Host": "evil.example"}, 403),
+        ('{"active": true}', {"Content-Type": "text/plain"}, 415),
+        ("active=true", {"Content-Type": "application/x-www-form-urlencoded"}, 415),
+        ('{"active": 1}', {}, 400),
+        ("[true]", {}, 400),
+        ("\xff", {}, 400),
+    ],
+)
+def test_other_requests_for_a_recording_are_refused(
+    page: LivePage, body: str, headers: dict[str, str], code: int
+) -> None:
+    assert asked_for(page, body, **headers) == code
+
+
+def test_a_recording_needs_the_token(guarded: LivePage) -> None:
+    assert asked_for(guarded, '{"active": true}') == 401
+    assert asked_for(guarded, '{"active": true}', Authorization=f"Bearer {TOKEN}") == 202
+
+
+@pytest.mark.parametrize("after", [[], ["--channel", "x"], ["127.0.0.1:8642"]])
+def test_the_option_alone_means_a_loopback_address(
+    monkeypatch: pytest.MonkeyPatch, after: list[str]
+) -> None:
+    def note(_: object, values: dict[str, Any]) -> None:
+        given.update(values)
+        raise InputError("enough")
+
+    given: dict[str, Any] = {}
+    monkeypatch.setattr("cangauge.cli.run.load_config", note)
+    assert "enough" in in_process("run", "-m", "m.json", "--dashboard", *after).err
+    assert given["dashboard"] == "127.0.0.1:8642"
+    assert given["channel"] == ("x" if "x" in after else None)
 
 
 def test_an_address_in_use_is_refused(page: LivePage) -> None:

@@ -2,7 +2,8 @@
 
 `python -m cangauge.dashboard.server` is started by `launch`, with listening sockets that it
 inherits. Each viewer asks for what is new since its last question, so a slow or hidden one costs
-nothing, here or in the service. End of stdin ends the process.
+nothing, here or in the service. A line on stdout asks the service for a recording or for its end.
+End of stdin ends the process.
 """
 
 from __future__ import annotations
@@ -16,10 +17,12 @@ import os
 import secrets
 import signal
 import socket
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any, Final, cast
+from urllib.parse import urlsplit
 
 from bokeh.resources import Resources
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -52,10 +55,13 @@ class Site:
     history : History
     token : str or None
         Token that a viewer must know.
+    ask : callable
+        Takes whether a recording shall run, once a viewer asks.
     """
 
-    def __init__(self, history: History, token: str | None) -> None:
+    def __init__(self, history: History, token: str | None, ask: Callable[[bool], None]) -> None:
         self.history = history
+        self.ask = ask
         self.token = token
         self.id = secrets.token_hex(8)
         """Key of this run; another one means that the row numbers start again."""
@@ -94,6 +100,7 @@ class Site:
                 ("/rows", _Rows, context),
                 ("/comparison", _Comparison, context),
                 ("/range.csv", _Range, context),
+                ("/recording", _Recording, context),
                 (f"/{LOG_NAME}", _LastHour, context),
             ],
             default_handler_class=_Nothing,
@@ -232,6 +239,28 @@ class _Range(_Page):
         self.send_csv("cangauge-live.csv", _csv(rows[(time_ms >= start) & (time_ms <= end)]))
 
 
+class _Recording(_Page):
+    def post(self) -> None:
+        """Ask the service to begin or end its recording: `{"active": true}`.
+
+        Not for pages of other sites, of other ports of this machine neither: a browser states
+        whose page asks, and asks first before it sends JSON elsewhere, which is never allowed.
+        """
+        headers = self.request.headers
+        kind = headers.get("Content-Type", "").partition(";")[0].strip().lower()
+        origin = headers.get("Origin")
+        if origin is not None and urlsplit(origin).netloc != self.request.host:
+            self.refuse(403, "a page of another site may not ask for this")
+        elif kind != "application/json":
+            self.refuse(415, "send JSON")
+        elif (wanted := _wanted(self.request.body)) is None:
+            self.refuse(400, 'send {"active": true} or {"active": false}')
+        else:
+            self.site.ask(wanted)
+            self.set_status(202)
+            self.send_json({"active": wanted})
+
+
 class _LastHour(_Page):
     def get(self) -> None:
         self.send_csv(LOG_NAME, last_hour(self.site.history))
@@ -242,6 +271,15 @@ class _Nothing(_Page):
 
     def get(self) -> None:
         self.refuse(404, "there is nothing here: the live page is at /")
+
+
+def _wanted(body: bytes) -> bool | None:
+    try:
+        content = json.loads(body)
+    except ValueError:
+        return None
+    wanted = content.get("active") if isinstance(content, dict) else None
+    return wanted if isinstance(wanted, bool) else None
 
 
 def _csv(rows: FloatArray) -> str:
@@ -278,6 +316,11 @@ def _bokeh_file(name: str) -> str:
     return Path(Resources(mode="server").base_dir, "js", name).read_text(encoding="utf-8")
 
 
+def _ask_service(active: bool) -> None:
+    sys.stdout.write(json.dumps({"active": active}) + "\n")
+    sys.stdout.flush()
+
+
 async def _serve(site: Site, sockets: Sequence[socket.socket], lines: IO[bytes]) -> None:
     server = HTTPServer(
         site.application(),
@@ -304,7 +347,7 @@ def main() -> None:
     for each in sockets:
         each.setblocking(False)
     os.nice(settings["nice"])
-    asyncio.run(_serve(Site(History(), settings["token"]), sockets, lines))
+    asyncio.run(_serve(Site(History(), settings["token"], _ask_service), sockets, lines))
 
 
 if __name__ == "__main__":

@@ -2,12 +2,14 @@
 // Ask ten times a second for what is new, and show it. `FACTS` and the figures come from charts.js.
 (() => {
   Bokeh.set_log_level("error");  // it warns of each figure without data
-  const EVERY_MS = 100, GIVE_UP_MS = 700, CHANGES = 12, PIXELS = 500;
+  const EVERY_MS = 100, GIVE_UP_MS = 700, CHANGES = 12, PIXELS = 500, ANSWER_MS = 3000;
   const at = id => document.getElementById(id);
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const SPANS_MS = { "10min": 6e5, "1h": 3.6e6, all: Infinity };
   let span = "10min", key = "", added = 0, width_ms = SPANS_MS[span], paused = false, moving = false;
   let figures, rows, runs, time, answered_ms = performance.now(), drawn_ms = 0;
+  // All rows of the span; `rows` holds those drawn.
+  let kept = { time_ms: [] }, dropped = 0;
 
   const fixed = (value, digits) => value.toFixed(digits).replace("-", "−");
   const num = (value, digits, unit = "") =>
@@ -19,11 +21,28 @@
   // bokeh's axes show UTC: local time is drawn by moving the stamps.
   const SHIFT_MS = -6e4 * new Date().getTimezoneOffset();
   const clock = ms => new Date(ms).toISOString().slice(11, 19);
-  const put = (element, text) => { if (element.textContent !== text) element.textContent = text; };
+  const put = (element, text) => {
+    if (element.firstChild === null) element.textContent = text;
+    else if (element.firstChild.data !== text) element.firstChild.data = text;
+  };
+
+  // Means of the last second: shown once a second.
+  let means = {}, means_ms = -Infinity;
+  function meanTiles(status, latest) {
+    if (performance.now() - means_ms < 1000 && "Frames" in means) return means;
+    means_ms = performance.now();
+    const counts = Object.values(status.rejects).reduce((sum, count) => sum + count, 0);
+    means = {
+      "Frames": num(latest.frames_per_s, 0, "/s"),
+      "Rejects": `${counts} (${num(latest.rejects_per_s, 1, "/s")})`,
+      "Latency": num(latest.latency_ms, 2, "ms"),
+      "Latency, 99 % below": num(scaled(status.latency.p99_at_most_s, 1e3), 1, "ms"),
+    };
+    return means;
+  }
 
   function tiles(status, latest) {
-    const { estimate, health, power, cells, record } = status, sample = status.sample ?? {};
-    const counts = Object.values(status.rejects).reduce((sum, count) => sum + count, 0);
+    const { estimate, health, power, cells } = status, sample = status.sample ?? {};
     return {
       "SoC by voltage": num(estimate.soc_newton_pct, 2, "%"),
       "SoC by counting": num(estimate.soc_coulomb_pct, 2, "%"),
@@ -42,11 +61,7 @@
         "Weakest cell": cells.weakest === null ? "not distinguishable" : `number ${cells.weakest} of ${cells.cells}`,
         "SoC of that cell": pm(cells.soc_pct, cells.soc_std_pct, 1, "%"),
       } : {}),
-      "Frames": num(latest.frames_per_s, 0, "/s"),
-      "Rejects": `${counts} (${num(latest.rejects_per_s, 1, "/s")})`,
-      "Latency": num(latest.latency_ms, 2, "ms"),
-      "Latency, 99 % below": num(scaled(status.latency.p99_at_most_s, 1e3), 1, "ms"),
-      ...(record ? { "Recording": record.problem ?? `${num(record.written_bytes / 1e6, 1)} MB, ${record.lost_frames} lost` } : {}),
+      ...meanTiles(status, latest),
     };
   }
 
@@ -56,6 +71,7 @@
     put(at("state"), status.status);
     at("state").dataset.status = status.status;
     put(at("reasons"), words(latest.reasons).join("; "));
+    showRecording(status);
     const wanted = Object.entries(tiles(status, latest)), list = at("tiles");
     if (list.children.length !== wanted.length) {
       list.replaceChildren(...wanted.map(([name]) => {
@@ -69,6 +85,36 @@
       put(list.children[index].firstChild, name);
       put(list.children[index].lastChild, text);
     });
+  }
+
+  // The state of the recording is the service's, so all viewers see the same.
+  let recording = null, uptime_s = 0, restarted = false, asked_ms = -ANSWER_MS;
+  function showRecording(status) {
+    const record = status.record, is_active = Boolean(record?.active), was = Boolean(recording?.active);
+    if (status.uptime_s < uptime_s) restarted = was && !is_active;
+    else if (was !== is_active) { restarted = false; asked_ms = -ANSWER_MS; }
+    [recording, uptime_s] = [record, status.uptime_s];
+    put(at("record"), is_active ? "Stop recording" : "Start recording");
+    at("record").dataset.active = String(is_active);
+    at("record").setAttribute("aria-disabled", String(performance.now() - asked_ms < ANSWER_MS));
+    const lost = record?.lost_frames ? `, ${record.lost_frames} frames lost` : "";
+    const bytes = record?.written_bytes, size = (bytes < 1e6 ? num(bytes / 1e3, 0, "kB") : num(bytes / 1e6, 1, "MB")) + lost;
+    const problem = record?.problem ? ` ${record.problem}` : "";
+    put(at("recording"), is_active ? `${record.path}: ${size}.${problem}`
+      : restarted ? "Not recording: the service was restarted."
+        : problem ? `Not recording:${problem}` : record ? `Recorded: ${record.path}, ${size}.` : "Not recording.");
+  }
+
+  async function toggleRecording() {
+    if (performance.now() - asked_ms < ANSWER_MS) return;
+    asked_ms = performance.now();
+    try {
+      const answer = await fetch("/recording", {
+        method: "POST", headers: { "Content-Type": "application/json" },
+        body: JSON.stringify({ active: !recording?.active }), signal: AbortSignal.timeout(ANSWER_MS),
+      });
+      if (answer.status === 401) location.assign("/enter");
+    } catch { asked_ms = -ANSWER_MS; }
   }
 
   function trouble(texts) {
@@ -88,11 +134,11 @@
       if (last) last.right = ms;
       found.push({ left: ms, right: ms, status, colour: FACTS.colours[status], words: text });
     });
-    const kept = found.filter(run => !rows.data.time_ms.length || run.right >= rows.data.time_ms[0]).slice(-2000);
-    const isLonger = kept.length !== runs.data.left.length || fresh;
-    runs.data = Object.fromEntries(["left", "right", "status", "colour", "words"].map(name => [name, kept.map(run => run[name])]));
+    const shown = found.filter(run => !kept.time_ms.length || run.right >= kept.time_ms[0]).slice(-2000);
+    const isLonger = shown.length !== runs.data.left.length || fresh;
+    runs.data = Object.fromEntries(["left", "right", "status", "colour", "words"].map(name => [name, shown.map(run => run[name])]));
     if (!isLonger) return;
-    at("changes").replaceChildren(...kept.slice(-CHANGES).reverse().map(run => {
+    at("changes").replaceChildren(...shown.slice(-CHANGES).reverse().map(run => {
       const item = document.createElement("li");
       item.textContent = `${clock(run.left)} ${run.status}` + (run.words === "no reason" ? "" : `: ${run.words}`);
       return item;
@@ -106,10 +152,34 @@
   }
 
   function follow() {
-    const times = rows.data.time_ms;
+    const times = kept.time_ms;
     if (!times.length || paused) return;
     const end = times.at(-1), first = times[0];
     setRange(Math.max(end - width_ms, Math.min(first, end - 1e4)), end);
+  }
+
+  // Draw the rows between the ends of the time axis: all, or the least and largest of a pixel's stretch.
+  function draw() {
+    const times = kept.time_ms, first = Math.max(times.findIndex(ms => ms >= time.start) - 1, 0);
+    const after = times.findLastIndex(ms => ms <= time.end) + 2, every = Math.ceil((after - first) / PIXELS);
+    const cut = values => values.slice(first, after);
+    if (every <= 2) { rows.data = Object.fromEntries(Object.entries(kept).map(([name, values]) => [name, cut(values)])); return; }
+    // Stretches begin at the same rows in each picture, so that it stands still.
+    const starts = [];
+    for (let row = first - (first + dropped) % every; row < Math.min(after, times.length); row += every) starts.push(Math.max(row, 0));
+    const ends = [...starts.slice(1), Math.min(after, times.length)];
+    rows.data = Object.fromEntries(Object.entries(kept).map(([name, values]) => [name, starts.flatMap((start, index) =>
+      name === "time_ms" ? [values[start], values[ends[index] - 1]] : extremes(values, start, ends[index]))]));
+  }
+
+  // The least and the largest value, in the order of their rows.
+  function extremes(values, start, end) {
+    let low = start, high = start;
+    for (let row = start; row < end; row += 1) {
+      if (!(values[row] >= values[low])) { if (!Number.isNaN(values[row])) low = row; }
+      if (!(values[row] <= values[high])) { if (!Number.isNaN(values[row])) high = row; }
+    }
+    return [values[Math.min(low, high)], values[Math.max(low, high)]];
   }
 
   function take(answer) {
@@ -119,16 +189,19 @@
     }
     columns.time_ms = columns.time_ms.map(ms => ms + SHIFT_MS);
     const fresh = answer.key !== key && !isContinued(answer);
-    if (fresh) rows.data = columns;
-    else if (columns.time_ms.length) rows.stream(columns, FACTS.rows_at_most[span]);
+    if (fresh) [kept, dropped] = [columns, 0];
+    else for (const [name, values] of Object.entries(columns)) kept[name].push(...values);
+    const excess = Math.max(kept.time_ms.length - FACTS.rows_at_most[span], 0);
+    dropped += excess;
+    for (const values of Object.values(kept)) values.splice(0, excess);
     key = answer.key;
     added = answer.added;
-    if (fresh || columns.time_ms.length) { extend(columns, fresh); follow(); }
+    if (fresh || columns.time_ms.length) { extend(columns, fresh); follow(); draw(); }
   }
 
   // After a restart of the service its rows go on from those already shown.
   function isContinued(answer) {
-    const times = rows.data.time_ms;
+    const times = kept.time_ms;
     return key !== "" && key.split("-")[0] !== answer.key.split("-")[0] && times.length > 0 && !(answer.columns.time_ms[0] <= times.at(-1));
   }
 
@@ -200,7 +273,7 @@
     paused = wanted;
     at("pause").setAttribute("aria-pressed", String(paused));
     put(at("pause"), paused ? "Resume" : "Pause");
-    if (!paused) { width_ms = SPANS_MS[span]; follow(); }
+    if (!paused) { width_ms = SPANS_MS[span]; follow(); draw(); }
   }
 
   function move(scale, shift) {
@@ -208,6 +281,7 @@
     setPaused(true);
     const middle = end - width / 2;
     setRange(middle - scale * width / 2, middle + scale * width / 2);
+    draw();
   }
 
   function choose(tab) {
@@ -243,7 +317,12 @@
       try { await navigator.clipboard.writeText(at("command").textContent); put(at("copied"), "Copied."); }
       catch { put(at("copied"), "The browser refuses: select the command and copy it."); }
     });
-    time.change.connect(() => { if (!moving && !paused) setPaused(true); });
+    time.change.connect(() => {
+      if (moving) return;
+      if (!paused) setPaused(true);
+      draw();
+    });
+    at("record").addEventListener("click", toggleRecording);
     dark.addEventListener("change", paint);
   }
 
