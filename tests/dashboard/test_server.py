@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import http.client
 import json
 import socket
@@ -11,6 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from tornado.websocket import websocket_connect
 
 from cangauge.bus.vehicle import Vehicle
 from cangauge.dashboard.launch import LivePage
@@ -122,6 +124,45 @@ def test_a_slow_viewer_does_not_hold_the_others(page: LivePage) -> None:
 def snapshot_of(page: LivePage) -> Snapshot:
     assert page._latest is not None
     return replace(page._latest, made_s=time.monotonic())
+
+
+UPGRADE = {
+    "Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13",
+    "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+}  # fmt: skip
+
+
+def test_the_stream_is_for_the_own_page_only(page: LivePage, guarded: LivePage) -> None:
+    evil = UPGRADE | {"Origin": "https://evil.example"}
+    assert get(page, "/stream", headers=evil)[0] == 403
+    assert get(page, "/stream", headers=UPGRADE | {"Host": "evil.example"})[0] == 403
+    assert get(guarded, "/stream", headers=UPGRADE)[0] == 401
+
+
+def test_the_stream_sends_what_is_new(page: LivePage) -> None:
+    async def watch() -> list[dict[str, Any]]:
+        stream = await websocket_connect(f"ws://127.0.0.1:{page.port}/stream")
+        found = []
+        for question in ("[", '{"span": 1, "after": -1e400}', '{"span": "10min"}'):
+            await stream.write_message(question)
+            found.append(json.loads(str(await stream.read_message())))
+        while "columns" not in found[-1]:
+            found.append(json.loads(str(await stream.read_message())))
+        for _ in range(3):
+            await asyncio.sleep(0.15)  # rows are 0.1 s apart
+            page.show(snapshot_of(page))
+            found.append(json.loads(str(await stream.read_message())))
+        stream.close()
+        return found
+
+    assert waits(lambda: json.loads(get(page, "/rows")[2])["status"] is not None, 20.0)
+    found = [each for each in asyncio.run(watch()) if "columns" in each]
+    assert len(found) > 3
+    known = found[0]["added"]
+    for each in found[1:]:
+        assert len(each["columns"]["time_ms"]) == each["added"] - known
+        known = each["added"]
+    assert known > found[0]["added"]
 
 
 @pytest.mark.parametrize("path", ["/rows", "/range.csv", "/comparison", "/cangauge-last-hour.csv"])

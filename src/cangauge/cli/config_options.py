@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -31,7 +32,7 @@ class ConfigCommand(TyperCommand):
 
 
 def _with_values(arguments: Sequence[str]) -> Iterator[str]:
-    for word, following in zip(arguments, [*arguments[1:], "-"], strict=True):
+    for word, following in zip_longest(arguments, arguments[1:], fillvalue="-"):
         yield word
         if word in _BARE and following.startswith("-"):
             yield _BARE[word]

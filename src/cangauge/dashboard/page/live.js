@@ -1,15 +1,15 @@
 "use strict";
-// Ask ten times a second for what is new, and show it. `FACTS` and the figures come from charts.js.
+// Show what is new, ten times a second. `FACTS` and the figures come from charts.js.
 (() => {
   Bokeh.set_log_level("error");  // it warns of each figure without data
-  const EVERY_MS = 100, GIVE_UP_MS = 700, CHANGES = 12, PIXELS = 500, ANSWER_MS = 3000;
+  const GIVE_UP_MS = 700, WATCH_MS = 200, AGAIN_MS = 200, CHANGES = 12, PIXELS = 500, ANSWER_MS = 3000;
   const at = id => document.getElementById(id);
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const SPANS_MS = { "10min": 6e5, "1h": 3.6e6, all: Infinity };
   let span = "10min", key = "", added = 0, width_ms = SPANS_MS[span], paused = false, moving = false;
   let figures, rows, runs, time, answered_ms = performance.now(), drawn_ms = 0;
   // All rows of the span; `rows` holds those drawn.
-  let kept = { time_ms: [] }, dropped = 0;
+  let kept = { time_ms: [] }, dropped = 0, extended = 0;
 
   const fixed = (value, digits) => value.toFixed(digits).replace("-", "−");
   const num = (value, digits, unit = "") =>
@@ -124,11 +124,13 @@
   }
 
   // Stretches of one status and reasons, and the list of the latest changes.
-  function extend(columns, fresh) {
+  function extend(fresh) {
+    const start = Math.max(extended - dropped, 0), times = kept.time_ms.slice(start);
+    extended = dropped + kept.time_ms.length;
     const found = fresh ? [] : runs.data.left.map((_, index) =>
       Object.fromEntries(Object.entries(runs.data).map(([name, values]) => [name, values[index]])));
-    columns.time_ms.forEach((ms, index) => {
-      const status = FACTS.statuses[columns.status[index]], text = words(columns.reasons[index]).join("; ") || "no reason";
+    times.forEach((ms, index) => {
+      const status = FACTS.statuses[kept.status[start + index]], text = words(kept.reasons[start + index]).join("; ") || "no reason";
       const last = found.at(-1);
       if (last && last.status === status && last.words === text) { last.right = ms; return; }
       if (last) last.right = ms;
@@ -189,14 +191,16 @@
     }
     columns.time_ms = columns.time_ms.map(ms => ms + SHIFT_MS);
     const fresh = answer.key !== key && !isContinued(answer);
-    if (fresh) [kept, dropped] = [columns, 0];
+    if (fresh) [kept, dropped, extended] = [columns, 0, 0];
     else for (const [name, values] of Object.entries(columns)) kept[name].push(...values);
     const excess = Math.max(kept.time_ms.length - FACTS.rows_at_most[span], 0);
     dropped += excess;
     for (const values of Object.values(kept)) values.splice(0, excess);
     key = answer.key;
     added = answer.added;
-    if (fresh || columns.time_ms.length) { extend(columns, fresh); follow(); draw(); }
+    // The figures are drawn again once the picture has moved by about two pixels; the tiles each time.
+    const isDue = performance.now() - drawn_ms >= (time.end - time.start) / PIXELS;
+    if (fresh || (isDue && columns.time_ms.length)) redraw(fresh);
   }
 
   // After a restart of the service its rows go on from those already shown.
@@ -205,31 +209,45 @@
     return key !== "" && key.split("-")[0] !== answer.key.split("-")[0] && times.length > 0 && !(answer.columns.time_ms[0] <= times.at(-1));
   }
 
-  async function ask() {
-    // The figures are drawn again once the picture has moved by about two pixels; the tiles each time.
-    const isDue = performance.now() - drawn_ms >= (time.end - time.start) / PIXELS;
-    const query = paused || (!isDue && key) ? "" : `?span=${span}&key=${key}&after=${added}`, asked = span;
-    try {
-      const answer = await fetch(`/rows${query}`, { signal: AbortSignal.timeout(GIVE_UP_MS) });
-      if (answer.status === 401) { location.assign("/enter"); return; }
-      if (!answer.ok) throw new Error(String(answer.status));
-      const content = await answer.json();
-      answered_ms = performance.now();
-      if (content.columns && asked === span && !paused) { take(content); drawn_ms = answered_ms; }
-      if (content.status) {
-        show(content.status, content.latest);
-      }
-      trouble(content.troubles);
-    } catch {
-      const seconds = (performance.now() - answered_ms) / 1e3;
-      if (1e3 * seconds > GIVE_UP_MS) trouble([`The service does not answer for ${seconds.toFixed(0)} s. The values are old.`]);
-    }
+  function redraw(fresh) {
+    drawn_ms = performance.now();
+    extend(fresh);
+    follow();
+    draw();
   }
 
-  async function poll() {
-    const began = performance.now();
-    if (!document.hidden) await ask();
-    setTimeout(poll, Math.max(EVERY_MS - (performance.now() - began), 20));
+  // What is new comes by a socket, from each question on: which rows this page has, or that it wants none.
+  let socket = null;
+  function question() {
+    if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(paused ? {} : { span, key, after: added }));
+  }
+
+  function hear(content) {
+    answered_ms = performance.now();
+    if (content.columns && content.span === span && !paused) take(content);
+    if (content.status) show(content.status, content.latest);
+    trouble(content.troubles);
+  }
+
+  function connect() {
+    if (socket || document.hidden) return;
+    const own = socket = new WebSocket(`${location.origin.replace("http", "ws")}/stream`);
+    own.onopen = question;
+    own.onmessage = event => hear(JSON.parse(event.data));
+    own.onclose = async () => {
+      if (socket === own) socket = null;
+      if (document.hidden) return;
+      const answer = await fetch("/rows").catch(() => null);
+      if (answer?.status === 401) location.assign("/enter");
+      else setTimeout(connect, AGAIN_MS);
+    };
+  }
+
+  function watch() {
+    const seconds = (performance.now() - answered_ms) / 1e3;
+    if (document.hidden || 1e3 * seconds <= GIVE_UP_MS) return;
+    trouble([`The service does not answer for ${seconds.toFixed(0)} s. The values are old.`]);
+    if (1e3 * seconds > ANSWER_MS && socket) { const old = socket; socket = null; old.close(); }
   }
 
   async function compare() {
@@ -273,6 +291,7 @@
     paused = wanted;
     at("pause").setAttribute("aria-pressed", String(paused));
     put(at("pause"), paused ? "Resume" : "Pause");
+    question();
     if (!paused) { width_ms = SPANS_MS[span]; follow(); draw(); }
   }
 
@@ -338,7 +357,17 @@
     }
     paint();
     controls();
-    poll();
+    // A figure out of sight is not drawn.
+    const seen = new IntersectionObserver(entries => {
+      for (const { target, isIntersecting } of entries) {
+        const view = Bokeh.index.find_one_by_id(figures.find(({ name }) => name === target.dataset.figure).id);
+        if (isIntersecting) view.unpause(); else if (!view.is_paused) view.pause();
+      }
+    });
+    for (const section of document.querySelectorAll("[data-figure]")) seen.observe(section);
+    connect();
+    setInterval(watch, WATCH_MS);
+    document.addEventListener("visibilitychange", () => { if (document.hidden) socket?.close(); else connect(); });
     compare();
   }
   begin();
