@@ -5,12 +5,9 @@ from __future__ import annotations
 import contextlib
 import csv
 import importlib
-import importlib.util
 import io
 import json
-import shutil
 import socket
-import tempfile
 import threading
 import time
 import urllib.request
@@ -20,6 +17,7 @@ from typing import Any, Self
 
 import cantools
 import pytest
+from headless import MARKS, chromium, faults, set_scheme
 
 from cangauge._resources import shared_file
 from cangauge.bus.captures.capture import open_capture
@@ -29,27 +27,10 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.validity import Sample
 from live import Command, leaf_model_path, waits
 
-CHROMIUM, DRIVER = (
-    next(filter(None, map(shutil.which, names)), None)
-    for names in (("chromium", "chromium-browser", "google-chrome"), ("chromedriver",))
-)
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(
-        CHROMIUM is None or DRIVER is None, reason="needs chromium and chromedriver"
-    ),
-]
-webdriver = pytest.importorskip("selenium.webdriver", reason="needs selenium")
+pytestmark = MARKS
 
 GROUP = "239.74.163.91"
 CURRENT_A, VOLTAGE_V, TEMPERATURE_C = 12.5, 378.2, 23.0
-ARGUMENTS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
-    "--window-size=1280,1000",
-)  # fmt: skip
-
-
 TIMES_MS = "return Bokeh.documents[0].get_model_by_name('rows').data.time_ms"
 
 
@@ -121,19 +102,8 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        options = webdriver.ChromeOptions()
-        options.binary_location = str(CHROMIUM)
-        for argument in (*ARGUMENTS, f"--user-data-dir={folder}"):
-            options.add_argument(argument)
-        options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-        driver = webdriver.Chrome(
-            options=options, service=webdriver.ChromeService(executable_path=DRIVER)
-        )
-        try:
-            yield driver
-        finally:
-            driver.quit()
+    with chromium() as driver:
+        yield driver
 
 
 @pytest.fixture
@@ -177,21 +147,6 @@ def is_shown(browser: Any, words: str, seconds: float = 5.0) -> bool:
     return waits(lambda: words in text(browser, "troubles"), seconds)
 
 
-def faults(browser: Any) -> list[str]:
-    """Return the serious faults of accessibility that axe-core finds."""
-    source = Path(str(importlib.util.find_spec("axe_core_python").origin)).parent / "axe.min.js"
-    browser.execute_script(source.read_text(encoding="utf-8"))
-    result = browser.execute_async_script(
-        "axe.run(document, {resultTypes: ['violations']}).then(arguments[0])"
-    )
-    assert len(result["passes"]) > 10
-    return [
-        f"{each['id']}: {[node['html'][:80] for node in each['nodes']]}"
-        for each in result["violations"]
-        if each["impact"] in {"serious", "critical"}
-    ]
-
-
 def test_the_page_shows_what_the_bus_carries(bench: Bench, page: Any) -> None:
     assert tile(page, "Voltage") == f"{VOLTAGE_V:.2f} V"
     assert tile(page, "Temperature") == f"{TEMPERATURE_C:.1f} °C"
@@ -229,7 +184,8 @@ def test_a_silent_bus_is_shown_within_a_second(bench: Bench, page: Any) -> None:
         page.execute_script(
             "new MutationObserver(() => { window.first ??= "
             "document.getElementById('troubles').textContent || undefined; })"
-            ".observe(document.getElementById('troubles'), {childList: true})"
+            ".observe(document.getElementById('troubles'),"
+            " {childList: true, characterData: true, subtree: true})"
         )
         assert is_shown(page, "The bus is silent: no sample for")
         first_s = float(page.execute_script("return window.first").split(" for ")[1].split(" ")[0])
@@ -277,8 +233,7 @@ def test_the_range_shown_is_downloaded(bench: Bench, page: Any) -> None:
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_axe_finds_no_serious_fault(page: Any, scheme: str) -> None:
-    feature = {"name": "prefers-color-scheme", "value": scheme}
-    page.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
+    set_scheme(page, scheme)
     assert faults(page) == []
     page.find_element("id", "tab-gap").click()
     assert faults(page) == []

@@ -2,7 +2,7 @@
 // Show what is new, ten times a second. `FACTS` and the figures come from charts.js.
 (() => {
   Bokeh.set_log_level("error");  // it warns of each figure without data
-  const GIVE_UP_MS = 700, WATCH_MS = 200, AGAIN_MS = 200, CHANGES = 12, PIXELS = 500, ANSWER_MS = 3000;
+  const GIVE_UP_MS = 700, DRAW_MS = 250, WATCH_MS = 200, AGAIN_MS = 200, CHANGES = 12, PIXELS = 500, ANSWER_MS = 3000;
   const at = id => document.getElementById(id);
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const SPANS_MS = { "10min": 6e5, "1h": 3.6e6, all: Infinity };
@@ -198,8 +198,9 @@
     for (const values of Object.values(kept)) values.splice(0, excess);
     key = answer.key;
     added = answer.added;
-    // The figures are drawn again once the picture has moved by about two pixels; the tiles each time.
-    const isDue = performance.now() - drawn_ms >= (time.end - time.start) / PIXELS;
+    // The figures are drawn again once the picture has moved by about two pixels, at most four times a second; the
+    // tiles each time.
+    const isDue = performance.now() - drawn_ms >= Math.max((time.end - time.start) / PIXELS, DRAW_MS);
     if (fresh || (isDue && columns.time_ms.length)) redraw(fresh);
   }
 
