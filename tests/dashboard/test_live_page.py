@@ -304,4 +304,6 @@ def test_an_open_page_survives_a_restart(bench: Bench, page: Any) -> None:
     after = page.execute_script(TIMES_MS)
     assert after[: len(before)] == before
     assert after == sorted(after)
+    broken = 'return Bokeh.documents[0].get_model_by_name("rows").data.soc_pct.some(Number.isNaN)'
+    assert page.execute_script(broken)  # no line over the time without a service
     assert text(page, "recording") == "Not recording: the service was restarted."

@@ -131,6 +131,7 @@ class Site:
             "key": present,
             "is_known": key == present,
             "added": span.added,
+            "every_ms": 1e3 * span.every_s,
             "columns": shown_columns(span.rows(after if key == present else 0)),
         }
 

@@ -2,14 +2,14 @@
 // Show what is new, ten times a second. `FACTS` and the figures come from charts.js.
 (() => {
   Bokeh.set_log_level("error");  // it warns of each figure without data
-  const GIVE_UP_MS = 700, DRAW_MS = 250, WATCH_MS = 200, AGAIN_MS = 200, CHANGES = 12, PIXELS = 500, ANSWER_MS = 3000;
+  const GIVE_UP_MS = 700, DRAW_MS = 250, GAP_MS = 2000, WATCH_MS = 200, AGAIN_MS = 200, CHANGES = 12, PIXELS = 500, ANSWER_MS = 3000;
   const at = id => document.getElementById(id);
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const SPANS_MS = { "10min": 6e5, "1h": 3.6e6, all: Infinity };
   let span = "10min", key = "", added = 0, width_ms = SPANS_MS[span], paused = false, moving = false;
   let figures, rows, runs, time, answered_ms = performance.now(), drawn_ms = 0;
   // All rows of the span; `rows` holds those drawn.
-  let kept = { time_ms: [] }, dropped = 0, extended = 0;
+  let kept = { time_ms: [] }, dropped = 0, extended = 0, every_ms = 100;
 
   const fixed = (value, digits) => value.toFixed(digits).replace("-", "−");
   const num = (value, digits, unit = "") =>
@@ -132,8 +132,9 @@
     times.forEach((ms, index) => {
       const status = FACTS.statuses[kept.status[start + index]], text = words(kept.reasons[start + index]).join("; ") || "no reason";
       const last = found.at(-1);
-      if (last && last.status === status && last.words === text) { last.right = ms; return; }
-      if (last) last.right = ms;
+      const isNext = last && ms - last.right <= gap_ms();
+      if (isNext) last.right = ms;
+      if (isNext && last.status === status && last.words === text) return;
       found.push({ left: ms, right: ms, status, colour: FACTS.colours[status], words: text });
     });
     const shown = found.filter(run => !kept.time_ms.length || run.right >= kept.time_ms[0]).slice(-2000);
@@ -145,6 +146,19 @@
       item.textContent = `${clock(run.left)} ${run.status}` + (run.words === "no reason" ? "" : `: ${run.words}`);
       return item;
     }));
+  }
+
+  // Longest time between rows of which none is missing.
+  const gap_ms = () => Math.max(5 * every_ms, GAP_MS);
+
+  // Break the lines where rows are missing: a service that was stopped, for instance.
+  function broken(data, limit_ms) {
+    const times = data.time_ms;
+    for (let row = times.length - 1; row > 0; row -= 1) {
+      if (!(times[row] - times[row - 1] > limit_ms)) continue;
+      for (const values of Object.values(data)) values.splice(row, 0, values === times ? times[row - 1] : NaN);
+    }
+    return data;
   }
 
   function setRange(start, end) {
@@ -165,13 +179,15 @@
     const times = kept.time_ms, first = Math.max(times.findIndex(ms => ms >= time.start) - 1, 0);
     const after = times.findLastIndex(ms => ms <= time.end) + 2, every = Math.ceil((after - first) / PIXELS);
     const cut = values => values.slice(first, after);
-    if (every <= 2) { rows.data = Object.fromEntries(Object.entries(kept).map(([name, values]) => [name, cut(values)])); return; }
+    const columns = of => Object.fromEntries(Object.entries(kept).map(([name, values]) => [name, of(values, name)]));
+    if (every <= 2) { rows.data = broken(columns(cut), gap_ms()); return; }
     // Stretches begin at the same rows in each picture, so that it stands still.
     const starts = [];
     for (let row = first - (first + dropped) % every; row < Math.min(after, times.length); row += every) starts.push(Math.max(row, 0));
     const ends = [...starts.slice(1), Math.min(after, times.length)];
-    rows.data = Object.fromEntries(Object.entries(kept).map(([name, values]) => [name, starts.flatMap((start, index) =>
-      name === "time_ms" ? [values[start], values[ends[index] - 1]] : extremes(values, start, ends[index]))]));
+    rows.data = broken(columns((values, name) => starts.flatMap((start, index) =>
+      name === "time_ms" ? [values[start], values[ends[index] - 1]] : extremes(values, start, ends[index]))),
+    every * every_ms + gap_ms());
   }
 
   // The least and the largest value, in the order of their rows.
@@ -196,8 +212,7 @@
     const excess = Math.max(kept.time_ms.length - FACTS.rows_at_most[span], 0);
     dropped += excess;
     for (const values of Object.values(kept)) values.splice(0, excess);
-    key = answer.key;
-    added = answer.added;
+    ({ key, added, every_ms } = answer);
     // The figures are drawn again once the picture has moved by about two pixels, at most four times a second; the
     // tiles each time.
     const isDue = performance.now() - drawn_ms >= Math.max((time.end - time.start) / PIXELS, DRAW_MS);
