@@ -93,7 +93,8 @@ def _command(name: str) -> Any:
     alone = typer.Typer(
         rich_markup_mode="markdown", add_completion=False, context_settings=_CONTEXT
     )
-    alone.command(name)(getattr(import_module(f"cangauge.cli.{module}"), f"{module}_command"))
+    function = getattr(import_module(f"cangauge.cli.{module}"), f"{module}_command")
+    alone.command(name, cls=getattr(function, "command_class", None))(function)
     return build_command(alone)
 
 

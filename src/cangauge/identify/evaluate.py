@@ -57,7 +57,7 @@ def energy_balance(logs: Sequence[Log], slope_ohm: float) -> Energy:
         regenerated_kwh=regenerated / JOULE_PER_KWH,
         net_kwh=net / JOULE_PER_KWH,
         heat_kwh=heat / JOULE_PER_KWH,
-        efficiency_pct=100.0 * net / (net + heat) if net + heat > 0.0 else float("nan"),
+        efficiency_pct=100.0 * net / (net + heat) if net > 0.0 else float("nan"),
     )
 
 

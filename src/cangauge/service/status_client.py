@@ -219,6 +219,7 @@ _SHAPE: Final[dict[str, Any]] = {
             "lost_frames": int,
             "written_bytes": int,
             "problem": (str, type(None)),
+            "active": bool,
         },
     ),
 }
