@@ -112,11 +112,14 @@ class Dataset:
                     found[row["log"]] = row
         return {log: row for log, row in found.items() if row.get("is_final", True)}
 
-    def rows(self, run: str | None = None, *, bad: bool = False) -> Iterator[dict[str, Any]]:
-        """Yield the rows, of one run if stated, with `vehicle`."""
+    def rows(
+        self, run: str | None = None, *, bad: bool = False, without: Sequence[str] = ()
+    ) -> Iterator[dict[str, Any]]:
+        """Yield the rows, of one run if stated, with `vehicle` and without some columns."""
         wanted = None if run is None else pc.field("run") == run
         table = self.tables[bad]
-        yield from self._rows(table, [*self._schemas[table].names, "vehicle"], wanted)
+        names = [name for name in self._schemas[table].names if name not in without]
+        yield from self._rows(table, names, wanted)
 
     def settle(self) -> None:
         """Join the files of each vehicle to one, with the latest row of each log."""

@@ -167,7 +167,7 @@ def _shuffled(logs: Sequence[FleetLog]) -> list[FleetLog]:
     return sorted(logs, key=_order)
 
 
-def gap_job_parts(
+def suspect_and_healthy(
     logs: Sequence[FleetLog], per_vehicle: int
 ) -> tuple[dict[str, tuple[FleetLog, ...]], dict[str, tuple[FleetLog, ...]]]:
     """Return the latest logs to diagnose, and the healthy ones, by vehicle.
