@@ -378,7 +378,9 @@ def _run(  # noqa: PLR0917 - one call of each command
 
         write_texts_atomic({report: fleet_report(found)})
     if json_output:
-        emit_json(summary.to_dict() | found.to_dict() | {"output": out, "report": report})
+        emit_json(
+            summary.to_dict() | found.to_dict() | {"output": out, "report": report and str(report)}
+        )
     else:
         _show(summary, found)
     if not summary.done + summary.skipped:

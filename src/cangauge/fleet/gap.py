@@ -59,6 +59,7 @@ class GapJob(Job):
     alarm_below: float = ALARM_BELOW
 
     kind: ClassVar[str] = "gap"
+    of: ClassVar[str] = "vehicles"
     reads_log: ClassVar[bool] = False
     columns: ClassVar[Mapping[str, Any]] = {
         "logs": _NAMES, "references": COUNT, "reference_vehicles": COUNT, "unread": _NAMES,

@@ -50,6 +50,8 @@ class Job(ABC):
     """Columns of a row, with their Arrow types."""
     is_chained: ClassVar[bool] = False
     """Whether the column `state` of a log is the input of the vehicle's next one."""
+    of: ClassVar[str] = "logs"
+    """What its rows are about."""
     reads_log: ClassVar[bool] = True
     """Whether the log is one file."""
 

@@ -80,6 +80,8 @@ class Summary:
         Largest number of workers at a time.
     reasons : dict
         Of the logs set aside now, with their number.
+    of : str
+        What is counted: logs, or vehicles.
     """
 
     logs: int
@@ -90,6 +92,7 @@ class Summary:
     seconds: float = 0.0
     workers: int = 0
     reasons: dict[str, int] = field(default_factory=dict)
+    of: str = "logs"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the counts as JSON."""
@@ -100,7 +103,7 @@ class Summary:
         finished = self.skipped + self.done + self.bad + self.bad_before
         aside = self.bad + self.bad_before
         return (
-            f"{finished} of {self.logs} logs: {self.done} computed, {self.skipped} known,"
+            f"{finished} of {self.logs} {self.of}: {self.done} computed, {self.skipped} known,"
             f" {aside} set aside"
         )
 
@@ -137,7 +140,7 @@ def connected(scheduler: str, workers: int | None = None) -> Iterator[Any]:
     if scheduler == LOCAL:
         cluster = LocalCluster(
             n_workers=workers or os.cpu_count() or 1, threads_per_worker=1, processes=True,
-            dashboard_address="127.0.0.1:0", silence_logs=logging.ERROR,
+            dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL,
         )  # fmt: skip
         with cluster, Client(cluster, set_as_default=False) as client:
             yield _announced(client)
@@ -217,7 +220,7 @@ class _Run:
     """
 
     def __init__(self, job: Job, logs: Sequence[FleetLog], dataset: Dataset, client: Any) -> None:
-        self.summary = Summary(len(logs))
+        self.summary = Summary(len(logs), of=job.of)
         self.began = time.monotonic()
         self._job, self._dataset, self._client = job, dataset, client
         self._id = run_id(job)
