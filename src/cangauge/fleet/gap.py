@@ -83,7 +83,7 @@ class GapJob(Job):
         """Return one entry for each vehicle; its stamp is that of its logs and references."""
         found = []
         for vehicle, logs in sorted(self.logs.items()):
-            used = [*logs, *self._references(vehicle)]
+            used = [*logs, *self.references_of(vehicle)]
             text = "".join(f"{log.url}{log.stamp}{log.initial_soc_pct}" for log in used)
             stamp = hashlib.sha256(text.encode()).hexdigest()[:16]
             found.append(FleetLog(vehicle, vehicle, stamp))
@@ -96,7 +96,7 @@ class GapJob(Job):
         logs = list(self._read(self.logs[log.vehicle], unread))
         if not logs:
             raise InputError(f"none of its logs can be read: {unread[0]}")
-        chosen = self._references(log.vehicle)
+        chosen = self.references_of(log.vehicle)
         references = list(self._read(chosen, unread))
         found = diagnose(logs, self.model, references, alarm_below=self.alarm_below)
         return {
@@ -107,7 +107,7 @@ class GapJob(Job):
             **_columns_of(found),
         }
 
-    def _references(self, vehicle: str) -> list[FleetLog]:
+    def references_of(self, vehicle: str) -> list[FleetLog]:
         """Return the vehicle's own healthy logs, at most half, then one of each other in turn."""
         own = _shuffled(self.healthy.get(vehicle, ()))[: max(self.references // 2, 1)]
         others = [_shuffled(logs) for name, logs in sorted(self.healthy.items()) if name != vehicle]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from datetime import UTC, datetime
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -102,7 +102,8 @@ def _tiles(found: FleetOverview) -> list[Tile]:
     if found.health:
         names = {vehicle for vehicle, _, _ in found.outlying}
         tiles.append(Tile("Outliers in health", str(len(names)), f"|z| ≥ {OUTLIER_Z}"))
-    tiles.append(Tile("Logs set aside", str(len(found.bad)), "not counted"))
+    aside = {row["log"] for row in found.bad}
+    tiles.append(Tile("Logs set aside", str(len(aside)), "not counted"))
     return tiles
 
 
@@ -177,10 +178,11 @@ def _over_time(found: FleetOverview, quantity: str, marked: set[str]) -> Plot:
         rows = [row for row in found.health[name] if row[quantity] is not None]
         x = np.array([(row["end_s"] - first_s) / DAY_S for row in rows])
         y = np.array([row[quantity] for row in rows])
-        color = ORANGE if name in marked else BLUE
-        few = len(found.health) <= 8
-        pen = Pen(color, 2.0 if name in marked else 1.0, 1.0 if name in marked else 0.5,
-                  in_legend=few or name in marked)  # fmt: skip
+        is_marked = name in marked
+        color = ORANGE if is_marked else BLUE
+        pen = (
+            Pen(color, 2.0, in_legend=True) if is_marked else Pen(color, 1.0, 0.5, in_legend=False)
+        )
         add_line(plot, name, x, y, pen)
         plot.scatter(x=x, y=y, size=4, color=color, alpha=pen.alpha, name=name)
     return plot
@@ -240,17 +242,17 @@ def _estimates(found: FleetOverview) -> list[Block]:
 def _bad(found: FleetOverview) -> list[Block]:
     if not found.bad:
         return []
-    kinds: Counter[str] = Counter()
-    example: dict[str, dict[str, Any]] = {}
+    kinds: Counter[tuple[str, str]] = Counter()
+    example: dict[tuple[str, str], str] = {}
     for row in found.bad:
-        kind = row["reason"].removeprefix(f"{row['log']}: ")
+        kind = row["table"], row["reason"].removeprefix(f"{row['log']}: ")
         kinds[kind] += 1
-        example.setdefault(kind, row)
+        example.setdefault(kind, row["log"])
     rows = [
-        [str(count), kind, example[kind]["log"], example[kind]["table"]]
-        for kind, count in kinds.most_common(SHOWN)
+        [command, str(count), reason, example[command, reason]]
+        for (command, reason), count in kinds.most_common(SHOWN)
     ]
-    return [Table(["logs", "reason", "for example", "command"], rows)]
+    return [Table(["command", "logs", "reason", "for example"], rows)]
 
 
 def _shown(total: int) -> str:
