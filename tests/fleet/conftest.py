@@ -22,7 +22,7 @@ from cangauge.validation.cases import Scenario, draw_scenario
 from cangauge.validation.twin.recording import record_drive
 from fleet_cluster import Cluster, free_port
 
-VEHICLES, LOGS = 4, 3
+VEHICLES, LOGS = 4, 2
 
 
 @pytest.fixture(scope="session")
@@ -37,7 +37,7 @@ def folder(scenario: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path
     (root / "car0").mkdir()
     write_log(scenario.training[0].log, root / "car0" / "full.parquet")
     for vehicle in range(VEHICLES):
-        drives = scenario.draw_drives(np.random.default_rng([7, vehicle]), LOGS, 0.5)
+        drives = scenario.draw_drives(np.random.default_rng([7, vehicle]), LOGS, 0.4)
         (root / f"car{vehicle}").mkdir(exist_ok=True)
         for number, drive in enumerate(drives):
             recording = record_drive(scenario.plant, drive, (), name=f"trip{number}")

@@ -108,12 +108,12 @@ def test_health_passes_from_log_to_log(logs: list[FleetLog], model: Model) -> No
     for log in trips:
         rows.append(perform(job, log, "", state).row or {})
         state = rows[-1]["state"]
-    alone = perform(job, trips[2], "", None).row or {}
-    assert rows[2]["capacity_std_ah"] < alone["capacity_std_ah"]
+    alone = perform(job, trips[1], "", None).row or {}
+    assert rows[1]["capacity_std_ah"] < alone["capacity_std_ah"]
     assert [row["end_s"] for row in rows] == sorted(row["end_s"] for row in rows)
-    dated = replace(trips[1], start="2024-05-01T08:00:00Z")
+    dated = replace(trips[0], start="2024-05-01T08:00:00Z")
     first = perform(job, dated, "", None).row or {}
-    early = perform(job, replace(trips[2], start="2024-05-01T08:10:00Z"), "", first["state"])
+    early = perform(job, replace(trips[1], start="2024-05-01T08:10:00Z"), "", first["state"])
     assert "before the vehicle's log before it ends" in early.reason
 
 
@@ -134,11 +134,11 @@ def test_one_vehicle_apart_from_the_others_is_an_outlier() -> None:
 
 
 def test_references_come_from_all_vehicles(logs: list[FleetLog], model: Model) -> None:
-    marked = [replace(log, healthy="trip2" not in log.url) for log in logs]
+    marked = [replace(log, healthy="trip1" not in log.url) for log in logs]
     suspect, healthy = suspect_and_healthy(marked, 1)
     job = GapJob(ReadOptions(), model, suspect, healthy, references=5)
     chosen = job.references_of("car1")
-    assert [log.vehicle for log in chosen].count("car1") == 2
+    assert [log.vehicle for log in chosen].count("car1") == 1
     assert {log.vehicle for log in chosen} == {"car0", "car1", "car2", "car3"}
     assert chosen == replace(job, logs=dict(reversed(suspect.items()))).references_of("car1")
     with pytest.raises(InputError, match="known to be healthy"):
@@ -150,8 +150,8 @@ def test_a_vehicle_is_diagnosed_with_references_of_others(
 ) -> None:
     broken = tmp_path / "broken.csv"
     broken.write_text("x\n")
-    suspect = {"car1": (logs[5], FleetLog(str(broken), "car1", "s"))}
-    healthy = {"car2": (logs[7],)}
+    suspect = {"car1": (logs[3], FleetLog(str(broken), "car1", "s"))}
+    healthy = {"car2": (logs[5],)}
     job = GapJob(ReadOptions(), model, suspect, healthy, references=1)
     (vehicle,) = job.vehicles()
     row = perform(job, vehicle, "", None).row

@@ -16,10 +16,8 @@ HEAD = "time_s,current_a,voltage_v,temperature_c\n"
 
 def test_a_glob_finds_the_logs_of_each_folder(folder: Path) -> None:
     found = find_logs([f"{folder}/*/trip*.parquet"])
-    assert [log.vehicle for log in found] == ["car0"] * 3 + ["car1"] * 3 + ["car2"] * 3 + [
-        "car3"
-    ] * 3
-    assert [Path(log.url).stem for log in found[:3]] == ["trip0", "trip1", "trip2"]
+    assert [log.vehicle for log in found] == [f"car{k}" for k in range(4) for _ in range(2)]
+    assert [Path(log.url).stem for log in found[:2]] == ["trip0", "trip1"]
 
 
 def test_a_pattern_finds_the_vehicle_in_the_name(tmp_path: Path) -> None:
