@@ -42,6 +42,9 @@ TASKS_PER_THREAD: Final = 4
 REPORT_S: Final = 30.0
 """Interval of the lines of progress in a log file [s]."""
 
+ASK_S: Final = 1.0
+"""Interval of questions to the scheduler for its workers, and of the progress shown [s]."""
+
 CONNECT_S: Final = 10.0
 """Time for the scheduler to answer [s]."""
 
@@ -228,7 +231,8 @@ class _Run:
         self._in_flight: dict[str, _Lane] = {}
         self._rows: list[dict[str, Any]] = []
         self._bad: list[dict[str, Any]] = []
-        self._flushed = self._reported = self.began
+        self._flushed = self._reported = self._asked = self.began
+        self._threads = 0
 
     def _to_do(self, logs: Sequence[FleetLog]) -> list[_Lane]:
         known = self._dataset.known(self._id, *self._job.resumes_with)
@@ -253,6 +257,8 @@ class _Run:
         # A task, not scattered data: it is computed again if its worker is lost.
         job = self._client.submit(_identity, self._job, key=f"job-{self._id}")
         done = as_completed(loop=self._client.loop, with_results=True, raise_errors=False)
+        if not self._ask_workers():
+            _LOG.info("waiting for workers")
         self._fill(done, job)
         while self._in_flight:
             future, result = next(done)
@@ -261,14 +267,16 @@ class _Run:
             self._report()
 
     def _fill(self, done: Any, job: Any) -> None:
-        wanted = max(2, TASKS_PER_THREAD * self._threads())
+        wanted = max(2, TASKS_PER_THREAD * self._threads)
         while len(self._in_flight) < wanted and (lane := next(self._lanes, None)) is not None:
             self._submit(lane, done, job)
 
-    def _threads(self) -> int:
-        workers = self._client.scheduler_info(n_workers=-1)["workers"]
-        self.summary.workers = max(self.summary.workers, len(workers))
-        return sum(int(each["nthreads"]) for each in workers.values())
+    def _ask_workers(self) -> int:
+        """Return the number of workers now, and note their threads."""
+        threads = self._client.nthreads()
+        self.summary.workers = max(self.summary.workers, len(threads))
+        self._threads = sum(threads.values())
+        return len(threads)
 
     def _submit(self, lane: _Lane, done: Any, job: Any) -> None:
         log, sha256 = lane.waiting.popleft()
@@ -316,7 +324,9 @@ class _Run:
         now = time.monotonic()
         if now - self._flushed >= FLUSH_S or len(self._rows) >= FLUSH_ROWS:
             self.flush()
-        workers = len(self._client.scheduler_info(n_workers=-1)["workers"])
+        if now - self._asked < ASK_S:
+            return
+        self._asked, workers = now, self._ask_workers()
         _LOG.debug("%s: %s (%d workers)", self._job.kind, self.summary, workers)
         if now - self._reported >= REPORT_S:
             self._reported = now
