@@ -41,17 +41,18 @@ def main() -> None:
         size = sum(path.stat().st_size for path in root.rglob("*.parquet")) / options.logs
         sys.stdout.write(f"{options.logs} logs of {options.hours} h, {size / 1e3:.0f} kB each\n")
         _run(root, "fit", scenario, 1, root / "first")
-        for command in ("fit", "estimate"):
-            for workers in (1, 2):
-                _measure(root, command, scenario, workers, options.logs)
+        for workers in (1, 2):
+            # Starts the cluster, and finds every log known.
+            empty = _timed(root, "fit", scenario, workers, root / "first")
+            for command in ("fit", "estimate"):
+                spent = _timed(root, command, scenario, workers, root / f"{command}{workers}")
+                _print(command, workers, options.logs, spent, empty)
 
 
-def _measure(root: Path, command: str, scenario: Scenario, workers: int, logs: int) -> None:
-    out = root / f"{command}{workers}"
-    # Starts the cluster, and finds every log known.
-    empty_s, empty_cpu_s = _timed(root, "fit", scenario, workers, root / "first")
-    wall_s, cpu_s = _timed(root, command, scenario, workers, out)
-    wall_s, per_log_s = wall_s - empty_s, (cpu_s - empty_cpu_s) / logs
+def _print(
+    command: str, workers: int, logs: int, spent: tuple[float, float], empty: tuple[float, float]
+) -> None:
+    wall_s, per_log_s = spent[0] - empty[0], (spent[1] - empty[1]) / logs
     hours = MILLION * per_log_s / 3600.0
     sys.stdout.write(
         f"{command:9}{workers} workers  {logs / wall_s:6.2f} logs/s  {per_log_s:6.3f} s CPU a log"

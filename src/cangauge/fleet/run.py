@@ -29,6 +29,8 @@ from cangauge.fleet.sources import FleetLog, local_file
 
 _LOG = logging.getLogger(__name__)
 
+LOST: Final = "the scheduler was lost; finished logs are kept: run the same command again"
+
 LOCAL: Final = "local"
 """Scheduler and workers on this machine."""
 
@@ -140,6 +142,9 @@ def connected(scheduler: str, workers: int | None = None) -> Iterator[Any]:
             "dask.distributed is not installed", field="--scheduler", value=scheduler,
             cure="pip install 'cangauge[fleet]'",
         ) from error  # fmt: skip
+    for name in ("distributed", "distributed.client"):
+        # A lost worker or scheduler is reported here, without their tracebacks.
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     if scheduler == LOCAL:
         cluster = LocalCluster(
             n_workers=workers or os.cpu_count() or 1, threads_per_worker=1, processes=True,
@@ -173,6 +178,8 @@ def worker_version() -> str:
 def _check_versions(client: Any) -> None:
     try:
         found = client.run(worker_version)
+    except OSError as error:
+        raise CangaugeError(LOST) from error
     except Exception as error:
         raise InputError(
             f"the workers cannot run cangauge: {error}", field="--scheduler",
@@ -291,9 +298,7 @@ class _Run:
     def _take(self, future: Any, result: Any, done: Any, job: Any) -> None:
         lane = self._in_flight.pop(future.key)
         if future.status in {"cancelled", "lost"}:
-            raise CangaugeError(
-                "the scheduler was lost; finished logs are kept: run the same command again"
-            )
+            raise CangaugeError(LOST)
         if isinstance(result, Outcome):
             outcome = result
         else:  # distributed gives type, error and traceback of a task that could not run
