@@ -21,10 +21,7 @@ from cangauge.fleet.dataset import Dataset
 from cangauge.fleet.jobs import EstimateJob
 from cangauge.fleet.run import Summary, connected, perform, run_job
 from cangauge.fleet.sources import FleetLog, ReadOptions, find_logs
-from cangauge.identify.fit import fit
-from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model, ModelNoise
-from cangauge.validation.cases import Scenario
 from fleet_cluster import Cluster, wait_until
 from live import in_process
 
@@ -60,15 +57,15 @@ def assert_same_noise(found: ModelNoise, wanted: ModelNoise) -> None:
 
 
 def test_fleet_fit_is_the_fit_of_all_logs(
-    cluster: Cluster, folder: Path, logs: list[FleetLog], scenario: Scenario, tmp_path: Path
+    cluster: Cluster, folder: Path, logs: list[FleetLog], model: Model, tmp_path: Path
 ) -> None:
-    capacity = scenario.pack.capacity_ah
+    plain = model  # of `cangauge.fit` on the same logs
     (folder / "car3" / "broken.parquet").write_bytes(b"PAR1")
     try:
         ended = in_process(
             "fleet", "fit", f"{folder}/*/*.parquet", "-m", tmp_path / "type.json",
-            "-o", tmp_path / "out", "--capacity-ah", capacity, "--scheduler", cluster.address,
-            "--json",
+            "-o", tmp_path / "out", "--capacity-ah", plain.capacity_ah,
+            "--scheduler", cluster.address, "--json",
         )  # fmt: skip
     finally:
         (folder / "car3" / "broken.parquet").unlink()
@@ -76,7 +73,6 @@ def test_fleet_fit_is_the_fit_of_all_logs(
     first, second = json.loads(ended.out)["passes"]
     assert (first["done"], first["bad"], second["done"]) == (len(logs), 1, len(logs))
     found = Model.load(tmp_path / "type.json")
-    plain = fit([read_log(log.url) for log in logs], capacity_ah=capacity).model
     for name, wanted in plain.coefficients.items():
         item = found.coefficients[name]
         assert item.value == pytest.approx(wanted.value, rel=1e-9)
