@@ -20,7 +20,7 @@ help:
 	@echo "make wheel     build the wheel and run the job from it in an environment of its own"
 	@echo "make trips     the table on the real BMW i3 trips (see README for the data)"
 
-$(VENV)/installed: pyproject.toml
+$(VENV)/installed: pyproject.toml hatch_build.py $(wildcard core/*.[ch])
 	$(PYTHON) -c 'import sys; sys.exit("cangauge needs Python 3.11 or later (set PYTHON=…)" if sys.version_info < (3, 11) else 0)'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .

@@ -108,3 +108,21 @@ def test_error_has_the_stated_deviation(start_std_pct: float, discharged_pct: fl
     # A given start is never worse than counting, whose error is that of the start.
     if start_std_pct == 1.0:
         assert rmse < 1.05
+
+
+def test_merging_two_hypotheses_moves_neither_soc_nor_deviation() -> None:
+    _, voltage_v = drive(seed=1, steps=1000, discharged_pct=0.0)
+    voltage_v += SLOPE_V * 2.0
+    two = HypothesisFilter(make_ekf)
+    two.start(50.0, 1.0)
+    stated, number = [], []
+    for value in voltage_v:
+        since = ChargeSinceUpdate(seconds=1.0)
+        two.predict(since)
+        two.update(Measurement(float(value), 0.0, 52.0, FAST_V, 0.0, 0.0), since)
+        stated.append(two.soc_after(ChargeSinceUpdate()))
+        number.append(len(two.snapshot().hypotheses))
+    assert number[800] == 2
+    assert number[-1] == 1
+    steps = np.abs(np.diff(stated[600:], axis=0))
+    assert steps.max() < 0.01

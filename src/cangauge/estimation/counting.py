@@ -71,7 +71,7 @@ def parked_std_pct(seconds: float, rms_pct_per_s: float) -> float:
     """
     drain_pct = min(DRAIN_PCT_PER_HOUR * seconds / 3600.0, DRAIN_AT_MOST_PCT)
     use_pct = min(rms_pct_per_s * min(seconds, USE_S), MOVED_STD_AT_MOST_PCT)
-    return math.hypot(drain_pct, use_pct)
+    return math.sqrt(drain_pct * drain_pct + use_pct * use_pct)
 
 
 def moved_std_pct(seconds: float) -> float:
@@ -114,6 +114,8 @@ class CoulombCounter:
     ----------
     state : CounterState
         Charge counted so far, and the last sample.
+    is_restored : bool
+        Whether no sample has come since the state was restored.
     """
 
     def __init__(self, capacity_ah: float, gap_s: float) -> None:
@@ -121,7 +123,7 @@ class CoulombCounter:
         self._gap_s = gap_s
         # Of a slow log the usual step may exceed a minute; as offline (`logs.gaps.bridge_s`).
         self._bridge_s = max(BRIDGE_S, gap_s)
-        self._is_restored = False
+        self.is_restored = False
         self.state = CounterState()
 
     def step(self, time_s: float, current_a: float) -> ChargeStep:
@@ -135,20 +137,20 @@ class CoulombCounter:
             return ChargeStep(0.0, 0.0, 0.0)
         seconds = time_s - last_s
         across_a = 0.5 * (current_a + last_a)
-        if self._is_restored and seconds > self._gap_s:
+        if self.is_restored and seconds > self._gap_s:
             held = HELD_S / seconds * -math.expm1(-0.5 * seconds / HELD_S)
             across_a = state.mean_a + held * (current_a + last_a - 2.0 * state.mean_a)
-        self._is_restored = False
+        self.is_restored = False
         kept = math.exp(-seconds / MEAN_MEMORY_S)
         state.mean_a = kept * state.mean_a + (1.0 - kept) * current_a
         kept = math.exp(-seconds / MEAN_SQUARE_MEMORY_S)
         # At the start of a drive the mean square lags: the currents at the ends of the gap bound it
         # from below.
         mean_square_a2 = state.mean_square_a2
-        state.mean_square_a2 = kept * state.mean_square_a2 + (1.0 - kept) * current_a**2
+        state.mean_square_a2 = kept * state.mean_square_a2 + (1.0 - kept) * (current_a * current_a)
         if seconds > self._bridge_s:
             away_pct = min(AWAY_PCT_PER_HOUR * seconds / 3600.0, AWAY_AT_MOST_PCT)
-            rms_a = math.sqrt(max(mean_square_a2, last_a**2))
+            rms_a = math.sqrt(max(mean_square_a2, last_a * last_a))
             parked_pct = parked_std_pct(seconds, rms_a * self._pct_per_as)
             return ChargeStep(seconds, 0.0, away_pct, seconds, parked_pct)
         state.counted_s += seconds
@@ -157,7 +159,7 @@ class CoulombCounter:
         state.moved_pct += abs(out_pct)
         if seconds <= self._gap_s:
             return ChargeStep(seconds, out_pct, 0.0)
-        rms_a = math.sqrt(max(mean_square_a2, 0.5 * (current_a**2 + last_a**2)))
+        rms_a = math.sqrt(max(mean_square_a2, 0.5 * (current_a * current_a + last_a * last_a)))
         return ChargeStep(seconds, out_pct, rms_a * seconds * self._pct_per_as)
 
     def uncounted_std_pct(self, seconds: float) -> float:
@@ -165,13 +167,13 @@ class CoulombCounter:
         state = self.state
         if math.isnan(state.time_s):
             return 0.0
-        rms_a = math.sqrt(max(state.mean_square_a2, state.current_a**2))
+        rms_a = math.sqrt(max(state.mean_square_a2, state.current_a * state.current_a))
         return min(rms_a * seconds * self._pct_per_as, MOVED_STD_AT_MOST_PCT)
 
-    def restore(self, state: CounterState) -> None:
+    def restore(self, state: CounterState, *, is_restored: bool = True) -> None:
         """Continue from a state after a restart; the counter works on it."""
         self.state = state
-        self._is_restored = True
+        self.is_restored = is_restored
 
 
 LATEST_S = 1e11

@@ -35,11 +35,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from operator import mul
 from typing import Final
 
 import numpy as np
 
+from cangauge._arithmetic import dot
 from cangauge.errors import InputError
 from cangauge.estimation.measurement_noise import CurveFunctions, Measurement
 from cangauge.estimation.state import EkfState
@@ -108,7 +108,8 @@ def count_std_pct(
     """
     pct_per_as = 100.0 / (3600.0 * capacity_ah)
     offset_pct = OFFSET_STD_PER_AH * capacity_ah * 3600.0 * hours * pct_per_as
-    return math.sqrt(start_var_pct2 + offset_pct**2 + (CAPACITY_STD * moved_pct) ** 2)
+    capacity_pct = CAPACITY_STD * moved_pct
+    return math.sqrt(start_var_pct2 + offset_pct * offset_pct + capacity_pct * capacity_pct)
 
 
 class SocEkf:
@@ -146,6 +147,8 @@ class SocEkf:
         self._lasting_pct = noise.lasting_soc_pct
         self._lasting_var = noise.lasting_std_v**2
         self._offset_std_a = OFFSET_STD_PER_AH * capacity_ah
+        walk_a = OFFSET_WALK_PER_SQRT_H * self._offset_std_a
+        self._walk_var = walk_a * walk_a
         self._mean_innovation_v = 0.0
         self._mean_seconds = 0.0
         self.was_outlier = False
@@ -158,8 +161,8 @@ class SocEkf:
         size = self._size
         self._x = [soc_pct, *[0.0] * (size - 1)]
         variances = [
-            soc_std_pct**2, self._offset_std_a**2, self._slow_var,
-            self._lasting_var, CAPACITY_STD**2, *[1.0] * (size - LEARNED),
+            soc_std_pct * soc_std_pct, self._offset_std_a * self._offset_std_a, self._slow_var,
+            self._lasting_var, CAPACITY_STD * CAPACITY_STD, *[1.0] * (size - LEARNED),
         ]  # fmt: skip
         self._p = [[0.0] * k + [variances[k]] + [0.0] * (size - 1 - k) for k in range(size)]
         self._reset_innovations()
@@ -193,9 +196,9 @@ class SocEkf:
             (slow_kept, lasting_kept),
             (
                 gap_var_pct2,
-                (OFFSET_WALK_PER_SQRT_H * self._offset_std_a) ** 2 * seconds / 3600.0,
-                self._slow_var * (1.0 - slow_kept**2),
-                self._lasting_var * (1.0 - lasting_kept**2),
+                self._walk_var * seconds / 3600.0,
+                self._slow_var * (1.0 - slow_kept * slow_kept),
+                self._lasting_var * (1.0 - lasting_kept * lasting_kept),
             ),
         )
         self._clip_soc()
@@ -260,9 +263,10 @@ class SocEkf:
         bool
             Whether a lasting contradiction made the SoC unknown again.
         """
-        fast_v2 = measurement.std_v**2
+        fast_v2 = measurement.std_v * measurement.std_v
         forgotten = -math.expm1(-2.0 * seconds / self._slow_time_s)
-        self._p[SLOW][SLOW] += measurement.resistance_std_v**2 * forgotten
+        resistance_v = measurement.resistance_std_v
+        self._p[SLOW][SLOW] += resistance_v * resistance_v * forgotten
         jacobian, unbiased_v = self._linearized(measurement, self._x[SOC])
         if self._is_contradicted(measurement, unbiased_v, jacobian, seconds):
             offset_a, offset_var = self._x[OFFSET], self._p[OFFSET][OFFSET]
@@ -274,9 +278,9 @@ class SocEkf:
         start_pct = at_pct = self._x[SOC]
         for _ in range(ITERATIONS_AT_MOST):
             innovation = measurement.voltage_v - unbiased_v
-            innovation -= sum(map(mul, jacobian[SLOW:], self._x[SLOW:]))
-            spread = [sum(map(mul, row, jacobian)) for row in self._p]
-            of_state = max(sum(map(mul, spread, jacobian)), 0.0)
+            innovation -= dot(jacobian[SLOW:], self._x[SLOW:])
+            spread = [dot(row, jacobian) for row in self._p]
+            of_state = max(dot(spread, jacobian), 0.0)
             corrected_pct = start_pct + spread[SOC] / (of_state + fast_v2) * innovation
             corrected_pct = min(max(corrected_pct, LOWEST_PCT), HIGHEST_PCT)
             if abs(corrected_pct - at_pct) < LINEAR_PCT:
@@ -284,9 +288,10 @@ class SocEkf:
             at_pct = corrected_pct
             jacobian, unbiased_v = self._linearized(measurement, at_pct)
             unbiased_v += jacobian[SOC] * (start_pct - at_pct)
-        self.was_outlier = innovation**2 > OUTLIER_SIGMAS**2 * (of_state + fast_v2)
+        square = innovation * innovation
+        self.was_outlier = square > OUTLIER_SIGMAS * OUTLIER_SIGMAS * (of_state + fast_v2)
         if self.was_outlier:
-            fast_v2 = max(fast_v2, innovation**2 - of_state)
+            fast_v2 = max(fast_v2, square - of_state)
         self._correct(jacobian, spread, innovation, of_state, fast_v2)
         self._clip_soc()
         return is_contradicted
@@ -304,7 +309,7 @@ class SocEkf:
         """Update with an external SoC reference and its standard deviation [%]."""
         jacobian = [1.0, *[0.0] * (self._size - 1)]
         spread = [row[SOC] for row in self._p]
-        self._correct(jacobian, spread, soc_pct - self._x[SOC], spread[SOC], std_pct**2)
+        self._correct(jacobian, spread, soc_pct - self._x[SOC], spread[SOC], std_pct * std_pct)
         self._clip_soc()
 
     def _correct(
@@ -343,7 +348,7 @@ class SocEkf:
 
     def shrink_bias(self) -> None:
         """Reduce the slow error after a long rest, in which slow polarization has decayed."""
-        limit = RESTED_BIAS**2 * self._slow_var
+        limit = RESTED_BIAS * RESTED_BIAS * self._slow_var
         p = self._p
         if p[SLOW][SLOW] <= limit:
             return
@@ -385,6 +390,10 @@ class SocEkf:
             or not np.linalg.eigvalsh(correlation)[0] > -ROUNDING
         ):
             raise InputError("not a positive semidefinite covariance", field="filter.hypotheses")
+        self.resume(state)
+
+    def resume(self, state: EkfState) -> None:
+        """Continue from a state that this filter had."""
         self._x = list(state.x)
         self._p = [list(row) for row in state.p]
         self._mean_innovation_v = state.mean_innovation_v
@@ -456,14 +465,14 @@ class SocEkf:
         if self._mean_seconds < PERSISTENT_S:
             return False
         of_model = jacobian[KT:]
-        mean_var = self._slow_var + self._lasting_var + sum(map(mul, of_model, of_model))
-        mean_var += jacobian[SOC] ** 2 * self._p[SOC][SOC]
-        mean_var += measurement.resistance_std_v**2 + measurement.std_v**2 * seconds / (
-            2.0 * PERSISTENT_S
-        )
+        mean_var = self._slow_var + self._lasting_var + dot(of_model, of_model)
+        slope, fast_v = jacobian[SOC], measurement.std_v
+        resistance_v = measurement.resistance_std_v
+        mean_var += slope * slope * self._p[SOC][SOC] + resistance_v * resistance_v
+        mean_var += fast_v * fast_v * seconds / (2.0 * PERSISTENT_S)
         seen = 1.0 - math.exp(-self._mean_seconds / PERSISTENT_S)
         mean = self._mean_innovation_v / seen
-        return bool(mean**2 > PERSISTENT_SIGMAS**2 * mean_var)
+        return mean * mean > PERSISTENT_SIGMAS * PERSISTENT_SIGMAS * mean_var
 
     def _reset_innovations(self) -> None:
         self._mean_innovation_v = 0.0

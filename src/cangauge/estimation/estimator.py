@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from operator import mul
 
+from cangauge._arithmetic import dot, total
 from cangauge.errors import InputError
 from cangauge.estimation.cells import PackTick
 from cangauge.estimation.counting import CoulombCounter, EstimatorClock
@@ -43,7 +43,7 @@ from cangauge.estimation.validity import (
 from cangauge.model.delay_line import DelayLine
 from cangauge.model.effects.base import Reading
 from cangauge.model.model_file import Model, effective_error_std_v
-from cangauge.model.voltage_model import TEMPERATURE_MARGIN_K, VoltageModel, soc_from_ocv
+from cangauge.model.voltage_model import TEMPERATURE_MARGIN_K, Curve, VoltageModel, soc_from_ocv
 
 __all__ = ["Estimator", "EstimatorSettings"]
 
@@ -111,8 +111,7 @@ class Estimator:
         self._voltage_model = extended.model
         self._online = extended.online(self.settings.capacity_ah)
         self._has_effects = not self._online.plain
-        # Without effects the voltage model gives the same numbers with half the calls.
-        self._curve = self._online if self._has_effects else self._voltage_model
+        self._curve = self._make_curve()
         self.capacity_ah = self._online.capacity_ah
         self.filter = HypothesisFilter(
             lambda: make_ekf(self._curve, self._online.steady_ohm, self.capacity_ah, model.noise)
@@ -122,7 +121,8 @@ class Estimator:
         self._line = DelayLine(self._voltage_model.delay_s, gap_s=self.settings.gap_s)
         self._references = SocReferenceDetector(self.settings.full_charge, self.settings.long_rest)
         self._noise = MeasurementNoise(model, self._online)
-        self._bias_std_v = math.hypot(model.noise.slow_std_v, model.noise.lasting_std_v)
+        slow_v, lasting_v = model.noise.slow_std_v, model.noise.lasting_std_v
+        self._bias_std_v = math.sqrt(slow_v * slow_v + lasting_v * lasting_v)
         self._functions = CurveFunctions(model.noise)
         self._nominal_v = self._voltage_model.pseudo_ocv_at(50.0)[0]
         self._health = HealthEstimator(
@@ -157,6 +157,11 @@ class Estimator:
         if self.settings.initial_soc_pct is not None:
             soc_pct = self._online.initial_soc_pct(self.settings.initial_soc_pct)
             self._start(soc_pct, self.settings.initial_soc_std_pct)
+
+    def _make_curve(self) -> Curve:
+        """Return the pseudo-OCV with effects; the compiled estimator has its own."""
+        # Without effects the voltage model gives the same numbers with half the calls.
+        return self._online if self._has_effects else self._voltage_model
 
     def step(self, sample: Sample) -> Estimate:
         """Process one sample and return the estimate after it; see `update`."""
@@ -241,7 +246,7 @@ class Estimator:
             std_pct,
             sample.voltage_v,
             without_ocv_v,
-            sum(map(mul, self._voltage_model.resistance_ohm, self._delayed_a)),
+            dot(self._voltage_model.resistance_ohm, self._delayed_a),
             self._counter.state.moved_pct,
         )
 
@@ -290,13 +295,13 @@ class Estimator:
         since.moved_pct += abs(charge.discharged_pct)
         if charge.away_s:
             since.away_s += charge.away_s
-            since.unseen_var_pct2 += charge.parked_std_pct**2
+            since.unseen_var_pct2 += charge.parked_std_pct * charge.parked_std_pct
         else:
-            since.gap_var_pct2 += charge.gap_std_pct**2
+            since.gap_var_pct2 += charge.gap_std_pct * charge.gap_std_pct
         if charge.seconds > self.settings.gap_s:
             memory.gap_until_s = time_s + self._voltage_model.delay_s[-1]
         if charge.gap_std_pct and not math.isnan(memory.coulomb_var_pct2):
-            memory.coulomb_var_pct2 += charge.gap_std_pct**2
+            memory.coulomb_var_pct2 += charge.gap_std_pct * charge.gap_std_pct
 
         if abs(current_a) > REST_CURRENT_C_RATE * self.capacity_ah:
             memory.rest_since_s = math.nan
@@ -346,17 +351,18 @@ class Estimator:
         newton = soc_from_ocv(self._curve, sample.voltage_v - without_ocv_v, guess_pct)
         memory.newton_pct, memory.newton_inside = newton
         std_v, kt_std_v = self._noise.at(memory.temperature_c, self._line)
-        drop_v = sum(self._delayed_a) / len(self._delayed_a) * self._online.steady_ohm
+        drop_v = total(self._delayed_a) / len(self._delayed_a) * self._online.steady_ohm
         resistance_std_v = self._noise.resistance_std(memory.temperature_c) * drop_v
         slope = self._curve.pseudo_ocv_at(memory.newton_pct)[1]
         curve_std_v = self._functions.std_v(memory.newton_pct)
-        error_v = math.hypot(std_v, self._bias_std_v, curve_std_v, kt_std_v, resistance_std_v)
+        parts_v = (std_v, self._bias_std_v, curve_std_v, kt_std_v, resistance_std_v)
+        error_v = math.sqrt(dot(parts_v, parts_v))
         memory.newton_std_pct = min(error_v / slope, UNKNOWN_SOC_STD_PCT)
         if math.isnan(memory.coulomb_start_pct):
             # No initial SoC: start from the voltage's with a wide prior, from which the filter
             # learns how SoC and bias share what the voltage cannot separate.
             self._start(memory.newton_pct, UNKNOWN_SOC_STD_PCT)
-            memory.coulomb_var_pct2 = memory.newton_std_pct**2
+            memory.coulomb_var_pct2 = memory.newton_std_pct * memory.newton_std_pct
         if self._is_filtering:
             measurement = Measurement(
                 sample.voltage_v,
@@ -392,7 +398,7 @@ class Estimator:
         memory, model = self._memory, self._voltage_model
         cold, hot = model.temperature_range_c
         margin_k = TEMPERATURE_MARGIN_K
-        drop_v = sum(map(mul, model.resistance_ohm, self._delayed_a))
+        drop_v = dot(model.resistance_ohm, self._delayed_a)
         return VoltageTick(
             sample.voltage_v,
             without_ocv_v,
@@ -415,7 +421,7 @@ class Estimator:
 
     def _start(self, soc_pct: float, std_pct: float) -> None:
         """Start counting, and the filter where it is used, from a SoC [%]."""
-        self._start_count(soc_pct, std_pct**2)
+        self._start_count(soc_pct, std_pct * std_pct)
         if self.settings.method == "ekf":
             self.filter.start(soc_pct, std_pct)
             self._is_filtering = True
@@ -436,7 +442,8 @@ class Estimator:
         if not reference.is_by_voltage:
             self._health.correct(reference.soc_pct, reference.soc_std_pct)
         soc_pct = _clip(self._coulomb_pct())
-        var_pct2, reference_var_pct2 = self._coulomb_std_pct() ** 2, reference.soc_std_pct**2
+        std_pct, reference_std_pct = self._coulomb_std_pct(), reference.soc_std_pct
+        var_pct2, reference_var_pct2 = std_pct * std_pct, reference_std_pct * reference_std_pct
         gain = var_pct2 / (var_pct2 + reference_var_pct2)
         self._start_count(soc_pct + gain * (reference.soc_pct - soc_pct), (1.0 - gain) * var_pct2)
         if self._is_filtering:
@@ -480,7 +487,8 @@ class Estimator:
         if self._counter.state.time_s < memory.mismatch_until_s:
             # A model that does not fit: as uncertain as its inputs disagree.
             counted_pct = _clip(self._coulomb_pct()) - soc_pct
-            std_pct = math.hypot(std_pct, memory.bias_pct, counted_pct)
+            parts_pct = (std_pct, memory.bias_pct, counted_pct)
+            std_pct = math.sqrt(dot(parts_pct, parts_pct))
         return soc_pct, std_pct
 
     def _has_other_capacity(self) -> bool:

@@ -48,6 +48,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from cangauge._arithmetic import total
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.estimation.counting import moved_std_pct
@@ -411,7 +412,8 @@ class HealthEstimator:
         if abs(there.soc_pct - soc_pct) > FAR_PCT:
             slope = (there_v - ocv_v) / (there.soc_pct - soc_pct)
         row[_S] = slope
-        std_v = math.hypot(math.sqrt(self._lasting_var), AXIS_STD_PCT * there_slope)
+        axis_v = AXIS_STD_PCT * there_slope
+        std_v = math.sqrt(self._lasting_var + axis_v * axis_v)
         below, weights, between_var = _between_nodes(there.soc_pct)
         row[_C + below], row[_C + below + 1] = std_v * weights[0], std_v * weights[1]
         shared_by = max(0.5 * NODE_PCT / max(moved_pct, SHORTEST_PCT), 1.0)
@@ -501,9 +503,9 @@ class ResistanceEstimator:
             noise = max(yy - slope * xy, 0.0) / (count - 1.0)
             if noise > 0.0:
                 found.append((slope, xx / noise))
-        weight = sum(each for _, each in found)
-        change = sum(slope * each for slope, each in found) / (weight + prior)
-        spread = sum(each * (slope - change) ** 2 for slope, each in found) / (weight + prior)
+        weight = total(each for _, each in found)
+        change = total(slope * each for slope, each in found) / (weight + prior)
+        spread = total(each * (slope - change) ** 2 for slope, each in found) / (weight + prior)
         return 1.0 + change, math.sqrt(1.0 / (weight + prior) + spread)
 
     def snapshot(self) -> ResistanceState:

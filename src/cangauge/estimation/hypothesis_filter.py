@@ -15,8 +15,8 @@ Assoc. 90 (1995) 614). Likelihoods summed over voltages would count an error tha
 that of the curve, as new evidence each second. The output is the mean weighted by the odds; the
 spread between the hypotheses is part of its standard deviation. The SoC therefore moves toward the
 likelier hypothesis as evidence grows, without a jump. Once the odds are clear the other hypothesis
-is dropped; if they stay unclear the two are merged. A rejected initial SoC has no influence on the
-result.
+is dropped; if they stay unclear the two are merged, which changes neither SoC nor σ. A rejected
+initial SoC has no influence on the result.
 
 A mixture of a narrow and a wide hypothesis is no normal distribution: what is improbable and far
 away makes up most of its variance. The standard deviation stated is therefore half the half-width
@@ -29,11 +29,15 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from cangauge.errors import InputError
 from cangauge.estimation.counting import moved_log_odds, moved_std_pct
-from cangauge.estimation.ekf import HIGHEST_PCT, LOWEST_PCT, UNKNOWN_SOC_STD_PCT, SocEkf
+from cangauge.estimation.ekf import (
+    HIGHEST_PCT,
+    LOWEST_PCT,
+    SOC,
+    UNKNOWN_SOC_STD_PCT,
+    SocEkf,
+)
 from cangauge.estimation.measurement_noise import Measurement
 from cangauge.estimation.state import ChargeSinceUpdate, EkfState, HypothesisFilterState, Verdict
 
@@ -111,7 +115,7 @@ class HypothesisFilter:
             moved = self._restored(self._filters[0].snapshot())
             self._add(moved, moved_log_odds(since.away_s), moved_pct)
             self.verdict = "open"
-            variances[1] = since.gap_var_pct2 + moved_pct**2
+            variances[1] = since.gap_var_pct2 + moved_pct * moved_pct
         for each, variance in zip(self._filters, variances, strict=False):
             each.predict(
                 since.seconds, since.discharged_pct, since.moved_pct, variance, since.away_s
@@ -176,20 +180,25 @@ class HypothesisFilter:
 
     def soc_after(self, since: ChargeSinceUpdate) -> tuple[float, float]:
         """Return SoC and standard deviation [%] after the charge counted since the last update."""
-        counted_s = since.seconds - since.away_s
-        soc_pct, std_pct, offset_pct = self._filters[0].summary(counted_s)
-        if len(self._filters) > 1:
-            first, second = (each.summary(counted_s) for each in self._filters)
-            soc_pct, _, offset_pct = map(self._mean, zip(first, second, strict=True))
-            std_pct = self._stated_std_pct(
-                [(abs(soc - soc_pct), std) for soc, std, _ in (first, second)]
-            )
+        soc_pct, std_pct, offset_pct = self._soc_and_std_pct(since.seconds - since.away_s)
         soc_pct -= since.discharged_pct - offset_pct
         since_var_pct2 = since.gap_var_pct2 + since.unseen_var_pct2
         if since.away_s:
             odds = math.exp(moved_log_odds(since.away_s))
-            since_var_pct2 += odds / (1.0 + odds) * moved_std_pct(since.away_s) ** 2
-        return min(max(soc_pct, 0.0), 100.0), math.sqrt(std_pct**2 + since_var_pct2)
+            moved_pct = moved_std_pct(since.away_s)
+            since_var_pct2 += odds / (1.0 + odds) * (moved_pct * moved_pct)
+        return min(max(soc_pct, 0.0), 100.0), math.sqrt(std_pct * std_pct + since_var_pct2)
+
+    def _soc_and_std_pct(self, counted_s: float) -> tuple[float, float, float]:
+        """Return SoC, the σ stated, and the charge that the offset adds in a time [%]."""
+        if len(self._filters) == 1:
+            return self._filters[0].summary(counted_s)
+        first, second = (each.summary(counted_s) for each in self._filters)
+        soc_pct, _, offset_pct = map(self._mean, zip(first, second, strict=True))
+        std_pct = self._stated_std_pct(
+            [(abs(soc - soc_pct), std) for soc, std, _ in (first, second)]
+        )
+        return soc_pct, std_pct, offset_pct
 
     @property
     def soc_pct(self) -> float:
@@ -244,7 +253,14 @@ class HypothesisFilter:
                 f"not a valid filter, or a SoC outside {LOWEST_PCT:g} … {HIGHEST_PCT:g} %",
                 field="filter.hypotheses",
             )
-        self._filters = filters
+        self.resume(state)
+
+    def resume(self, state: HypothesisFilterState) -> None:
+        """Continue from a state that this filter had."""
+        self._filters = []
+        for each in state.hypotheses:
+            self._filters.append(self._make_ekf())
+            self._filters[-1].resume(each)
         self._is_untested = state.is_untested
         self._log_odds = _bounded(state.log_odds)
         self._prior_log_odds = _bounded(state.prior_log_odds)
@@ -263,11 +279,13 @@ class HypothesisFilter:
         (soc1_pct, std1_pct, _), (soc2_pct, std2_pct, _) = (
             each.summary(0.0) for each in self._filters
         )
-        more_pct2 = std2_pct**2 - std1_pct**2
-        if more_pct2 <= FORGOTTEN * std2_pct**2:
+        second_pct2 = std2_pct * std2_pct
+        more_pct2 = second_pct2 - std1_pct * std1_pct
+        if more_pct2 <= FORGOTTEN * second_pct2:
             return self._log_odds
-        square = (soc2_pct - soc1_pct) ** 2 / more_pct2
-        ratio = self._wide_std_pct * math.sqrt(more_pct2) / std2_pct**2
+        apart_pct = soc2_pct - soc1_pct
+        square = apart_pct * apart_pct / more_pct2
+        ratio = self._wide_std_pct * math.sqrt(more_pct2) / second_pct2
         return _bounded(self._prior_log_odds + 0.5 * square - math.log(ratio))
 
     def _second_probability(self) -> float:
@@ -316,21 +334,30 @@ class HypothesisFilter:
         return is_contradicted
 
     def _merge(self, verdict: Verdict) -> None:
-        """Replace two hypotheses by one with their weighted mean and spread."""
+        """Replace two hypotheses by one with their mean, covariance, and the σ stated.
+
+        The moments of the mixture, with the SoC scaled: what is improbable and far away makes up
+        most of the mixture's variance, and is given up here as it is not in the σ stated.
+        """
         if len(self._filters) == 1:
             return
-        states = [each.snapshot() for each in self._filters]
-        second = self._second_probability()
-        weights = (1.0 - second, second)
-        xs, ps = [np.array(each.x) for each in states], [np.array(each.p) for each in states]
-        x = weights[0] * xs[0] + weights[1] * xs[1]
-        p = sum(
-            weight * (cov + np.outer(at - x, at - x))
-            for weight, at, cov in zip(weights, xs, ps, strict=True)
-        )
-        likelier = states[int(second > 0.5)]
-        merged = replace(likelier, x=x.tolist(), p=np.asarray(p).tolist())
-        self._filters = [self._restored(merged)]
+        std_pct = self._soc_and_std_pct(0.0)[1]
+        first, second = (each.snapshot() for each in self._filters)
+        x = [self._mean(pair) for pair in zip(first.x, second.x, strict=True)]
+        away = [[at - mean for at, mean in zip(each.x, x, strict=True)] for each in (first, second)]
+        p = [
+            [
+                self._mean((first.p[k][j] + d1 * e1, second.p[k][j] + d2 * e2))
+                for j, (e1, e2) in enumerate(zip(*away, strict=True))
+            ]
+            for k, (d1, d2) in enumerate(zip(*away, strict=True))
+        ]
+        scale = std_pct / math.sqrt(p[SOC][SOC]) if p[SOC][SOC] > 0.0 else 1.0
+        p[SOC] = [scale * value for value in p[SOC]]
+        for row in p:
+            row[SOC] *= scale
+        likelier = second if self._log_odds > 0.0 else first
+        self._filters = [self._restored(replace(likelier, x=x, p=p))]
         if self.verdict == "open":
             self.verdict = verdict
 
@@ -339,7 +366,7 @@ def _within(width: float, away: float, std: float) -> tuple[float, float]:
     """Return the probability of ±width of a normal distribution with mean `away`, and its slope."""
     scale = max(std, WIDTH_TO_PCT) * math.sqrt(2.0)
     low, high = (-width - away) / scale, (width - away) / scale
-    density = (math.exp(-(low**2)) + math.exp(-(high**2))) / (scale * math.sqrt(math.pi))
+    density = (math.exp(-(low * low)) + math.exp(-(high * high))) / (scale * math.sqrt(math.pi))
     return 0.5 * (math.erf(high) - math.erf(low)), density
 
 

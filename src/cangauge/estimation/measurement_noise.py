@@ -11,6 +11,7 @@ import math
 from bisect import bisect_right
 from typing import NamedTuple
 
+from cangauge._arithmetic import dot, total
 from cangauge.model.delay_line import DelayLine
 from cangauge.model.extended import OnlineExtendedModel
 from cangauge.model.model_file import Model, ModelNoise, effective_error_std_v
@@ -74,7 +75,7 @@ class MeasurementNoise:
             Signed effect of one standard deviation of the temperature coefficient.
         """
         model = self._model
-        variance = self._fast_std_v**2
+        variance = self._fast_std_v * self._fast_std_v
         filled_s = line.filled_s
         if not filled_s >= model.delay_s[-1]:
             variance = self._filling_var_v2(variance, filled_s)
@@ -100,12 +101,13 @@ class MeasurementNoise:
         they carry the information of one.
         """
         model = self._model
-        unknown_ohm = sum(
+        unknown_ohm = total(
             abs(resistance)
             for resistance, delay in zip(model.resistance_ohm, model.delay_s, strict=True)
             if delay > filled_s
         )
-        return (filled_var_v2 + (unknown_ohm * self._usual_a) ** 2) * self._shared_by
+        unknown_v = unknown_ohm * self._usual_a
+        return (filled_var_v2 + unknown_v * unknown_v) * self._shared_by
 
     def _start_var_v2(self, known_s: float) -> float:
         """Return the variance from currents before the first, in the effects' memory [V²].
@@ -117,8 +119,9 @@ class MeasurementNoise:
         known_s : float
             Time that the current is known for [s].
         """
-        return sum(
-            (ohm * self._usual_a) ** 2
+        return total(
+            (ohm * self._usual_a)
+            * (ohm * self._usual_a)
             * math.exp(-2.0 * known_s / tau_s)
             * max(tau_s * self._rate_hz, 1.0)
             for ohm, tau_s in self._memory
@@ -169,4 +172,5 @@ class CurveFunctions:
 
     def std_v(self, soc_pct: float) -> float:
         """Return the standard deviation of the curve's error at a SoC [V]."""
-        return math.sqrt(sum(value * value for value in self.at(soc_pct)))
+        values = self.at(soc_pct)
+        return math.sqrt(dot(values, values))

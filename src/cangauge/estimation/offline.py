@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from cangauge._dataframes import ArrowExport
 from cangauge._display import figure
 from cangauge._typing import FloatArray
+from cangauge.estimation.compiled import CompiledEstimator, make_estimator
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import (
     VALID_STD_PCT,
@@ -107,6 +109,12 @@ class EstimateTable(ArrowExport):
         }
         numbers: dict[str, Any] = {name: np.array(by_name[name], np.float64) for name in NUMBERS}
         return cls(**numbers, **flags)
+
+    @classmethod
+    def joined(cls, blocks: Sequence[Sequence[NDArray[Any]]]) -> EstimateTable:
+        """Join blocks of columns, from `time_s` to `reasons`."""
+        columns: Any = map(np.concatenate, zip(*blocks, strict=True))
+        return cls(*columns) if blocks else cls.of([])
 
     def plot(self, log: Log | None = None) -> Any:
         """Return SoC with ±2σ and voltage residual over time, for `bokeh.plotting.show`.
@@ -245,10 +253,11 @@ def estimate_log(
     observe: Callable[[Estimator, Sample], None] | None = None,
     *,
     smooth: bool = False,
+    at_end: Callable[[Estimator], None] | None = None,
 ) -> tuple[EstimateTable, Scores]:
     """Estimate a log with given settings, and score it; see `run_estimator` and `score`."""
     began = time.perf_counter()
-    table = run_estimator(samples_of(log), model, settings, progress, observe, smooth=smooth)
+    table = run_estimator(log, model, settings, progress, observe, smooth=smooth, at_end=at_end)
     return table, score(table, log, time.perf_counter() - began)
 
 
@@ -259,19 +268,21 @@ def samples_of(log: Log) -> Iterator[Sample]:
 
 
 def run_estimator(
-    samples: Iterable[Sample],
+    samples: Iterable[Sample] | Log,
     model: Model,
     settings: EstimatorSettings,
     progress: Callable[[int], None] | None = None,
     observe: Callable[[Estimator, Sample], None] | None = None,
     *,
     smooth: bool = False,
+    at_end: Callable[[Estimator], None] | None = None,
 ) -> EstimateTable:
     """Return the estimates of all samples, in order.
 
     Parameters
     ----------
-    samples : iterable of Sample
+    samples : iterable of Sample, or Log
+        A log is the fastest.
     model : Model
     settings : EstimatorSettings
     progress : callable, optional
@@ -280,23 +291,57 @@ def run_estimator(
         Called with estimator and sample after each sample.
     smooth : bool
         Add the smoothed SoC (`smoothing`), which takes a few kB of memory for each voltage used.
+    at_end : callable, optional
+        Called with the estimator after the last sample.
     """
     smoother = Smoother() if smooth else None
-    estimator = Estimator(model, settings, None if smoother is None else RecordingEkf)
-    estimates = []
-    for done, sample in enumerate(samples, start=1):
-        estimates.append(estimator.step(sample))
-        if observe is not None:
-            observe(estimator, sample)
-        if smoother is not None:
-            smoother.observe(estimator)
-        if progress is not None and done % PROGRESS_EVERY == 0:
-            progress(done)
-    table = EstimateTable.of(estimates)
+    estimator = make_estimator(model, settings, None if smoother is None else RecordingEkf)
+    if isinstance(estimator, CompiledEstimator) and observe is None:
+        table = _run_compiled(estimator, _blocks(samples), progress)
+    else:
+        estimates = []
+        rows = samples_of(samples) if isinstance(samples, Log) else samples
+        for done, sample in enumerate(rows, start=1):
+            estimates.append(estimator.step(sample))
+            if observe is not None:
+                observe(estimator, sample)
+            if smoother is not None:
+                smoother.observe(estimator)
+            if progress is not None and done % PROGRESS_EVERY == 0:
+                progress(done)
+        table = EstimateTable.of(estimates)
+    if at_end is not None:
+        at_end(estimator)
     if smoother is None:
         return table
     soc_pct, std_pct = smoother.soc(estimator, table.soc_pct, table.soc_std_pct)
     return replace(table, soc_smooth_pct=soc_pct, soc_smooth_std_pct=std_pct)
+
+
+def _blocks(samples: Iterable[Sample] | Log) -> Iterator[list[FloatArray]]:
+    """Yield blocks of up to `PROGRESS_EVERY` samples as columns."""
+    if isinstance(samples, Log):
+        columns = (samples.time_s, samples.current_a, samples.voltage_v, samples.temperature_c)
+        for row in range(0, len(samples), PROGRESS_EVERY):
+            yield [each[row : row + PROGRESS_EVERY] for each in columns]
+        return
+    rest = iter(samples)
+    while block := list(itertools.islice(rest, PROGRESS_EVERY)):
+        yield list(np.array(block, dtype=np.float64).T)
+
+
+def _run_compiled(
+    estimator: CompiledEstimator,
+    blocks: Iterable[Sequence[FloatArray]],
+    progress: Callable[[int], None] | None = None,
+) -> EstimateTable:
+    found, done = [], 0
+    for block in blocks:
+        found.append(estimator.run(block))
+        done += len(block[0])
+        if progress is not None and done % PROGRESS_EVERY == 0:
+            progress(done)
+    return EstimateTable.joined(found)
 
 
 def score(table: EstimateTable, log: Log, seconds: float = 0.0) -> Scores:

@@ -51,7 +51,10 @@ def filled_at(
     return np.asarray(since >= longest_delay_s)
 
 
-_BLOCK = 512
+SPACING_S = 0.009
+"""Least spacing of every second sample kept [s]: it bounds the memory at any frame rate."""
+
+BLOCK = 512
 """Number of stale currents that are dropped at once."""
 
 
@@ -70,7 +73,7 @@ class DelayLine:
     """
 
     def __init__(
-        self, delay_s: Sequence[float], *, gap_s: float = GAP_S, spacing_s: float = 0.009
+        self, delay_s: Sequence[float], *, gap_s: float = GAP_S, spacing_s: float = SPACING_S
     ) -> None:
         self._delays = tuple(delay_s)
         self._longest = self._delays[-1]
@@ -93,7 +96,7 @@ class DelayLine:
         times.append(time_s)
         currents.append(current_a)
         # In blocks: deleting the first element of a list at each push costs more.
-        if len(times) > _BLOCK + 1 and times[_BLOCK + 1] <= time_s - self._longest:
+        if len(times) > BLOCK + 1 and times[BLOCK + 1] <= time_s - self._longest:
             stale = bisect_right(times, time_s - self._longest) - 1
             del times[:stale]
             del currents[:stale]

@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from cangauge._arithmetic import total
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.model.coulomb_counting import discharged_ah
@@ -185,7 +186,7 @@ class ExtendedModel:
         Polarisation counts in full; effects of the sign of the current alone, such as hysteresis,
         do not.
         """
-        ohm = sum(self.model.resistance_ohm)
+        ohm = total(self.model.resistance_ohm)
         if not self.effects:
             return ohm
         usual_a = STEADY_C_RATE * self.capacity_ah
@@ -206,7 +207,7 @@ class ExtendedModel:
             current_a=current_a * constant,
             temperature_c=self.model.t_ref_c * constant,
             soc_pct=50.0 * constant,
-            drop_v=current_a * sum(self.model.resistance_ohm) * constant,
+            drop_v=current_a * total(self.model.resistance_ohm) * constant,
         )
         return float(self.extra_voltage(state)[-1])
 
@@ -298,7 +299,7 @@ class OnlineExtendedModel:
                 effect.advance(time_s, current_a, temperature_c, drop_v)
             elif not effect.follows_temperature:
                 effect.advance(time_s, current_a, self.model.t_ref_c, drop_v)
-        self._beside_soc_v = sum((item.extra_voltage(0.0) for item in self._beside_soc), 0.0)
+        self._beside_soc_v = total(item.extra_voltage(0.0) for item in self._beside_soc)
 
     def state(self) -> list[list[float]]:
         """Return the state of each effect, for `restore`."""
@@ -344,4 +345,4 @@ class OnlineExtendedModel:
         return volts, slope
 
     def _over_soc_v(self, soc_pct: float) -> float:
-        return sum((effect.extra_voltage(soc_pct) for effect in self._over_soc), 0.0)
+        return total(effect.extra_voltage(soc_pct) for effect in self._over_soc)

@@ -18,6 +18,7 @@ from pydantic import (
     model_validator,
 )
 
+from cangauge._arithmetic import total
 from cangauge._config import schema_error
 from cangauge._io import (
     MAX_MODEL_BYTES,
@@ -392,12 +393,12 @@ def _check_coefficients(model: VoltageModel, capacity_ah: float) -> None:
                 cure="check the value and its unit, or the capacity",
             )
     # A log of constant current leaves the sign open, and there the resistances cancel.
-    (low_a, high_a), total = model.current_range_a, sum(model.resistance_ohm)
-    if total * (high_a - low_a) > RESISTANCE_AT_LEAST * pack.voltage_v:
+    (low_a, high_a), lasting_ohm = model.current_range_a, total(model.resistance_ohm)
+    if lasting_ohm * (high_a - low_a) > RESISTANCE_AT_LEAST * pack.voltage_v:
         raise InputError(
             "the sum of the resistances is positive, so that discharging would raise the voltage",
             field="coefficients",
-            value=total,
+            value=lasting_ohm,
             cure="positive current discharges, so resistances are negative",
         )
     steepest = SLOPE_BY_TEMPERATURE * pack.voltage_v

@@ -151,7 +151,7 @@ class VoltageModel:
         soc = np.atleast_1d(np.asarray(soc_pct, dtype=np.float64))
         inside = np.clip(soc, *self.soc_range_pct)
         volts = ocv_basis(inside, self.epsilon) @ np.array(self.ocv_v)
-        low, high = self._slope_beyond
+        low, high = self.slope_beyond
         volts = volts + np.where(soc < inside, low, high) * (soc - inside)
         if temperature_c is not None:
             lo, hi = self._temperature_limits_c
@@ -180,7 +180,7 @@ class VoltageModel:
         inside: FloatArray = ocv_basis_slope(np.clip(soc, lo, hi), self.epsilon) @ np.array(
             self.ocv_v
         )
-        low, high = self._slope_beyond
+        low, high = self.slope_beyond
         return np.asarray(np.where(soc < lo, low, np.where(soc > hi, high, inside)))
 
     def voltage(
@@ -220,7 +220,7 @@ class VoltageModel:
             by_s = k5 + k6 * r - k7 / (1.0 - s)
             by_s -= r * r * (k1 + r * (2.0 * k2 + r * (3.0 * k3 + r * 4.0 * k4)))
             return volts, by_s * gain
-        slope = self._slope_beyond[0] if soc_pct < at else self._slope_beyond[1]
+        slope = self.slope_beyond[0] if soc_pct < at else self.slope_beyond[1]
         return volts + slope * (soc_pct - at), slope
 
     def offset_at(self, temperature_c: float, delayed_current_a: Sequence[float]) -> float:
@@ -254,7 +254,7 @@ class VoltageModel:
         )
 
     @cached_property
-    def _slope_beyond(self) -> tuple[float, float]:
+    def slope_beyond(self) -> tuple[float, float]:
         """Slopes of the extrapolation below and above the identified SoC [V per %]."""
         low, high = self._columns_beyond
         volts = np.array(self.ocv_v)

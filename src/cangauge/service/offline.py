@@ -146,6 +146,15 @@ class PackHistory:
         self._due_s = -math.inf
         self._rows: list[tuple[float, PackReport]] = []
 
+    @property
+    def takes_samples(self) -> bool:
+        """Whether `observe` must be called for every sample."""
+        return self._keeps_rows or self._cells is not None
+
+    def take(self, estimator: Estimator) -> None:
+        """Take the estimator after the last sample of a log."""
+        self._estimator = estimator
+
     def observe(self, estimator: Estimator, sample: Sample) -> None:
         """Take a sample of a log, and the estimator after it."""
         self._estimator = estimator
@@ -329,7 +338,10 @@ def estimate_recorded_log(
     if gap_from_log:
         settings = replace(settings, gap_s=gap_of(log))
     history = PackHistory() if pack is None else pack
-    table, scores = estimate_log(log, model, settings, progress, history.observe, smooth=smooth)
+    observe = history.observe if history.takes_samples else None
+    table, scores = estimate_log(
+        log, model, settings, progress, observe, smooth=smooth, at_end=history.take
+    )
     return RecordedEstimate(log, table, scores, model, settings, origin, pack=history.finish())
 
 

@@ -26,7 +26,7 @@ from cangauge.bus.time_source import ReplayClock, TimeSourceName, is_clock, time
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.cells import CellEstimator
-from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.state import EstimatorState
 from cangauge.estimation.validity import Estimate, Reason, Sample, Status, status_of
@@ -152,7 +152,7 @@ class Pipeline:
         self._beginnings = 0
         self._pack = _pack_of(model, self.settings.estimator.capacity_ah)
         self.decoder = SampleDecoder(vehicle, self._pack)
-        self.estimator = Estimator(model, _with_source(self.settings.estimator, vehicle))
+        self.estimator = make_estimator(model, _with_source(self.settings.estimator, vehicle))
         self.samples = self.taken = 0
         self._refused = 0  # in a row
         self.stamp_shift_s = 0.0
@@ -329,7 +329,7 @@ class Pipeline:
         )
         pack = _pack_of(model, estimator_settings.capacity_ah)
         if (model, estimator_settings) != (self.model, started):
-            before, self.estimator = self.estimator, Estimator(model, estimator_settings)
+            before, self.estimator = self.estimator, make_estimator(model, estimator_settings)
             self.estimator.take_over(before)
             self.model = model
         if vehicle is not None or pack != self._pack:
@@ -362,7 +362,7 @@ class Pipeline:
         InputError
             If the state does not fit the model; nothing is changed then.
         """
-        estimator = Estimator(self.model, self.estimator.settings)
+        estimator = make_estimator(self.model, self.estimator.settings)
         latest = estimator.restore(state, age_s)
         self.estimator = estimator
         if isinstance(self._time, ReplayClock):
@@ -383,7 +383,7 @@ class Pipeline:
             return False
         default_std_pct = EstimatorSettings().initial_soc_std_pct
         settings = replace(settings, initial_soc_pct=None, initial_soc_std_pct=default_std_pct)
-        self.estimator = Estimator(self.model, settings)
+        self.estimator = make_estimator(self.model, settings)
         return True
 
     def _estimate(self, sample: Sample) -> None:
@@ -451,7 +451,7 @@ class Pipeline:
         if self._publisher is not None:
             self._publisher.restart()
         self.decoder = SampleDecoder(self.vehicle, self._pack)
-        self.estimator = Estimator(self.model, self.estimator.settings)
+        self.estimator = make_estimator(self.model, self.estimator.settings)
         self.cells = self._new_cells()
         self._estimated = None
 

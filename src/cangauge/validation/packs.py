@@ -25,7 +25,7 @@ import numpy as np
 
 from cangauge._resources import single_threaded
 from cangauge.errors import InputError
-from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.offline import EstimateTable, gap_of, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.identify.fit import fit
@@ -548,7 +548,7 @@ def _estimate(log: Log, model: Model, case: Case, method: Literal["ekf", "newton
         current_a=log.current_a + case.offset_a,
         voltage_v=case.voltage_factor * log.voltage_v,
     )
-    estimator = Estimator(
+    estimator = make_estimator(
         model,
         EstimatorSettings(
             method=method,

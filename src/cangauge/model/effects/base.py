@@ -27,6 +27,7 @@ from typing import ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
 
+from cangauge._arithmetic import total
 from cangauge._typing import FloatArray
 from cangauge.model.coulomb_counting import BRIDGE_S, discharged_ah
 from cangauge.model.delay_line import delayed_currents
@@ -87,10 +88,10 @@ class Pack:
             voltage_v=volts,
             capacity_ah=capacity_ah,
             resistance_ohm=max(
-                abs(sum(model.resistance_ohm)), RESISTANCE_AT_LEAST * volts / capacity_ah
+                abs(total(model.resistance_ohm)), RESISTANCE_AT_LEAST * volts / capacity_ah
             ),
             cells=max(1, round(volts / 3.7)),
-            temperature_c=min(max(0.5 * sum(model.temperature_range_c), coldest), hottest),
+            temperature_c=min(max(0.5 * total(model.temperature_range_c), coldest), hottest),
         )
 
 
@@ -325,6 +326,17 @@ class Reading(NamedTuple):
     temperature_c: float
 
 
+class CoreForm(NamedTuple):
+    """Constants of an online effect in the C core (`core/cangauge.h`)."""
+
+    kind: str
+    """Name in `cg_effect_kind`, in lower case without its prefix."""
+    values: tuple[float, ...] = ()
+    """In the order that the header states."""
+    tau_s: tuple[float, ...] = ()
+    """Time constants of its lags [s]."""
+
+
 class OnlineEffect:
     """State of an effect in the estimator, advanced one sample at a time.
 
@@ -361,6 +373,10 @@ class OnlineEffect:
     def extra_voltage(self, soc_pct: float) -> float:
         """Return the extra voltage at the latest sample if the SoC were `soc_pct` [V]."""
         return self.volts
+
+    def core_form(self) -> CoreForm | None:
+        """Return its form in the C core; None: it has none, and the estimator stays in Python."""
+        return CoreForm("no_effect") if type(self) is OnlineEffect else None
 
     def state(self) -> list[float]:
         """Return the state as numbers for `restore`."""

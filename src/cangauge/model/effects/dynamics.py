@@ -8,9 +8,18 @@ from typing import ClassVar, Final
 
 import numpy as np
 
+from cangauge._arithmetic import total
 from cangauge._typing import FloatArray
 from cangauge.model.coulomb_counting import BRIDGE_S
-from cangauge.model.effects.base import Effect, OnlineEffect, Pack, PackState, Parameter, Values
+from cangauge.model.effects.base import (
+    CoreForm,
+    Effect,
+    OnlineEffect,
+    Pack,
+    PackState,
+    Parameter,
+    Values,
+)
 from cangauge.model.effects.first_order import LowPass
 from cangauge.model.effects.resistance import arrhenius, arrhenius_at
 from cangauge.model.voltage_model import VoltageModel
@@ -38,6 +47,10 @@ class _OnlineRc(OnlineEffect):
         self._activation_k = activation_k
         self.lags = [LowPass(tau_s, 0.0, rest_s=BRIDGE_S) for _, tau_s in elements]
 
+    def core_form(self) -> CoreForm:
+        values = (self._activation_k, 0.0, 0.0, *self._ohm)
+        return CoreForm("rc", values, tuple(tau_s for _, tau_s in self.memory))
+
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         for lag in self.lags:
             lag.step(time_s, current_a)
@@ -52,7 +65,7 @@ class _OnlineRc(OnlineEffect):
         self._set_volts(1.0)  # the temperature comes with the next sample
 
     def _set_volts(self, colder: float) -> None:
-        self.volts = sum(
+        self.volts = total(
             -ohm * colder * lag.value for ohm, lag in zip(self._ohm, self.lags, strict=True)
         )
 
@@ -162,7 +175,7 @@ def _elements(values: Values) -> list[tuple[float, float]]:
     """Return resistance [Ω] and time constant [s] of each element, the slowest first."""
     weights = [(values["spread"] / RESISTANCE_RATIO) ** k for k in range(ELEMENTS)]
     return [
-        (values["ohm"] * weight / sum(weights), values["tau_s"] / TAU_RATIO**k)
+        (values["ohm"] * weight / total(weights), values["tau_s"] / TAU_RATIO**k)
         for k, weight in enumerate(weights)
         if weight > 0.0
     ]
@@ -185,6 +198,10 @@ class _OnlineRcBySlope(_OnlineRc):
         self._by_slope = values["by_slope"]
         self._model = model
         self._mean_slope = _mean_slope(model)
+
+    def core_form(self) -> CoreForm:
+        (activation_k, _, _, *ohm), tau_s = super().core_form()[1:]
+        return CoreForm("rc", (activation_k, self._by_slope, self._mean_slope, *ohm), tau_s)
 
     def extra_voltage(self, soc_pct: float) -> float:
         steepness = self._model.pseudo_ocv_at(soc_pct)[1] / self._mean_slope
@@ -251,6 +268,12 @@ class _ChargeTransferOnline(OnlineEffect):
         self._bend_only = values["bend_only"]
         self._activation_k = values["activation_k"]
         self._zero_a = zero_a
+
+    def core_form(self) -> CoreForm:
+        values = (
+            self._scale_v, self._per_a, self._bend_only, self._activation_k, self._zero_a,
+        )  # fmt: skip
+        return CoreForm("charge_transfer", values)
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         per_a = self._per_a * arrhenius_at(temperature_c, self._activation_k)

@@ -8,11 +8,13 @@ from typing import ClassVar, Final
 
 import numpy as np
 
+from cangauge._arithmetic import total
 from cangauge._typing import FloatArray
 from cangauge.model.coulomb_counting import BRIDGE_S
 from cangauge.model.effects.base import (
     LAG,
     WITHIN_C,
+    CoreForm,
     Effect,
     OnlineEffect,
     OnlineInteriorEffect,
@@ -69,6 +71,9 @@ class _HysteresisOnline(OnlineEffect):
         self._travel_as = travel_as
         self._last: tuple[float, float] | None = None
         self._state = 0.0
+
+    def core_form(self) -> CoreForm:
+        return CoreForm("hysteresis", (self._half_width_v, self._travel_as))
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         if self._last is not None and time_s - self._last[0] <= BRIDGE_S:
@@ -146,6 +151,10 @@ class _EntropicCoefficientOnline(OnlineInteriorEffect):
         self._t_ref_c = t_ref_c
         self._warmer = 0.0
 
+    def core_form(self) -> CoreForm:
+        values = (self._level, self._slope, self._curve, self._t_ref_c)
+        return CoreForm("entropic", values, (self.interior.tau_s,))
+
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         low, high = WITHIN_C
         interior_c = self.interior.step(time_s, temperature_c)
@@ -202,11 +211,15 @@ class _OcvShapeOnline(OnlineEffect):
     def __init__(self, heights_v: list[float]) -> None:
         self._bumps = tuple(zip(heights_v, CENTRES_PCT, WIDTHS_PCT, strict=True))
 
+    def core_form(self) -> CoreForm:
+        return CoreForm("ocv_shape", tuple(height for height, _, _ in self._bumps))
+
     def extra_voltage(self, soc_pct: float) -> float:
         soc = min(max(soc_pct, 0.0), 100.0)
-        return sum(
-            height * math.exp(-0.5 * ((soc - centre) / width) ** 2)
+        return total(
+            height * math.exp(-0.5 * away * away)
             for height, centre, width in self._bumps
+            for away in ((soc - centre) / width,)
         )
 
 
@@ -257,6 +270,9 @@ class _WeakCellOnline(OnlineEffect):
         self._fraction = fraction
         self._ahead = 1.0 / (1.0 - deficit_pct / 100.0)
         self._model = model
+
+    def core_form(self) -> CoreForm:
+        return CoreForm("weak_cell", (self._fraction, self._ahead))
 
     def extra_voltage(self, soc_pct: float) -> float:
         weak = 100.0 - (100.0 - soc_pct) * self._ahead

@@ -101,7 +101,7 @@ class LowPass:
     def __init__(self, tau_s: float, start: float | None = None, rest_s: float = math.inf) -> None:
         self.is_lagging = tau_s > NO_LAG_S
         self.value = 0.0
-        self._tau_s = tau_s
+        self.tau_s = tau_s
         self._start = start
         self._rest_s = rest_s
         self._last: tuple[float, float] | None = None
@@ -114,7 +114,7 @@ class LowPass:
             self.value = value if self._start is None else self._start
         else:
             seconds = time_s - self._last[0]
-            step = seconds / self._tau_s
+            step = seconds / self.tau_s
             a = math.exp(-step)
             self.value *= a
             if seconds <= self._rest_s:

@@ -13,6 +13,7 @@ from cangauge.model.effects.base import (
     DELAYED,
     LAG,
     WITHIN_C,
+    CoreForm,
     Effect,
     OnlineEffect,
     OnlineInteriorEffect,
@@ -104,6 +105,13 @@ class _ResistanceTemperatureOnline(OnlineInteriorEffect):
         self._reference_per_k = _inverse_k_at(values["reference_c"])
         self._resistance_ohm = resistance_ohm
 
+    def core_form(self) -> CoreForm:
+        values = (
+            self._share, self._activation_k, self._delayed, self._reference_per_k,
+            self._resistance_ohm,
+        )  # fmt: skip
+        return CoreForm("resistance_temperature", values, (self.interior.tau_s,))
+
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         scaled_v = scaled_drop_at(drop_v, current_a, self._delayed, self._resistance_ohm)
         colder = _inverse_k_at(self.interior.step(time_s, temperature_c)) - self._reference_per_k
@@ -153,6 +161,12 @@ class _ResistanceSocOnline(OnlineEffect):
         self._resistance_ohm = resistance_ohm
         self._drop_v = 0.0
 
+    def core_form(self) -> CoreForm:
+        values = (
+            self._at_empty, self._at_full, self._width_pct, self._delayed, self._resistance_ohm,
+        )  # fmt: skip
+        return CoreForm("resistance_soc", values)
+
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         self._drop_v = scaled_drop_at(drop_v, current_a, self._delayed, self._resistance_ohm)
 
@@ -190,6 +204,9 @@ class ResistanceAsymmetry(Effect):
 class _ResistanceAsymmetryOnline(OnlineEffect):
     def __init__(self, charging_ohm: float) -> None:
         self._charging_ohm = charging_ohm
+
+    def core_form(self) -> CoreForm:
+        return CoreForm("resistance_asymmetry", (self._charging_ohm,))
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         self.volts = -self._charging_ohm * min(current_a, 0.0)
@@ -241,6 +258,9 @@ class _ResistanceStepOnline(OnlineEffect):
         self._step_ohm = step_ohm
         self._start_s = start_s
         self._first_s: float | None = None
+
+    def core_form(self) -> CoreForm:
+        return CoreForm("resistance_step", (self._step_ohm, self._start_s))
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         if self._first_s is None:

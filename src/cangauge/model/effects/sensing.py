@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import ClassVar, Literal
 
 from cangauge.model.effects.base import (
+    CoreForm,
     Effect,
     OnlineEffect,
     Pack,
@@ -45,6 +46,10 @@ class _OnlineLinear(OnlineEffect):
         self._offset = offset
         self._gain = gain
         self._is_current = is_current
+
+    def core_form(self) -> CoreForm:
+        kind = "current_sensor" if self._is_current else "voltage_sensor"
+        return CoreForm(kind, (self._offset, self._gain))
 
     def correct(self, reading: Reading) -> Sequence[Reading]:
         time_s, current_a, voltage_v, temperature_c = reading

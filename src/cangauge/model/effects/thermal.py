@@ -10,6 +10,7 @@ from typing import ClassVar
 from cangauge._typing import FloatArray
 from cangauge.model.coulomb_counting import BRIDGE_S
 from cangauge.model.effects.base import (
+    CoreForm,
     Effect,
     OnlineEffect,
     OnlineInteriorEffect,
@@ -56,6 +57,9 @@ class _TemperatureLagOnline(OnlineEffect):
         self._ahead = ahead
         self._smooth = LowPass(SMOOTHING_S)
         self.lags = (self._smooth,)
+
+    def core_form(self) -> CoreForm:
+        return CoreForm("temperature_lag", (self._ahead,), (SMOOTHING_S,))
 
     def correct(self, reading: Reading) -> Sequence[Reading]:
         time_s, current_a, voltage_v, measured = reading
@@ -122,9 +126,14 @@ class _CoreTemperatureOnline(OnlineEffect):
         self._followed = LowPass(values["tau_s"])
         self.lags = (self._above, self._followed) if self._late else (self._above,)
 
+    def core_form(self) -> CoreForm:
+        values = (self._rise_k, self._late, self._capacity_ah)
+        return CoreForm("core_temperature", values, (self._above.tau_s, self._followed.tau_s))
+
     def correct(self, reading: Reading) -> Sequence[Reading]:
         time_s, current_a, voltage_v, temperature_c = reading
-        above = self._above.step(time_s, (current_a / self._capacity_ah) ** 2)
+        rate = current_a / self._capacity_ah
+        above = self._above.step(time_s, rate * rate)
         core = temperature_c + self._rise_k * above
         if self._late and not math.isnan(temperature_c):
             core += self._late * (self._followed.step(time_s, temperature_c) - temperature_c)
@@ -167,6 +176,10 @@ class _InnerTemperatureOnline(OnlineInteriorEffect):
         super().__init__(values["tau_s"])
         self._voltage_v_per_k = values["voltage_v_per_k"]
         self._drop_per_k = values["drop_per_k"]
+
+    def core_form(self) -> CoreForm:
+        values = (self._voltage_v_per_k, self._drop_per_k)
+        return CoreForm("inner_temperature", values, (self.interior.tau_s,))
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
         away = self.interior.step(time_s, temperature_c) - temperature_c

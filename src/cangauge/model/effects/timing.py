@@ -13,6 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from cangauge.model.effects.base import (
+    CoreForm,
     Effect,
     OnlineEffect,
     Pack,
@@ -72,6 +73,9 @@ class _TimeSkewOnline(OnlineEffect):
         self._waiting: deque[Reading] = deque()
         self._times: list[float] = []
         self._currents: list[float] = []
+
+    def core_form(self) -> CoreForm:
+        return CoreForm("time_skew", (self._skew_s,))
 
     def correct(self, reading: Reading) -> Sequence[Reading]:
         self._times.append(reading.time_s)

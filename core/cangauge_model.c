@@ -1,0 +1,666 @@
+/* cangauge_model.c - delay line, voltage model, its effects and the noise of a voltage.
+ *
+ * Follows the Python modules model.delay_line, model.voltage_model, model.extended, model.effects
+ * and estimation.measurement_noise operation by operation.
+ */
+#include "cangauge_internal.h"
+
+#define BRIDGE_S 60.0 /* over a longer step the current is unknown */
+#define NO_LAG_S 1e-3
+#define SLOPE_STEP_PCT 0.05
+#define SLOPE_AT_LEAST 2e-5
+#define TEMPERATURE_MARGIN_K 5.0
+#define STEPS_AT_MOST 80
+#define COLDEST_C (-60.0)
+#define HOTTEST_C 120.0
+#define ZERO_C_IN_K 273.15
+#define REFERENCE_C 25.0
+#define STEEPNESS_AT_MOST 5.0
+#define SMOOTHING_S 200.0
+#define STALE_AT_MOST 64
+#define BUMPS 11
+
+#define USUAL_CURRENT_C_RATE (1.0 / 3.0)
+#define MEMORY_TIMES 10.0
+#define TEMPERATURE_STD_K 10.0
+#define OUTSIDE_TEMPERATURE_V_PER_K 1e-3
+
+static const cg_real CENTRES_PCT[BUMPS] = {
+    R(3.0), R(8.0), R(14.0), R(22.0), R(32.0), R(43.0), R(54.0), R(65.0), R(76.0), R(86.0), R(94.0),
+};
+static const cg_real WIDTHS_PCT[BUMPS] = {
+    R(3.0), R(3.5), R(4.5), R(5.5), R(6.5), R(7.0), R(7.0), R(7.0), R(6.5), R(5.5), R(4.5),
+};
+
+/* ------------------------------------------------------------------ delay line */
+
+static cg_current *line_entry(const cg_line *line, int32_t index)
+{
+    int32_t place = line->first + index;
+    if (place >= line->size) {
+        place -= line->size;
+    }
+    return &line->at[place];
+}
+
+static void line_drop(cg_line *line, int32_t number)
+{
+    line->first = (line->first + number) % line->size;
+    line->count -= number;
+}
+
+/* Number of entries at or before a time. */
+static int32_t line_until(const cg_line *line, cg_time time_s)
+{
+    int32_t low = 0;
+    int32_t high = line->count;
+    while (low < high) {
+        const int32_t middle = (low + high) / 2;
+        if (time_s < line_entry(line, middle)->time_s) {
+            high = middle;
+        } else {
+            low = middle + 1;
+        }
+    }
+    return low;
+}
+
+void cg_line_push(cg_line *line, cg_real longest_s, cg_real gap_s, cg_time time_s,
+                  cg_real current_a)
+{
+    if ((line->count == 0) ||
+        ((time_s - line_entry(line, line->count - 1)->time_s) > (cg_time)gap_s)) {
+        line->count = 0;
+        line->since_s = time_s;
+    } else if ((line->count > 1) && ((time_s - line_entry(line, line->count - 2)->time_s) <
+                                     (cg_time)line->spacing_s)) {
+        line->count -= 1;
+    } else if (line->count == line->size) {
+        line_drop(line, 1); /* memory smaller than the spacing needs */
+    } else {
+        /* room for one more */
+    }
+    line->count += 1;
+    cg_current *newest = line_entry(line, line->count - 1);
+    newest->time_s = time_s;
+    newest->current_a = current_a;
+    const int32_t stale_at = line->block + 1;
+    const cg_time oldest_s = time_s - (cg_time)longest_s;
+    if ((line->count > stale_at) && (line_entry(line, stale_at)->time_s <= oldest_s)) {
+        line_drop(line, line_until(line, oldest_s) - 1);
+    }
+}
+
+cg_time cg_line_filled_s(const cg_line *line)
+{
+    return (line->count > 0) ? (line_entry(line, line->count - 1)->time_s - line->since_s) : 0.0;
+}
+
+static cg_real between(const cg_current *before, const cg_current *after, cg_time at_s)
+{
+    const cg_real part_s = (cg_real)(at_s - before->time_s);
+    const cg_real step_s = (cg_real)(after->time_s - before->time_s);
+    return before->current_a + ((after->current_a - before->current_a) * part_s / step_s);
+}
+
+cg_real cg_line_at(const cg_line *line, cg_time ago_s)
+{
+    const cg_time at_s = line_entry(line, line->count - 1)->time_s - ago_s;
+    const int32_t right = line_until(line, at_s);
+    if (right == 0) {
+        return line_entry(line, 0)->current_a;
+    }
+    if (right == line->count) {
+        return line_entry(line, line->count - 1)->current_a;
+    }
+    return between(line_entry(line, right - 1), line_entry(line, right), at_s);
+}
+
+/* ------------------------------------------------------------------ voltage model */
+
+cg_real cg_ocv(const cg_model *model, cg_real soc_pct, cg_real *slope)
+{
+    const cg_real *k = model->ocv_v;
+    const cg_real at = cg_clip(soc_pct, model->soc_range_pct[0], model->soc_range_pct[1]);
+    const cg_real gain = (R(1.0) - (R(2.0) * model->epsilon)) / R(100.0);
+    const cg_real s = (at * gain) + model->epsilon;
+    const cg_real r = R(1.0) / s;
+    const cg_real powers = r * (k[1] + (r * (k[2] + (r * (k[3] + (r * k[4]))))));
+    const cg_real volts =
+        k[0] + powers + (k[5] * s) + (k[6] * cg_log(s)) + (k[7] * cg_log1p(-s));
+    if (soc_pct == at) {
+        cg_real by_s = k[5] + (k[6] * r) - (k[7] / (R(1.0) - s));
+        by_s -= r * r * (k[1] + (r * ((R(2.0) * k[2]) + (r * ((R(3.0) * k[3]) +
+                                                              (r * R(4.0) * k[4]))))));
+        *slope = by_s * gain;
+        return volts;
+    }
+    *slope = (soc_pct < at) ? model->slope_beyond[0] : model->slope_beyond[1];
+    return volts + (*slope * (soc_pct - at));
+}
+
+cg_real cg_offset_v(const cg_model *model, cg_real temperature_c, const cg_real *delayed_a)
+{
+    const cg_real low = model->temperature_range_c[0] - R(TEMPERATURE_MARGIN_K);
+    const cg_real high = model->temperature_range_c[1] + R(TEMPERATURE_MARGIN_K);
+    cg_real volts = model->kt_v_per_k * (cg_clip(temperature_c, low, high) - model->t_ref_c);
+    for (int32_t j = 0; j < model->delays; ++j) {
+        volts += model->resistance_ohm[j] * delayed_a[j];
+    }
+    return volts;
+}
+
+/* ------------------------------------------------------------------ effects */
+
+static cg_real lag_step(cg_lag *lag, cg_real tau_s, cg_real rest_s, cg_time time_s, cg_real input)
+{
+    if (!(tau_s > R(NO_LAG_S))) {
+        return input;
+    }
+    const cg_real seconds = (cg_real)(time_s - lag->time_s);
+    const cg_real step = seconds / tau_s;
+    const cg_real a = cg_exp(-step);
+    lag->value *= a;
+    if (seconds <= rest_s) {
+        const cg_real b = (-cg_expm1(-step) / step) - a;
+        lag->value += ((R(1.0) - a) * input) + (b * (lag->input - input));
+    }
+    lag->time_s = time_s;
+    lag->input = input;
+    return lag->value;
+}
+
+/* A lag that starts at its first input, or at a given value. */
+static cg_real lag_from(cg_lag *lag, cg_real tau_s, cg_time time_s, cg_real input)
+{
+    if (!lag->is_started && (tau_s > R(NO_LAG_S))) {
+        lag->is_started = true;
+        lag->time_s = time_s;
+        lag->input = input;
+        lag->value = input;
+        return input;
+    }
+    return lag_step(lag, tau_s, R(INFINITY), time_s, input);
+}
+
+static cg_real lag_from_rest(cg_lag *lag, cg_real tau_s, cg_time time_s, cg_real input)
+{
+    if (!lag->is_started && (tau_s > R(NO_LAG_S))) {
+        lag->is_started = true;
+        lag->time_s = time_s;
+        lag->input = input;
+        lag->value = R(0.0);
+        return R(0.0);
+    }
+    return lag_step(lag, tau_s, R(BRIDGE_S), time_s, input);
+}
+
+static cg_real inverse_k(cg_real temperature_c)
+{
+    return R(1.0) / (cg_clip(temperature_c, R(COLDEST_C), R(HOTTEST_C)) + R(ZERO_C_IN_K));
+}
+
+static cg_real arrhenius(cg_real temperature_c, cg_real activation_k)
+{
+    const cg_real reference = R(1.0) / (R(REFERENCE_C) + R(ZERO_C_IN_K));
+    return cg_exp(activation_k * (inverse_k(temperature_c) - reference));
+}
+
+static cg_real scaled_drop(cg_real drop_v, cg_real current_a, cg_real delayed, cg_real ohm)
+{
+    return (delayed * drop_v) + ((R(1.0) - delayed) * (-ohm * current_a));
+}
+
+int32_t cg_skew_of(const cg_model *model)
+{
+    int32_t k = 0;
+    while ((k < model->effects) && (model->effect[k].kind != (int32_t)CG_TIME_SKEW)) {
+        ++k;
+    }
+    return k;
+}
+
+static void correct_core(const cg_effect *effect, cg_effect_state *state, cg_sample *sample)
+{
+    const cg_real rise_k = effect->value[0];
+    const cg_real late = effect->value[1];
+    const cg_real rate = sample->current_a / effect->value[2];
+    const cg_real above = lag_from_rest(&state->lag[0], effect->tau_s[0], sample->time_s,
+                                        cg_square(rate));
+    const cg_real outside_c = sample->temperature_c;
+    sample->temperature_c += rise_k * above;
+    if ((late != R(0.0)) && !isnan(outside_c)) {
+        const cg_real followed =
+            lag_from(&state->lag[1], effect->tau_s[1], sample->time_s, outside_c);
+        sample->temperature_c += late * (followed - outside_c);
+    }
+}
+
+/* Apply the corrections of the effects from one to before another. */
+void cg_correct(cg_estimator *self, cg_sample *sample, int32_t from, int32_t to)
+{
+    for (int32_t k = from; k < to; ++k) {
+        const cg_effect *effect = &self->model->effect[k];
+        cg_effect_state *state = &self->state.effect[k];
+        switch (effect->kind) {
+        case CG_CURRENT_SENSOR:
+            sample->current_a = (sample->current_a - effect->value[0]) / effect->value[1];
+            break;
+        case CG_VOLTAGE_SENSOR:
+            sample->voltage_v = (sample->voltage_v - effect->value[0]) / effect->value[1];
+            break;
+        case CG_TEMPERATURE_LAG:
+            if (!isnan(sample->temperature_c)) {
+                const cg_real smooth = lag_from(&state->lag[0], R(SMOOTHING_S), sample->time_s,
+                                                sample->temperature_c);
+                sample->temperature_c += effect->value[0] * (sample->temperature_c - smooth);
+            }
+            break;
+        case CG_CORE_TEMPERATURE:
+            correct_core(effect, state, sample);
+            break;
+        default: /* corrects nothing */
+            break;
+        }
+    }
+}
+
+/* Keep a sample until its current is known. */
+void cg_skew_push(cg_skew *skew, const cg_sample *sample)
+{
+    if (skew->count == CG_WAITING) {
+        skew->first = (skew->first + 1) % CG_WAITING;
+        skew->count -= 1;
+    }
+    cg_current *newest = &skew->at[(skew->first + skew->count) % CG_WAITING];
+    newest->time_s = sample->time_s;
+    newest->current_a = sample->current_a;
+    skew->count += 1;
+    if (skew->waiting_count == CG_WAITING) {
+        skew->waiting_first = (skew->waiting_first + 1) % CG_WAITING;
+        skew->waiting_count -= 1;
+    }
+    skew->waiting[(skew->waiting_first + skew->waiting_count) % CG_WAITING] = *sample;
+    skew->waiting_count += 1;
+}
+
+static int32_t skew_until(const cg_skew *skew, cg_time time_s)
+{
+    int32_t low = 0;
+    int32_t high = skew->count;
+    while (low < high) {
+        const int32_t middle = (low + high) / 2;
+        if (time_s < skew->at[(skew->first + middle) % CG_WAITING].time_s) {
+            high = middle;
+        } else {
+            low = middle + 1;
+        }
+    }
+    return low;
+}
+
+/* Take the oldest sample if its current is known, which it then has. */
+bool cg_skew_pop(cg_skew *skew, cg_real skew_s, cg_time now_s, cg_sample *sample)
+{
+    if ((skew->waiting_count > 0) &&
+        ((skew->waiting[skew->waiting_first].time_s + (cg_time)skew_s) <= now_s)) {
+        *sample = skew->waiting[skew->waiting_first];
+        skew->waiting_first = (skew->waiting_first + 1) % CG_WAITING;
+        skew->waiting_count -= 1;
+        const cg_time at_s = sample->time_s + (cg_time)skew_s;
+        const int32_t right = skew_until(skew, at_s);
+        const cg_current *after = &skew->at[(skew->first + right) % CG_WAITING];
+        const cg_current *before = &skew->at[(skew->first + right + CG_WAITING - 1) % CG_WAITING];
+        if (right == 0) {
+            sample->current_a = after->current_a;
+        } else if (right == skew->count) {
+            sample->current_a = before->current_a;
+        } else {
+            sample->current_a = between(before, after, at_s);
+        }
+        return true;
+    }
+    const cg_time upcoming_s =
+        (skew->waiting_count > 0) ? skew->waiting[skew->waiting_first].time_s : now_s;
+    const int32_t stale = skew_until(skew, upcoming_s + (cg_time)skew_s) - 1;
+    if (stale > STALE_AT_MOST) {
+        skew->first = (skew->first + stale) % CG_WAITING;
+        skew->count -= stale;
+    }
+    return false;
+}
+
+static void advance_hysteresis(const cg_effect *effect, cg_lag *lag, const cg_sample *sample)
+{
+    const cg_real seconds = (cg_real)(sample->time_s - lag->time_s);
+    if (lag->is_started && (seconds <= R(BRIDGE_S))) {
+        const cg_real mean = R(0.5) * (sample->current_a + lag->input);
+        const cg_real decay = cg_fabs(mean) * seconds / effect->value[1];
+        const cg_real toward = (signbit(mean) != 0) ? R(-1.0) : R(1.0);
+        lag->value = (cg_exp(-decay) * lag->value) + (toward * cg_expm1(-decay));
+    }
+    lag->is_started = true;
+    lag->time_s = sample->time_s;
+    lag->input = sample->current_a;
+}
+
+static cg_real rc_volts(const cg_effect *effect, cg_effect_state *state, const cg_sample *sample,
+                        cg_real temperature_c)
+{
+    for (int32_t j = 0; j < effect->lags; ++j) {
+        (void)lag_from_rest(&state->lag[j], effect->tau_s[j], sample->time_s, sample->current_a);
+    }
+    const cg_real activation_k = effect->value[0];
+    const cg_real colder =
+        (activation_k != R(0.0)) ? arrhenius(temperature_c, activation_k) : R(1.0);
+    cg_real volts = R(0.0);
+    for (int32_t j = 0; j < effect->lags; ++j) {
+        volts += -effect->value[3 + j] * colder * state->lag[j].value;
+    }
+    return volts;
+}
+
+static cg_real charge_transfer_v(const cg_effect *effect, cg_real current_a, cg_real temperature_c)
+{
+    const cg_real *value = effect->value;
+    const cg_real per_a = value[1] * arrhenius(temperature_c, value[3]);
+    const cg_real slope = value[2] * cg_asinh(value[4] * per_a) / value[4];
+    return -value[0] * (cg_asinh(current_a * per_a) - (slope * current_a));
+}
+
+/* Advance an effect to a corrected sample: its voltage, or what that over SoC is computed from. */
+static void advance_effect(const cg_effect *effect, cg_effect_state *state,
+                           const cg_sample *sample, cg_real temperature_c, cg_real drop_v)
+{
+    const cg_real *value = effect->value;
+    const cg_real current_a = sample->current_a;
+    cg_lag *lag = &state->lag[0];
+    cg_real at_c;
+    switch (effect->kind) {
+    case CG_RESISTANCE_TEMPERATURE:
+        at_c = lag_from(lag, effect->tau_s[0], sample->time_s, temperature_c);
+        state->volts = value[0] * scaled_drop(drop_v, current_a, value[2], value[4]) *
+                       cg_expm1(value[1] * (inverse_k(at_c) - value[3]));
+        break;
+    case CG_RESISTANCE_SOC:
+        state->volts = scaled_drop(drop_v, current_a, value[3], value[4]);
+        break;
+    case CG_RESISTANCE_ASYMMETRY:
+        state->volts = -value[0] * cg_min(current_a, R(0.0));
+        break;
+    case CG_RESISTANCE_STEP:
+        if (!lag->is_started) {
+            lag->is_started = true;
+            lag->time_s = sample->time_s;
+        }
+        state->volts =
+            ((sample->time_s - lag->time_s) >= (cg_time)value[1]) ? (-value[0] * current_a) : R(0.0);
+        break;
+    case CG_CHARGE_TRANSFER:
+        state->volts = charge_transfer_v(effect, current_a, temperature_c);
+        break;
+    case CG_RC:
+        state->volts = rc_volts(effect, state, sample, temperature_c);
+        break;
+    case CG_HYSTERESIS:
+        advance_hysteresis(effect, lag, sample);
+        state->volts = value[0] * lag->value;
+        break;
+    case CG_ENTROPIC:
+        at_c = lag_from(lag, effect->tau_s[0], sample->time_s, temperature_c);
+        state->volts = cg_clip(at_c, R(COLDEST_C), R(HOTTEST_C)) - value[3];
+        break;
+    case CG_INNER_TEMPERATURE:
+        at_c = lag_from(lag, effect->tau_s[0], sample->time_s, temperature_c);
+        state->volts = (value[0] + (value[1] * drop_v)) * (at_c - temperature_c);
+        break;
+    default: /* has no state */
+        break;
+    }
+}
+
+static bool follows_temperature(const cg_effect *effect)
+{
+    const int32_t kind = effect->kind;
+    return ((kind == (int32_t)CG_RESISTANCE_TEMPERATURE) || (kind == (int32_t)CG_ENTROPIC) ||
+            (kind == (int32_t)CG_INNER_TEMPERATURE)) &&
+           (effect->tau_s[0] > R(NO_LAG_S));
+}
+
+static bool depends_on_soc(const cg_effect *effect)
+{
+    const int32_t kind = effect->kind;
+    return (kind == (int32_t)CG_RESISTANCE_SOC) || (kind == (int32_t)CG_ENTROPIC) ||
+           (kind == (int32_t)CG_OCV_SHAPE) || (kind == (int32_t)CG_WEAK_CELL) ||
+           ((kind == (int32_t)CG_RC) && (effect->value[1] != R(0.0)));
+}
+
+void cg_advance(cg_estimator *self, const cg_sample *sample, cg_real temperature_c)
+{
+    const cg_model *model = self->model;
+    cg_real drop_v = R(0.0);
+    for (int32_t j = 0; j < model->delays; ++j) {
+        drop_v += model->resistance_ohm[j] * cg_line_at(&self->line, (cg_time)model->delay_s[j]);
+    }
+    const bool is_known = isfinite(temperature_c) != 0;
+    cg_real beside_v = R(0.0);
+    for (int32_t k = 0; k < model->effects; ++k) {
+        const cg_effect *effect = &model->effect[k];
+        cg_effect_state *state = &self->state.effect[k];
+        if (is_known || !follows_temperature(effect)) {
+            advance_effect(effect, state, sample, is_known ? temperature_c : model->t_ref_c, drop_v);
+        }
+        if (!depends_on_soc(effect)) {
+            beside_v += state->volts;
+        }
+    }
+    self->state.beside_soc_v = beside_v;
+}
+
+static cg_real ocv_shape_v(const cg_real *height_v, cg_real soc_pct)
+{
+    const cg_real soc = cg_clip(soc_pct, R(0.0), R(100.0));
+    cg_real volts = R(0.0);
+    for (int32_t k = 0; k < BUMPS; ++k) {
+        const cg_real away = (soc - CENTRES_PCT[k]) / WIDTHS_PCT[k];
+        volts += height_v[k] * cg_exp(R(-0.5) * away * away);
+    }
+    return volts;
+}
+
+/* The voltage of an effect that depends on the SoC, at one. */
+static cg_real effect_v(const cg_model *model, const cg_effect *effect,
+                        const cg_effect_state *state, cg_real soc_pct)
+{
+    const cg_real *value = effect->value;
+    const cg_real soc = cg_clip(soc_pct, R(0.0), R(100.0));
+    cg_real slope;
+    cg_real volts;
+    switch (effect->kind) {
+    case CG_RESISTANCE_SOC:
+        volts = value[0] * cg_exp(-soc / value[2]);
+        volts += value[1] * cg_exp((soc - R(100.0)) / value[2]);
+        volts = state->volts * volts;
+        break;
+    case CG_ENTROPIC: {
+        const cg_real x = (soc / R(50.0)) - R(1.0);
+        volts = state->volts *
+                (value[0] + (value[1] * x) + (value[2] * ((R(1.5) * x * x) - R(0.5))));
+        break;
+    }
+    case CG_OCV_SHAPE:
+        volts = ocv_shape_v(value, soc_pct);
+        break;
+    case CG_WEAK_CELL: {
+        const cg_real weak_v =
+            cg_ocv(model, R(100.0) - ((R(100.0) - soc_pct) * value[1]), &slope);
+        volts = value[0] * (weak_v - cg_ocv(model, soc_pct, &slope));
+        break;
+    }
+    default: /* CG_RC along the slope */
+        (void)cg_ocv(model, soc_pct, &slope);
+        slope = cg_clip(slope / value[2], R(0.0), R(STEEPNESS_AT_MOST));
+        volts = (R(1.0) + (value[1] * (slope - R(1.0)))) * state->volts;
+        break;
+    }
+    return volts;
+}
+
+static cg_real over_soc_v(const cg_estimator *self, cg_real soc_pct)
+{
+    const cg_model *model = self->model;
+    cg_real volts = R(0.0);
+    for (int32_t k = 0; k < model->effects; ++k) {
+        if (depends_on_soc(&model->effect[k])) {
+            volts += effect_v(model, &model->effect[k], &self->state.effect[k], soc_pct);
+        }
+    }
+    return volts;
+}
+
+cg_real cg_pseudo_ocv(const cg_estimator *self, cg_real soc_pct, cg_real *slope)
+{
+    const cg_model *model = self->model;
+    cg_real volts = cg_ocv(model, soc_pct, slope);
+    bool is_over_soc = false;
+    for (int32_t k = 0; k < model->effects; ++k) {
+        is_over_soc = is_over_soc || depends_on_soc(&model->effect[k]);
+    }
+    if (model->effects > 0) {
+        volts += self->state.beside_soc_v;
+    }
+    if (is_over_soc) {
+        volts += over_soc_v(self, soc_pct);
+        const cg_real above_v = over_soc_v(self, soc_pct + R(SLOPE_STEP_PCT));
+        const cg_real below_v = over_soc_v(self, soc_pct - R(SLOPE_STEP_PCT));
+        *slope += (above_v - below_v) / (R(2.0) * R(SLOPE_STEP_PCT));
+        *slope = cg_max(*slope, R(SLOPE_AT_LEAST) * model->nominal_v);
+    }
+    return volts;
+}
+
+/* Newton's method inside a bracket: the SoC whose pseudo-OCV is a voltage. */
+cg_real cg_newton(const cg_estimator *self, cg_real ocv_v, cg_real guess_pct, bool *inside)
+{
+    cg_real low = R(0.0);
+    cg_real high = R(100.0);
+    cg_real slope;
+    const cg_real low_v = cg_pseudo_ocv(self, low, &slope);
+    const cg_real high_v = cg_pseudo_ocv(self, high, &slope);
+    if (ocv_v <= low_v) {
+        *inside = (ocv_v == low_v);
+        return low;
+    }
+    if (ocv_v >= high_v) {
+        *inside = (ocv_v == high_v);
+        return high;
+    }
+    *inside = true;
+    cg_real soc = cg_clip(guess_pct, low, high);
+    for (int32_t step = 0; step < STEPS_AT_MOST; ++step) {
+        const cg_real error = cg_pseudo_ocv(self, soc, &slope) - ocv_v;
+        if (error > R(0.0)) {
+            high = soc;
+        } else {
+            low = soc;
+        }
+        cg_real following = soc - (error / slope);
+        if (!((low < following) && (following < high))) {
+            following = R(0.5) * (low + high);
+        }
+        if (cg_fabs(following - soc) < R(CG_CLOSE_PCT)) {
+            return following;
+        }
+        soc = following;
+    }
+    return soc;
+}
+
+/* ------------------------------------------------------------------ noise of a voltage */
+
+/* Variance while the delay line fills: that of all samples that share the unknown currents. */
+static cg_real filling_var_v2(const cg_model *model, cg_real filled_var_v2, cg_time filled_s)
+{
+    const cg_real usual_a = R(USUAL_CURRENT_C_RATE) * model->capacity_ah;
+    const cg_real shared_by = cg_max(model->delay_s[model->delays - 1] * model->rate_hz, R(1.0));
+    cg_real unknown_ohm = R(0.0);
+    for (int32_t j = 0; j < model->delays; ++j) {
+        if ((cg_time)model->delay_s[j] > filled_s) {
+            unknown_ohm += cg_fabs(model->resistance_ohm[j]);
+        }
+    }
+    return (filled_var_v2 + cg_square(unknown_ohm * usual_a)) * shared_by;
+}
+
+/* Variance from currents before the first, in the memory of effects. */
+static cg_real start_var_v2(const cg_model *model, cg_real known_s)
+{
+    const cg_real usual_a = R(USUAL_CURRENT_C_RATE) * model->capacity_ah;
+    cg_real variance = R(0.0);
+    for (int32_t k = 0; k < model->memories; ++k) {
+        const cg_real tau_s = model->memory_tau_s[k];
+        variance += cg_square(model->memory_ohm[k] * usual_a) *
+                    cg_exp(R(-2.0) * known_s / tau_s) * cg_max(tau_s * model->rate_hz, R(1.0));
+    }
+    return variance;
+}
+
+cg_real cg_fast_std_v(const cg_estimator *self, cg_real temperature_c, cg_real *kt_std_v)
+{
+    const cg_model *model = self->model;
+    const cg_time filled_s = cg_line_filled_s(&self->line);
+    cg_real variance = cg_square(model->fast_std_v);
+    cg_real memory_s = R(0.0);
+    for (int32_t k = 0; k < model->memories; ++k) {
+        memory_s = cg_max(memory_s, model->memory_tau_s[k]);
+    }
+    memory_s = R(MEMORY_TIMES) * memory_s;
+    if (!(filled_s >= (cg_time)model->delay_s[model->delays - 1])) {
+        variance = filling_var_v2(model, variance, filled_s);
+    }
+    if (filled_s < (cg_time)memory_s) {
+        variance += start_var_v2(model, (cg_real)filled_s);
+    }
+    if (isnan(temperature_c)) {
+        *kt_std_v = cg_fabs(model->kt_v_per_k) * R(TEMPERATURE_STD_K);
+    } else {
+        const cg_real outside = R(OUTSIDE_TEMPERATURE_V_PER_K) * model->nominal_v;
+        const cg_real colder = cg_min(temperature_c - model->temperature_range_c[0], R(0.0));
+        const cg_real hotter = cg_max(temperature_c - model->temperature_range_c[1], R(0.0));
+        *kt_std_v = (model->kt_std_v_per_k * (temperature_c - model->mean_c)) +
+                    (outside * (colder + hotter));
+    }
+    return cg_sqrt(variance);
+}
+
+cg_real cg_resistance_std(const cg_model *model, cg_real temperature_c)
+{
+    if (isnan(temperature_c)) {
+        return model->resistance_std_per_k * R(TEMPERATURE_STD_K);
+    }
+    return model->resistance_std_per_k * (temperature_c - model->mean_c);
+}
+
+/* Values of the functions of the curve's error at a SoC. */
+void cg_curve_functions(const cg_model *model, cg_real soc_pct, cg_real *values)
+{
+    if (model->functions > 0) {
+        int32_t k = 0;
+        while ((k < model->knots) && !(soc_pct < model->knot_pct[k])) {
+            ++k;
+        }
+        if (k < 1) {
+            k = 1;
+        }
+        if (k > (model->knots - 1)) {
+            k = model->knots - 1;
+        }
+        const cg_real low = model->knot_pct[k - 1];
+        const cg_real high = model->knot_pct[k];
+        const cg_real part = cg_clip((soc_pct - low) / (high - low), R(0.0), R(1.0));
+        const cg_real rest = R(1.0) - part;
+        for (int32_t j = 0; j < model->functions; ++j) {
+            values[j] = (rest * model->function_v[k - 1][j]) + (part * model->function_v[k][j]);
+        }
+    }
+}

@@ -1,0 +1,802 @@
+/* python.c - the core as the extension module `cangauge._core`.
+ *
+ * Constants and states cross by name, as dicts of numbers and lists; see the tables of fields.
+ */
+#define PY_SSIZE_T_CLEAN
+#include <Python.h>
+#include <stddef.h>
+
+#include "cangauge_internal.h"
+
+#ifndef CG_SOURCES
+#define CG_SOURCES "" /* digest of the sources that this was built from */
+#endif
+
+/* ------------------------------------------------------------------ structures by name */
+
+typedef struct {
+    const char *name;
+    char kind; /* d: double, i: int32, u: uint32, l: int64, b: bool */
+    size_t offset;
+    Py_ssize_t count; /* 0: a number, else the length of a list */
+} field;
+
+#define NUMBER(type, member, kind) {#member, kind, offsetof(type, member), 0}
+#define LIST(type, member, kind, count) {#member, kind, offsetof(type, member), count}
+#define END {NULL, 0, 0, 0}
+
+static const field MODEL[] = {
+    LIST(cg_model, ocv_v, 'd', CG_OCV),
+    NUMBER(cg_model, epsilon, 'd'),
+    LIST(cg_model, slope_beyond, 'd', 2),
+    NUMBER(cg_model, kt_v_per_k, 'd'),
+    NUMBER(cg_model, t_ref_c, 'd'),
+    LIST(cg_model, soc_range_pct, 'd', 2),
+    LIST(cg_model, temperature_range_c, 'd', 2),
+    LIST(cg_model, current_range_a, 'd', 2),
+    NUMBER(cg_model, delays, 'i'),
+    LIST(cg_model, delay_s, 'd', CG_DELAYS),
+    LIST(cg_model, resistance_ohm, 'd', CG_DELAYS),
+    NUMBER(cg_model, rate_hz, 'd'),
+    NUMBER(cg_model, capacity_ah, 'd'),
+    NUMBER(cg_model, charge_efficiency, 'd'),
+    NUMBER(cg_model, initial_offset_pct, 'd'),
+    NUMBER(cg_model, steady_ohm, 'd'),
+    NUMBER(cg_model, nominal_v, 'd'),
+    NUMBER(cg_model, fast_std_v, 'd'),
+    NUMBER(cg_model, slow_std_v, 'd'),
+    NUMBER(cg_model, slow_time_s, 'd'),
+    NUMBER(cg_model, lasting_std_v, 'd'),
+    NUMBER(cg_model, lasting_time_s, 'd'),
+    NUMBER(cg_model, lasting_soc_pct, 'd'),
+    NUMBER(cg_model, mean_c, 'd'),
+    NUMBER(cg_model, kt_std_v_per_k, 'd'),
+    NUMBER(cg_model, resistance_std_per_k, 'd'),
+    NUMBER(cg_model, knots, 'i'),
+    NUMBER(cg_model, functions, 'i'),
+    LIST(cg_model, knot_pct, 'd', CG_KNOTS),
+    LIST(cg_model, function_v, 'd', CG_KNOTS * CG_FUNCTIONS),
+    NUMBER(cg_model, effects, 'i'),
+    NUMBER(cg_model, memories, 'i'),
+    LIST(cg_model, memory_ohm, 'd', CG_MEMORIES),
+    LIST(cg_model, memory_tau_s, 'd', CG_MEMORIES),
+    END,
+};
+static const field EFFECT[] = {
+    NUMBER(cg_effect, kind, 'i'),
+    NUMBER(cg_effect, lags, 'i'),
+    LIST(cg_effect, value, 'd', CG_VALUES),
+    LIST(cg_effect, tau_s, 'd', CG_LAGS),
+    END,
+};
+static const field SETTINGS[] = {
+    NUMBER(cg_settings, method, 'i'),
+    NUMBER(cg_settings, initial_soc_pct, 'd'),
+    NUMBER(cg_settings, initial_soc_std_pct, 'd'),
+    NUMBER(cg_settings, valid_std_pct, 'd'),
+    NUMBER(cg_settings, gap_s, 'd'),
+    NUMBER(cg_settings, reasons, 'u'),
+    NUMBER(cg_settings, full_voltage_v, 'd'),
+    NUMBER(cg_settings, full_current_a, 'd'),
+    NUMBER(cg_settings, full_hold_s, 'd'),
+    NUMBER(cg_settings, full_soc_pct, 'd'),
+    NUMBER(cg_settings, full_soc_std_pct, 'd'),
+    NUMBER(cg_settings, rest_after_s, 'd'),
+    NUMBER(cg_settings, rest_soc_std_pct, 'd'),
+    END,
+};
+static const field CLOCK[] = {
+    NUMBER(cg_clock, last_s, 'd'),   NUMBER(cg_clock, shift_s, 'd'),
+    NUMBER(cg_clock, behind, 'l'),   NUMBER(cg_clock, behind_s, 'd'),
+    NUMBER(cg_clock, age_s, 'd'),    NUMBER(cg_clock, is_restored, 'b'),
+    END,
+};
+static const field COUNTER[] = {
+    NUMBER(cg_counter, time_s, 'd'),         NUMBER(cg_counter, current_a, 'd'),
+    NUMBER(cg_counter, mean_square_a2, 'd'), NUMBER(cg_counter, mean_a, 'd'),
+    NUMBER(cg_counter, discharged_pct, 'd'), NUMBER(cg_counter, moved_pct, 'd'),
+    NUMBER(cg_counter, counted_s, 'd'),      NUMBER(cg_counter, is_restored, 'b'),
+    END,
+};
+static const field SINCE[] = {
+    NUMBER(cg_since, seconds, 'd'),        NUMBER(cg_since, away_s, 'd'),
+    NUMBER(cg_since, discharged_pct, 'd'), NUMBER(cg_since, moved_pct, 'd'),
+    NUMBER(cg_since, gap_var_pct2, 'd'),   NUMBER(cg_since, unseen_var_pct2, 'd'),
+    END,
+};
+static const field EKF[] = {
+    LIST(cg_ekf, x, 'd', CG_STATES),
+    LIST(cg_ekf, p, 'd', CG_STATES * CG_STATES),
+    NUMBER(cg_ekf, mean_innovation_v, 'd'),
+    NUMBER(cg_ekf, mean_seconds, 'd'),
+    NUMBER(cg_ekf, was_outlier, 'b'),
+    END,
+};
+static const field FILTER[] = {
+    NUMBER(cg_filter, hypotheses, 'i'),     NUMBER(cg_filter, verdict, 'i'),
+    NUMBER(cg_filter, log_odds, 'd'),       NUMBER(cg_filter, prior_log_odds, 'd'),
+    NUMBER(cg_filter, wide_std_pct, 'd'),   NUMBER(cg_filter, open_s, 'd'),
+    NUMBER(cg_filter, outlier_s, 'd'),      NUMBER(cg_filter, is_untested, 'b'),
+    END,
+};
+static const field MEMORY[] = {
+    NUMBER(cg_memory, samples, 'l'),
+    NUMBER(cg_memory, resets, 'l'),
+    NUMBER(cg_memory, first_s, 'd'),
+    NUMBER(cg_memory, tick, 'l'),
+    NUMBER(cg_memory, temperature_c, 'd'),
+    NUMBER(cg_memory, newton_pct, 'd'),
+    NUMBER(cg_memory, newton_inside, 'b'),
+    NUMBER(cg_memory, newton_std_pct, 'd'),
+    NUMBER(cg_memory, coulomb_start_pct, 'd'),
+    NUMBER(cg_memory, coulomb_var_pct2, 'd'),
+    NUMBER(cg_memory, coulomb_counted_s, 'd'),
+    NUMBER(cg_memory, coulomb_moved_pct, 'd'),
+    NUMBER(cg_memory, gap_until_s, 'd'),
+    NUMBER(cg_memory, contradicted_until_s, 'd'),
+    NUMBER(cg_memory, mismatch_until_s, 'd'),
+    NUMBER(cg_memory, bias_pct, 'd'),
+    NUMBER(cg_memory, rest_since_s, 'd'),
+    NUMBER(cg_memory, level_s, 'd'),
+    NUMBER(cg_memory, level_residual_v, 'd'),
+    NUMBER(cg_memory, level_drop_v, 'd'),
+    END,
+};
+static const field REFERENCES[] = {
+    NUMBER(cg_memory, full_since_s, 'd'),
+    NUMBER(cg_memory, is_full, 'b'),
+    NUMBER(cg_memory, is_rested, 'b'),
+    END,
+};
+static const field LATEST[] = {
+    NUMBER(cg_estimate, time_s, 'd'),          NUMBER(cg_estimate, soc_pct, 'd'),
+    NUMBER(cg_estimate, soc_std_pct, 'd'),     NUMBER(cg_estimate, soc_newton_pct, 'd'),
+    NUMBER(cg_estimate, soc_coulomb_pct, 'd'), NUMBER(cg_estimate, voltage_model_v, 'd'),
+    NUMBER(cg_estimate, residual_v, 'd'),      NUMBER(cg_estimate, status, 'i'),
+    NUMBER(cg_estimate, reasons, 'u'),         NUMBER(cg_estimate, samples, 'l'),
+    END,
+};
+static const field STATE[] = {
+    NUMBER(cg_state, is_pending, 'b'),         NUMBER(cg_state, is_filtering, 'b'),
+    NUMBER(cg_state, is_refused, 'b'),         NUMBER(cg_state, has_other_capacity, 'b'),
+    NUMBER(cg_state, implausible, 'u'),        NUMBER(cg_state, beside_soc_v, 'd'),
+    END,
+};
+static const field LAG[] = {
+    NUMBER(cg_lag, time_s, 'd'),
+    NUMBER(cg_lag, input, 'd'),
+    NUMBER(cg_lag, value, 'd'),
+    NUMBER(cg_lag, is_started, 'b'),
+    END,
+};
+
+static PyObject *get_number(const char *at, char kind)
+{
+    switch (kind) {
+    case 'd':
+        return PyFloat_FromDouble(*(const double *)at);
+    case 'i':
+        return PyLong_FromLong(*(const int32_t *)at);
+    case 'u':
+        return PyLong_FromUnsignedLong(*(const uint32_t *)at);
+    case 'l':
+        return PyLong_FromLongLong(*(const int64_t *)at);
+    default:
+        return PyBool_FromLong(*(const bool *)at);
+    }
+}
+
+static int set_number(char *at, char kind, PyObject *value)
+{
+    if (kind == 'd') {
+        *(double *)at = PyFloat_AsDouble(value);
+    } else {
+        const long long number = PyLong_AsLongLong(value);
+        if (kind == 'i') {
+            *(int32_t *)at = (int32_t)number;
+        } else if (kind == 'u') {
+            *(uint32_t *)at = (uint32_t)number;
+        } else if (kind == 'l') {
+            *(int64_t *)at = number;
+        } else {
+            *(bool *)at = number != 0;
+        }
+    }
+    return (PyErr_Occurred() != NULL) ? -1 : 0;
+}
+
+static PyObject *get_fields(const void *structure, const field *fields)
+{
+    PyObject *found = PyDict_New();
+    for (const field *each = fields; (found != NULL) && (each->name != NULL); ++each) {
+        const char *at = (const char *)structure + each->offset;
+        PyObject *value = NULL;
+        if (each->count == 0) {
+            value = get_number(at, each->kind);
+        } else {
+            value = PyList_New(each->count); /* of doubles */
+            for (Py_ssize_t k = 0; (value != NULL) && (k < each->count); ++k) {
+                PyList_SET_ITEM(value, k, PyFloat_FromDouble(((const double *)at)[k]));
+            }
+        }
+        if ((value == NULL) || (PyDict_SetItemString(found, each->name, value) != 0)) {
+            Py_CLEAR(found);
+        }
+        Py_XDECREF(value);
+    }
+    return found;
+}
+
+static int set_list(double *at, const field *each, PyObject *value)
+{
+    PyObject *items = PySequence_Fast(value, "a list of numbers is needed");
+    if (items == NULL) {
+        return -1;
+    }
+    const Py_ssize_t count = PySequence_Fast_GET_SIZE(items);
+    int failed = 0;
+    if (count > each->count) {
+        PyErr_Format(PyExc_ValueError, "%s: at most %zd numbers", each->name, each->count);
+        failed = -1;
+    }
+    for (Py_ssize_t k = 0; (failed == 0) && (k < count); ++k) {
+        failed = set_number((char *)&at[k], 'd', PySequence_Fast_GET_ITEM(items, k));
+    }
+    Py_DECREF(items);
+    return failed;
+}
+
+/* Set every field of a structure from a dict. */
+static int set_fields(void *structure, const field *fields, PyObject *values)
+{
+    for (const field *each = fields; each->name != NULL; ++each) {
+        char *at = (char *)structure + each->offset;
+        PyObject *value = PyDict_Check(values) ? PyDict_GetItemString(values, each->name) : NULL;
+        if (value == NULL) {
+            PyErr_Format(PyExc_KeyError, "%s", each->name);
+            return -1;
+        }
+        const int failed = (each->count == 0) ? set_number(at, each->kind, value)
+                                              : set_list((double *)at, each, value);
+        if (failed != 0) {
+            return -1;
+        }
+    }
+    return 0;
+}
+
+/* ------------------------------------------------------------------ the type Core */
+
+typedef struct {
+    PyObject_HEAD
+    cg_estimator estimator;
+    cg_model model;
+    cg_skew *skew;
+    cg_current *storage;
+    PyObject *hook; /* object with count, tick and correct */
+} Core;
+
+static bool hooked(Core *self, PyObject *answer)
+{
+    bool is_other = self->estimator.state.has_other_capacity;
+    if (answer != NULL) {
+        is_other = PyObject_IsTrue(answer) == 1;
+        Py_DECREF(answer);
+    }
+    return is_other;
+}
+
+static bool hook_count(void *context, const cg_since *since)
+{
+    Core *self = context;
+    return !PyErr_Occurred() &&
+           hooked(self, PyObject_CallMethod(self->hook, "count", "ddddd", since->seconds,
+                                            since->away_s, since->discharged_pct, since->moved_pct,
+                                            since->gap_var_pct2));
+}
+
+static bool hook_tick(void *context, const cg_tick *tick)
+{
+    Core *self = context;
+    const cg_since *since = &tick->since;
+    if (PyErr_Occurred()) {
+        return false;
+    }
+    PyObject *charge = Py_BuildValue("ddddd", since->seconds, since->away_s, since->discharged_pct,
+                                     since->moved_pct, since->gap_var_pct2);
+    if (!tick->has_voltage) {
+        return hooked(self, PyObject_CallMethod(self->hook, "tick", "Nd", charge, tick->seconds));
+    }
+    return hooked(self,
+                  PyObject_CallMethod(self->hook, "tick", "NddddddNN", charge, tick->seconds,
+                                      tick->voltage_v, tick->without_ocv_v, tick->drop_v,
+                                      tick->soc_newton_pct, tick->soc_counted_pct,
+                                      PyBool_FromLong(tick->is_filled),
+                                      PyBool_FromLong(tick->is_inside)));
+}
+
+static bool hook_correct(void *context, cg_real soc_pct, cg_real std_pct)
+{
+    Core *self = context;
+    return !PyErr_Occurred() &&
+           hooked(self, PyObject_CallMethod(self->hook, "correct", "dd", soc_pct, std_pct));
+}
+
+static int set_effects(Core *self, PyObject *effects)
+{
+    const Py_ssize_t count = PyList_Check(effects) ? PyList_GET_SIZE(effects) : -1;
+    if (count != self->model.effects || count > CG_EFFECTS) {
+        PyErr_SetString(PyExc_ValueError, "effects: not a list of as many dicts");
+        return -1;
+    }
+    for (Py_ssize_t k = 0; k < count; ++k) {
+        if (set_fields(&self->model.effect[k], EFFECT, PyList_GET_ITEM(effects, k)) != 0) {
+            return -1;
+        }
+    }
+    return 0;
+}
+
+static int Core_init(Core *self, PyObject *args, PyObject *kwargs)
+{
+    static char *names[] = {"model", "effects", "settings", "hook", "line_size", "line_block",
+                            "spacing_s", NULL};
+    PyObject *model, *effects, *settings_of, *hook;
+    int size, block;
+    double spacing_s;
+    cg_settings settings;
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "OOOOiid", names, &model, &effects, &settings_of,
+                                     &hook, &size, &block, &spacing_s) ||
+        (set_fields(&self->model, MODEL, model) != 0) || (set_effects(self, effects) != 0) ||
+        (set_fields(&settings, SETTINGS, settings_of) != 0)) {
+        return -1;
+    }
+    PyMem_Free(self->storage);
+    PyMem_Free(self->skew);
+    self->storage = PyMem_New(cg_current, (size_t)size);
+    self->skew = NULL;
+    if (cg_skew_of(&self->model) < self->model.effects) {
+        self->skew = PyMem_New(cg_skew, 1);
+    }
+    if ((self->storage == NULL) ||
+        ((self->skew == NULL) && (cg_skew_of(&self->model) < self->model.effects))) {
+        PyErr_NoMemory();
+        return -1;
+    }
+    const cg_line line = {self->storage, size, 0, 0, block, spacing_s, 0.0};
+    cg_init(&self->estimator, &self->model, &settings, &line, self->skew);
+    self->estimator.hook = (cg_hook){self, hook_count, hook_tick, hook_correct};
+    Py_XSETREF(self->hook, Py_NewRef(hook));
+    return 0;
+}
+
+static int Core_traverse(Core *self, visitproc visit, void *arg)
+{
+    Py_VISIT(self->hook);
+    return 0;
+}
+
+static int Core_clear(Core *self)
+{
+    Py_CLEAR(self->hook);
+    return 0;
+}
+
+static void Core_dealloc(Core *self)
+{
+    PyObject_GC_UnTrack(self);
+    (void)Core_clear(self);
+    PyMem_Free(self->storage);
+    PyMem_Free(self->skew);
+    Py_TYPE(self)->tp_free((PyObject *)self);
+}
+
+/* ------------------------------------------------------------------ samples and estimates */
+
+static PyObject *Core_update(Core *self, PyObject *sample)
+{
+    if (!PyTuple_Check(sample) || (PyTuple_GET_SIZE(sample) != 4)) {
+        PyErr_SetString(PyExc_TypeError, "a sample is a tuple of four numbers");
+        return NULL;
+    }
+    const cg_sample now = {
+        PyFloat_AsDouble(PyTuple_GET_ITEM(sample, 0)), PyFloat_AsDouble(PyTuple_GET_ITEM(sample, 1)),
+        PyFloat_AsDouble(PyTuple_GET_ITEM(sample, 2)), PyFloat_AsDouble(PyTuple_GET_ITEM(sample, 3)),
+    };
+    if (PyErr_Occurred()) {
+        return NULL;
+    }
+    (void)cg_update(&self->estimator, &now);
+    if (PyErr_Occurred()) {
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
+static PyObject *Core_estimate(Core *self, PyObject *Py_UNUSED(none))
+{
+    const cg_estimate now = cg_evaluate(&self->estimator);
+    return Py_BuildValue("dddddddikL", now.time_s, now.soc_pct, now.soc_std_pct, now.soc_newton_pct,
+                         now.soc_coulomb_pct, now.voltage_model_v, now.residual_v, (int)now.status,
+                         (unsigned long)now.reasons, (long long)now.samples);
+}
+
+#define COLUMNS_IN 4
+#define COLUMNS_OUT 9
+
+/* Step over whole columns: (4 columns of doubles in), (7 of doubles and 2 of int64 out). */
+static PyObject *Core_run(Core *self, PyObject *args)
+{
+    Py_buffer column[COLUMNS_IN + COLUMNS_OUT];
+    int taken = 0;
+    Py_ssize_t rows = -1;
+    PyObject *given = NULL;
+    if (!PyArg_ParseTuple(args, "O!", &PyTuple_Type, &given)) {
+        return NULL;
+    }
+    if (PyTuple_GET_SIZE(given) != COLUMNS_IN + COLUMNS_OUT) {
+        PyErr_SetString(PyExc_TypeError, "4 columns in and 9 out are needed");
+        return NULL;
+    }
+    for (int k = 0; k < COLUMNS_IN + COLUMNS_OUT; ++k) {
+        const int flags = PyBUF_C_CONTIGUOUS | ((k >= COLUMNS_IN) ? PyBUF_WRITABLE : 0);
+        if (PyObject_GetBuffer(PyTuple_GET_ITEM(given, k), &column[k], flags) != 0) {
+            break;
+        }
+        taken += 1;
+        const Py_ssize_t length = column[k].len / 8;
+        if ((column[k].itemsize != 8) || ((rows >= 0) && (length != rows))) {
+            PyErr_SetString(PyExc_ValueError, "columns of 8-byte numbers of one length are needed");
+            break;
+        }
+        rows = length;
+    }
+    for (Py_ssize_t k = 0; !PyErr_Occurred() && (k < rows); ++k) {
+        const cg_sample now = {
+            ((const double *)column[0].buf)[k], ((const double *)column[1].buf)[k],
+            ((const double *)column[2].buf)[k], ((const double *)column[3].buf)[k],
+        };
+        (void)cg_update(&self->estimator, &now);
+        const cg_estimate found = cg_evaluate(&self->estimator);
+        const double number[7] = {
+            found.time_s,          found.soc_pct,         found.soc_std_pct, found.soc_newton_pct,
+            found.soc_coulomb_pct, found.voltage_model_v, found.residual_v,
+        };
+        for (int j = 0; j < 7; ++j) {
+            ((double *)column[COLUMNS_IN + j].buf)[k] = number[j];
+        }
+        ((int64_t *)column[COLUMNS_IN + 7].buf)[k] = found.status;
+        ((int64_t *)column[COLUMNS_IN + 8].buf)[k] = found.reasons;
+        if (((k & 0xfff) == 0xfff) && (PyErr_CheckSignals() != 0)) {
+            break;
+        }
+    }
+    for (int k = 0; k < taken; ++k) {
+        PyBuffer_Release(&column[k]);
+    }
+    if (PyErr_Occurred()) {
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
+static PyObject *Core_pseudo_ocv_at(Core *self, PyObject *soc)
+{
+    const double soc_pct = PyFloat_AsDouble(soc);
+    double slope;
+    if (PyErr_Occurred()) {
+        return NULL;
+    }
+    const double volts = cg_pseudo_ocv(&self->estimator, soc_pct, &slope);
+    return Py_BuildValue("dd", volts, slope);
+}
+
+static PyObject *Core_offset_a(Core *self, PyObject *Py_UNUSED(none))
+{
+    return PyFloat_FromDouble(cg_offset_a(&self->estimator));
+}
+
+static PyObject *Core_uncounted_std_pct(Core *self, PyObject *seconds)
+{
+    const double given = PyFloat_AsDouble(seconds);
+    return PyErr_Occurred() ? NULL
+                            : PyFloat_FromDouble(cg_uncounted_std_pct(&self->estimator, given));
+}
+
+static PyObject *Core_is_refused(Core *self, void *Py_UNUSED(closure))
+{
+    return PyBool_FromLong(self->estimator.state.is_refused);
+}
+
+/* ------------------------------------------------------------------ delay line */
+
+static PyObject *Core_current_at(Core *self, PyObject *ago)
+{
+    const double ago_s = PyFloat_AsDouble(ago);
+    if (PyErr_Occurred()) {
+        return NULL;
+    }
+    if (self->estimator.line.count == 0) {
+        PyErr_SetString(PyExc_IndexError, "the delay line is empty");
+        return NULL;
+    }
+    return PyFloat_FromDouble(cg_line_at(&self->estimator.line, ago_s));
+}
+
+static PyObject *Core_filled_s(Core *self, PyObject *Py_UNUSED(none))
+{
+    return PyFloat_FromDouble(cg_line_filled_s(&self->estimator.line));
+}
+
+static PyObject *Core_line(Core *self, PyObject *Py_UNUSED(none))
+{
+    const cg_line *line = &self->estimator.line;
+    PyObject *times = PyList_New(line->count);
+    PyObject *currents = PyList_New(line->count);
+    for (int32_t k = 0; (times != NULL) && (currents != NULL) && (k < line->count); ++k) {
+        const cg_current *at = &line->at[(line->first + k) % line->size];
+        PyList_SET_ITEM(times, k, PyFloat_FromDouble(at->time_s));
+        PyList_SET_ITEM(currents, k, PyFloat_FromDouble(at->current_a));
+    }
+    if ((times == NULL) || (currents == NULL)) {
+        Py_XDECREF(times);
+        Py_XDECREF(currents);
+        return NULL;
+    }
+    return Py_BuildValue("NNd", times, currents, line->since_s);
+}
+
+static PyObject *Core_fill_line(Core *self, PyObject *args)
+{
+    cg_line *line = &self->estimator.line;
+    PyObject *times, *currents;
+    double since_s;
+    if (!PyArg_ParseTuple(args, "O!O!d", &PyList_Type, &times, &PyList_Type, &currents, &since_s)) {
+        return NULL;
+    }
+    /* The latest, where a longer delay line left more. */
+    const Py_ssize_t given = PyList_GET_SIZE(times);
+    const Py_ssize_t kept = (given < line->size) ? given : line->size;
+    line->first = 0;
+    line->count = (int32_t)kept;
+    line->since_s = since_s;
+    for (Py_ssize_t k = 0; k < kept; ++k) {
+        const Py_ssize_t from = given - kept + k;
+        line->at[k].time_s = PyFloat_AsDouble(PyList_GET_ITEM(times, from));
+        line->at[k].current_a = PyFloat_AsDouble(PyList_GET_ITEM(currents, from));
+    }
+    self->estimator.without_ocv_v = NAN;
+    if (PyErr_Occurred()) {
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
+/* ------------------------------------------------------------------ state by name */
+
+typedef struct {
+    const char *name;
+    const field *fields;
+    size_t offset;
+} part;
+
+static const part PARTS[] = {
+    {"clock", CLOCK, offsetof(cg_state, clock)},
+    {"counter", COUNTER, offsetof(cg_state, counter)},
+    {"since", SINCE, offsetof(cg_state, since)},
+    {"filter", FILTER, offsetof(cg_state, filter)},
+    {"first", EKF, offsetof(cg_state, filter.ekf[0])},
+    {"second", EKF, offsetof(cg_state, filter.ekf[1])},
+    {"memory", MEMORY, offsetof(cg_state, memory)},
+    {"references", REFERENCES, offsetof(cg_state, memory)},
+    {"latest", LATEST, offsetof(cg_state, latest)},
+    {"state", STATE, 0},
+    {NULL, NULL, 0},
+};
+
+static const part *part_named(const char *name)
+{
+    for (const part *each = PARTS; each->name != NULL; ++each) {
+        if (strcmp(each->name, name) == 0) {
+            return each;
+        }
+    }
+    PyErr_SetString(PyExc_KeyError, name);
+    return NULL;
+}
+
+static PyObject *Core_get(Core *self, PyObject *args)
+{
+    const char *name;
+    if (!PyArg_ParseTuple(args, "s", &name)) {
+        return NULL;
+    }
+    const part *found = part_named(name);
+    return (found == NULL)
+               ? NULL
+               : get_fields((char *)&self->estimator.state + found->offset, found->fields);
+}
+
+static PyObject *Core_set(Core *self, PyObject *args)
+{
+    const char *name;
+    PyObject *values;
+    if (!PyArg_ParseTuple(args, "sO", &name, &values)) {
+        return NULL;
+    }
+    const part *found = part_named(name);
+    if ((found == NULL) || (set_fields((char *)&self->estimator.state + found->offset,
+                                       found->fields, values) != 0)) {
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
+static cg_effect_state *effect_numbered(Core *self, int effect)
+{
+    if ((effect < 0) || (effect >= self->model.effects)) {
+        PyErr_SetString(PyExc_IndexError, "no such effect");
+        return NULL;
+    }
+    return &self->estimator.state.effect[effect];
+}
+
+static PyObject *Core_get_lags(Core *self, PyObject *number)
+{
+    const long effect = PyLong_AsLong(number);
+    cg_effect_state *state = PyErr_Occurred() ? NULL : effect_numbered(self, (int)effect);
+    PyObject *lags = (state == NULL) ? NULL : PyList_New(CG_LAGS);
+    for (int k = 0; (lags != NULL) && (k < CG_LAGS); ++k) {
+        PyList_SET_ITEM(lags, k, get_fields(&state->lag[k], LAG));
+    }
+    return lags;
+}
+
+static PyObject *Core_set_lags(Core *self, PyObject *args)
+{
+    int effect;
+    double volts;
+    PyObject *lags;
+    if (!PyArg_ParseTuple(args, "idO!", &effect, &volts, &PyList_Type, &lags)) {
+        return NULL;
+    }
+    cg_effect_state *state = effect_numbered(self, effect);
+    if (state == NULL) {
+        return NULL;
+    }
+    state->volts = volts;
+    for (Py_ssize_t k = 0; (k < CG_LAGS) && (k < PyList_GET_SIZE(lags)); ++k) {
+        if (set_fields(&state->lag[k], LAG, PyList_GET_ITEM(lags, k)) != 0) {
+            return NULL;
+        }
+    }
+    Py_RETURN_NONE;
+}
+
+/* Samples that time_skew holds back, as the state of that effect: number, samples, times, currents. */
+static PyObject *Core_get_skew(Core *self, PyObject *Py_UNUSED(none))
+{
+    const cg_skew *skew = self->skew;
+    PyObject *numbers = PyList_New(0);
+    if ((numbers == NULL) || (skew == NULL)) {
+        return numbers;
+    }
+    const Py_ssize_t waiting = skew->waiting_count;
+    const Py_ssize_t total = 1 + 4 * waiting + 2 * (Py_ssize_t)skew->count;
+    Py_SETREF(numbers, PyList_New(total));
+    if (numbers == NULL) {
+        return NULL;
+    }
+    PyList_SET_ITEM(numbers, 0, PyFloat_FromDouble((double)waiting));
+    for (int32_t k = 0; k < skew->waiting_count; ++k) {
+        const cg_sample *each = &skew->waiting[(skew->waiting_first + k) % CG_WAITING];
+        const double number[4] = {each->time_s, each->current_a, each->voltage_v,
+                                  each->temperature_c};
+        for (int j = 0; j < 4; ++j) {
+            PyList_SET_ITEM(numbers, 1 + 4 * k + j, PyFloat_FromDouble(number[j]));
+        }
+    }
+    for (int32_t k = 0; k < skew->count; ++k) {
+        const cg_current *at = &skew->at[(skew->first + k) % CG_WAITING];
+        PyList_SET_ITEM(numbers, 1 + 4 * waiting + k, PyFloat_FromDouble(at->time_s));
+        PyList_SET_ITEM(numbers, 1 + 4 * waiting + skew->count + k,
+                        PyFloat_FromDouble(at->current_a));
+    }
+    return numbers;
+}
+
+static PyObject *Core_set_skew(Core *self, PyObject *args)
+{
+    cg_skew *skew = self->skew;
+    PyObject *waiting, *times, *currents;
+    if (!PyArg_ParseTuple(args, "O!O!O!", &PyList_Type, &waiting, &PyList_Type, &times, &PyList_Type,
+                          &currents)) {
+        return NULL;
+    }
+    if ((skew == NULL) || (PyList_GET_SIZE(waiting) > 4 * CG_WAITING) ||
+        (PyList_GET_SIZE(times) > CG_WAITING) || (PyList_GET_SIZE(waiting) % 4 != 0) ||
+        (PyList_GET_SIZE(times) != PyList_GET_SIZE(currents))) {
+        PyErr_SetString(PyExc_ValueError, "more samples held back than there is memory for");
+        return NULL;
+    }
+    skew->waiting_first = skew->first = 0;
+    skew->waiting_count = (int32_t)(PyList_GET_SIZE(waiting) / 4);
+    skew->count = (int32_t)PyList_GET_SIZE(times);
+    for (int32_t k = 0; k < skew->waiting_count; ++k) {
+        skew->waiting[k].time_s = PyFloat_AsDouble(PyList_GET_ITEM(waiting, 4 * k));
+        skew->waiting[k].current_a = PyFloat_AsDouble(PyList_GET_ITEM(waiting, 4 * k + 1));
+        skew->waiting[k].voltage_v = PyFloat_AsDouble(PyList_GET_ITEM(waiting, 4 * k + 2));
+        skew->waiting[k].temperature_c = PyFloat_AsDouble(PyList_GET_ITEM(waiting, 4 * k + 3));
+    }
+    for (int32_t k = 0; k < skew->count; ++k) {
+        skew->at[k].time_s = PyFloat_AsDouble(PyList_GET_ITEM(times, k));
+        skew->at[k].current_a = PyFloat_AsDouble(PyList_GET_ITEM(currents, k));
+    }
+    if (PyErr_Occurred()) {
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
+/* ------------------------------------------------------------------ module */
+
+static PyMethodDef METHODS[] = {
+    {"update", (PyCFunction)Core_update, METH_O, "Process one sample, a tuple of four numbers."},
+    {"estimate", (PyCFunction)Core_estimate, METH_NOARGS, "Return the latest estimate's numbers."},
+    {"run", (PyCFunction)Core_run, METH_VARARGS, "Step over columns: 4 in, 7 + 2 out."},
+    {"pseudo_ocv_at", (PyCFunction)Core_pseudo_ocv_at, METH_O, "Return voltage and slope at a SoC."},
+    {"offset_a", (PyCFunction)Core_offset_a, METH_NOARGS, "Return the current's offset [A]."},
+    {"uncounted_std_pct", (PyCFunction)Core_uncounted_std_pct, METH_O, "After a silence [%]."},
+    {"current_at", (PyCFunction)Core_current_at, METH_O, "Return an earlier current [A]."},
+    {"filled_s", (PyCFunction)Core_filled_s, METH_NOARGS, "Return the gap-free stretch [s]."},
+    {"line", (PyCFunction)Core_line, METH_NOARGS, "Return times, currents and start."},
+    {"fill_line", (PyCFunction)Core_fill_line, METH_VARARGS, "Set times, currents and start."},
+    {"get", (PyCFunction)Core_get, METH_VARARGS, "Return a part of the state."},
+    {"set", (PyCFunction)Core_set, METH_VARARGS, "Set a part of the state."},
+    {"get_lags", (PyCFunction)Core_get_lags, METH_O, "Return the lags of an effect."},
+    {"set_lags", (PyCFunction)Core_set_lags, METH_VARARGS, "Set voltage and lags of an effect."},
+    {"get_skew", (PyCFunction)Core_get_skew, METH_NOARGS, "Return what time_skew holds back."},
+    {"set_skew", (PyCFunction)Core_set_skew, METH_VARARGS, "Set what time_skew holds back."},
+    {NULL, NULL, 0, NULL},
+};
+
+static PyGetSetDef GETSET[] = {
+    {"is_refused", (getter)Core_is_refused, NULL, "Whether the latest sample was refused.", NULL},
+    {NULL, NULL, NULL, NULL, NULL},
+};
+
+static PyTypeObject CoreType = {
+    PyVarObject_HEAD_INIT(NULL, 0)
+    .tp_name = "cangauge._core.Core",
+    .tp_doc = "Estimator in C.",
+    .tp_basicsize = sizeof(Core),
+    .tp_flags = Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC,
+    .tp_new = PyType_GenericNew,
+    .tp_init = (initproc)Core_init,
+    .tp_dealloc = (destructor)Core_dealloc,
+    .tp_traverse = (traverseproc)Core_traverse,
+    .tp_clear = (inquiry)Core_clear,
+    .tp_methods = METHODS,
+    .tp_getset = GETSET,
+};
+
+static struct PyModuleDef MODULE = {
+    PyModuleDef_HEAD_INIT, "_core", "The estimator's core, compiled.", -1, NULL, NULL, NULL, NULL,
+    NULL,
+};
+
+PyMODINIT_FUNC PyInit__core(void)
+{
+    if (PyType_Ready(&CoreType) < 0) {
+        return NULL;
+    }
+    PyObject *module = PyModule_Create(&MODULE);
+    if ((module == NULL) || (PyModule_AddObjectRef(module, "Core", (PyObject *)&CoreType) < 0) ||
+        (PyModule_AddIntConstant(module, "FUNCTIONS", CG_FUNCTIONS) < 0) ||
+        (PyModule_AddIntConstant(module, "STATES", CG_STATES) < 0) ||
+        (PyModule_AddStringConstant(module, "SOURCES", CG_SOURCES) < 0)) {
+        Py_XDECREF(module);
+        return NULL;
+    }
+    return module;
+}

@@ -1,0 +1,181 @@
+"""The compiled core gives the numbers of the reference implementation, bit for bit."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Iterable
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from cangauge.estimation.compiled import CompiledEstimator, make_estimator
+from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.offline import run_estimator, samples_of
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.validity import Sample
+from cangauge.identify.fit import fit
+from cangauge.logs.log import Log
+from cangauge.model.coulomb_counting import capacity_from_reference
+from cangauge.model.effects.library import LIBRARY
+from cangauge.model.model_file import Model
+from cangauge.validation.packs import BenchPack, load
+from estimation.test_any_input import MODELS, RULES, inputs, odd, samples_of_rows
+from estimation.test_snapshot import eventful_samples
+
+core = pytest.importorskip("cangauge._core", reason="the extension was not built: no C compiler")
+
+ROOT = Path(__file__).parents[2]
+STARTS = st.sampled_from([None, 0.0, 50.0, 100.0])
+
+
+def bits(numbers: Iterable[float]) -> list[str]:
+    return [float(number).hex() for number in numbers]
+
+
+def pair(model: Model, chosen: EstimatorSettings) -> tuple[Estimator, CompiledEstimator]:
+    compiled = make_estimator(model, chosen)
+    assert isinstance(compiled, CompiledEstimator)
+    return Estimator(model, chosen), compiled
+
+
+def follow(reference: Estimator, compiled: Estimator, samples: Iterable[Sample]) -> None:
+    """Hand the same samples to both; each estimate has the same bits."""
+    for number, sample in enumerate(samples):
+        expected, found = reference.step(sample), compiled.step(sample)
+        assert bits(expected) == bits(found), f"sample {number}: {sample}"
+
+
+def state_of(estimator: Estimator) -> Any:
+    return json.loads(estimator.snapshot().model_dump_json())
+
+
+def test_extension_is_built_from_these_sources() -> None:
+    sys.path.insert(0, str(ROOT))
+    try:
+        hook = import_module("hatch_build")
+    finally:
+        sys.path.remove(str(ROOT))
+    digest = hook.sources_digest(ROOT / "core")
+    assert digest == core.SOURCES, "run `python hatch_build.py` again"
+
+
+@pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
+@pytest.mark.parametrize("which", ["plain", "together"])
+@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
+@given(drawn=inputs, with_rules=st.booleans(), start=STARTS)
+def test_any_input_gives_the_same_bits(
+    which: str, method: Any, drawn: Any, with_rules: bool, start: Any
+) -> None:
+    chosen = EstimatorSettings(
+        method=method, initial_soc_pct=start, **(RULES if with_rules else {})
+    )
+    reference, compiled = pair(MODELS[which], chosen)
+    follow(reference, compiled, samples_of_rows(drawn))
+    assert state_of(reference) == state_of(compiled)
+
+
+@pytest.mark.parametrize("which", ["plain", "together"])
+@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
+@given(drawn=st.lists(st.tuples(odd, odd, odd, odd), max_size=40))
+def test_extreme_numbers_give_the_same_bits(which: str, drawn: Any) -> None:
+    follow(*pair(MODELS[which], EstimatorSettings()), [Sample(*row) for row in drawn])
+
+
+@pytest.mark.parametrize("effect_id", LIBRARY)
+def test_eventful_drive_gives_the_same_bits_with_each_effect(effect_id: str) -> None:
+    chosen = EstimatorSettings(initial_soc_pct=85.0)
+    reference, compiled = pair(MODELS[effect_id], chosen)
+    samples = eventful_samples()
+    follow(reference, compiled, samples[:700])
+    assert state_of(reference) == state_of(compiled)
+    assert bits(reference.power()) == bits(compiled.power())
+    assert bits(reference.health) == bits(compiled.health)
+    now = samples[699]
+    assert bits(reference.pack_tick(now)) == bits(compiled.pack_tick(now))
+    stamps = [now.time_s - 3.0, math.nan]
+    assert bits(reference.current_changes(now.time_s, stamps)) == bits(
+        compiled.current_changes(now.time_s, stamps)
+    )
+    # Each continues from the other's state.
+    after = pair(MODELS[effect_id], chosen)
+    after[0].restore(compiled.snapshot(), 5.0)
+    after[1].restore(reference.snapshot(), 5.0)
+    follow(*after, samples[700:])
+
+
+def test_other_model_takes_over_with_the_same_bits() -> None:
+    before = pair(MODELS["plain"], EstimatorSettings(initial_soc_pct=85.0))
+    after = pair(MODELS["together"], EstimatorSettings(method="coulomb"))
+    samples = eventful_samples()
+    follow(*before, samples[:500])
+    for old, new in zip(before, after, strict=True):
+        new.take_over(old)
+    follow(*after, samples[500:])
+
+
+def test_columns_give_the_same_bits_as_samples() -> None:
+    columns = np.array(eventful_samples()).T
+    chosen = EstimatorSettings()
+    reference, compiled = pair(MODELS["plain"], chosen)
+    found = compiled.run(columns)
+    expected = [reference.step(Sample._make(row)) for row in columns.T.tolist()]
+    for number, row in enumerate(zip(*found, strict=True)):
+        assert bits(row) == bits(expected[number][:9])
+
+
+def test_environment_switches_the_core_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CANGAUGE_PURE_PYTHON", "1")
+    assert type(make_estimator(MODELS["plain"])) is Estimator
+
+
+def test_error_of_the_health_estimator_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, compiled = pair(MODELS["plain"], EstimatorSettings())
+
+    def fail(*_: object) -> None:
+        raise ArithmeticError("no")
+
+    monkeypatch.setattr("cangauge.estimation.health.HealthEstimator.use", fail)
+    with pytest.raises(ArithmeticError, match="no"):
+        compiled.step(Sample(0.0, 10.0, 385.0, 23.0))
+
+
+def same_table(log: Log, model: Model, chosen: EstimatorSettings) -> None:
+    """Both estimate a log with the same bits, by columns."""
+    found = run_estimator(log, model, chosen)
+    reference = Estimator(model, chosen)
+    expected = np.array([reference.step(sample)[:9] for sample in samples_of(log)])
+    columns = [
+        found.time_s, found.soc_pct, found.soc_std_pct, found.soc_newton_pct,
+        found.soc_coulomb_pct, found.voltage_model_v, found.residual_v,
+    ]  # fmt: skip
+    for column, wanted in zip(columns, expected.T, strict=False):
+        np.testing.assert_array_equal(column.view(np.int64), wanted.copy().view(np.int64))
+    np.testing.assert_array_equal(found.reasons, expected[:, 8])
+
+
+@pytest.fixture(scope="module")
+def packs(shared_data: Path) -> list[BenchPack]:
+    return load(shared_data)
+
+
+@pytest.mark.real
+def test_held_out_trips_of_the_i3_give_the_same_bits(packs: list[BenchPack]) -> None:
+    (i3,) = (pack for pack in packs if pack.name == "i3")
+    model = fit(i3.training[:3], capacity_ah=60.0).model
+    for log in i3.judged[:4]:
+        same_table(log, model, EstimatorSettings(initial_soc_pct=80.0))
+
+
+@pytest.mark.real
+def test_every_pack_of_the_bench_gives_the_same_bits(packs: list[BenchPack]) -> None:
+    for pack in packs:
+        capacity_ah = pack.capacity_ah or capacity_from_reference(pack.training[:1])
+        model = fit(pack.training[:1], capacity_ah=capacity_ah).model
+        same_table(pack.judged[-1].rows(slice(0, 800)), model, EstimatorSettings())
