@@ -41,7 +41,8 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.app import COMMANDS
 from cangauge.diagnosis import diagnose
 from cangauge.estimation.cells import CellEstimator
-from cangauge.estimation.offline import run_estimator, samples_of
+from cangauge.estimation.compiled import make_estimator
+from cangauge.estimation.offline import run_estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.validity import Sample
 from cangauge.export.equivalent_circuit import equivalent_circuit
@@ -52,7 +53,7 @@ from cangauge.model.model_file import Coefficient, Model
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.validation import simulate
 from peer_filters import Circuit, bare_ekf, run
-from peers import make_estimator, step_us
+from peers import step_us
 
 KEPT = Path(__file__).with_name("ratios.json")
 WORSE = 1.2
@@ -140,15 +141,15 @@ def live_frame_us(frames: list[can.Message]) -> tuple[float, float]:
 def ratios(rounds: int = ROUNDS) -> Result:
     """Return each ratio to its barest form, the median of rounds, with both times [µs]."""
     known, fast, slow, frames = model(), drive(10), drive(1), wanted_frames(3000)
-    make, found = make_estimator(), {}
+    found: dict[str, list[tuple[float, float, float]]] = {}
     for _ in range(rounds):
         bare = bare_step_us(known, fast)
         began = time.process_time()
-        run_estimator(samples_of(fast), known, EstimatorSettings())
+        run_estimator(fast, known, EstimatorSettings())
         offline = 1e6 * (time.process_time() - began) / len(fast)
         times = {
-            "step at 10 Hz": (step_us(make, known, fast), bare),
-            "step at 1 Hz": (step_us(make, known, slow), bare),
+            "step at 10 Hz": (step_us(make_estimator, known, fast), bare),
+            "step at 1 Hz": (step_us(make_estimator, known, slow), bare),
             "offline row at 10 Hz": (offline, bare),
             "live frame": live_frame_us(frames),
         }
@@ -185,10 +186,10 @@ def with_delays(known: Model, number: int) -> Model:
 
 def growth() -> Result:
     """Return how a step at 1 Hz grows with the model, and a tick with its cells [µs]."""
-    make, known, log = make_estimator(), model(), drive(1)
+    known, log = model(), drive(1)
 
     def median_us(changed: Model) -> float:
-        return statistics.median(step_us(make, changed, log) for _ in range(3))
+        return statistics.median(step_us(make_estimator, changed, log) for _ in range(3))
 
     result: Result = {
         "step at 1 Hz, delays [µs]": {
@@ -209,8 +210,7 @@ def growth() -> Result:
 def cells_us(count: int) -> float:
     """Return the time of a second of a pack with so many cell voltages [µs]."""
     known = model()
-    make = make_estimator()
-    estimator = make(known, EstimatorSettings(initial_soc_pct=80.0))
+    estimator = make_estimator(known, EstimatorSettings(initial_soc_pct=80.0))
     cells = CellEstimator(known.voltage_model(), count)
     volts = np.full(count, 380.0 / count)
     total_s, ticks = 0.0, 300
@@ -219,7 +219,7 @@ def cells_us(count: int) -> float:
         estimator.update(sample)
         began = time.process_time()
         if cells.is_due(sample.time_s):
-            cells.update(estimator.pack_tick(sample), volts)
+            cells.update(estimator.pack_tick(sample), volts, np.zeros(count))
         total_s += time.process_time() - began
     return 1e6 * total_s / ticks
 

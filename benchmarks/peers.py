@@ -27,6 +27,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
@@ -52,15 +53,6 @@ OURS = "cangauge"
 Result = dict[str, Any]
 
 
-def make_estimator() -> Callable[..., Estimator]:
-    """Return the estimator that the service uses: the compiled one where it was built."""
-    try:
-        from cangauge.estimation.compiled import make_estimator as make  # noqa: PLC0415
-    except ImportError:
-        return Estimator
-    return make
-
-
 def step_us(
     make: Callable[..., Estimator], model: Model, log: Log, rows: int = TIMED_ROWS
 ) -> float:
@@ -74,20 +66,15 @@ def step_us(
     return 1e6 * (time.process_time() - began) / len(samples)
 
 
-def prepare(data: Path) -> tuple[Result, dict[str, list[Log]], dict[str, dict[str, Model]]]:
+def prepare(data: Path) -> tuple[Result, dict[str, list[Log]], dict[str, Model]]:
     """Fit the models; return what the peers are given, the judged logs and our models."""
     work: Result = {"packs": {}}
     judged, models = {}, {}
     for pack in load(data, PACKS):
         training, judged[pack.name] = next(pack.splits(TRAINING_LOGS, 1, SEED))
         capacity_ah = pack.capacity_ah or capacity_from_reference(training)
-        models[pack.name] = {
-            OURS: fit(training, capacity_ah=capacity_ah).model,
-            f"{OURS}, effects auto": fit(
-                training, capacity_ah=capacity_ah, effects=("auto",)
-            ).model,
-        }
-        tables = _tables(models[pack.name][OURS])
+        models[pack.name] = fit(training, capacity_ah=capacity_ah).model
+        tables = _tables(models[pack.name])
         work["packs"][pack.name] = {
             "tables": tables,
             "training": [_columns(log) for log in training],
@@ -129,7 +116,7 @@ def compare(data: Path, python: Path, rounds: int) -> Result:
     sys.stderr.write("fitting the models of both packs …\n")
     work, judged, models = prepare(data)
     timed = dict(zip(work["timing"]["logs"], judged.pop("timing"), strict=True))
-    kinds = {f"{OURS}, pure Python": Estimator, OURS: make_estimator()}
+    kinds = {f"{OURS}, pure Python": Estimator, OURS: make_estimator}
     found: Result = {name: {"us": {}, "mae_pct": {}} for name in (*PEERS, *kinds)}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "work.json"
@@ -138,17 +125,15 @@ def compare(data: Path, python: Path, rounds: int) -> Result:
             sys.stderr.write(f"round {number + 1} of {rounds} …\n")
             for name, make in kinds.items():
                 for rate, log in timed.items():
-                    us = step_us(make, models["i3"][OURS], log)
+                    us = step_us(make, models["i3"], log)
                     found[name]["us"].setdefault(rate, []).append(us)
             for name in PEERS:
                 _add_peer(found[name], name, [python, path], judged)
     for row in found.values():
         row["us"] = {rate: float(np.median(values)) for rate, values in row["us"].items()}
     for pack, logs in judged.items():
-        for kind, model in models[pack].items():
-            tables = [run_estimator(samples_of(log), model, EstimatorSettings()) for log in logs]
-            row = found.setdefault(kind, {"us": {}, "mae_pct": {}})
-            row["mae_pct"][pack] = mae_pct([table.soc_pct for table in tables], logs)
+        tables = [run_estimator(log, models[pack], EstimatorSettings()) for log in logs]
+        found[OURS]["mae_pct"][pack] = mae_pct([table.soc_pct for table in tables], logs)
     return found
 
 
@@ -187,6 +172,34 @@ def show(found: Result, console: Console) -> None:
     console.print(table)
 
 
+def draw(found: Result, path: Path) -> None:
+    """Draw time of a step against error; models without a filter have no error."""
+    import matplotlib as mpl  # noqa: PLC0415 - of the extra `figures`
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt  # noqa: PLC0415
+
+    figure, axes = plt.subplots(figsize=(9, 4.2), dpi=110)
+    names = list(found)
+    places = np.arange(len(names))
+    for offset, rate in ((-0.2, "10 Hz"), (0.2, "1 Hz")):
+        times = [row["us"].get(rate, np.nan) for row in found.values()]
+        axes.barh(places + offset, times, height=0.38, label=f"samples at {rate}")
+    for place, row in zip(places, found.values(), strict=True):
+        errors = ", ".join(f"{pack} {_percent(row['mae_pct'].get(pack))} %" for pack in PACKS)
+        longest = max(row["us"].values(), default=1.0)
+        axes.text(1.15 * longest, place, errors if row["mae_pct"] else "no filter", va="center")
+    axes.set(
+        xscale="log", yticks=places, yticklabels=names, xlabel="time of a sample [µs]",
+        title="A sample with its estimate, and the mean error of the SoC",
+    )  # fmt: skip
+    axes.set_xlim(right=60.0 * axes.get_xlim()[1])
+    axes.invert_yaxis()
+    axes.legend(loc="lower right")
+    figure.tight_layout()
+    figure.savefig(path)
+
+
 def _percent(value: float | None) -> str:
     return "–" if value is None else f"{value:.2f}"
 
@@ -200,10 +213,13 @@ def main() -> None:
     parser.add_argument("--peers", type=Path, required=True, help="Python with the peers")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here too")
+    parser.add_argument("--figure", type=Path, metavar="FILE", help="draw them (PNG)")
     options = parser.parse_args()
     found = compare(options.data, options.peers, options.rounds)
     if options.json:
         options.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    if options.figure:
+        draw(found, options.figure)
     show(found, Console(width=130))
 
 

@@ -12,8 +12,6 @@ from cangauge._io import write_text_atomic
 from cangauge.cli.options import JsonOption, check_outputs
 from cangauge.cli.output import emit_json, note, print_table
 from cangauge.errors import InputError
-from cangauge.export.equivalent_circuit import equivalent_circuit
-from cangauge.model.model_file import Model
 
 
 def export_ecm_command(
@@ -41,6 +39,10 @@ def export_ecm_command(
             "neither .py nor .json", field="-o", value=str(output), cure="name a .py or .json file"
         )
     check_outputs([output], [model])
+    # Deferred, so that the help page does not wait for numpy and scipy.
+    from cangauge.export.equivalent_circuit import equivalent_circuit  # noqa: PLC0415
+    from cangauge.model.model_file import Model  # noqa: PLC0415
+
     circuit = equivalent_circuit(Model.load(model))
     text = circuit.to_module() if output.suffix == ".py" else circuit.to_json()
     write_text_atomic(output, text)

@@ -10,8 +10,6 @@ import typer
 from cangauge.cli.options import JsonOption, check_outputs
 from cangauge.cli.output import emit_json, note
 from cangauge.errors import InputError
-from cangauge.export.fmu import Kind, Version, export_fmu
-from cangauge.model.model_file import Model
 
 
 def export_fmu_command(
@@ -47,6 +45,10 @@ def export_fmu_command(
     if output.suffix != ".fmu":
         raise InputError("not .fmu", field="-o", value=str(output), cure="name a .fmu file")
     check_outputs([output], [model])
+    # Deferred, so that the help page does not wait for numpy and scipy.
+    from cangauge.export.fmu import Kind, Version, export_fmu  # noqa: PLC0415
+    from cangauge.model.model_file import Model  # noqa: PLC0415
+
     export_fmu(Model.load(model), output, kind=cast("Kind", kind), version=cast("Version", fmi))
     if json_output:
         emit_json({"output": str(output), "kind": kind, "fmi": fmi})
