@@ -168,6 +168,7 @@ def test_the_command_writes_a_unit(tmp_path: Path) -> None:
     assert done.exit_code == 0
     description = fmpy.read_model_description(str(unit))
     assert description.fmiVersion == "2.0"
+    assert description.coSimulation.modelIdentifier.isidentifier()
     assert [item.name for item in description.modelVariables if item.causality == "input"] == [
         "current_a",
         "temperature_c",

@@ -70,6 +70,8 @@ SENSORS: Final = ("current_sensor", "voltage_sensor", "time_skew")
 """Kinds that change what is measured, not the pack."""
 PLACES: Final = 12
 """Number of values of an effect, `CG_VALUES`; its time constants follow."""
+LONGEST_NAME: Final = 60
+"""Characters of a unit's name, a C identifier and the name of its binary."""
 UNITS: Final = {
     "A": {"A": "1"},
     "V": {"kg": "1", "m": "2", "s": "-3", "A": "-1"},
@@ -158,10 +160,10 @@ class _Unit:
             variables = (*_pack_variables(model), *names)
         else:
             parameters, variables = [], _estimator_variables()
-        name = re.sub(r"\W+", "_", model.name, flags=re.ASCII).strip("_") or "model"
+        name = re.sub(r"\W+", "_", f"{kind} {model.name}", flags=re.ASCII).rstrip("_")
         token = hashlib.sha256(f"{kind} {version} {__version__} {model.to_json()}".encode())
         return cls(
-            f"{name}_{kind}", kind, version, constants, tuple(variables), tuple(parameters),
+            name[:LONGEST_NAME], kind, version, constants, tuple(variables), tuple(parameters),
             token.hexdigest(),
         )  # fmt: skip
 
