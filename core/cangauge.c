@@ -199,7 +199,7 @@ static cg_real coulomb_std_pct(const cg_estimator *self)
 }
 
 /* SoC of the chosen method, and its standard deviation; NAN until known. */
-static cg_real soc_now(const cg_estimator *self, cg_real *std_pct)
+static cg_real soc_now(cg_estimator *self, cg_real *std_pct)
 {
     const cg_memory *memory = &self->state.memory;
     const int32_t method = self->settings.method;
@@ -411,7 +411,7 @@ static void use_references(cg_estimator *self, const cg_sample *sample, cg_time 
 static void restart_if_lost(cg_estimator *self, cg_time time_s)
 {
     cg_state *state = &self->state;
-    if (state->is_filtering && cg_filter_is_lost(&state->filter, cg_states(self->model))) {
+    if (state->is_filtering && cg_filter_is_lost(&state->filter)) {
         cg_real soc_pct = state->memory.newton_pct;
         if (isnan(soc_pct)) {
             soc_pct = cg_clip_soc((cg_real)coulomb_pct(state));
@@ -561,7 +561,7 @@ bool cg_update(cg_estimator *self, const cg_sample *sample)
     cg_correct(self, &now, 0, skew);
     if (skew < model->effects) {
         cg_skew_push(self->skew, &now);
-        is_ready = cg_skew_pop(self->skew, model->effect[skew].value[0], newest_s, &now);
+        is_ready = cg_skew_pop(self->skew, model->skew_s, newest_s, &now);
     }
     if (!is_ready) {
         state->latest.time_s = stamp_s;
@@ -574,7 +574,7 @@ bool cg_update(cg_estimator *self, const cg_sample *sample)
         state->pending_stamp_s = stamp_s;
         state->is_pending = true;
         is_ready = (skew < model->effects) &&
-                   cg_skew_pop(self->skew, model->effect[skew].value[0], newest_s, &now);
+                   cg_skew_pop(self->skew, model->skew_s, newest_s, &now);
     }
     return true;
 }
@@ -695,6 +695,7 @@ static void forget(cg_state *state)
     state->counter.time_s = (cg_time)NAN;
     state->filter.hypotheses = 1;
     state->filter.wide_std_pct = R(CG_UNKNOWN_SOC_STD_PCT);
+    state->filter.stated_pct = nan;
     state->memory.tick = -1;
     state->memory.temperature_c = nan;
     state->memory.newton_pct = nan;

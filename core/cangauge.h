@@ -50,7 +50,7 @@ typedef enum {
     CG_NO_EFFECT = 0, /* or one that changes the count only */
     CG_CURRENT_SENSOR, /* offset, gain */
     CG_VOLTAGE_SENSOR, /* offset, gain */
-    CG_TIME_SKEW, /* skew_s */
+    CG_TIME_SKEW, /* `skew_s` of the model */
     CG_TEMPERATURE_LAG, /* ahead; lag: smoothing */
     CG_CORE_TEMPERATURE, /* rise_k, late, capacity_ah; lags: Joule heat, temperature */
     CG_RESISTANCE_TEMPERATURE, /* share, activation_k, delayed, reference_per_k, ohm; lag: interior */
@@ -113,6 +113,7 @@ typedef struct {
     /* effects, in the order of their application */
     int32_t effects;
     cg_effect effect[CG_EFFECTS];
+    cg_time skew_s; /* of CG_TIME_SKEW: how late the time stamps of the current are */
     int32_t memories; /* RC elements of effects: what currents before the first sample left */
     cg_real memory_ohm[CG_MEMORIES];
     cg_real memory_tau_s[CG_MEMORIES];
@@ -221,10 +222,11 @@ typedef struct {
     cg_real unseen_var_pct2;
 } cg_since;
 
-/* State and covariance: SoC, current offset, slow and lasting error, capacity, curve's errors. */
+/* SoC, current offset, slow and lasting error, capacity, and the curve's errors. Covariance of the
+ * learned states with all; the others have variance 1 and no covariance among each other. */
 typedef struct {
     cg_real x[CG_STATES];
-    cg_real p[CG_STATES][CG_STATES];
+    cg_real p[CG_LEARNED][CG_STATES];
     cg_real mean_innovation_v;
     cg_real mean_seconds;
     bool was_outlier;
@@ -240,7 +242,7 @@ typedef struct {
     cg_real log_odds;
     cg_real prior_log_odds;
     cg_real wide_std_pct;
-    cg_real open_s;
+    cg_real stated_pct; /* standard deviation of two hypotheses; NAN until it is needed */
     cg_real outlier_s;
     bool is_untested;
 } cg_filter;

@@ -19,11 +19,11 @@
 /* hypotheses */
 #define CLEAR_LOG_ODDS 6.907755278982137 /* ln 1000 */
 #define FORGOTTEN 0.01
+#define NEGLIGIBLE 0.02
 #define LOG_ODDS_AT_MOST 50.0
 #define TWO_SIGMA 0.9544997361036416 /* erf(sqrt 2) */
 #define NARROWEST_PCT 1e-9
 #define WRONG_LOG_ODDS (-4.59511985013459) /* -ln 99 */
-#define OPEN_AT_MOST_S 900.0
 #define DIVERGED_S 180.0
 #define OUTLIER_STEP_AT_MOST_S 10.0
 #define WIDTH_STEPS_AT_MOST 200
@@ -44,10 +44,9 @@ static void ekf_start(cg_ekf *ekf, const cg_model *model, cg_real soc_pct, cg_re
     const cg_real offset_std_a = R(CG_OFFSET_STD_PER_AH) * model->capacity_ah;
     for (int32_t k = 0; k < size; ++k) {
         ekf->x[k] = R(0.0);
-        for (int32_t j = 0; j < size; ++j) {
-            ekf->p[k][j] = R(0.0);
+        for (int32_t j = 0; j < CG_LEARNED; ++j) {
+            ekf->p[j][k] = R(0.0);
         }
-        ekf->p[k][k] = R(1.0);
     }
     ekf->x[CG_X_SOC] = soc_pct;
     ekf->p[CG_X_SOC][CG_X_SOC] = cg_square(std_pct);
@@ -96,7 +95,7 @@ static void ekf_predict(cg_ekf *ekf, const cg_model *model, const cg_since *sinc
     slow[CG_X_LASTING] = lasting[CG_X_SLOW];
     slow[CG_X_SOC] = first[CG_X_SLOW];
     lasting[CG_X_SOC] = first[CG_X_LASTING];
-    for (int32_t k = 1; k < size; ++k) {
+    for (int32_t k = 1; k < CG_LEARNED; ++k) {
         ekf->p[k][CG_X_SOC] = first[k];
         ekf->p[k][CG_X_SLOW] = slow[k];
         ekf->p[k][CG_X_LASTING] = lasting[k];
@@ -161,13 +160,28 @@ static void ekf_correct(cg_ekf *ekf, int32_t size, const cg_real *spread, cg_rea
             ekf->p[k][j] = ekf->p[k][j] - (gain * spread[j]);
         }
     }
-    for (int32_t k = 1; k < size; ++k) {
-        const int32_t end = (k < CG_LEARNED) ? k : CG_LEARNED;
-        for (int32_t j = 0; j < end; ++j) {
+    for (int32_t k = 1; k < CG_LEARNED; ++k) {
+        for (int32_t j = 0; j < k; ++j) {
             ekf->p[k][j] = ekf->p[j][k];
         }
     }
     ekf_clip(ekf);
+}
+
+/* P H' of a voltage, to which slow and lasting error count in full. */
+static void ekf_spread(const cg_ekf *ekf, int32_t size, const cg_real *jacobian, cg_real *spread)
+{
+    for (int32_t k = 0; k < size; ++k) {
+        spread[k] = (jacobian[CG_X_SOC] * ekf->p[CG_X_SOC][k]) +
+                    (jacobian[CG_X_OFFSET] * ekf->p[CG_X_OFFSET][k]) + ekf->p[CG_X_SLOW][k] +
+                    ekf->p[CG_X_LASTING][k];
+    }
+    for (int32_t k = 0; k < CG_LEARNED; ++k) {
+        spread[k] += cg_dot(ekf->p[k], jacobian, CG_LEARNED, size);
+    }
+    for (int32_t k = CG_LEARNED; k < size; ++k) {
+        spread[k] += jacobian[k];
+    }
 }
 
 /* Update with one voltage. Whether a lasting contradiction made the SoC unknown again. */
@@ -196,11 +210,8 @@ static bool ekf_update(const cg_estimator *self, cg_ekf *ekf, const cg_measureme
     cg_real innovation = R(0.0);
     cg_real of_state = R(0.0);
     for (int32_t step = 0; step < ITERATIONS_AT_MOST; ++step) {
-        innovation = seen->voltage_v - unbiased_v;
-        innovation -= cg_dot(jacobian, ekf->x, CG_X_SLOW, size);
-        for (int32_t k = 0; k < size; ++k) {
-            spread[k] = cg_dot(ekf->p[k], jacobian, 0, size);
-        }
+        innovation = seen->voltage_v - unbiased_v - (ekf->x[CG_X_SLOW] + ekf->x[CG_X_LASTING]);
+        ekf_spread(ekf, size, jacobian, spread);
         of_state = cg_max(cg_dot(spread, jacobian, 0, size), R(0.0));
         cg_real corrected_pct = start_pct + (spread[CG_X_SOC] / (of_state + fast_v2) * innovation);
         corrected_pct = cg_clip(corrected_pct, R(LOWEST_PCT), R(HIGHEST_PCT));
@@ -225,7 +236,7 @@ static void ekf_set_soc(cg_ekf *ekf, int32_t size, cg_real soc_pct, cg_real std_
 {
     cg_real spread[CG_STATES];
     for (int32_t k = 0; k < size; ++k) {
-        spread[k] = ekf->p[k][CG_X_SOC];
+        spread[k] = ekf->p[CG_X_SOC][k];
     }
     ekf_correct(ekf, size, spread, soc_pct - ekf->x[CG_X_SOC], spread[CG_X_SOC] + cg_square(std_pct));
 }
@@ -242,15 +253,15 @@ static void ekf_shrink_bias(cg_ekf *ekf, const cg_model *model)
             ekf->p[CG_X_SLOW][k] = shrink * ekf->p[CG_X_SLOW][k];
         }
         ekf->p[CG_X_SLOW][CG_X_SLOW] *= shrink;
-        for (int32_t k = 0; k < size; ++k) {
+        for (int32_t k = 0; k < CG_LEARNED; ++k) {
             ekf->p[k][CG_X_SLOW] = ekf->p[CG_X_SLOW][k];
         }
     }
 }
 
-static bool ekf_is_valid(const cg_ekf *ekf, int32_t size)
+static bool ekf_is_valid(const cg_ekf *ekf)
 {
-    for (int32_t k = 0; k < size; ++k) {
+    for (int32_t k = 0; k < CG_LEARNED; ++k) {
         if (!((ekf->p[k][k] >= R(0.0)) && (cg_fabs(ekf->x[k]) < R(INFINITY)))) {
             return false;
         }
@@ -302,6 +313,7 @@ static cg_real mean_of(const cg_filter *filter, cg_real first, cg_real second)
 
 void cg_filter_start(cg_filter *filter, const cg_model *model, cg_real soc_pct, cg_real std_pct)
 {
+    filter->stated_pct = CG_NAN;
     filter->hypotheses = 1;
     ekf_start(&filter->ekf[0], model, soc_pct, std_pct);
     filter->ekf[0].was_outlier = false;
@@ -316,11 +328,11 @@ void cg_filter_start(cg_filter *filter, const cg_model *model, cg_real soc_pct, 
 static void filter_open(cg_filter *filter, cg_real log_odds, cg_real wide_std_pct)
 {
     filter->hypotheses = 2;
+    filter->stated_pct = CG_NAN;
     filter->ekf[1].was_outlier = false;
     filter->log_odds = log_odds;
     filter->prior_log_odds = log_odds;
     filter->wide_std_pct = wide_std_pct;
-    filter->open_s = R(0.0);
 }
 
 static cg_real soc_std_pct(const cg_ekf *ekf)
@@ -342,10 +354,10 @@ static cg_real within(cg_real width, cg_real away, cg_real std, cg_real *density
 static cg_real stated_std_pct(const cg_filter *filter, const cg_real *away, const cg_real *std)
 {
     cg_real low = R(0.0);
-    cg_real width = R(0.0);
     cg_real high = cg_max(away[0] + (R(3.0) * std[0]), away[1] + (R(3.0) * std[1]));
+    cg_real width = cg_min(R(2.0) * mean_of(filter, std[0], std[1]), high);
     cg_real step = high;
-    for (int32_t k = 0; (k < WIDTH_STEPS_AT_MOST) && (cg_fabs(step) > R(CG_CLOSE_PCT)); ++k) {
+    for (int32_t k = 0; (k < WIDTH_STEPS_AT_MOST) && (cg_fabs(step) > R(CG_LAST_STEP_PCT)); ++k) {
         cg_real density[2];
         const cg_real one = within(width, away[0], std[0], &density[0]);
         const cg_real other = within(width, away[1], std[1], &density[1]);
@@ -373,7 +385,7 @@ typedef struct {
     cg_real offset_pct;
 } mixture;
 
-static mixture mix(const cg_filter *filter, cg_real pct_per_a)
+static mixture mix(cg_filter *filter, cg_real pct_per_a)
 {
     const cg_ekf *one = &filter->ekf[0];
     const cg_ekf *other = &filter->ekf[1];
@@ -385,7 +397,10 @@ static mixture mix(const cg_filter *filter, cg_real pct_per_a)
             mean_of(filter, mixed.offset_pct, pct_per_a * other->x[CG_X_OFFSET]);
         const cg_real away[2] = {cg_fabs(one->x[CG_X_SOC] - mixed.soc_pct),
                                  cg_fabs(other->x[CG_X_SOC] - mixed.soc_pct)};
-        mixed.std_pct = stated_std_pct(filter, away, std);
+        if (isnan(filter->stated_pct)) {
+            filter->stated_pct = stated_std_pct(filter, away, std);
+        }
+        mixed.std_pct = filter->stated_pct;
     }
     return mixed;
 }
@@ -407,7 +422,7 @@ static void filter_merge(cg_filter *filter, int32_t size)
         from_other[k] = other->x[k] - x;
         one->x[k] = x;
     }
-    for (int32_t k = 0; k < size; ++k) {
+    for (int32_t k = 0; k < CG_LEARNED; ++k) {
         for (int32_t j = 0; j < size; ++j) {
             one->p[k][j] = mean_of(filter, one->p[k][j] + (from_one[k] * from_one[j]),
                                    other->p[k][j] + (from_other[k] * from_other[j]));
@@ -418,7 +433,7 @@ static void filter_merge(cg_filter *filter, int32_t size)
     for (int32_t k = 0; k < size; ++k) {
         one->p[CG_X_SOC][k] = scale * one->p[CG_X_SOC][k];
     }
-    for (int32_t k = 0; k < size; ++k) {
+    for (int32_t k = 0; k < CG_LEARNED; ++k) {
         one->p[k][CG_X_SOC] *= scale;
     }
     if (filter->log_odds > R(0.0)) {
@@ -450,6 +465,7 @@ void cg_filter_predict(cg_filter *filter, const cg_model *model, const cg_since 
 {
     const cg_real parked_var_pct2 = since->gap_var_pct2 + since->unseen_var_pct2;
     cg_real second_var_pct2 = parked_var_pct2;
+    filter->stated_pct = CG_NAN;
     if (since->away_s != R(0.0)) {
         const cg_real moved_pct = moved_std_pct(since->away_s);
         filter_merge(filter, cg_states(model));
@@ -464,25 +480,32 @@ void cg_filter_predict(cg_filter *filter, const cg_model *model, const cg_since 
     }
 }
 
-/* Log odds of the second hypothesis, given all voltages (Savage-Dickey ratio). */
-static cg_real odds_of_second(const cg_filter *filter)
+/* Set the log odds from all voltages (Savage-Dickey ratio). Whether the less likely still counts. */
+static bool weigh(cg_filter *filter)
 {
-    const cg_real std1_pct = soc_std_pct(&filter->ekf[0]);
-    const cg_real std2_pct = soc_std_pct(&filter->ekf[1]);
-    const cg_real more_pct2 = cg_square(std2_pct) - cg_square(std1_pct);
-    if (more_pct2 <= (R(FORGOTTEN) * cg_square(std2_pct))) {
-        return filter->log_odds;
-    }
+    const cg_real first_pct2 = cg_square(soc_std_pct(&filter->ekf[0]));
+    const cg_real second_pct2 = cg_square(soc_std_pct(&filter->ekf[1]));
+    const cg_real more_pct2 = second_pct2 - first_pct2;
     const cg_real apart_pct = filter->ekf[1].x[CG_X_SOC] - filter->ekf[0].x[CG_X_SOC];
-    const cg_real square = cg_square(apart_pct) / more_pct2;
-    const cg_real ratio = filter->wide_std_pct * cg_sqrt(more_pct2) / cg_square(std2_pct);
-    return bounded(filter->prior_log_odds + (R(0.5) * square) - cg_log(ratio));
+    if (more_pct2 > (R(FORGOTTEN) * second_pct2)) {
+        const cg_real square = cg_square(apart_pct) / more_pct2;
+        const cg_real ratio = filter->wide_std_pct * cg_sqrt(more_pct2) / second_pct2;
+        filter->log_odds = bounded(filter->prior_log_odds + (R(0.5) * square) - cg_log(ratio));
+    }
+    const cg_real second = second_probability(filter);
+    const cg_real first = R(1.0) - second;
+    const cg_real spread_pct2 = first * second * apart_pct * apart_pct;
+    if (second > R(0.5)) {
+        return cg_fabs(spread_pct2 - (first * more_pct2)) > (R(NEGLIGIBLE) * second_pct2);
+    }
+    return cg_fabs(spread_pct2 + (second * more_pct2)) > (R(NEGLIGIBLE) * first_pct2);
 }
 
 /* Update with one voltage. Whether it shows that the SoC was wrong until now. */
 bool cg_filter_update(cg_estimator *self, const cg_measurement *seen, const cg_since *since)
 {
     cg_filter *filter = &self->state.filter;
+    filter->stated_pct = CG_NAN;
     if (filter->is_untested) {
         filter->is_untested = false;
         if (filter->hypotheses == 1) {
@@ -505,8 +528,7 @@ bool cg_filter_update(cg_estimator *self, const cg_measurement *seen, const cg_s
     if (filter->hypotheses == 1) {
         return is_contradicted;
     }
-    filter->log_odds = odds_of_second(filter);
-    filter->open_s += since->seconds - since->away_s;
+    const bool is_open = weigh(filter);
     if (is_contradicted != is_second_contradicted) {
         return filter_decide(filter, is_contradicted, false);
     }
@@ -514,22 +536,19 @@ bool cg_filter_update(cg_estimator *self, const cg_measurement *seen, const cg_s
         (filter->verdict == (int32_t)CG_OPEN) ? R(0.0) : filter->prior_log_odds;
     const bool is_clear = (filter->log_odds > R(CLEAR_LOG_ODDS)) ||
                           (filter->log_odds < (prior - R(CLEAR_LOG_ODDS)));
-    if (is_contradicted || is_clear) {
-        return filter_decide(filter, filter->log_odds > R(0.0), is_contradicted);
+    if (is_open && !(is_contradicted || is_clear)) {
+        return false;
     }
-    if (filter->open_s > R(OPEN_AT_MOST_S)) {
-        filter_merge(filter, cg_states(self->model));
-    }
-    return false;
+    return filter_decide(filter, filter->log_odds > R(0.0), is_contradicted);
 }
 
-bool cg_filter_is_lost(const cg_filter *filter, int32_t size)
+bool cg_filter_is_lost(const cg_filter *filter)
 {
     if (filter->outlier_s > R(DIVERGED_S)) {
         return true;
     }
     for (int32_t k = 0; k < filter->hypotheses; ++k) {
-        if (!ekf_is_valid(&filter->ekf[k], size)) {
+        if (!ekf_is_valid(&filter->ekf[k])) {
             return true;
         }
     }
@@ -537,9 +556,9 @@ bool cg_filter_is_lost(const cg_filter *filter, int32_t size)
 }
 
 /* SoC after the charge counted since the last update, and its standard deviation. */
-cg_real cg_filter_soc(const cg_estimator *self, cg_real *std_pct)
+cg_real cg_filter_soc(cg_estimator *self, cg_real *std_pct)
 {
-    const cg_filter *filter = &self->state.filter;
+    cg_filter *filter = &self->state.filter;
     const cg_since *since = &self->state.since;
     const cg_real counted_s = since->seconds - since->away_s;
     const mixture mixed = mix(filter, cg_pct_per_as(self->model) * counted_s);
@@ -571,6 +590,7 @@ cg_real cg_offset_a(const cg_estimator *self)
 /* Update with a SoC that is known otherwise. */
 void cg_filter_set_soc(cg_filter *filter, const cg_model *model, cg_real soc_pct, cg_real std_pct)
 {
+    filter->stated_pct = CG_NAN;
     filter_merge(filter, cg_states(model));
     filter->is_untested = false;
     ekf_set_soc(&filter->ekf[0], cg_states(model), soc_pct, std_pct);
@@ -579,6 +599,7 @@ void cg_filter_set_soc(cg_filter *filter, const cg_model *model, cg_real soc_pct
 /* Reduce the slow error of all hypotheses after a long rest. */
 void cg_filter_shrink_bias(cg_filter *filter, const cg_model *model)
 {
+    filter->stated_pct = CG_NAN;
     for (int32_t k = 0; k < filter->hypotheses; ++k) {
         ekf_shrink_bias(&filter->ekf[k], model);
     }

@@ -13,7 +13,9 @@
 #define CG_JOIN(a, b) CG_JOIN_(a, b)
 
 #if CG_JOIN(CG_REAL_IS_, CANGAUGE_REAL)
-#define CG_CLOSE_PCT 1e-4 /* where an iteration on a SoC stops */
+/* Where an iteration on a SoC, and on a standard deviation, stops. */
+#define CG_CLOSE_PCT 1e-4
+#define CG_LAST_STEP_PCT 1e-4
 #define cg_exp expf
 #define cg_expm1 expm1f
 #define cg_log logf
@@ -24,6 +26,7 @@
 #define cg_fabs fabsf
 #else
 #define CG_CLOSE_PCT 1e-9
+#define CG_LAST_STEP_PCT 1e-6
 #define cg_exp exp
 #define cg_expm1 expm1
 #define cg_log log
@@ -93,7 +96,7 @@ cg_real cg_newton(const cg_estimator *self, cg_real ocv_v, cg_real guess_pct, bo
 int32_t cg_skew_of(const cg_model *model);
 void cg_correct(cg_estimator *self, cg_sample *sample, int32_t from, int32_t to);
 void cg_skew_push(cg_skew *skew, const cg_sample *sample);
-bool cg_skew_pop(cg_skew *skew, cg_real skew_s, cg_time now_s, cg_sample *sample);
+bool cg_skew_pop(cg_skew *skew, cg_time skew_s, cg_time now_s, cg_sample *sample);
 void cg_advance(cg_estimator *self, const cg_sample *sample, cg_real temperature_c);
 
 /* noise of a voltage */
@@ -117,8 +120,8 @@ void cg_filter_predict(cg_filter *filter, const cg_model *model, const cg_since 
 bool cg_filter_update(cg_estimator *self, const cg_measurement *seen, const cg_since *since);
 void cg_filter_set_soc(cg_filter *filter, const cg_model *model, cg_real soc_pct, cg_real std_pct);
 void cg_filter_shrink_bias(cg_filter *filter, const cg_model *model);
-bool cg_filter_is_lost(const cg_filter *filter, int32_t size);
-cg_real cg_filter_soc(const cg_estimator *self, cg_real *std_pct);
+bool cg_filter_is_lost(const cg_filter *filter);
+cg_real cg_filter_soc(cg_estimator *self, cg_real *std_pct);
 const cg_ekf *cg_likelier(const cg_filter *filter);
 cg_real cg_strain(const cg_ekf *ekf, const cg_model *model);
 

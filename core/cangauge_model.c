@@ -300,14 +300,14 @@ static int32_t skew_until(const cg_skew *skew, cg_time time_s)
 }
 
 /* Take the oldest sample if its current is known, which it then has. */
-bool cg_skew_pop(cg_skew *skew, cg_real skew_s, cg_time now_s, cg_sample *sample)
+bool cg_skew_pop(cg_skew *skew, cg_time skew_s, cg_time now_s, cg_sample *sample)
 {
     if ((skew->waiting_count > 0) &&
-        ((skew->waiting[skew->waiting_first].time_s + (cg_time)skew_s) <= now_s)) {
+        ((skew->waiting[skew->waiting_first].time_s + skew_s) <= now_s)) {
         *sample = skew->waiting[skew->waiting_first];
         skew->waiting_first = (skew->waiting_first + 1) % CG_WAITING;
         skew->waiting_count -= 1;
-        const cg_time at_s = sample->time_s + (cg_time)skew_s;
+        const cg_time at_s = sample->time_s + skew_s;
         const int32_t right = skew_until(skew, at_s);
         const cg_current *after = &skew->at[(skew->first + right) % CG_WAITING];
         const cg_current *before = &skew->at[(skew->first + right + CG_WAITING - 1) % CG_WAITING];
@@ -322,7 +322,7 @@ bool cg_skew_pop(cg_skew *skew, cg_real skew_s, cg_time now_s, cg_sample *sample
     }
     const cg_time upcoming_s =
         (skew->waiting_count > 0) ? skew->waiting[skew->waiting_first].time_s : now_s;
-    const int32_t stale = skew_until(skew, upcoming_s + (cg_time)skew_s) - 1;
+    const int32_t stale = skew_until(skew, upcoming_s + skew_s) - 1;
     if (stale > STALE_AT_MOST) {
         skew->first = (skew->first + stale) % CG_WAITING;
         skew->count -= stale;

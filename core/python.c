@@ -57,6 +57,7 @@ static const field MODEL[] = {
     LIST(cg_model, knot_pct, 'd', CG_KNOTS),
     LIST(cg_model, function_v, 'd', CG_KNOTS * CG_FUNCTIONS),
     NUMBER(cg_model, effects, 'i'),
+    NUMBER(cg_model, skew_s, 'd'),
     NUMBER(cg_model, memories, 'i'),
     LIST(cg_model, memory_ohm, 'd', CG_MEMORIES),
     LIST(cg_model, memory_tau_s, 'd', CG_MEMORIES),
@@ -106,7 +107,7 @@ static const field SINCE[] = {
 };
 static const field EKF[] = {
     LIST(cg_ekf, x, 'd', CG_STATES),
-    LIST(cg_ekf, p, 'd', CG_STATES * CG_STATES),
+    LIST(cg_ekf, p, 'd', CG_LEARNED * CG_STATES),
     NUMBER(cg_ekf, mean_innovation_v, 'd'),
     NUMBER(cg_ekf, mean_seconds, 'd'),
     NUMBER(cg_ekf, was_outlier, 'b'),
@@ -115,8 +116,8 @@ static const field EKF[] = {
 static const field FILTER[] = {
     NUMBER(cg_filter, hypotheses, 'i'),     NUMBER(cg_filter, verdict, 'i'),
     NUMBER(cg_filter, log_odds, 'd'),       NUMBER(cg_filter, prior_log_odds, 'd'),
-    NUMBER(cg_filter, wide_std_pct, 'd'),   NUMBER(cg_filter, open_s, 'd'),
-    NUMBER(cg_filter, outlier_s, 'd'),      NUMBER(cg_filter, is_untested, 'b'),
+    NUMBER(cg_filter, wide_std_pct, 'd'),   NUMBER(cg_filter, outlier_s, 'd'),
+    NUMBER(cg_filter, stated_pct, 'd'),     NUMBER(cg_filter, is_untested, 'b'),
     END,
 };
 static const field MEMORY[] = {

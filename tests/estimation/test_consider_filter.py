@@ -110,19 +110,16 @@ def test_error_has_the_stated_deviation(start_std_pct: float, discharged_pct: fl
         assert rmse < 1.05
 
 
-def test_merging_two_hypotheses_moves_neither_soc_nor_deviation() -> None:
-    _, voltage_v = drive(seed=1, steps=1000, discharged_pct=0.0)
-    voltage_v += SLOPE_V * 2.0
+@pytest.mark.parametrize("wrong_pct", [4.0, 6.0])
+def test_open_hypotheses_never_make_the_estimate_jump(wrong_pct: float) -> None:
+    _, voltage_v = drive(seed=1, steps=1200, discharged_pct=0.0)
+    voltage_v += SLOPE_V * wrong_pct
     two = HypothesisFilter(make_ekf)
     two.start(50.0, 1.0)
-    stated, number = [], []
+    stated = []
     for value in voltage_v:
         since = ChargeSinceUpdate(seconds=1.0)
         two.predict(since)
-        two.update(Measurement(float(value), 0.0, 52.0, FAST_V, 0.0, 0.0), since)
+        two.update(Measurement(float(value), 0.0, 50.0 + wrong_pct, FAST_V, 0.0, 0.0), since)
         stated.append(two.soc_after(ChargeSinceUpdate()))
-        number.append(len(two.snapshot().hypotheses))
-    assert number[800] == 2
-    assert number[-1] == 1
-    steps = np.abs(np.diff(stated[600:], axis=0))
-    assert steps.max() < 0.01
+    assert np.abs(np.diff(stated[600:], axis=0)).max() < 0.05  # noise of single voltages

@@ -153,7 +153,7 @@ def _fits(content: dict[str, Any]) -> bool:
 def _hashed(content: dict[str, Any]) -> str:
     text = json.dumps(content, sort_keys=True, separators=(",", ":"))
     sha256 = hashlib.sha256(text.encode()).hexdigest()
-    head = {"format": "cangauge-state", "version": 1, "sha256": sha256}
+    head = {"format": "cangauge-state", "version": 2, "sha256": sha256}
     return json.dumps({**head, "content": content})
 
 
@@ -404,12 +404,12 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "large": (lambda path: path.write_bytes(b" " * ((8 << 20) + 1)), "larger than 8 MB"),
     "a huge number": (lambda path: path.write_text("9" * 10_000), "not JSON"),
     "not a number": (lambda path: path.write_text("NaN"), "not JSON"),
-    "version": (overwrite(version=2), "this release reads version 1 (got 2)"),
-    "no version": (overwrite(version=None), "this release reads version 1"),
+    "version": (overwrite(version=1), "this release reads version 2 (got 1)"),
+    "no version": (overwrite(version=None), "this release reads version 2"),
     "hash": (overwrite(sha256="0" * 64), "damaged"),
     "no content": (overwrite(content=None), "damaged"),
     "infinite": (lambda path: path.write_text(
-        '{"format": "cangauge-state", "version": 1, "sha256": "", "content": {"a": 1e999}}'),
+        '{"format": "cangauge-state", "version": 2, "sha256": "", "content": {"a": 1e999}}'),
         "damaged"),
     "unknown key": (edited("more", value=1), "content.more"),
     "soc beyond": (edited("estimator", "estimate", 1, value=130.0), "outside 0–100"),
@@ -479,7 +479,7 @@ def test_a_refused_state_replaces_only_an_earlier_one(machine: Machine) -> None:
     foreign.write_text("somebody's")
     for _ in range(2):
         kept(machine, 3)
-        overwrite(version=2)(machine.path)
+        overwrite(version=1)(machine.path)
         machine.start()
     assert foreign.read_text() == "somebody's"
     assert sorted(each.name for each in machine.path.parent.iterdir()) == [

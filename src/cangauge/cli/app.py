@@ -30,6 +30,7 @@ COMMANDS: Final = {
     "gap": "Diagnose the gap between a model and logs: size, place, probable cause.",
     "gap-check": "Measure how often `gap` finds the right cause, on withheld causes.",
     "packs-check": "Measure the SoC errors, and their σ, on recorded packs.",
+    "export-c": "Write a model and the estimator as C sources, with tests, for a microcontroller.",
     "run": "Estimate the state of charge from a bus, and publish it there.",
     "status": "Show the state of a running service: SoC ± standard deviation [%], frames, delays.",
     "monitor": "Watch a running service in the terminal: values, charts, status with its reasons.",

@@ -22,7 +22,7 @@ from cangauge._arithmetic import total
 from cangauge._typing import FloatArray
 from cangauge.estimation.cells import PackTick
 from cangauge.estimation.core_constants import CoreConstants, core_constants, effect_fields
-from cangauge.estimation.ekf import KT, SocEkf
+from cangauge.estimation.ekf import KT, LEARNED, SocEkf
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.health import Health, HealthEstimator, VoltageTick
 from cangauge.estimation.hypothesis_filter import HypothesisFilter
@@ -251,10 +251,11 @@ class CompiledEstimator(Estimator):
         for name in names:
             ekf = self._core.get(name)
             size, stride = KT + 1 + self._functions.number, _core.STATES
-            rows = [ekf["p"][k * stride : k * stride + size] for k in range(size)]
+            rows = [ekf["p"][k * stride : k * stride + size] for k in range(LEARNED)]
             hypotheses.append(
                 EkfState(ekf["x"][:size], rows, ekf["mean_innovation_v"], ekf["mean_seconds"])
             )
+        fields.pop("stated_pct")
         verdict = VERDICTS[fields.pop("verdict")]
         self._filter.resume(HypothesisFilterState(hypotheses, verdict=verdict, **fields))
 
@@ -285,7 +286,10 @@ class CompiledEstimator(Estimator):
                 "mean_innovation_v": ekf.mean_innovation_v, "mean_seconds": ekf.mean_seconds,
             })  # fmt: skip
         count, verdict = len(state.hypotheses), VERDICTS.index(state.verdict)
-        self._core.set("filter", vars(state) | {"hypotheses": count, "verdict": verdict})
+        self._core.set(
+            "filter",
+            vars(state) | {"hypotheses": count, "verdict": verdict, "stated_pct": math.nan},
+        )
 
     def _effect_state(self, number: int) -> list[float]:
         """Return the state of an effect as `OnlineEffect.state` does."""

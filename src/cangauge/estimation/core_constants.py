@@ -88,6 +88,7 @@ def core_constants(model: Model, settings: EstimatorSettings) -> CoreConstants |
         "functions": 0 if curve is None else len(curve.functions_v),
         "knot_pct": [] if curve is None else list(curve.soc_pct),
         "effects": len(known),
+        "skew_s": sum(form.values[0] for form in known if form.kind == "time_skew"),
         "memories": len(online.memory),
         "memory_ohm": [ohm for ohm, _ in online.memory],
         "memory_tau_s": [tau_s for _, tau_s in online.memory],

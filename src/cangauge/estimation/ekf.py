@@ -40,6 +40,7 @@ from typing import Final
 import numpy as np
 
 from cangauge._arithmetic import dot
+from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.estimation.measurement_noise import CurveFunctions, Measurement
 from cangauge.estimation.state import EkfState
@@ -112,6 +113,16 @@ def count_std_pct(
     return math.sqrt(start_var_pct2 + offset_pct * offset_pct + capacity_pct * capacity_pct)
 
 
+def full_covariance(rows: Sequence[Sequence[float]]) -> FloatArray:
+    """Return the covariance of all states from the rows of the learned ones."""
+    learned = np.array(rows)
+    covariance = np.eye(learned.shape[1])
+    covariance[:, :LEARNED] = learned.T
+    covariance[:LEARNED, :LEARNED] = learned[:, :LEARNED]
+    covariance[:LEARNED, LEARNED:] = learned[:, LEARNED:]
+    return covariance
+
+
 class SocEkf:
     """Extended Kalman filter; state and equations are in the module's docstring.
 
@@ -141,11 +152,11 @@ class SocEkf:
         self._functions = CurveFunctions(noise)
         self._pct_per_as = 100.0 / (3600.0 * capacity_ah)
         self._steady_ohm = steady_ohm
-        self._slow_var = noise.slow_std_v**2
+        self._slow_var = noise.slow_std_v * noise.slow_std_v
         self._slow_time_s = noise.slow_time_s
         self._lasting_time_s = noise.lasting_time_s
         self._lasting_pct = noise.lasting_soc_pct
-        self._lasting_var = noise.lasting_std_v**2
+        self._lasting_var = noise.lasting_std_v * noise.lasting_std_v
         self._offset_std_a = OFFSET_STD_PER_AH * capacity_ah
         walk_a = OFFSET_WALK_PER_SQRT_H * self._offset_std_a
         self._walk_var = walk_a * walk_a
@@ -154,17 +165,19 @@ class SocEkf:
         self.was_outlier = False
         self._size = KT + 1 + self._functions.number
         self._x = [0.0] * self._size
-        self._p = [[0.0] * self._size for _ in range(self._size)]
+        # Rows of the covariance of the states that are learned. The considered ones have variance 1
+        # and no covariance among each other, always.
+        self._p = [[0.0] * self._size for _ in range(LEARNED)]
 
     def start(self, soc_pct: float, soc_std_pct: float) -> None:
         """Restart from a SoC with its standard deviation [%]."""
         size = self._size
         self._x = [soc_pct, *[0.0] * (size - 1)]
-        variances = [
+        variances = (
             soc_std_pct * soc_std_pct, self._offset_std_a * self._offset_std_a, self._slow_var,
-            self._lasting_var, CAPACITY_STD * CAPACITY_STD, *[1.0] * (size - LEARNED),
-        ]  # fmt: skip
-        self._p = [[0.0] * k + [variances[k]] + [0.0] * (size - 1 - k) for k in range(size)]
+            self._lasting_var, CAPACITY_STD * CAPACITY_STD,
+        )  # fmt: skip
+        self._p = [[0.0] * k + [each] + [0.0] * (size - 1 - k) for k, each in enumerate(variances)]
         self._reset_innovations()
 
     def predict(
@@ -277,9 +290,8 @@ class SocEkf:
             is_contradicted = False
         start_pct = at_pct = self._x[SOC]
         for _ in range(ITERATIONS_AT_MOST):
-            innovation = measurement.voltage_v - unbiased_v
-            innovation -= dot(jacobian[SLOW:], self._x[SLOW:])
-            spread = [dot(row, jacobian) for row in self._p]
+            innovation = measurement.voltage_v - unbiased_v - (self._x[SLOW] + self._x[LASTING])
+            spread = self._spread(jacobian)
             of_state = max(dot(spread, jacobian), 0.0)
             corrected_pct = start_pct + spread[SOC] / (of_state + fast_v2) * innovation
             corrected_pct = min(max(corrected_pct, LOWEST_PCT), HIGHEST_PCT)
@@ -296,6 +308,20 @@ class SocEkf:
         self._clip_soc()
         return is_contradicted
 
+    def _spread(self, jacobian: list[float]) -> list[float]:
+        """Return P·Hᵀ of a voltage, to which slow and lasting error count in full."""
+        p = self._p
+        slope, by_offset, of_model = jacobian[SOC], jacobian[OFFSET], jacobian[LEARNED:]
+        spread = [
+            slope * a + by_offset * b + c + d
+            for a, b, c, d in zip(p[SOC], p[OFFSET], p[SLOW], p[LASTING], strict=True)
+        ]
+        for k, row in enumerate(p):
+            spread[k] += dot(row[LEARNED:], of_model)
+        for k, value in enumerate(of_model, LEARNED):
+            spread[k] += value
+        return spread
+
     def _linearized(self, measurement: Measurement, soc_pct: float) -> tuple[list[float], float]:
         """Return the Jacobian at a SoC, and the voltage without the model's errors [V]."""
         ocv_v, slope = self._curve.pseudo_ocv_at(soc_pct)
@@ -308,7 +334,7 @@ class SocEkf:
     def correct(self, soc_pct: float, std_pct: float) -> None:
         """Update with an external SoC reference and its standard deviation [%]."""
         jacobian = [1.0, *[0.0] * (self._size - 1)]
-        spread = [row[SOC] for row in self._p]
+        spread = list(self._p[SOC])
         self._correct(jacobian, spread, soc_pct - self._x[SOC], spread[SOC], std_pct * std_pct)
         self._clip_soc()
 
@@ -334,17 +360,14 @@ class SocEkf:
         """
         x, p = self._x, self._p
         total = of_state + variance
-        learned = LEARNED
-        for k in range(learned):
+        for k, row in enumerate(p):
             gain = spread[k] / total
             x[k] += gain * innovation
-            p[k] = [a - gain * b for a, b in zip(p[k], spread, strict=True)]
-        for k in range(1, learned):
+            p[k] = [a - gain * b for a, b in zip(row, spread, strict=True)]
+        for k in range(1, LEARNED):
             row = p[k]
             for j in range(k):
                 row[j] = p[j][k]
-        for k in range(learned, len(p)):
-            p[k][:learned] = [p[j][k] for j in range(learned)]
 
     def shrink_bias(self) -> None:
         """Reduce the slow error after a long rest, in which slow polarization has decayed."""
@@ -378,9 +401,9 @@ class SocEkf:
             If it has another number of variables, or its covariance is not semidefinite.
         """
         size = self._size
-        if [len(state.x), *map(len, state.p)] != [size] * (size + 1) or len(state.p) != size:
+        if [len(state.x), *map(len, state.p)] != [size] * (LEARNED + 1):
             raise InputError(f"not a filter of {size} states", field="filter.hypotheses")
-        covariance = np.array(state.p)
+        covariance = full_covariance(state.p)
         variance = np.diag(covariance)
         scale = np.sqrt(np.where(variance > 0.0, variance, 1.0))
         correlation = covariance / np.outer(scale, scale)
@@ -403,7 +426,7 @@ class SocEkf:
         """Return whether the state is finite, and no variance negative."""
         return all(
             row[k] >= 0.0 and abs(value) < math.inf
-            for k, (row, value) in enumerate(zip(self._p, self._x, strict=True))
+            for k, (row, value) in enumerate(zip(self._p, self._x, strict=False))
         )
 
     @property

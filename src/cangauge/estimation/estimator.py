@@ -493,9 +493,9 @@ class Estimator:
 
     def _has_other_capacity(self) -> bool:
         """Return whether the learned capacity is beyond what the filter allows for, surely."""
-        health = self._health.health
-        difference_ah = abs(health.capacity_ah - self.capacity_ah)
-        allowed_ah = max(health.capacity_std_ah, CAPACITY_STD * self.capacity_ah)
+        capacity_ah, std_ah = self._health.capacity
+        difference_ah = abs(capacity_ah - self.capacity_ah)
+        allowed_ah = max(std_ah, CAPACITY_STD * self.capacity_ah)
         return difference_ah > MISMATCH_SIGMAS * allowed_ah
 
     def _coulomb_pct(self) -> float:

@@ -252,15 +252,18 @@ class HealthEstimator:
         self._fuse(row, soc_pct - float(self._x[_S]), std_pct**2)
 
     @property
+    def capacity(self) -> tuple[float, float]:
+        """Capacity and its standard deviation as known now [Ah]."""
+        gain = float(self._x[_G])
+        capacity_ah = self._reference_ah / gain
+        return capacity_ah, capacity_ah / gain * math.sqrt(float(self._p[_G, _G]))
+
+    @property
     def health(self) -> Health:
         """Capacity, resistance and offset as known now."""
-        gain, ratio = float(self._x[_G]), self._resistance.ratio()
-        capacity_ah = self._reference_ah / gain
         return Health(
-            capacity_ah,
-            capacity_ah / gain * math.sqrt(float(self._p[_G, _G])),
-            ratio[0],
-            ratio[1],
+            *self.capacity,
+            *self._resistance.ratio(),
             float(self._x[_O]),
             math.sqrt(float(self._p[_O, _O])),
         )

@@ -15,8 +15,9 @@ Assoc. 90 (1995) 614). Likelihoods summed over voltages would count an error tha
 that of the curve, as new evidence each second. The output is the mean weighted by the odds; the
 spread between the hypotheses is part of its standard deviation. The SoC therefore moves toward the
 likelier hypothesis as evidence grows, without a jump. Once the odds are clear the other hypothesis
-is dropped; if they stay unclear the two are merged, which changes neither SoC nor σ. A rejected
-initial SoC has no influence on the result.
+is dropped, and also once it no longer counts in the result. Until then both are kept: merged while
+they know different things, the same voltages would count again for their mean. A rejected initial
+SoC has no influence on the result.
 
 A mixture of a narrow and a wide hypothesis is no normal distribution: what is improbable and far
 away makes up most of its variance. The standard deviation stated is therefore half the half-width
@@ -48,20 +49,24 @@ FORGOTTEN = 0.01
 """Below this part of the second's variance the first hypothesis knows no more than the second, and
 the odds stay."""
 
+NEGLIGIBLE = 0.02
+"""The less likely hypothesis is dropped where the variance of both differs by less than this part
+from that of the other: σ changes by less than 1 %."""
+
 LOG_ODDS_AT_MOST = 50.0
 
 TWO_SIGMA = math.erf(math.sqrt(2.0))
 """Probability within two standard deviations of a normal distribution: 95.45 %."""
 
-WIDTH_TO_PCT = 1e-9
-"""Accuracy of the half-width of a mixture [%]."""
+LAST_STEP_PCT = 1e-6
+"""Last step to the half-width of a mixture [%]: by Newton's method its error is the square."""
+
+NARROWEST_PCT = 1e-9
+"""Least standard deviation in a mixture [%]."""
 
 WRONG_LOG_ODDS = -math.log(99.0)
 """Prior log odds that a given SoC is wrong, such as one of another pack, day or scale: an
 assumption, one in a hundred."""
-
-OPEN_AT_MOST_S = 900.0
-"""Time with voltages after which undecided hypotheses are merged [s]."""
 
 DIVERGED_S = 180.0
 """Time without a voltage that is not an outlier, after which the filter counts as lost [s]."""
@@ -92,12 +97,14 @@ class HypothesisFilter:
         self._log_odds = 0.0
         self._prior_log_odds = 0.0
         self._wide_std_pct = UNKNOWN_SOC_STD_PCT
-        self._open_s = 0.0
         self._outlier_s = 0.0
+        # σ stated of two hypotheses [%]; NaN until it is needed.
+        self._stated_pct = math.nan
         self.verdict: Verdict = ""
 
     def start(self, soc_pct: float, std_pct: float) -> None:
         """Restart from a SoC with its standard deviation [%]."""
+        self._stated_pct = math.nan
         self._filters = [self._make_ekf()]
         self._filters[0].start(soc_pct, std_pct)
         self._is_untested = std_pct < UNKNOWN_SOC_STD_PCT
@@ -107,6 +114,7 @@ class HypothesisFilter:
 
     def predict(self, since: ChargeSinceUpdate) -> None:
         """Propagate all hypotheses over the charge counted since the last call."""
+        self._stated_pct = math.nan
         parked_var_pct2 = since.gap_var_pct2 + since.unseen_var_pct2
         variances = [parked_var_pct2, parked_var_pct2]
         if since.away_s:
@@ -129,6 +137,7 @@ class HypothesisFilter:
         bool
             Whether it shows that the SoC was wrong until now.
         """
+        self._stated_pct = math.nan
         if self._is_untested:
             self._is_untested = False
             if len(self._filters) == 1:
@@ -145,27 +154,26 @@ class HypothesisFilter:
             self._outlier_s = 0.0
         if second is first:
             return is_contradicted
-        self._log_odds = self._odds_of_second()
-        self._open_s += since.seconds - since.away_s
+        is_open = self._weigh()
         if is_contradicted != is_second_contradicted:
             return self._decide(int(is_contradicted))
         # The prior odds against a wrong initial SoC alone must not count as a clear decision.
         prior = 0.0 if self.verdict == "open" else self._prior_log_odds
         is_clear = self._log_odds > CLEAR_LOG_ODDS or self._log_odds < prior - CLEAR_LOG_ODDS
-        if is_contradicted or is_clear:
-            return self._decide(int(self._log_odds > 0.0), is_contradicted=is_contradicted)
-        if self._open_s > OPEN_AT_MOST_S:
-            self._merge("unclear")
-        return False
+        if is_open and not (is_contradicted or is_clear):
+            return False
+        return self._decide(int(self._log_odds > 0.0), is_contradicted=is_contradicted)
 
     def correct(self, soc_pct: float, std_pct: float) -> None:
         """Update with an external SoC reference and its standard deviation [%]."""
+        self._stated_pct = math.nan
         self._merge("unclear")
         self._is_untested = False
         self._filters[0].correct(soc_pct, std_pct)
 
     def shrink_bias(self) -> None:
         """Reduce the slow bias of all hypotheses after a long rest."""
+        self._stated_pct = math.nan
         for each in self._filters:
             each.shrink_bias()
 
@@ -195,10 +203,11 @@ class HypothesisFilter:
             return self._filters[0].summary(counted_s)
         first, second = (each.summary(counted_s) for each in self._filters)
         soc_pct, _, offset_pct = map(self._mean, zip(first, second, strict=True))
-        std_pct = self._stated_std_pct(
-            [(abs(soc - soc_pct), std) for soc, std, _ in (first, second)]
-        )
-        return soc_pct, std_pct, offset_pct
+        if math.isnan(self._stated_pct):
+            self._stated_pct = self._stated_std_pct(
+                [(abs(soc - soc_pct), std) for soc, std, _ in (first, second)]
+            )
+        return soc_pct, self._stated_pct, offset_pct
 
     @property
     def soc_pct(self) -> float:
@@ -230,7 +239,6 @@ class HypothesisFilter:
             [each.snapshot() for each in self._filters],
             self._is_untested,
             self._log_odds,
-            self._open_s,
             self._outlier_s,
             self.verdict,
             self._prior_log_odds,
@@ -261,11 +269,11 @@ class HypothesisFilter:
         for each in state.hypotheses:
             self._filters.append(self._make_ekf())
             self._filters[-1].resume(each)
+        self._stated_pct = math.nan
         self._is_untested = state.is_untested
         self._log_odds = _bounded(state.log_odds)
         self._prior_log_odds = _bounded(state.prior_log_odds)
         self._wide_std_pct = state.wide_std_pct
-        self._open_s = state.open_s
         self._outlier_s = state.outlier_s
         self.verdict = state.verdict
 
@@ -274,19 +282,23 @@ class HypothesisFilter:
         ekf.restore(state)
         return ekf
 
-    def _odds_of_second(self) -> float:
-        """Return the log odds of the second hypothesis against the first, given all voltages."""
+    def _weigh(self) -> bool:
+        """Set the odds from all voltages; return whether the less likely one still counts."""
         (soc1_pct, std1_pct, _), (soc2_pct, std2_pct, _) = (
             each.summary(0.0) for each in self._filters
         )
-        second_pct2 = std2_pct * std2_pct
-        more_pct2 = second_pct2 - std1_pct * std1_pct
-        if more_pct2 <= FORGOTTEN * second_pct2:
-            return self._log_odds
+        first_pct2, second_pct2 = std1_pct * std1_pct, std2_pct * std2_pct
+        more_pct2 = second_pct2 - first_pct2
         apart_pct = soc2_pct - soc1_pct
-        square = apart_pct * apart_pct / more_pct2
-        ratio = self._wide_std_pct * math.sqrt(more_pct2) / second_pct2
-        return _bounded(self._prior_log_odds + 0.5 * square - math.log(ratio))
+        if more_pct2 > FORGOTTEN * second_pct2:
+            square = apart_pct * apart_pct / more_pct2
+            ratio = self._wide_std_pct * math.sqrt(more_pct2) / second_pct2
+            self._log_odds = _bounded(self._prior_log_odds + 0.5 * square - math.log(ratio))
+        second = self._second_probability()
+        spread_pct2 = (1.0 - second) * second * apart_pct * apart_pct
+        if second > 0.5:
+            return abs(spread_pct2 - (1.0 - second) * more_pct2) > NEGLIGIBLE * second_pct2
+        return abs(spread_pct2 + second * more_pct2) > NEGLIGIBLE * first_pct2
 
     def _second_probability(self) -> float:
         return 1.0 / (1.0 + math.exp(-self._log_odds))
@@ -299,15 +311,16 @@ class HypothesisFilter:
         hypotheses : sequence of two pairs of floats
             Distance from the mean, and standard deviation, of each [%].
         """
-        low, width = 0.0, 0.0
-        high = max(away + 3.0 * std for away, std in hypotheses)
+        (away1, std1), (away2, std2) = hypotheses
+        low, high = 0.0, max(away1 + 3.0 * std1, away2 + 3.0 * std2)
+        width = min(2.0 * self._mean((std1, std2)), high)
         step = high
         # Newton's method, halving the bracket where it would leave it.
-        while abs(step) > WIDTH_TO_PCT:
-            inside = [_within(width, away, std) for away, std in hypotheses]
-            missing = TWO_SIGMA - self._mean([share for share, _ in inside])
+        while abs(step) > LAST_STEP_PCT:
+            first, second = _within(width, away1, std1), _within(width, away2, std2)
+            missing = TWO_SIGMA - self._mean((first[0], second[0]))
             low, high = (width, high) if missing > 0.0 else (low, width)
-            density = self._mean([density for _, density in inside])
+            density = self._mean((first[1], second[1]))
             following = width + missing / density if density > 0.0 else math.inf
             if not low < following < high:
                 following = 0.5 * (low + high)
@@ -321,9 +334,9 @@ class HypothesisFilter:
     def _add(self, ekf: SocEkf, log_odds: float, wide_std_pct: float) -> None:
         """Open a second hypothesis, with its prior and standard deviation of the SoC [%]."""
         self._filters.append(ekf)
+        self._stated_pct = math.nan
         self._log_odds = self._prior_log_odds = log_odds
         self._wide_std_pct = wide_std_pct
-        self._open_s = 0.0
 
     def _decide(self, accepted: int, *, is_contradicted: bool = False) -> bool:
         """Keep one hypothesis; return whether this changes the SoC assumed so far."""
@@ -347,10 +360,10 @@ class HypothesisFilter:
         away = [[at - mean for at, mean in zip(each.x, x, strict=True)] for each in (first, second)]
         p = [
             [
-                self._mean((first.p[k][j] + d1 * e1, second.p[k][j] + d2 * e2))
-                for j, (e1, e2) in enumerate(zip(*away, strict=True))
+                self._mean((a + d1 * e1, b + d2 * e2))
+                for a, b, e1, e2 in zip(row1, row2, *away, strict=True)
             ]
-            for k, (d1, d2) in enumerate(zip(*away, strict=True))
+            for row1, row2, d1, d2 in zip(first.p, second.p, *away, strict=False)
         ]
         scale = std_pct / math.sqrt(p[SOC][SOC]) if p[SOC][SOC] > 0.0 else 1.0
         p[SOC] = [scale * value for value in p[SOC]]
@@ -364,7 +377,7 @@ class HypothesisFilter:
 
 def _within(width: float, away: float, std: float) -> tuple[float, float]:
     """Return the probability of ±width of a normal distribution with mean `away`, and its slope."""
-    scale = max(std, WIDTH_TO_PCT) * math.sqrt(2.0)
+    scale = max(std, NARROWEST_PCT) * math.sqrt(2.0)
     low, high = (-width - away) / scale, (width - away) / scale
     density = (math.exp(-(low * low)) + math.exp(-(high * high))) / (scale * math.sqrt(math.pi))
     return 0.5 * (math.erf(high) - math.erf(low)), density

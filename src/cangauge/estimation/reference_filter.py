@@ -16,7 +16,16 @@ from collections.abc import Sequence
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
-from cangauge.estimation.ekf import CAPACITY, LASTING, LEARNED, OFFSET, SLOW, SOC, SocEkf
+from cangauge.estimation.ekf import (
+    CAPACITY,
+    LASTING,
+    LEARNED,
+    OFFSET,
+    SLOW,
+    SOC,
+    SocEkf,
+    full_covariance,
+)
 
 
 class ReferenceEkf(SocEkf):
@@ -57,9 +66,9 @@ class ReferenceEkf(SocEkf):
         """Return filterpy's filter at the present state."""
         ekf = ExtendedKalmanFilter(dim_x=len(self._x), dim_z=1, dim_u=1)
         ekf.x = np.array(self._x).reshape(-1, 1)
-        ekf.P = np.array(self._p)
+        ekf.P = full_covariance(self._p)
         return ekf
 
     def _store(self, ekf: ExtendedKalmanFilter) -> None:
         self._x = ekf.x[:, 0].tolist()
-        self._p = ekf.P.tolist()
+        self._p = ekf.P[:LEARNED].tolist()

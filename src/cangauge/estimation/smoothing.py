@@ -20,7 +20,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from cangauge._typing import FloatArray
-from cangauge.estimation.ekf import CAPACITY, LASTING, LEARNED, OFFSET, SLOW, SOC, SocEkf
+from cangauge.estimation.ekf import (
+    CAPACITY,
+    LASTING,
+    LEARNED,
+    OFFSET,
+    SLOW,
+    SOC,
+    SocEkf,
+    full_covariance,
+)
 from cangauge.estimation.estimator import Estimator
 
 TIME_ROUNDING_S = 1e-6
@@ -75,12 +84,12 @@ class RecordingEkf(SocEkf):
         kept: tuple[float, float],
         noise: tuple[float, float, float, float],
     ) -> None:
-        x, p = np.array(self._x), np.array(self._p)
+        x, p = np.array(self._x), full_covariance(self._p)
         super()._propagate(discharged_pct, by_offset_and_capacity, kept, noise)
         transition = np.eye(x.size)
         transition[SOC, OFFSET], transition[SOC, CAPACITY] = by_offset_and_capacity
         transition[SLOW, SLOW], transition[LASTING, LASTING] = kept
-        after = np.array(self._x), np.array(self._p)
+        after = np.array(self._x), full_covariance(self._p)
         self.steps.append(Step(x, p, transition, *after, self._elapsed_s))
 
     def restore(self, state: object) -> None:
@@ -90,7 +99,7 @@ class RecordingEkf(SocEkf):
 
     def smoothed(self) -> tuple[FloatArray, FloatArray]:
         """Return SoC and standard deviation [%] before each prediction, and now: (steps + 1,)."""
-        x, p = np.array(self._x), np.array(self._p)
+        x, p = np.array(self._x), full_covariance(self._p)
         soc, variance = [x[SOC]], [p[SOC, SOC]]
         for step in reversed(self.steps):
             # Scaled: the states differ by orders of magnitude.

@@ -127,13 +127,11 @@ class EkfState:
         list[Annotated[list[_Finite], Field(max_length=FILTER_STATES_AT_MOST)]],
         Field(max_length=FILTER_STATES_AT_MOST),
     ]
-    """Covariance, by rows."""
+    """Covariance of the learned states with all states, by rows."""
     mean_innovation_v: _Finite
     """Running mean of the innovation [V]."""
     mean_seconds: _NotNegative
     """Time that it covers [s]."""
-    outside_v2: _NotNegative = 0.0
-    """Variance of the lasting error outside the identified temperatures [V²]."""
 
 
 Verdict = Literal["", "open", "parked", "moved", "unclear"]
@@ -151,8 +149,6 @@ class HypothesisFilterState:
     """Whether no voltage has tested a given initial SoC yet."""
     log_odds: _Finite
     """Log odds of the second hypothesis against the first."""
-    open_s: _NotNegative
-    """Counted time for which two hypotheses have been open [s]."""
     outlier_s: _NotNegative
     """Time for which every voltage has been an outlier [s]."""
     verdict: Verdict

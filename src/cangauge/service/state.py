@@ -1,6 +1,6 @@
 """The service's state across restarts: restored at the start, saved while it runs.
 
-    {"format": "cangauge-state", "version": 1, "sha256": "…", "content": {…}}
+    {"format": "cangauge-state", "version": 2, "sha256": "…", "content": {…}}
 
 The hash is that of the content, written without spaces and with sorted keys. Everything is checked
 before use: size, JSON, format, version, hash, then the type and range of every field. A file that
@@ -38,7 +38,7 @@ from cangauge.service.loop import CHECKPOINT_EVERY_S
 from cangauge.service.pipeline import Pipeline
 
 STATE_FORMAT: Final = "cangauge-state"
-STATE_VERSION: Final = 1
+STATE_VERSION: Final = 2
 """To be increased with every change of the estimator's state."""
 
 LARGEST_BYTES: Final = 8 << 20

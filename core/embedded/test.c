@@ -1,0 +1,99 @@
+/* test.c - the core on this processor against the Python package, on a drive with events.
+ *
+ * The drive is in golden.h: a gap, missing signals, implausible values and an unobserved interval.
+ */
+#include <math.h>
+#include <stdio.h>
+
+#include "frames.h"
+#include "golden.h"
+#include "pack_model.h"
+
+#ifdef CG_CLOCK
+#include "clock.h"
+#else
+static unsigned long instructions(void) { return 0; }
+#endif
+
+/* Largest error allowed [% SoC]: none with doubles, 0.02 with floats. */
+#define TOLERANCE_PCT ((sizeof(cg_real) == sizeof(double)) ? 1e-9 : 0.02)
+
+static cg_current storage[PACK_LINE_SIZE];
+static cg_skew skew;
+static cg_estimator pack;
+static int failures;
+
+static double apart(double expected, double found)
+{
+    if ((isnan(expected) != 0) && (isnan(found) != 0)) {
+        return 0.0;
+    }
+    return isnan(found - expected) ? INFINITY : fabs(found - expected);
+}
+
+static void check(const char *what, double error, double at_most)
+{
+    const int is_met = error <= at_most;
+    printf("%-28s %.3g, at most %.3g: %s\n", what, error, at_most, is_met ? "ok" : "FAILED");
+    failures += is_met ? 0 : 1;
+}
+
+int main(void)
+{
+    const cg_settings settings = cg_default_settings();
+    const cg_line line = {storage, PACK_LINE_SIZE, 0, 0, 0, PACK_SPACING_S, 0.0};
+    double worst[4] = {0.0, 0.0, 0.0, 0.0};
+    long differing = 0, other_status = 0, other_frames = 0;
+    unsigned long steps[2] = {0, 0}, all[2] = {0, 0}, longest = 0;
+    cg_init(&pack, &pack_model, &settings, &line, &skew);
+    for (int k = 0; k < GOLDEN_SAMPLES; ++k) {
+        const golden *each = &golden_samples[k];
+        const cg_sample sample = {each->time_s, (cg_real)each->current_a, (cg_real)each->voltage_v,
+                                  (cg_real)each->temperature_c};
+        const int64_t tick = pack.state.memory.tick;
+        const unsigned long before = instructions();
+        (void)cg_update(&pack, &sample);
+        const cg_estimate found = cg_evaluate(&pack);
+        const unsigned long taken = instructions() - before;
+        const double number[4] = {(double)found.soc_pct, (double)found.soc_std_pct,
+                                  (double)found.soc_newton_pct, (double)found.soc_coulomb_pct};
+        uint8_t data[8];
+        const int uses_voltage = (pack.state.memory.tick != tick) ? 1 : 0;
+        steps[uses_voltage] += 1;
+        all[uses_voltage] += taken;
+        longest = (taken > longest) ? taken : longest;
+        for (int j = 0; j < 4; ++j) {
+            const double error = apart(each->number[j], number[j]);
+            worst[j] = (error > worst[j]) ? error : worst[j];
+            differing += (error != 0.0) ? 1 : 0;
+        }
+        other_status += (found.status != each->status) || (found.reasons != each->reasons);
+        frames_soc_estimate(&found, 0, (uint8_t)(k & 0xF), data);
+        for (int j = 0; j < 8; ++j) {
+            if (data[j] != each->frame[j]) {
+                other_frames += 1;
+                break;
+            }
+        }
+    }
+    printf("%d samples, %ld of %d numbers differ in a bit\n", GOLDEN_SAMPLES, differing,
+           4 * GOLDEN_SAMPLES);
+    check("SoC [%]", worst[0], TOLERANCE_PCT);
+    check("its deviation [%]", worst[1], TOLERANCE_PCT);
+    check("SoC by voltage [%]", worst[2], TOLERANCE_PCT);
+    check("SoC by counting [%]", worst[3], TOLERANCE_PCT);
+    /* A value at a limit or between two steps of a frame may fall on the other side with floats. */
+    const double share = (sizeof(cg_real) == sizeof(double)) ? 0.0 : 0.01;
+    check("other status or reasons", (double)other_status, share * GOLDEN_SAMPLES);
+    check("other frames", (double)other_frames, 20.0 * share * GOLDEN_SAMPLES);
+    printf("bytes: state %lu, delay line %lu, held back %lu, constants %lu\n",
+           (unsigned long)sizeof(cg_estimator), (unsigned long)sizeof(storage),
+           (unsigned long)sizeof(skew),
+           (unsigned long)sizeof(pack_model));
+    if ((all[1] > 0U) && (steps[0] > 0U)) {
+        printf("instructions: %lu a sample, %lu where its voltage is used, at most %lu\n",
+               all[0] / steps[0], all[1] / steps[1], longest);
+    }
+    printf("%s\n", (failures == 0) ? "PASSED" : "FAILED");
+    return (failures == 0) ? 0 : 1;
+}

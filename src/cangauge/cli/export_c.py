@@ -1,0 +1,36 @@
+"""`cangauge export-c`: write a model as C sources for a microcontroller."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cangauge.cli.options import JsonOption
+from cangauge.cli.output import emit_json, note
+from cangauge.embedded import PERIOD_S, export_c
+from cangauge.model.model_file import Model
+
+
+def export_c_command(
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file of `cangauge fit`.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the sources.")
+    ],
+    period: Annotated[
+        float, typer.Option(metavar="S", help="Time between two samples of the current [s].")
+    ] = PERIOD_S,
+    as_json: JsonOption = False,
+) -> None:
+    """Write a model and the estimator as C sources, with tests, for a microcontroller."""
+    done = export_c(Model.load(model), output, period_s=period)
+    if as_json:
+        emit_json({
+            "folder": str(done.folder),
+            "files": list(done.files),
+            "delay_line_bytes": done.delay_line_bytes,
+        })  # fmt: skip
+        return
+    note(f"{len(done.files)} files in {done.folder}: `make test` there tries them on this machine.")
+    note(f"The delay line takes {done.delay_line_bytes / 1024:.1f} KiB at {period:g} s a sample.")

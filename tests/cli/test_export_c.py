@@ -1,0 +1,156 @@
+"""`cangauge export-c`: the exported sources compile cleanly and give the package's numbers."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from cangauge.cli.app import app
+from cangauge.embedded import CORE, drive_with_events, export_c
+from cangauge.errors import InputError
+from cangauge.estimation.validity import Sample
+from cangauge.model.model_file import CurveNoise, Model
+from cangauge.model.published import leaf_2012_model_file
+from estimation.test_snapshot import extended_by
+
+PLAIN = leaf_2012_model_file()
+EFFECTS = [
+    "current_offset", "voltage_gain", "time_skew", "core_temperature", "resistance_temperature",
+    "resistance_soc", "charge_transfer", "slow_diffusion", "hysteresis", "ocv_shape",
+]  # fmt: skip
+STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-ffp-contract=off"]
+
+needs_make = pytest.mark.skipif(
+    not (shutil.which("make") and shutil.which("cc")), reason="no make or no C compiler"
+)
+
+
+def with_curve(model: Model) -> Model:
+    """Return the model with an error of its curve, as a fit states it."""
+    curve = CurveNoise(
+        soc_pct=[0.0, 20.0, 60.0, 100.0],
+        functions_v=[[2.0, 0.5, 0.2, 0.1], [0.1, 0.4, -0.3, 0.2]],
+        temperature_c=21.0,
+        kt_std_v_per_k=0.05,
+        resistance_std_per_k=0.004,
+    )
+    return model.model_copy(update={"noise": model.noise.model_copy(update={"curve": curve})})
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Exports of the published model, and of one with effects and an error of its curve."""
+    made = {}
+    for name, model in (("plain", PLAIN), ("effects", with_curve(extended_by(EFFECTS)))):
+        made[name] = tmp_path_factory.mktemp(name)
+        export_c(model, made[name])
+    return made
+
+
+def run(folder: Path, *command: str) -> str:
+    done = subprocess.run(
+        command, check=False, cwd=folder, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@needs_make
+@pytest.mark.parametrize("which", ["plain", "effects"])
+def test_exported_tests_pass_with_equal_bits(folders: dict[str, Path], which: str) -> None:
+    output = run(folders[which], "make", "test")
+    doubles, _, floats = output.partition("./test-float")
+    assert re.search(r"samples, 0 of \d+ numbers differ", doubles)
+    assert doubles.count("PASSED") == floats.count("PASSED") == 1
+
+
+@needs_make
+@pytest.mark.parametrize("real", ["double", "float"])
+def test_core_compiles_without_a_warning(folders: dict[str, Path], real: str) -> None:
+    sources = [name for name in CORE if name.endswith(".c")]
+    for folder, config in ((folders["effects"], "-DCANGAUGE_CONFIG"), (folders["plain"], "-DX")):
+        run(folder, "cc", *STRICT, config, f"-DCANGAUGE_REAL={real}", "-fsyntax-only", *sources)
+
+
+@needs_make
+def test_sanitizers_find_nothing(folders: dict[str, Path]) -> None:
+    sources = [name for name in CORE if name.endswith(".c")]
+    flags = [*STRICT, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    own = ["pack_model.c", "frames.c", "soc_frames.c", "test.c"]
+    folder = folders["effects"]
+    flags.remove("-Wconversion")  # cantools' frames
+    run(folder, "cc", *flags, "-DCANGAUGE_CONFIG", *sources, *own, "-lm", "-o", "sanitized")
+    assert "PASSED" in run(folder, "./sanitized")
+
+
+@pytest.mark.skipif(not shutil.which("cppcheck"), reason="no cppcheck")
+def test_cppcheck_finds_nothing(folders: dict[str, Path]) -> None:
+    run(
+        folders["effects"], "cppcheck", "--std=c99", "--quiet", "--error-exitcode=1",
+        "--enable=warning,style,performance,portability",
+        *(name for name in CORE if name.endswith(".c")),
+    )  # fmt: skip
+
+
+@pytest.mark.skipif(
+    not (shutil.which("arm-none-eabi-gcc") and shutil.which("qemu-system-arm")),
+    reason="no gcc-arm-none-eabi or no qemu-system-arm",
+)
+def test_cortex_m4f_gives_the_numbers_in_qemu(folders: dict[str, Path]) -> None:
+    output = run(folders["effects"], "make", "arm")
+    assert "PASSED" in output
+    assert re.search(r"instructions: \d+ a sample, \d+ where its voltage is used", output)
+
+
+@needs_make
+def test_example_writes_a_frame_for_each_sample(folders: dict[str, Path]) -> None:
+    run(folders["plain"], "make", "example")
+    rows = "".join(f"{k},{10.0},{385.0},{23.0}\n" for k in range(20))
+    done = subprocess.run(
+        ["./example"], check=True, cwd=folders["plain"], input=rows, capture_output=True, text=True,
+        timeout=60,
+    )  # fmt: skip
+    lines = done.stdout.splitlines()
+    assert len(lines) == 20
+    assert all(re.search(r"reasons [0-9a-f]{5},( [0-9A-F]{2}){8}$", line) for line in lines)
+
+
+def test_core_calls_nothing_but_mathematics(folders: dict[str, Path]) -> None:
+    for name in CORE:
+        text = (folders["plain"] / name).read_text(encoding="utf-8")
+        included = set(re.findall(r'#include [<"]([^>"]+)', text))
+        assert included <= {
+            "math.h", "stdbool.h", "stddef.h", "stdint.h", "cangauge.h", "cangauge_internal.h",
+            "cangauge_config.h",
+        }  # fmt: skip
+        assert not re.search(r"\b(malloc|calloc|free|goto|setjmp)\b", text)
+
+
+def test_drive_of_the_tests_has_its_events() -> None:
+    samples = list(drive_with_events(PLAIN, 0.1))
+    steps = [b.time_s - a.time_s for a, b in pairwise(samples)]
+    assert min(steps) < 0.2
+    assert sum(step > 2.0 for step in steps) == 2
+    assert any(sample.voltage_v != sample.voltage_v for sample in samples)
+    assert all(isinstance(sample, Sample) for sample in samples)
+
+
+def test_command_names_what_it_wrote(tmp_path: Path) -> None:
+    PLAIN.save(tmp_path / "pack.json")
+    done = CliRunner().invoke(
+        app, ["export-c", str(tmp_path / "pack.json"), "-o", str(tmp_path / "c"), "--json"]
+    )
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "c" / "pack_model.c").is_file()
+    assert '"delay_line_bytes"' in done.output
+
+
+def test_period_out_of_range_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"0\.001"):
+        export_c(PLAIN, tmp_path, period_s=0.0)
