@@ -38,6 +38,9 @@ COMMANDS: Final = {
     "replay": "Play a recorded log or capture on a bus.",
     "inspect": "Show what a log or capture holds, and the sign of its current.",
     "twin": "Simulate a pack, a drive, the weather and the sensors: a log whose truth is known.",
+    "export-ecm": "Write a model as an equivalent circuit: open-circuit voltage, R0 and RC pairs as"
+    " tables.",
+    "export-fmu": "Write a model as a functional mock-up unit (FMI 2.0 or 3.0, co-simulation).",
 }
 """Help line of each command: the first of its docstring, so that listing needs no imports."""
 
