@@ -19,6 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from cangauge._typing import FloatArray
@@ -81,6 +82,10 @@ class NormalEquations:
     counts: FloatArray
     """Haar coefficients of each scale, shape (SCALES,); reduced where rows have less weight."""
     _last_weighted: dict[tuple[float, ...], FloatArray] = field(default_factory=dict, repr=False)
+
+    def columns(self, kept: NDArray[np.intp]) -> NormalEquations:
+        """Return the products of some columns."""
+        return NormalEquations(self.products[:, kept[:, None], kept], self.counts)
 
     def inflated(self, factor: float) -> NormalEquations:
         """Return the products for an error variance `factor` times as large."""

@@ -62,6 +62,7 @@ class FastPolarization(Effect):
 
     id = "fast_polarization"
     family = "dynamics"
+    is_pointwise: ClassVar[bool] = True
     is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("ohm", "ohm", 0.0, 1.0, scale="resistance"),
@@ -112,6 +113,7 @@ class SlowDiffusion(Effect):
 
     id = "slow_diffusion"
     family = "dynamics"
+    is_pointwise: ClassVar[bool] = True
     is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("ohm", "ohm", 0.0, 1.5, scale="resistance"),
@@ -209,6 +211,7 @@ class ChargeTransfer(Effect):
 
     id = "charge_transfer"
     family = "dynamics"
+    is_pointwise: ClassVar[bool] = True
     is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("scale_v", "V", 0.0, 0.03, scale="voltage"),

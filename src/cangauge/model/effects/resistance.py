@@ -61,6 +61,7 @@ class ResistanceTemperature(Effect):
 
     id = "resistance_temperature"
     family = "resistance"
+    is_pointwise: ClassVar[bool] = True
     is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("share", "1", 0.0, 3.0),
@@ -115,6 +116,7 @@ class ResistanceSoc(Effect):
 
     id = "resistance_soc"
     family = "resistance"
+    is_pointwise: ClassVar[bool] = True
     is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("at_empty", "1", -0.4, 3.0),
@@ -168,6 +170,7 @@ class ResistanceAsymmetry(Effect):
 
     id = "resistance_asymmetry"
     family = "resistance"
+    is_pointwise: ClassVar[bool] = True
     is_structure: ClassVar[bool] = True
     parameters = (Parameter("charging_ohm", "ohm", -0.6, 1.5, scale="resistance"),)
     signature = "min(I, 0): only while charging, in step with the current"

@@ -140,6 +140,7 @@ class InnerTemperature(Effect):
 
     id = "inner_temperature"
     family = "thermal"
+    is_pointwise: ClassVar[bool] = True
     is_structure: ClassVar[bool] = True
     is_cause: ClassVar[bool] = False
     parameters = (
