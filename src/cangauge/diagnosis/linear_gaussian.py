@@ -57,6 +57,8 @@ class ErrorModel:
     1 where not listed."""
     reference_v2: float = 0.0
     """Mean square error of left-out references, per-log effects included [V²]."""
+    reference_excess: tuple[float, ...] = ()
+    """Excess chi-square of each left-out reference (`bayes_factors.excess_chi_square`)."""
     information_weight: float = 1.0
     """Weight of the model file's information: below 1 where references contradict it."""
     structure: Mapping[str, float] = field(default_factory=dict)

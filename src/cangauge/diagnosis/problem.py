@@ -24,7 +24,7 @@ from cangauge.diagnosis.error_model import (
     with_overdispersion,
 )
 from cangauge.diagnosis.hypotheses import Hypotheses
-from cangauge.diagnosis.input_checks import check_inputs
+from cangauge.diagnosis.input_checks import check_count, check_inputs
 from cangauge.diagnosis.linear_gaussian import (
     ErrorModel,
     NormalEquations,
@@ -41,7 +41,7 @@ from cangauge.diagnosis.structure import (
 from cangauge.errors import InputError
 from cangauge.identify.starts import start_by_model, with_start
 from cangauge.inference.linearized import residual
-from cangauge.inference.rows import FitOptions, SampledLog, sample_log
+from cangauge.inference.rows import SOC_TOLERANCE_PCT, FitOptions, SampledLog, sample_log
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.resample import dequantize, resample, usual_step_k
 from cangauge.model.effects.library import LIBRARY, Candidate, candidates
@@ -215,7 +215,9 @@ def build_problem(
     library = [effect for effect in LIBRARY.values() if effect.id not in leave_out]
     choices = candidates(library, widened.pack, logs[0].time_s, for_diagnosis=True)
     # Steps of the temperature are visible only before averaging.
-    of_logs = [_sampled(log, options) for log in logs]
+    for log in logs:
+        check_count(log, options)
+    of_logs = [_sampled(log, options, soc_tolerance_pct=np.inf) for log in logs]
     of_references = [_sampled(log, replace(options, initial_soc_pct=None)) for log in references]
     covered = not of_references or temperatures_covered(of_references, of_logs)
     hypotheses = _hypotheses(
@@ -275,9 +277,12 @@ def build_problem(
     )
 
 
-def _sampled(log: Log, options: FitOptions) -> SampledLog:
+def _sampled(
+    log: Log, options: FitOptions, *, soc_tolerance_pct: float = SOC_TOLERANCE_PCT
+) -> SampledLog:
     """Return a log with its rows, and a history of its current that all columns share."""
-    return sample_log(resample(dequantize(log)), options).with_history_cache()
+    sampled = sample_log(resample(dequantize(log)), options, soc_tolerance_pct=soc_tolerance_pct)
+    return sampled.with_history_cache()
 
 
 def with_wider_range(model: ExtendedModel, logs: Sequence[Log]) -> ExtendedModel:
