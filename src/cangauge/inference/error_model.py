@@ -440,8 +440,9 @@ def describe_error_of(
     usual_v = max(rms_v, 1e-6 * voltage_v)
     error = fit_time_error(likelihood.log_likelihood, usual_v, voltage_v)
     mean, covariance = likelihood.posterior(error)
-    next_slow_v2 = PRIOR_LOGS * (PART_STD * voltage_v) ** 2 + len(logs) * error.slow_std_v**2
-    error = replace(error, slow_std_v=math.sqrt(next_slow_v2 / (PRIOR_LOGS + len(logs))))
+    n = len(equations.rows)
+    next_slow_v2 = PRIOR_LOGS * (PART_STD * voltage_v) ** 2 + n * error.slow_std_v**2
+    error = replace(error, slow_std_v=math.sqrt(next_slow_v2 / (PRIOR_LOGS + n)))
     # A mean that the model does not contain is an error, too.
     second = covariance + np.outer(mean, mean)
     return error, CurveError(
