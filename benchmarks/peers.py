@@ -33,11 +33,12 @@ from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.export.equivalent_circuit import equivalent_circuit
 from cangauge.identify.fit import fit
+from cangauge.inference.rows import decimate
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import capacity_from_reference
 from cangauge.model.model_file import Model
-from cangauge.validation.packs import load
+from cangauge.validation.packs import RATE_HZ, load
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 PACKS = ("i3", "car1")
@@ -77,7 +78,7 @@ def prepare(data: Path) -> tuple[Result, dict[str, list[Log]], dict[str, Model]]
         tables = _tables(models[pack.name])
         work["packs"][pack.name] = {
             "tables": tables,
-            "training": [_columns(log) for log in training],
+            "training": [_columns(log.rows(decimate(log.time_s, RATE_HZ))) for log in training],
             "judged": [_columns(log) for log in judged[pack.name]],
         }
     fast = read_log(data / "bmw_i3" / TIMED)
@@ -99,7 +100,9 @@ def _tables(model: Model) -> Result:
 def _columns(log: Log) -> Result:
     names = ("time_s", "current_a", "voltage_v", "soc_pct")
     columns = {name: np.asarray(getattr(log, name)).tolist() for name in names}
-    return columns | {"mean_c": float(np.mean(log.temperature_c))}
+    start = log.first_soc()
+    means = {"mean_c": float(np.mean(log.temperature_c))}
+    return columns | means | {"start_pct": None if start is None else start[1]}
 
 
 def mae_pct(soc_pct: Sequence[Sequence[float]], logs: Sequence[Log]) -> float:
