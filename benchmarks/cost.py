@@ -259,9 +259,9 @@ def _long_logs(number: int) -> Iterator[Log]:
     for seed in range(number):
         rng = np.random.default_rng(seed)
         time_s = np.arange(float(ROWS_A_LOG))
-        current_a = 60.0 * 3600.0 * 0.9 / ROWS_A_LOG + 25.0 * np.repeat(
-            rng.standard_normal(ROWS_A_LOG // 10), 10
-        )
+        pulses_a = 25.0 * rng.standard_normal(ROWS_A_LOG // 20)
+        pairs_a = np.repeat(np.column_stack([pulses_a, -pulses_a]).ravel(), 10)
+        current_a = 60.0 * 3600.0 * 0.9 / ROWS_A_LOG + pairs_a
         soc_pct = 95.0 - np.cumsum(current_a) / 36.0 / 60.0
         temperature_c = 23.0 + 2.0 * np.sin(time_s / 700.0)
         delayed = np.column_stack([np.interp(time_s - d, time_s, current_a) for d in known.delay_s])
