@@ -232,7 +232,7 @@ class BatterySe:
             {"soc_values": self._circuit.soc, "voltage_values": self._circuit.ocv_v}
         )
         structure.add_basis_functions(["s", "1/s"])
-        data = [self._given(log, log["soc_pct"][0] / 100.0) for log in training]
+        data = [self._given(log, log["start_pct"] / 100.0) for log in training]
         with redirect_stdout(sys.stderr):
             self._model = identify_model(data, structure, 2, 1, ["ridgecv.sklearn"])
 

@@ -38,6 +38,7 @@ VALID = {
     "inspect": ["absent.csv"],
     "twin": ["-o", "absent/out.csv"],
     "packs-check": ["--data", "absent"],
+    "export-c": ["absent.json", "-o", "out"],
     "export-ecm": ["absent.json", "-o", "out.py"],
     "export-fmu": ["absent.json", "-o", "out.fmu"],
 }
