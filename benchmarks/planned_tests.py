@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cangauge.diagnosis import NONE, UNKNOWN, Verdict
-from cangauge.diagnosis.next_test import plan_test
+from cangauge.diagnosis.next_test import design_of, plan_test
 from cangauge.diagnosis.problem import DiagnosisProblem, build_problem
 from cangauge.diagnosis.profiles import Limits, Profile
 from cangauge.diagnosis.verdict import decide
@@ -82,20 +82,16 @@ class Pack:
         floor_v = model_rmse_v(known, clean)
         return cls(scenario, model, references, replace(options, floor_v=floor_v))
 
-    def diagnosed(self, logs: Sequence[Log]) -> tuple[DiagnosisProblem, Verdict]:
-        """Diagnose logs up to the verdict."""
-        problem = build_problem(logs, self.model, self.references)
-        return problem, decide(problem)
-
-    def with_test(self, case: DrawnCase, drive: Drive, name: str, first: Verdict) -> Verdict:
+    def with_test(self, case: DrawnCase, drive: Drive, first: DiagnosisProblem) -> Verdict:
         """Return the verdict on a case and a test; the first one if the pack is empty at once."""
         faults = [item.fault for item in case.faults]
-        log = record_drive(self.scenario.plant, drive, faults, name=name).log
+        log = record_drive(self.scenario.plant, drive, faults, name="test").log
         try:
-            return self.diagnosed([*case.logs, log])[1]
+            test = design_of(first, log)
         except InputError as error:
-            print(f"{name}: {error}", file=sys.stderr)
-            return first
+            print(error, file=sys.stderr)
+            return decide(first)
+        return decide(replace(first, diagnosed=(*first.diagnosed, test)))
 
 
 def drive_of(profile: Profile, seed: int) -> Drive:
@@ -128,7 +124,8 @@ def outcomes(seed: int, minutes: float, skip: int) -> Iterator[Outcome | None]:
 
 def outcome_of(pack: Pack, case: DrawnCase, truth: str, minutes: float) -> Outcome | None:
     """Diagnose a case alone, with the planned test, and with a random drive."""
-    problem, first = pack.diagnosed(case.logs)
+    problem = build_problem(case.logs, pack.model, pack.references)
+    first = decide(problem)
     effects = [name for name in first.credible_set if name not in {NONE, UNKNOWN}]
     if len(effects) < 2:
         return None
@@ -138,7 +135,7 @@ def outcome_of(pack: Pack, case: DrawnCase, truth: str, minutes: float) -> Outco
         "planned": drive_of(plan.best.profile, int(rng.integers(2**31))),
         "random": pack.scenario.draw_drives(rng, 1, minutes / 60.0)[0],
     }
-    found = {name: pack.with_test(case, drive, name, first) for name, drive in drives.items()}
+    found = {name: pack.with_test(case, drive, problem) for name, drive in drives.items()}
     return Outcome(
         truth=truth,
         test=plan.best.profile.name,
