@@ -44,6 +44,9 @@ most 4 %, and the tests share the random numbers."""
 
 _IN_WORDS = {NONE: "no fault"}
 
+NAMED = 4
+"""Causes that sentence and table name; a plan is for all of the credible set."""
+
 
 @dataclass(frozen=True, eq=False)
 class PlannedTest:
@@ -97,6 +100,8 @@ class Plan:
         """The proposal in an engineer's words."""
         best = self.best.profile
         names = [_IN_WORDS.get(name, name) for name in self.causes]
+        if len(names) > NAMED:
+            names[NAMED:] = [f"{len(names) - NAMED} more"]
         purpose = f"tell {names[0]} from {', '.join(names[1:])}" if names[1:] else (
             f"confirm {names[0]}"
         )  # fmt: skip
