@@ -6,7 +6,8 @@ Packs, drives and faults are drawn as in the protocol `simulated` of `gap-check`
 seeds. A case counts where the first log leaves it ambiguous: two effects or more in the 90 % set.
 The test that `gap --plan` proposes is then driven by the simulated pack with the same fault, and
 diagnosed together with the first log; so is a random drive of equal length in its place. A
-resistance step is left out: it happens once, and not again in every test.
+resistance step is left out: it happens once, and not again in every test. Weak cells lag by what
+was taken out in between.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ from cangauge.validation.cases import CaseOptions, DrawnCase, Scenario, draw_cas
 from cangauge.validation.plan import EFFECTS
 from cangauge.validation.recordings import model_rmse_v
 from cangauge.validation.twin.drive import Drive
+from cangauge.validation.twin.faults import Fault
 from cangauge.validation.twin.recording import record_drive
 
 CASES_PER_PACK, CLEAN_DRIVES = 4, 3
@@ -84,7 +86,8 @@ class Pack:
 
     def with_test(self, case: DrawnCase, drive: Drive, first: DiagnosisProblem) -> Verdict:
         """Return the verdict on a case and a test; the first one if the pack is empty at once."""
-        faults = [item.fault for item in case.faults]
+        soc = float(case.recordings[0].true_soc_pct[0]) / 100.0
+        faults = [later(item.fault, soc, drive.start_soc) for item in case.faults]
         log = record_drive(self.scenario.plant, drive, faults, name="test").log
         try:
             test = design_of(first, log)
@@ -92,6 +95,18 @@ class Pack:
             print(error, file=sys.stderr)
             return decide(first)
         return decide(replace(first, diagnosed=(*first.diagnosed, test)))
+
+
+def later(fault: Fault, soc: float, test_soc: float) -> Fault:
+    """Return a fault of a pack at a test's SoC [-], by what it was at another.
+
+    Weak cells lag more the emptier the pack is; the simulator balances them at every start.
+    """
+    if fault.id != "weak_cell":
+        return fault
+    shape = fault.full_shape()
+    lag = (soc - test_soc) / (1.0 - fault.size)
+    return replace(fault, shape={**shape, "deficit": max(shape["deficit"] + lag, 0.0)})
 
 
 def drive_of(profile: Profile, seed: int) -> Drive:
