@@ -6,7 +6,8 @@ Packs, drives and faults are drawn as in the protocol `simulated` of `gap-check`
 seeds. A case counts where the first log leaves it ambiguous: two effects or more in the 90 % set.
 The test that `gap --plan` proposes is then driven by the simulated pack with the same fault, and
 diagnosed together with the first log; so is a random drive of equal length in its place. A
-resistance step is left out: it happens once, and not again in every test.
+resistance step is left out: it happens once, and not again in every test. Weak cells lag by what
+was taken out in between.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cangauge.diagnosis import NONE, UNKNOWN, Verdict
-from cangauge.diagnosis.next_test import plan_test
+from cangauge.diagnosis.next_test import design_of, plan_test
 from cangauge.diagnosis.problem import DiagnosisProblem, build_problem
 from cangauge.diagnosis.profiles import Limits, Profile
 from cangauge.diagnosis.verdict import decide
@@ -37,6 +38,7 @@ from cangauge.validation.cases import CaseOptions, DrawnCase, Scenario, draw_cas
 from cangauge.validation.plan import EFFECTS
 from cangauge.validation.recordings import model_rmse_v
 from cangauge.validation.twin.drive import Drive
+from cangauge.validation.twin.faults import Fault
 from cangauge.validation.twin.recording import record_drive
 
 CASES_PER_PACK, CLEAN_DRIVES = 4, 3
@@ -82,20 +84,29 @@ class Pack:
         floor_v = model_rmse_v(known, clean)
         return cls(scenario, model, references, replace(options, floor_v=floor_v))
 
-    def diagnosed(self, logs: Sequence[Log]) -> tuple[DiagnosisProblem, Verdict]:
-        """Diagnose logs up to the verdict."""
-        problem = build_problem(logs, self.model, self.references)
-        return problem, decide(problem)
-
-    def with_test(self, case: DrawnCase, drive: Drive, name: str, first: Verdict) -> Verdict:
+    def with_test(self, case: DrawnCase, drive: Drive, first: DiagnosisProblem) -> Verdict:
         """Return the verdict on a case and a test; the first one if the pack is empty at once."""
-        faults = [item.fault for item in case.faults]
-        log = record_drive(self.scenario.plant, drive, faults, name=name).log
+        soc = float(case.recordings[0].true_soc_pct[0]) / 100.0
+        faults = [later(item.fault, soc, drive.start_soc) for item in case.faults]
+        log = record_drive(self.scenario.plant, drive, faults, name="test").log
         try:
-            return self.diagnosed([*case.logs, log])[1]
+            test = design_of(first, log)
         except InputError as error:
-            print(f"{name}: {error}", file=sys.stderr)
-            return first
+            print(error, file=sys.stderr)
+            return decide(first)
+        return decide(replace(first, diagnosed=(*first.diagnosed, test)))
+
+
+def later(fault: Fault, soc: float, test_soc: float) -> Fault:
+    """Return a fault of a pack at a test's SoC [-], by what it was at another.
+
+    Weak cells lag more the emptier the pack is; the simulator balances them at every start.
+    """
+    if fault.id != "weak_cell":
+        return fault
+    shape = fault.full_shape()
+    lag = (soc - test_soc) / (1.0 - fault.size)
+    return replace(fault, shape={**shape, "deficit": max(shape["deficit"] + lag, 0.0)})
 
 
 def drive_of(profile: Profile, seed: int) -> Drive:
@@ -128,7 +139,8 @@ def outcomes(seed: int, minutes: float, skip: int) -> Iterator[Outcome | None]:
 
 def outcome_of(pack: Pack, case: DrawnCase, truth: str, minutes: float) -> Outcome | None:
     """Diagnose a case alone, with the planned test, and with a random drive."""
-    problem, first = pack.diagnosed(case.logs)
+    problem = build_problem(case.logs, pack.model, pack.references)
+    first = decide(problem)
     effects = [name for name in first.credible_set if name not in {NONE, UNKNOWN}]
     if len(effects) < 2:
         return None
@@ -138,7 +150,7 @@ def outcome_of(pack: Pack, case: DrawnCase, truth: str, minutes: float) -> Outco
         "planned": drive_of(plan.best.profile, int(rng.integers(2**31))),
         "random": pack.scenario.draw_drives(rng, 1, minutes / 60.0)[0],
     }
-    found = {name: pack.with_test(case, drive, name, first) for name, drive in drives.items()}
+    found = {name: pack.with_test(case, drive, problem) for name, drive in drives.items()}
     return Outcome(
         truth=truth,
         test=plan.best.profile.name,

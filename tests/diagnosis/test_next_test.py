@@ -8,18 +8,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from days import more_volts, short_day
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cangauge.diagnosis.hypotheses import Hypotheses
 from cangauge.diagnosis.linear_gaussian import ErrorModel, Posterior
-from cangauge.diagnosis.next_test import Outcomes, PlannedTest, expected_of
+from cangauge.diagnosis.next_test import Outcomes, PlannedTest, design_of, expected_of
+from cangauge.diagnosis.problem import build_problem
 from cangauge.diagnosis.profiles import Limits, Profile, library_of_tests
+from cangauge.diagnosis.verdict import decide
 from cangauge.errors import InputError
 from cangauge.inference.time_scales import SCALES
+from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import discharged_ah
 from cangauge.model.effects.base import Pack
 from cangauge.model.effects.library import LIBRARY, candidates
+from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 
 PACK = Pack.of(leaf_2012_model(), CAPACITY_AH)
@@ -106,6 +111,17 @@ def test_library_leaves_out_what_the_limits_exclude() -> None:
     assert "cold start and drive" not in names(temperature_c=(18.0, 25.0))
     assert {"rest", "drive"} < names(charge_a=0.0)
     assert not {"regeneration pulses", "warm-up by alternating pulses"} & names(charge_a=0.0)
+
+
+def test_a_further_log_is_as_if_diagnosed_from_the_start(
+    model: Model, short_references: list[Log]
+) -> None:
+    """What a plan predicts is what a diagnosis of both logs is made of."""
+    first, test = (more_volts(short_day(seed), 3.0) for seed in (21, 22))
+    problem = build_problem([first], model, short_references)
+    joined = replace(problem, diagnosed=(*problem.diagnosed, design_of(problem, test)))
+    whole = build_problem([first, test], model, short_references)
+    assert decide(joined).probabilities == pytest.approx(decide(whole).probabilities, abs=1e-6)
 
 
 def test_csv_says_where_to_start_and_gives_every_second() -> None:

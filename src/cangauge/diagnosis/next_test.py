@@ -42,6 +42,11 @@ DRAWS = 200
 """Simulated outcomes of a test for each cause; the standard error of an expected probability is at
 most 4 %, and the tests share the random numbers."""
 
+_IN_WORDS = {NONE: "no fault"}
+
+NAMED = 4
+"""Causes that sentence and table name; a plan is for all of the credible set."""
+
 
 @dataclass(frozen=True, eq=False)
 class PlannedTest:
@@ -94,8 +99,12 @@ class Plan:
     def sentence(self) -> str:
         """The proposal in an engineer's words."""
         best = self.best.profile
-        names = " from ".join(filter(None, [self.causes[0], ", ".join(self.causes[1:])]))
-        purpose = f"tell {names}" if self.causes[1:] else f"confirm {self.causes[0]}"
+        names = [_IN_WORDS.get(name, name) for name in self.causes]
+        if len(names) > NAMED:
+            names[NAMED:] = [f"{len(names) - NAMED} more"]
+        purpose = f"tell {names[0]} from {', '.join(names[1:])}" if names[1:] else (
+            f"confirm {names[0]}"
+        )  # fmt: skip
         return (
             f"To {purpose}, run next: {best.name}, {best.time_s[-1] / 60.0:.0f} min, starting at"
             f" {best.start_soc_pct:.0f} % SoC and {best.start_c:.0f} °C. The probability of the"
@@ -283,7 +292,7 @@ class Outcomes:
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class CandidateEvidence:
     """Evidence for K candidates of k amplitudes each, for n gradients, at W widths of the prior."""
 
     effect_ids: tuple[str, ...]
@@ -311,7 +320,7 @@ class Evidence:
 
 def evidence(
     hypotheses: Hypotheses, gradients: FloatArray, curvature: FloatArray
-) -> list[Evidence]:
+) -> list[CandidateEvidence]:
     """Return the evidence for all candidates that can be a cause, for many gradients at once.
 
     Parameters
@@ -340,7 +349,7 @@ def evidence(
             log_bayes += _log_mass((bounds[:, 0, None] - mode) * np.sqrt(total[..., :1, 0, None]))
             log_bayes -= _log_mass(bounds[:, 0, None] * np.sqrt(prior[..., :1, 0, None]))
         ids = tuple(hypotheses.candidates[k].effect.id for k in chosen)
-        found.append(Evidence(ids, at, bounds, log_bayes, mode, covariance))
+        found.append(CandidateEvidence(ids, at, bounds, log_bayes, mode, covariance))
     return found
 
 

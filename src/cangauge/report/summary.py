@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from cangauge._formatting import NONE_KNOWN, number, significant, span
 from cangauge.diagnosis import LIKELY, NONE, UNKNOWN, Diagnosis
-from cangauge.diagnosis.next_test import Plan
+from cangauge.diagnosis.next_test import NAMED, Plan
 from cangauge.identify.effect_search import FittedEffects
 from cangauge.model.effects.library import LIBRARY
 
@@ -248,6 +248,7 @@ PLAN_TITLE: Final = "Next test: expected probability of each cause where it is t
 
 def plan_rows(plan: Plan) -> tuple[list[str], Rows]:
     """Return headings and rows: the tests, best first, and the probabilities without any."""
+    causes = plan.causes[:NAMED]
     rows = [
         [
             test.profile.name,
@@ -255,14 +256,14 @@ def plan_rows(plan: Plan) -> tuple[list[str], Rows]:
             number(test.profile.start_c, 0),
             number(test.information_nats, 2),
             number(test.probability, 2),
-            *(number(test.expected[cause], 2) for cause in plan.causes),
+            *(number(test.expected[cause], 2) for cause in causes),
         ]
         for test in plan.tests
     ]
-    now = [number(plan.before[cause], 2) for cause in plan.causes]
+    now = [number(plan.before[cause], 2) for cause in causes]
     rows.append(["without a test", *[NONE_KNOWN] * 3, number(plan.probability, 2), *now])
     headings = ["<test", "from SoC [%]", "from [°C]", "information [nats]", "P(true one)"]
-    return [*headings, *plan.causes], rows
+    return [*headings, *causes], rows
 
 
 SHOWN_IN_NOTEBOOK: Final = 5
