@@ -48,9 +48,8 @@ PART_STD: Final = 0.003
 accuracy of a vehicle's voltage sensor."""
 
 PRIOR_LOGS: Final = 1.0
-"""Weight of that prior in the slow error's variance in a log to come, in logs (scaled inverse χ²;
-Gelman et al., Bayesian Data Analysis, 2013, ch. 2.6): the least that keeps one log from deciding
-alone."""
+"""Weight of that prior in the slow error of a log to come, in logs: the least that keeps one log
+from deciding alone. The standard deviations of logs are log-normal, so their mean is geometric."""
 
 LEVEL_STD: Final = 0.2
 """Prior standard deviation of the curve's level, relative to the voltage: not known."""
@@ -440,9 +439,9 @@ def describe_error_of(
     usual_v = max(rms_v, 1e-6 * voltage_v)
     error = fit_time_error(likelihood.log_likelihood, usual_v, voltage_v)
     mean, covariance = likelihood.posterior(error)
-    n = len(equations.rows)
-    next_slow_v2 = PRIOR_LOGS * (PART_STD * voltage_v) ** 2 + n * error.slow_std_v**2
-    error = replace(error, slow_std_v=math.sqrt(next_slow_v2 / (PRIOR_LOGS + n)))
+    weight = PRIOR_LOGS / (PRIOR_LOGS + len(equations.rows))
+    next_slow_v = (PART_STD * voltage_v) ** weight * error.slow_std_v ** (1.0 - weight)
+    error = replace(error, slow_std_v=next_slow_v)
     # A mean that the model does not contain is an error, too.
     second = covariance + np.outer(mean, mean)
     return error, CurveError(
