@@ -103,9 +103,8 @@ def target_costs() -> dict[str, int]:
             ["make", "arm"],  # noqa: S607
             cwd=folder, capture_output=True, text=True, check=True,
         )  # fmt: skip
-    text = {
-        name: int(size) for size, name in re.findall(r"(\d+)(?:\s+\w+){4}\s+(\w+\.o)", done.stdout)
-    }
+    sizes = re.findall(r"^ *(\d+)(?:\s+\w+){4}\s+(\w+)\.o$", done.stdout, re.MULTILINE)
+    text = {name: int(size) for size, name in sizes}
     parts = dict(re.findall(r"(state|delay line|constants) (\d+)", done.stdout))
     steps = re.search(r"instructions: (\d+) a sample, (\d+) .* most (\d+)", done.stdout)
     assert steps is not None  # noqa: S101
