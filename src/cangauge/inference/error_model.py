@@ -15,7 +15,8 @@ IEEE 81 (1993) 1428), from the scales' normal equations alone.
 
 Few logs show a lasting error badly, and one log not at all. The variances of the slow and the
 lasting part are therefore posterior means over a grid, with half-normal priors: with few logs they
-are wide.
+are wide. The slow error of a next log is in part the prior's too, as if one more log had shown it:
+logs differ, and one whose errors are white does not prove that the next one's are.
 
 The posterior covariance of e is wide where no log has been, whatever the residuals are. Its leading
 principal functions are what the estimator carries.
@@ -26,7 +27,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -45,6 +46,11 @@ KNOTS_PCT: Final = np.concatenate((np.arange(0.0, 15.0, 2.5), np.arange(15.0, 10
 PART_STD: Final = 0.003
 """Prior standard deviation of the slow and of the lasting error, relative to the voltage: the
 accuracy of a vehicle's voltage sensor."""
+
+PRIOR_LOGS: Final = 1.0
+"""Weight of that prior in the slow error's variance in a log to come, in logs (scaled inverse χ²;
+Gelman et al., Bayesian Data Analysis, 2013, ch. 2.6): the least that keeps one log from deciding
+alone."""
 
 LEVEL_STD: Final = 0.2
 """Prior standard deviation of the curve's level, relative to the voltage: not known."""
@@ -355,6 +361,8 @@ def describe_error(
     usual_v = max(float(np.sqrt(np.mean(residual_v**2))), 1e-6 * voltage_v)
     error = fit_time_error(likelihood.log_likelihood, usual_v, voltage_v)
     mean, covariance = likelihood.posterior(error)
+    next_slow_v2 = PRIOR_LOGS * (PART_STD * voltage_v) ** 2 + len(logs) * error.slow_std_v**2
+    error = replace(error, slow_std_v=math.sqrt(next_slow_v2 / (PRIOR_LOGS + len(logs))))
     # A mean that the model does not contain is an error, too.
     second = covariance + np.outer(mean, mean)
     return error, CurveError(
