@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 # Where SocketCAN is not to be had directly, a command that provides it (as in .ci/run).
 SOCKETCAN ?= $(wildcard ../shared/tools/with-socketcan)
 
-.PHONY: help demo test lint coverage check faults trips lowest site wheel clean
+.PHONY: help demo test lint coverage check faults trips bench bench-check lowest site wheel clean
 
 help:
 	@echo "make demo      the whole job on the shipped log: fit, bus, service, report"
@@ -18,6 +18,7 @@ help:
 	@echo "make lowest    the lowest versions that pyproject.toml allows, on every Python here (or PYTHONS=…)"
 	@echo "make site      the documentation as a site, in out/site"
 	@echo "make wheel     build the wheel and run the job from it in an environment of its own"
+	@echo "make bench     time and accuracy beside other packages, and how the cost grows (see README for the data)"
 	@echo "make trips     the table on the real BMW i3 trips (see README for the data)"
 
 $(VENV)/installed: pyproject.toml hatch_build.py $(wildcard core/*.[ch])
@@ -58,6 +59,27 @@ check: $(VENV)/installed
 trips: $(VENV)/installed
 	$(BIN)/python benchmarks/real_trips.py
 
+# The other packages, in an environment of their own.
+PEERS := .venv-peers
+BENCH := out/bench
+
+$(PEERS)/installed:
+	$(PYTHON) -m venv $(PEERS)
+	$(PEERS)/bin/python -m pip install --quiet --disable-pip-version-check numpy filterpy thevenin pybamm progpy pybatteryse
+	touch $@
+
+bench: export OMP_NUM_THREADS := 1
+bench: export OPENBLAS_NUM_THREADS := 1
+bench: $(VENV)/installed-dev $(PEERS)/installed
+	mkdir -p $(BENCH)
+	$(BIN)/python benchmarks/peers.py --peers $(PEERS)/bin/python --json $(BENCH)/peers.json --figure $(BENCH)/peers.png
+	$(BIN)/python benchmarks/cost.py --json $(BENCH)/cost.json
+
+# Warns, never fails.
+bench-check: export OMP_NUM_THREADS := 1
+bench-check: $(VENV)/installed
+	$(BIN)/python benchmarks/cost.py --check
+
 faults: $(VENV)/installed
 	PYTHONPATH=benchmarks $(BIN)/python -m faults $(if $(SOCKETCAN),--socketcan "$(SOCKETCAN) -t 3600 -m 2G")
 
@@ -73,4 +95,4 @@ lowest:
 	.ci/lowest $(PYTHONS)
 
 clean:
-	rm -rf $(VENV) .venv-lowest out
+	rm -rf $(VENV) .venv-lowest $(PEERS) out

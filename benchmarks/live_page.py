@@ -1,15 +1,17 @@
 """CPU time and memory of the live page, beside the service without it.
 
-    python benchmarks/live_page.py [--seconds 120] [--json]
+    python benchmarks/live_page.py [--minutes 10] [--case NAME]... [--json]
 
 1,000 wanted frames/s by UDP multicast on this machine; `cangauge run` without the page, with it and
-no viewer, with it and one viewer in headless Chromium, with it and four of which three only fetch.
-Linux only: CPU time and memory are read from /proc.
+no viewer, with it and one viewer in headless Chromium, with it and four of which three only listen.
+The cases run side by side, so that other work on the machine counts for each. Linux only: CPU time
+and memory are read from /proc.
 """
 
 from __future__ import annotations
 
 import argparse
+import asyncio
 import json
 import math
 import os
@@ -17,25 +19,30 @@ import shutil
 import tempfile
 import threading
 import time
-import urllib.request
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
 from rich.console import Console
 from rich.table import Table
+from tornado.websocket import websocket_connect
 
 from cangauge.bus.encoder import FrameEncoder
-from cangauge.bus.open import bus_address, open_bus
+from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.validity import Sample
 from cangauge.replay.player import Pacer
 from live_service import service
 
 FRAMES_PER_S: Final = 1000
-BUS = bus_address("udp_multicast", "239.74.163.92", {"port": 43_561})
+GROUP: Final = "239.74.163.92"
+BUS_PORT: Final = 43_561
 PAGE_PORT: Final = 18_643
+"""Ports of the first case; each further one has the next."""
+WARM_S: Final = 10.0
+"""Time from the first viewer to the measurement [s]."""
 TICK_S: Final = 1.0 / os.sysconf("SC_CLK_TCK")
 CASES: Final = {
     "without the page": (False, 0, 0),
@@ -78,12 +85,12 @@ def memory_mb(processes: list[int]) -> float:
 
 
 @contextmanager
-def frames() -> Iterator[None]:
+def frames(address: BusAddress) -> Iterator[None]:
     """Send wanted frames from a thread."""
     done = threading.Event()
 
     def send() -> None:
-        encoder, bus, sent = FrameEncoder(Vehicle.load("generic")), open_bus(BUS), 0
+        encoder, bus, sent = FrameEncoder(Vehicle.load("generic")), open_bus(address), 0
         pacer = Pacer(1.0, done.is_set)
         pacer.wait(0)
         while not done.is_set():
@@ -105,7 +112,7 @@ def frames() -> Iterator[None]:
 
 
 @contextmanager
-def chromium() -> Iterator[Any]:
+def chromium(port: int) -> Iterator[Any]:
     """Open the page in headless Chromium; yield its driver."""
     from selenium import webdriver  # noqa: PLC0415 - an extra of development
 
@@ -117,7 +124,7 @@ def chromium() -> Iterator[Any]:
             options=options,
             service=webdriver.ChromeService(executable_path=shutil.which("chromedriver")),
         )
-        driver.get(f"http://127.0.0.1:{PAGE_PORT}/")
+        driver.get(f"http://127.0.0.1:{port}/")
         try:
             yield driver
         finally:
@@ -125,19 +132,18 @@ def chromium() -> Iterator[Any]:
 
 
 @contextmanager
-def fetcher() -> Iterator[None]:
-    """Ask as a viewer does, ten times a second."""
+def listener(port: int) -> Iterator[None]:
+    """Listen as a viewer does, without drawing."""
     done = threading.Event()
 
-    def ask() -> None:
-        key, after = "", 0
-        while not done.wait(0.1):
-            url = f"http://127.0.0.1:{PAGE_PORT}/rows?span=10min&key={key}&after={after}"
-            with urllib.request.urlopen(url) as answer:
-                content = json.load(answer)
-            key, after = content["key"], content["added"]
+    async def listen() -> None:
+        stream = await websocket_connect(f"ws://127.0.0.1:{port}/stream")
+        await stream.write_message('{"span": "10min"}')
+        while not done.is_set():
+            json.loads(str(await stream.read_message()))
+        stream.close()
 
-    thread = threading.Thread(target=ask)
+    thread = threading.Thread(target=lambda: asyncio.run(listen()))
     thread.start()
     try:
         yield
@@ -146,48 +152,62 @@ def fetcher() -> Iterator[None]:
         thread.join()
 
 
-def measure(case: str, seconds: float) -> dict[str, Any]:
-    """Return CPU [% of a core] and memory [MB] of service, page and browser, and the delay."""
-    has_page, browsers, fetchers = CASES[case]
+def measure(number: int, case: str, seconds: float) -> dict[str, Any]:
+    """Return CPU [% of a core] and memory [MB] of service, page and browser."""
+    has_page, browsers, listeners = CASES[case]
+    address = bus_address("udp_multicast", GROUP, {"port": BUS_PORT + number})
+    port = PAGE_PORT + number
     arguments = ["--until-idle", "3", "--initial-soc", "70", "--status-socket", "off"]
-    arguments += ["--dashboard", str(PAGE_PORT)] if has_page else []
-    with service(BUS, *arguments) as process, frames():
-        with ExitStack() as stack:
-            time.sleep(5.0)
-            groups = {"service": [process.pid]}
-            if has_page:
-                groups["page"] = children(process.pid)[1:]
-            viewers = [stack.enter_context(chromium()) for _ in range(browsers)]
-            for _ in range(fetchers):
-                stack.enter_context(fetcher())
-            time.sleep(10.0)
-            if viewers:
-                groups["browser"] = children(viewers[0].service.process.pid)
-            before = {name: cpu_s(each) for name, each in groups.items()}
-            began = time.monotonic()
-            time.sleep(seconds)
-            took = time.monotonic() - began
-            used = {
-                name: 100.0 * (cpu_s(each) - before[name]) / took for name, each in groups.items()
-            }
-            memory = {name: memory_mb(each) for name, each in groups.items()}
-        return {"cpu_pct": used, "memory_mb": memory}
+    arguments += ["--dashboard", str(port)] if has_page else []
+    with service(address, *arguments) as process, frames(address), ExitStack() as stack:
+        time.sleep(5.0)
+        groups = {"service": [process.pid]}
+        if has_page:
+            groups["page"] = children(process.pid)[1:]
+        viewers = [stack.enter_context(chromium(port)) for _ in range(browsers)]
+        for _ in range(listeners):
+            stack.enter_context(listener(port))
+        time.sleep(WARM_S)
+        if viewers:
+            groups["browser"] = children(viewers[0].service.process.pid)
+        before = {name: cpu_s(each) for name, each in groups.items()}
+        first = {name: memory_mb(each) for name, each in groups.items()}
+        began = time.monotonic()
+        time.sleep(seconds)
+        took = time.monotonic() - began
+        used = {name: 100.0 * (cpu_s(each) - before[name]) / took for name, each in groups.items()}
+        memory = {name: memory_mb(each) for name, each in groups.items()}
+    return {"cpu_pct": used, "memory_mb": memory, "memory_at_first_mb": first}
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=120.0)
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--case", choices=CASES, action="append", help="default: all")
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
-    results = {case: measure(case, given.seconds) for case in CASES}
+    cases = given.case or list(CASES)
+    with ThreadPoolExecutor(len(cases)) as pool:
+        jobs = [
+            pool.submit(measure, number, case, 60.0 * given.minutes)
+            for number, case in enumerate(cases)
+        ]
+        results = {case: job.result() for case, job in zip(cases, jobs, strict=True)}
     if given.json:
         print(json.dumps(results))
         return
-    table = Table("", "service", "page", "browser", title="CPU [% of a core], memory [MB]")
+    table = Table(
+        "",
+        "service",
+        "page",
+        "browser",
+        title="CPU [% of a core], memory at first → at the end [MB]",
+    )
     for case, result in results.items():
         cells = [
-            f"{result['cpu_pct'][name]:.1f} %, {result['memory_mb'][name]:.0f} MB"
+            f"{result['cpu_pct'][name]:.1f} %, {result['memory_at_first_mb'][name]:.0f}"
+            f" → {result['memory_mb'][name]:.0f} MB"
             if name in result["cpu_pct"]
             else "–"
             for name in ("service", "page", "browser")

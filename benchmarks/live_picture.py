@@ -59,7 +59,7 @@ def main() -> None:
     given = parser.parse_args()
     arguments = ("--time-source", "replay-clock", "--temperature-source", "room")
     page = ("--dashboard", str(PAGE_PORT), "--status-socket", "off")
-    with service(BUS, *arguments, *page), chromium() as browser:
+    with service(BUS, *arguments, *page), chromium(PAGE_PORT) as browser:
         browser.set_window_size(SIZE[0], 1200)
         found = pictures(browser)
     found = found[:: -(-len(found) // PICTURES)]

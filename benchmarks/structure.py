@@ -49,6 +49,7 @@ LAYERS = (
     ("replay",),
     ("inspect",),
     ("validation",),
+    ("fleet",),
     ("report",),
     ("cli",),
 )  # fmt: skip

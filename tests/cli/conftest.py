@@ -14,6 +14,7 @@ from cangauge.cli.app import main
 from cangauge.cli.estimate import estimate_command
 from cangauge.cli.fit import fit_command
 from cangauge.cli.gap import gap_command
+from cangauge.cli.gap_check import gap_check_command
 from cangauge.identify.fit import fit
 from cangauge.logs.canonical import write_log
 from synthetic import synthetic_log
@@ -22,6 +23,7 @@ app = typer.Typer()
 app.command("fit")(fit_command)
 app.command("estimate")(estimate_command)
 app.command("gap")(gap_command)
+app.command("gap-check")(gap_check_command)
 
 
 @dataclass

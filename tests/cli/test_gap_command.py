@@ -13,6 +13,7 @@ import pytest
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
+from report_html import drawn_figures
 from synthetic import synthetic_log
 
 Run = Callable[..., object]
@@ -41,20 +42,23 @@ def references(days: Path) -> list[object]:
     ]  # fmt: skip
 
 
-def test_json_report_and_a_model_that_runs(
-    run: Run, made: Path, days: Path, tmp_path: Path
+def test_json_report_figures_and_a_model_that_runs(
+    run: Run, made: Path, days: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    better, page = tmp_path / "better.json", tmp_path / "gap.html"
+    monkeypatch.setattr("cangauge.report.export._PNG_DPI", 20)  # what is drawn, not how finely
+    better, page, folder = tmp_path / "better.json", tmp_path / "gap.html", tmp_path / "figures"
     ran = run(
         "gap", days / "trip.csv", "-m", made / "model.json", *references(days),
-        "--json", "--extended", better, "--report", page,
+        "--json", "--extended", better, "--report", page, "--figures", folder,
     )  # fmt: skip
     assert ran.code == 0
     found = json.loads(ran.out)
     assert "voltage_offset" in {found["cause"]["verdict"], *found["cause"]["ambiguous_with"]}
     assert found["extended_model"] == str(better)
     assert isinstance(found["limits"], list)
-    assert "What these logs cannot show" in page.read_text(encoding="utf-8") or not found["limits"]
+    text = page.read_text(encoding="utf-8")
+    assert "What these logs cannot show" in text or not found["limits"]
+    assert drawn_figures(folder) == text.count("<figure ")
     assert [entry["id"] for entry in Model.load(better).effects]
     ran = run("estimate", days / "trip.csv", "-m", better, "-o", tmp_path / "soc.csv")
     assert ran.code == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import http.client
 import json
 import socket
@@ -11,6 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from tornado.websocket import websocket_connect
 
 from cangauge.bus.vehicle import Vehicle
 from cangauge.dashboard.launch import LivePage
@@ -20,7 +22,7 @@ from cangauge.service.config import load_config
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.status import Identity, Monitor, Snapshot
-from live import LoggedLines, leaf_model, leaf_model_path, waits
+from live import LoggedLines, in_process, leaf_model, leaf_model_path, waits
 
 TOKEN = "a-token-of-some-length"  # noqa: S105 - made up
 
@@ -124,6 +126,45 @@ def snapshot_of(page: LivePage) -> Snapshot:
     return replace(page._latest, made_s=time.monotonic())
 
 
+UPGRADE = {
+    "Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13",
+    "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+}  # fmt: skip
+
+
+def test_the_stream_is_for_the_own_page_only(page: LivePage, guarded: LivePage) -> None:
+    evil = UPGRADE | {"Origin": "https://evil.example"}
+    assert get(page, "/stream", headers=evil)[0] == 403
+    assert get(page, "/stream", headers=UPGRADE | {"Host": "evil.example"})[0] == 403
+    assert get(guarded, "/stream", headers=UPGRADE)[0] == 401
+
+
+def test_the_stream_sends_what_is_new(page: LivePage) -> None:
+    async def watch() -> list[dict[str, Any]]:
+        stream = await websocket_connect(f"ws://127.0.0.1:{page.port}/stream")
+        found = []
+        for question in ("[", '{"span": 1, "after": -1e400}', '{"span": "10min"}'):
+            await stream.write_message(question)
+            found.append(json.loads(str(await stream.read_message())))
+        while "columns" not in found[-1]:
+            found.append(json.loads(str(await stream.read_message())))
+        for _ in range(3):
+            await asyncio.sleep(0.15)  # rows are 0.1 s apart
+            page.show(snapshot_of(page))
+            found.append(json.loads(str(await stream.read_message())))
+        stream.close()
+        return found
+
+    assert waits(lambda: json.loads(get(page, "/rows")[2])["status"] is not None, 20.0)
+    found = [each for each in asyncio.run(watch()) if "columns" in each]
+    assert len(found) > 3
+    known = found[0]["added"]
+    for each in found[1:]:
+        assert len(each["columns"]["time_ms"]) == each["added"] - known
+        known = each["added"]
+    assert known > found[0]["added"]
+
+
 @pytest.mark.parametrize("path", ["/rows", "/range.csv", "/comparison", "/cangauge-last-hour.csv"])
 def test_a_token_is_needed(guarded: LivePage, path: str) -> None:
     assert get(guarded, path)[0] == 401
@@ -153,6 +194,61 @@ def test_the_cookie_outlives_a_restart(guarded: LivePage) -> None:
     cookie = headers["Set-Cookie"].split(";")[0]
     with LivePage(replace(guarded._address, port=0)) as other:
         assert get(other, "/rows", headers={"Cookie": cookie})[0] == 200
+
+
+def asked_for(page: LivePage, body: str, **headers: str) -> int:
+    """Return the code of a request for a recording."""
+    kind = {"Content-Type": "application/json"}
+    return get(page, "/recording", method="POST", body=body, headers=kind | headers)[0]
+
+
+def test_a_viewer_asks_for_a_recording_and_its_end() -> None:
+    asked: list[bool] = []
+    with LivePage(http_address("127.0.0.1:0", None, {}), asked.append) as page:
+        own = f"http://127.0.0.1:{page.port}"
+        assert asked_for(page, '{"active": true}', Origin=own) == 202
+        assert asked_for(page, '{"active": false}') == 202
+        assert waits(lambda: asked == [True, False])
+
+
+@pytest.mark.parametrize(
+    ("body", "headers", "code"),
+    [
+        ('{"active": true}', {"Origin": "https://evil.example"}, 403),
+        ('{"active": true}', {"Origin": "http://127.0.0.1:1"}, 403),
+        ('{"active": true}', {"Origin": "null"}, 403),
+        ('{"active": true}', {"Host": "evil.example"}, 403),
+        ('{"active": true}', {"Content-Type": "text/plain"}, 415),
+        ("active=true", {"Content-Type": "application/x-www-form-urlencoded"}, 415),
+        ('{"active": 1}', {}, 400),
+        ("[true]", {}, 400),
+        ("\xff", {}, 400),
+    ],
+)
+def test_other_requests_for_a_recording_are_refused(
+    page: LivePage, body: str, headers: dict[str, str], code: int
+) -> None:
+    assert asked_for(page, body, **headers) == code
+
+
+def test_a_recording_needs_the_token(guarded: LivePage) -> None:
+    assert asked_for(guarded, '{"active": true}') == 401
+    assert asked_for(guarded, '{"active": true}', Authorization=f"Bearer {TOKEN}") == 202
+
+
+@pytest.mark.parametrize("after", [[], ["--channel", "x"], ["127.0.0.1:8642"]])
+def test_the_option_alone_means_a_loopback_address(
+    monkeypatch: pytest.MonkeyPatch, after: list[str]
+) -> None:
+    def note(_: object, values: dict[str, Any]) -> None:
+        given.update(values)
+        raise InputError("enough")
+
+    given: dict[str, Any] = {}
+    monkeypatch.setattr("cangauge.cli.run.load_config", note)
+    assert "enough" in in_process("run", "-m", "m.json", "--dashboard", *after).err
+    assert given["dashboard"] == "127.0.0.1:8642"
+    assert given["channel"] == ("x" if "x" in after else None)
 
 
 def test_an_address_in_use_is_refused(page: LivePage) -> None:

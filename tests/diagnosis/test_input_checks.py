@@ -16,6 +16,7 @@ from cangauge.diagnosis.verdict import decide
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
+from synthetic import synthetic_log
 
 
 def with_row(log: Log, channel: str, row: int, value: float) -> Log:
@@ -68,6 +69,20 @@ def test_many_outliers_are_a_fault_to_diagnose(model: Model) -> None:
     kept, rows = without_outliers(log, model.extended_model())
     assert kept is log
     assert rows.size == 0
+
+
+def test_a_start_that_counts_beyond_full_is_a_cause(model: Model, references: list[Log]) -> None:
+    log = synthetic_log(hours=0.8, start_pct=95.0, end_pct=65.0, noise_v=0.5, seed=21)
+    assert log.soc_pct is not None
+    found = diagnose([replace(log, soc_pct=log.soc_pct + 10.0)], model, references)
+    assert found.verdict.cause == "initial_soc"
+    assert found.extension.cause["initial_soc"]["offset_pct"] == pytest.approx(-10.0, abs=1.0)
+
+
+def test_a_count_that_no_start_explains_is_refused(model: Model, references: list[Log]) -> None:
+    log = day(21)
+    with pytest.raises(InputError, match="no start explains it"):
+        diagnose([replace(log, current_a=8.0 * log.current_a)], model, references)
 
 
 @pytest.mark.parametrize("channel", ["current_a", "voltage_v"])

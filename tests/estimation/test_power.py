@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -130,6 +131,29 @@ def test_nothing_is_possible_to_say_before_the_soc() -> None:
     assert all(math.isnan(each) for each in estimator.power())
     estimator.update(Sample(0.0, 10.0, math.nan, 23.0))
     assert all(math.isnan(each) for each in estimator.power())
+
+
+@pytest.mark.parametrize("is_constant", [True, False])
+def test_a_voltage_that_rises_with_the_current_limits_nothing(is_constant: bool) -> None:
+    file = leaf_2012_model_file()
+    # The sum of the resistances is right, as identified from constant currents.
+    coefficients = dict(file.coefficients)
+    for name, more_ohm in (("R1", 0.9), ("R4", -0.9)):
+        was = coefficients[name]
+        coefficients[name] = was.model_copy(update={"value": was.value + more_ohm})
+    model = file.model_copy(update={"coefficients": coefficients})
+    estimator = Estimator(model, EstimatorSettings(limits=LIMITS))
+    rows = LOG.rows(slice(0, 600))
+    if is_constant:
+        drop_v = 20.0 * sum(PACK.resistance_ohm)
+        volts = PACK.pseudo_ocv(np.asarray(rows.soc_pct), 23.0) + drop_v
+        rows = replace(rows, current_a=np.full(600, 20.0), voltage_v=volts)
+    for sample in samples_of(rows):
+        estimator.update(sample)
+    power = estimator.power()
+    assert all(math.isnan(each) for each in power[:4])
+    # In a drive the resistance itself is found to be of the wrong sign.
+    assert math.isnan(power.energy_wh) is not is_constant
 
 
 def test_energy_ends_at_the_stated_soc() -> None:

@@ -16,9 +16,10 @@ import typer
 from cangauge.cli.app import app, main
 from fuzzing import corpus
 
-# `status` answers 1 where no service runs, `monitor` waits for one, and `gap-check` draws its own
-# cases: they are tested in tests/service, tests/cli and tests/validation.
-ELSEWHERE = {"status", "monitor", "gap-check"}
+# `status` answers 1 where no service runs, `monitor` waits for one, `gap-check` draws its own
+# cases, and `fleet` has commands of its own: see tests/service, tests/cli, tests/validation and
+# tests/fleet.
+ELSEWHERE = {"status", "monitor", "gap-check", "fleet"}
 GROUP: Any = typer.main.get_command(app)
 COMMANDS: dict[str, Any] = {
     name: GROUP.get_command(None, name)
@@ -37,6 +38,8 @@ VALID = {
     "inspect": ["absent.csv"],
     "twin": ["-o", "absent/out.csv"],
     "packs-check": ["--data", "absent"],
+    "export-ecm": ["absent.json", "-o", "out.py"],
+    "export-fmu": ["absent.json", "-o", "out.fmu"],
 }
 
 

@@ -13,6 +13,7 @@ from cangauge.inference.error_model import (
     CURVE_FROM_S,
     KNOTS_PCT,
     SCALES,
+    ErrorEquations,
     LogResidual,
     RestrictedLikelihood,
     TimeError,
@@ -64,7 +65,7 @@ def test_white_errors_have_the_dense_restricted_likelihood() -> None:
         table[:, :3] = np.repeat(rng.normal(size=(2, 3)), 128, axis=0)
     prior = np.diag([1.0, 4.0, 0.25])
     mean = np.array([0.3, -0.2, 0.1])
-    found = RestrictedLikelihood(tables, mean, prior, 1.0)
+    found = RestrictedLikelihood(ErrorEquations.of_tables(tables), mean, prior, 1.0)
 
     def dense(error: TimeError) -> float:
         columns = np.vstack([table[:, :3] for table in tables])
@@ -86,7 +87,9 @@ def test_a_shared_error_is_integrated_out() -> None:
     rng = np.random.default_rng(4)
     column = np.repeat([1.0, -0.5], 128)
     table = np.column_stack([column, rng.normal(size=256) + 0.7 * column])
-    likelihood = RestrictedLikelihood([table], np.zeros(1), np.array([[2.0]]), 1.0)
+    likelihood = RestrictedLikelihood(
+        ErrorEquations.of_tables([table]), np.zeros(1), np.array([[2.0]]), 1.0
+    )
 
     def by_quadrature(std_v: float) -> float:
         def density(amplitude: float) -> float:
@@ -150,7 +153,9 @@ def test_principal_functions_keep_every_variance() -> None:
 def test_short_stretches_say_nothing_of_the_curve() -> None:
     rng = np.random.default_rng(1)
     table = rng.normal(size=(2048, 3))
-    likelihood = RestrictedLikelihood([table], np.zeros(2), np.eye(2), 1.0)
+    likelihood = RestrictedLikelihood(
+        ErrorEquations.of_tables([table]), np.zeros(2), np.eye(2), 1.0
+    )
     _, covariance = likelihood.posterior(TimeError(1.0, 0.0, 1e-9, 300.0, 1e-9))
     scales = haar_transform(table[:, :2], SCALES)
     slow = [item for j, item in enumerate(scales) if 2.0 ** (j + 1) >= CURVE_FROM_S]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from cangauge.errors import InputError
 from cangauge.model.delay_line import DelayLine, delayed_currents, filled_at
 from cangauge.model.published import leaf_2012_model
-from cangauge.model.voltage_model import VoltageModel
+from cangauge.model.voltage_model import VoltageModel, soc_from_ocv, socs_from_ocv
 
 MODEL = leaf_2012_model()
 K = (394.4, 48.89, -4.769, 0.2158, -0.003718, -54.59, 109.3, -3.141)
@@ -138,3 +138,9 @@ def test_memory_is_bounded_at_any_rate() -> None:
         line.push(k * 1e-3, float(k))
     assert len(line._times) < 2 * 70.0 / 0.009
     assert line.currents()[1] == pytest.approx(399_999 - 70_000, abs=0.01)
+
+
+@given(st.lists(st.floats(200.0, 500.0), max_size=40))
+def test_voltages_are_inverted_together_as_one_by_one(volts: list[float]) -> None:
+    expected = [soc_from_ocv(MODEL, value).soc_pct for value in volts]
+    assert socs_from_ocv(MODEL, np.array(volts)) == pytest.approx(expected, abs=1e-9)

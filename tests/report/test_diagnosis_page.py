@@ -1,4 +1,4 @@
-"""The page of a diagnosis: a figure for every question, caveats first."""
+"""The page of a diagnosis: the answer first, details folded."""
 
 from __future__ import annotations
 
@@ -15,19 +15,26 @@ from cangauge.diagnosis import SEGMENTS, Diagnosis, ErrorShare, diagnose
 from cangauge.errors import InputError
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
+from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH
-from cangauge.report.diagnosis import gap_page, share_figures
+from cangauge.report.diagnosis import gap_page
+from cangauge.report.error_places import share_figures
 from cangauge.report.page import Beside, Bullets, Figure, InputFile, Page, Section, Table, render
-from cangauge.report.summary import headline
-from report_html import MAX_PAGE_BYTES, Html, excess_width_px
+from cangauge.report.summary import EXPLAINED, headline
+from report_html import MAX_PAGE_BYTES, Html, excess_width_px, title_after_scripts
 from synthetic import synthetic_log
 
 SECTIONS = [
-    "How large the gap is",
+    "How sure this is",
     "Where the gap is",
-    "Cause",
-    "How far the gap closes",
+    "How far the gap shrinks",
+    "What was compared",
+]
+DETAILS = [
+    "Every effect: evidence and parameters",
+    "Errors in numbers",
+    "Error over SoC, current, temperature and time",
     "Worst segments",
     "What these logs can show",
 ]
@@ -76,8 +83,29 @@ def stacked(figure: Figure) -> list[Any]:
 
 
 def test_every_question_has_its_section(page: Page) -> None:
-    titles = [item.title for item in page.sections]
-    assert [title for title in titles if title in SECTIONS] == SECTIONS
+    assert [item.title for item in page.sections if not item.is_folded] == SECTIONS
+    assert [item.title for item in page.sections if item.is_folded] == DETAILS
+    text = render(page)
+    assert text.count("<details>") == text.count("</details>") == len(DETAILS)
+
+
+def test_every_answer_is_explained_in_a_line(page: Page, offset: Diagnosis) -> None:
+    causes = {name for name, effect in LIBRARY.items() if effect.is_cause}
+    assert causes | {"none", "unknown"} <= EXPLAINED.keys() <= {*LIBRARY, "none", "unknown"}
+    explained = dict(tables(section(page, "How sure this is"))[0].rows)
+    assert {*offset.verdict.credible_set, "none", "unknown"} <= explained.keys()
+    assert explained["none"] == EXPLAINED["none"]
+    assert len(tables(section(page, DETAILS[0]))[0].rows) == len(offset.candidates)
+
+
+def test_compared_are_all_logs_and_references(page: Page) -> None:
+    rows = tables(section(page, "What was compared"))[0].rows
+    assert [(row[0], row[1]) for row in rows] == [
+        ("log", "day 21"), ("log", "day 22"),
+        ("reference", "day 11"), ("reference", "day 12"), ("reference", "day 13"),
+    ]  # fmt: skip
+    errors = [float(row[5]) for row in rows]
+    assert max(errors[2:]) < min(errors[:2])
 
 
 def test_title_names_the_logs_and_the_lead_size_and_cause(page: Page, offset: Diagnosis) -> None:
@@ -88,7 +116,7 @@ def test_title_names_the_logs_and_the_lead_size_and_cause(page: Page, offset: Di
 
 
 def test_size_is_in_volts_and_soc_against_two_floors(page: Page, offset: Diagnosis) -> None:
-    rows = {row[0]: row for row in tables(section(page, "How large the gap is"))[0].rows}
+    rows = {row[0]: row for row in tables(section(page, "Errors in numbers"))[0].rows}
     assert list(rows) == [
         "model as given", "with current_offset", "floor: references", "floor: explainable",
     ]  # fmt: skip
@@ -139,11 +167,11 @@ def test_ten_worst_segments_are_drawn_on_one_scale(page: Page, offset: Diagnosis
 
 
 def test_closing_is_shown_over_time_and_by_log(page: Page) -> None:
-    part = section(page, "How far the gap closes")
-    over_time = next(block for block in part.blocks if isinstance(block, Figure))
+    part = section(page, "How far the gap shrinks")
+    over_time = [block for block in part.blocks if isinstance(block, Figure)][-1]
     names = {line.name for line in over_time.plot.renderers}
     assert {"model as given", "with current_offset"} <= names
-    rows = tables(part)[0].rows
+    rows = tables(section(page, "Errors in numbers"))[1].rows
     assert [row[0] for row in rows] == ["day 21", "day 22"]
     assert all(float(row[5]) < float(row[4]) for row in rows)
 
@@ -163,9 +191,7 @@ def test_shares_of_small_currents_have_distinct_names() -> None:
         ErrorShare("current", low, high, "A", 0.25, 0.1, (0.2, 0.3))
         for low, high in pairwise(edges)
     ]
-    (row,) = share_figures(places)
-    assert isinstance(row, Beside)
-    (figure,) = row.figures
+    (figure,) = share_figures(places)
     names = figure.plot.y_range.factors
     assert len(set(names)) == len(names)
     assert "−0.06 … 0.06" in names
@@ -191,6 +217,15 @@ def test_page_is_small_and_loads_nothing(page: Page) -> None:
 
 
 @pytest.mark.slow
+def test_page_with_folded_details_is_short(page: Page, tmp_path: Path) -> None:
+    measuring = """<script>setTimeout(() => {
+      document.title = document.documentElement.scrollHeight }, 3000)</script></body>"""
+    file = tmp_path / "page.html"
+    file.write_text(render(page).replace("</body>", measuring), encoding="utf-8")
+    assert 2000 < int(title_after_scripts(file, "1280,1000")) <= 3500
+
+
+@pytest.mark.slow
 def test_page_does_not_scroll_sideways_at_400_px(page: Page, tmp_path: Path) -> None:
     assert excess_width_px(render(page), tmp_path) == 0
 
@@ -201,8 +236,8 @@ def test_caveats_of_a_poor_log_come_first(model: Model) -> None:
     found = diagnose([short], model, [])
     assert found.verdict.cause == "none"
     page = gap_page(found)
-    assert page.sections[0].title == "What these logs cannot show"
-    bullets = page.sections[0].blocks[0]
+    assert page.sections[0].title == "How sure this is"
+    bullets = page.sections[0].blocks[-1]
     assert isinstance(bullets, Bullets)
     words = " ".join(bullets.items)
     for said in ("No cause can be named", "does not prove that there is none", "Shorter than 10",

@@ -59,7 +59,10 @@ GOOD: dict[str, Any] = {
     "config": {"reloading": False, "problem": "broken"},
     "latency": {"count": 1, "p50_at_most_s": 0.001, "p99_at_most_s": None},
     "step": {"count": 0, "p50_at_most_s": None, "p99_at_most_s": None},
-    "record": {"path": "r.log", "frames": 1, "lost_frames": 0, "written_bytes": 9, "problem": None},
+    "record": {
+        "path": "r.log", "frames": 1, "lost_frames": 0, "written_bytes": 9, "problem": None,
+        "active": True,
+    },
 }  # fmt: skip
 
 

@@ -17,12 +17,14 @@ from cangauge.errors import InputError
 from cangauge.estimation.offline import EstimateTable
 from cangauge.estimation.validity import Status
 from cangauge.logs.log import Log
+from cangauge.model.coulomb_counting import counted_soc_pct
 from cangauge.model.published import CAPACITY_AH
-from cangauge.validation import packs
+from cangauge.validation import packs, packs_quantities, packs_run
+from cangauge.validation.packs_quantities import Quantity, QuantityRow, pool_quantities
 from cangauge.validation.packs_score import Bench, LogScore, Row, pool_scores, score_log
 from synthetic import synthetic_log
 
-CASES = {case.name: case for case in packs.CASES}
+CASES = {case.name: case for case in packs_run.CASES}
 
 
 def small_pack(**changes: Any) -> packs.BenchPack:
@@ -44,7 +46,7 @@ def small_pack(**changes: Any) -> packs.BenchPack:
 
 def bench_of_small_pack(jobs: int) -> Bench:
     cases = [CASES[name] for name in ("withheld", "given", "+2 A")]
-    return packs.run([small_pack()], cases=cases, sizes=[2], splits=2, jobs=jobs)
+    return packs_run.run([small_pack()], cases=cases, sizes=[2], splits=2, jobs=jobs)
 
 
 @pytest.fixture(scope="module")
@@ -80,12 +82,13 @@ def test_errors_of_sensors_reach_the_estimate(bench: Bench) -> None:
     # 2 A over half an hour are 1 Ah of 51.5 Ah, 1.0 % on average.
     assert given.counting_mae_pct == pytest.approx(0.0, abs=1e-9)
     assert offset.counting_mae_pct == pytest.approx(100.0 * 0.5 / CAPACITY_AH, rel=0.01)
-    assert math.isfinite(offset.offset_error_a)
-    assert math.isnan(given.offset_error_a)
+    asked = {(row.case, row.quantity): row.asked for row in bench.quantities}
+    assert asked["+2 A", "offset at 20 min, A"] == asked["+2 A", "offset at the end, A"] == 2
+    assert ("given", "offset at 20 min, A") not in asked
 
 
 def test_voltage_and_capacity_errors_reach_the_estimate() -> None:
-    found = packs.run(
+    found = packs_run.run(
         [small_pack()],
         cases=[CASES["given"], CASES["voltage +0.5 %"], CASES["capacity +10 %"]],
         sizes=[1],
@@ -215,11 +218,35 @@ def test_counting_that_repeats_the_reference_sets_no_limit() -> None:
     assert row_of(a_score(**exact, counting_is_reference=True)).missed == ()
 
 
+def quantity_row(*found: Quantity) -> QuantityRow:
+    (row,) = pool_quantities({("p", "judged", 5, "case"): found})
+    return row
+
+
 def test_offset_must_be_found_unless_the_std_covers_it() -> None:
-    missing = {"case": "+2 A", "offset_a": 2.0, "found_offset_a": 1.5}
-    assert row_of(a_score(**missing)).missed == ()
-    assert row_of(a_score(**missing, cover=0.8)).missed == ("2σ", "offset")
-    assert row_of(a_score(**missing | {"found_offset_a": 1.8}, cover=0.8)).missed == ("2σ",)
+    name = "offset at 20 min, A"
+    assert quantity_row(Quantity(name, 1.0, 0.6, 2.0)).missed == ()
+    assert quantity_row(Quantity(name, 1.0, 0.4, 2.0)).missed == ("2σ beside the SoC", "offset")
+    assert quantity_row(Quantity(name, 1.8, 0.05, 2.0)).missed == ("2σ beside the SoC",)
+
+
+def test_quantities_are_pooled_and_unknown_ones_left_out() -> None:
+    name = "capacity, %"
+    row = quantity_row(
+        Quantity(name, 103.0, 1.0, 100.0),
+        Quantity(name, 99.0, 2.0, 100.0),
+        Quantity(name, math.nan, 1.0, 100.0),
+    )
+    assert (row.asked, row.mae, row.max, row.cover, row.mean_std) == (2, 2.0, 3.0, 0.5, 1.5)
+    assert row.std_over_rmse == pytest.approx(1.5 / math.sqrt(5.0))
+    assert row.missed == ("2σ beside the SoC",)
+    assert "capacity" in quantity_row(Quantity(name, 103.0, 2.0, 100.0)).missed
+
+
+def test_every_number_of_a_weak_cell_must_be_right() -> None:
+    found = [Quantity("weak cell", 20.0, 1.0, 20.0, is_right) for is_right in (True, False)]
+    assert quantity_row(*found).missed == ("number",)
+    assert quantity_row(found[0]).missed == ()
 
 
 def test_uncovered_error_near_empty_is_a_miss() -> None:
@@ -246,23 +273,78 @@ def test_wrong_start_outside_the_scale_is_no_case() -> None:
     log = synthetic_log(hours=0.3, start_pct=15.0, end_pct=10.0)
     assert (low.suits(log), high.suits(log)) == (False, True)
     assert CASES["withheld"].suits(log)
-    found = packs.run([small_pack()], cases=[CASES["withheld"], high], sizes=[1], splits=1)
+    found = packs_run.run([small_pack()], cases=[CASES["withheld"], high], sizes=[1], splits=1)
     # "d1" starts at 90 %.
     assert {score.log for score in found.logs if score.case == high.name} <= {"d2", "d3"}
 
 
 def test_logs_without_a_model_are_named() -> None:
     # Capacities of a quarter: the counted SoC leaves 0 to 100 %.
-    found = packs.run([small_pack(capacity_ah=CAPACITY_AH / 4.0)], sizes=[1], splits=1)
+    found = packs_run.run([small_pack(capacity_ah=CAPACITY_AH / 4.0)], sizes=[1], splits=1)
     assert found.rows == ()
     (failure,) = found.failures
     assert (failure.pack, failure.size) == ("small", 1)
     assert "capacity" in failure.error
 
 
+def test_charges_between_logs_return_the_charge() -> None:
+    logs = small_pack().judged[:2]  # 90 to 60 %, 75 to 45 %
+    log, is_measured = packs_run.chain(logs, CAPACITY_AH)
+    assert log.soc_pct is not None
+    assert len(log) == len(is_measured)
+    assert np.isnan(log.soc_pct[~is_measured]).all()
+    charged_ah = -log.current_a[~is_measured].sum() / 3600.0
+    assert charged_ah == pytest.approx(0.15 * CAPACITY_AH, rel=1e-3)
+    counted = counted_soc_pct(log, CAPACITY_AH, 90.0)
+    assert counted[is_measured] == pytest.approx(log.soc_pct[is_measured], abs=0.05)
+
+
+def test_a_wrong_capacity_is_asked_for_after_the_charges() -> None:
+    case = CASES["charges, capacity +10 %"]
+    found = packs_run.run([small_pack()], cases=[case], sizes=[2], splits=1)
+    (row,), (capacity,) = found.rows, found.quantities
+    assert (row.logs, capacity.quantity) == (1, "capacity, %")
+    assert row.mae_pct < row.counting_mae_pct
+    assert (capacity.asked, capacity.cover) == (1, 1.0)
+
+
+def test_the_model_of_another_pack_is_told_apart() -> None:
+    other = [
+        replace(log, current_a=1.6 * log.current_a, voltage_v=0.97 * log.voltage_v)
+        for log in small_pack().judged
+    ]
+    found = packs_run.run(
+        [
+            small_pack(place="here"),
+            small_pack(name="other", place="there", judged=other, training=other),
+        ],
+        cases=[CASES["withheld"], CASES["another pack's model"]],
+        sizes=[2],
+        splits=1,
+    )
+    mine = {row.case: row for row in found.rows if row.pack == "small"}
+    assert (mine["withheld"].mismatches, mine["another pack's model"].logs) == (0, 3)
+    assert {log.log.split(":")[0] for log in found.logs if log.is_model_wrong} == {"other", "small"}
+    assert mine["another pack's model"].targets == ()
+
+
+def test_a_weakened_cell_is_empty_first() -> None:
+    log = synthetic_log(hours=0.5, start_pct=90.0, end_pct=0.0)
+    real_v = np.column_stack([log.voltage_v / 96.0] * 6)
+    weak = packs_quantities.WeakCell.of(log, real_v, 96, 50)
+    assert weak.cells_v.shape == (len(weak.log), 96)
+    assert weak.cells_v.sum(axis=1) == pytest.approx(weak.log.voltage_v)
+    assert int(np.argmin(weak.cells_v[-1])) == 49
+    assert weak.soc_pct[-1] == pytest.approx(0.0, abs=0.5)
+    assert weak.log.soc_pct is not None
+    assert weak.log.soc_pct[-1] == pytest.approx(20.0, abs=0.5)
+    six = packs_quantities.WeakCell.of(log, real_v, 6, 1)
+    assert six.cells_v.sum(axis=1) == pytest.approx(six.log.voltage_v)
+
+
 def test_number_of_logs_that_no_pack_has_is_an_error() -> None:
     with pytest.raises(InputError, match="--logs"):
-        packs.run([small_pack()], sizes=[7])
+        packs_run.run([small_pack()], sizes=[7])
 
 
 def test_pack_of_a_cell_counts_from_the_known_start() -> None:
@@ -330,9 +412,9 @@ def test_quick_bench_on_a_recorded_pack(
     result = json.loads(printed.out)
     assert main_code == 0
     assert "fitting and estimating" in printed.err
-    assert [row["case"] for row in result["rows"]] == list(packs.QUICK_CASES)
+    assert [row["case"] for row in result["rows"]] == list(packs_run.QUICK_CASES)
     for row in result["rows"]:
-        assert (row["role"], row["size"], row["logs"]) == ("development", 5, packs.QUICK_LOGS)
+        assert (row["role"], row["size"], row["logs"]) == ("development", 5, packs_run.QUICK_LOGS)
         assert 0.0 < row["mae_pct"] <= row["rmse_pct"] <= row["max_pct"] < 100.0
         assert set(row["missed"]) == {t["name"] for t in row["targets"] if not t["met"]}
     # The car's own SoC is counted: a given start leaves counting nothing to lose.

@@ -31,6 +31,7 @@ from cangauge.bus.time_source import ReceiveTime, TimeSource, TimeSourceName, ti
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.validity import Sample
+from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.draft import Sign
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.read import KNOWN_LOGS, LogFile, not_recognised, open_log
@@ -162,6 +163,40 @@ def open_recording(path: str | PathLike[str]) -> LogFile | Capture:
             f" {KNOWN_CAPTURES}",
         )
     return capture
+
+
+def open_with_columns(
+    path: Path,
+    *,
+    columns: ColumnMap | None = None,
+    mapped: ColumnMap | None = None,
+    sign: Sign | None = None,
+) -> LogFile | Capture:
+    """Open a log by stated columns, or any recording by its content.
+
+    Parameters
+    ----------
+    path : Path
+    columns : ColumnMap, optional
+        The user's: the file is then a table.
+    mapped : ColumnMap, optional
+        A map file's, for tables of no known format.
+    sign : {"charge", "discharge"}, optional
+        What a positive current in a log does.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or an option is wrong.
+    """
+    if columns is not None:
+        return open_log(path, columns=columns, sign=sign)
+    if mapped is not None and path.is_file():  # not the name of a recording's parts
+        found = open_log(path)
+        if found.is_any_table or (found.reader is None and find_capture(path) is None):
+            return open_log(path, columns=mapped, sign=sign)
+    recording = open_recording(path)
+    return replace(recording, sign=sign) if isinstance(recording, LogFile) else recording
 
 
 def capture_without_vehicle(path: str | PathLike[str]) -> InputError:

@@ -34,9 +34,13 @@ COMMANDS: Final = {
     "run": "Estimate the state of charge from a bus, and publish it there.",
     "status": "Show the state of a running service: SoC ± standard deviation [%], frames, delays.",
     "monitor": "Watch a running service in the terminal: values, charts, status with its reasons.",
+    "fleet": "Fit, estimate, diagnose and watch the health of a fleet's logs, on Dask.",
     "replay": "Play a recorded log or capture on a bus.",
     "inspect": "Show what a log or capture holds, and the sign of its current.",
     "twin": "Simulate a pack, a drive, the weather and the sensors: a log whose truth is known.",
+    "export-ecm": "Write a model as an equivalent circuit: open-circuit voltage, R0 and RC pairs as"
+    " tables.",
+    "export-fmu": "Write a model as a functional mock-up unit (FMI 2.0 or 3.0, co-simulation).",
 }
 """Help line of each command: the first of its docstring, so that listing needs no imports."""
 
@@ -90,10 +94,14 @@ class _Listing(TyperGroup):
 
 def _command(name: str) -> Any:
     module = name.replace("-", "_")
+    found = import_module(f"cangauge.cli.{module}")
+    if (group := getattr(found, f"{module}_app", None)) is not None:
+        return build_command(group)
     alone = typer.Typer(
         rich_markup_mode="markdown", add_completion=False, context_settings=_CONTEXT
     )
-    alone.command(name)(getattr(import_module(f"cangauge.cli.{module}"), f"{module}_command"))
+    function = getattr(found, f"{module}_command")
+    alone.command(name, cls=getattr(function, "command_class", None))(function)
     return build_command(alone)
 
 
@@ -200,9 +208,7 @@ def _usage_line(error: Any) -> str:
         return ""
     if not text[1:2].isupper():
         text = text[0].lower() + text[1:]
-    command = "cangauge"
-    if error.ctx is not None and error.ctx.parent is not None:
-        command = f"cangauge {error.ctx.info_name}"
+    command = "cangauge" if error.ctx is None else error.ctx.command_path
     return f"error: {text.rstrip('.')}; see `{command} --help`"
 
 

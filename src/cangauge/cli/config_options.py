@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
+from typer.core import TyperCommand
 
 from cangauge.bus.open import parse_bus_options
 from cangauge.errors import InputError
@@ -16,6 +18,24 @@ from cangauge.service.config_tables import ConfigKey
 
 _KEYS: Final = {key.name: key for key in config_keys() if key.option}
 _TYPES: Final[Mapping[str, type]] = {"number": float, "true or false": bool}
+
+
+_BARE: Final = {key.option: key.info.bare for key in _KEYS.values() if key.info.bare}
+
+
+class ConfigCommand(TyperCommand):
+    """A command some of whose options may stand without a value."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the arguments, with the usual values where none are given."""
+        return super().parse_args(ctx, list(_with_values(args)))
+
+
+def _with_values(arguments: Sequence[str]) -> Iterator[str]:
+    for word, following in zip_longest(arguments, arguments[1:], fillvalue="-"):
+        yield word
+        if word in _BARE and following.startswith("-"):
+            yield _BARE[word]
 
 
 def config_option(name: str) -> Any:
@@ -42,6 +62,7 @@ def config_options(command: Callable[..., None]) -> Callable[..., None]:
         command(**values)
 
     with_options.__doc__ = command.__doc__
+    with_options.command_class = ConfigCommand  # type: ignore[attr-defined] # read by the app
     parameters = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in own]
     with_options.__signature__ = inspect.Signature(parameters + made)  # type: ignore[attr-defined] # read by typer
     with_options.__annotations__ = {each.name: each.annotation for each in parameters + made}

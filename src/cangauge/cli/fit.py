@@ -133,7 +133,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
     within(epsilon, 1e-4, 0.49, option="--epsilon", unit="")
     within(t_ref, -60.0, 120.0, option="--t-ref", unit="°C")
     effect_ids = parse_effect_ids(effects) if effects else ()
-    delay_s = DELAYS_S if delays == AUTO else _delays(delays)
+    delay_s = DELAYS_S if delays == AUTO else parse_delays(delays)
     check_outputs([output, report], logs)
     with console.status("reading") as status:
         recorded = []
@@ -239,7 +239,8 @@ def _initial_soc(given: list[str] | None, number: int) -> float | list[float | N
     return found[0] if len(found) == 1 else found
 
 
-def _delays(given: str) -> tuple[float, ...]:
+def parse_delays(given: str) -> tuple[float, ...]:
+    """Return the value of `--delays` [s]; raise InputError if it is none."""
     cure = "give increasing seconds from 0, such as 0,10,30,70, or auto"
     try:
         delays = tuple(float(text) for text in given.split(","))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +10,7 @@ import typer
 
 from cangauge._formatting import NONE_KNOWN, number, printable
 from cangauge._io import write_texts_atomic
+from cangauge.cli.next_test import NextTestOptions, show_tests
 from cangauge.cli.options import (
     ColumnsOption,
     DbcOption,
@@ -28,8 +30,10 @@ from cangauge.cli.options import (
 from cangauge.cli.output import emit_json, note, print_table, progress_shown, save_figures
 from cangauge.cli.simulator import SimulatorOptions, corrected_path, write_corrected
 from cangauge.diagnosis import ALARM_BELOW, NONE, UNKNOWN, Diagnosis, diagnose
+from cangauge.diagnosis.next_test import NextSteps
 from cangauge.diagnosis.simulator import SimulatorDiagnosis, diagnose_simulator
 from cangauge.errors import InputError
+from cangauge.identify.starts import with_start
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import difference_from_reference
 from cangauge.model.model_file import Model
@@ -110,6 +114,35 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
             help="Report a fault where the probability of none is at most this.",
         ),
     ] = ALARM_BELOW,
+    plan: Annotated[
+        bool,
+        typer.Option(
+            "--plan", help="Propose the next test: the one that separates the likely causes best."
+        ),
+    ] = False,
+    plan_file: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.csv", help="Write the current profile of that test: time_s, current_a."
+        ),
+    ] = None,
+    limits: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME=LOW:HIGH,…",
+            help="Limits of that test: current=-60:120 (A), soc=20:90 (%), temperature=5:30 (°C at"
+            " the start), minutes=20. Default: what the references usually show, and 20"
+            " minutes.",
+        ),
+    ] = None,
+    add_test: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="LOG",
+            help="Log of a further test of the same cause, beside the LOGs of the first diagnosis:"
+            " diagnoses both together and tells what the test changed; repeat the option.",
+        ),
+    ] = None,
     vehicle: VehicleOption = None,
     dbc: DbcOption = None,
     map_file: MapOption = None,
@@ -135,20 +168,26 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     `cangauge gap cold1.csv cold2.csv -m pack.json --reference mild1.csv --reference mild2.csv
     --reference mild3.csv --report gap.html --extended cold.json`
 
+    `cangauge gap cold1.csv -m pack.json --reference mild1.csv --reference mild2.csv --reference
+    mild3.csv --plan-file test.csv --limits current=-40:100,soc=30:80`, then the same with
+    `--add-test test_as_driven.csv`
+
     `cangauge gap day1.csv --simulated "V sim [V]" --capacity-ah 60 --reference good1.csv
     --reference good2.csv --reference good3.csv --corrected .`
     """
-    given = list(reference or [])
-    options = SimulatorOptions(simulated, simulator, columns, temperature)
-    _refuse_common(logs, given)
-    outputs = [] if corrected is None else [corrected_path(log, corrected) for log in logs]
-    check_outputs([report, extended, *outputs], [*logs, *given, *([model] if model else [])])
-    model_file = _model(model, options, corrected)
+    given, added = list(reference or []), list(add_test or [])
+    paths = [*logs, *added]
+    options = SimulatorOptions(simulated, simulator, columns, temperature, capacity_ah)
+    next_test = NextTestOptions(plan, plan_file, limits)
+    _refuse_common(paths, given)
+    outputs = [] if corrected is None else [corrected_path(log, corrected) for log in paths]
+    check_outputs(
+        [report, extended, plan_file, *outputs], [*paths, *given, *([model] if model else [])]
+    )
     within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
     within(alarm, 0.0, 1.0, option="--alarm", unit="")
     within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
-    if capacity_ah is not None and model_file is not None:
-        model_file = model_file.model_copy(update={"capacity_ah": capacity_ah})
+    model_file = _model(model, options, corrected)
 
     def read(path: Path) -> Log:
         return load_log(
@@ -163,43 +202,66 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
             refuse_inverted=True,
         )
 
-    diagnosed = [_long_enough(read(path)) for path in logs]
+    diagnosed = [_long_enough(read(path)) for path in paths]
     references = [read(path) for path in given]
     if model_file is not None:
         _note_differences([*diagnosed, *references], model_file.capacity_ah)
-    of_simulator = None
+    if initial_soc is not None:  # an added test has its own start
+        started = [with_start(log, initial_soc) for log in diagnosed[: len(logs)]]
+        diagnosed = [*started, *diagnosed[len(logs) :]]
+    task = _Task(diagnosed, paths, references, given, alarm)
     with progress_shown("cangauge.diagnosis"):
-        if model_file is not None and not options.are_given:
-            found = diagnose(
-                diagnosed,
-                model_file,
-                references,
-                initial_soc_pct=initial_soc,
-                alarm_below=alarm,
-            )
-        else:
-            of_simulator = diagnose_simulator(
-                [options.run(*each, initial_soc) for each in zip(diagnosed, logs, strict=True)],
-                [options.run(*each, None) for each in zip(references, given, strict=True)],
-                model=model_file,
-                capacity_ah=capacity_ah,
-                alarm_below=alarm,
-            )
-            found = of_simulator.diagnosis
-    _write(found, model, report, extended)
-    save_figures(figures, "diagnosis.gap_page", found)
+        first = task.run(len(logs), model_file, options)[0].verdict if added else None
+        found, of_simulator = task.run(len(paths), model_file, options)
+        steps = next_test.steps(found, first, [log.name for log in diagnosed[len(logs) :]])
+    texts = next_test.texts(steps)
+    if extended is not None:
+        texts[extended] = found.extended_model.to_json()
+    if report is not None:
+        texts[report] = _page(found, model, steps)
+    write_texts_atomic(texts)
+    save_figures(figures, "diagnosis.gap_page", found, None, steps)
     if of_simulator is not None and corrected is not None:
-        write_corrected(of_simulator, logs, corrected)
+        write_corrected(of_simulator, paths, corrected)
     if json_output:
         result = found.to_dict(None if extended is None else str(extended))
         result |= {} if of_simulator is None else {"simulator": of_simulator.to_dict()}
+        result |= next_test.to_dict(steps)
         emit_json(result | {"assumed": assumed_of([*diagnosed, *references])})
         return
-    _show(found)
+    _show(found, "" if steps.plan else next_step(found))
     if of_simulator is not None:
         _show_simulator(of_simulator)
-    for written in filter(None, (extended, report, *outputs)):
+    show_tests(steps)
+    for written in filter(None, (extended, report, plan_file, *outputs)):
         note(f"wrote {written}")
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """Logs to diagnose, with their files."""
+
+    logs: list[Log]
+    paths: list[Path]
+    references: list[Log]
+    reference_paths: list[Path]
+    alarm_below: float
+
+    def run(
+        self, number: int, model: Model | None, options: SimulatorOptions
+    ) -> tuple[Diagnosis, SimulatorDiagnosis | None]:
+        """Diagnose the first logs, that many."""
+        logs, references = self.logs[:number], self.references
+        if model is not None and not options.are_given:
+            return diagnose(logs, model, references, alarm_below=self.alarm_below), None
+        found = diagnose_simulator(
+            [options.run(*each) for each in zip(logs, self.paths, strict=False)],
+            [options.run(*each) for each in zip(references, self.reference_paths, strict=True)],
+            model=model,
+            capacity_ah=options.capacity_ah,
+            alarm_below=self.alarm_below,
+        )
+        return found.diagnosis, found
 
 
 def _note_differences(logs: list[Log], capacity_ah: float) -> None:
@@ -208,19 +270,12 @@ def _note_differences(logs: list[Log], capacity_ah: float) -> None:
             note(f"warning: {difference}")
 
 
-def _write(
-    found: Diagnosis, model: Path | None, report: Path | None, extended: Path | None
-) -> None:
-    texts = {}
-    if extended is not None:
-        texts[extended] = found.extended_model.to_json()
-    if report is not None:
-        # bokeh takes half a second to import.
-        from cangauge.report.diagnosis import gap_report  # noqa: PLC0415
-        from cangauge.report.page import InputFile  # noqa: PLC0415
+def _page(found: Diagnosis, model: Path | None, steps: NextSteps) -> str:
+    # bokeh takes half a second to import.
+    from cangauge.report.diagnosis import gap_report  # noqa: PLC0415
+    from cangauge.report.page import InputFile  # noqa: PLC0415
 
-        texts[report] = gap_report(found, InputFile.of_model(found.model, model))
-    write_texts_atomic(texts)
+    return gap_report(found, InputFile.of_model(found.model, model), steps)
 
 
 def _model(path: Path | None, options: SimulatorOptions, corrected: Path | None) -> Model | None:
@@ -234,7 +289,12 @@ def _model(path: Path | None, options: SimulatorOptions, corrected: Path | None)
         raise InputError(
             "no model", field="--model", cure="give the model file, or --simulated or --simulator"
         )
-    return None if path is None else Model.load(path)
+    if path is None:
+        return None
+    found = Model.load(path)
+    if options.capacity_ah is None:
+        return found
+    return found.model_copy(update={"capacity_ah": options.capacity_ah})
 
 
 def _refuse_common(logs: list[Path], references: list[Path]) -> None:
@@ -260,12 +320,12 @@ def _long_enough(log: Log) -> Log:
     return log
 
 
-def _show(found: Diagnosis) -> None:
+def _show(found: Diagnosis, next_words: str) -> None:
     for sentence in (
         headline(found),
         found.summary,
         open_question(found),
-        next_step(found),
+        next_words,
     ):
         if sentence:
             typer.echo(printable(sentence))

@@ -8,6 +8,7 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,8 +24,20 @@ from rich.progress import (
 
 from cangauge._formatting import duration
 from cangauge._io import write_text_atomic
-from cangauge.cli.options import JsonOption, ReportOption, check_outputs
+from cangauge.cli.options import (
+    ColumnsOption,
+    DbcOption,
+    JsonOption,
+    MapOption,
+    ReportOption,
+    SignOption,
+    TemperatureOption,
+    VehicleOption,
+    check_outputs,
+    load_log,
+)
 from cangauge.cli.output import console, emit_json, note
+from cangauge.cli.own_logs import OwnLogsOptions
 from cangauge.errors import InputError
 from cangauge.validation.check import (
     OPEN_SET,
@@ -55,6 +68,33 @@ PROTOCOLS = (*FULL, OPEN_SET)
 
 
 def gap_check_command(  # noqa: PLR0917 - typer passes options by name
+    own: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[LOG]…",
+            help="Your own logs without a fault: every effect is injected into them instead.",
+        ),
+    ] = None,
+    own_logs: Annotated[
+        bool, typer.Option("--logs", help="Check on the given LOGs, each left out in turn.")
+    ] = False,
+    reference: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="LOG", help="With LOGs: a further log without a fault; repeatable."),
+    ] = None,
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            "-m",
+            "--model",
+            metavar="MODEL",
+            help="With LOGs: model file. Default: fitted to all LOGs but the one left out.",
+        ),
+    ] = None,
+    capacity_ah: Annotated[
+        float | None,
+        typer.Option(metavar="A", help="With LOGs: charge from 100 to 0 % [Ah]."),
+    ] = None,
     protocol: Annotated[
         list[str] | None,
         typer.Option(
@@ -104,12 +144,22 @@ def gap_check_command(  # noqa: PLR0917 - typer passes options by name
     ] = False,
     at_most: Annotated[
         int | None,
-        typer.Option(metavar="N", min=1, help="Diagnose at most this many, drawn at random."),
+        typer.Option(
+            metavar="N",
+            min=1,
+            help="Diagnose at most this many, drawn at random; of LOGs: leave out at most as many.",
+        ),
     ] = None,
     jobs: Annotated[
         int | None,
         typer.Option(metavar="N", min=1, help="Parallel processes. Default: one per core."),
     ] = None,
+    vehicle: VehicleOption = None,
+    dbc: DbcOption = None,
+    map_file: MapOption = None,
+    columns: ColumnsOption = None,
+    sign: SignOption = None,
+    temperature: TemperatureOption = None,
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:
@@ -125,6 +175,9 @@ def gap_check_command(  # noqa: PLR0917 - typer passes options by name
     by a core temperature that the sensor does not measure; `published` packs report that
     temperature.
 
+    With LOGs: injects every effect at three sizes into your own logs without a fault, diagnoses
+    each with the others as references, and tells what this diagnosis would find on this pack.
+
     Examples
     --------
     `cangauge gap-check --part small`
@@ -134,7 +187,27 @@ def gap_check_command(  # noqa: PLR0917 - typer passes options by name
     `cangauge gap-check --protocol simulated --per-effect 5 --healthy 50 --keep cases`
 
     `cangauge gap-check --cases cases --protocol simulated --at-most 60`
+
+    `cangauge gap-check --logs mine/*.csv -m pack.json --report mine.html`
     """
+    _refuse_mixed(
+        own=own is not None or own_logs,
+        for_drawn={
+            "--protocol": protocol, "--per-effect": per_effect, "--healthy": healthy,
+            "--seed": seed, "--final": final or None, "--data": data, "--keep": keep,
+            "--cases": cases, "--score-only": score_only or None,
+        },
+        for_own={"--reference": reference, "--model": model, "--capacity-ah": capacity_ah},
+    )  # fmt: skip
+    if own is not None or own_logs:
+        read = partial(
+            load_log, vehicle=vehicle, dbc=dbc, map_file=map_file, temperature_c=temperature,
+            columns=columns, sign=sign, refuse_inverted=True,
+        )  # fmt: skip
+        OwnLogsOptions(
+            own or [], reference or [], model, capacity_ah, at_most, report, json_output
+        ).check(read, _progress())
+        return
     check_outputs([report], [])
     jobs = jobs or os.cpu_count() or 1
     with ExitStack() as stack:
@@ -204,6 +277,10 @@ def gap_check_command(  # noqa: PLR0917 - typer passes options by name
         "cases": [item.to_dict() for item in outcomes],
     }
     result["targets"] = judge_targets(result)
+    _show(result, report, json_output=json_output)
+
+
+def _show(result: dict[str, Any], report: Path | None, *, json_output: bool) -> None:
     print_result(result, console)
     if report is not None:
         # Slow to import.
@@ -236,6 +313,12 @@ def _refuse(given: dict[str, bool], reason: str) -> None:
     for option, is_given in given.items():
         if is_given:
             raise InputError(reason, field=option, cure="leave it out")
+
+
+def _refuse_mixed(*, own: bool, for_drawn: dict[str, Any], for_own: dict[str, Any]) -> None:
+    """Raise InputError for an option of the other check: drawn cases, or one's own logs."""
+    given = {name: value is not None for name, value in (for_drawn if own else for_own).items()}
+    _refuse(given, "nothing is drawn for your own logs" if own else "it needs your own LOGs")
 
 
 def _new_folder(keep: Path | None) -> Path | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sized
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeVar, cast
@@ -169,22 +169,16 @@ class TableOptions:
             If the file cannot be read, or an option is wrong.
         """
         # Deferred: the service shares these options, but needs neither pyarrow nor the readers.
-        from cangauge.bus.captures.capture import find_capture  # noqa: PLC0415
         from cangauge.bus.mapping import columns_of_map  # noqa: PLC0415
-        from cangauge.bus.recording import open_recording  # noqa: PLC0415
+        from cangauge.bus.recording import open_with_columns  # noqa: PLC0415
         from cangauge.logs.column_map import ColumnMap  # noqa: PLC0415
-        from cangauge.logs.read import LogFile, open_log  # noqa: PLC0415
 
-        sign = cast("Literal['charge', 'discharge'] | None", self.sign)
-        if self.columns is not None:
-            return open_log(path, columns=ColumnMap.of(self.columns, "--columns"), sign=sign)
-        mapped = None if self.map_file is None else columns_of_map(self.map_file)
-        if mapped is not None and path.is_file():  # not the name of a recording's parts
-            found = open_log(path)
-            if found.is_any_table or (found.reader is None and find_capture(path) is None):
-                return open_log(path, columns=mapped, sign=sign)
-        recording = open_recording(path)
-        return replace(recording, sign=sign) if isinstance(recording, LogFile) else recording
+        return open_with_columns(
+            path,
+            columns=None if self.columns is None else ColumnMap.of(self.columns, "--columns"),
+            mapped=None if self.map_file is None else columns_of_map(self.map_file),
+            sign=cast("Literal['charge', 'discharge'] | None", self.sign),
+        )
 
 
 def load_log(

@@ -13,7 +13,7 @@ from cangauge.cli.options import JsonOption
 from cangauge.cli.output import PlainConsole, console, emit_json
 from cangauge.errors import InputError
 from cangauge.identify.effect_search import parse_effect_ids
-from cangauge.validation import packs
+from cangauge.validation import packs, packs_run
 from cangauge.validation.packs_score import WIDTH, print_bench
 
 
@@ -38,7 +38,7 @@ def packs_check_command(  # noqa: PLR0917 - typer passes options by name
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help=f"Case; repeat for several: {', '.join(each.name for each in packs.CASES)}."
+            help=f"Case; repeat for several: {', '.join(each.name for each in packs_run.CASES)}."
             " Default: all.",
         ),
     ] = None,
@@ -82,6 +82,10 @@ def packs_check_command(  # noqa: PLR0917 - typer passes options by name
     sensor, the capacity and the voltage sensor. The table compares the filter with the Newton
     inverse and with counting, and judges its σ; targets that a row misses are named.
 
+    A second table compares with what the logs show: the capacity learned over three charges, the
+    current's offset, the current possible for 10 s, the energy left, and a weakened cell. The last
+    case runs a model on other packs' logs: how often, and how soon, a mismatch is reported.
+
     Constants of the filter may be chosen on the `_dev` packs; all others are judged only.
 
     Examples
@@ -92,7 +96,7 @@ def packs_check_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge packs-check --data recorded --json > packs.json 2> packs.txt`
     """
-    by_name = {each.name: each for each in packs.CASES}
+    by_name = {each.name: each for each in packs_run.CASES}
     for name in case or ():
         if name not in by_name:
             raise InputError(
@@ -100,8 +104,8 @@ def packs_check_command(  # noqa: PLR0917 - typer passes options by name
             )
     names, sizes, chosen = pack, logs, case
     if quick:
-        names, chosen = names or list(packs.DEVELOPMENT), chosen or list(packs.QUICK_CASES)
-        sizes, splits = sizes or list(packs.QUICK_SIZES), splits or 1
+        names, chosen = names or list(packs.DEVELOPMENT), chosen or list(packs_run.QUICK_CASES)
+        sizes, splits = sizes or list(packs_run.QUICK_SIZES), splits or 1
     effect_ids = () if effects == "none" else parse_effect_ids([effects])
     found = packs.load(data, names)
     with Progress(
@@ -109,12 +113,12 @@ def packs_check_command(  # noqa: PLR0917 - typer passes options by name
         console=console,
     ) as progress:  # fmt: skip
         estimating = progress.add_task("fitting and estimating", total=None)
-        bench = packs.run(
+        bench = packs_run.run(
             found,
             cases=[by_name[name] for name in chosen or by_name],
             sizes=sizes,
             splits=splits or 2,
-            judged_at_most=packs.QUICK_LOGS if quick else None,
+            judged_at_most=packs_run.QUICK_LOGS if quick else None,
             effects=effect_ids,
             jobs=jobs or os.cpu_count() or 1,
             seed=seed,

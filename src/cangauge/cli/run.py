@@ -64,7 +64,7 @@ def run_command(
 
     `cangauge run --config car.toml --state /var/lib/cangauge`
 
-    `cangauge run --config car.toml --dashboard 8642`  (the live page at http://127.0.0.1:8642/)
+    `cangauge run --config car.toml --dashboard`  (the live page at http://127.0.0.1:8642/)
     """
     given = config_values(options)
     loaded = load_config(config, given)
@@ -77,7 +77,8 @@ def run_command(
             # bokeh is slow to import, and few services serve the page.
             from cangauge.dashboard.launch import LivePage  # noqa: PLC0415
 
-            shown_on.append(stack.enter_context(LivePage(address)).show)
+            page = LivePage(address, lambda active: service.record(active=active))
+            shown_on.append(stack.enter_context(page).show)
         service.on_status = _each(shown_on)
         # Everything loaded so far lives until exit. Garbage collection of it would pause the loop,
         # and destroying it would delay the exit by a second.

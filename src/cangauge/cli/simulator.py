@@ -15,7 +15,6 @@ import numpy as np
 
 from cangauge.diagnosis.simulator import Run, SimulatorDiagnosis, start_of
 from cangauge.errors import InputError
-from cangauge.identify.starts import with_start
 from cangauge.logs.canonical import write_table
 from cangauge.logs.column_map import ColumnMap, ColumnSpec
 from cangauge.logs.log import Log
@@ -39,6 +38,8 @@ class SimulatorOptions:
         Value of `--columns`, for a table with a simulated voltage.
     temperature_c : float, optional
         Constant temperature [°C].
+    capacity_ah : float, optional
+        Charge from 100 to 0 % [Ah].
 
     Raises
     ------
@@ -50,6 +51,7 @@ class SimulatorOptions:
     function: str | None
     columns: str | None = None
     temperature_c: float | None = None
+    capacity_ah: float | None = None
 
     def __post_init__(self) -> None:
         if self.column is not None and self.function is not None:
@@ -63,7 +65,7 @@ class SimulatorOptions:
         """Whether a simulator takes the model's place."""
         return self.column is not None or self.function is not None
 
-    def run(self, log: Log, path: Path, initial_soc_pct: float | None) -> Run:
+    def run(self, log: Log, path: Path) -> Run:
         """Return a log with its simulated voltage.
 
         Parameters
@@ -71,16 +73,12 @@ class SimulatorOptions:
         log : Log
         path : Path
             File of the log.
-        initial_soc_pct : float, optional
-            SoC at the first row [%]; by default the log's own.
 
         Raises
         ------
         InputError
             If the column or function is missing, or the voltages do not fit the log.
         """
-        if initial_soc_pct is not None:
-            log = with_start(log, initial_soc_pct)
         if self.column is not None:
             return Run(log, self._of_column(log, path))
         return Run(log, self._of_function(log, start_of(log)))

@@ -87,6 +87,7 @@ def status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
     ]
     if record is not None:
         problem = f"; FAILING: {record['problem']}" if record["problem"] else ""
+        problem += "" if record["active"] else "; ended"
         rows.append(
             (
                 "recording",

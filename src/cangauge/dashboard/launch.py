@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from types import TracebackType
 from typing import Final, Self
 
@@ -35,6 +36,8 @@ class LivePage:
     Parameters
     ----------
     address : HttpAddress
+    on_record : callable, optional
+        Takes, in a thread, whether a recording shall run, once a viewer asks.
 
     Raises
     ------
@@ -42,7 +45,9 @@ class LivePage:
         If the address cannot be bound, or the system cannot hand sockets to another process.
     """
 
-    def __init__(self, address: HttpAddress) -> None:
+    def __init__(
+        self, address: HttpAddress, on_record: Callable[[bool], None] = lambda _: None
+    ) -> None:
         if os.name != "posix":
             raise InputError(
                 "the live page needs Linux or macOS", field="dashboard", cure="run without it"
@@ -50,6 +55,7 @@ class LivePage:
         self._address = address
         self._sockets = open_tcp(address, "dashboard")
         self.port = int(self._sockets[0].getsockname()[1])
+        self._on_record = on_record
         self._latest: Snapshot | None = None
         self._new = threading.Event()
         self._done = False
@@ -60,12 +66,13 @@ class LivePage:
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "cangauge.dashboard.server"],  # -P: not the working folder
             stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
             pass_fds=numbers,
             env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         )
         self._first = {"sockets": numbers, "token": self._address.token, "nice": NICE}
         self._thread.start()
+        threading.Thread(target=self._listen, name="cangauge-page-asks", daemon=True).start()
         host = f"[{self._address.host}]" if ":" in self._address.host else self._address.host
         emit(
             _LOG,
@@ -114,6 +121,13 @@ class LivePage:
             if not self._done:
                 text = f"the live page is no longer served: {error}; the estimate continues"
                 emit(_LOG, logging.WARNING, "dashboard.failed", text)
+
+    def _listen(self) -> None:
+        lines = self._process.stdout
+        assert lines is not None  # noqa: S101 - as it was made
+        with lines:
+            for line in lines:
+                self._on_record(json.loads(line)["active"])
 
     @staticmethod
     def _send(pipe: int, content: object) -> None:

@@ -1,8 +1,9 @@
 """Answer the browsers of the live page; the service's status arrives as lines on stdin.
 
 `python -m cangauge.dashboard.server` is started by `launch`, with listening sockets that it
-inherits. Each viewer asks for what is new since its last question, so a slow or hidden one costs
-nothing, here or in the service. End of stdin ends the process.
+inherits. Each viewer is sent what is new once it has taken what came before, so a slow or hidden
+one costs nothing, here or in the service. A line on stdout asks the service for a recording or for
+its end. End of stdin ends the process.
 """
 
 from __future__ import annotations
@@ -16,15 +17,19 @@ import os
 import secrets
 import signal
 import socket
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any, Final, cast
+from urllib.parse import urlsplit
 
 from bokeh.resources import Resources
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from tornado.httpserver import HTTPServer
 from tornado.web import Application, RequestHandler
+from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from cangauge._typing import FloatArray
 from cangauge.dashboard.charts import CHARTS, STATUS_COLOURS, STATUS_NAMES, chart_parts
@@ -36,6 +41,10 @@ from cangauge.service.http import MAX_BODY_BYTES, MAX_HEADER_BYTES, has_token
 COOKIE: Final = "cangauge"
 IDLE_S: Final = 30.0
 """Time after which a connection without a request is closed [s]."""
+ALIVE_S: Final = 0.25
+"""Longest time without a message to a viewer [s]."""
+PING_S: Final = 10.0
+"""Interval at which a viewer must show that it still listens [s]."""
 _LINE_BYTES: Final = 1 << 20
 _SCRIPTS: Final = ("bokeh.min.js",)
 _POLICY: Final = (
@@ -52,10 +61,13 @@ class Site:
     history : History
     token : str or None
         Token that a viewer must know.
+    ask : callable
+        Takes whether a recording shall run, once a viewer asks.
     """
 
-    def __init__(self, history: History, token: str | None) -> None:
+    def __init__(self, history: History, token: str | None, ask: Callable[[bool], None]) -> None:
         self.history = history
+        self.ask = ask
         self.token = token
         self.id = secrets.token_hex(8)
         """Key of this run; another one means that the row numbers start again."""
@@ -66,6 +78,7 @@ class Site:
             autoescape=True,
             undefined=StrictUndefined,
         )
+        self._news = asyncio.Event()
         script, elements = chart_parts()
         facts = {
             "reasons": REASONS,
@@ -83,6 +96,45 @@ class Site:
             **{name: _bokeh_file(name) for name in _SCRIPTS},
         }
 
+    def add(self, status: dict[str, Any]) -> None:
+        """Add a status, and wake those who wait for it."""
+        self.history.add(status)
+        news, self._news = self._news, asyncio.Event()
+        news.set()
+
+    async def news(self) -> None:
+        """Wait for the next status, at most `ALIVE_S`."""
+        with suppress(TimeoutError):
+            await asyncio.wait_for(self._news.wait(), ALIVE_S)
+
+    def answer(self, name: str, key: str, after: int) -> dict[str, Any]:
+        """Return the status, what is wrong, and the rows of a span that are new to a viewer.
+
+        Parameters
+        ----------
+        name : str
+            Name of the span; another one for no rows.
+        key : str
+            Key of the answer that the viewer had last.
+        after : int
+            Number of rows ever added to the span then.
+        """
+        history = self.history
+        content: dict[str, Any] = {"status": history.status, "troubles": history.troubles()}
+        content["latest"] = history.latest()
+        span = history.spans.get(name)
+        if span is None:
+            return content
+        present = f"{self.id}-{span.generation}"
+        return content | {
+            "span": name,
+            "key": present,
+            "is_known": key == present,
+            "added": span.added,
+            "every_ms": 1e3 * span.every_s,
+            "columns": shown_columns(span.rows(after if key == present else 0)),
+        }
+
     def application(self) -> Application:
         """Return the pages by their paths."""
         context = {"site": self}
@@ -92,13 +144,16 @@ class Site:
                 ("/enter", _Enter, context),
                 (r"/files/([a-z.]+)", _File, context),
                 ("/rows", _Rows, context),
+                ("/stream", _Stream, context),
                 ("/comparison", _Comparison, context),
                 ("/range.csv", _Range, context),
+                ("/recording", _Recording, context),
                 (f"/{LOG_NAME}", _LastHour, context),
             ],
             default_handler_class=_Nothing,
             default_handler_args=context,
             log_function=lambda _: None,
+            websocket_ping_interval=PING_S,
         )
 
 
@@ -199,21 +254,44 @@ class _File(_Page):
 class _Rows(_Page):
     def get(self) -> None:
         """Return the status, what is wrong, and the rows of a span after those already known."""
-        history = self.site.history
-        span = history.spans.get(self.get_query_argument("span", ""))
-        content: dict[str, Any] = {"status": history.status, "troubles": history.troubles()}
-        content["latest"] = history.latest()
-        if span is not None:
-            key = f"{self.site.id}-{span.generation}"
-            is_known = self.get_query_argument("key", "") == key
-            after = int(self.argument("after", 0.0)) if is_known else 0
-            content |= {
-                "key": key,
-                "is_known": is_known,
-                "added": span.added,
-                "columns": shown_columns(span.rows(after)),
-            }
-        self.send_json(content)
+        key, after = self.get_query_argument("key", ""), int(self.argument("after", 0.0))
+        self.send_json(self.site.answer(self.get_query_argument("span", ""), key, after))
+
+
+class _Stream(_Page, WebSocketHandler):
+    """Send what `/rows` answers, as it comes: from each question of the viewer on.
+
+    The next message is made once the viewer's connection has taken the one before.
+    """
+
+    def open(self, *_: str, **__: str) -> None:
+        self._question: dict[str, Any] = {}
+        self._is_asked = asyncio.Event()
+        self._sending = asyncio.ensure_future(self._send())
+
+    def on_message(self, message: str | bytes) -> None:
+        """Take a question: `{"span": "10min", "key": "", "after": 0}`."""
+        try:
+            question = json.loads(message)
+        except ValueError:
+            question = None
+        self._question = question if isinstance(question, dict) else {}
+        self._is_asked.set()
+
+    def on_close(self) -> None:
+        self._sending.cancel()
+
+    async def _send(self) -> None:
+        await self._is_asked.wait()
+        with suppress(WebSocketClosedError):
+            while True:
+                question = self._question
+                name, key, after = (question.get(part) for part in ("span", "key", "after"))
+                number = after if isinstance(after, int) and after >= 0 else 0
+                answer = self.site.answer(str(name), str(key), number)
+                self._question = question | {"key": answer.get("key"), "after": answer.get("added")}
+                await self.write_message(json.dumps(answer, ensure_ascii=False, allow_nan=False))
+                await self.site.news()
 
 
 class _Comparison(_Page):
@@ -232,6 +310,28 @@ class _Range(_Page):
         self.send_csv("cangauge-live.csv", _csv(rows[(time_ms >= start) & (time_ms <= end)]))
 
 
+class _Recording(_Page):
+    def post(self) -> None:
+        """Ask the service to begin or end its recording: `{"active": true}`.
+
+        Not for pages of other sites, of other ports of this machine neither: a browser states
+        whose page asks, and asks first before it sends JSON elsewhere, which is never allowed.
+        """
+        headers = self.request.headers
+        kind = headers.get("Content-Type", "").partition(";")[0].strip().lower()
+        origin = headers.get("Origin")
+        if origin is not None and urlsplit(origin).netloc != self.request.host:
+            self.refuse(403, "a page of another site may not ask for this")
+        elif kind != "application/json":
+            self.refuse(415, "send JSON")
+        elif (wanted := _wanted(self.request.body)) is None:
+            self.refuse(400, 'send {"active": true} or {"active": false}')
+        else:
+            self.site.ask(wanted)
+            self.set_status(202)
+            self.send_json({"active": wanted})
+
+
 class _LastHour(_Page):
     def get(self) -> None:
         self.send_csv(LOG_NAME, last_hour(self.site.history))
@@ -242,6 +342,15 @@ class _Nothing(_Page):
 
     def get(self) -> None:
         self.refuse(404, "there is nothing here: the live page is at /")
+
+
+def _wanted(body: bytes) -> bool | None:
+    try:
+        content = json.loads(body)
+    except ValueError:
+        return None
+    wanted = content.get("active") if isinstance(content, dict) else None
+    return wanted if isinstance(wanted, bool) else None
 
 
 def _csv(rows: FloatArray) -> str:
@@ -278,6 +387,11 @@ def _bokeh_file(name: str) -> str:
     return Path(Resources(mode="server").base_dir, "js", name).read_text(encoding="utf-8")
 
 
+def _ask_service(active: bool) -> None:
+    sys.stdout.write(json.dumps({"active": active}) + "\n")
+    sys.stdout.flush()
+
+
 async def _serve(site: Site, sockets: Sequence[socket.socket], lines: IO[bytes]) -> None:
     server = HTTPServer(
         site.application(),
@@ -292,7 +406,7 @@ async def _serve(site: Site, sockets: Sequence[socket.socket], lines: IO[bytes])
         lambda: asyncio.StreamReaderProtocol(reader), lines
     )
     while line := await reader.readline():
-        site.history.add(json.loads(line))
+        site.add(json.loads(line))
 
 
 def main() -> None:
@@ -304,7 +418,7 @@ def main() -> None:
     for each in sockets:
         each.setblocking(False)
     os.nice(settings["nice"])
-    asyncio.run(_serve(Site(History(), settings["token"]), sockets, lines))
+    asyncio.run(_serve(Site(History(), settings["token"], _ask_service), sockets, lines))
 
 
 if __name__ == "__main__":

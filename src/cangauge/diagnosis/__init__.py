@@ -22,6 +22,8 @@ cross_validation    errors on held-out rows, closed fraction, SoC error
 extended_model      refined amplitudes, change points; the extended model file
 error_breakdown     shares of the error, worst segments, maps
 caveats             limits of what the logs can show
+profiles            current profiles of tests within limits
+next_test           which test would separate the likely causes best
 ==================  ==============================================================================
 
 The method is described in docs/diagnosis.md.

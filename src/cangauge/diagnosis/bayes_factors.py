@@ -172,31 +172,6 @@ def mean_square_v2(
     return float(np.sum((log.products @ weights) @ weights) / np.sum(log.counts))
 
 
-def expected_mean_square_v2(log: NormalEquations, references: Posterior) -> float:
-    """Return the mean square error that a diagnosed log would have without a cause [V²].
-
-    Sum of the references' error, the per-log effects, and the uncertainty of coefficients and
-    structure at the operating points of this log.
-
-    Parameters
-    ----------
-    log : NormalEquations
-        Of a diagnosed log.
-    references : Posterior
-        Of the references alone.
-    """
-    error, layout = references.error, references.hypotheses.diagnosed_layout
-    shared, per_log = layout.shared, layout.per_log
-    products = log.products.sum(axis=0)
-    balance = 1.0 / np.sqrt(np.diag(references.precision))
-    covariance = np.linalg.inv(references.precision * balance * balance[:, None])
-    covariance *= balance * balance[:, None]
-    squares = float(np.sum(products[np.ix_(shared, shared)] * covariance))
-    squares += float(np.diag(products)[per_log] @ np.array(error.per_log_std) ** 2)
-    squares += float(log.counts @ np.array(error.scale_v2))
-    return squares / float(np.sum(log.counts))
-
-
 def excess_chi_square(
     posterior: Posterior,
     diagnosed: Sequence[NormalEquations],

@@ -86,18 +86,17 @@ def design_matrix(
     """
     voltage_model = model.model
     rows = sampled.rows
-    cached = sampled.with_history_cache()  # until all columns are computed
-    slow = cached.signals.history.lagged_a(SLOW_POLARISATION_S)
+    slow = sampled.signals.history.at(sampled.at).lagged_a(SLOW_POLARISATION_S)
     per_log_states = np.column_stack(
         [
-            -model.pack.resistance_ohm * slow[sampled.at],
+            -model.pack.resistance_ohm * slow,
             -model.pack.resistance_ohm * sampled.log.current_a[sampled.at],
         ]
     )
-    smooth = with_modelled_voltage(cached, model)
+    smooth = with_modelled_voltage(sampled, model)
     at_model = (residual(smooth, model), pack_state(smooth, model))
     if structured is not None:
-        smooth_structured = with_modelled_voltage(cached, structured)
+        smooth_structured = with_modelled_voltage(sampled, structured)
         at_structured = (
             residual(smooth_structured, structured),
             pack_state(smooth_structured, structured),
@@ -120,7 +119,7 @@ def design_matrix(
         else effect_columns(smooth, model, candidate, *at_model)
         for candidate in candidates
     )
-    residual_v = residual(cached, structured or model)
+    residual_v = residual(sampled, structured or model)
     if structured is not None:
         change = structured.model.coefficients - voltage_model.coefficients
         residual_v += coefficients @ change + _structure_v(model, structured, candidates, effects)

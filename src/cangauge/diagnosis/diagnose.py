@@ -21,9 +21,9 @@ from cangauge.diagnosis.caveats import (
     temperature_step_caveat,
 )
 from cangauge.diagnosis.classifier import (
+    EXPECTED_BEYOND,
     MIN_LOG_BAYES,
     NONE,
-    TEMPERATURE_EFFECTS,
     UNKNOWN,
 )
 from cangauge.diagnosis.cross_validation import (
@@ -160,7 +160,7 @@ class Diagnosis:
             f"{verdict.cause} (probability {verdict.probability:.2f}{ambiguous}): gap of {sizes};"
             f" {self.extended_rmse_v:.2f} V with it on held-out rows{worse}."
         )
-        if not self.problem.covered and verdict.cause in TEMPERATURE_EFFECTS:
+        if not self.problem.covered and verdict.cause in EXPECTED_BEYOND:
             text += (
                 " No reference covers these temperatures, where healthy cells behave like that:"
                 " this does not indicate a fault."

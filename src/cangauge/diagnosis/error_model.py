@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
-from cangauge.diagnosis.bayes_factors import mean_square_v2
+from cangauge.diagnosis.bayes_factors import excess_chi_square, mean_square_v2
 from cangauge.diagnosis.design_matrix import PER_LOG_STATES
 from cangauge.diagnosis.hypotheses import Hypotheses
 from cangauge.diagnosis.linear_gaussian import (
@@ -177,12 +177,13 @@ def with_overdispersion(
         per_log=tuple(range(size, len(columns))),
     )
     ratios: dict[str, list[float]] = {}
-    mean_squares = []
+    mean_squares, excess = [], []
     for number, log in enumerate(diagnosed):
         others = [other for k, other in enumerate(references) if k != number]
         posterior = marginalize(subset, others, [log], error)
         without = marginalize(subset, others, [], error)
         mean_squares.append(mean_square_v2(subset, log, without.mean))
+        excess.append(excess_chi_square(posterior, [log], without.chi_square))
         for k, candidate in enumerate(subset.candidates):
             at = posterior.slice_of(k)
             curvature, gradient = posterior.curvature[at, at], posterior.gradient[at]
@@ -202,6 +203,7 @@ def with_overdispersion(
         error,
         overdispersion={name: max(value, usual) for name, value in overdispersion.items()},
         reference_v2=float(np.average(mean_squares, weights=weight)),
+        reference_excess=tuple(excess),
     )
 
 

@@ -29,7 +29,7 @@ from cangauge.diagnosis.linear_gaussian import (
 from cangauge.diagnosis.problem import DiagnosisProblem
 from cangauge.diagnosis.structure import select_structure, with_structure
 from cangauge.inference.linearized import pack_state, residual, with_modelled_voltage
-from cangauge.model.effects.base import BOUND_MARGIN, Effect, Pack, Values
+from cangauge.model.effects.base import BOUND_MARGIN, Effect, Pack, PackState, Values
 from cangauge.model.effects.library import STEP, Candidate, effect_entries, shape_key
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Made, Model, Ranges
@@ -103,12 +103,13 @@ def extend(problem: DiagnosisProblem, accepted: Sequence[Score]) -> Extension:
     accepted : sequence of Score
         Of the verdict; without any, the model has the references' coefficients and structure only.
     """
-    reduced = _with_selected_structure(problem)
+    pieces = select_structure(problem.hypotheses, problem.reference_equations, problem.error)
+    reduced = _with_structure_of(problem, pieces)
     if not accepted:
         return Extension(*_healthy_model(reduced))
     # All structure is marginalised here, not only what the extended model has.
     causes, covariance, explained = _refine_amplitudes(problem, _initial_causes(reduced, accepted))
-    base, remarks = _healthy_model(_with_selected_structure(explained))
+    base, remarks = _healthy_model(_with_structure_of(explained, pieces))
     # Bounds depend on the pack, which has changed with the coefficients.
     causes = [
         replace(cause, values=cause.candidate.effect.clipped(cause.values, base.pack))
@@ -126,7 +127,7 @@ def extend(problem: DiagnosisProblem, accepted: Sequence[Score]) -> Extension:
     )
 
 
-def _with_selected_structure(problem: DiagnosisProblem) -> DiagnosisProblem:
+def _with_structure_of(problem: DiagnosisProblem, structure: tuple[int, ...]) -> DiagnosisProblem:
     """Return the problem with no more structure than the references need.
 
     Judged by the error expected of the diagnosed logs: beyond the references' temperatures that is
@@ -134,9 +135,9 @@ def _with_selected_structure(problem: DiagnosisProblem) -> DiagnosisProblem:
     voltage better and the SoC worse.)
     """
     before = problem.hypotheses
-    structure = select_structure(before, problem.reference_equations, problem.error)
     hypotheses = replace(before, structure=structure)
     at = [before.reference_columns.index(k) for k in hypotheses.reference_columns]
+    columns = before.reference_amplitudes(at)
     return replace(
         problem,
         hypotheses=hypotheses,
@@ -144,6 +145,7 @@ def _with_selected_structure(problem: DiagnosisProblem) -> DiagnosisProblem:
             replace(matrix, effects=tuple(matrix.effects[k] for k in at))
             for matrix in problem.references
         ),
+        reference_equations=tuple(log.columns(columns) for log in problem.reference_equations),
     )
 
 
@@ -247,12 +249,7 @@ def _best_onset(
 
     def columns_of(onset_s: float) -> list[FloatArray]:
         trial = {**values, name: onset_s}
-        columns = []
-        for matrix, state in zip(logs, states, strict=True):
-            extra_v = effect.extra_voltage(state, trial, model.model, model.pack)
-            rows = matrix.sampled.at
-            columns.append(np.zeros(rows.size) if extra_v is None else extra_v[rows])
-        return columns
+        return [_extra_v(effect, state, trial, model) for state in states]
 
     residual_v = unexplained([residual(matrix.sampled, model) for matrix in logs])
     least_v2 = MIN_ONSET_PART * float(np.sum(np.concatenate(columns_of(0.0)) ** 2))
@@ -268,6 +265,12 @@ def _best_onset(
     best = float(max(tried, key=explained_v2))
     tried = [best, *np.linspace(max(best - step_s, 0.0), best + step_s, ONSETS)]
     return float(max(tried, key=explained_v2))
+
+
+def _extra_v(effect: Effect, state: PackState, values: Values, model: ExtendedModel) -> FloatArray:
+    """Return the voltage that an effect adds on the rows of a state [V]."""
+    extra_v = effect.extra_voltage_at(state, values, model.model, model.pack)
+    return np.zeros_like(state.time_s) if extra_v is None else extra_v
 
 
 def _refine_parameters(
@@ -290,11 +293,20 @@ def _refine_parameters(
         values = (centre + unit * scale).tolist()
         return {p.name: value for p, value in zip(parameters, values, strict=True)} | constants
 
-    logs = [matrix.sampled.with_history_cache() for matrix in problem.diagnosed]
+    logs = [matrix.sampled for matrix in problem.diagnosed]
+
+    base_v = [residual(log, model) for log in logs]
+    states = [pack_state(log, model) for log in logs]
 
     def errors(unit: FloatArray) -> FloatArray:
-        trial = model.with_effect(effect, values_of(unit))
-        volts = [residual(log, trial) for log in logs]
+        trial = values_of(unit)
+        if effect.adds_voltage_only:
+            volts = [
+                before_v - _extra_v(effect, state, trial, model)
+                for before_v, state in zip(base_v, states, strict=True)
+            ]
+        else:
+            volts = [residual(log, model.with_effect(effect, trial)) for log in logs]
         return np.concatenate([*volts, prior * unit])
 
     begin = (np.array([start[parameter.name] for parameter in parameters]) - centre) / scale
@@ -427,7 +439,7 @@ def _at_causes(
     tangents: bool = True,
 ) -> DesignMatrix:
     """Return a design matrix with the causes in its residual, and their tangents there."""
-    sampled, base = matrix.sampled.with_history_cache(), problem.structured or problem.model
+    sampled, base = matrix.sampled, problem.structured or problem.model
     with_all = _with_causes(base, causes)
     change_v = residual(sampled, with_all) - residual(sampled, base)
     effects = list(matrix.effects)

@@ -120,10 +120,32 @@ class Hypotheses:
             residual=end,
         )
 
+    @cached_property
+    def reference_places(self) -> Indices:
+        """Place of each column of a reference among those without duplicates.
+
+        Structure may be a per-log effect as well.
+        """
+        p, columns = self.column_scale.size, self.reference_columns
+        unique = tuple(dict.fromkeys(columns))
+        first = p + np.concatenate(([0], np.cumsum(np.diff(self.offsets)[list(unique)])))
+        place = {k: np.arange(first[at], first[at + 1]) for at, k in enumerate(unique)}
+        states = first[-1] + np.arange(len(PER_LOG_STATES) + 1)  # and the residual
+        parts = [np.arange(p), *(place[k] for k in columns), states]
+        return np.concatenate(parts).astype(np.intp)
+
     @property
     def reference_columns(self) -> tuple[int, ...]:
         """Candidates with columns in the references: shared structure, then per-log effects."""
         return (*self.structure, *self.per_log)
+
+    def reference_amplitudes(self, kept: Sequence[int]) -> Indices:
+        """Return a reference's columns with only some of `reference_columns`, by their place."""
+        p, widths = self.column_scale.size, np.diff(self.offsets)[list(self.reference_columns)]
+        first = p + np.concatenate(([0], np.cumsum(widths)))
+        parts = [np.arange(first[k], first[k + 1]) for k in kept]
+        states = first[-1] + np.arange(len(PER_LOG_STATES) + 1)  # and the residual
+        return np.concatenate([np.arange(p), *parts, states]).astype(np.intp)
 
     def amplitudes_of(self, chosen: Sequence[int]) -> Indices:
         """Return the amplitude indices of some candidates."""

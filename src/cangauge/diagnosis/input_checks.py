@@ -1,6 +1,7 @@
 """Input checks: refuse logs of another pack, dead channels and duplicates; remove outliers.
 
-An outlier is removed and reported; everything else raises an error.
+An outlier is removed and reported. A count beyond full or empty is diagnosed if some start explains
+it. Everything else raises an error.
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
+from cangauge.inference.rows import SOC_TOLERANCE_PCT, FitOptions
 from cangauge.logs.log import Log
+from cangauge.model.coulomb_counting import counted_soc_pct
 from cangauge.model.extended import ExtendedModel
 
 LEAST_PART, MOST_PART = 0.7, 1.4
@@ -40,6 +43,10 @@ RESPONSE_S, RESPONSE_PART = 5.0, 0.25
 """Time within which the voltage responds to a current [s], even with a late sensor, and the part of
 the ohmic drop that it reaches."""
 
+MOST_COUNTED_PCT = 150.0
+"""Span of the counted SoC that a wrong capacity or current gain explains at most: their physical
+bounds are a third of the value."""
+
 MIN_ROWS = 100
 """Rows that a search for outliers needs."""
 
@@ -65,6 +72,29 @@ def check_inputs(
         kept.append(clean)
         sentences += [_outlier_sentence(log, int(row)) for row in rows]
     return kept[: len(logs)], kept[len(logs) :], sentences
+
+
+def check_count(log: Log, options: FitOptions) -> None:
+    """Raise InputError if no start explains a log whose counted SoC leaves 0–100 %.
+
+    A wrong start, capacity or efficiency is a cause to find: the voltage says where the SoC is.
+    """
+    soc = counted_soc_pct(log, options.capacity_ah, options.initial_soc_pct)
+    low, high = float(soc.min()), float(soc.max())
+    if low >= -SOC_TOLERANCE_PCT and high <= 100.0 + SOC_TOLERANCE_PCT:
+        return
+    too_much = high - low > MOST_COUNTED_PCT
+    # As the SoC rises so does the voltage, whatever the start.
+    if too_much or np.corrcoef(soc, log.voltage_v)[0, 1] < 0.0:
+        reason = "no start explains it" if too_much else "the voltage moves the other way"
+        raise InputError(
+            f"the SoC counted with {options.capacity_ah:.2f} Ah runs from {high:.1f} to"
+            f" {low:.1f} %: {reason}",
+            source=log.source or log.name,
+            field="soc_pct",
+            cure="check --capacity-ah and the sign of current (positive must discharge; see"
+            " `cangauge inspect`)",
+        )
 
 
 def without_outliers(log: Log, model: ExtendedModel) -> tuple[Log, NDArray[np.intp]]:

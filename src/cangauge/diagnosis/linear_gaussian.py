@@ -19,6 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from cangauge._typing import FloatArray
@@ -56,6 +57,8 @@ class ErrorModel:
     1 where not listed."""
     reference_v2: float = 0.0
     """Mean square error of left-out references, per-log effects included [V²]."""
+    reference_excess: tuple[float, ...] = ()
+    """Excess chi-square of each left-out reference (`bayes_factors.excess_chi_square`)."""
     information_weight: float = 1.0
     """Weight of the model file's information: below 1 where references contradict it."""
     structure: Mapping[str, float] = field(default_factory=dict)
@@ -81,6 +84,10 @@ class NormalEquations:
     counts: FloatArray
     """Haar coefficients of each scale, shape (SCALES,); reduced where rows have less weight."""
     _last_weighted: dict[tuple[float, ...], FloatArray] = field(default_factory=dict, repr=False)
+
+    def columns(self, kept: NDArray[np.intp]) -> NormalEquations:
+        """Return the products of some columns."""
+        return NormalEquations(self.products[:, kept[:, None], kept], self.counts)
 
     def inflated(self, factor: float) -> NormalEquations:
         """Return the products for an error variance `factor` times as large."""

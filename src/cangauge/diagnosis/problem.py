@@ -24,7 +24,7 @@ from cangauge.diagnosis.error_model import (
     with_overdispersion,
 )
 from cangauge.diagnosis.hypotheses import Hypotheses
-from cangauge.diagnosis.input_checks import check_inputs
+from cangauge.diagnosis.input_checks import check_count, check_inputs
 from cangauge.diagnosis.linear_gaussian import (
     ErrorModel,
     NormalEquations,
@@ -32,11 +32,16 @@ from cangauge.diagnosis.linear_gaussian import (
     marginalize,
     normal_equations,
 )
-from cangauge.diagnosis.structure import learn_structure, reference_equations, reference_matrices
+from cangauge.diagnosis.structure import (
+    learn_structure,
+    reference_equations,
+    reference_matrices,
+    reference_normal_equations,
+)
 from cangauge.errors import InputError
 from cangauge.identify.starts import start_by_model, with_start
 from cangauge.inference.linearized import residual
-from cangauge.inference.rows import FitOptions, SampledLog, sample_log
+from cangauge.inference.rows import SOC_TOLERANCE_PCT, FitOptions, SampledLog, sample_log
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.resample import dequantize, resample, usual_step_k
 from cangauge.model.effects.library import LIBRARY, Candidate, candidates
@@ -93,6 +98,8 @@ class DiagnosisProblem:
     error: ErrorModel
     references: tuple[DesignMatrix, ...]
     diagnosed: tuple[DesignMatrix, ...]
+    reference_equations: tuple[NormalEquations, ...]
+    """Normal equations of the references."""
     given: ExtendedModel
     """Given model with its own temperature range; the gap is its error."""
     covered: bool = True
@@ -115,11 +122,6 @@ class DiagnosisProblem:
     def diagnosed_errors_v(self) -> tuple[FloatArray, ...]:
         """Errors of the given model on each diagnosed log, shape (m,) [V]."""
         return tuple(residual(matrix.sampled, self.given) for matrix in self.diagnosed)
-
-    @cached_property
-    def reference_equations(self) -> tuple[NormalEquations, ...]:
-        """Normal equations of the references."""
-        return reference_equations(self.references, self.hypotheses)
 
     @cached_property
     def diagnosed_equations(self) -> tuple[NormalEquations, ...]:
@@ -213,9 +215,10 @@ def build_problem(
     library = [effect for effect in LIBRARY.values() if effect.id not in leave_out]
     choices = candidates(library, widened.pack, logs[0].time_s, for_diagnosis=True)
     # Steps of the temperature are visible only before averaging.
-    of_logs = [sample_log(resample(dequantize(log)), options) for log in logs]
-    without_start = replace(options, initial_soc_pct=None)
-    of_references = [sample_log(resample(dequantize(log)), without_start) for log in references]
+    for log in logs:
+        check_count(log, options)
+    of_logs = [_sampled(log, options, soc_tolerance_pct=np.inf) for log in logs]
+    of_references = [_sampled(log, replace(options, initial_soc_pct=None)) for log in references]
     covered = not of_references or temperatures_covered(of_references, of_logs)
     hypotheses = _hypotheses(
         model,
@@ -227,6 +230,7 @@ def build_problem(
     error = error_from_noise(model.noise, model.rate_hz, hypotheses)
     known, structured = widened, None
     matrices: tuple[DesignMatrix, ...] = ()
+    equations: tuple[NormalEquations, ...] = ()
     if of_references:
         _LOG.info("learning the error model from the references")
         several = len(of_references) > 1
@@ -240,7 +244,7 @@ def build_problem(
         _LOG.info("learning the structure from the references")
         learned = learn_structure(of_references, widened, hypotheses, equations, expected)
         known, structured, hypotheses = learned.model, learned.structured, learned.hypotheses
-        matrices = learned.matrices
+        matrices, equations = learned.matrices, learned.equations
         if several:
             diagnosed_like = [
                 _covered_equations(number, learned.matrices, learned.equations, hypotheses, given)
@@ -263,6 +267,7 @@ def build_problem(
         error=error,
         references=matrices,
         diagnosed=tuple(diagnosed),
+        reference_equations=equations,
         given=given,
         covered=covered,
         structured=structured,
@@ -270,6 +275,14 @@ def build_problem(
         temperature_source=model.temperature_source,
         outliers=tuple(outliers),
     )
+
+
+def _sampled(
+    log: Log, options: FitOptions, *, soc_tolerance_pct: float = SOC_TOLERANCE_PCT
+) -> SampledLog:
+    """Return a log with its rows, and a history of its current that all columns share."""
+    sampled = sample_log(resample(dequantize(log)), options, soc_tolerance_pct=soc_tolerance_pct)
+    return sampled.with_history_cache()
 
 
 def with_wider_range(model: ExtendedModel, logs: Sequence[Log]) -> ExtendedModel:
@@ -378,7 +391,7 @@ def _covered_equations(
     weight = soc_weight(matrices[number].sampled, others, given.model.soc_range_pct)
     if np.all(weight == 1.0) or np.mean(weight > 0.0) < LEAST_COVERED:
         return equations[number]
-    return normal_equations(matrices[number], hypotheses.column_scale, weight)
+    return reference_normal_equations(matrices[number], hypotheses, weight)
 
 
 def _error_beyond(error: ErrorModel) -> ErrorModel:

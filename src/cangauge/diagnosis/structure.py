@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.design_matrix import DesignMatrix, candidates_for, design_matrix
@@ -169,25 +170,34 @@ def select_structure(
     """
     whole = marginalize(hypotheses, references, [], error)
     right = whole.precision @ whole.mean
-    prior = structure_precision(hypotheses, error)
     p = hypotheses.column_scale.size
-    spans = _spans(hypotheses)
-
-    def log_probability(pieces: Sequence[int]) -> float:
-        at = np.concatenate([np.arange(p), *(np.arange(*spans[j]) for j in pieces)])
-        log_prior = 0.5 * float(np.sum(np.log(prior[at[p:] - p])))
-        return log_gaussian_integral(whole.precision[np.ix_(at, at)], right[at]) + log_prior
-
+    prior = structure_precision(hypotheses, error)
+    pieces = [np.arange(*span) - p for span in _spans(hypotheses)]
+    # What the coefficients and the pieces chosen so far leave of the rest.
+    known = np.linalg.solve(whole.precision[:p, :p], whole.precision[:p, p:])
+    precision = whole.precision[p:, p:] - whole.precision[p:, :p] @ known
+    right = right[p:] - known.T @ right[:p]
     chosen: list[int] = []
-    best = log_probability(chosen)
-    while len(chosen) < min(MAX_PIECES, len(hypotheses.structure)):
-        rest = [j for j in range(len(hypotheses.structure)) if j not in chosen]
-        values = [log_probability([*chosen, j]) for j in rest]
-        if max(values) < best + MIN_LOG_GAIN:
+    while len(chosen) < min(MAX_PIECES, len(pieces)):
+        rest = [j for j in range(len(pieces)) if j not in chosen]
+        gains = [_log_gain(precision, right, prior, pieces[j]) for j in rest]
+        if max(gains) < MIN_LOG_GAIN:
             break
-        best = max(values)
-        chosen.append(rest[int(np.argmax(values))])
+        chosen.append(rest[int(np.argmax(gains))])
+        at = pieces[chosen[-1]]
+        known = np.linalg.solve(precision[np.ix_(at, at)], precision[at])
+        right = right - known.T @ right[at]
+        precision = precision - precision[:, at] @ known
     return tuple(hypotheses.structure[j] for j in chosen)
+
+
+def _log_gain(
+    precision: FloatArray, right: FloatArray, prior: FloatArray, at: NDArray[np.intp]
+) -> float:
+    """Return the increase of the log probability by one piece's amplitudes."""
+    return log_gaussian_integral(precision[np.ix_(at, at)], right[at]) + 0.5 * float(
+        np.sum(np.log(prior[at]))
+    )
 
 
 def with_structure(
@@ -236,7 +246,7 @@ def reference_matrices(
 ) -> tuple[DesignMatrix, ...]:
     """Return the references' design matrices, with the columns `Hypotheses.reference_columns`."""
     columns = hypotheses.reference_columns
-    unique = tuple(dict.fromkeys(columns))  # structure may be a per-log effect as well
+    unique = tuple(dict.fromkeys(columns))
     at = [unique.index(k) for k in columns]
     found = []
     for item in references:
@@ -249,4 +259,15 @@ def reference_equations(
     matrices: Sequence[DesignMatrix], hypotheses: Hypotheses
 ) -> tuple[NormalEquations, ...]:
     """Return the references' normal equations."""
-    return tuple(normal_equations(matrix, hypotheses.column_scale) for matrix in matrices)
+    return tuple(reference_normal_equations(matrix, hypotheses) for matrix in matrices)
+
+
+def reference_normal_equations(
+    matrix: DesignMatrix, hypotheses: Hypotheses, weight: FloatArray | None = None
+) -> NormalEquations:
+    """Return a reference's normal equations; columns that have two roles are multiplied once."""
+    columns = hypotheses.reference_columns
+    first = [columns.index(k) for k in dict.fromkeys(columns)]
+    unique = replace(matrix, effects=tuple(matrix.effects[k] for k in first))
+    equations = normal_equations(unique, hypotheses.column_scale, weight)
+    return equations.columns(hypotheses.reference_places)

@@ -13,9 +13,9 @@ standard deviations:
     S ← S − g·a·(i − o)·Δt,   a = 100/(3600·reference capacity)
     U = OCV(S) + kt·(T − T_r) + (1 + r)·Σ Rj·I(t − dj) − R·o + b + l + v + c(S)·ξ(S) + fast error
 
-The curve's standard deviation c is that of the lasting error in volts and, where the curve is
-steep, `AXIS_STD_PCT` of SoC times its slope: the knees of a curve are placed by the SoC of its
-logs, and move with temperature and current.
+The curve's standard deviation c is that of the lasting error in volts, that of the identified curve
+where few logs have been, and, where the curve is steep, `AXIS_STD_PCT` of SoC times its slope: the
+knees of a curve are placed by the SoC of its logs, and move with temperature and current.
 
 The curve's error belongs to the SoC, not to the drive, so it is the same each time that the SoC
 passes: no number of charges averages it out, and the standard deviation of the capacity stops
@@ -59,6 +59,7 @@ from cangauge.estimation.ekf import (
     OUTLIER_SIGMAS,
     UNKNOWN_SOC_STD_PCT,
 )
+from cangauge.estimation.measurement_noise import CurveFunctions
 from cangauge.estimation.state import ChargeSinceUpdate, HealthState, ResistanceState
 from cangauge.model.model_file import ModelNoise
 from cangauge.model.voltage_model import Curve, soc_from_ocv
@@ -191,6 +192,7 @@ class HealthEstimator:
         self._slow_var = noise.slow_std_v**2
         self._slow_time_s = noise.slow_time_s
         self._lasting_var = noise.lasting_std_v**2
+        self._functions = CurveFunctions(noise)
         self._reference_ah = capacity_ah
         self._pct_per_as = 100.0 / (3600.0 * capacity_ah)
         self._offset_std_a = OFFSET_STD_PER_AH * capacity_ah
@@ -415,8 +417,8 @@ class HealthEstimator:
         if abs(there.soc_pct - soc_pct) > FAR_PCT:
             slope = (there_v - ocv_v) / (there.soc_pct - soc_pct)
         row[_S] = slope
-        axis_v = AXIS_STD_PCT * there_slope
-        std_v = math.sqrt(self._lasting_var + axis_v * axis_v)
+        axis_v, curve_v = AXIS_STD_PCT * there_slope, self._functions.std_v(there.soc_pct)
+        std_v = math.sqrt(self._lasting_var + axis_v * axis_v + curve_v * curve_v)
         below, weights, between_var = _between_nodes(there.soc_pct)
         row[_C + below], row[_C + below + 1] = std_v * weights[0], std_v * weights[1]
         shared_by = max(0.5 * NODE_PCT / max(moved_pct, SHORTEST_PCT), 1.0)

@@ -133,7 +133,7 @@ class KnownLimits(NamedTuple):
 
 
 class Power(NamedTuple):
-    """Possible currents, both positive, and the energy left; NaN while the SoC is unknown."""
+    """Possible currents, both positive, and the energy left; NaN where not known."""
 
     discharge_a: float = _NAN
     """Discharge current possible for 10 s [A]."""
@@ -192,7 +192,8 @@ class PowerModel:
         line : DelayLine
             Currents up to now.
         """
-        if math.isnan(now.soc_pct) or not line.filled_s > 0.0:
+        # A learned resistance of the wrong sign: those of the model are not the pack's.
+        if math.isnan(now.soc_pct) or not line.filled_s > 0.0 or now.health.resistance_ratio <= 0.0:
             return Power()
         level = self._level(now)
         moments = self._moments(now, line)
@@ -257,7 +258,11 @@ class PowerModel:
         limit_v: float,
         nearest: Callable[..., tuple[float, float]],
     ) -> tuple[float, float]:
-        """Return the current that meets a voltage first within the horizon, and its std [A]."""
+        """Return the current that meets a voltage first within the horizon, and its std [A].
+
+        A model of constant currents knows the sum of its resistances, but not when each acts: at a
+        moment at which its voltage would rise with the current, it knows no limit. NaN: at none.
+        """
         per_as = self._pct_per_as(now)
         found = []
         for unknown_v, ohm, past_v, seconds in moments:
@@ -270,12 +275,15 @@ class PowerModel:
                 current_a += step_a
                 if abs(step_a) < _CLOSE_A:
                     break
+            volt_per_a = slope * per_a - ohm
+            if volt_per_a <= 0.0:
+                continue
             drop_v = past_v + ohm * current_a - now.health.resistance_ratio * now.drop_v
             error_v = now.health.resistance_std / now.health.resistance_ratio * drop_v
             variance = self._fast_var + level[1] + error_v**2 + unknown_v**2
             variance += self._curvature_v(now, per_a * current_a) ** 2
-            found.append((current_a, math.sqrt(variance) / (slope * per_a - ohm)))
-        return nearest(found)
+            found.append((current_a, math.sqrt(variance) / volt_per_a))
+        return nearest(found) if found else (_NAN, _NAN)
 
     def _curvature_v(self, now: PackNow, taken_pct: float) -> float:
         """Return how much the fall of the OCV differs one standard deviation lower [V]."""

@@ -13,7 +13,7 @@ from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import BRIDGE_S
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.extended import ExtendedModel, Prediction
-from cangauge.model.voltage_model import VoltageModel, soc_from_ocv
+from cangauge.model.voltage_model import VoltageModel, soc_from_ocv, socs_from_ocv
 
 JOULE_PER_KWH = 3.6e6
 
@@ -57,7 +57,7 @@ def energy_balance(logs: Sequence[Log], slope_ohm: float) -> Energy:
         regenerated_kwh=regenerated / JOULE_PER_KWH,
         net_kwh=net / JOULE_PER_KWH,
         heat_kwh=heat / JOULE_PER_KWH,
-        efficiency_pct=100.0 * net / (net + heat) if net + heat > 0.0 else float("nan"),
+        efficiency_pct=100.0 * net / (net + heat) if net > 0.0 else float("nan"),
     )
 
 
@@ -92,17 +92,13 @@ class LogFit:
 
 def evaluate(model: VoltageModel, rows: FitRows) -> LogFit:
     """Return the fit of a voltage model to the rows of a log."""
-    newton = np.empty(len(rows))
-    guess = 50.0
-    for k in range(len(rows)):
-        offset_v = model.offset_at(float(rows.temperature_c[k]), rows.delayed_current_a[k].tolist())
-        guess = soc_from_ocv(model, float(rows.voltage_v[k]) - offset_v, guess).soc_pct
-        newton[k] = guess
+    voltage_v = model.voltage(rows.soc_pct, rows.temperature_c, rows.delayed_current_a)
+    without_ocv_v = voltage_v - model.pseudo_ocv(rows.soc_pct)
     return LogFit(
         rows=rows,
         pseudo_ocv_v=model.pseudo_ocv(rows.soc_pct, rows.temperature_c),
-        voltage_model_v=model.voltage(rows.soc_pct, rows.temperature_c, rows.delayed_current_a),
-        soc_newton_pct=newton,
+        voltage_model_v=voltage_v,
+        soc_newton_pct=socs_from_ocv(model, rows.voltage_v - without_ocv_v),
     )
 
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,14 @@ from cangauge._formatting import duration
 from cangauge._typing import FloatArray
 from cangauge._version import __version__
 from cangauge.errors import InputError
+from cangauge.identify.assemble import (
+    WHOLE_LOGS,
+    coefficients_of,
+    common_name,
+    information_of_rows,
+    log_sha256,
+    noise_of,
+)
 from cangauge.identify.effect_search import FittedEffects, fit_effects, parse_effect_ids
 from cangauge.identify.evaluate import (
     Energy,
@@ -26,7 +33,7 @@ from cangauge.identify.evaluate import (
     slope_resistance,
 )
 from cangauge.identify.starts import Start, find_starts, given_starts
-from cangauge.identify.voltage_fit import KT, fit_voltage_model, held_out_errors, stacked
+from cangauge.identify.voltage_fit import fit_voltage_model, held_out_errors, stacked
 from cangauge.inference.error_model import KNOTS_PCT, LogResidual, describe_error
 from cangauge.inference.least_squares import Solution
 from cangauge.inference.rows import (
@@ -47,8 +54,6 @@ from cangauge.model.coulomb_counting import (
 from cangauge.model.effects.library import effect_entries
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import (
-    Coefficient,
-    CurveNoise,
     Information,
     Made,
     Model,
@@ -230,12 +235,7 @@ def fit(
     names = [*BASIS_NAMES, "kt", *resistance_names(len(options.delay_s))]
     model = Model(
         name=name or common_name([log.name for log in logs]),
-        coefficients={
-            key: Coefficient(value=float(value), std_error=float(error), unit=_unit(key))
-            for key, value, error in zip(
-                names, solution.coefficients, solution.std_error, strict=True
-            )
-        },
+        coefficients=coefficients_of(names, solution),
         epsilon=voltage_model.epsilon,
         t_ref_c=voltage_model.t_ref_c,
         delays_s=list(voltage_model.delay_s),
@@ -312,31 +312,6 @@ def _check_logs(logs: Sequence[Log]) -> None:
         )
 
 
-def common_name(names: Sequence[str]) -> str:
-    """Return a name for several logs: their common prefix and their number.
-
-    Examples
-    --------
-    >>> common_name(["TripA01", "TripA03", "TripA05"])
-    'TripA (3 logs)'
-    """
-    if len(names) == 1:
-        return names[0]
-    prefix = os.path.commonprefix(list(names))  # noqa: RUF071 - of strings, not of paths
-    if any(name[len(prefix) : len(prefix) + 1].isdigit() for name in names):
-        prefix = prefix.rstrip("0123456789")  # of a number that differs
-    prefix = prefix.rstrip(" _-.,(")
-    if not prefix:
-        return f"{names[0]} and {len(names) - 1} more"
-    return f"{prefix} ({len(names)} logs)"
-
-
-def _unit(name: str) -> Literal["V", "V/K", "ohm"]:
-    if name == "kt":
-        return "V/K"
-    return "ohm" if name.startswith("R") else "V"
-
-
 def _noise(
     voltage_model: VoltageModel,
     fits: Sequence[LogFit],
@@ -351,7 +326,7 @@ def _noise(
         known = np.isfinite(errors)
         judged_on = "the rows of the fit itself (too short a log to hold any out)"
     elif len(fits) >= LOGS_AT_LEAST:
-        judged_on = "whole logs left out in turn"
+        judged_on = WHOLE_LOGS
     else:
         judged_on = "interleaved blocks of 240 s left out in turn"
     time_error, curve = describe_error(
@@ -368,17 +343,11 @@ def _noise(
         voltage_model.resistance_ohm,
         rate_hz,
     )
-    return ModelNoise(
-        **vars(time_error),
+    return noise_of(
+        time_error,
+        curve,
         lasting_time_s=float(np.mean([np.ptp(item.rows.time_s) for item in fits])),
         lasting_soc_pct=float(np.mean([np.ptp(item.rows.soc_pct) for item in fits])),
-        curve=CurveNoise(
-            soc_pct=curve.soc_pct.tolist(),
-            functions_v=curve.function_v.tolist(),
-            temperature_c=curve.temperature_c,
-            kt_std_v_per_k=curve.kt_std_v_per_k,
-            resistance_std_per_k=curve.resistance_std_per_k,
-        ),
         voltage_mae_pct=100.0 * float(np.mean(np.abs(errors[known]) / volts[known])),
         voltage_rmse_v=float(np.sqrt(np.mean(errors[known] ** 2))),
         judged_on=judged_on,
@@ -392,11 +361,7 @@ def _information(
     solution: Solution,
     found: FittedEffects | None,
 ) -> Information:
-    """Return the square root of the information of the rows on the coefficients.
-
-    The columns of the effects come first in the triangular factor, so that they are marginalised.
-    The priors of kt and of the pseudo-OCV are included.
-    """
+    """Return the square root of the information of the rows on the coefficients."""
     if found is None or not found.model.effects:
         columns, volts, _ = stacked(rows, options)
         effect_columns = np.empty((volts.size, 0))
@@ -404,25 +369,12 @@ def _information(
         n = len(names)
         columns, effect_columns = found.linear.columns[:, :n], found.linear.columns[:, n:]
         volts = found.linear.residual_v + columns @ found.linear.model.model.coefficients
-    scale = np.linalg.norm(columns, axis=0)
-    scale[scale == 0.0] = 1.0
-    first = effect_columns.shape[1]
-    table = np.column_stack([effect_columns, columns / scale, volts])
-    weight = 0.0
+    kt_weight = 0.0
     if solution.kt_prior is not None:
-        weight = solution.kt_prior.row_weight
+        kt_weight = solution.kt_prior.row_weight
     elif found is not None:
-        weight = found.linear.kt_weight
-    prior_row = np.zeros(table.shape[1])
-    prior_row[first + KT] = weight / scale[KT]
-    root = np.linalg.qr(np.vstack([table, prior_row])).R[first:, first:]
-    n = columns.shape[1]
-    return Information(
-        columns=list(names),
-        scale=scale.tolist(),
-        root=root[:n, :n].tolist(),
-        projected=root[:n, n].tolist(),
-    )
+        kt_weight = found.linear.kt_weight
+    return information_of_rows(columns, effect_columns, volts, names, kt_weight)
 
 
 def _made(
@@ -432,7 +384,7 @@ def _made(
     rows: Sequence[FitRows],
     initial_soc_pct: float | Sequence[float | None] | None,
 ) -> Made:
-    hashes = [_sha256(log) for log in logs]
+    hashes = [log_sha256(log) for log in logs]
     return Made(
         by=f"cangauge {__version__}",
         options={
@@ -450,13 +402,6 @@ def _made(
         ],
         fingerprint=hashlib.sha256("".join(hashes).encode()).hexdigest(),
     )
-
-
-def _sha256(log: Log) -> str:
-    digest = hashlib.sha256()
-    for channel in (log.time_s, log.current_a, log.voltage_v, log.temperature_c):
-        digest.update(channel.tobytes())
-    return digest.hexdigest()
 
 
 def _remarks_on_time(

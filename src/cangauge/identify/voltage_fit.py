@@ -70,16 +70,18 @@ def fit_voltage_model(
     if keep is not None:
         columns, volts, block, number = columns[keep], volts[keep], block[keep], number[keep]
         soc, temperature, current = soc[keep], temperature[keep], current[keep]
-    _check_identifiable(rows, soc, current, columns.shape)
+    source = ", ".join(item.name for item in rows)
+    check_identifiable(source, columns.shape, float(np.ptp(soc)), float(np.ptp(current)))
     span = float(soc.min()), float(soc.max())
     if with_kt_prior:
         lengths = np.bincount(number, minlength=len(rows)).tolist()
         solution, prior = rising_with_kt_prior(
             columns, volts, block, span, options.epsilon, lengths=lengths
         )
-        solution = _with_prior_errors(solution, prior)
+        solution = with_prior_errors(solution, prior)
     else:
-        solution = _rising(columns, volts, block, span, options.epsilon)
+        nominal_v = float(np.median(volts))
+        solution = rising(columns, volts, block, span, options.epsilon, nominal_v=nominal_v)
     x = [float(value) for value in solution.coefficients]
     return VoltageModel(
         ocv_v=tuple(x[: len(BASIS_NAMES)]),
@@ -94,18 +96,28 @@ def fit_voltage_model(
     ), solution
 
 
-def _rising(
+def rising(
     columns: FloatArray,
     volts: FloatArray,
     block: NDArray[np.intp],
     span_pct: tuple[float, float],
     epsilon: float,
+    *,
+    nominal_v: float,
 ) -> Solution:
     """Return the least-squares solution whose pseudo-OCV rises over a span of SoC [%].
 
-    Columns beyond those of `design_matrix` may follow.
+    Columns beyond those of `design_matrix` may follow. In place of rows there may be a triangular
+    factor of their QR decomposition: the standard errors are then meaningless.
+
+    Parameters
+    ----------
+    columns, volts, block, span_pct, epsilon
+        As `rising_with_kt_prior`.
+    nominal_v : float
+        Median of the voltage [V], for the least slope.
     """
-    at_least = SLOPE_AT_LEAST * float(np.median(volts))
+    at_least = SLOPE_AT_LEAST * nominal_v
     grid = np.linspace(*span_pct, SLOPE_CHECKS)
     between = np.linspace(*span_pct, SLOPE_POINTS)
     for _ in range(REFINED_AT_MOST):
@@ -144,21 +156,24 @@ def rising_with_kt_prior(
     lengths : sequence of int
         Rows of each log.
     """
-    solution = _rising(columns, volts, block, span_pct, epsilon)
+    nominal_v = float(np.median(volts))
+    solution = rising(columns, volts, block, span_pct, epsilon, nominal_v=nominal_v)
     prior = kt_prior(columns, volts - columns @ solution.coefficients, volts, lengths, KT)
+    columns, volts = with_prior_row(columns, volts, prior)
+    block = np.append(block, block.max() + 1)
+    return rising(columns, volts, block, span_pct, epsilon, nominal_v=nominal_v), prior
+
+
+def with_prior_row(
+    columns: FloatArray, volts: FloatArray, prior: KtPrior
+) -> tuple[FloatArray, FloatArray]:
+    """Return columns and voltage with a further row, kt = 0 V/K by its weight."""
     row = np.zeros(columns.shape[1])
     row[KT] = prior.row_weight
-    solution = _rising(
-        np.vstack([columns, row]),
-        np.append(volts, 0.0),
-        np.append(block, block.max() + 1),
-        span_pct,
-        epsilon,
-    )
-    return solution, prior
+    return np.vstack([columns, row]), np.append(volts, 0.0)
 
 
-def _with_prior_errors(solution: Solution, prior: KtPrior) -> Solution:
+def with_prior_errors(solution: Solution, prior: KtPrior) -> Solution:
     """Return the solution with standard errors that include the uncertainty of kt.
 
     The other coefficients shift with kt: the pseudo-OCV absorbs what the prior takes from it.
@@ -192,7 +207,8 @@ def held_out_errors(
     for training, held_out in folds(rows):
         shape = int(training.sum()), KT + 1 + delayed.shape[1]
         try:
-            _check_identifiable(rows, soc[training], delayed[training, 0], shape)
+            current = delayed[training, 0]
+            check_identifiable("", shape, float(np.ptp(soc[training])), float(np.ptp(current)))
         except InputError as error:
             if len(rows) < LOGS_AT_LEAST:
                 raise  # a log that identifies a model does so without one of its blocks
@@ -223,23 +239,38 @@ def stacked(
     return columns, volts, block_numbers(rows, CLUSTER_S)
 
 
-def _check_identifiable(
-    rows: Sequence[FitRows], soc: FloatArray, current: FloatArray, shape: tuple[int, ...]
+def check_identifiable(
+    source: str, shape: tuple[int, ...], soc_span_pct: float, current_span_a: float
 ) -> None:
-    source = ", ".join(item.name for item in rows)
+    """Refuse rows that cannot identify a model.
+
+    Parameters
+    ----------
+    source : str
+        Names of the logs, for the message.
+    shape : tuple of int
+        Numbers of rows and coefficients.
+    soc_span_pct, current_span_a : float
+        Largest minus smallest SoC [%] and current [A].
+
+    Raises
+    ------
+    InputError
+        If there are too few rows, or SoC or current hardly change.
+    """
     if shape[0] < 4 * shape[1]:
         raise InputError(
             f"{shape[0]} rows cannot identify {shape[1]} coefficients", source=source,
             cure="give a longer log or more logs",
         )  # fmt: skip
-    if np.ptp(soc) < SOC_SPAN_AT_LEAST_PCT:
+    if soc_span_pct < SOC_SPAN_AT_LEAST_PCT:
         raise InputError(
-            f"the logs cover only {np.ptp(soc):.2f} % SoC, too little for a voltage model",
+            f"the logs cover only {soc_span_pct:.2f} % SoC, too little for a voltage model",
             source=source,
             field="soc_pct",
             cure=f"give logs over at least {SOC_SPAN_AT_LEAST_PCT:.0f} %, better the whole range",
         )
-    if np.ptp(current) == 0.0:
+    if current_span_a == 0.0:
         raise InputError(
             "the current is constant, so resistance and open-circuit voltage are not separable",
             source=source,

@@ -155,13 +155,52 @@ class LogResidual:
     """Shape (n, delays) [A]."""
 
 
+@dataclass(frozen=True, eq=False)
+class ErrorEquations:
+    """Normal equations of logs by time scale; those of several logs add up.
+
+    Parameters
+    ----------
+    rows : array of shape (logs,)
+        Rows of each log.
+    means : array of shape (logs, p + 1)
+        Haar coefficient of each log's mean.
+    counts : array of shape (SCALES,)
+        Coefficients of each scale, without the means.
+    products : array of shape (SCALES, p + 1, p + 1)
+        Their sums of products.
+    """
+
+    rows: FloatArray
+    means: FloatArray
+    counts: FloatArray
+    products: FloatArray
+
+    @classmethod
+    def of_tables(cls, tables: Sequence[FloatArray]) -> ErrorEquations:
+        """Return the equations of tables, shape (n, p + 1): columns of the shared errors, residual.
+
+        Each table is of one log, in order of time.
+        """
+        transforms = [haar_transform(table, SCALES) for table in tables]
+        by_scale = [
+            np.vstack([each[j][: -1 if j == SCALES - 1 else None] for each in transforms])
+            for j in range(SCALES)
+        ]
+        return cls(
+            rows=np.array([len(table) for table in tables], dtype=np.float64),
+            means=np.array([each[-1][-1] for each in transforms]),
+            counts=np.array([len(item) for item in by_scale], dtype=np.float64),
+            products=np.array([item.T @ item for item in by_scale]),
+        )
+
+
 class RestrictedLikelihood:
     """Restricted likelihood of the errors in time, from normal equations by time scale.
 
     Parameters
     ----------
-    tables : sequence of arrays of shape (n, p + 1)
-        Columns of the shared errors, and the residual [V], of each log in order of time.
+    logs : ErrorEquations
     prior_mean : array of shape (p,)
     prior_precision : array of shape (p, p)
     rate_hz : float
@@ -170,22 +209,15 @@ class RestrictedLikelihood:
 
     def __init__(
         self,
-        tables: Sequence[FloatArray],
+        logs: ErrorEquations,
         prior_mean: FloatArray,
         prior_precision: FloatArray,
         rate_hz: float,
     ) -> None:
         self._rate_hz = rate_hz
         self._prior = prior_precision
-        self._rows = np.array([len(table) for table in tables], dtype=np.float64)
-        transforms = [haar_transform(table, SCALES) for table in tables]
-        self._means = np.array([each[-1][-1] for each in transforms])
-        by_scale = [
-            np.vstack([each[j][: -1 if j == SCALES - 1 else None] for each in transforms])
-            for j in range(SCALES)
-        ]
-        self._counts = np.array([len(item) for item in by_scale], dtype=np.float64)
-        self._products = np.array([item.T @ item for item in by_scale])
+        self._rows, self._counts = logs.rows, logs.counts
+        self._means, self._products = logs.means, logs.products.copy()
         # Only the residual's own squares count at scales that the delayed currents explain.
         fast = 2.0 ** np.arange(1, SCALES + 1) < CURVE_FROM_S * rate_hz
         self._products[fast, :-1, :] = 0.0
@@ -341,12 +373,60 @@ def describe_error(
     rate_hz : float
         Rate of the rows.
     """
-    voltage_v = float(np.mean(ocv_v))
     mean_c = float(np.mean(np.concatenate([log.temperature_c for log in logs])))
-    tables = [
-        np.column_stack([_columns(log, mean_c, resistance_ohm), log.residual_v]) for log in logs
-    ]
-    prior = np.zeros((tables[0].shape[1] - 1,) * 2)
+    equations = error_equations(logs, mean_c, resistance_ohm)
+    residual_v = np.concatenate([log.residual_v for log in logs])
+    rms_v = float(np.sqrt(np.mean(residual_v**2)))
+    return describe_error_of(
+        equations,
+        rms_v=rms_v,
+        mean_c=mean_c,
+        ocv_v=ocv_v,
+        resistance_ohm=resistance_ohm,
+        rate_hz=rate_hz,
+    )
+
+
+def error_equations(
+    logs: Sequence[LogResidual], mean_c: float, resistance_ohm: Sequence[float]
+) -> ErrorEquations:
+    """Return the normal equations that the error model is estimated from.
+
+    Parameters
+    ----------
+    logs : sequence of LogResidual
+    mean_c : float
+        Mean temperature of all logs [°C].
+    resistance_ohm : sequence of float
+        Rj [Ω], negative.
+    """
+    return ErrorEquations.of_tables(
+        [np.column_stack([_columns(log, mean_c, resistance_ohm), log.residual_v]) for log in logs]
+    )
+
+
+def describe_error_of(
+    equations: ErrorEquations,
+    *,
+    rms_v: float,
+    mean_c: float,
+    ocv_v: FloatArray,
+    resistance_ohm: Sequence[float],
+    rate_hz: float,
+) -> tuple[TimeError, CurveError]:
+    """Return the error model from the normal equations of all logs; else as `describe_error`.
+
+    Parameters
+    ----------
+    equations : ErrorEquations
+    rms_v : float
+        Root mean square of the residuals [V].
+    mean_c : float
+        Mean temperature of all logs [°C].
+    ocv_v, resistance_ohm, rate_hz
+    """
+    voltage_v = float(np.mean(ocv_v))
+    prior = np.zeros((equations.means.shape[1] - 1,) * 2)
     m = KNOTS_PCT.size
     curve_mean, curve_covariance = curve_prior(voltage_v)
     prior_mean = np.zeros(len(prior))
@@ -356,13 +436,13 @@ def describe_error(
     scales = [KT_STD_PER_K * voltage_v, RESISTANCE_STD_PER_K]
     scales += [RESISTANCE_STD * total_ohm] * len(resistance_ohm)
     prior[np.arange(m, len(prior)), np.arange(m, len(prior))] = np.array(scales) ** -2.0
-    likelihood = RestrictedLikelihood(tables, prior_mean, prior, rate_hz)
-    residual_v = np.concatenate([log.residual_v for log in logs])
-    usual_v = max(float(np.sqrt(np.mean(residual_v**2))), 1e-6 * voltage_v)
+    likelihood = RestrictedLikelihood(equations, prior_mean, prior, rate_hz)
+    usual_v = max(rms_v, 1e-6 * voltage_v)
     error = fit_time_error(likelihood.log_likelihood, usual_v, voltage_v)
     mean, covariance = likelihood.posterior(error)
-    next_slow_v2 = PRIOR_LOGS * (PART_STD * voltage_v) ** 2 + len(logs) * error.slow_std_v**2
-    error = replace(error, slow_std_v=math.sqrt(next_slow_v2 / (PRIOR_LOGS + len(logs))))
+    n = len(equations.rows)
+    next_slow_v2 = PRIOR_LOGS * (PART_STD * voltage_v) ** 2 + n * error.slow_std_v**2
+    error = replace(error, slow_std_v=math.sqrt(next_slow_v2 / (PRIOR_LOGS + n)))
     # A mean that the model does not contain is an error, too.
     second = covariance + np.outer(mean, mean)
     return error, CurveError(

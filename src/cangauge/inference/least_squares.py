@@ -67,13 +67,18 @@ class Solution:
     """Of the scaled columns."""
     constrained: bool
     """Whether a bound is active: the plain solution's pseudo-OCV falls."""
+    back: FloatArray
+    """Coefficients of orthonormal coordinates, shape (p, kept): x = back·z."""
     kt_prior: KtPrior | None = None
     """Prior on the temperature coefficient, if one was used."""
 
     def first(self, number: int) -> Solution:
         """Return the solution restricted to the first coefficients."""
         return replace(
-            self, coefficients=self.coefficients[:number], std_error=self.std_error[:number]
+            self,
+            coefficients=self.coefficients[:number],
+            std_error=self.std_error[:number],
+            back=self.back[:number],
         )
 
 
@@ -114,6 +119,7 @@ def solve(
         std_error=_clustered_std_error(left, target - columns @ x, block, back),
         condition_number=float(singular[0] / singular[-1]) if singular[-1] > 0 else float("inf"),
         constrained=constrained,
+        back=back,
     )
 
 
@@ -183,16 +189,37 @@ def _solve_quadratic(z: FloatArray, bounds: FloatArray, at_least: FloatArray) ->
 def _clustered_std_error(
     left: FloatArray, residual: FloatArray, block: NDArray[np.intp], back: FloatArray
 ) -> FloatArray:
-    """Return the cluster-robust sandwich estimate (Liang and Zeger), at least the plain one."""
     _, number = np.unique(block, return_inverse=True)
     scores = np.zeros((int(number.max()) + 1, left.shape[1]))
     np.add.at(scores, number, left * residual[:, None])
-    groups, (n, p) = scores.shape[0], left.shape
-    small_sample = (groups / max(groups - 1, 1)) * ((n - 1) / max(n - p, 1))
+    clusters = np.sum((back @ scores.T) ** 2, axis=1)
+    return sandwich_std_error(
+        back, clusters, len(scores), square_v2=float(residual @ residual), rows=len(left)
+    )
+
+
+def sandwich_std_error(
+    back: FloatArray, clusters: FloatArray, groups: int, *, square_v2: float, rows: int
+) -> FloatArray:
+    """Return the cluster-robust sandwich estimate (Liang and Zeger), at least the plain one.
+
+    Parameters
+    ----------
+    back : array of shape (p, kept)
+        Of a `Solution`.
+    clusters : array of shape (p,)
+        Sum over the clusters of the squared effect of their scores on each coefficient.
+    groups : int
+        Number of clusters.
+    square_v2 : float
+        Sum of the squared residuals.
+    rows : int
+    """
+    free = max(rows - back.shape[1], 1)
+    small_sample = (groups / max(groups - 1, 1)) * ((rows - 1) / free)
     # A few clusters cannot determine p directions: the plain estimate is the lower limit.
-    clustered = small_sample * np.sum((back @ scores.T) ** 2, axis=1)
-    plain = float(residual @ residual) / max(n - p, 1) * np.sum(back**2, axis=1)
-    return np.asarray(np.sqrt(np.maximum(clustered, plain)))
+    plain = square_v2 / free * np.sum(back**2, axis=1)
+    return np.asarray(np.sqrt(np.maximum(small_sample * clusters, plain)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,8 +230,8 @@ class KtPrior:
     """Standard error of kt from the logs alone [V/K]."""
     prior_std_v_per_k: float
     """Prior standard deviation [V/K]."""
-    orthogonal_k: FloatArray
-    """Part of the temperature column orthogonal to the other columns, shape (n,) [K]."""
+    orthogonal_k2: float
+    """Sum of squares of the part of the temperature column orthogonal to the others [K²]."""
     shift_per_kt: FloatArray
     """Change of the other coefficients with kt, shape (p,), 0 for kt itself."""
     residual_std_v: float
@@ -215,10 +242,9 @@ class KtPrior:
         """Weight of the row kt = 0 V/K that makes least squares shrink kt by `shrinkage` [K].
 
         At least the weight for white errors, which bounds kt where the temperature is constant and
-        `orthogonal_k` is zero.
+        `orthogonal_k2` is zero.
         """
-        square_k2 = self.orthogonal_k @ self.orthogonal_k
-        weight = float(np.sqrt((1.0 / self.shrinkage - 1.0) * square_k2))
+        weight = float(np.sqrt((1.0 / self.shrinkage - 1.0) * self.orthogonal_k2))
         return max(weight, self.residual_std_v / self.prior_std_v_per_k)
 
     @property
@@ -253,15 +279,54 @@ def kt_prior(
     kt : int
         Index of the temperature column.
     """
-    scale = np.sqrt(np.mean(columns**2, axis=0))
-    scale[scale == 0.0] = 1.0
-    table = np.column_stack([columns / scale, residual_v])
     ends = np.cumsum(lengths)[:-1]
-    transforms = [haar_transform(item) for item in np.split(table, ends) if len(item)]
+    table = np.column_stack([columns, residual_v])
+    transforms = [haar_transform(item, SCALES) for item in np.split(table, ends) if len(item)]
     by_scale = [np.vstack([each[j] for each in transforms]) for j in range(SCALES)]
-    variance = _scale_variances([item[:, -1] for item in by_scale])
+    return kt_prior_by_scale(
+        columns,
+        by_scale,
+        [len(item) for item in by_scale],
+        kt,
+        nominal_v=float(np.median(volts)),
+        residual_std_v=float(np.sqrt(np.mean(residual_v**2))),
+    )
+
+
+def kt_prior_by_scale(
+    columns: FloatArray,
+    by_scale: Sequence[FloatArray],
+    counts: Sequence[int],
+    kt: int,
+    *,
+    nominal_v: float,
+    residual_std_v: float,
+) -> KtPrior:
+    """Return the prior on kt from the Haar coefficients of columns and residual.
+
+    Only sums of products count: in place of rows there may be the triangular factor of their QR
+    decomposition, with as many rows as columns.
+
+    Parameters
+    ----------
+    columns : array of shape (n, p)
+    by_scale : SCALES arrays of shape (n_j, p + 1)
+        Haar coefficients of the columns, and of the residual [V].
+    counts : sequence of int
+        Numbers of coefficients of each scale.
+    kt : int
+        Index of the temperature column.
+    nominal_v : float
+        Median of the voltage [V].
+    residual_std_v : float
+        Root mean square of the residual [V].
+    """
+    scale = np.sqrt(np.sum(columns**2, axis=0) / sum(counts))
+    scale[scale == 0.0] = 1.0
+    variance = _scale_variances([item[:, -1] for item in by_scale], counts)
     information = sum(
-        item[:, :-1].T @ item[:, :-1] / v2 for item, v2 in zip(by_scale, variance, strict=True)
+        item.T @ item / v2
+        for item, v2 in zip([each[:, :-1] / scale for each in by_scale], variance, strict=True)
     )
     total = np.asarray(information)
     total[np.diag_indices(len(total))] += JITTER * np.trace(total) / len(total)
@@ -269,10 +334,10 @@ def kt_prior(
     orthogonal_k, shift_per_kt = _orthogonal_part(columns, kt)
     return KtPrior(
         data_std_v_per_k=float(np.sqrt(kt_variance)) / float(scale[kt]),
-        prior_std_v_per_k=KT_PRIOR_PER_K * float(np.median(volts)),
-        orthogonal_k=orthogonal_k,
+        prior_std_v_per_k=KT_PRIOR_PER_K * nominal_v,
+        orthogonal_k2=float(orthogonal_k @ orthogonal_k),
         shift_per_kt=shift_per_kt,
-        residual_std_v=float(np.sqrt(np.mean(residual_v**2))),
+        residual_std_v=residual_std_v,
     )
 
 
@@ -287,14 +352,14 @@ def _orthogonal_part(columns: FloatArray, at: int) -> tuple[FloatArray, FloatArr
     return columns[:, at] - columns @ slopes, -slopes
 
 
-def _scale_variances(residual_v: Sequence[FloatArray]) -> FloatArray:
+def _scale_variances(residual_v: Sequence[FloatArray], sizes: Sequence[int]) -> FloatArray:
     """Return the expected variance of the errors of each scale, shape (SCALES,) [V²].
 
     Slower errors than those of the well-observed scales are absorbed by the fit; their variance is
     extrapolated.
     """
-    counts = np.array([item.size for item in residual_v])
-    found = np.array([float(item @ item) / max(item.size, 1) for item in residual_v])
+    counts = np.array(sizes)
+    found = np.array([float(item @ item) for item in residual_v]) / np.maximum(counts, 1)
     found = np.maximum(found, 1e-12)
     observed = np.flatnonzero(counts >= COEFFICIENTS_AT_LEAST)
     if observed.size:

@@ -61,21 +61,19 @@ def predict_logs(model: ExtendedModel, logs: Sequence[SampledLog]) -> list[Predi
 
 
 def pack_state(log: SampledLog, model: ExtendedModel) -> PackState:
-    """Return the inputs of the extra voltages, for all samples of the log."""
+    """Return the inputs of the extra voltages, on the rows of the log."""
     corrected = model.corrected(log.signals)
-    return model.state(corrected, model.counted_soc(corrected, log.initial_soc_pct))
+    return model.state(corrected, model.counted_soc(corrected, log.initial_soc_pct), log.at)
 
 
 def with_modelled_voltage(log: SampledLog, model: ExtendedModel) -> SampledLog:
-    """Return the log with the model's voltage instead of the measured one.
+    """Return the log with the model's voltage instead of the measured one on its rows.
 
     The derivative by an effect in proportion to the voltage would otherwise contain its noise.
     """
-    signals = log.signals
-    everywhere = np.arange(signals.time_s.size)
-    prediction = model.predict(signals, log.initial_soc_pct, everywhere)
-    volts = signals.voltage_v - prediction.residual_v
-    return replace(log, signals=replace(signals, voltage_v=volts))
+    volts = log.signals.voltage_v.copy()
+    volts[log.at] -= residual(log, model)
+    return replace(log, signals=replace(log.signals, voltage_v=volts))
 
 
 def effect_columns(
@@ -105,8 +103,8 @@ def effect_columns(
         amplitude[k] = step
         values = candidate.values(amplitude)
         if state is not None and candidate.effect.adds_voltage_only:
-            extra = candidate.effect.extra_voltage(state, values, model.model, model.pack)
-            columns[:, k] = 0.0 if extra is None else extra[log.at] / step
+            extra = candidate.effect.extra_voltage_at(state, values, model.model, model.pack)
+            columns[:, k] = 0.0 if extra is None else extra / step
             continue
         extended = model.with_effect(candidate.effect, values)
         columns[:, k] = (residual_v - residual(log, extended)) / step

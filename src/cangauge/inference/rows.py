@@ -112,7 +112,9 @@ class SampledLog:
         return replace(self, signals=self.signals.with_history_cache())
 
 
-def sample_log(log: Log, options: FitOptions) -> SampledLog:
+def sample_log(
+    log: Log, options: FitOptions, *, soc_tolerance_pct: float = SOC_TOLERANCE_PCT
+) -> SampledLog:
     """Return a log with its rows and its SoC at the first sample.
 
     Raises
@@ -120,7 +122,7 @@ def sample_log(log: Log, options: FitOptions) -> SampledLog:
     InputError
         As `fit_rows`.
     """
-    rows = fit_rows(log, options)
+    rows = fit_rows(log, options, soc_tolerance_pct=soc_tolerance_pct)
     at = np.searchsorted(log.time_s, rows.time_s)
     out_ah = discharged_ah(log.time_s, log.current_a)
     first_pct = float(rows.soc_pct[0] + 100.0 * out_ah[at[0]] / options.capacity_ah)
@@ -128,20 +130,26 @@ def sample_log(log: Log, options: FitOptions) -> SampledLog:
     return SampledLog(log, rows, at, first_pct, signals)
 
 
-def fit_rows(log: Log, options: FitOptions, *, gap_s: float = GAP_S) -> FitRows:
+def fit_rows(
+    log: Log,
+    options: FitOptions,
+    *,
+    gap_s: float = GAP_S,
+    soc_tolerance_pct: float = SOC_TOLERANCE_PCT,
+) -> FitRows:
     """Return the rows of a log that take part in a fit.
 
     Raises
     ------
     InputError
         If no row is left, the SoC is known nowhere, or the counted SoC leaves 0–100 % by more than
-        `SOC_TOLERANCE_PCT`.
+        the tolerance.
     """
     source = log.source or log.name
     capacity_ah, delay_s = options.capacity_ah, options.delay_s
     soc = counted_soc_pct(log, capacity_ah, options.initial_soc_pct)
     low, high = float(soc.min()), float(soc.max())
-    if low < -SOC_TOLERANCE_PCT or high > 100.0 + SOC_TOLERANCE_PCT:
+    if low < -soc_tolerance_pct or high > 100.0 + soc_tolerance_pct:
         raise InputError(
             f"the SoC counted with {capacity_ah:.2f} Ah runs from {high:.1f} to {low:.1f} %",
             source=source,

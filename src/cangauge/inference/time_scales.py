@@ -12,8 +12,6 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import sparse
 
 from cangauge._typing import FloatArray
 
@@ -37,44 +35,27 @@ def haar_transform(columns: FloatArray, scales: int = SCALES) -> list[FloatArray
         `scales` arrays of shape (n_j, k) with Σ n_j = n. The transform is orthonormal: sums of
         squares and products are those of the rows.
     """
-    n = columns.shape[0]
-    total = np.zeros((n + 1, columns.shape[1]))
-    np.cumsum(columns, axis=0, out=total[1:])
-    differences, counts = _differences(n, scales)
-    coefficients = np.empty_like(total[1:])
-    coefficients[:-1] = differences @ total
-    coefficients[-1] = total[-1] / np.sqrt(n)
-    return np.split(coefficients, np.cumsum(counts)[:-1])
-
-
-def _differences(n: int, scales: int) -> tuple[sparse.csr_array, NDArray[np.intp]]:
-    """Return the matrix from cumulative sums to coefficients, and the number per scale.
-
-    The matrix, shape (n − 1, n + 1), holds the finest scale first and omits the log's mean.
-    """
-    edges = np.array([0, n])
-    stretches = []
-    while True:
-        first, end = edges[:-1], edges[1:]
-        split = end - first > 1
-        if not split.any():
-            break
-        first, end = first[split], end[split]
-        # Split at the largest power of two, so that stretches have the same lengths in all logs.
-        middle = first + 2 ** np.ceil(np.log2(end - first) - 1.0).astype(np.intp)
-        stretches.append(np.stack([first, middle, end]))
-        edges = np.unique(np.concatenate((edges, middle)))
-    first, middle, end = np.hstack([np.zeros((3, 0), dtype=np.intp), *stretches])
-    scale = np.minimum(np.rint(np.log2(end - first)).astype(np.intp) - 1, scales - 1)
-    order = np.argsort(scale, kind="stable")
-    first, middle, end = first[order], middle[order], end[order]
-    left, right = (middle - first).astype(float), (end - middle).astype(float)
-    gain = np.sqrt(left * right / (left + right))
-    weights = np.concatenate((gain / left, -gain / left - gain / right, gain / right))
-    at = (np.tile(np.arange(first.size), 3), np.concatenate((first, middle, end)))
-    counts = np.bincount(scale, minlength=scales)
-    counts[-1] += 1  # the mean
-    return sparse.csr_array((weights, at), shape=(first.size, n + 1)), counts
+    parts: list[list[FloatArray]] = [[] for _ in range(scales)]
+    sums, size, last = columns, 1, 1  # of stretches of `size` rows; the last one may be shorter
+    while len(sums) > 1:
+        pairs = len(sums) // 2
+        left, right = sums[: 2 * pairs : 2], sums[1 : 2 * pairs : 2]
+        differences = (left - right) / np.sqrt(2.0 * size)
+        is_odd = len(sums) % 2 == 1
+        full = pairs if is_odd or last == size else pairs - 1
+        parts[min(size.bit_length() - 1, scales - 1)].append(differences[:full])
+        if full < pairs:
+            gain = np.sqrt(size * last / (size + last))
+            scale = int(np.rint(np.log2(size + last))) - 1
+            shorter = gain * (left[-1:] / size - right[-1:] / last)
+            parts[min(scale, scales - 1)].append(shorter)
+        added = left + right
+        sums = np.concatenate((added, sums[-1:])) if is_odd else added
+        last = last if is_odd else size + last
+        size *= 2
+    parts[-1].append(sums / np.sqrt(columns.shape[0]))  # the mean
+    none = columns[:0]
+    return [np.concatenate(part) if len(part) > 1 else [*part, none][0] for part in parts]
 
 
 def scale_variances(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,6 @@ from cangauge._arithmetic import total
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.model.coulomb_counting import discharged_ah
-from cangauge.model.delay_line import delayed_currents
 from cangauge.model.effects.base import Counting, Effect, Pack, PackState, Reading, Signals, Values
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.voltage_model import SLOPE_AT_LEAST, VoltageModel
@@ -121,15 +120,11 @@ class ExtendedModel:
         """
         corrected = self.corrected(signals)
         soc = self.counted_soc(corrected, initial_soc_pct, initial_row=initial_row)
-        state = self.state(corrected, soc) if self.effects else None
-        if state is not None:
-            delayed = state.history.delayed_a(self.model.delay_s)[at_rows]
-        else:  # a fast log has far more samples than rows
-            time = corrected.time_s
-            delayed = delayed_currents(time, corrected.current_a, self.model.delay_s, time[at_rows])
+        # A fast log has far more samples than rows.
+        delayed = corrected.history.at(at_rows).delayed_a(self.model.delay_s)
         volts = self.model.voltage(soc[at_rows], corrected.temperature_c[at_rows], delayed)
-        if state is not None:
-            volts = volts + self.extra_voltage(state)[at_rows]
+        if self.effects:
+            volts = volts + self.extra_voltage(self.state(corrected, soc, at_rows))
         return Prediction(at_rows, volts, corrected, soc)
 
     def corrected(self, signals: Signals) -> Signals:
@@ -158,24 +153,30 @@ class ExtendedModel:
         moved = 100.0 * (out - out[initial_row]) / counting.capacity_ah
         return np.asarray(counting.initial_soc_pct - moved)
 
-    def state(self, corrected: Signals, soc_pct: FloatArray) -> PackState:
-        """Return the inputs of the extra voltages, for all rows of corrected signals."""
+    def state(
+        self, corrected: Signals, soc_pct: FloatArray, rows: NDArray[np.intp] | None = None
+    ) -> PackState:
+        """Return the inputs of the extra voltages, for some or all rows of corrected signals."""
         history = corrected.history
-        delayed = history.delayed_a(self.model.delay_s)
+        kept = slice(None) if rows is None else rows
+        at_rows = history if rows is None else history.at(rows)
         return PackState(
-            time_s=corrected.time_s,
-            current_a=corrected.current_a,
-            temperature_c=corrected.temperature_c,
-            soc_pct=soc_pct,
-            drop_v=delayed @ np.array(self.model.resistance_ohm),
-            cached_history=history,
+            time_s=corrected.time_s[kept],
+            current_a=corrected.current_a[kept],
+            temperature_c=corrected.temperature_c[kept],
+            soc_pct=soc_pct[kept],
+            drop_v=at_rows.delayed_a(self.model.delay_s) @ np.array(self.model.resistance_ohm),
+            cached_history=at_rows,
+            rows=rows,
+            log=None if rows is None else corrected,
+            of_log=None if rows is None else partial(self.state, corrected, soc_pct),
         )
 
     def extra_voltage(self, state: PackState) -> FloatArray:
         """Return the sum of the effects' voltages [V], shape (n,)."""
         volts = np.zeros_like(state.time_s)
         for effect, values in self.effects:
-            extra = effect.extra_voltage(state, values, self.model, self.pack)
+            extra = effect.extra_voltage_at(state, values, self.model, self.pack)
             if extra is not None:
                 volts += extra
         return volts

@@ -379,3 +379,38 @@ def soc_from_ocv(model: Curve, ocv_v: float, guess_pct: float = 50.0) -> Inverse
             return Inverse(following, inside=True)
         soc = following
     return Inverse(soc, inside=True)
+
+
+INVERTED_AT_ONCE = 1 << 16
+"""Voltages inverted together: bounds the memory of `socs_from_ocv`."""
+
+
+def socs_from_ocv(model: VoltageModel, ocv_v: FloatArray) -> FloatArray:
+    """Return `soc_from_ocv` of many voltages [%], shape (n,): the same root to `TOLERANCE_PCT`.
+
+    Parameters
+    ----------
+    model : VoltageModel
+    ocv_v : array of shape (n,)
+        Voltages [V] less the parts that do not depend on SoC.
+    """
+    parts = range(0, ocv_v.size, INVERTED_AT_ONCE)
+    found = [_roots(model, ocv_v[start : start + INVERTED_AT_ONCE]) for start in parts]
+    return np.concatenate(found) if found else np.empty(0)
+
+
+def _roots(model: VoltageModel, ocv_v: FloatArray) -> FloatArray:
+    grid = np.linspace(0.0, 100.0, SLOPE_POINTS)
+    soc = np.interp(ocv_v, model.pseudo_ocv(grid), grid)
+    low, high = np.zeros_like(soc), np.full_like(soc, 100.0)
+    empty_v, full_v = model.pseudo_ocv([0.0, 100.0])
+    for _ in range(STEPS_AT_MOST):
+        error = model.pseudo_ocv(soc) - ocv_v
+        high, low = np.where(error > 0.0, soc, high), np.where(error > 0.0, low, soc)
+        following = soc - error / model.pseudo_ocv_slope(soc)
+        is_bracketed = (low < following) & (following < high)
+        following = np.where(is_bracketed, following, 0.5 * (low + high))
+        moved, soc = np.abs(following - soc), following
+        if np.all(moved < TOLERANCE_PCT):
+            break
+    return np.where(ocv_v <= empty_v, 0.0, np.where(ocv_v >= full_v, 100.0, soc))

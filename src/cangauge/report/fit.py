@@ -317,7 +317,7 @@ def _energy(result: Identification) -> list[Block]:
     energy = result.energy
 
     def share(part: float, whole: float) -> str:
-        return number(100.0 * part / whole if whole else None, 1, "%")
+        return number(100.0 * part / whole if whole > 0.0 else None, 1, "%")
 
     entries = [
         ("driven", energy.driven_kwh, BLUE, "", "∫U·I over I > 0"),

@@ -206,6 +206,8 @@ class Section:
 
     title: str
     blocks: Sequence[Block]
+    is_folded: bool = False
+    """Whether only the title is seen until it is opened."""
 
 
 @dataclass(frozen=True, eq=False)

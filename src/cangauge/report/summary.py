@@ -6,8 +6,9 @@ import math
 from html import escape
 from typing import Any, Final
 
-from cangauge._formatting import number, significant, span
+from cangauge._formatting import NONE_KNOWN, number, significant, span
 from cangauge.diagnosis import LIKELY, NONE, UNKNOWN, Diagnosis
+from cangauge.diagnosis.next_test import Plan
 from cangauge.identify.effect_search import FittedEffects
 from cangauge.model.effects.library import LIBRARY
 
@@ -28,6 +29,35 @@ _SIZES: Final = {
                              "too high", "too low"),
 }  # fmt: skip
 """Effect → its main parameter, a sentence, and the words for a positive and a negative value."""
+
+
+EXPLAINED: Final = {
+    "current_offset": "the current sensor is off by a constant, or a load bypasses it",
+    "current_gain": "the current sensor reads too much or too little in proportion",
+    "voltage_offset": "the voltage reading is off by a constant",
+    "voltage_gain": "the voltage reading is off in proportion",
+    "time_skew": "current and voltage are not recorded at the same moment",
+    "temperature_lag": "the temperature sensor follows the pack late",
+    "core_temperature": "the cells inside are warmer than the sensor shows after high current",
+    "inner_temperature": "the cells inside follow slow changes of the measured temperature late",
+    "capacity": "the pack holds more or less charge than the model assumes",
+    "initial_soc": "the log starts at another state of charge than assumed",
+    "coulombic_efficiency": "part of the charge that is put in cannot be taken out again",
+    "resistance_temperature": "the resistance rises more (or less) in the cold than modelled",
+    "resistance_soc": "the resistance rises towards empty or full",
+    "resistance_asymmetry": "charging meets another resistance than discharging",
+    "resistance_step": "the resistance changes at one moment, as by a loose contact",
+    "charge_transfer": "the voltage drop is not in proportion to the current: steep at small ones",
+    "fast_polarization": "the voltage needs seconds to follow a change of load",
+    "slow_diffusion": "the voltage needs minutes to recover after a load",
+    "hysteresis": "at rest the voltage differs after charging and after discharging",
+    "entropic_coefficient": "the open-circuit voltage depends on temperature otherwise",
+    "ocv_shape": "the open-circuit voltage has another shape over the state of charge",
+    "weak_cell": "some cells are empty before the others",
+    NONE: "the logs differ from the model no more than logs without a fault",
+    UNKNOWN: "a gap that no effect of the library explains",
+}
+"""Answer → what it means, in a line."""
 
 
 def rounded(value: float, std_error: float | None) -> tuple[str, str]:
@@ -203,9 +233,36 @@ def parameters_text(parameters: dict[str, dict[str, Any]], separator: str = ", "
     return separator.join(texts)
 
 
+def percent(fraction: float) -> str:
+    """Return a fraction in %."""
+    return number(100.0 * fraction, 0, "%")
+
+
 def percent_span(low: float, high: float) -> str:
     """Return a range of fractions in %."""
     return span(100.0 * low, 100.0 * high, 0, "%")
+
+
+PLAN_TITLE: Final = "Next test: expected probability of each cause where it is the true one"
+
+
+def plan_rows(plan: Plan) -> tuple[list[str], Rows]:
+    """Return headings and rows: the tests, best first, and the probabilities without any."""
+    rows = [
+        [
+            test.profile.name,
+            number(test.profile.start_soc_pct, 0),
+            number(test.profile.start_c, 0),
+            number(test.information_nats, 2),
+            number(test.probability, 2),
+            *(number(test.expected[cause], 2) for cause in plan.causes),
+        ]
+        for test in plan.tests
+    ]
+    now = [number(plan.before[cause], 2) for cause in plan.causes]
+    rows.append(["without a test", *[NONE_KNOWN] * 3, number(plan.probability, 2), *now])
+    headings = ["<test", "from SoC [%]", "from [°C]", "information [nats]", "P(true one)"]
+    return [*headings, *plan.causes], rows
 
 
 SHOWN_IN_NOTEBOOK: Final = 5

@@ -146,12 +146,12 @@ def inspect_verdict(found: LogInspection) -> str:
     for ability in found.abilities:
         names[ability.verdict].append(ability.topic)
     parts = [
-        f"{words} {', '.join(names[verdict])}"
-        for verdict, words in (("yes", "can identify"), ("partly", "in part"), ("no", "not"))
+        words + ", ".join(names[verdict])
+        for verdict, words in (("yes", ""), ("partly", "in part "), ("no", "not "))
         if names[verdict]
     ]
     lacking = next((each for each in found.abilities if each.verdict == "no"), None)
-    text = "This log " + "; ".join(parts)
+    text = "This log can identify " + "; ".join(parts)
     if names["no"] and not names["yes"] and not names["partly"]:
         text = f"This log cannot identify {', '.join(names['no'])}"
     if lacking is None:

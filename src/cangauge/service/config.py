@@ -324,10 +324,12 @@ class RunConfig(Strict):
     mqtt: MqttConfig | None = key(None, "MQTT broker that takes the state (extra `mqtt`).")
     dashboard: str | None = key(
         None,
-        "Serve the live page there, e.g. 127.0.0.1:8642. An address beyond loopback needs a token,"
-        " as with --http.",
+        "Serve the live page there; on the command line alone: at 127.0.0.1:8642. An address beyond"
+        " loopback needs a token, as with --http. The page can begin and end a recording: that of"
+        " `record`, else candump files in the working folder.",
         "HOST:PORT",
         needs_restart=True,
+        bare="127.0.0.1:8642",
     )
     status_socket: str = key(
         "auto",

@@ -33,6 +33,8 @@ class OptionInfo:
         A reload does not apply a change of this key.
     is_path : bool
         A path, relative to the file that it is in.
+    bare : str
+        Value of the option where none follows it; "" if one must.
     """
 
     metavar: str = ""
@@ -41,6 +43,7 @@ class OptionInfo:
     default: str = ""
     needs_restart: bool = False
     is_path: bool = False
+    bare: str = ""
 
 
 def key(
@@ -52,10 +55,11 @@ def key(
     default_text: str = "",
     needs_restart: bool = False,
     is_path: bool = False,
+    bare: str = "",
     **bounds: float | str,
 ) -> Any:
     """Return the field of a key; arguments as of `OptionInfo`, bounds as of pydantic's Field."""
-    info = OptionInfo(metavar, flags, unit, default_text, needs_restart, is_path)
+    info = OptionInfo(metavar, flags, unit, default_text, needs_restart, is_path, bare)
     field: FieldInfo = Field(default, description=text, **bounds)  # type: ignore[call-overload] # bounds are numbers or patterns
     field.metadata.append(info)
     return field

@@ -257,7 +257,9 @@ def _record(snapshot: Snapshot) -> Iterator[Metric]:
         "cangauge_record_written_bytes", "Bytes written.", record.written_bytes
     )
     yield GaugeMetricFamily(
-        "cangauge_record_failing", "1 while the disk rejects data.", record.problem is not None
+        "cangauge_record_failing",
+        "1 while the disk rejects data.",
+        record.is_active and record.problem is not None,
     )
 
 

@@ -75,7 +75,9 @@ class RecordState:
     frames, lost_frames, written_bytes : int
         Frames recorded; frames that could not be written; bytes written.
     problem : str or None
-        Why the disk rejects data at present.
+        Why the disk rejects data at present, or why the recording could not begin.
+    is_active : bool
+        False once it has ended.
     """
 
     path: str
@@ -83,6 +85,7 @@ class RecordState:
     lost_frames: int
     written_bytes: int
     problem: str | None
+    is_active: bool = True
 
 
 @dataclass(frozen=True)

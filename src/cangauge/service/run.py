@@ -28,7 +28,7 @@ from cangauge.service.lifecycle import Notifier, note_hangups, stop_on_signals
 from cangauge.service.loop import LoopSettings, Outputs, RunSummary, serve
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.reading import START_S, BackgroundReader, Reading
-from cangauge.service.recording import Recorder
+from cangauge.service.record_control import RecordControl
 from cangauge.service.state import StateKeeper, check_state_path
 from cangauge.service.status import PAGE_EVERY_S, SHOW_EVERY_S, Identity, Monitor, Snapshot
 
@@ -97,6 +97,7 @@ class Service:
         self._address = loaded.address()
         self._stop = threading.Event()
         self._reload = threading.Event()
+        self._recording: RecordControl | None = None
         self.on_status: Callable[[Snapshot], None] | None = None
 
     def stop(self) -> None:
@@ -106,6 +107,11 @@ class Service:
     def reload(self) -> None:
         """Read and apply the configuration again while `run` runs; from any thread."""
         self._reload.set()
+
+    def record(self, *, active: bool) -> None:
+        """Begin or end a recording while `run` runs; from any thread."""
+        if self._recording is not None:
+            self._recording.request(active=active)
 
     def run(self) -> dict[str, Any]:
         """Run until `stop`, a signal, or a configured end.
@@ -136,21 +142,22 @@ class Service:
             stack.callback(self._reader.close)
             port = stack.enter_context(ReconnectingBus(self._address, pipeline.filters))
             port.open(wait=config.wait_for_bus)
-            recorder = table = keeper = None
+            table = keeper = None
             if self._state is not None:
                 keeper = stack.enter_context(StateKeeper(self._state, pipeline, port.name))
-            if config.record is not None:
-                recorder = stack.enter_context(Recorder(config.record, config.record_limits()))
+            record_path = None if config.record is None else Path(config.record)
+            recording = RecordControl(record_path, config.record_limits())
+            self._recording = stack.enter_context(recording)
             if config.output is not None:
                 # pyarrow is slow to import, and few services write a table.
                 from cangauge.service.estimate_table import EstimateWriter  # noqa: PLC0415
 
                 table = stack.enter_context(EstimateWriter(config.output))
-            monitor = stack.enter_context(self._supervised(port, recorder))
+            monitor = stack.enter_context(self._supervised(port, recording))
             outputs = Outputs(
-                record=recorder,
-                table=self._rows(table, recorder),
-                show=self._each_turn(monitor, recorder),
+                record=recording,
+                table=self._rows(table, recording),
+                show=self._each_turn(monitor, recording),
                 checkpoint=None if keeper is None else keeper.checkpoint,
                 reload=lambda: self._poll_reload(monitor, wanted=hangup()),
                 stepped=monitor.stepped,
@@ -166,10 +173,9 @@ class Service:
                 f"{port.name}: no expected frame arrived; check channel, bit rate and vehicle"
                 " (--vehicle, or --dbc and --map)",
             )
-        # BLF and MF4 files begin with the first frame: without one there is no file.
-        is_recorded = recorder is not None and (recorder.frames or recorder.path.exists())
+        recorded = recording.written
         written = {
-            "record": str(recorder.path) if recorder is not None and is_recorded else None,
+            "record": None if recorded is None else str(recorded),
             "output": None if table is None or table.failed else config.output,
         }
         for path in filter(None, written.values()):
@@ -247,10 +253,10 @@ class Service:
         return settings
 
     def _rows(
-        self, table: EstimateWriter | None, recorder: Recorder | None
+        self, table: EstimateWriter | None, recording: RecordControl
     ) -> Callable[[float, Estimate], None] | None:
         """Return what takes each sample's estimate: the table, the recording, both or none."""
-        if recorder is None or not recorder.keeps_estimates:
+        if not recording.keeps_estimates:
             return None if table is None else table.add
         pipeline = self.pipeline
 
@@ -259,22 +265,21 @@ class Service:
                 table.add(time_s, estimate)
             if pipeline.latest_sample is not None:
                 soc_pct = pipeline.decoder.reference_soc_pct
-                recorder.write_estimate(pipeline.latest_sample, soc_pct, estimate)
+                recording.write_estimate(pipeline.latest_sample, soc_pct, estimate)
 
         return add
 
-    def _each_turn(self, monitor: Monitor, recorder: Recorder | None) -> Callable[[float], None]:
+    def _each_turn(self, monitor: Monitor, recording: RecordControl) -> Callable[[float], None]:
         def turn(now_s: float) -> None:
             is_new = monitor.turn(now_s)
-            if recorder is not None:
-                recorder.tick(now_s)
+            recording.tick(now_s)
             if is_new and self.on_status is not None:
                 self.on_status(monitor.latest)
 
         return turn
 
     @contextmanager
-    def _supervised(self, port: ReconnectingBus, recorder: Recorder | None) -> Iterator[Monitor]:
+    def _supervised(self, port: ReconnectingBus, recording: RecordControl) -> Iterator[Monitor]:
         """Yield the monitor, with its status served and systemd notified."""
         config, vehicle = self.config, self.pipeline.vehicle.name
         identity = Identity(
@@ -294,7 +299,7 @@ class Service:
                 port,
                 identity=identity,
                 notifier=notifier,
-                record=recorder,
+                record=recording,
                 show_every_s=SHOW_EVERY_S if config.dashboard is None else PAGE_EVERY_S,
             )
             _serve_status(config, monitor, stack)

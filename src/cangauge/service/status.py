@@ -24,7 +24,8 @@ from cangauge.bus.publish import NO_REPORT, PackReport
 from cangauge.estimation.validity import Estimate, Reason, Sample, Status, reason_name, reason_names
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline
-from cangauge.service.recording import Recorder, RecordState
+from cangauge.service.record_control import RecordControl
+from cangauge.service.recording import RecordState
 from cangauge.service.status_client import SCHEMA
 
 _LOG = logging.getLogger(__name__)
@@ -187,6 +188,7 @@ class Snapshot:
         Time from receive stamp to published SoC; processing time of the frame that completes a
         sample.
     record : RecordState or None
+        Of the recording that runs or has ended.
     config : ConfigState
     report : PackReport or None
         Health, power and cells, of the last second; None before the first sample.
@@ -319,6 +321,7 @@ def as_json(snapshot: Snapshot, now_s: float) -> dict[str, Any]:
             "lost_frames": record.lost_frames,
             "written_bytes": record.written_bytes,
             "problem": record.problem,
+            "active": record.is_active,
         },
     }
 
@@ -347,7 +350,7 @@ class Monitor:
     port : BusConnection
     identity : Identity
     notifier : Notifier
-    record : Recorder, optional
+    record : RecordControl, optional
     clock : callable
         Monotonic time [s].
     show_every_s : float
@@ -368,7 +371,7 @@ class Monitor:
         *,
         identity: Identity,
         notifier: Notifier,
-        record: Recorder | None = None,
+        record: RecordControl | None = None,
         clock: Callable[[], float] = time.monotonic,
         show_every_s: float = SHOW_EVERY_S,
     ) -> None:

@@ -220,6 +220,7 @@ _SHAPE: Final[dict[str, Any]] = {
             "lost_frames": int,
             "written_bytes": int,
             "problem": (str, type(None)),
+            "active": bool,
         },
     ),
 }

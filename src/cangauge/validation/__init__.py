@@ -12,10 +12,16 @@ scores the answers::
     score        labels and answers → figures; `tables` prints them
     final_seeds  seeds of the published figures
 
+The diagnosis on one's own healthy logs injects the same faults::
+
+    own_logs     every effect injected into logs of one pack, each left out in turn
+
 The estimator's bench on recorded packs is apart from it::
 
-    packs        recorded packs; models from few logs, and the other logs estimated by them
-    packs_score  errors, σ and targets; the tables
+    packs             recorded packs: logs that train models, logs that judge them
+    packs_run         models from few logs, and the other logs estimated by them in every case
+    packs_quantities  capacity, offset, power, energy and weakest cell beside what the log shows
+    packs_score       errors, σ and targets; the tables
 
 The public names are those of the twin, loaded on first use.
 """

@@ -227,7 +227,7 @@ class DrawnCase:
     recordings: tuple[Recording, ...] = ()
 
 
-class _FaultRequest(NamedTuple):
+class FaultRequest(NamedTuple):
     """A fault to be scaled once the logs are known."""
 
     kind: FaultKind
@@ -249,13 +249,13 @@ class _FaultRequest(NamedTuple):
 
 def _draw_requests(
     effects: Sequence[str], floor_v: float, rng: np.random.Generator
-) -> list[_FaultRequest]:
+) -> list[FaultRequest]:
     kinds = [fault_kind(effect) for effect in effects]
     low, high = np.log(_GAP_IN_FLOORS)
     targets = [float(floor_v * np.exp(rng.uniform(low, high))) for _ in kinds]
     signs = [-1.0 if kind.signed and rng.random() < 0.5 else 1.0 for kind in kinds]
     seeds = [int(rng.integers(2**31)) for _ in kinds]
-    return list(map(_FaultRequest, kinds, targets, signs, seeds))
+    return list(map(FaultRequest, kinds, targets, signs, seeds))
 
 
 def draw_case(

@@ -1,7 +1,4 @@
-"""The estimator on recorded packs: models from few logs, errors and their σ on the other logs.
-
-`load` reads the packs, `run` fits models to a few of a pack's logs, drawn with fixed seeds, and
-estimates the others in every case; `packs_score` pools the errors and judges them by the targets.
+"""Recorded packs: logs that train models of a pack, and logs that judge them.
 
 Constants of the filter may be chosen on packs of the role "development" only. A log that a pack of
 the role "judged" is scored on is in no development pack. But its models are trained on development
@@ -10,31 +7,22 @@ logs too, and `leaf_module` and `a123_lfp` alone are packs of which development 
 
 from __future__ import annotations
 
-import math
-import multiprocessing
-import time
+import gzip
 import zlib
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal
 
 import numpy as np
 
-from cangauge._resources import single_threaded
+from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.estimation.compiled import make_estimator
-from cangauge.estimation.offline import EstimateTable, gap_of, samples_of
-from cangauge.estimation.settings import EstimatorSettings
-from cangauge.identify.fit import fit
 from cangauge.inference.rows import decimate
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
-from cangauge.model.coulomb_counting import capacity_from_reference, counted_soc_pct
-from cangauge.model.model_file import Model
-from cangauge.validation.packs_score import Bench, Failure, LogScore, pool_scores, score_log
+from cangauge.model.coulomb_counting import counted_soc_pct
 from cangauge.validation.recordings import (
     LG_CAPACITY_AH,
     LG_PARALLEL,
@@ -61,57 +49,10 @@ PIECE_S: Final = 1800.0
 _MODULE_SERIES: Final = 16
 _MODULE_CAPACITY_AH: Final = 55.1
 """Mean of the four full discharges at 0.3 to 2.75 C, 54.9 to 55.4 Ah."""
+_MODULE_CELLS: Final = range(20, 26)
 _A123_CAPACITY_AH: Final = 2.07
 """Discharge at C/30 and 25 °C [Ah]."""
 _A123_PARALLEL: Final = 20
-
-
-class Case(NamedTuple):
-    """What is wrong, or not told, while a log is estimated."""
-
-    name: str
-    start_error_pct: float | None = 0.0
-    """Error of the given start [% SoC]; None: the start is withheld."""
-    offset_a: float = 0.0
-    """Added to the measured current [A]."""
-    capacity_factor: float = 1.0
-    """Factor on the model's capacity."""
-    voltage_factor: float = 1.0
-    """Factor on the measured voltage."""
-    after_s: float = 0.0
-    """Rows before this time are not scored [s]."""
-
-    def suits(self, log: Log) -> bool:
-        """Whether the wrong start is one that can be given: from 0 to 100 %."""
-        start = log.first_soc()
-        if not self.start_error_pct or start is None:
-            return True
-        return 0.0 <= start[1] + self.start_error_pct <= 100.0
-
-    @property
-    def counting_is_reference(self) -> bool:
-        """Whether counting repeats the reference, which is counted too, and cannot be beaten."""
-        return self.start_error_pct == 0.0 and not self.offset_a and self.capacity_factor == 1.0
-
-
-CASES: Final = (
-    Case("withheld", None, after_s=300.0),
-    Case("given"),
-    Case("start 20 % low", -20.0, after_s=600.0),
-    Case("start 20 % high", 20.0, after_s=600.0),
-    Case("+2 A", offset_a=2.0),
-    Case("-2 A", offset_a=-2.0),
-    Case("capacity +10 %", capacity_factor=1.1),
-    Case("capacity -10 %", capacity_factor=0.9),
-    Case("voltage +0.5 %", voltage_factor=1.005),
-)
-"""Starts are given with σ 1 %. The cases after the fourth start from the true SoC. A log whose
-wrong start would be below 0 or above 100 % is left out of that case."""
-
-QUICK_CASES: Final = ("withheld", "given", "start 20 % low")
-QUICK_SIZES: Final = (3, 5)
-QUICK_LOGS: Final = 4
-"""Cases, numbers of training logs, and judged logs of a pack in a quick run."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +75,10 @@ class BenchPack:
         Known capacity [Ah]; by default the training logs' charge per 100 % of their reference.
     sizes : sequence of int
         Numbers of training logs.
+    cells_v : mapping of str to array of shape (n, cells)
+        Judged log → voltages of cells at its n rows [V], where they are known.
+    place : str
+        Packs of another place are other packs.
     """
 
     name: str
@@ -144,6 +89,8 @@ class BenchPack:
     reference: str
     capacity_ah: float | None = None
     sizes: Sequence[int] = SIZES
+    cells_v: Mapping[str, FloatArray] = field(default_factory=dict)
+    place: str = ""
 
     def splits(self, size: int, number: int, seed: int) -> Iterator[tuple[list[Log], list[Log]]]:
         """Yield training and judged logs of at most `number` different draws."""
@@ -190,7 +137,8 @@ def load(folder: Path, names: Sequence[str] | None = None) -> list[BenchPack]:
         if names is None and not is_folder(folder / place):
             continue
         if names is None or name in names:
-            packs.append(replace(read(folder_of(place, folder)), name=name))
+            found = read(folder_of(place, folder))
+            packs.append(replace(found, name=name, place=place))
     if not packs:
         raise InputError(
             "no recorded packs in this folder",
@@ -254,16 +202,35 @@ def _leaf_module(folder: Path) -> BenchPack:
         as_pack(_read(path), _MODULE_SERIES, 1, _MODULE_CAPACITY_AH, 100.0)
         for path in sorted(folder.glob("module123-*.csv.gz"))
     ]
+    judged = _judgeable(logs)
     return BenchPack(
         "leaf_module",
         "judged",
         "nmc",
         logs,
-        _judgeable(logs),
+        judged,
         "counted from full to the cut-off of the weakest cell with 55.1 Ah (54.9 to 55.4): 0.5 %",
         _MODULE_CAPACITY_AH,
         (1, 2, 3),
+        {log.name: module_cells(folder / f"{log.name}.csv.gz", log.time_s) for log in judged},
     )
+
+
+def module_cells(path: Path, time_s: FloatArray) -> FloatArray:
+    """Read the six cell voltages of a module's file at given times, shape (n, 6) [V].
+
+    The file's heading is shorter than its rows; rows without numbers are headings.
+    """
+    rows = []
+    with gzip.open(path, "rt", encoding="latin-1") as file:
+        for line in file:
+            cells = line.split(",")
+            try:
+                rows.append([float(cells[at]) for at in (0, *_MODULE_CELLS)])
+            except (ValueError, IndexError):
+                continue
+    table = np.array(sorted(rows))
+    return np.column_stack([np.interp(time_s, table[:, 0], each) for each in table.T[1:]])
 
 
 def _a123(folder: Path) -> BenchPack:
@@ -360,210 +327,3 @@ def _judgeable(logs: Sequence[Log]) -> list[Log]:
     """Return the logs that are long enough, at `RATE_HZ`."""
     long = [log for log in logs if log.duration_s >= 60.0 * MIN_MINUTES]
     return [log.rows(decimate(log.time_s, RATE_HZ)) for log in long]
-
-
-@dataclass(frozen=True, eq=False)
-class _Task:
-    pack: BenchPack
-    size: int
-    split: int
-    training: list[Log]
-    judged: list[Log]
-    cases: Sequence[Case]
-    effects: Sequence[str]
-
-    @property
-    def rows(self) -> int:
-        """Number of samples to estimate."""
-        return sum(len(log) for case in self.cases for log in filter(case.suits, self.judged))
-
-
-@dataclass(frozen=True, eq=False)
-class _Done:
-    scores: list[LogScore] = field(default_factory=list)
-    failure: Failure | None = None
-
-
-def run(
-    packs: Sequence[BenchPack],
-    *,
-    cases: Sequence[Case] = CASES,
-    sizes: Sequence[int] | None = None,
-    splits: int = 2,
-    judged_at_most: int | None = None,
-    effects: Sequence[str] = (),
-    jobs: int = 1,
-    seed: int = 1,
-    progress: Callable[[int, int], None] | None = None,
-) -> Bench:
-    """Fit models to few logs of each pack and estimate its other logs in every case.
-
-    The result does not depend on `jobs`.
-
-    Parameters
-    ----------
-    packs : sequence of BenchPack
-        From `load`, or made from own logs.
-    cases : sequence of Case
-    sizes : sequence of int, optional
-        Numbers of training logs; by default those of each pack.
-    splits : int
-        Draws of training logs for each number.
-    judged_at_most : int, optional
-        Estimate at most this many logs of each draw, spread evenly.
-    effects : sequence of str
-        Effects of the models, as for `fit`; none by default. The Newton inverse of the published
-        equation is scored beside them.
-    jobs : int
-        Number of processes.
-    seed : int
-        Seed of the draws.
-    progress : callable, optional
-        Called with the samples done and to do after each draw.
-
-    Raises
-    ------
-    InputError
-        If no pack is judged with models of one of the `sizes`.
-    """
-    began = time.perf_counter()
-    tasks = [
-        _Task(pack, size, split, training, _spread(judged, judged_at_most), cases, effects)
-        for pack in packs
-        for size in pack.sizes
-        if sizes is None or size in sizes
-        for split, (training, judged) in enumerate(pack.splits(size, splits, seed))
-    ]
-    if not tasks:
-        raise InputError(
-            "no pack is judged with models of so many logs",
-            field="--logs",
-            value=", ".join(map(str, sizes or ())),
-            cure="use 1, 2, 3, 5 or 10, as far as the pack has logs",
-        )
-    total, done_rows = sum(task.rows for task in tasks), 0
-    done: dict[int, _Done] = {}
-    # The longest first, so that no process is left alone with one at the end.
-    order = sorted(range(len(tasks)), key=lambda k: -tasks[k].rows)
-    for k, found in _work([(k, tasks[k]) for k in order], jobs):
-        done[k] = found
-        done_rows += tasks[k].rows
-        if progress is not None:
-            progress(done_rows, total)
-    scores = [score for k in sorted(done) for score in done[k].scores]
-    return Bench(
-        rows=pool_scores(scores, {pack.name: pack.chemistry for pack in packs}),
-        logs=tuple(scores),
-        failures=tuple(item.failure for k, item in sorted(done.items()) if item.failure),
-        packs={
-            pack.name: {
-                "role": pack.role,
-                "chemistry": pack.chemistry,
-                "reference": pack.reference,
-                "training_logs": [log.name for log in pack.training],
-                "judged_logs": [log.name for log in pack.judged],
-            }
-            for pack in packs
-        },
-        settings={"effects": list(effects), "splits": splits, "seed": seed, "rate_hz": RATE_HZ},
-        seconds=time.perf_counter() - began,
-    )
-
-
-def _work(tasks: Sequence[tuple[int, _Task]], jobs: int) -> Iterator[tuple[int, _Done]]:
-    if jobs == 1:
-        for k, task in tasks:
-            yield k, _judge(task)
-        return
-    with (
-        single_threaded(),
-        ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool,
-    ):
-        running = {pool.submit(_judge, task): k for k, task in tasks}
-        for future in as_completed(running):
-            yield running[future], future.result()
-
-
-def _spread(logs: list[Log], at_most: int | None) -> list[Log]:
-    if at_most is None or len(logs) <= at_most:
-        return logs
-    return [logs[k] for k in np.linspace(0, len(logs) - 1, at_most).round().astype(int)]
-
-
-def _judge(task: _Task) -> _Done:
-    """Fit the models of one draw and score every judged log in every case."""
-    began = time.perf_counter()
-    try:
-        capacity = task.pack.capacity_ah or capacity_from_reference(task.training)
-        model = fit(task.training, capacity_ah=capacity, effects=task.effects).model
-        plain = fit(task.training, capacity_ah=capacity).model if task.effects else model
-        model.extended_model()  # refuses coefficients that no pack has
-    except InputError as error:
-        return _Done(failure=Failure(task.pack.name, task.size, task.split, str(error)))
-    fit_seconds = time.perf_counter() - began
-    scores = []
-    for case in task.cases:
-        for log in filter(case.suits, task.judged):
-            ran = _estimate(log, model, case)
-            newton = ran.table
-            if plain is not model:
-                newton = _estimate(log, plain, case, "newton").table
-            score = score_log(ran.table, newton.soc_newton_pct, log, case.after_s)
-            scores.append(
-                replace(
-                    score,
-                    pack=task.pack.name,
-                    role=task.pack.role,
-                    case=case.name,
-                    size=task.size,
-                    split=task.split,
-                    counting_is_reference=case.counting_is_reference,
-                    offset_a=case.offset_a,
-                    found_offset_a=ran.offset_a,
-                    fit_seconds=fit_seconds,
-                    step_us=1e6 * ran.seconds / len(log),
-                )
-            )
-    return _Done(scores)
-
-
-class _Ran(NamedTuple):
-    table: EstimateTable
-    offset_a: float
-    seconds: float
-
-
-OFFSET_AT_S: Final = 1200.0
-"""When the estimated offset of the current sensor is read [s]."""
-
-
-def _estimate(log: Log, model: Model, case: Case, method: Literal["ekf", "newton"] = "ekf") -> _Ran:
-    """Run the estimator over a log with the case's errors; NaN offset for a shorter log."""
-    start = log.first_soc()
-    initial = None
-    if case.start_error_pct is not None and start is not None:
-        initial = min(max(start[1] + case.start_error_pct, 0.0), 100.0)
-    seen = replace(
-        log,
-        current_a=log.current_a + case.offset_a,
-        voltage_v=case.voltage_factor * log.voltage_v,
-    )
-    estimator = make_estimator(
-        model,
-        EstimatorSettings(
-            method=method,
-            initial_soc_pct=initial,
-            capacity_ah=case.capacity_factor * model.capacity_ah,
-            gap_s=gap_of(log),
-            temperature_source=log.temperature_source,
-        ),
-    )
-    read_s, offset_a = log.time_s[0] + OFFSET_AT_S, math.nan
-    began = time.perf_counter()
-    estimates = []
-    for sample in samples_of(seen):
-        estimates.append(estimator.step(sample))
-        if sample.time_s >= read_s and math.isnan(offset_a) and method == "ekf":
-            offset_a = estimator.filter.offset_a
-    seconds = time.perf_counter() - began
-    return _Ran(EstimateTable.of(estimates), offset_a, seconds)

@@ -19,8 +19,10 @@ from rich.text import Text
 from cangauge._formatting import duration, number, printable
 from cangauge._typing import FloatArray
 from cangauge.estimation.offline import EstimateTable
-from cangauge.estimation.validity import Status
+from cangauge.estimation.validity import Reason, Status
 from cangauge.logs.log import Log
+from cangauge.validation.packs_quantities import COLUMNS as QUANTITY_COLUMNS
+from cangauge.validation.packs_quantities import Quantity, QuantityRow, Verdict
 
 FIVE_MIN_S: Final = 300.0
 TEN_MIN_S: Final = 600.0
@@ -73,9 +75,11 @@ class LogScore:
     size: int = 0
     split: int = 0
     counting_is_reference: bool = False
-    offset_a: float = 0.0
-    found_offset_a: float = math.nan
-    """Offset of the current sensor, and its estimate after 20 minutes [A]."""
+    is_model_wrong: bool = False
+    """Whether the model is that of another pack."""
+    mismatch_min: float = math.nan
+    """Time until a model mismatch is first reported [min]; NaN: never."""
+    quantities: tuple[Quantity, ...] = ()
     fit_seconds: float = 0.0
     step_us: float = 0.0
     """Time of the fit [s], and of a sample [µs]."""
@@ -106,6 +110,7 @@ def score_log(
     five_min, late = scored & (since_s >= FIVE_MIN_S), scored & (since_s >= TEN_MIN_S)
     empty = scored & (reference < EMPTY_PCT)
     covered = error <= 2.0 * std
+    mismatch_s = since_s[(table.reasons & Reason.MODEL_MISMATCH) != 0]
 
     def mean(values: FloatArray, rows: FloatArray = scored) -> float:
         found = values[rows & np.isfinite(values)]
@@ -132,21 +137,8 @@ def score_log(
         valid_wrong=float((is_valid & wrong).mean()),
         empty_rows=int(empty.sum()),
         empty_uncovered=int((empty & (error > EMPTY_ERROR_PCT) & ~covered).sum()),
+        mismatch_min=float(mismatch_s[0]) / 60.0 if mismatch_s.size else math.nan,
     )
-
-
-class Verdict(NamedTuple):
-    """A target of a row: its figure, limits and whether they are met."""
-
-    name: str
-    value: float
-    low: float
-    high: float
-
-    @property
-    def met(self) -> bool:
-        """Whether the figure is within the limits; an unknown figure is not."""
-        return self.low <= self.value <= self.high
 
 
 @dataclass(frozen=True)
@@ -186,8 +178,11 @@ class Row:
     valid_wrong: float
     empty_rows: int
     empty_uncovered: int
-    offset_error_a: float
-    """Mean absolute error of the estimated offset of the current sensor after 20 minutes [A]."""
+    is_model_wrong: bool
+    mismatches: int
+    """Logs in which a model mismatch is reported."""
+    mismatch_min: float
+    """Median time until then [min]; NaN: never."""
     fit_seconds: float
     step_us: float
     targets: tuple[Verdict, ...] = ()
@@ -240,8 +235,7 @@ def _pooled(scores: Sequence[LogScore]) -> Row:
     lasting = [score for score in scores if score.minutes > LONG_MINUTES] or scores
     least_covered = min(lasting, key=lambda score: score.cover)
     farthest = max(scores, key=lambda score: score.mae_pct)
-    offsets = [abs(s.found_offset_a - s.offset_a) for s in scores if s.offset_a]
-    known_offsets = [each for each in offsets if math.isfinite(each)]
+    mismatches = [s.mismatch_min for s in scores if math.isfinite(s.mismatch_min)]
     return Row(
         pack=first.pack,
         role=first.role,
@@ -272,7 +266,9 @@ def _pooled(scores: Sequence[LogScore]) -> Row:
         ),
         empty_rows=sum(score.empty_rows for score in scores),
         empty_uncovered=sum(score.empty_uncovered for score in scores),
-        offset_error_a=float(np.mean(known_offsets)) if known_offsets else math.nan,
+        is_model_wrong=first.is_model_wrong,
+        mismatches=len(mismatches),
+        mismatch_min=float(np.median(mismatches)) if mismatches else math.nan,
         fit_seconds=float(np.mean([score.fit_seconds for score in scores])),
         step_us=float(np.mean([score.step_us for score in scores])),
     )
@@ -299,11 +295,11 @@ WITHHELD_PCT: Final = {10: 1.0, 5: 1.5}
 COVER: Final = (0.90, 0.99)
 WORST_COVER: Final = 0.75
 STD_OVER_RMSE: Final = (0.7, 1.5)
-OFFSET_A: Final = 0.3
-"""Error of the current offset after 20 minutes, where the SoC's σ does not cover it [A]."""
 
 
 def _targets(row: Row, withheld: Row | None, chemistry: str) -> Iterator[Verdict]:
+    if row.is_model_wrong:
+        return  # nothing can be asked of it but to be noticed
     inputs = [row.newton_mae_pct]
     if not row.counting_is_reference:
         inputs.append(row.counting_mae_pct)
@@ -323,8 +319,6 @@ def _targets(row: Row, withheld: Row | None, chemistry: str) -> Iterator[Verdict
     yield Verdict("σ/RMSE", row.std_over_rmse, *STD_OVER_RMSE)
     if row.empty_rows:
         yield Verdict("empty", row.empty_uncovered, 0.0, 0.0)
-    if math.isfinite(row.offset_error_a) and row.cover < COVER[0]:
-        yield Verdict("offset", row.offset_error_a, 0.0, OFFSET_A)
 
 
 class Failure(NamedTuple):
@@ -344,6 +338,8 @@ class Bench:
     ----------
     rows : tuple of Row
         One for each pack, number of training logs and case.
+    quantities : tuple of QuantityRow
+        One for each quantity that is asked for in one of these.
     logs : tuple of LogScore
         One for each judged log of each draw and case.
     failures : tuple of Failure
@@ -355,6 +351,7 @@ class Bench:
     """
 
     rows: tuple[Row, ...]
+    quantities: tuple[QuantityRow, ...]
     logs: tuple[LogScore, ...]
     failures: tuple[Failure, ...]
     packs: dict[str, dict[str, Any]]
@@ -368,17 +365,22 @@ class Bench:
             "settings": self.settings,
             "seconds": self.seconds,
             "packs": self.packs,
-            "rows": [
-                {
-                    **asdict(row),
-                    "targets": [{**target._asdict(), "met": target.met} for target in row.targets],
-                    "missed": list(row.missed),
-                }
-                for row in self.rows
+            "rows": [_as_dict(row) for row in self.rows],
+            "quantities": [_as_dict(row) for row in self.quantities],
+            "logs": [
+                {**asdict(score), "quantities": [each._asdict() for each in score.quantities]}
+                for score in self.logs
             ],
-            "logs": [asdict(score) for score in self.logs],
             "failures": [failure._asdict() for failure in self.failures],
         }
+
+
+def _as_dict(row: Row | QuantityRow) -> dict[str, Any]:
+    return {
+        **asdict(row),
+        "targets": [{**target._asdict(), "met": target.met} for target in row.targets],
+        "missed": list(row.missed),
+    }
 
 
 Cell = Callable[[Row], str]
@@ -391,6 +393,11 @@ def _percent(share: float) -> str:
 def _counting(row: Row) -> str:
     text = number(row.counting_mae_pct, 2)
     return f"({text})" if row.counting_is_reference else text
+
+
+def _mismatch(row: Row) -> str:
+    after = f", {number(row.mismatch_min, 0)} min" if row.mismatches else ""
+    return f"{row.mismatches} of {row.logs}{after}"
 
 
 COLUMNS: Final[tuple[tuple[str, Cell], ...]] = (
@@ -410,38 +417,19 @@ COLUMNS: Final[tuple[tuple[str, Cell], ...]] = (
     ("worst\nMAE", lambda row: number(row.worst_mae_pct, 2)),
     ("valid\n%", lambda row: _percent(row.valid)),
     ("wrong\n%", lambda row: number(100.0 * row.valid_wrong, 1)),
-    ("offset\nerror A", lambda row: number(row.offset_error_a, 2)),
+    ("mis-\nmatch", _mismatch),
     ("targets", lambda row: "missed: " + ", ".join(row.missed) if row.missed else "pass"),
 )
 WIDTH: Final = 170
 
 
 def print_bench(bench: Bench, console: Console) -> None:
-    """Print a table for each pack, and how many rows meet each target."""
+    """Print a table for each pack, the quantities, and how many rows meet each target."""
     for name, about in bench.packs.items():
         rows = [row for row in bench.rows if row.pack == name]
-        if not rows:
-            continue
-        role = {
-            "development": "development: constants may be chosen on it",
-            "judged": "judged: left out of every choice of a constant",
-        }[about["role"]]
-        table = Table(
-            title=Text(printable(f"{name} ({role})")),
-            title_justify="left",
-            box=box.SIMPLE_HEAD,
-            pad_edge=False,
-            padding=(0, 1, 0, 0),
-        )
-        for heading, _ in COLUMNS:
-            table.add_column(Text(heading), justify="left" if heading in {"case", "targets"} else
-                             "right", no_wrap=heading != "targets")  # fmt: skip
-        for before, row in zip([rows[0], *rows], rows, strict=False):
-            if row.size != before.size:
-                table.add_section()
-            table.add_row(*(Text(printable(cell(row))) for _, cell in COLUMNS))
-        console.print(table)
-        console.print(Text(printable(f"reference: {about['reference']}\n")))
+        if rows:
+            console.print(_table_of_pack(name, about["role"], rows))
+            console.print(Text(printable(f"reference: {about['reference']}\n")))
     for failure in bench.failures:
         text = f"no model: {failure.pack}, {failure.size} logs, draw {failure.split + 1}"
         console.print(Text(printable(f"{text}: {failure.error}")))
@@ -449,20 +437,62 @@ def print_bench(bench: Bench, console: Console) -> None:
         "MAE, RMSE, max in % SoC; 2σ: share of samples within 2σ; worst: over single logs; valid:"
         " share with status VALID; wrong: valid, but off by more than 3σ and 3 %. Counting in"
         " brackets repeats the reference. Withheld is scored after 5 min, wrong starts after 10."
+        " Mismatch: logs in which the model is reported not to fit, and after how long."
     )
-    table = Table(title="Rows that meet each target", title_justify="left", box=box.SIMPLE_HEAD)
+    if bench.quantities:
+        console.print(_table_of_quantities(bench.quantities))
+    console.print(_table_of_targets((*bench.rows, *bench.quantities)))
+    console.print(f"{duration(bench.seconds)} in all")
+
+
+def _table_of_pack(name: str, role: str, rows: Sequence[Row]) -> Table:
+    about = {
+        "development": "development: constants may be chosen on it",
+        "judged": "judged: left out of every choice of a constant",
+    }[role]
+    table = _empty_table(f"{name} ({about})")
+    for heading, _ in COLUMNS:
+        table.add_column(Text(heading), justify="left" if heading in {"case", "targets"} else
+                         "right", no_wrap=heading != "targets")  # fmt: skip
+    for before, row in zip([rows[0], *rows], rows, strict=False):
+        if row.size != before.size:
+            table.add_section()
+        table.add_row(*(Text(printable(cell(row))) for _, cell in COLUMNS))
+    return table
+
+
+def _table_of_quantities(rows: Sequence[QuantityRow]) -> Table:
+    table = _empty_table("Beside the SoC")
+    for heading, _ in QUANTITY_COLUMNS:
+        table.add_column(Text(heading), no_wrap=heading != "targets")
+    for row in rows:
+        table.add_row(*(Text(printable(cell(row))) for _, cell in QUANTITY_COLUMNS))
+    return table
+
+
+def _table_of_targets(rows: Sequence[Row | QuantityRow]) -> Table:
+    table = _empty_table("Rows that meet each target")
     for heading in ("target", "development", "judged"):
         table.add_column(heading)
-    for name in dict.fromkeys(target.name for row in bench.rows for target in row.targets):
+    for name in dict.fromkeys(target.name for row in rows for target in row.targets):
         cells = []
         for role in ("development", "judged"):
             met = [
                 target.met
-                for row in bench.rows
+                for row in rows
                 for target in row.targets
                 if row.role == role and target.name == name
             ]
             cells.append(f"{sum(met)} of {len(met)}")
         table.add_row(Text(name), *cells)
-    console.print(table)
-    console.print(f"{duration(bench.seconds)} in all")
+    return table
+
+
+def _empty_table(title: str) -> Table:
+    return Table(
+        title=Text(printable(title)),
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )

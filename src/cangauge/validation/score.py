@@ -12,7 +12,6 @@ from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from scipy.stats import binomtest, bootstrap
 
 from cangauge.validation.plan import EFFECTS, is_outside
 from cangauge.validation.twin.faults import fault_kinds
@@ -40,6 +39,8 @@ Figures = dict[str, Any]
 
 def proportion(hits: int, of: int) -> Figures:
     """Return a share with its 95 % interval (Wilson 1927)."""
+    from scipy.stats import binomtest  # noqa: PLC0415 - half a second to import
+
     interval = None
     if of:
         interval = list(binomtest(hits, of).proportion_ci(0.95, method="wilson"))
@@ -60,6 +61,8 @@ def bootstrapped(values: Sequence[float], statistic: Callable[..., Any]) -> Figu
     statistic : callable
         `np.median` or `np.mean`: takes an array and an axis.
     """
+    from scipy.stats import bootstrap  # noqa: PLC0415 - half a second to import
+
     data = np.asarray(values, dtype=np.float64)
     if data.size == 0:
         return {"value": None, "ci": None, "of": 0}

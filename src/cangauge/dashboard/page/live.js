@@ -1,13 +1,15 @@
 "use strict";
-// Ask ten times a second for what is new, and show it. `FACTS` and the figures come from charts.js.
+// Show what is new, ten times a second. `FACTS` and the figures come from charts.js.
 (() => {
   Bokeh.set_log_level("error");  // it warns of each figure without data
-  const EVERY_MS = 100, GIVE_UP_MS = 700, CHANGES = 12, PIXELS = 500;
+  const GIVE_UP_MS = 700, DRAW_MS = 250, GAP_MS = 2000, WATCH_MS = 200, AGAIN_MS = 200, CHANGES = 12, PIXELS = 500, ANSWER_MS = 3000;
   const at = id => document.getElementById(id);
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const SPANS_MS = { "10min": 6e5, "1h": 3.6e6, all: Infinity };
   let span = "10min", key = "", added = 0, width_ms = SPANS_MS[span], paused = false, moving = false;
   let figures, rows, runs, time, answered_ms = performance.now(), drawn_ms = 0;
+  // All rows of the span; `rows` holds those drawn.
+  let kept = { time_ms: [] }, dropped = 0, extended = 0, every_ms = 100;
 
   const fixed = (value, digits) => value.toFixed(digits).replace("-", "−");
   const num = (value, digits, unit = "") =>
@@ -19,11 +21,28 @@
   // bokeh's axes show UTC: local time is drawn by moving the stamps.
   const SHIFT_MS = -6e4 * new Date().getTimezoneOffset();
   const clock = ms => new Date(ms).toISOString().slice(11, 19);
-  const put = (element, text) => { if (element.textContent !== text) element.textContent = text; };
+  const put = (element, text) => {
+    if (element.firstChild === null) element.textContent = text;
+    else if (element.firstChild.data !== text) element.firstChild.data = text;
+  };
+
+  // Means of the last second: shown once a second.
+  let means = {}, means_ms = -Infinity;
+  function meanTiles(status, latest) {
+    if (performance.now() - means_ms < 1000 && "Frames" in means) return means;
+    means_ms = performance.now();
+    const counts = Object.values(status.rejects).reduce((sum, count) => sum + count, 0);
+    means = {
+      "Frames": num(latest.frames_per_s, 0, "/s"),
+      "Rejects": `${counts} (${num(latest.rejects_per_s, 1, "/s")})`,
+      "Latency": num(latest.latency_ms, 2, "ms"),
+      "Latency, 99 % below": num(scaled(status.latency.p99_at_most_s, 1e3), 1, "ms"),
+    };
+    return means;
+  }
 
   function tiles(status, latest) {
-    const { estimate, health, power, cells, record } = status, sample = status.sample ?? {};
-    const counts = Object.values(status.rejects).reduce((sum, count) => sum + count, 0);
+    const { estimate, health, power, cells } = status, sample = status.sample ?? {};
     return {
       "SoC by voltage": num(estimate.soc_newton_pct, 2, "%"),
       "SoC by counting": num(estimate.soc_coulomb_pct, 2, "%"),
@@ -42,11 +61,7 @@
         "Weakest cell": cells.weakest === null ? "not distinguishable" : `number ${cells.weakest} of ${cells.cells}`,
         "SoC of that cell": pm(cells.soc_pct, cells.soc_std_pct, 1, "%"),
       } : {}),
-      "Frames": num(latest.frames_per_s, 0, "/s"),
-      "Rejects": `${counts} (${num(latest.rejects_per_s, 1, "/s")})`,
-      "Latency": num(latest.latency_ms, 2, "ms"),
-      "Latency, 99 % below": num(scaled(status.latency.p99_at_most_s, 1e3), 1, "ms"),
-      ...(record ? { "Recording": record.problem ?? `${num(record.written_bytes / 1e6, 1)} MB, ${record.lost_frames} lost` } : {}),
+      ...meanTiles(status, latest),
     };
   }
 
@@ -56,6 +71,7 @@
     put(at("state"), status.status);
     at("state").dataset.status = status.status;
     put(at("reasons"), words(latest.reasons).join("; "));
+    showRecording(status);
     const wanted = Object.entries(tiles(status, latest)), list = at("tiles");
     if (list.children.length !== wanted.length) {
       list.replaceChildren(...wanted.map(([name]) => {
@@ -71,6 +87,36 @@
     });
   }
 
+  // The state of the recording is the service's, so all viewers see the same.
+  let recording = null, uptime_s = 0, restarted = false, asked_ms = -ANSWER_MS;
+  function showRecording(status) {
+    const record = status.record, is_active = Boolean(record?.active), was = Boolean(recording?.active);
+    if (status.uptime_s < uptime_s) restarted = was && !is_active;
+    else if (was !== is_active) { restarted = false; asked_ms = -ANSWER_MS; }
+    [recording, uptime_s] = [record, status.uptime_s];
+    put(at("record"), is_active ? "Stop recording" : "Start recording");
+    at("record").dataset.active = String(is_active);
+    at("record").setAttribute("aria-disabled", String(performance.now() - asked_ms < ANSWER_MS));
+    const lost = record?.lost_frames ? `, ${record.lost_frames} frames lost` : "";
+    const bytes = record?.written_bytes, size = (bytes < 1e6 ? num(bytes / 1e3, 0, "kB") : num(bytes / 1e6, 1, "MB")) + lost;
+    const problem = record?.problem ? ` ${record.problem}` : "";
+    put(at("recording"), is_active ? `${record.path}: ${size}.${problem}`
+      : restarted ? "Not recording: the service was restarted."
+        : problem ? `Not recording:${problem}` : record ? `Recorded: ${record.path}, ${size}.` : "Not recording.");
+  }
+
+  async function toggleRecording() {
+    if (performance.now() - asked_ms < ANSWER_MS) return;
+    asked_ms = performance.now();
+    try {
+      const answer = await fetch("/recording", {
+        method: "POST", headers: { "Content-Type": "application/json" },
+        body: JSON.stringify({ active: !recording?.active }), signal: AbortSignal.timeout(ANSWER_MS),
+      });
+      if (answer.status === 401) location.assign("/enter");
+    } catch { asked_ms = -ANSWER_MS; }
+  }
+
   function trouble(texts) {
     // The seconds in a text change all the time: read aloud once only.
     put(at("troubles"), texts.join(" "));
@@ -78,25 +124,41 @@
   }
 
   // Stretches of one status and reasons, and the list of the latest changes.
-  function extend(columns, fresh) {
+  function extend(fresh) {
+    const start = Math.max(extended - dropped, 0), times = kept.time_ms.slice(start);
+    extended = dropped + kept.time_ms.length;
     const found = fresh ? [] : runs.data.left.map((_, index) =>
       Object.fromEntries(Object.entries(runs.data).map(([name, values]) => [name, values[index]])));
-    columns.time_ms.forEach((ms, index) => {
-      const status = FACTS.statuses[columns.status[index]], text = words(columns.reasons[index]).join("; ") || "no reason";
+    times.forEach((ms, index) => {
+      const status = FACTS.statuses[kept.status[start + index]], text = words(kept.reasons[start + index]).join("; ") || "no reason";
       const last = found.at(-1);
-      if (last && last.status === status && last.words === text) { last.right = ms; return; }
-      if (last) last.right = ms;
+      const isNext = last && ms - last.right <= gap_ms();
+      if (isNext) last.right = ms;
+      if (isNext && last.status === status && last.words === text) return;
       found.push({ left: ms, right: ms, status, colour: FACTS.colours[status], words: text });
     });
-    const kept = found.filter(run => !rows.data.time_ms.length || run.right >= rows.data.time_ms[0]).slice(-2000);
-    const isLonger = kept.length !== runs.data.left.length || fresh;
-    runs.data = Object.fromEntries(["left", "right", "status", "colour", "words"].map(name => [name, kept.map(run => run[name])]));
+    const shown = found.filter(run => !kept.time_ms.length || run.right >= kept.time_ms[0]).slice(-2000);
+    const isLonger = shown.length !== runs.data.left.length || fresh;
+    runs.data = Object.fromEntries(["left", "right", "status", "colour", "words"].map(name => [name, shown.map(run => run[name])]));
     if (!isLonger) return;
-    at("changes").replaceChildren(...kept.slice(-CHANGES).reverse().map(run => {
+    at("changes").replaceChildren(...shown.slice(-CHANGES).reverse().map(run => {
       const item = document.createElement("li");
       item.textContent = `${clock(run.left)} ${run.status}` + (run.words === "no reason" ? "" : `: ${run.words}`);
       return item;
     }));
+  }
+
+  // Longest time between rows of which none is missing.
+  const gap_ms = () => Math.max(5 * every_ms, GAP_MS);
+
+  // Break the lines where rows are missing: a service that was stopped, for instance.
+  function broken(data, limit_ms) {
+    const times = data.time_ms;
+    for (let row = times.length - 1; row > 0; row -= 1) {
+      if (!(times[row] - times[row - 1] > limit_ms)) continue;
+      for (const values of Object.values(data)) values.splice(row, 0, values === times ? times[row - 1] : NaN);
+    }
+    return data;
   }
 
   function setRange(start, end) {
@@ -106,10 +168,36 @@
   }
 
   function follow() {
-    const times = rows.data.time_ms;
+    const times = kept.time_ms;
     if (!times.length || paused) return;
     const end = times.at(-1), first = times[0];
     setRange(Math.max(end - width_ms, Math.min(first, end - 1e4)), end);
+  }
+
+  // Draw the rows between the ends of the time axis: all, or the least and largest of a pixel's stretch.
+  function draw() {
+    const times = kept.time_ms, first = Math.max(times.findIndex(ms => ms >= time.start) - 1, 0);
+    const after = times.findLastIndex(ms => ms <= time.end) + 2, every = Math.ceil((after - first) / PIXELS);
+    const cut = values => values.slice(first, after);
+    const columns = of => Object.fromEntries(Object.entries(kept).map(([name, values]) => [name, of(values, name)]));
+    if (every <= 2) { rows.data = broken(columns(cut), gap_ms()); return; }
+    // Stretches begin at the same rows in each picture, so that it stands still.
+    const starts = [];
+    for (let row = first - (first + dropped) % every; row < Math.min(after, times.length); row += every) starts.push(Math.max(row, 0));
+    const ends = [...starts.slice(1), Math.min(after, times.length)];
+    rows.data = broken(columns((values, name) => starts.flatMap((start, index) =>
+      name === "time_ms" ? [values[start], values[ends[index] - 1]] : extremes(values, start, ends[index]))),
+    every * every_ms + gap_ms());
+  }
+
+  // The least and the largest value, in the order of their rows.
+  function extremes(values, start, end) {
+    let low = start, high = start;
+    for (let row = start; row < end; row += 1) {
+      if (!(values[row] >= values[low])) { if (!Number.isNaN(values[row])) low = row; }
+      if (!(values[row] <= values[high])) { if (!Number.isNaN(values[row])) high = row; }
+    }
+    return [values[Math.min(low, high)], values[Math.max(low, high)]];
   }
 
   function take(answer) {
@@ -119,44 +207,63 @@
     }
     columns.time_ms = columns.time_ms.map(ms => ms + SHIFT_MS);
     const fresh = answer.key !== key && !isContinued(answer);
-    if (fresh) rows.data = columns;
-    else if (columns.time_ms.length) rows.stream(columns, FACTS.rows_at_most[span]);
-    key = answer.key;
-    added = answer.added;
-    if (fresh || columns.time_ms.length) { extend(columns, fresh); follow(); }
+    if (fresh) [kept, dropped, extended] = [columns, 0, 0];
+    else for (const [name, values] of Object.entries(columns)) kept[name].push(...values);
+    const excess = Math.max(kept.time_ms.length - FACTS.rows_at_most[span], 0);
+    dropped += excess;
+    for (const values of Object.values(kept)) values.splice(0, excess);
+    ({ key, added, every_ms } = answer);
+    // The figures are drawn again once the picture has moved by about two pixels, at most four times a second; the
+    // tiles each time.
+    const isDue = performance.now() - drawn_ms >= Math.max((time.end - time.start) / PIXELS, DRAW_MS);
+    if (fresh || (isDue && columns.time_ms.length)) redraw(fresh);
   }
 
   // After a restart of the service its rows go on from those already shown.
   function isContinued(answer) {
-    const times = rows.data.time_ms;
+    const times = kept.time_ms;
     return key !== "" && key.split("-")[0] !== answer.key.split("-")[0] && times.length > 0 && !(answer.columns.time_ms[0] <= times.at(-1));
   }
 
-  async function ask() {
-    // The figures are drawn again once the picture has moved by about two pixels; the tiles each time.
-    const isDue = performance.now() - drawn_ms >= (time.end - time.start) / PIXELS;
-    const query = paused || (!isDue && key) ? "" : `?span=${span}&key=${key}&after=${added}`, asked = span;
-    try {
-      const answer = await fetch(`/rows${query}`, { signal: AbortSignal.timeout(GIVE_UP_MS) });
-      if (answer.status === 401) { location.assign("/enter"); return; }
-      if (!answer.ok) throw new Error(String(answer.status));
-      const content = await answer.json();
-      answered_ms = performance.now();
-      if (content.columns && asked === span && !paused) { take(content); drawn_ms = answered_ms; }
-      if (content.status) {
-        show(content.status, content.latest);
-      }
-      trouble(content.troubles);
-    } catch {
-      const seconds = (performance.now() - answered_ms) / 1e3;
-      if (1e3 * seconds > GIVE_UP_MS) trouble([`The service does not answer for ${seconds.toFixed(0)} s. The values are old.`]);
-    }
+  function redraw(fresh) {
+    drawn_ms = performance.now();
+    extend(fresh);
+    follow();
+    draw();
   }
 
-  async function poll() {
-    const began = performance.now();
-    if (!document.hidden) await ask();
-    setTimeout(poll, Math.max(EVERY_MS - (performance.now() - began), 20));
+  // What is new comes by a socket, from each question on: which rows this page has, or that it wants none.
+  let socket = null;
+  function question() {
+    if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(paused ? {} : { span, key, after: added }));
+  }
+
+  function hear(content) {
+    answered_ms = performance.now();
+    if (content.columns && content.span === span && !paused) take(content);
+    if (content.status) show(content.status, content.latest);
+    trouble(content.troubles);
+  }
+
+  function connect() {
+    if (socket || document.hidden) return;
+    const own = socket = new WebSocket(`${location.origin.replace("http", "ws")}/stream`);
+    own.onopen = question;
+    own.onmessage = event => hear(JSON.parse(event.data));
+    own.onclose = async () => {
+      if (socket === own) socket = null;
+      if (document.hidden) return;
+      const answer = await fetch("/rows").catch(() => null);
+      if (answer?.status === 401) location.assign("/enter");
+      else setTimeout(connect, AGAIN_MS);
+    };
+  }
+
+  function watch() {
+    const seconds = (performance.now() - answered_ms) / 1e3;
+    if (document.hidden || 1e3 * seconds <= GIVE_UP_MS) return;
+    trouble([`The service does not answer for ${seconds.toFixed(0)} s. The values are old.`]);
+    if (1e3 * seconds > ANSWER_MS && socket) { const old = socket; socket = null; old.close(); }
   }
 
   async function compare() {
@@ -200,7 +307,8 @@
     paused = wanted;
     at("pause").setAttribute("aria-pressed", String(paused));
     put(at("pause"), paused ? "Resume" : "Pause");
-    if (!paused) { width_ms = SPANS_MS[span]; follow(); }
+    question();
+    if (!paused) { width_ms = SPANS_MS[span]; follow(); draw(); }
   }
 
   function move(scale, shift) {
@@ -208,6 +316,7 @@
     setPaused(true);
     const middle = end - width / 2;
     setRange(middle - scale * width / 2, middle + scale * width / 2);
+    draw();
   }
 
   function choose(tab) {
@@ -243,7 +352,12 @@
       try { await navigator.clipboard.writeText(at("command").textContent); put(at("copied"), "Copied."); }
       catch { put(at("copied"), "The browser refuses: select the command and copy it."); }
     });
-    time.change.connect(() => { if (!moving && !paused) setPaused(true); });
+    time.change.connect(() => {
+      if (moving) return;
+      if (!paused) setPaused(true);
+      draw();
+    });
+    at("record").addEventListener("click", toggleRecording);
     dark.addEventListener("change", paint);
   }
 
@@ -259,7 +373,17 @@
     }
     paint();
     controls();
-    poll();
+    // A figure out of sight is not drawn.
+    const seen = new IntersectionObserver(entries => {
+      for (const { target, isIntersecting } of entries) {
+        const view = Bokeh.index.find_one_by_id(figures.find(({ name }) => name === target.dataset.figure).id);
+        if (isIntersecting) view.unpause(); else if (!view.is_paused) view.pause();
+      }
+    });
+    for (const section of document.querySelectorAll("[data-figure]")) seen.observe(section);
+    connect();
+    setInterval(watch, WATCH_MS);
+    document.addEventListener("visibilitychange", () => { if (document.hidden) socket?.close(); else connect(); });
     compare();
   }
   begin();

@@ -20,18 +20,19 @@ An effect names a signature at the terminals; it does not prove a mechanism.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cangauge._arithmetic import total
 from cangauge._typing import FloatArray
 from cangauge.model.coulomb_counting import BRIDGE_S, discharged_ah
 from cangauge.model.delay_line import delayed_currents
-from cangauge.model.effects.first_order import LowPass, low_passed
+from cangauge.model.effects.first_order import NO_LAG_S, LowPass, decaying_sum, low_passed
 from cangauge.model.voltage_model import VoltageModel
 
 Scale = Literal["one", "capacity", "voltage", "resistance"]
@@ -168,8 +169,8 @@ LAG: Final = Parameter(
 """Time constant of the cell interior behind the measured temperature (0: none). Only a diagnosis
 tries others: on a day on which the pack warms, the interior's temperature separates causes."""
 
-MOST_LAGS = 64
-"""Lagged currents kept in a cache; all shapes of all effects use about fifty."""
+MOST_LAGS, MOST_SHIFTS = 64, 4
+"""Lagged and shifted currents kept in a cache; all shapes of all effects use about fifty lags."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,12 +184,38 @@ class CurrentHistory:
 
     time_s: FloatArray
     current_a: FloatArray
+    rows: NDArray[np.intp] | None = None
+    """Samples at which lagged and delayed currents are returned; all if None."""
     _lagged: dict[tuple[float, bool], FloatArray] = field(
         default_factory=dict, init=False, repr=False
     )
+    _lagged_c: dict[float, tuple[FloatArray, FloatArray]] = field(
+        default_factory=dict, init=False, repr=False
+    )
+    _turned: dict[float, FloatArray] = field(default_factory=dict, init=False, repr=False)
+    _at_rows: dict[int, CurrentHistory] = field(default_factory=dict, init=False, repr=False)
+    _shifted: dict[float, CurrentHistory] = field(default_factory=dict, init=False, repr=False)
     _delayed_a: dict[tuple[float, ...], FloatArray] = field(
         default_factory=dict, init=False, repr=False
     )
+
+    def at(self, rows: NDArray[np.intp]) -> CurrentHistory:
+        """Return the same history at some rows only; the same one for the same array of rows."""
+        key = id(rows)
+        if key not in self._at_rows:
+            self._at_rows[key] = CurrentHistory(self.time_s, self.current_a, rows)
+        return self._at_rows[key]
+
+    def shifted(self, seconds: float) -> CurrentHistory:
+        """Return the history of I(t + seconds), held beyond the ends of the log."""
+        found = self._shifted.pop(seconds, None)
+        if found is None:
+            current_a = np.interp(self.time_s + seconds, self.time_s, self.current_a)
+            found = CurrentHistory(self.time_s, current_a)
+            while len(self._shifted) >= MOST_SHIFTS:
+                del self._shifted[next(iter(self._shifted))]
+        self._shifted[seconds] = found  # the latest one last
+        return found
 
     def lagged_a(self, tau_s: float) -> FloatArray:
         """Return the current behind a first-order lag [A], shape (n,), at rest before the log."""
@@ -200,19 +227,43 @@ class CurrentHistory:
 
     def _low_passed(self, tau_s: float, *, squared: bool) -> FloatArray:
         key = (tau_s, squared)
-        if key not in self._lagged:
+        lagged = self._lagged.pop(key, None)
+        if lagged is None:
             while len(self._lagged) >= MOST_LAGS:  # a fit varies the time constants
                 del self._lagged[next(iter(self._lagged))]
             values = self.current_a**2 if squared else self.current_a
-            self._lagged[key] = low_passed(self.time_s, values, tau_s, 0.0, rest_s=BRIDGE_S)
-        return self._lagged[key]
+            lagged = low_passed(self.time_s, values, tau_s, 0.0, rest_s=BRIDGE_S)
+            lagged = lagged if self.rows is None else lagged[self.rows]
+        self._lagged[key] = lagged  # the latest one last
+        return lagged
+
+    def lagged_c(self, temperature_c: FloatArray, lag_s: float) -> FloatArray:
+        """Return the temperature of all samples behind a lag, equal to it at the start [°C]."""
+        known, lagged = self._lagged_c.get(lag_s, (None, temperature_c))
+        if known is not temperature_c:  # corrected differently
+            lagged = low_passed(self.time_s, temperature_c, lag_s)
+            lagged = lagged if self.rows is None else lagged[self.rows]
+            self._lagged_c[lag_s] = (temperature_c, lagged)
+        return lagged
+
+    def turned(self, travel_as: float) -> FloatArray:
+        """Return the memory of the current's sign over a charge [As], −1 … 1, shape (n,).
+
+        dh/dt = |I|/travel·(−sign(I) − h), 0 before the log and unchanged over gaps.
+        """
+        if travel_as not in self._turned:
+            seconds = np.diff(self.time_s)
+            mean = 0.5 * (self.current_a[1:] + self.current_a[:-1])
+            decay = np.where(seconds > BRIDGE_S, 0.0, np.abs(mean) * seconds / travel_as)
+            turned = decaying_sum(decay, np.sign(mean) * np.expm1(-decay), 0.0)
+            self._turned[travel_as] = turned if self.rows is None else turned[self.rows]
+        return self._turned[travel_as]
 
     def delayed_a(self, delay_s: tuple[float, ...]) -> FloatArray:
         """Return I(t − dj) [A], shape (n, len(delay_s))."""
         if delay_s not in self._delayed_a:
-            self._delayed_a[delay_s] = delayed_currents(
-                self.time_s, self.current_a, delay_s, self.time_s
-            )
+            at_s = self.time_s if self.rows is None else self.time_s[self.rows]
+            self._delayed_a[delay_s] = delayed_currents(self.time_s, self.current_a, delay_s, at_s)
         return self._delayed_a[delay_s]
 
     @cached_property
@@ -282,18 +333,34 @@ class PackState:
     drop_v: FloatArray
     """Σ Rj·I(t − dj) of the voltage model [V]; negative while discharging."""
     cached_history: CurrentHistory | None = None
+    rows: NDArray[np.intp] | None = None
+    """Samples of the log that the state is restricted to; all if None."""
+    log: Signals | None = None
+    """Corrected signals of the whole log, where `rows` is given."""
+    of_log: Callable[[], PackState] | None = None
+    """Returns the state of the whole log, where `rows` is given."""
     _lagged_c: dict[float, FloatArray] = field(default_factory=dict, init=False, repr=False)
     _slopes: dict[VoltageModel, FloatArray] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def history(self) -> CurrentHistory:
-        """History of the current."""
+        """History of the current; at the state's rows."""
+        if self.rows is not None and self.cached_history is not None:
+            return self.cached_history
         return _history_of(self.time_s, self.current_a, self.cached_history)
+
+    @cached_property
+    def whole(self) -> PackState:
+        """The state of the whole log."""
+        return self if self.of_log is None else self.of_log()
 
     def lagged_temperature_c(self, lag_s: float) -> FloatArray:
         """Return the temperature behind a lag, equal to it at the start [°C], shape (n,)."""
+        if lag_s <= NO_LAG_S:
+            return self.temperature_c
         if lag_s not in self._lagged_c:
-            self._lagged_c[lag_s] = low_passed(self.time_s, self.temperature_c, lag_s)
+            whole = self.temperature_c if self.log is None else self.log.temperature_c
+            self._lagged_c[lag_s] = self.history.lagged_c(whole, lag_s)
         return self._lagged_c[lag_s]
 
     def ocv_slope(self, model: VoltageModel) -> FloatArray:
@@ -429,6 +496,9 @@ class Effect:
     """Whether a diagnosis may name it; otherwise it is structure, learned from references only."""
     is_structure: ClassVar[bool] = False
     """Whether a healthy pack may have it: the part that references show is then not a cause."""
+    is_pointwise: ClassVar[bool] = False
+    """Whether the extra voltage at a sample follows from the state there and its histories; then
+    it is computed at the rows that are asked for, else over the whole log."""
     secant_points: ClassVar[tuple[float, ...]] = ()
     """For an effect that is strongly nonlinear in its only amplitude: fractions of the widest bound
     at which the diagnosis takes the change of the voltage, besides a small one."""
@@ -513,6 +583,16 @@ class Effect:
         self, state: PackState, values: Values, model: VoltageModel, pack: Pack
     ) -> FloatArray | None:  # fmt: skip
         """Return the extra voltage [V], shape (n,), or None if the effect adds none."""
+
+    def extra_voltage_at(
+        self, state: PackState, values: Values, model: VoltageModel, pack: Pack
+    ) -> FloatArray | None:  # fmt: skip
+        """Return the extra voltage at the rows of a state [V], or None if the effect adds none."""
+        adds_none = type(self).extra_voltage is Effect.extra_voltage
+        if state.rows is None or self.is_pointwise or adds_none:
+            return self.extra_voltage(state, values, model, pack)
+        volts = self.extra_voltage(state.whole, values, model, pack)
+        return None if volts is None else volts[state.rows]
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
         """Return the effect's state before the first sample."""

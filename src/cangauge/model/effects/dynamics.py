@@ -75,6 +75,7 @@ class FastPolarization(Effect):
 
     id = "fast_polarization"
     family = "dynamics"
+    is_pointwise: ClassVar[bool] = True
     is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("ohm", "ohm", 0.0, 1.0, scale="resistance"),
@@ -125,6 +126,7 @@ class SlowDiffusion(Effect):
 
     id = "slow_diffusion"
     family = "dynamics"
+    is_pointwise: ClassVar[bool] = True
     is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("ohm", "ohm", 0.0, 1.5, scale="resistance"),
@@ -226,6 +228,7 @@ class ChargeTransfer(Effect):
 
     id = "charge_transfer"
     family = "dynamics"
+    is_pointwise: ClassVar[bool] = True
     is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("scale_v", "V", 0.0, 0.03, scale="voltage"),

@@ -23,7 +23,6 @@ from cangauge.model.effects.base import (
     Parameter,
     Values,
 )
-from cangauge.model.effects.first_order import decaying_sum
 from cangauge.model.voltage_model import VoltageModel
 
 
@@ -35,6 +34,7 @@ class Hysteresis(Effect):
 
     id = "hysteresis"
     family = "equilibrium"
+    is_pointwise: ClassVar[bool] = True
     is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("half_width_v", "V", 0.0, 0.01, scale="voltage"),
@@ -53,11 +53,8 @@ class Hysteresis(Effect):
     def extra_voltage(
         self, state: PackState, values: Values, model: VoltageModel, pack: Pack
     ) -> FloatArray:
-        seconds = np.diff(state.time_s)
-        mean = 0.5 * (state.current_a[1:] + state.current_a[:-1])
         travel_as = 36.0 * pack.capacity_ah * values["travel_pct"]
-        decay = np.where(seconds > BRIDGE_S, 0.0, np.abs(mean) * seconds / travel_as)
-        return values["half_width_v"] * decaying_sum(decay, np.sign(mean) * np.expm1(-decay), 0.0)
+        return values["half_width_v"] * state.history.turned(travel_as)
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
         return _HysteresisOnline(
@@ -109,6 +106,7 @@ class EntropicCoefficient(Effect):
 
     id = "entropic_coefficient"
     family = "equilibrium"
+    is_pointwise: ClassVar[bool] = True
     is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("level_v_per_k", "V/K", -1.1e-4, 1.1e-4, scale="voltage"),
@@ -179,6 +177,7 @@ class OcvShape(Effect):
 
     id = "ocv_shape"
     family = "equilibrium"
+    is_pointwise: ClassVar[bool] = True
     is_structure: ClassVar[bool] = True
     is_cause: ClassVar[bool] = False
     parameters = tuple(
@@ -232,6 +231,7 @@ class WeakCell(Effect):
 
     id = "weak_cell"
     family = "imbalance"
+    is_pointwise: ClassVar[bool] = True
     parameters = (
         Parameter("fraction", "1", 0.0, 0.15),
         Parameter(

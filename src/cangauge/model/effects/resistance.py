@@ -62,6 +62,7 @@ class ResistanceTemperature(Effect):
 
     id = "resistance_temperature"
     family = "resistance"
+    is_pointwise: ClassVar[bool] = True
     is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("share", "1", 0.0, 3.0),
@@ -123,6 +124,7 @@ class ResistanceSoc(Effect):
 
     id = "resistance_soc"
     family = "resistance"
+    is_pointwise: ClassVar[bool] = True
     is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("at_empty", "1", -0.4, 3.0),
@@ -182,6 +184,7 @@ class ResistanceAsymmetry(Effect):
 
     id = "resistance_asymmetry"
     family = "resistance"
+    is_pointwise: ClassVar[bool] = True
     is_structure: ClassVar[bool] = True
     parameters = (Parameter("charging_ohm", "ohm", -0.6, 1.5, scale="resistance"),)
     signature = "min(I, 0): only while charging, in step with the current"

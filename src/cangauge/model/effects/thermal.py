@@ -149,6 +149,7 @@ class InnerTemperature(Effect):
 
     id = "inner_temperature"
     family = "thermal"
+    is_pointwise: ClassVar[bool] = True
     is_structure: ClassVar[bool] = True
     is_cause: ClassVar[bool] = False
     parameters = (

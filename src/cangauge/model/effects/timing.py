@@ -10,8 +10,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import ClassVar
 
-import numpy as np
-
 from cangauge.model.effects.base import (
     CoreForm,
     Effect,
@@ -60,8 +58,8 @@ class TimeSkew(Effect):
         skew_s = values["skew_s"]
         if skew_s == 0.0:
             return signals
-        current = np.interp(signals.time_s + skew_s, signals.time_s, signals.current_a)
-        return replace(signals, current_a=current)
+        shifted = signals.history.shifted(skew_s)
+        return replace(signals, current_a=shifted.current_a, cached_history=shifted)
 
     def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
         return _TimeSkewOnline(values["skew_s"]) if values["skew_s"] != 0.0 else OnlineEffect()

@@ -1,0 +1,346 @@
+"""What cangauge costs, how it grows, and whether it became slower than the ratios that are kept.
+
+    python benchmarks/cost.py [--only NAME]… [--json FILE] [--keep] [--check]
+
+ratios    a step at 10 and 1 Hz, a row offline, and a wanted frame, as multiples of what does the
+          same at its barest in the same run (filterpy's extended Kalman filter of an equivalent
+          circuit; receiving and decoding by python-can and cantools): the machine cancels.
+growth    with delays, effects, cells, frames/s; rows and logs of a fit with its memory; logs of a
+          diagnosis.
+start     `--help` of every command.
+
+--keep writes the ratios to `ratios.json`; --check measures them alone and warns where one is 20 %
+above the kept one. It never fails: other work on the machine slows one of two things at times.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import can
+import cantools
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from cangauge._resources import shared_file
+from cangauge.bus.encoder import FrameEncoder
+from cangauge.bus.vehicle import Vehicle
+from cangauge.cli.app import COMMANDS
+from cangauge.diagnosis import diagnose
+from cangauge.estimation.cells import CellEstimator
+from cangauge.estimation.compiled import make_estimator
+from cangauge.estimation.offline import run_estimator
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.validity import Sample
+from cangauge.export.equivalent_circuit import equivalent_circuit
+from cangauge.identify.fit import fit
+from cangauge.logs.log import Log
+from cangauge.logs.read import read_log
+from cangauge.model.model_file import Coefficient, Model
+from cangauge.service.pipeline import Pipeline, PipelineSettings
+from cangauge.validation import simulate
+from peer_filters import Circuit, bare_ekf, run
+from peers import step_us
+
+KEPT = Path(__file__).with_name("ratios.json")
+WORSE = 1.2
+"""Factor on a kept ratio from which a warning is given."""
+ROUNDS = 7
+ROWS = 2000
+"""Rows of a timed log: 200 s at 10 Hz."""
+FIT_ROWS = (100_000, 300_000, 1_000_000)
+ROWS_A_LOG = 50_000
+EFFECTS = (
+    {"id": "fast_polarization", "parameters": {"ohm": 0.01, "tau_s": 3.0, "activation_k": 0.0}},
+    {"id": "resistance_temperature", "parameters": {
+        "share": 0.3, "activation_k": 2500.0, "delayed": 1.0, "reference_c": 23.0, "lag_s": 0.0}},
+    {"id": "resistance_soc", "parameters": {
+        "at_empty": 0.5, "at_full": 0.1, "width_pct": 10.0, "delayed": 1.0}},
+    {"id": "hysteresis", "parameters": {"half_width_v": 0.5, "travel_pct": 2.0}},
+)  # fmt: skip
+
+Result = dict[str, Any]
+
+
+def model() -> Model:
+    """Return the model of the timings: the published one."""
+    return Model.load(shared_file("replay", "leaf2012_published_model.json"))
+
+
+def drive(rate_hz: int) -> Log:
+    """Return a drive at 10 Hz, or every tenth row of it."""
+    log = read_log(shared_file("replay", "leaf2012_reconstruction_white.parquet"))
+    return log.rows(slice(0, ROWS * 10 // rate_hz, 10 // rate_hz))
+
+
+def bare_step_us(known: Model, log: Log) -> float:
+    """Return the time of a step of a bare filter [µs]."""
+    circuit = Circuit(asdict(equivalent_circuit(known)) | {"noise_v": 1.0}, 23.0)
+    columns = {
+        name: np.asarray(getattr(log, name)).tolist()
+        for name in ("time_s", "current_a", "voltage_v")
+    }
+    return 1e6 * run(bare_ekf(circuit, 0.9), columns, ROWS)[1]
+
+
+def frame_us(handle: Callable[[can.Message], object], frames: list[can.Message]) -> float:
+    """Return the time to receive and handle a frame on a virtual bus [µs]."""
+    with (
+        can.Bus(interface="virtual", channel="cost") as receiver,
+        can.Bus(interface="virtual", channel="cost") as sender,
+    ):
+        for frame in frames:
+            sender.send(frame)
+        began = time.process_time()
+        for _ in frames:
+            handle(receiver.recv(1.0))
+        return 1e6 * (time.process_time() - began) / len(frames)
+
+
+def wanted_frames(count: int) -> list[can.Message]:
+    """Return frames of current, voltage and temperature at 10 Hz."""
+    encoder = FrameEncoder(Vehicle.load("generic"))
+    frames: list[can.Message] = []
+    number = 0
+    while len(frames) < count:
+        sample = Sample(1.7e9 + 0.1 * number, 20.0 + number % 7, 380.0, 25.0)
+        frames += encoder.encode(sample)
+        number += 1
+    return frames
+
+
+def live_frame_us(frames: list[can.Message]) -> tuple[float, float]:
+    """Return the time of a wanted frame in the service, and at its barest [µs]."""
+    pipeline = Pipeline(Vehicle.load("generic"), model(), PipelineSettings())
+    database = cantools.database.load_file(shared_file("dbc", "generic_pack.dbc"))
+    layouts = {message.frame_id: message for message in database.messages}
+
+    def handle(frame: can.Message) -> None:
+        if pipeline.handle(frame):
+            pipeline.latest  # noqa: B018 - the reading is what is timed
+
+    def decode(frame: can.Message) -> object:
+        return layouts[frame.arbitration_id].decode(frame.data)
+
+    return frame_us(handle, frames), frame_us(decode, frames)
+
+
+def ratios(rounds: int = ROUNDS) -> Result:
+    """Return each ratio to its barest form, the median of rounds, with both times [µs]."""
+    known, fast, slow, frames = model(), drive(10), drive(1), wanted_frames(3000)
+    found: dict[str, list[tuple[float, float, float]]] = {}
+    for _ in range(rounds):
+        bare = bare_step_us(known, fast)
+        began = time.process_time()
+        run_estimator(fast, known, EstimatorSettings())
+        offline = 1e6 * (time.process_time() - began) / len(fast)
+        times = {
+            "step at 10 Hz": (step_us(make_estimator, known, fast), bare),
+            "step at 1 Hz": (step_us(make_estimator, known, slow), bare),
+            "offline row at 10 Hz": (offline, bare),
+            "live frame": live_frame_us(frames),
+        }
+        for name, pair in times.items():
+            found.setdefault(name, []).append((pair[0] / pair[1], *pair))
+    medians = {
+        name: [statistics.median(values) for values in zip(*rows, strict=True)]
+        for name, rows in found.items()
+    }
+    return {
+        name: dict(zip(("ratio", "us", "bare_us"), row, strict=True))
+        for name, row in medians.items()
+    }
+
+
+def slower(found: Result, kept: dict[str, float]) -> list[str]:
+    """Return a warning for each ratio that is more than 20 % above the kept one."""
+    return [
+        f"warning: {name} costs {row['ratio']:.2f} × its barest form; kept is {kept[name]:.2f}"
+        for name, row in found.items()
+        if name in kept and row["ratio"] > WORSE * kept[name]
+    ]
+
+
+def with_delays(known: Model, number: int) -> Model:
+    """Return a model with another number of delays, of the same sum of resistances."""
+    delays = [0.0, *np.linspace(10.0, 70.0, number - 1).tolist()][:number]
+    others = {k: v for k, v in known.coefficients.items() if not k.startswith("R")}
+    total = sum(v.value for k, v in known.coefficients.items() if k.startswith("R"))
+    ohm = Coefficient(value=total / number, unit="ohm")
+    given = others | {f"R{k}": ohm for k in range(1, number + 1)}
+    return known.model_copy(update={"delays_s": delays, "coefficients": given})
+
+
+def growth() -> Result:
+    """Return how a step at 1 Hz grows with the model, and a tick with its cells [µs]."""
+    known, log = model(), drive(1)
+
+    def median_us(changed: Model) -> float:
+        return statistics.median(step_us(make_estimator, changed, log) for _ in range(3))
+
+    result: Result = {
+        "step at 1 Hz, delays [µs]": {
+            number: median_us(with_delays(known, number)) for number in (1, 4, 8)
+        },
+        "step at 1 Hz, effects [µs]": {
+            number: median_us(known.model_copy(update={"effects": list(EFFECTS[:number])}))
+            for number in range(len(EFFECTS) + 1)
+        },
+        "cells, a second [µs]": {count: cells_us(count) for count in (1, 12, 96)},
+    }
+    for count in (300, 3000, 30_000):
+        frames = wanted_frames(count)
+        result.setdefault("live frame, of so many [µs]", {})[count] = live_frame_us(frames)[0]
+    return result
+
+
+def cells_us(count: int) -> float:
+    """Return the time of a second of a pack with so many cell voltages [µs]."""
+    known = model()
+    estimator = make_estimator(known, EstimatorSettings(initial_soc_pct=80.0))
+    cells = CellEstimator(known.voltage_model(), count)
+    volts = np.full(count, 380.0 / count)
+    total_s, ticks = 0.0, 300
+    for number in range(ticks):
+        sample = Sample(float(number), 20.0, 380.0, 25.0)
+        estimator.update(sample)
+        began = time.process_time()
+        if cells.is_due(sample.time_s):
+            cells.update(estimator.pack_tick(sample), volts, np.zeros(count))
+        total_s += time.process_time() - began
+    return 1e6 * total_s / ticks
+
+
+def fits() -> Result:
+    """Return time and memory of a fit by its rows, in logs of 50,000."""
+    return {rows: _in_a_process(_fit, rows) for rows in FIT_ROWS}
+
+
+def _in_a_process(work: Callable[[Connection, int], None], number: int) -> Result:
+    ours, theirs = get_context("spawn").Pipe()
+    process = get_context("spawn").Process(target=work, args=(theirs, number))
+    process.start()
+    result: Result = ours.recv()
+    process.join()
+    return result
+
+
+def _fit(pipe: Connection, rows: int) -> None:
+    logs = list(_long_logs(rows // ROWS_A_LOG))
+    before_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    began = time.process_time()
+    fit(logs, capacity_ah=60.0)
+    peak_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    pipe.send(
+        {
+            "seconds": time.process_time() - began,
+            "peak_mib": peak_kib / 1024.0,
+            "of_logs_mib": before_kib / 1024.0,
+        }
+    )
+
+
+def _long_logs(number: int) -> Iterator[Log]:
+    """Yield logs of 50,000 rows at 1 Hz by the published equation with noise."""
+    known = model().voltage_model()
+    for seed in range(number):
+        rng = np.random.default_rng(seed)
+        time_s = np.arange(float(ROWS_A_LOG))
+        current_a = 60.0 * 3600.0 * 0.9 / ROWS_A_LOG + 25.0 * np.repeat(
+            rng.standard_normal(ROWS_A_LOG // 10), 10
+        )
+        soc_pct = 95.0 - np.cumsum(current_a) / 36.0 / 60.0
+        temperature_c = 23.0 + 2.0 * np.sin(time_s / 700.0)
+        delayed = np.column_stack([np.interp(time_s - d, time_s, current_a) for d in known.delay_s])
+        volts = known.voltage(soc_pct, temperature_c, delayed) + rng.normal(0.0, 0.5, time_s.size)
+        yield Log(time_s, current_a, volts, temperature_c, soc_pct, name=f"log {seed}")
+
+
+def diagnoses() -> Result:
+    """Return the time of a diagnosis by the number of logs [s]."""
+    simulated = [simulate(seed=1, drive=day, hours=1.0).log for day in range(1, 9)]
+    known = fit(simulated[:2], capacity_ah=60.0).model
+    result = {}
+    for number in (1, 2, 4):
+        began = time.process_time()
+        diagnose(simulated[5 - number : 5], known, simulated[5:8])
+        result[number] = time.process_time() - began
+    return result
+
+
+def starts() -> Result:
+    """Return the time of `--help` of every command [s], the median of three."""
+    script = "import sys; from cangauge.cli.app import main; main()"
+    found = {}
+    for name in ("", *COMMANDS):
+        command = [sys.executable, "-c", script, *([name] if name else []), "--help"]
+        times = []
+        for _ in range(3):
+            began = time.perf_counter()
+            subprocess.run(command, stdout=subprocess.DEVNULL, check=True)
+            times.append(time.perf_counter() - began)
+        found[name or "cangauge"] = statistics.median(times)
+    return found
+
+
+PARTS: dict[str, Callable[[], Result]] = {
+    "ratios": ratios, "growth": growth, "fit": fits, "diagnosis": diagnoses, "start": starts,
+}  # fmt: skip
+
+
+def show(result: Result, console: Console) -> None:
+    """Print each part as a table of names and values."""
+    for part, rows in result.items():
+        table = Table("", "", title=part)
+        for name, value in rows.items():
+            fields = value.items() if isinstance(value, dict) else [("", value)]
+            table.add_row(str(name), "; ".join(f"{key} {_short(item)}" for key, item in fields))
+        console.print(table)
+
+
+def _short(value: float) -> str:
+    return f"{value:.3g}" if value < 1000.0 else f"{value:.0f}"
+
+
+def main() -> None:
+    """Measure, print, keep or compare."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--only", action="append", choices=list(PARTS), help="repeat for several")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here too")
+    parser.add_argument("--keep", action="store_true", help=f"write the ratios to {KEPT.name}")
+    parser.add_argument("--check", action="store_true", help="compare with the kept ratios")
+    options = parser.parse_args()
+    if options.check:
+        kept = json.loads(KEPT.read_text(encoding="utf-8"))
+        lines = slower(ratios(), kept)
+        sys.stdout.write("\n".join(lines or ["no ratio is 20 % above the kept one"]) + "\n")
+        return
+    result = {}
+    for name in options.only or PARTS:
+        sys.stderr.write(f"measuring: {name} …\n")
+        result[name] = PARTS[name]()
+    show(result, Console(width=130))
+    if options.json:
+        options.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    if options.keep:
+        kept = {name: round(row["ratio"], 3) for name, row in result["ratios"].items()}
+        KEPT.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+/* fmu.h - a functional mock-up unit: its variables by value reference, and a step.
+ *
+ * `pack.c` and `estimator.c` say what a unit does, `fmi2.c` and `fmi3.c` how a simulator calls it;
+ * `fmu_config.h` and `fmu_model.c` are written by `cangauge export-fmu`.
+ *
+ * An input that is set before a step is the sample at the end of that step; between two samples the
+ * current is linear.
+ */
+#ifndef CANGAUGE_FMU_H
+#define CANGAUGE_FMU_H
+
+#include <stddef.h>
+
+#include "cangauge_internal.h"
+#include "fmu_config.h"
+
+#if defined(_WIN32)
+#define FMU_API __declspec(dllexport)
+#else
+#define FMU_API __attribute__((visibility("default")))
+#endif
+
+/* Value references: time and inputs first, then what the unit is given, then outputs. */
+enum {
+    FMU_TIME_S = 0,
+    FMU_CURRENT_A = 1,
+    FMU_TEMPERATURE_C = 2,
+    FMU_VOLTAGE_V = 3, /* input of the estimator, output of the pack */
+    FMU_SOC_PCT = 4,
+    FMU_INITIAL_SOC_PCT = 5,
+    FMU_CAPACITY_AH = 6, /* pack */
+    FMU_SOC_STD_PCT = 6, /* estimator, as all below */
+    FMU_STATUS = 7,
+    FMU_REASONS = 8,
+    FMU_SOC_NEWTON_PCT = 9,
+    FMU_SOC_COULOMB_PCT = 10,
+    FMU_VOLTAGE_MODEL_V = 11
+};
+
+typedef struct {
+    double value[FMU_VARIABLES];
+    cg_model model; /* with the parameters that the simulator sets */
+    cg_estimator core;
+    cg_current line[FMU_LINE];
+    cg_skew skew;
+    cg_sample last; /* pack */
+    cg_sum discharged_ah; /* pack */
+} fmu;
+
+/* A parameter of an effect: its effect, and its place among the values, then the time constants. */
+typedef struct {
+    int32_t reference;
+    int32_t effect;
+    int32_t place;
+} fmu_parameter;
+
+extern const cg_model FMU_MODEL;
+extern const cg_settings FMU_SETTINGS;
+extern const double FMU_START[FMU_VARIABLES];
+extern const fmu_parameter FMU_PARAMETER[FMU_PARAMETERS + 1];
+
+/* The unit: begin at a time with the values that are set, take a sample at a later time. */
+void fmu_begin(fmu *self, double time_s);
+void fmu_sample(fmu *self, double time_s);
+
+/* For the interfaces: a new unit (NULL without memory or for another token), and its values. */
+fmu *fmu_new(const char *token);
+void fmu_reset(fmu *self);
+bool fmu_get(const fmu *self, const uint32_t *reference, size_t count, double *value);
+bool fmu_set(fmu *self, const uint32_t *reference, size_t count, const double *value);
+
+#endif

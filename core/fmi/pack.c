@@ -1,0 +1,57 @@
+/* pack.c - the pack: current and temperature in; voltage and SoC out. */
+#include "fmu.h"
+
+#include <string.h>
+
+#define NEVER_S 1e12 /* between samples the current is linear, however long */
+
+void fmu_begin(fmu *self, double time_s)
+{
+    const cg_line line = {self->line, FMU_LINE, 0, 0, 0, R(FMU_SPACING_S), 0.0};
+    self->model = FMU_MODEL;
+    self->model.capacity_ah = self->value[FMU_CAPACITY_AH];
+    for (int32_t k = 0; k < FMU_PARAMETERS; ++k) {
+        const fmu_parameter *parameter = &FMU_PARAMETER[k];
+        cg_effect *effect = &self->model.effect[parameter->effect];
+        cg_real *place = (parameter->place < CG_VALUES)
+                             ? &effect->value[parameter->place]
+                             : &effect->tau_s[parameter->place - CG_VALUES];
+        *place = self->value[parameter->reference];
+    }
+    cg_settings settings = FMU_SETTINGS;
+    settings.gap_s = NEVER_S;
+    cg_init(&self->core, &self->model, &settings, &line, NULL);
+    self->discharged_ah = 0.0;
+    self->last.time_s = NAN;
+    fmu_sample(self, time_s);
+}
+
+void fmu_sample(fmu *self, double time_s)
+{
+    cg_estimator *core = &self->core;
+    const cg_model *model = &self->model;
+    double *value = self->value;
+    cg_sample now = {time_s, value[FMU_CURRENT_A], CG_NAN, value[FMU_TEMPERATURE_C]};
+    cg_correct(core, &now, 0, model->effects);
+    const cg_real counted =
+        (now.current_a < 0.0) ? (model->charge_efficiency * now.current_a) : now.current_a;
+    if (!isnan(self->last.time_s)) {
+        const double seconds = time_s - self->last.time_s;
+        self->discharged_ah += 0.5 * (counted + self->last.current_a) * seconds / 3600.0;
+    }
+    self->last.time_s = time_s;
+    self->last.current_a = counted;
+    cg_line_push(&core->line, model->delay_s[model->delays - 1], core->settings.gap_s, time_s,
+                 now.current_a);
+    for (int32_t j = 0; j < model->delays; ++j) {
+        core->delayed_a[j] = cg_line_at(&core->line, (cg_time)model->delay_s[j]);
+    }
+    cg_advance(core, &now, now.temperature_c);
+    const double soc_pct =
+        value[FMU_INITIAL_SOC_PCT] - (100.0 * self->discharged_ah / model->capacity_ah);
+    cg_real slope;
+    value[FMU_TIME_S] = time_s;
+    value[FMU_SOC_PCT] = soc_pct;
+    value[FMU_VOLTAGE_V] = cg_pseudo_ocv(core, soc_pct, &slope) +
+                           cg_offset_v(model, now.temperature_c, core->delayed_a);
+}

@@ -1,0 +1,408 @@
+"""`cangauge fleet`: fit, estimate, gap and health over the logs of a fleet, on Dask."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, Final, cast
+
+import typer
+
+from cangauge._formatting import number, significant
+from cangauge._io import file_sha256, write_texts_atomic
+from cangauge.bus.mapping import columns_of_map
+from cangauge.bus.vehicle import Vehicle
+from cangauge.cli.fit import parse_delays
+from cangauge.cli.options import (
+    ColumnsOption,
+    DbcOption,
+    JsonOption,
+    MapOption,
+    ReportOption,
+    SignOption,
+    TemperatureOption,
+    TemperatureSourceOption,
+    VehicleOption,
+    check_outputs,
+    known_temperature_source,
+    within,
+)
+from cangauge.cli.output import console, emit_json, note, print_table, progress_shown
+from cangauge.diagnosis import ALARM_BELOW
+from cangauge.errors import InputError
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.fleet.dataset import Dataset
+from cangauge.fleet.fit import fit_fleet
+from cangauge.fleet.gap import LOGS, REFERENCES, GapJob, suspect_and_healthy
+from cangauge.fleet.health import HealthJob
+from cangauge.fleet.jobs import EstimateJob, Job
+from cangauge.fleet.overview import FleetOverview
+from cangauge.fleet.run import LOCAL, Summary, connected, run_job
+from cangauge.fleet.sources import VEHICLE_PATTERN, FleetLog, ReadOptions, find_logs
+from cangauge.inference.rows import FitOptions
+from cangauge.logs.column_map import ColumnMap
+from cangauge.logs.draft import Sign
+from cangauge.model.model_file import Model
+
+fleet_app: Final = typer.Typer(
+    name="fleet", rich_markup_mode="markdown", add_completion=False, no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)  # fmt: skip
+
+LogsArgument = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="LOGS",
+        help="Logs or captures: paths or URLs with * and **, or a manifest (CSV with the columns"
+        " log, vehicle, start, initial_soc_pct, healthy).",
+    ),
+]
+ModelOption = Annotated[
+    Path, typer.Option("-m", "--model", metavar="MODEL", help="Model file of the vehicles' type.")
+]
+OutOption = Annotated[
+    str,
+    typer.Option(
+        "-o", "--output", metavar="OUT",
+        help="Folder or URL of the results: Parquet, one row a log, by vehicle. Logs that it holds"
+        " with the same model and options are skipped.",
+    ),
+]  # fmt: skip
+SchedulerOption = Annotated[
+    str,
+    typer.Option(
+        metavar="ADDRESS|local",
+        help="Dask scheduler (tcp://10.0.0.5:8786), or this machine.",
+    ),
+]
+WorkersOption = Annotated[
+    int | None,
+    typer.Option(metavar="N", help="Worker processes of `local`. Default: one a core."),
+]
+PatternOption = Annotated[
+    str,
+    typer.Option(
+        "--vehicle-pattern", metavar="REGEX",
+        help="The first group finds the vehicle in the name of a log. Default: its folder.",
+    ),
+]  # fmt: skip
+CapacityOption = Annotated[
+    float | None,
+    typer.Option("--capacity-ah", metavar="A", help="Charge from 100 to 0 % [Ah]."),
+]
+
+
+@fleet_app.callback()
+def fleet_command() -> None:
+    """Fit, estimate, diagnose and watch the health of a fleet's logs, on Dask.
+
+    Each log is a task of a Dask scheduler. Results are Parquet files by vehicle: a run that is
+    repeated or killed continues where it was, and logs that cannot be read are set aside with the
+    reason. Needs the extra `fleet`.
+    """
+
+
+@fleet_app.command("fit")
+def fit_fleet_command(  # noqa: PLR0917 - typer passes options by name
+    logs: LogsArgument,
+    output: Annotated[
+        Path, typer.Option("-m", "--model", metavar="MODEL", help="Model file to write (JSON).")
+    ],
+    out: OutOption,
+    capacity_ah: Annotated[
+        float, typer.Option(metavar="A", help="Charge from 100 to 0 % [Ah], e.g. 51.5.")
+    ],
+    scheduler: SchedulerOption = LOCAL,
+    workers: WorkersOption = None,
+    pattern: PatternOption = VEHICLE_PATTERN,
+    rate_hz: Annotated[
+        float, typer.Option(metavar="HZ", help="Rate of the fit [Hz]; faster logs are decimated.")
+    ] = 1.0,
+    delays: Annotated[
+        str, typer.Option(metavar="S,S,…", help="Delays of the current [s].")
+    ] = "0,10,30,70",
+    epsilon: Annotated[float, typer.Option(metavar="E", help="Margin ε of the scaled SoC.")] = 0.05,
+    t_ref: Annotated[float, typer.Option(metavar="C", help="Reference temperature [°C].")] = 20.0,
+    name: Annotated[str | None, typer.Option(help="Name of the model.")] = None,
+    vehicle: VehicleOption = None,
+    dbc: DbcOption = None,
+    map_file: MapOption = None,
+    columns: ColumnsOption = None,
+    sign: SignOption = None,
+    temperature: TemperatureOption = None,
+    temperature_source: TemperatureSourceOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Identify one model from all logs: the fit of `cangauge fit`, out of core.
+
+    Each log is reduced to its information matrix, and these add up. Every log needs its SoC, or
+    initial_soc_pct in the manifest.
+
+    Examples
+    --------
+    `cangauge fleet fit 'logs/*/*.parquet' -m type.json -o results --capacity-ah 51.5`
+    """
+    within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
+    within(rate_hz, 0.01, 1000.0, option="--rate-hz", unit="Hz")
+    within(epsilon, 1e-4, 0.49, option="--epsilon", unit="")
+    within(t_ref, -60.0, 120.0, option="--t-ref", unit="°C")
+    options = FitOptions(capacity_ah, None, rate_hz, parse_delays(delays), epsilon, t_ref)
+    check_outputs([output], [])
+    reading = _reading(
+        vehicle=vehicle, dbc=dbc, map_file=map_file, columns=columns, sign=sign,
+        temperature=temperature, temperature_source=temperature_source,
+    )  # fmt: skip
+    found_logs = find_logs(logs, pattern=pattern)
+    result = _on_cluster(
+        scheduler,
+        workers,
+        lambda client: fit_fleet(found_logs, reading, options, out, client, name=name),
+    )
+    write_texts_atomic({output: result.model.to_json()})
+    if json_output:
+        emit_json(result.to_dict() | {"model": str(output), "output": out})
+        return
+    figures = result.to_dict()
+    print_table(
+        f"Model {result.model.name}",
+        ["", "value", "<unit"],
+        [
+            ["voltage error, MAE", number(figures["voltage_mae_pct"], 3), "%"],
+            ["voltage error, RMSE", significant(figures["voltage_rmse_v"], 3), "V"],
+            ["voltage error held out, MAE", number(result.model.noise.voltage_mae_pct, 3), "%"],
+            ["SoC from voltage, MAE", number(figures["soc_newton_mae_pct"], 2), "%"],
+            ["slope resistance", significant(result.slope_ohm, 3), "Ω"],
+            ["condition number", significant(result.solution.condition_number, 2), ""],
+            ["rows used", str(figures["rows"]), ""],
+        ],
+    )
+    for remark in result.remarks:
+        note(f"note: {remark}")
+    note(f"model: {output}")
+
+
+@fleet_app.command("estimate")
+def estimate_fleet_command(  # noqa: PLR0917 - typer passes options by name
+    logs: LogsArgument,
+    model: ModelOption,
+    out: OutOption,
+    scheduler: SchedulerOption = LOCAL,
+    workers: WorkersOption = None,
+    pattern: PatternOption = VEHICLE_PATTERN,
+    capacity_ah: CapacityOption = None,
+    vehicle: VehicleOption = None,
+    dbc: DbcOption = None,
+    map_file: MapOption = None,
+    columns: ColumnsOption = None,
+    sign: SignOption = None,
+    temperature: TemperatureOption = None,
+    temperature_source: TemperatureSourceOption = None,
+    report: ReportOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Estimate the state of charge of every log, with its error where the log has SoC.
+
+    Examples
+    --------
+    `cangauge fleet estimate 's3://drives/*/*.parquet' -m type.json -o s3://results/may
+    --scheduler tcp://10.0.0.5:8786`
+    """
+    reading = _reading(
+        vehicle=vehicle, dbc=dbc, map_file=map_file, columns=columns, sign=sign,
+        temperature=temperature, temperature_source=temperature_source,
+    )  # fmt: skip
+    job = EstimateJob(reading, Model.load(model), EstimatorSettings(capacity_ah=capacity_ah))
+    _run(job, find_logs(logs, pattern=pattern), out, scheduler, workers, report, json_output)
+
+
+@fleet_app.command("health")
+def health_fleet_command(  # noqa: PLR0917 - typer passes options by name
+    logs: LogsArgument,
+    model: ModelOption,
+    out: OutOption,
+    scheduler: SchedulerOption = LOCAL,
+    workers: WorkersOption = None,
+    pattern: PatternOption = VEHICLE_PATTERN,
+    capacity_ah: CapacityOption = None,
+    vehicle: VehicleOption = None,
+    dbc: DbcOption = None,
+    map_file: MapOption = None,
+    columns: ColumnsOption = None,
+    sign: SignOption = None,
+    temperature: TemperatureOption = None,
+    temperature_source: TemperatureSourceOption = None,
+    report: ReportOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Follow capacity and resistance of each vehicle over its logs, and find outliers.
+
+    A vehicle's logs follow each other in order of their start (manifest), else of their names.
+
+    Examples
+    --------
+    `cangauge fleet health manifest.csv -m type.json -o results --report fleet.html`
+    """
+    reading = _reading(
+        vehicle=vehicle, dbc=dbc, map_file=map_file, columns=columns, sign=sign,
+        temperature=temperature, temperature_source=temperature_source,
+    )  # fmt: skip
+    job = HealthJob(reading, Model.load(model), EstimatorSettings(capacity_ah=capacity_ah))
+    _run(job, find_logs(logs, pattern=pattern), out, scheduler, workers, report, json_output)
+
+
+@fleet_app.command("gap")
+def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
+    logs: LogsArgument,
+    model: ModelOption,
+    out: OutOption,
+    reference: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="LOGS",
+            help="Logs without a fault, of any vehicles of the type; repeat the option. Or the"
+            " column healthy of a manifest.",
+        ),
+    ] = None,
+    references: Annotated[
+        int, typer.Option(metavar="N", help="References of a diagnosis at most.")
+    ] = REFERENCES,
+    latest: Annotated[
+        int, typer.Option(metavar="N", help="Latest logs of a vehicle, diagnosed together.")
+    ] = LOGS,
+    alarm: Annotated[
+        float,
+        typer.Option(
+            metavar="P", help="Report a fault where the probability of none is at most this."
+        ),
+    ] = ALARM_BELOW,
+    scheduler: SchedulerOption = LOCAL,
+    workers: WorkersOption = None,
+    pattern: PatternOption = VEHICLE_PATTERN,
+    vehicle: VehicleOption = None,
+    dbc: DbcOption = None,
+    map_file: MapOption = None,
+    columns: ColumnsOption = None,
+    sign: SignOption = None,
+    temperature: TemperatureOption = None,
+    temperature_source: TemperatureSourceOption = None,
+    report: ReportOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Diagnose each vehicle against references of the whole fleet.
+
+    Its own healthy logs come first, then one of each other vehicle in turn.
+
+    Examples
+    --------
+    `cangauge fleet gap 'may/*/*.parquet' --reference 'april/*/*.parquet' -m type.json -o results
+    --report fleet.html`
+    """
+    within(float(references), 1, 1000, option="--references", unit="")
+    within(float(latest), 1, 1000, option="--latest", unit="")
+    within(alarm, 0.0, 1.0, option="--alarm", unit="")
+    reading = _reading(
+        vehicle=vehicle, dbc=dbc, map_file=map_file, columns=columns, sign=sign,
+        temperature=temperature, temperature_source=temperature_source,
+    )  # fmt: skip
+    known = find_logs(reference or [], pattern=pattern)
+    healthy = {log.url for log in known}
+    found = [log for log in find_logs(logs, pattern=pattern) if log.url not in healthy]
+    suspect, good = suspect_and_healthy(
+        [*found, *(replace(log, healthy=True) for log in known)], latest
+    )
+    job = GapJob(reading, Model.load(model), suspect, good, references, alarm)
+    _run(job, job.vehicles(), out, scheduler, workers, report, json_output)
+
+
+def _reading(
+    *,
+    vehicle: str | None,
+    dbc: Path | None,
+    map_file: Path | None,
+    columns: str | None,
+    sign: str | None,
+    temperature: float | None,
+    temperature_source: str | None,
+) -> ReadOptions:
+    """Return how logs are read; files of the vehicle are read here, not by the workers."""
+    if sign not in {None, "charge", "discharge"}:
+        raise InputError("neither charge nor discharge", field="--sign", value=sign)
+    mapped = None if map_file is None else columns_of_map(map_file)
+    car = None
+    if vehicle is not None or dbc is not None or (map_file is not None and mapped is None):
+        car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature)
+    files = {str(path): file_sha256(path) for path in (dbc, map_file) if path is not None}
+    given = [vehicle, files, columns, sign, temperature, temperature_source]
+    return ReadOptions(
+        vehicle=car,
+        columns=None if columns is None else ColumnMap.of(columns, "--columns"),
+        mapped=mapped,
+        sign=cast("Sign | None", sign),
+        temperature_c=temperature,
+        temperature_source=known_temperature_source(temperature_source),
+        described=json.dumps(given),
+    )
+
+
+def _on_cluster(scheduler: str, workers: int | None, work: Callable[[Any], Any]) -> Any:
+    """Return what a function of the Dask client returns; show its progress."""
+    within(None if workers is None else float(workers), 1, 1024, option="--workers", unit="")
+    shown: AbstractContextManager[Any] = nullcontext()
+    if console.is_terminal:
+        shown = console.status("starting")
+    with shown as status:
+        step = None if status is None else status.update
+        with progress_shown("cangauge.fleet", step), connected(scheduler, workers) as client:
+            return work(client)
+
+
+def _run(  # noqa: PLR0917 - one call of each command
+    job: Job,
+    logs: Sequence[FleetLog],
+    out: str,
+    scheduler: str,
+    workers: int | None,
+    report: Path | None,
+    json_output: bool,
+) -> None:
+    """Run a job over the logs, and print and write what it found of the fleet."""
+    check_outputs([report], [])
+    dataset = Dataset(out, job.kind, job.columns)
+    summary = _on_cluster(scheduler, workers, lambda client: run_job(job, logs, dataset, client))
+    found = FleetOverview.read(out)
+    if report is not None:
+        from cangauge.report.fleet import fleet_report  # noqa: PLC0415 - bokeh is slow to import
+
+        write_texts_atomic({report: fleet_report(found)})
+    if json_output:
+        emit_json(
+            summary.to_dict() | found.to_dict() | {"output": out, "report": report and str(report)}
+        )
+    else:
+        _show(summary, found)
+    if not summary.done + summary.skipped:
+        note(f"error: no result; the reasons are in {out}/{dataset.tables[1]}")
+        raise typer.Exit(1)
+
+
+def _show(summary: Summary, found: FleetOverview) -> None:
+    typer.echo(f"{summary} ({summary.seconds:.0f} s, {summary.workers} workers)")
+    for reason, count in sorted(summary.reasons.items(), key=lambda item: -item[1])[:10]:
+        note(f"set aside: {count} × {reason}")
+    if found.gaps:
+        rows = [
+            [
+                name,
+                row["verdict"],
+                number(row["probability"], 2),
+                number(row["probability_none"], 3),
+            ]
+            for name, row in ((name, found.gaps[name]) for name in found.alarms)
+        ]
+        print_table("Vehicles with a gap", ["vehicle", "<cause", "probability", "P(none)"], rows)
+    if found.z:
+        rows = [[vehicle, quantity, number(z, 1)] for vehicle, quantity, z in found.outlying]
+        print_table("Outliers in health", ["vehicle", "<quantity", "robust z"], rows)

@@ -1,0 +1,1 @@
+"""An identified model in the forms of other simulators."""

@@ -1,0 +1,325 @@
+"""`fleet fit`: one model from all logs, by two passes over them (`identify.pooled`).
+
+The rows of both passes are kept. A further log costs the reading of itself in the first pass; the
+second pass is computed again for all, since each log changes the model.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+
+from cangauge._version import __version__
+from cangauge.errors import InputError
+from cangauge.fleet.dataset import Dataset
+from cangauge.fleet.passes import (
+    ErrorsJob,
+    InformationJob,
+    errors_of_row,
+    information_of_row,
+)
+from cangauge.fleet.run import Summary, run_id, run_job
+from cangauge.fleet.sources import FleetLog, ReadOptions
+from cangauge.identify.assemble import (
+    WHOLE_LOGS,
+    coefficients_of,
+    common_name,
+    information_of_rows,
+    noise_of,
+)
+from cangauge.identify.pooled import (
+    LogErrors,
+    LogInformation,
+    fit_information,
+    pooled,
+    slope_resistances,
+    summed,
+    with_std_errors,
+)
+from cangauge.inference.error_model import KNOTS_PCT, describe_error_of
+from cangauge.inference.least_squares import Solution
+from cangauge.inference.rows import (
+    FOLDS_AT_MOST,
+    LOGS_AT_LEAST,
+    FitOptions,
+)
+from cangauge.model.model_file import Made, Model, Ranges, SourceLog, resistance_names
+from cangauge.model.voltage_model import BASIS_NAMES, VoltageModel
+
+LISTED_LOGS: Final = 4096
+"""Source logs that a model file names; of more, it states the number."""
+
+POOLED_AT_ONCE: Final = 256
+"""Logs of which the factors are stacked for one QR decomposition."""
+
+
+@dataclass(frozen=True, eq=False)
+class FleetFit:
+    """Model of all logs, with its figures.
+
+    Parameters
+    ----------
+    model : Model
+    solution : Solution
+    errors : LogErrors
+        Of all logs.
+    slope_ohm, slope_expected_ohm : float
+        As of `cangauge.Identification` [Ω].
+    summaries : tuple of Summary
+        Of both passes.
+    remarks : tuple of str
+    """
+
+    model: Model
+    solution: Solution
+    errors: LogErrors
+    slope_ohm: float
+    slope_expected_ohm: float
+    summaries: tuple[Summary, ...]
+    remarks: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the object that `cangauge fleet fit --json` prints."""
+        sums, noise = self.errors.sums, self.model.noise
+        return {
+            "voltage_mae_pct": sums["voltage_pct"] / sums["rows"],
+            "voltage_rmse_v": float(np.sqrt(sums["square_v2"] / sums["rows"])),
+            "soc_newton_mae_pct": sums["newton_pct"] / sums["rows"],
+            "capacity_ah": self.model.capacity_ah,
+            "slope_ohm": self.slope_ohm,
+            "slope_expected_ohm": self.slope_expected_ohm,
+            "condition_number": self.solution.condition_number,
+            "constrained": self.solution.constrained,
+            "coefficients": {
+                name: item.model_dump() for name, item in self.model.coefficients.items()
+            },
+            "held_out": {
+                "voltage_mae_pct": noise.voltage_mae_pct,
+                "voltage_rmse_v": noise.voltage_rmse_v,
+                "judged_on": noise.judged_on,
+            },
+            "rows": int(sums["rows"]),
+            "passes": [summary.to_dict() for summary in self.summaries],
+            "remarks": list(self.remarks),
+        }
+
+
+def fit_fleet(
+    logs: Sequence[FleetLog],
+    options: ReadOptions,
+    fit: FitOptions,
+    out: str,
+    client: Any,
+    *,
+    name: str | None = None,
+) -> FleetFit:
+    """Identify the model of a type of pack from all logs of a fleet.
+
+    Parameters
+    ----------
+    logs : sequence of FleetLog
+    options : ReadOptions
+    fit : FitOptions
+    out : str
+        Folder or URL of the data sets of both passes.
+    client : distributed.Client
+    name : str, optional
+        Name of the model.
+
+    Raises
+    ------
+    InputError
+        If fewer than three logs can be used, or they do not identify a model.
+    """
+    first = InformationJob(options, fit)
+    dataset = Dataset(out, first.kind, first.columns)
+    summary = run_job(first, logs, dataset, client)
+    used, remarks = _usable(logs, dataset, run_id(first))
+    by_fold = _pooled_by_fold(used, dataset, run_id(first))
+    whole = pooled(by_fold)
+    model, solution = fit_information(whole, fit, source=out)
+    second = ErrorsJob(options, fit, model, solution, _models_without(by_fold, fit), whole.mean_c)
+    errors_set = Dataset(out, second.kind, second.columns)
+    later = run_job(second, [log for log, _ in used.values()], errors_set, client)
+    errors = _summed(errors_set.rows(run_id(second)), used, solution)
+    if errors.sums["rows"] < whole.rows:
+        raise InputError(
+            f"{later.bad + later.bad_before} logs of the first pass failed in the second",
+            source=out,
+            cure=f"see {second.kind}-bad in it, and run the same command again",
+        )
+    solution = with_std_errors(solution, errors)
+    slope, expected = slope_resistances(errors, model.resistance_ohm)
+    return FleetFit(
+        _model_file(whole, model, solution, errors=errors, fit=fit, used=used, name=name),
+        solution,
+        errors,
+        slope,
+        expected,
+        (summary, later),
+        tuple(remarks),
+    )
+
+
+_Used = dict[str, tuple[FleetLog, Mapping[str, Any]]]
+
+
+def _usable(logs: Sequence[FleetLog], dataset: Dataset, run: str) -> tuple[_Used, list[str]]:
+    """Return the logs with information, by URL in their order, each with a fold."""
+    wanted = ("name", "rows", "data_sha256", "signals_sha256", "temperature_source")
+    known = {url: row for url, row in dataset.known(run, *wanted).items() if "data_sha256" in row}
+    used: _Used = {}
+    remarks: list[str] = []
+    by_signals: dict[str, str] = {}
+    for log in logs:
+        if log.url not in known:
+            continue
+        row = known[log.url]
+        twin = by_signals.setdefault(row["signals_sha256"], log.url)
+        if twin != log.url:
+            remarks.append(f"{log.url}: same rows as {twin}: left out")
+            continue
+        used[log.url] = (log, row)
+    if len(used) < LOGS_AT_LEAST:
+        raise InputError(
+            f"only {len(used)} logs can be used, {LOGS_AT_LEAST} are needed",
+            source=dataset.out,
+            cure=f"see the reasons in {dataset.tables[1]}; one or two logs: `cangauge fit`",
+        )
+    sources = sorted({row["temperature_source"] for _, row in used.values()})
+    if len(sources) > 1:
+        raise InputError(
+            "the temperatures of the logs have different sources", field="temperature_source",
+            value=sources, cure="fit logs with the same temperature source together",
+        )  # fmt: skip
+    number = min(len(used), FOLDS_AT_MOST)
+    for k, (url, (log, found)) in enumerate(used.items()):
+        used[url] = (replace(log, fold=k % number), found)
+    return used, remarks
+
+
+def _pooled_by_fold(used: _Used, dataset: Dataset, run: str) -> list[LogInformation]:
+    waiting: dict[int, list[LogInformation]] = {}
+    for row in dataset.rows(run):
+        if (found := used.get(row["log"])) is None:
+            continue
+        parts = waiting.setdefault(found[0].fold, [])
+        parts.append(information_of_row(row))
+        if len(parts) >= POOLED_AT_ONCE:
+            parts[:] = [pooled(parts)]
+    return [pooled(waiting[fold]) for fold in sorted(waiting)]
+
+
+def _models_without(
+    by_fold: Sequence[LogInformation], fit: FitOptions
+) -> tuple[VoltageModel | None, ...]:
+    """Return the model without each fold; None where the rest identifies none.
+
+    Raises
+    ------
+    InputError
+        If that is so for every fold.
+    """
+    found: list[VoltageModel | None] = []
+    refused: InputError | None = None
+    for k in range(len(by_fold)):
+        rest = pooled([part for j, part in enumerate(by_fold) if j != k])
+        try:
+            found.append(fit_information(rest, fit)[0])
+        except InputError as error:
+            refused = error
+            found.append(None)
+    if refused is not None and not any(found):
+        raise refused
+    return tuple(found)
+
+
+def _summed(rows: Iterable[Mapping[str, Any]], used: _Used, solution: Solution) -> LogErrors:
+    kept = solution.back.shape[1]
+    waiting: list[LogErrors] = []
+    for row in rows:
+        if row["log"] in used:
+            waiting.append(errors_of_row(row, kept))
+        if len(waiting) >= POOLED_AT_ONCE:
+            waiting = [summed(waiting)]
+    return summed(waiting)
+
+
+def _model_file(
+    whole: LogInformation,
+    model: VoltageModel,
+    solution: Solution,
+    *,
+    errors: LogErrors,
+    fit: FitOptions,
+    used: _Used,
+    name: str | None,
+) -> Model:
+    names = [*BASIS_NAMES, "kt", *resistance_names(len(fit.delay_s))]
+    sums = errors.sums
+    time_error, curve = describe_error_of(
+        errors.equations,
+        rms_v=float(np.sqrt(sums["square_v2"] / sums["rows"])),
+        mean_c=whole.mean_c,
+        ocv_v=model.pseudo_ocv(KNOTS_PCT),
+        resistance_ohm=model.resistance_ohm,
+        rate_hz=fit.rate_hz,
+    )
+    prior, root = solution.kt_prior, whole.root
+    rows = [row for _, row in used.values()]
+    return Model(
+        name=name or common_name([row["name"] for row in rows]),
+        coefficients=coefficients_of(names, solution),
+        epsilon=model.epsilon,
+        t_ref_c=model.t_ref_c,
+        delays_s=list(model.delay_s),
+        rate_hz=fit.rate_hz,
+        capacity_ah=fit.capacity_ah,
+        temperature_source=rows[0]["temperature_source"],
+        range=Ranges(
+            soc_pct=model.soc_range_pct,
+            temperature_c=model.temperature_range_c,
+            current_a=model.current_range_a,
+        ),
+        noise=noise_of(
+            time_error,
+            curve,
+            lasting_time_s=float(whole.spans[0]) / whole.logs,
+            lasting_soc_pct=float(whole.spans[1]) / whole.logs,
+            voltage_mae_pct=sums["held_out_pct"] / sums["held_out"],
+            voltage_rmse_v=float(np.sqrt(sums["held_out_v2"] / sums["held_out"])),
+            judged_on=WHOLE_LOGS,
+        ),
+        effects=[],
+        information=information_of_rows(
+            root[:, :-1], np.empty((len(root), 0)), root[:, -1], names,
+            0.0 if prior is None else prior.row_weight,
+        ),
+        made=_made(rows, fit),
+    )  # fmt: skip
+
+
+def _made(rows: Sequence[Mapping[str, Any]], fit: FitOptions) -> Made:
+    listed = rows if len(rows) <= LISTED_LOGS else []
+    fingerprint = hashlib.sha256("".join(row["data_sha256"] for row in rows).encode())
+    return Made(
+        by=f"cangauge {__version__}",
+        options={
+            "capacity_ah": fit.capacity_ah,
+            "initial_soc_pct": None,
+            "rate_hz": fit.rate_hz,
+            "delay_s": list(fit.delay_s),
+            "epsilon": fit.epsilon,
+            "t_ref_c": fit.t_ref_c,
+            "fleet_logs": len(rows),
+        },
+        logs=[
+            SourceLog(name=row["name"], rows=row["rows"], sha256=row["data_sha256"])
+            for row in listed
+        ],
+        fingerprint=fingerprint.hexdigest(),
+    )

@@ -1,0 +1,125 @@
+"""Parts of a model file that the fit of rows and the fit of summaries (`pooled`) share."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Sequence
+from typing import Final, Literal
+
+import numpy as np
+
+from cangauge._typing import FloatArray
+from cangauge.identify.voltage_fit import KT
+from cangauge.inference.error_model import CurveError, TimeError
+from cangauge.inference.least_squares import Solution
+from cangauge.logs.log import Log
+from cangauge.model.model_file import Coefficient, CurveNoise, Information, ModelNoise
+
+WHOLE_LOGS: Final = "whole logs left out in turn"
+"""How the held-out error of three logs or more was made."""
+
+
+def coefficients_of(names: Sequence[str], solution: Solution) -> dict[str, Coefficient]:
+    """Return the coefficients with their standard errors and units."""
+    return {
+        key: Coefficient(value=float(value), std_error=float(error), unit=_unit(key))
+        for key, value, error in zip(names, solution.coefficients, solution.std_error, strict=True)
+    }
+
+
+def _unit(name: str) -> Literal["V", "V/K", "ohm"]:
+    if name == "kt":
+        return "V/K"
+    return "ohm" if name.startswith("R") else "V"
+
+
+def noise_of(
+    time_error: TimeError,
+    curve: CurveError,
+    *,
+    lasting_time_s: float,
+    lasting_soc_pct: float,
+    voltage_mae_pct: float,
+    voltage_rmse_v: float,
+    judged_on: str,
+) -> ModelNoise:
+    """Return the error model as it is written; the keywords are fields of `ModelNoise`."""
+    return ModelNoise(
+        **vars(time_error),
+        lasting_time_s=lasting_time_s,
+        lasting_soc_pct=lasting_soc_pct,
+        curve=CurveNoise(
+            soc_pct=curve.soc_pct.tolist(),
+            functions_v=curve.function_v.tolist(),
+            temperature_c=curve.temperature_c,
+            kt_std_v_per_k=curve.kt_std_v_per_k,
+            resistance_std_per_k=curve.resistance_std_per_k,
+        ),
+        voltage_mae_pct=voltage_mae_pct,
+        voltage_rmse_v=voltage_rmse_v,
+        judged_on=judged_on,
+    )
+
+
+def information_of_rows(
+    columns: FloatArray,
+    effect_columns: FloatArray,
+    volts: FloatArray,
+    names: Sequence[str],
+    kt_weight: float,
+) -> Information:
+    """Return the square root of the information of rows, or of their triangular factor.
+
+    The columns of the effects come first in the triangular factor, so that they are marginalised.
+    The priors of kt and of the pseudo-OCV are included.
+
+    Parameters
+    ----------
+    columns : array of shape (m, n)
+    effect_columns : array of shape (m, e)
+    volts : array of shape (m,)
+    names : sequence of n str
+    kt_weight : float
+        Weight of the prior's row kt = 0 V/K [K].
+    """
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0.0] = 1.0
+    first, n = effect_columns.shape[1], columns.shape[1]
+    table = np.column_stack([effect_columns, columns / scale, volts])
+    prior_row = np.zeros(table.shape[1])
+    prior_row[first + KT] = kt_weight / scale[KT]
+    root = np.linalg.qr(np.vstack([table, prior_row])).R[first:, first:]
+    return Information(
+        columns=list(names),
+        scale=scale.tolist(),
+        root=root[:n, :n].tolist(),
+        projected=root[:n, n].tolist(),
+    )
+
+
+def log_sha256(log: Log) -> str:
+    """Return the SHA-256 of a log's channels in hexadecimal."""
+    digest = hashlib.sha256()
+    for channel in (log.time_s, log.current_a, log.voltage_v, log.temperature_c):
+        digest.update(channel.tobytes())
+    return digest.hexdigest()
+
+
+def common_name(names: Sequence[str]) -> str:
+    """Return a name for several logs: their common prefix and their number.
+
+    Examples
+    --------
+    >>> common_name(["TripA01", "TripA03", "TripA05"])
+    'TripA (3 logs)'
+    """
+    if len(names) == 1:
+        return names[0]
+    prefix = os.path.commonprefix(list(names))  # noqa: RUF071 - of strings, not of paths
+    if any(name[len(prefix) : len(prefix) + 1].isdigit() for name in names):
+        prefix = prefix.rstrip("0123456789")  # of a number that differs
+    prefix = prefix.rstrip(" _-.,(")
+    if not prefix:
+        return f"{names[0]} and {len(names) - 1} more"
+    return f"{prefix} ({len(names)} logs)"

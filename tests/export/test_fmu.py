@@ -1,0 +1,176 @@
+"""Functional mock-up units: valid, and equal to the Python reference in a simulator."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from cangauge.cli.app import app
+from cangauge.errors import InputError
+from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.validity import Sample
+from cangauge.export.fmu import Kind, Version, export_fmu
+from cangauge.model.delay_line import DelayLine
+from cangauge.model.effects.base import Reading
+from cangauge.model.model_file import Model
+from cangauge.model.published import leaf_2012_model_file
+
+fmpy = pytest.importorskip("fmpy", reason="needs the simulator fmpy")
+if shutil.which("cc") is None:
+    pytest.skip("needs a C compiler", allow_module_level=True)
+
+TIME_S = np.arange(0.0, 301.0)
+CURRENT_A = 15.0 + 40.0 * np.sin(TIME_S / 17.0)
+TEMPERATURE_C = 22.0 + TIME_S / 300.0
+EFFECTS = [
+    {"id": "voltage_offset", "parameters": {"offset_v": 1.5}},
+    {
+        "id": "resistance_soc",
+        "parameters": {"at_empty": 0.5, "at_full": 0.2, "width_pct": 20.0, "delayed": 1.0},
+    },
+    {"id": "fast_polarization", "parameters": {"ohm": 0.02, "tau_s": 4.0, "activation_k": 900.0}},
+]
+
+
+def repaired() -> Model:
+    """The published model with effects, one of them of a sensor."""
+    return leaf_2012_model_file().model_copy(update={"effects": EFFECTS})
+
+
+@pytest.fixture(scope="module")
+def units(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[Kind, Version], Path]:
+    folder, kinds = tmp_path_factory.mktemp("units"), ("pack", "estimator")
+    return {
+        (kind, version): export_fmu(
+            repaired(), folder / f"{kind}{version}.fmu", kind=kind, version=version
+        )
+        for kind in kinds
+        for version in (2, 3)
+    }
+
+
+def simulate(unit: Path, outputs: list[str], more: dict[str, Any], **start: float) -> Any:
+    columns = {"time": TIME_S, "current_a": CURRENT_A, "temperature_c": TEMPERATURE_C} | more
+    given = np.array(
+        list(zip(*columns.values(), strict=True)), dtype=[(name, "f8") for name in columns]
+    )
+    return fmpy.simulate_fmu(
+        str(unit), stop_time=TIME_S[-1], step_size=1.0, output_interval=1.0, input=given,
+        output=outputs, start_values=start, fmi_type="CoSimulation",
+    )  # fmt: skip
+
+
+def held(values: np.ndarray) -> list[float]:
+    """What a unit gets at the end of each step: the input that was set before it."""
+    return [*values[:1], *values[:-1]]
+
+
+def pack_voltage(model: Model, initial_soc_pct: float) -> list[float]:
+    effects = [effect for effect in model.effects if effect["id"] != "voltage_offset"]
+    extended = model.model_copy(update={"effects": effects}).extended_model()
+    online, line = extended.online(), DelayLine(model.delays_s)
+    volts, out_ah, last = [], 0.0, 0.0
+    for time_s, current_a, temperature_c in zip(
+        TIME_S.tolist(), held(CURRENT_A), held(TEMPERATURE_C), strict=True
+    ):
+        (now,) = online.correct(Reading(time_s, current_a, float("nan"), temperature_c))
+        if volts:
+            out_ah += 0.5 * (now.current_a + last) / 3600.0
+        last = now.current_a
+        line.push(time_s, now.current_a)
+        online.advance(time_s, now.current_a, now.temperature_c, line.currents())
+        soc = initial_soc_pct - 100.0 * out_ah / model.capacity_ah
+        offset_v = extended.model.offset_at(now.temperature_c, line.currents())
+        volts.append(online.pseudo_ocv_at(soc)[0] + offset_v)
+    return volts
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("kind", ["pack", "estimator"])
+def test_the_unit_is_valid(units: dict[Any, Path], kind: Kind, version: Version) -> None:
+    from fmpy.validation import validate_fmu  # noqa: PLC0415
+
+    assert validate_fmu(str(units[kind, version])) == []
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_the_pack_is_the_model_bit_for_bit(units: dict[Any, Path], version: Version) -> None:
+    found = simulate(units["pack", version], ["voltage_v"], {}, initial_soc_pct=81.0)
+    assert found["voltage_v"].tolist() == pack_voltage(repaired(), 81.0)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_the_estimator_is_pythons_bit_for_bit(units: dict[Any, Path], version: Version) -> None:
+    volts = np.array(pack_voltage(repaired(), 80.0))
+    found = simulate(
+        units["estimator", version], ["soc_pct", "soc_std_pct", "status"], {"voltage_v": volts}
+    )
+    estimator = Estimator(repaired(), EstimatorSettings())
+    samples = zip(TIME_S.tolist(), held(CURRENT_A), held(volts), held(TEMPERATURE_C), strict=True)
+    for row, sample in zip(found, samples, strict=True):
+        estimator.update(Sample(*sample))
+        expected = estimator.estimate
+        assert row["soc_pct"] == expected.soc_pct
+        assert row["soc_std_pct"] == expected.soc_std_pct
+        assert row["status"] == expected.status
+
+
+def test_a_diagnosed_effect_is_a_parameter(units: dict[Any, Path]) -> None:
+    given = {"initial_soc_pct": 81.0, "effect_3_rc.ohm_1": 0.05}
+    found = simulate(units["pack", 3], ["voltage_v"], {}, **given)
+    polarization = {"ohm": 0.05, "tau_s": 4.0, "activation_k": 900.0}
+    changed = [*EFFECTS[:2], {"id": "fast_polarization", "parameters": polarization}]
+    model = repaired().model_copy(update={"effects": changed})
+    assert found["voltage_v"].tolist() == pack_voltage(model, 81.0)
+
+
+def test_a_saved_state_continues_as_it_was(units: dict[Any, Path], tmp_path: Path) -> None:
+    unit = units["pack", 3]
+    description = fmpy.read_model_description(str(unit))
+    fmu = fmpy.instantiate_fmu(fmpy.extract(str(unit), tmp_path), description, "CoSimulation")
+    fmu.enterInitializationMode(startTime=0.0)
+    fmu.exitInitializationMode()
+    fmu.setFloat64([1], [30.0])
+    fmu.doStep(0.0, 1.0)
+    state = fmu.getFMUState()
+    first = [_stepped(fmu, time_s) for time_s in range(1, 20)]
+    fmu.setFMUState(state)
+    assert [_stepped(fmu, time_s) for time_s in range(1, 20)] == first
+    fmu.freeFMUState(state)
+    fmu.terminate()
+    fmu.freeInstance()
+
+
+def _stepped(fmu: Any, time_s: float) -> float:
+    fmu.doStep(float(time_s), 1.0)
+    return float(fmu.getFloat64([3])[0])
+
+
+def test_a_missing_compiler_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(shutil, "which", lambda _name: None)
+    with pytest.raises(InputError, match="no C compiler"):
+        export_fmu(leaf_2012_model_file(), tmp_path / "pack.fmu")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_command_writes_a_unit(tmp_path: Path) -> None:
+    model, unit = tmp_path / "model.json", tmp_path / "estimator.fmu"
+    leaf_2012_model_file().save(model)
+    done = CliRunner().invoke(
+        app, ["export-fmu", str(model), "-o", str(unit), "--kind", "estimator", "--fmi", "2"]
+    )
+    assert done.exit_code == 0
+    description = fmpy.read_model_description(str(unit))
+    assert description.fmiVersion == "2.0"
+    assert description.coSimulation.modelIdentifier.isidentifier()
+    assert [item.name for item in description.modelVariables if item.causality == "input"] == [
+        "current_a",
+        "temperature_c",
+        "voltage_v",
+    ]

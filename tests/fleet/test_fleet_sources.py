@@ -1,0 +1,105 @@
+"""Globs and manifests → logs with their vehicles; logs of other storage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import fsspec
+import pytest
+
+from cangauge.errors import InputError
+from cangauge.fleet.sources import ABSENT, FleetLog, ReadOptions, find_logs, local_file
+from cangauge.logs.column_map import ColumnMap
+
+HEAD = "time_s,current_a,voltage_v,temperature_c\n"
+
+
+def test_a_glob_finds_the_logs_of_each_folder(folder: Path) -> None:
+    found = find_logs([f"{folder}/*/trip*.parquet"])
+    assert [log.vehicle for log in found] == [f"car{k}" for k in range(4) for _ in range(2)]
+    assert [Path(log.url).stem for log in found[:2]] == ["trip0", "trip1"]
+
+
+def test_a_pattern_finds_the_vehicle_in_the_name(tmp_path: Path) -> None:
+    (tmp_path / "A17_may.csv").write_text(HEAD)
+    (log,) = find_logs([f"{tmp_path}/*.csv"], pattern=r"([A-Z]\d+)_\w+\.csv$")
+    assert log.vehicle == "A17"
+    with pytest.raises(InputError, match="finds no vehicle"):
+        find_logs([f"{tmp_path}/*.csv"], pattern=r"(VIN\d+)")
+    for wrong, words in (("(", "regular expression"), ("A17", "no group")):
+        with pytest.raises(InputError, match=words):
+            find_logs([f"{tmp_path}/*.csv"], pattern=wrong)
+
+
+def test_a_manifest_orders_by_start_and_names_what_is_absent(tmp_path: Path) -> None:
+    (tmp_path / "b.csv").write_text(HEAD)
+    (tmp_path / "a.csv").write_text(HEAD)
+    (tmp_path / "manifest.csv").write_text(
+        "log,vehicle,start,initial_soc_pct,healthy\n"
+        "a.csv,X,2024-05-02T08:00:00Z,90,yes\nb.csv,X,2024-05-01T08:00:00Z,,\ngone.csv,Y,,,\n"
+    )
+    found = find_logs([str(tmp_path / "manifest.csv")])
+    assert [Path(log.url).name for log in found] == ["b.csv", "a.csv", "gone.csv"]
+    assert (found[1].initial_soc_pct, found[1].healthy, found[0].healthy) == (90.0, True, False)
+    assert found[2].stamp == ABSENT
+    assert ABSENT not in {found[0].stamp, found[1].stamp}
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("log,colour\na.csv,red\n", "not a column of a manifest: colour"),
+        ("log,start\na.csv,yesterday\n", "line 2.*yesterday"),
+        ("log,initial_soc_pct\na.csv,140\n", "0 … 100"),
+        ("log,healthy\na.csv,perhaps\n", "neither yes nor no"),
+        ("log,vehicle\n,X\n", "names no log"),
+        ("log,vehicle\na.csv,X\na.csv,X\n", "named twice"),
+    ],
+)
+def test_a_wrong_manifest_is_refused(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "manifest.csv").write_text(text)
+    with pytest.raises(InputError, match=words):
+        find_logs([str(tmp_path / "manifest.csv")])
+
+
+def test_nothing_found_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no log is named"):
+        find_logs([f"{tmp_path}/*.csv"])
+    with pytest.raises(InputError, match="no such file"):
+        find_logs([f"{tmp_path}/log.csv"])
+    with pytest.raises(InputError, match="is a folder"):
+        find_logs([str(tmp_path)])
+
+
+def test_the_stamp_changes_with_the_content(tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    path.write_text(HEAD)
+    (before,) = find_logs([str(path)])
+    assert find_logs([str(path)]) == [before]
+    path.write_text(f"{HEAD}0,1,380,20\n")
+    (after,) = find_logs([str(path)])
+    assert after.stamp != before.stamp
+
+
+def test_a_remote_log_is_read_as_a_local_one(logs: list[FleetLog]) -> None:
+    remote = fsspec.filesystem("memory")
+    remote.pipe_file("/drives/car9/trip.parquet", Path(logs[0].url).read_bytes())
+    (found,) = find_logs(["memory://drives/*/*.parquet"])
+    assert found.vehicle == "car9"
+    with local_file(found.url) as path:
+        copied = ReadOptions().read(path, found.url)
+    assert not path.exists()
+    assert copied.source == found.url
+    assert (
+        copied.voltage_v.tolist()
+        == ReadOptions().read(Path(logs[0].url), logs[0].url).voltage_v.tolist()
+    )
+
+
+def test_a_table_of_other_headings_is_read_by_its_columns(tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    rows = "\n".join(f"{k},{2 * k % 7 - 3},{380 - 0.1 * (2 * k % 7)},21" for k in range(20))
+    path.write_text(f"t,I,U,Temp\n{rows}\n")
+    columns = ColumnMap.of("time=t[s],current=I[A],voltage=U[V],temperature=Temp[°C]")
+    log = ReadOptions(columns=columns, sign="discharge").read(path, "x")
+    assert len(log) == 20
