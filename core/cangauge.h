@@ -23,9 +23,11 @@
 #define CANGAUGE_REAL double
 #endif
 typedef CANGAUGE_REAL cg_real;
-/* Times and running sums, which would lose digits as float. */
+/* What would lose its digits as float: times, running sums, and the coefficients of the pseudo-OCV,
+ * whose terms of up to 1e8 V cancel. */
 typedef double cg_time;
 typedef double cg_sum;
+typedef double cg_wide;
 
 /* Upper limits of a model; an exported model states its own, which are smaller. */
 #ifdef CANGAUGE_CONFIG
@@ -77,8 +79,8 @@ typedef struct {
 typedef struct {
     /* U = k0 + k1/s + k2/s^2 + k3/s^3 + k4/s^4 + k5 s + k6 ln s + k7 ln(1 - s)
      *     + kt (T - T_r) + sum Rj I(t - dj),  s = SoC scaled into [epsilon, 1 - epsilon] */
-    cg_real ocv_v[CG_OCV];
-    cg_real epsilon;
+    cg_wide ocv_v[CG_OCV];
+    cg_wide epsilon;
     cg_real slope_beyond[2]; /* dU/dS below and above the identified SoC [V per %] */
     cg_real kt_v_per_k;
     cg_real t_ref_c;

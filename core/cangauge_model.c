@@ -120,19 +120,18 @@ cg_real cg_line_at(const cg_line *line, cg_time ago_s)
 
 cg_real cg_ocv(const cg_model *model, cg_real soc_pct, cg_real *slope)
 {
-    const cg_real *k = model->ocv_v;
+    const cg_wide *k = model->ocv_v;
     const cg_real at = cg_clip(soc_pct, model->soc_range_pct[0], model->soc_range_pct[1]);
-    const cg_real gain = (R(1.0) - (R(2.0) * model->epsilon)) / R(100.0);
-    const cg_real s = (at * gain) + model->epsilon;
-    const cg_real r = R(1.0) / s;
-    const cg_real powers = r * (k[1] + (r * (k[2] + (r * (k[3] + (r * k[4]))))));
+    const cg_wide gain = (1.0 - (2.0 * model->epsilon)) / 100.0;
+    const cg_wide s = ((cg_wide)at * gain) + model->epsilon;
+    const cg_wide r = 1.0 / s;
+    const cg_wide powers = r * (k[1] + (r * (k[2] + (r * (k[3] + (r * k[4]))))));
     const cg_real volts =
-        k[0] + powers + (k[5] * s) + (k[6] * cg_log(s)) + (k[7] * cg_log1p(-s));
+        (cg_real)(k[0] + powers + (k[5] * s) + (k[6] * log(s)) + (k[7] * log1p(-s)));
     if (soc_pct == at) {
-        cg_real by_s = k[5] + (k[6] * r) - (k[7] / (R(1.0) - s));
-        by_s -= r * r * (k[1] + (r * ((R(2.0) * k[2]) + (r * ((R(3.0) * k[3]) +
-                                                              (r * R(4.0) * k[4]))))));
-        *slope = by_s * gain;
+        cg_wide by_s = k[5] + (k[6] * r) - (k[7] / (1.0 - s));
+        by_s -= r * r * (k[1] + (r * ((2.0 * k[2]) + (r * ((3.0 * k[3]) + (r * 4.0 * k[4]))))));
+        *slope = (cg_real)(by_s * gain);
         return volts;
     }
     *slope = (soc_pct < at) ? model->slope_beyond[0] : model->slope_beyond[1];

@@ -29,7 +29,7 @@ int main(void)
         estimate = cg_evaluate(&pack);
         frames_soc_estimate(&estimate, 0, counter, data);
         counter = (uint8_t)((counter + 1U) & 0xFU);
-        printf("%.3f %.2f +- %.2f %%, status %d, reasons %05lx,", estimate.time_s,
+        printf("%.3f %.4f +- %.4f %%, status %d, reasons %05lx,", estimate.time_s,
                (double)estimate.soc_pct, (double)estimate.soc_std_pct, (int)estimate.status,
                (unsigned long)estimate.reasons);
         for (int k = 0; k < 8; ++k) {

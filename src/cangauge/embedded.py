@@ -46,6 +46,9 @@ GOLDEN_S: Final = 1200.0
 FAST_SAMPLES: Final = 200
 """Samples of it that are `period_s` apart."""
 
+_WIDE: Final = ("ocv_v", "epsilon", "skew_s")
+"""Constants that are doubles with floats too."""
+
 _SIGNALS: Final = ("soc_pct", "soc_std_pct", "age_s")
 
 
@@ -144,8 +147,8 @@ def _number(value: object) -> str:
     return f"(cg_real){number!r}"
 
 
-def _row(values: Sequence[object]) -> str:
-    return "{" + ", ".join(map(_number, values)) + "}"
+def _row(values: Sequence[object], *, is_wide: bool = False) -> str:
+    return "{" + ", ".join(map(repr if is_wide else _number, values)) + "}"
 
 
 def _model_source(constants: CoreConstants) -> str:
@@ -154,8 +157,8 @@ def _model_source(constants: CoreConstants) -> str:
     for name, value in constants.model.items():
         if isinstance(value, list):
             if value:
-                lines.append(f"    .{name} = {_row(value)},")
-        elif name == "skew_s":  # a time
+                lines.append(f"    .{name} = {_row(value, is_wide=name in _WIDE)},")
+        elif name in _WIDE:
             lines.append(f"    .{name} = {value!r},")
         else:
             lines.append(f"    .{name} = {_number(value)},")

@@ -8,15 +8,20 @@ import subprocess
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from cangauge.cli.app import app
 from cangauge.embedded import CORE, drive_with_events, export_c
 from cangauge.errors import InputError
+from cangauge.estimation.offline import run_estimator, samples_of
+from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.validity import Sample
+from cangauge.identify.fit import fit
 from cangauge.model.model_file import CurveNoise, Model
 from cangauge.model.published import leaf_2012_model_file
+from cangauge.validation.packs import load
 from estimation.test_snapshot import extended_by
 
 PLAIN = leaf_2012_model_file()
@@ -119,6 +124,24 @@ def test_example_writes_a_frame_for_each_sample(folders: dict[str, Path]) -> Non
     lines = done.stdout.splitlines()
     assert len(lines) == 20
     assert all(re.search(r"reasons [0-9a-f]{5},( [0-9A-F]{2}){8}$", line) for line in lines)
+
+
+@needs_make
+@pytest.mark.real
+def test_floats_estimate_a_held_out_trip_as_python(shared_data: Path, tmp_path: Path) -> None:
+    # The coefficients of this model are of 1e7 V, and cancel.
+    (i3,) = load(shared_data, ["i3"])
+    model, log = fit(i3.training[:3], capacity_ah=60.0).model, i3.judged[0]
+    export_c(model, tmp_path, period_s=1.0)
+    run(tmp_path, "make", "example", "CC=cc -DCANGAUGE_REAL=float")
+    rows = "".join(",".join(map(repr, sample)) + "\n" for sample in samples_of(log))
+    done = subprocess.run(
+        ["./example"], check=True, cwd=tmp_path, input=rows, capture_output=True, text=True,
+        timeout=60,
+    )  # fmt: skip
+    found = [float(line.split()[1]) for line in done.stdout.splitlines()]
+    expected = run_estimator(log, model, EstimatorSettings()).soc_pct
+    np.testing.assert_allclose(found, expected, atol=0.02)
 
 
 def test_core_calls_nothing_but_mathematics(folders: dict[str, Path]) -> None:

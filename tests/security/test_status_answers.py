@@ -34,7 +34,8 @@ NUMBERS = dict.fromkeys(
 )  # fmt: skip
 GOOD: dict[str, Any] = {
     "schema": 1, "version": "0.1.0", "bus": "can0", "vehicle": "x", "model": "m.json",
-    "method": "ekf", "time_source": "receive", "status": "valid", "reasons": ["input_stale"],
+    "method": "ekf", "time_source": "receive", "core": "python",
+    "status": "valid", "reasons": ["input_stale"],
     "uptime_s": 3.0, "loop_stuck": False, "estimate": NUMBERS,
     "sample": {"age_s": 0.1, "current_a": 1.0, "voltage_v": None, "temperature_c": 20},
     "samples": 5, "samples_per_s": 1.0, "frames": {"received": 1, "used": 1, "lost": 0},

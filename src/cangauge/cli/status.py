@@ -106,7 +106,10 @@ def status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
         *rows,
         ("vehicle", status["vehicle"]),
         ("model", f"{status['model']} ({status['method']}, time: {status['time_source']})"),
-        ("running for", f"{duration(status['uptime_s'])}, cangauge {status['version']}"),
+        (
+            "running for",
+            f"{duration(status['uptime_s'])}, cangauge {status['version']}, {status['core']} core",
+        ),
     ]
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from importlib import import_module
-from typing import Any, Final, cast
+from typing import Any, ClassVar, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,6 +93,8 @@ class CompiledEstimator(Estimator):
     constants : CoreConstants
         Of this model and these settings.
     """
+
+    core: ClassVar[str] = "compiled"
 
     def __init__(self, model: Model, settings: EstimatorSettings, constants: CoreConstants) -> None:
         self._in_python = True

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import ClassVar
 
 from cangauge._arithmetic import dot, total
 from cangauge.errors import InputError
@@ -97,6 +98,9 @@ class Estimator:
     >>> round(estimate.soc_coulomb_pct)
     80
     """
+
+    core: ClassVar[str] = "python"
+    """Implementation of the step: "python", or "compiled" (`compiled`)."""
 
     def __init__(
         self,

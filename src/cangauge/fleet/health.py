@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from cangauge.errors import InputError
+from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import gap_of, initial_soc_of, samples_of
 from cangauge.estimation.settings import EstimatorSettings
@@ -105,7 +106,7 @@ class HealthJob(Job):
                 start = initial_soc_of(recorded, settings.capacity_ah or self.model.capacity_ah)
             if start is not None:
                 settings = replace(settings, initial_soc_pct=start)
-        estimator = Estimator(self.model, settings)
+        estimator = make_estimator(self.model, settings)
         if before is not None:
             estimator.restore(before)
         return estimator

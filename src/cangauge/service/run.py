@@ -289,6 +289,7 @@ class Service:
             method=config.method,
             time_source=config.time_source,
             began_s=time.time(),
+            core=self.pipeline.estimator.core,
         )
         with ExitStack() as stack:
             notifier = Notifier.from_environment()

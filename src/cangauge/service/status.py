@@ -126,6 +126,8 @@ class Identity:
     bus, vehicle, model, method, time_source : str
     began_s : float
         Start, seconds since 1970.
+    core : {"python", "compiled"}
+        Which implementation of the estimator's step is used; both give the same numbers.
     """
 
     bus: str
@@ -134,6 +136,7 @@ class Identity:
     method: str
     time_source: str
     began_s: float
+    core: str = "python"
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,6 +270,7 @@ def as_json(snapshot: Snapshot, now_s: float) -> dict[str, Any]:
         "model": identity.model,
         "method": identity.method,
         "time_source": identity.time_source,
+        "core": identity.core,
         "uptime_s": _finite(snapshot.uptime_s + max(now_s - snapshot.made_s, 0.0)),
         "loop_stuck": snapshot.is_stuck(now_s),
         "status": estimate.status.name.lower(),

@@ -150,7 +150,8 @@ def _content(body: bytes, endpoint: str) -> dict[str, Any]:
 _Number = (int, float, type(None))
 _Durations: Final = {"count": int, "p50_at_most_s": _Number, "p99_at_most_s": _Number}
 _SHAPE: Final[dict[str, Any]] = {
-    **dict.fromkeys(("version", "bus", "vehicle", "model", "method", "time_source", "status"), str),
+    **dict.fromkeys(("version", "bus", "vehicle", "model", "method"), str),
+    **dict.fromkeys(("time_source", "core", "status"), str),
     "reasons": [str],
     "uptime_s": (int, float),
     "loop_stuck": bool,

@@ -1,0 +1,175 @@
+"""Cost of the estimator's core: step in Python and compiled, and on a Cortex-M4F.
+
+    python benchmarks/core_cost.py [--bits FOLDER] [--json]
+
+step    processor time of a step, at 10 Hz and at 1 Hz (at 1 Hz every step uses a voltage), of the
+        published Leaf model: the reference in Python, the compiled one sample by sample as in the
+        service, and over columns as offline. Median of five interleaved rounds.
+target  flash of core, model and frames, memory, and instructions of a step with floats, from the
+        exported sources on QEMU's mps2-an386. Left out without gcc-arm-none-eabi or QEMU.
+bits    estimates of every judged log of the recorded packs in a folder, which both give: numbers
+        that differ in a bit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import shutil
+import statistics
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from cangauge.embedded import export_c
+from cangauge.errors import InputError
+from cangauge.estimation.compiled import CompiledEstimator, make_estimator
+from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.offline import run_estimator, samples_of
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.validity import Sample
+from cangauge.identify.fit import fit
+from cangauge.model.coulomb_counting import capacity_from_reference
+from cangauge.model.published import leaf_2012_model_file
+from cangauge.validation.packs import load
+
+MODEL: Final = leaf_2012_model_file()
+SETTINGS: Final = EstimatorSettings(initial_soc_pct=80.0)
+SAMPLES: Final = 20000
+ROUNDS: Final = 5
+
+
+def drive(step_s: float) -> list[Sample]:
+    """Return a drive of load steps from 80 to 20 % with a white error of 0.5 V."""
+    rng = np.random.default_rng(1)
+    voltage = MODEL.voltage_model()
+    current = np.repeat(rng.uniform(-40.0, 60.0, SAMPLES // 50 + 1), 50)[:SAMPLES]
+    soc = np.linspace(80.0, 20.0, SAMPLES)
+    volts = voltage.pseudo_ocv(soc) + sum(voltage.resistance_ohm) * current
+    volts += rng.normal(0.0, 0.5, SAMPLES)
+    rows = zip(step_s * np.arange(SAMPLES), current, volts, np.full(SAMPLES, 22.0), strict=True)
+    return [Sample(*map(float, row)) for row in rows]
+
+
+def step_costs() -> list[dict[str, Any]]:
+    """Measure the processor time of a step [µs]."""
+    found = []
+    for rate_hz in (10.0, 1.0):
+        samples = drive(1.0 / rate_hz)
+        columns = list(np.array(samples).T.copy())
+
+        def each(estimator: Estimator, samples: list[Sample] = samples) -> None:
+            for sample in samples:
+                estimator.update(sample)
+
+        def whole(estimator: Estimator, columns: list[np.ndarray] = columns) -> None:
+            assert isinstance(estimator, CompiledEstimator)  # noqa: S101
+            estimator.run(columns)
+
+        ways: dict[str, tuple[Callable[..., Estimator], Callable[[Estimator], None]]] = {
+            "python": (Estimator, each),
+            "compiled": (make_estimator, each),
+            "compiled, columns": (make_estimator, whole),
+        }
+        took: dict[str, list[float]] = {name: [] for name in ways}
+        for _ in range(ROUNDS):
+            for name, (make, run) in ways.items():
+                estimator = make(MODEL, SETTINGS)
+                began = time.process_time()
+                run(estimator)
+                took[name].append(1e6 * (time.process_time() - began) / SAMPLES)
+        found += [
+            {"rate_hz": rate_hz, "way": name, "us": statistics.median(values)}
+            for name, values in took.items()
+        ]
+    return found
+
+
+def target_costs() -> dict[str, int]:
+    """Measure flash, memory [B] and instructions on a Cortex-M4F; empty without its tools."""
+    if not (shutil.which("arm-none-eabi-gcc") and shutil.which("qemu-system-arm")):
+        return {}
+    with tempfile.TemporaryDirectory() as folder:
+        export_c(MODEL, Path(folder))
+        done = subprocess.run(
+            ["make", "arm"],  # noqa: S607
+            cwd=folder, capture_output=True, text=True, check=True,
+        )  # fmt: skip
+    sizes = re.findall(r"^ *(\d+)(?:\s+\w+){4}\s+(\w+)\.o$", done.stdout, re.MULTILINE)
+    text = {name: int(size) for size, name in sizes}
+    parts = dict(re.findall(r"(state|delay line|constants) (\d+)", done.stdout))
+    steps = re.search(r"instructions: (\d+) a sample, (\d+) .* most (\d+)", done.stdout)
+    assert steps is not None  # noqa: S101
+    return {
+        "flash_core": sum(text[name] for name in text if name.startswith("cangauge")),
+        "flash_model": text["pack_model"],
+        "flash_frames": text["frames"] + text["soc_frames"],
+        "ram_state": int(parts["state"]),
+        "ram_delay_line": int(parts["delay line"]),
+        "instructions_sample": int(steps[1]),
+        "instructions_voltage": int(steps[2]),
+        "instructions_at_most": int(steps[3]),
+    }  # fmt: skip
+
+
+def differing_bits(folder: Path) -> dict[str, dict[str, int]]:
+    """Compare both on every judged log of the recorded packs."""
+    found = {}
+    for pack in load(folder):
+        capacity_ah = pack.capacity_ah or capacity_from_reference(pack.training[:3])
+        try:
+            model = fit(pack.training[:3], capacity_ah=capacity_ah).model
+            model.extended_model()
+        except InputError as error:
+            found[pack.name] = {"numbers": 0, "differ": 0, "failed": str(error)}  # type: ignore[dict-item]
+            continue
+        numbers = differ = 0
+        for log in pack.judged:
+            table = run_estimator(log, model, EstimatorSettings())
+            reference = Estimator(model, EstimatorSettings())
+            expected = np.array([reference.step(sample)[1:7] for sample in samples_of(log)])
+            names = ("soc_pct", "soc_std_pct", "soc_newton_pct", "soc_coulomb_pct",
+                     "voltage_model_v", "residual_v")  # fmt: skip
+            columns = np.column_stack([getattr(table, name) for name in names])
+            both = columns.view(np.int64) == np.ascontiguousarray(expected).view(np.int64)
+            numbers += both.size
+            differ += int((~both).sum())
+        found[pack.name] = {"numbers": numbers, "differ": differ}
+    return found
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--bits", type=Path, metavar="FOLDER", help="recorded packs to compare on")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    given = parser.parse_args()
+    result: dict[str, Any] = {"step": step_costs(), "target": target_costs()}
+    if given.bits is not None:
+        result["bits"] = differing_bits(given.bits)
+    if given.json:
+        print(json.dumps(result, indent=1))
+        return
+    console = Console()
+    table = Table("rate [Hz]", "step", "µs", title="Processor time of a step")
+    for row in result["step"]:
+        table.add_row(f"{row['rate_hz']:g}", row["way"], f"{row['us']:.2f}")
+    console.print(table)
+    for name in ("target", "bits"):
+        if result.get(name):
+            table = Table(name, "", title=name)
+            for key, value in result[name].items():
+                table.add_row(key, str(value))
+            console.print(table)
+
+
+if __name__ == "__main__":
+    main()
