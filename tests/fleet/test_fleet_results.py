@@ -69,6 +69,28 @@ def test_a_log_is_either_done_or_set_aside(out: str) -> None:
     assert data.known("another") == {}
 
 
+def test_what_a_killed_run_was_writing_is_ignored(tmp_path: Path) -> None:
+    data = Dataset(str(tmp_path), "x", {"value": REAL})
+    data.add([keyed(LOG, value=1.0)])
+    (path,) = tmp_path.rglob("*.parquet")
+    path.with_name(".3f2c.a1b2.parquet").write_bytes(b"PAR1")
+    assert [row["value"] for row in data.rows()] == [1.0]
+    data.settle()
+    assert set(data.known("r")) == {"a.csv"}
+
+
+def test_two_runs_settle_at_the_same_time(out: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    data, other = (Dataset(out, "x", {"value": REAL}) for _ in range(2))
+    for k in range(3):
+        data.add([keyed(replace(LOG, url=f"{k}.csv"), value=float(k))])
+    listed = data._files("x")
+    other.settle()
+    monkeypatch.setattr(data, "_files", lambda table: listed if table == "x" else [])
+    assert not [*data.rows()]
+    data.settle()
+    assert sorted(row["value"] for row in other.rows()) == [0.0, 1.0, 2.0]
+
+
 def test_what_fails_is_a_reason_not_an_error(
     tmp_path: Path, model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:

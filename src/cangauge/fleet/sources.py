@@ -75,6 +75,11 @@ class FleetLog:
     fold: int = 0
 
     @property
+    def stated(self) -> str:
+        """What a manifest states of the log: its start, and the SoC there."""
+        return f"{self.start} {self.initial_soc_pct}"
+
+    @property
     def start_s(self) -> float | None:
         """Time of the first row since 1970 [s]; None if unknown."""
         if not self.start:
