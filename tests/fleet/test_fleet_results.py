@@ -69,6 +69,28 @@ def test_a_log_is_either_done_or_set_aside(out: str) -> None:
     assert data.known("another") == {}
 
 
+def test_what_a_killed_run_was_writing_is_ignored(tmp_path: Path) -> None:
+    data = Dataset(str(tmp_path), "x", {"value": REAL})
+    data.add([keyed(LOG, value=1.0)])
+    (path,) = tmp_path.rglob("*.parquet")
+    path.with_name(".3f2c.a1b2.parquet").write_bytes(b"PAR1")
+    assert [row["value"] for row in data.rows()] == [1.0]
+    data.settle()
+    assert set(data.known("r")) == {"a.csv"}
+
+
+def test_two_runs_settle_at_the_same_time(out: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    data, other = (Dataset(out, "x", {"value": REAL}) for _ in range(2))
+    for k in range(3):
+        data.add([keyed(replace(LOG, url=f"{k}.csv"), value=float(k))])
+    listed = data._files("x")
+    other.settle()
+    monkeypatch.setattr(data, "_files", lambda table: listed if table == "x" else [])
+    assert not [*data.rows()]
+    data.settle()
+    assert sorted(row["value"] for row in other.rows()) == [0.0, 1.0, 2.0]
+
+
 def test_what_fails_is_a_reason_not_an_error(
     tmp_path: Path, model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -114,7 +136,7 @@ def test_health_passes_from_log_to_log(logs: list[FleetLog], model: Model) -> No
     dated = replace(trips[0], start="2024-05-01T08:00:00Z")
     first = perform(job, dated, "", None).row or {}
     early = perform(job, replace(trips[1], start="2024-05-01T08:10:00Z"), "", first["state"])
-    assert "before the vehicle's log before it ends" in early.reason
+    assert "before the previous log of this vehicle ends" in early.reason
 
 
 def test_one_vehicle_apart_from_the_others_is_an_outlier() -> None:
@@ -136,11 +158,13 @@ def test_one_vehicle_apart_from_the_others_is_an_outlier() -> None:
 def test_references_come_from_all_vehicles(logs: list[FleetLog], model: Model) -> None:
     marked = [replace(log, healthy="trip1" not in log.url) for log in logs]
     suspect, healthy = suspect_and_healthy(marked, 1)
-    job = GapJob(ReadOptions(), model, suspect, healthy, references=5)
-    chosen = job.references_of("car1")
+    job = GapJob(ReadOptions(), model, references=5)
+    found = {each.vehicle: each for each in job.vehicles(suspect, healthy)}
+    chosen = found["car1"].references
+    assert chosen[0].vehicle == "car1"
     assert [log.vehicle for log in chosen].count("car1") == 1
     assert {log.vehicle for log in chosen} == {"car0", "car1", "car2", "car3"}
-    assert chosen == replace(job, logs=dict(reversed(suspect.items()))).references_of("car1")
+    assert job.vehicles(dict(reversed(suspect.items())), healthy) == [*found.values()]
     with pytest.raises(InputError, match="known to be healthy"):
         suspect_and_healthy(logs, 1)
 
@@ -152,8 +176,8 @@ def test_a_vehicle_is_diagnosed_with_references_of_others(
     broken.write_text("x\n")
     suspect = {"car1": (logs[3], FleetLog(str(broken), "car1", "s"))}
     healthy = {"car2": (logs[5],)}
-    job = GapJob(ReadOptions(), model, suspect, healthy, references=1)
-    (vehicle,) = job.vehicles()
+    job = GapJob(ReadOptions(), model, references=1)
+    (vehicle,) = job.vehicles(suspect, healthy)
     row = perform(job, vehicle, "", None).row
     assert row is not None
     assert (row["references"], row["reference_vehicles"]) == (1, 1)

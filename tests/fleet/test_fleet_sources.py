@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import fsspec
@@ -94,6 +95,13 @@ def test_a_remote_log_is_read_as_a_local_one(logs: list[FleetLog]) -> None:
         copied.voltage_v.tolist()
         == ReadOptions().read(Path(logs[0].url), logs[0].url).voltage_v.tolist()
     )
+
+
+def test_a_log_begins_with_the_soc_of_the_manifest(logs: list[FleetLog]) -> None:
+    stated = replace(logs[1], initial_soc_pct=42.0)
+    found = ReadOptions().read_log(stated, Path(stated.url))
+    assert found.first_soc() == (0, 42.0)
+    assert ReadOptions().read_log(logs[1], Path(logs[1].url)).first_soc() != (0, 42.0)
 
 
 def test_a_table_of_other_headings_is_read_by_its_columns(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from cangauge.identify.evaluate import evaluate
 from cangauge.identify.fit import Identification, fit
 from cangauge.identify.pooled import (
+    LEVELS_AT_MOST,
     LogInformation,
     errors_of,
     fit_information,
@@ -96,6 +98,23 @@ def test_standard_errors_and_slope_are_those_of_the_rows(
 def test_the_median_voltage_is_exact(rows: list[FitRows], parts: list[LogInformation]) -> None:
     volts = np.concatenate([item.voltage_v for item in rows])
     assert pooled(parts).nominal_v == np.median(volts)
+
+
+def test_pooled_voltages_do_not_grow_with_the_logs(
+    rows: list[FitRows], options: FitOptions
+) -> None:
+    rng = np.random.default_rng(2)
+    noisy = [
+        replace(item, voltage_v=item.voltage_v + rng.normal(0.0, 1e-3, len(item)))
+        for item in rows * 2
+    ]
+    parts = [information_of(item, options) for item in noisy]
+    volts = np.concatenate([item.voltage_v for item in noisy])
+    assert max(part.levels_v.size for part in parts) <= LEVELS_AT_MOST < np.unique(volts).size
+    whole = pooled([pooled(parts[:3]), *parts[3:]])
+    assert whole.levels_v.size <= LEVELS_AT_MOST
+    assert whole.level_rows.sum() == volts.size
+    assert whole.nominal_v == pytest.approx(np.median(volts), rel=1e-4)
 
 
 def test_voltages_of_many_levels_are_rounded_for_the_median(options: FitOptions) -> None:

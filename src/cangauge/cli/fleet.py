@@ -313,8 +313,8 @@ def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
     suspect, good = suspect_and_healthy(
         [*found, *(replace(log, healthy=True) for log in known)], latest
     )
-    job = GapJob(reading, Model.load(model), suspect, good, references, alarm)
-    _run(job, job.vehicles(), out, scheduler, workers, report, json_output)
+    job = GapJob(reading, Model.load(model), references, alarm)
+    _run(job, job.vehicles(suspect, good), out, scheduler, workers, report, json_output)
 
 
 def _reading(

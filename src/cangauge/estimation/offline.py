@@ -267,6 +267,15 @@ def samples_of(log: Log) -> Iterator[Sample]:
     yield from map(Sample._make, zip(*(each.tolist() for each in columns), strict=True))
 
 
+def update_all(estimator: Estimator, log: Log) -> None:
+    """Let an estimator process all rows of a log, by its compiled loop if it has one."""
+    if isinstance(estimator, CompiledEstimator):
+        _run_compiled(estimator, _blocks(log))
+        return
+    for sample in samples_of(log):
+        estimator.update(sample)
+
+
 def run_estimator(
     samples: Iterable[Sample] | Log,
     model: Model,

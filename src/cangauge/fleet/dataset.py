@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import io
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
@@ -31,6 +32,7 @@ KEYS: Final = {
     "log": _TEXT,  # URL
     "sha256": _TEXT,  # of its content
     "stamp": _TEXT,  # of its entry in the storage
+    "stated": _TEXT,  # of it in a manifest
     "run": _TEXT,  # model, options and version that made the row
     "made_at": pa.timestamp("us", tz="UTC"),
     "seconds": _REAL,  # computing time [s]
@@ -97,14 +99,14 @@ class Dataset:
         ----------
         run : str
         *columns : str
-            Columns of the rows beside `stamp`, `sha256` and `made_at`.
+            Columns of the rows beside `stamp`, `stated`, `sha256` and `made_at`.
         """
         found: dict[str, dict[str, Any]] = {}
         for table in self.tables:
             wanted = [name for name in columns if name in self._schemas[table].names]
             extra = ["is_final"] if table != self.kind else []
             for row in self._rows(
-                table, [*("log", "stamp", "sha256", "made_at"), *wanted, *extra],
+                table, [*("log", "stamp", "stated", "sha256", "made_at"), *wanted, *extra],
                 pc.field("run") == run,
             ):  # fmt: skip
                 earlier = found.get(row["log"])
@@ -121,19 +123,36 @@ class Dataset:
         names = [name for name in self._schemas[table].names if name not in without]
         yield from self._rows(table, names, wanted)
 
-    def settle(self) -> None:
-        """Join the files of each vehicle to one, with the latest row of each log."""
+    def settle(self, run: str = "", touched: Sequence[FleetLog] = ()) -> None:
+        """Join the files of each vehicle to one, with the latest row of each log.
+
+        Parameters
+        ----------
+        run : str
+        touched : sequence of FleetLog
+            Logs of which the storage shows another stamp than the rows of this run, for the same
+            content: the rows take the new one.
+        """
+        stamps: dict[str, dict[tuple[str, str], str]] = {}
+        for log in touched:
+            stamps.setdefault(log.vehicle, {})[log.url, run] = log.stamp
         files = {table: self._by_vehicle(table) for table in self.tables}
         good, bad = (files[table] for table in self.tables)
         for vehicle in sorted({*good, *bad}):
             of_vehicle = {table: files[table].get(vehicle, []) for table in self.tables}
-            if vehicle in bad or len(good[vehicle]) > 1:
-                self._settle_vehicle(vehicle, of_vehicle)
+            if vehicle in bad or vehicle in stamps or len(good[vehicle]) > 1:
+                self._settle_vehicle(vehicle, of_vehicle, stamps.get(vehicle, {}))
 
-    def _settle_vehicle(self, vehicle: str, files: Mapping[str, Sequence[str]]) -> None:
+    def _settle_vehicle(
+        self,
+        vehicle: str,
+        files: Mapping[str, Sequence[str]],
+        stamps: Mapping[tuple[str, str], str],
+    ) -> None:
         latest: dict[str, tuple[str, dict[str, Any]]] = {}
         for table in self.tables:
             for row in self._rows(table, self._schemas[table].names, None, files[table]):
+                row["stamp"] = stamps.get((row["log"], row["run"]), row["stamp"])
                 before = latest.get(row["log"])
                 if before is None or before[1]["made_at"] <= row["made_at"]:
                     latest[row["log"]] = (table, row)
@@ -142,7 +161,8 @@ class Dataset:
             written = self._write(table, vehicle, kept) if kept else ""
             for path in files[table]:
                 if path != written:
-                    self._fs.rm_file(path)
+                    with suppress(FileNotFoundError):  # another run has settled it
+                        self._fs.rm_file(path)
 
     def _write(self, table: str, vehicle: str, rows: Sequence[Row]) -> str:
         rows = sorted(rows, key=lambda row: row["log"])
@@ -173,7 +193,12 @@ class Dataset:
             found = self._fs.find(folder)
         except FileNotFoundError:
             return []
-        return sorted(path for path in found if path.endswith(".parquet"))
+        # A run that is killed while it writes leaves a hidden file.
+        return sorted(
+            path
+            for path in found
+            if path.endswith(".parquet") and not path.rpartition("/")[2].startswith(".")
+        )
 
     def _by_vehicle(self, table: str) -> dict[str, list[str]]:
         found: dict[str, list[str]] = {}
@@ -185,17 +210,21 @@ class Dataset:
         self, table: str, names: Sequence[str], wanted: Any, files: Sequence[str] | None = None
     ) -> Iterator[dict[str, Any]]:
         for path in self._files(table) if files is None else files:
-            vehicle = _vehicle_of(path)
-            with self._fs.open(path, "rb") as file:
-                source = pq.ParquetFile(file)
-                stored = [name for name in names if name in source.schema_arrow.names]
-                if wanted is not None and "run" not in stored:
-                    stored.append("run")
-                for batch in source.iter_batches(BATCH_ROWS, columns=stored):
-                    part = pa.Table.from_batches([batch])
-                    chosen = part if wanted is None else part.filter(wanted)
-                    for row in chosen.to_pylist():
-                        yield row | {"vehicle": vehicle}
+            with suppress(FileNotFoundError):  # another run has settled it
+                yield from self._rows_of(path, names, wanted)
+
+    def _rows_of(self, path: str, names: Sequence[str], wanted: Any) -> Iterator[dict[str, Any]]:
+        vehicle = _vehicle_of(path)
+        with self._fs.open(path, "rb") as file:
+            source = pq.ParquetFile(file)
+            stored = [name for name in names if name in source.schema_arrow.names]
+            if wanted is not None and "run" not in stored:
+                stored.append("run")
+            for batch in source.iter_batches(BATCH_ROWS, columns=stored):
+                part = pa.Table.from_batches([batch])
+                chosen = part if wanted is None else part.filter(wanted)
+                for row in chosen.to_pylist():
+                    yield row | {"vehicle": vehicle}
 
 
 def _vehicle_of(path: str) -> str:
@@ -218,6 +247,7 @@ def keys_of(log: FleetLog, run: str, sha256: str, seconds: float) -> dict[str, A
         "vehicle": log.vehicle,
         "sha256": sha256,
         "stamp": log.stamp,
+        "stated": log.stated,
         "run": run,
         "made_at": datetime.now(UTC),
         "seconds": seconds,

@@ -146,11 +146,17 @@ def fit_fleet(
     errors_set = Dataset(out, second.kind, second.columns)
     later = run_job(second, [log for log, _ in used.values()], errors_set, client)
     errors = _summed(errors_set.rows(run_id(second)), used, solution)
-    if errors.sums["rows"] < whole.rows:
+    if errors is None or errors.sums["rows"] < whole.rows:
         raise InputError(
             f"{later.bad + later.bad_before} logs of the first pass failed in the second",
             source=out,
             cure=f"see {second.kind}-bad in it, and run the same command again",
+        )
+    if not errors.sums["held_out"]:
+        raise InputError(
+            "no log has rows in the SoC range of the others, so that none can be held out",
+            source=out,
+            cure="give logs that overlap in SoC",
         )
     solution = with_std_errors(solution, errors)
     slope, expected = slope_resistances(errors, model.resistance_ohm)
@@ -238,7 +244,8 @@ def _models_without(
     return tuple(found)
 
 
-def _summed(rows: Iterable[Mapping[str, Any]], used: _Used, solution: Solution) -> LogErrors:
+def _summed(rows: Iterable[Mapping[str, Any]], used: _Used, solution: Solution) -> LogErrors | None:
+    """Return the errors of all used logs together; None if there is no row."""
     kept = solution.back.shape[1]
     waiting: list[LogErrors] = []
     for row in rows:
@@ -246,7 +253,7 @@ def _summed(rows: Iterable[Mapping[str, Any]], used: _Used, solution: Solution) 
             waiting.append(errors_of_row(row, kept))
         if len(waiting) >= POOLED_AT_ONCE:
             waiting = [summed(waiting)]
-    return summed(waiting)
+    return summed(waiting) if waiting else None
 
 
 def _model_file(

@@ -11,9 +11,9 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain, zip_longest
+from itertools import chain, islice, zip_longest
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, cast
 
 import pyarrow as pa
 
@@ -34,18 +34,30 @@ LOGS: Final = 3
 _NAMES: Final = pa.list_(pa.string())
 
 
+@dataclass(frozen=True, slots=True)
+class VehicleLogs(FleetLog):
+    """A vehicle with what its task reads.
+
+    Parameters
+    ----------
+    logs : tuple of FleetLog
+        Logs to diagnose.
+    references : tuple of FleetLog
+        Logs without a fault, its own first.
+    """
+
+    logs: tuple[FleetLog, ...] = ()
+    references: tuple[FleetLog, ...] = ()
+
+
 @dataclass(frozen=True, eq=False)
 class GapJob(Job):
-    """Verdict on each vehicle.
+    """Verdict on each vehicle; its logs are `VehicleLogs`.
 
     Parameters
     ----------
     model : Model
         Of the vehicles' type, such as from `fleet fit`.
-    logs : mapping of str to tuple of FleetLog
-        Logs to diagnose, by vehicle.
-    healthy : mapping of str to tuple of FleetLog
-        Logs without a fault, by vehicle.
     references : int
         Largest number of references of a diagnosis.
     alarm_below : float
@@ -53,8 +65,6 @@ class GapJob(Job):
     """
 
     model: Model
-    logs: Mapping[str, tuple[FleetLog, ...]]
-    healthy: Mapping[str, tuple[FleetLog, ...]]
     references: int = REFERENCES
     alarm_below: float = ALARM_BELOW
 
@@ -79,50 +89,60 @@ class GapJob(Job):
             "read": self.options.described,
         }
 
-    def vehicles(self) -> list[FleetLog]:
-        """Return one entry for each vehicle; its stamp is that of its logs and references."""
+    def vehicles(
+        self,
+        suspect: Mapping[str, tuple[FleetLog, ...]],
+        healthy: Mapping[str, tuple[FleetLog, ...]],
+    ) -> list[VehicleLogs]:
+        """Return each vehicle with its logs and references; its stamp is that of all of these.
+
+        References are the vehicle's own healthy logs, at most half, then one of each other vehicle
+        in turn.
+
+        Parameters
+        ----------
+        suspect, healthy : mapping of str to tuple of FleetLog
+            Logs to diagnose, and logs without a fault, by vehicle.
+        """
+        shuffled = {name: sorted(logs, key=_order) for name, logs in healthy.items()}
+        by_order = sorted(shuffled.values(), key=lambda logs: _order(logs[0]))
+        in_turn = [log for log in chain(*zip_longest(*by_order)) if log is not None]
         found = []
-        for vehicle, logs in sorted(self.logs.items()):
-            used = [*logs, *self.references_of(vehicle)]
-            text = "".join(f"{log.url}{log.stamp}{log.initial_soc_pct}" for log in used)
+        for vehicle, logs in sorted(suspect.items()):
+            tested = {log.url for log in logs}
+            own = shuffled.get(vehicle, [])[: max(self.references // 2, 1)]
+            others = (log for log in in_turn if log.vehicle != vehicle)
+            usable = (log for log in chain(own, others) if log.url not in tested)
+            chosen = tuple(islice(usable, self.references))
+            text = "".join(f"{each.url}{each.stamp}{each.stated}" for each in (*logs, *chosen))
             stamp = hashlib.sha256(text.encode()).hexdigest()[:16]
-            found.append(FleetLog(vehicle, vehicle, stamp))
+            found.append(VehicleLogs(vehicle, vehicle, stamp, logs=logs, references=chosen))
         return found
 
     def row(self, log: FleetLog, path: Path | None, state: str | None) -> dict[str, Any]:
-        """Return the verdict on the vehicle `log`."""
+        """Return the verdict on a vehicle."""
         del path, state
+        vehicle = cast("VehicleLogs", log)
         unread: list[str] = []
-        logs = list(self._read(self.logs[log.vehicle], unread))
+        logs = list(self._read(vehicle.logs, unread))
         if not logs:
             raise InputError(f"none of its logs can be read: {unread[0]}")
-        chosen = self.references_of(log.vehicle)
-        references = list(self._read(chosen, unread))
+        references = list(self._read(vehicle.references, unread))
         found = diagnose(logs, self.model, references, alarm_below=self.alarm_below)
         return {
-            "logs": [each.url for each in self.logs[log.vehicle]],
+            "logs": [each.url for each in vehicle.logs],
             "references": len(references),
-            "reference_vehicles": len({each.vehicle for each in chosen}),
+            "reference_vehicles": len({each.vehicle for each in vehicle.references}),
             "unread": unread,
             **_columns_of(found),
         }
-
-    def references_of(self, vehicle: str) -> list[FleetLog]:
-        """Return the vehicle's own healthy logs, at most half, then one of each other in turn."""
-        own = _shuffled(self.healthy.get(vehicle, ()))[: max(self.references // 2, 1)]
-        others = [_shuffled(logs) for name, logs in sorted(self.healthy.items()) if name != vehicle]
-        others.sort(key=lambda logs: _order(logs[0]))
-        in_turn = (each for each in chain(*zip_longest(*others)) if each is not None)
-        tested = {log.url for log in self.logs[vehicle]}
-        found = [log for log in (*own, *in_turn) if log.url not in tested]
-        return found[: self.references]
 
     def _read(self, logs: Sequence[FleetLog], unread: list[str]) -> Iterator[Log]:
         """Read logs; those that cannot be read are named in `unread`."""
         for log in logs:
             try:
                 with local_file(log.url) as path:
-                    recorded = self.options.read(path, log.url)
+                    recorded = self.options.read_log(log, path)
             except InputError as error:
                 unread.append(f"{log.url}: {error.problem}")
             else:
@@ -160,12 +180,8 @@ def _columns_of(found: Diagnosis) -> dict[str, Any]:
 
 
 def _order(log: FleetLog) -> str:
+    """Return a key that shuffles logs, by their names only."""
     return hashlib.sha256(log.url.encode()).hexdigest()
-
-
-def _shuffled(logs: Sequence[FleetLog]) -> list[FleetLog]:
-    """Return logs in an order that depends on their names only."""
-    return sorted(logs, key=_order)
 
 
 def suspect_and_healthy(
@@ -185,11 +201,10 @@ def suspect_and_healthy(
     InputError
         If no log is healthy, or all are.
     """
-    suspect: dict[str, tuple[FleetLog, ...]] = {}
-    healthy: dict[str, tuple[FleetLog, ...]] = {}
+    suspect: dict[str, list[FleetLog]] = {}
+    healthy: dict[str, list[FleetLog]] = {}
     for log in logs:
-        of = healthy if log.healthy else suspect
-        of[log.vehicle] = (*of.get(log.vehicle, ()), log)
+        (healthy if log.healthy else suspect).setdefault(log.vehicle, []).append(log)
     if not healthy:
         raise InputError(
             "no log is known to be healthy", field="--reference",
@@ -197,4 +212,7 @@ def suspect_and_healthy(
         )  # fmt: skip
     if not suspect:
         raise InputError("every log is a reference", cure="give logs to diagnose")
-    return {name: found[-per_vehicle:] for name, found in suspect.items()}, healthy
+    return (
+        {name: tuple(found[-per_vehicle:]) for name, found in suspect.items()},
+        {name: tuple(found) for name, found in healthy.items()},
+    )

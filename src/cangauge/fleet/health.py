@@ -13,7 +13,7 @@ import numpy as np
 from cangauge.errors import InputError
 from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.estimator import Estimator
-from cangauge.estimation.offline import gap_of, initial_soc_of, samples_of
+from cangauge.estimation.offline import gap_of, initial_soc_of, update_all
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.state import EstimatorState
 from cangauge.fleet.jobs import COUNT, REAL, TEXT, Job, known, required
@@ -78,13 +78,12 @@ class HealthJob(Job):
 
     def row(self, log: FleetLog, path: Path | None, state: str | None) -> dict[str, Any]:
         """Return capacity, resistance and offset with their deviations at the log's end."""
-        recorded = self.options.read(required(path, log), log.url)
+        recorded = self.options.read_log(log, required(path, log))
         require_same_pack(recorded, self.model)
         before = None if state is None else EstimatorState.model_validate_json(state)
         shift_s = self._shift_s(log, recorded, before)
-        estimator = self._estimator(log, recorded, before)
-        for sample in samples_of(recorded):
-            estimator.update(sample._replace(time_s=sample.time_s + shift_s))
+        estimator = self._estimator(recorded, before)
+        update_all(estimator, replace(recorded, time_s=recorded.time_s + shift_s))
         estimate = estimator.estimate
         return {
             "start": log.start,
@@ -96,16 +95,13 @@ class HealthJob(Job):
             "state": estimator.snapshot().model_dump_json(),
         }
 
-    def _estimator(self, log: FleetLog, recorded: Log, before: EstimatorState | None) -> Estimator:
+    def _estimator(self, recorded: Log, before: EstimatorState | None) -> Estimator:
         settings = replace(
             self.settings, gap_s=gap_of(recorded), temperature_source=recorded.temperature_source
         )
-        if before is None:
-            start = log.initial_soc_pct
-            if start is None and recorded.first_soc() is not None:
-                start = initial_soc_of(recorded, settings.capacity_ah or self.model.capacity_ah)
-            if start is not None:
-                settings = replace(settings, initial_soc_pct=start)
+        if before is None and recorded.first_soc() is not None:
+            start = initial_soc_of(recorded, settings.capacity_ah or self.model.capacity_ah)
+            settings = replace(settings, initial_soc_pct=start)
         estimator = make_estimator(self.model, settings)
         if before is not None:
             estimator.restore(before)
@@ -119,7 +115,7 @@ class HealthJob(Job):
             shift_s = log.start_s - float(recorded.time_s[0])
             if log.start_s <= ended_s:
                 raise InputError(
-                    "starts before the vehicle's log before it ends", field="start",
+                    "starts before the previous log of this vehicle ends", field="start",
                     value=log.start, cure="correct the dates of the manifest",
                 )  # fmt: skip
             return shift_s

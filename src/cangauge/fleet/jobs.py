@@ -62,10 +62,10 @@ class Job(ABC):
 
     def chained_stamp(self, before: str, log: FleetLog) -> str:
         """Return the stamp of a log; of a chained job it also depends on the logs before."""
-        given = f"{log.stamp}{log.start}{log.initial_soc_pct}"
-        if not self.is_chained:
-            return hashlib.sha256(given.encode()).hexdigest()[:16]
-        return hashlib.sha256(f"{before}{given}".encode()).hexdigest()[:16]
+        given = f"{log.stamp}{log.stated}"
+        if self.is_chained:
+            given = f"{before}{given}"
+        return hashlib.sha256(given.encode()).hexdigest()[:16]
 
     @abstractmethod
     def identity(self) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from cangauge.fleet.sources import FleetLog, ReadOptions
 from cangauge.identify.assemble import log_sha256
 from cangauge.identify.evaluate import evaluate
 from cangauge.identify.pooled import LogErrors, LogInformation, errors_of, information_of
-from cangauge.identify.starts import unknown_start, with_start
+from cangauge.identify.starts import unknown_start
 from cangauge.inference.error_model import SCALES as ERROR_SCALES
 from cangauge.inference.error_model import ErrorEquations
 from cangauge.inference.least_squares import Solution
@@ -146,9 +146,7 @@ def rows_of(
         If the SoC at its start is unknown, it was charged or driven in a gap, or its rows do not
         resolve the delays.
     """
-    recorded = options.read(path, log.url)
-    if log.initial_soc_pct is not None:
-        recorded = with_start(recorded, log.initial_soc_pct)
+    recorded = options.read_log(log, path)
     if recorded.first_soc() is None:
         raise unknown_start(recorded, others=False)
     if len(split_where_moved(recorded)) > 1:

@@ -47,6 +47,9 @@ REPORT_S: Final = 30.0
 ASK_S: Final = 1.0
 """Interval of questions to the scheduler for its workers, and of the progress shown [s]."""
 
+POLL_S: Final = 0.01
+"""Interval of looks at the finished tasks [s]: short against a task of 0.3 s."""
+
 CONNECT_S: Final = 10.0
 """Time for the scheduler to answer [s]."""
 
@@ -216,7 +219,7 @@ def run_job(job: Job, logs: Sequence[FleetLog], dataset: Dataset, client: Any) -
         run.compute()
     finally:
         run.flush()
-    dataset.settle()
+    dataset.settle(run_id(job), run.touched)
     run.summary.seconds = time.monotonic() - run.began
     _LOG.info("%s: %s", job.kind, run.summary)
     return run.summary
@@ -232,6 +235,7 @@ class _Run:
     def __init__(self, job: Job, logs: Sequence[FleetLog], dataset: Dataset, client: Any) -> None:
         self.summary = Summary(len(logs), of=job.of)
         self.began = time.monotonic()
+        self.touched: list[FleetLog] = []
         self._job, self._dataset, self._client = job, dataset, client
         self._id = run_id(job)
         self._lanes: Iterator[_Lane] = iter(self._to_do(logs))
@@ -249,9 +253,10 @@ class _Run:
             row = known.get(log.url)
             chained = replace(log, stamp=self._job.chained_stamp(lane.stamp, log))
             lane.stamp = chained.stamp
-            if row is None or row["stamp"] != chained.stamp:
-                lane.waiting.append((chained, "" if row is None else row["sha256"]))
-            elif "reason" in row or "is_final" in row:
+            # What follows a log that is computed begins with its state.
+            if lane.waiting or row is None or row["stamp"] != chained.stamp:
+                lane.waiting.append((chained, _valid_for(row, log)))
+            elif "is_final" in row:
                 self.summary.bad_before += 1
             else:
                 self.summary.skipped += 1
@@ -268,10 +273,18 @@ class _Run:
             _LOG.info("waiting for workers")
         self._fill(done, job)
         while self._in_flight:
+            self._wait(done)
             future, result = next(done)
             self._take(future, result, done, job)
             self._fill(done, job)
             self._report()
+
+    def _wait(self, done: Any) -> None:
+        """Wait for a task, and write what is due meanwhile."""
+        while not done.has_ready():
+            if time.monotonic() - self._flushed >= FLUSH_S:
+                self.flush()
+            time.sleep(POLL_S)
 
     def _fill(self, done: Any, job: Any) -> None:
         wanted = max(2, TASKS_PER_THREAD * self._threads)
@@ -321,6 +334,7 @@ class _Run:
             _LOG.debug("set aside: %s", outcome.reason)
         elif outcome.row is None:
             self.summary.skipped += 1
+            self.touched.append(outcome.log)
         else:
             self.summary.done += 1
             self._rows.append(keys | outcome.row)
@@ -354,6 +368,13 @@ class _Lane:
     stamp: str = ""
     log: FleetLog = field(default_factory=lambda: FleetLog("", "", ""))
     """In flight."""
+
+
+def _valid_for(row: dict[str, Any] | None, log: FleetLog) -> str:
+    """Return the hash of the content for which the row of a log stays valid, or ""."""
+    if row is None or "is_final" in row or row.get("stated") != log.stated:
+        return ""
+    return str(row["sha256"])
 
 
 def _identity(job: Job) -> Job:

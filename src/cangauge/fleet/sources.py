@@ -25,6 +25,7 @@ from cangauge.bus.captures.capture import Capture
 from cangauge.bus.recording import log_of, open_with_columns
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
+from cangauge.identify.starts import with_start
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.draft import Sign
 from cangauge.logs.log import Log
@@ -73,6 +74,11 @@ class FleetLog:
     initial_soc_pct: float | None = None
     healthy: bool = False
     fold: int = 0
+
+    @property
+    def stated(self) -> str:
+        """What a manifest states of the log: its start, and the SoC there."""
+        return f"{self.start} {self.initial_soc_pct}"
 
     @property
     def start_s(self) -> float | None:
@@ -350,6 +356,17 @@ class ReadOptions:
         if self.sign is None:
             require_discharge_positive(log)
         return replace(log, source=url)
+
+    def read_log(self, log: FleetLog, path: Path) -> Log:
+        """Read a log of a fleet, with the SoC at its first row that a manifest states.
+
+        Raises
+        ------
+        InputError
+            As `read`.
+        """
+        found = self.read(path, log.url)
+        return found if log.initial_soc_pct is None else with_start(found, log.initial_soc_pct)
 
 
 @contextmanager

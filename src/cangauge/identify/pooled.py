@@ -41,7 +41,7 @@ from cangauge.inference.time_scales import SCALES, haar_transform
 from cangauge.model.voltage_model import BASIS_NAMES, VoltageModel
 
 LEVELS_AT_MOST = 4096
-"""Different voltages of a log that are counted one by one; with more they are rounded, …"""
+"""Different voltages that are counted one by one; with more they are rounded, …"""
 
 LEVEL_STEP = 1e-4
 """… to this part of the voltage [-]: they only scale two priors."""
@@ -84,7 +84,7 @@ class LogInformation:
 
     @property
     def nominal_v(self) -> float:
-        """Median of the voltage [V]; to `LEVEL_STEP` where a log has more than LEVELS_AT_MOST."""
+        """Median of the voltage [V]; to `LEVEL_STEP` where there are more than LEVELS_AT_MOST."""
         ends = np.cumsum(self.level_rows)
         below, above = (self.rows - 1) // 2, self.rows // 2
         at = np.searchsorted(ends, [below, above], side="right")
@@ -102,7 +102,7 @@ def information_of(rows: FitRows, options: FitOptions) -> LogInformation:
     table = np.column_stack([columns, rows.voltage_v])
     by_scale = haar_transform(table, SCALES)
     channels = (rows.soc_pct, rows.temperature_c, rows.delayed_current_a[:, 0])
-    levels, level_rows = _levels(rows.voltage_v)
+    levels, level_rows = _levels(rows.voltage_v, np.ones(len(rows)))
     return LogInformation(
         rows=len(rows),
         logs=1,
@@ -118,19 +118,22 @@ def information_of(rows: FitRows, options: FitOptions) -> LogInformation:
     )
 
 
-def _levels(volts: FloatArray) -> tuple[FloatArray, FloatArray]:
-    levels, counts = np.unique(volts, return_counts=True)
+def _levels(volts: FloatArray, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the different voltages [V], rounded if they are many, and the rows of each."""
+    levels, at = np.unique(volts, return_inverse=True)
     if levels.size > LEVELS_AT_MOST:
         step = np.log1p(LEVEL_STEP)
         rounded = np.exp(np.round(np.log(volts) / step) * step)
-        levels, counts = np.unique(rounded, return_counts=True)
-    return levels, np.asarray(counts, dtype=np.float64)
+        levels, at = np.unique(rounded, return_inverse=True)
+    return levels, np.asarray(np.bincount(at, weights=rows), dtype=np.float64)
 
 
 def pooled(parts: Sequence[LogInformation]) -> LogInformation:
     """Return the information of several logs together."""
-    levels, at = np.unique(np.concatenate([each.levels_v for each in parts]), return_inverse=True)
-    weights = np.concatenate([each.level_rows for each in parts])
+    levels, level_rows = _levels(
+        np.concatenate([each.levels_v for each in parts]),
+        np.concatenate([each.level_rows for each in parts]),
+    )
     return LogInformation(
         rows=sum(each.rows for each in parts),
         logs=sum(each.logs for each in parts),
@@ -142,7 +145,7 @@ def pooled(parts: Sequence[LogInformation]) -> LogInformation:
         low=np.min([each.low for each in parts], axis=0),
         high=np.max([each.high for each in parts], axis=0),
         levels_v=levels,
-        level_rows=np.asarray(np.bincount(at, weights=weights), dtype=np.float64),
+        level_rows=level_rows,
         temperature_sum=float(np.sum([each.temperature_sum for each in parts])),
         spans=np.sum([each.spans for each in parts], axis=0),
     )
