@@ -33,7 +33,8 @@ def test_image_copies_what_the_build_needs() -> None:
     needed |= set(described["project"]["license-files"])
     needed |= {"hatch_build.py"} if "custom" in wheel["hooks"] else set()
     build = (ROOT / "Dockerfile").read_text(encoding="utf-8").partition("\n\nFROM ")[0]
-    copied = {word for line in re.findall(r"^COPY (.*)$", build, re.M) for word in line.split()}
+    lines = re.findall(r"^COPY (.*)$", build, re.MULTILINE)
+    copied = {word for line in lines for word in line.split()}
     ignored = (ROOT / ".dockerignore").read_text(encoding="utf-8").splitlines()
     assert needed <= copied
     assert needed <= {line.removeprefix("!") for line in ignored if line.startswith("!")}
