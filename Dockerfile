@@ -1,8 +1,12 @@
 # docker build -t cangauge . && docker run --rm --network host -v "$PWD:/data" cangauge run --help
 FROM python:3.13-slim AS build
 WORKDIR /src
-COPY pyproject.toml README.md LICENSE ./
+# For the C core; the image that runs has no compiler.
+RUN apt-get update && apt-get install -y --no-install-recommends gcc libc6-dev \
+    && rm -rf /var/lib/apt/lists/*
+COPY pyproject.toml hatch_build.py README.md LICENSE ./
 COPY src src
+COPY core core
 COPY dbc dbc
 COPY replay replay
 RUN python -m venv /opt/cangauge && /opt/cangauge/bin/pip install --no-cache-dir '.[metrics,mf4]'

@@ -1,6 +1,7 @@
 /* cangauge.c - clock, counting, and the step from sample to estimate.
  *
- * Follows the Python modules estimation.counting and estimation.estimator operation by operation; their docstrings state equations and sources.
+ * Follows the Python modules estimation.counting and estimation.estimator operation by operation;
+ * their docstrings state equations and sources.
  */
 #include "cangauge_internal.h"
 
@@ -737,14 +738,81 @@ void cg_init(cg_estimator *self, const cg_model *model, const cg_settings *setti
     }
 }
 
-void cg_restore(cg_estimator *self, const cg_state *state, cg_time age_s)
+static bool is_filter_plausible(const cg_filter *filter, const cg_model *model)
 {
+    if ((filter->hypotheses < 1) || (filter->hypotheses > 2) ||
+        (filter->verdict < (int32_t)CG_NO_TEST) || (filter->verdict > (int32_t)CG_UNCLEAR) ||
+        !isfinite(filter->log_odds) || !isfinite(filter->prior_log_odds) ||
+        !isfinite(filter->wide_std_pct) || !isfinite(filter->outlier_s)) {
+        return false;
+    }
+    const int32_t size = cg_states(model);
+    for (int32_t i = 0; i < filter->hypotheses; ++i) {
+        const cg_ekf *ekf = &filter->ekf[i];
+        bool is_finite = isfinite(ekf->mean_innovation_v) && isfinite(ekf->mean_seconds);
+        for (int32_t k = 0; k < size; ++k) {
+            is_finite = is_finite && isfinite(ekf->x[k]);
+            for (int32_t j = 0; j < CG_LEARNED; ++j) {
+                is_finite = is_finite && isfinite(ekf->p[j][k]);
+            }
+        }
+        if (!is_finite) {
+            return false;
+        }
+        for (int32_t j = 0; j < CG_LEARNED; ++j) {
+            if (ekf->p[j][j] < R(0.0)) {
+                return false;
+            }
+        }
+    }
+    return true;
+}
+
+static bool are_effects_plausible(const cg_state *state, const cg_model *model)
+{
+    bool is_finite = true;
+    for (int32_t k = 0; k < model->effects; ++k) {
+        for (int32_t j = 0; j < model->effect[k].lags; ++j) {
+            const cg_lag *lag = &state->effect[k].lag[j];
+            is_finite = is_finite &&
+                        (!lag->is_started || (isfinite(lag->time_s) && isfinite(lag->input) &&
+                                              isfinite(lag->value)));
+        }
+    }
+    return is_finite;
+}
+
+static bool is_plausible(const cg_state *state, const cg_model *model)
+{
+    const cg_clock *clock = &state->clock;
+    const cg_counter *counter = &state->counter;
+    const cg_memory *memory = &state->memory;
+    const bool are_counts = (clock->behind >= 0) && (memory->samples >= 0) &&
+                            (memory->resets >= 0) && (memory->tick >= -1);
+    const bool are_times = (isnan(clock->last_s) || (fabs(clock->last_s) <= (2.0 * LATEST_S))) &&
+                           isfinite(clock->shift_s) && !isinf(counter->time_s);
+    const bool is_charge = isfinite(counter->current_a) && isfinite(counter->mean_square_a2) &&
+                           isfinite(counter->mean_a) && isfinite(counter->discharged_pct) &&
+                           isfinite(counter->moved_pct) && isfinite(counter->counted_s) &&
+                           !isinf(memory->coulomb_start_pct) && !isinf(memory->newton_pct) &&
+                           !isinf(memory->temperature_c);
+    return are_counts && are_times && is_charge && are_effects_plausible(state, model) &&
+           (!state->is_filtering || is_filter_plausible(&state->filter, model));
+}
+
+bool cg_restore(cg_estimator *self, const cg_state *state, cg_time age_s)
+{
+    if (!is_plausible(state, self->model)) {
+        return false;
+    }
     self->state = *state;
+    self->state.is_pending = false; /* its delay line is gone */
     self->state.clock.age_s = age_s;
     self->state.clock.is_restored = true;
     self->state.counter.is_restored = true;
     self->line.count = 0;
     self->without_ocv_v = CG_NAN;
+    return true;
 }
 
 cg_real cg_current_at(const cg_estimator *self, cg_time ago_s)

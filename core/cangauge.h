@@ -55,7 +55,7 @@ typedef enum {
     CG_TIME_SKEW, /* `skew_s` of the model */
     CG_TEMPERATURE_LAG, /* ahead; lag: smoothing */
     CG_CORE_TEMPERATURE, /* rise_k, late, capacity_ah; lags: Joule heat, temperature */
-    CG_RESISTANCE_TEMPERATURE, /* share, activation_k, delayed, reference_per_k, ohm; lag: interior */
+    CG_RESISTANCE_TEMPERATURE, /* share, activation_k, delayed, reference_per_k, ohm; lag: inner */
     CG_RESISTANCE_SOC, /* at_empty, at_full, width_pct, delayed, ohm */
     CG_RESISTANCE_ASYMMETRY, /* charging_ohm */
     CG_RESISTANCE_STEP, /* step_ohm, start_s */
@@ -288,7 +288,8 @@ typedef struct {
 } cg_memory;
 
 /* All that must be kept to continue after a reset, but the delay line: plain data, to be copied to
- * non-volatile memory and back. Without its delay line the estimate is degraded for 70 s. */
+ * non-volatile memory and back. Without its delay line the estimate is degraded for the model's
+ * longest delay. */
 typedef struct {
     cg_clock clock;
     cg_counter counter;
@@ -369,17 +370,17 @@ typedef struct {
 
 /* ------------------------------------------------------------------ functions */
 
-/* Storage for the delay line at samples `spacing_s` apart; for static arrays. */
-#define CG_LINE_SIZE(longest_s, spacing_s) ((int32_t)(2.0 * (longest_s) / (spacing_s)) + 8)
+/* Storage for the delay line at samples `spacing_s` apart; for static arrays. Rounded up. */
+#define CG_LINE_SIZE(longest_s, spacing_s) ((int32_t)(2.0 * (longest_s) / (spacing_s)) + 9)
 
 /* Begin, with memory for the delay line (CG_LINE_SIZE) and, for a model with `time_skew`, for the
  * samples that it holds back. */
 void cg_init(cg_estimator *self, const cg_model *model, const cg_settings *settings,
              const cg_line *line, cg_skew *skew);
 
-/* Continue from a state that was copied. `age_s`: least time since then by another clock; NAN: none
- * measured it. */
-void cg_restore(cg_estimator *self, const cg_state *state, cg_time age_s);
+/* Continue from a state that was copied, after cg_evaluate. `age_s`: least time since then by another
+ * clock; NAN: none measured it. False: implausible numbers, nothing is changed. */
+bool cg_restore(cg_estimator *self, const cg_state *state, cg_time age_s);
 
 /* Process one sample. False: refused (no plausible current, or not later than the last). */
 bool cg_update(cg_estimator *self, const cg_sample *sample);

@@ -105,6 +105,9 @@ static cg_real between(const cg_current *before, const cg_current *after, cg_tim
 
 cg_real cg_line_at(const cg_line *line, cg_time ago_s)
 {
+    if (line->count == 0) {
+        return R(0.0); /* as before the first sample */
+    }
     const cg_time at_s = line_entry(line, line->count - 1)->time_s - ago_s;
     const int32_t right = line_until(line, at_s);
     if (right == 0) {

@@ -1,4 +1,4 @@
-"""The recipes of other package managers name what pyproject.toml names."""
+"""The recipes of other package managers and images name what pyproject.toml names."""
 
 from __future__ import annotations
 
@@ -23,3 +23,18 @@ def test_conda_recipe_has_the_dependencies_of_the_project() -> None:
     assert listed.pop("msgpack-python")  # what python-can's extra "multicast" installs
     assert listed == wanted
     assert f'version: "{project["version"]}"' in recipe
+
+
+def test_image_copies_what_the_build_needs() -> None:
+    described = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    wheel = described["tool"]["hatch"]["build"]["targets"]["wheel"]
+    needed = {"pyproject.toml", *wheel["force-include"], described["project"]["readme"]}
+    needed |= {path.partition("/")[0] for path in wheel["packages"]}
+    needed |= set(described["project"]["license-files"])
+    needed |= {"hatch_build.py"} if "custom" in wheel["hooks"] else set()
+    build = (ROOT / "Dockerfile").read_text(encoding="utf-8").partition("\n\nFROM ")[0]
+    lines = re.findall(r"^COPY (.*)$", build, re.MULTILINE)
+    copied = {word for line in lines for word in line.split()}
+    ignored = (ROOT / ".dockerignore").read_text(encoding="utf-8").splitlines()
+    assert needed <= copied
+    assert needed <= {line.removeprefix("!") for line in ignored if line.startswith("!")}

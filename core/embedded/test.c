@@ -31,11 +31,52 @@ static double apart(double expected, double found)
     return isnan(found - expected) ? INFINITY : fabs(found - expected);
 }
 
+static void update(const golden *each)
+{
+    const cg_sample sample = {each->time_s, (cg_real)each->current_a, (cg_real)each->voltage_v,
+                              (cg_real)each->temperature_c};
+    (void)cg_update(&pack, &sample);
+}
+
 static void check(const char *what, double error, double at_most)
 {
     const int is_met = error <= at_most;
     printf("%-28s %.3g, at most %.3g: %s\n", what, error, at_most, is_met ? "ok" : "FAILED");
     failures += is_met ? 0 : 1;
+}
+
+/* A state that is copied back after a reset gives the SoC at once and the drive goes on from it;
+ * one with impossible numbers is refused. */
+static void test_reset(const cg_settings *settings, const cg_line *line)
+{
+    static cg_state kept;
+    static cg_state broken;
+    const int at = GOLDEN_SAMPLES / 4;
+    cg_init(&pack, &pack_model, settings, line, &skew);
+    for (int k = 0; k < at; ++k) {
+        update(&golden_samples[k]);
+    }
+    kept = pack.state; /* its last sample is pending */
+    const double before_pct = (double)cg_evaluate(&pack).soc_pct;
+    const cg_state evaluated = pack.state;
+    cg_init(&pack, &pack_model, settings, line, &skew);
+    check("refused: a sound state", cg_restore(&pack, &kept, 1.0) ? 0.0 : 1.0, 0.0);
+    (void)cg_evaluate(&pack);
+    (void)cg_current_at(&pack, 0.0);
+    check("refused: one evaluated", cg_restore(&pack, &evaluated, 1.0) ? 0.0 : 1.0, 0.0);
+    check("SoC after a reset [%]", apart(before_pct, (double)cg_evaluate(&pack).soc_pct), 0.0);
+    update(&golden_samples[at]);
+    /* Charge between the two samples, and a step of the filter whose delay line is empty. */
+    check("SoC goes on [%]", apart(before_pct, (double)cg_evaluate(&pack).soc_pct), 2.0);
+    broken = evaluated;
+    broken.filter.hypotheses = 1000;
+    check("accepted: hypotheses", cg_restore(&pack, &broken, 1.0) ? 1.0 : 0.0, 0.0);
+    broken = evaluated;
+    broken.filter.ekf[0].x[0] = (cg_real)NAN;
+    check("accepted: a SoC of NAN", cg_restore(&pack, &broken, 1.0) ? 1.0 : 0.0, 0.0);
+    broken = evaluated;
+    broken.memory.samples = -1;
+    check("accepted: a negative count", cg_restore(&pack, &broken, 1.0) ? 1.0 : 0.0, 0.0);
 }
 
 int main(void)
@@ -48,11 +89,9 @@ int main(void)
     cg_init(&pack, &pack_model, &settings, &line, &skew);
     for (int k = 0; k < GOLDEN_SAMPLES; ++k) {
         const golden *each = &golden_samples[k];
-        const cg_sample sample = {each->time_s, (cg_real)each->current_a, (cg_real)each->voltage_v,
-                                  (cg_real)each->temperature_c};
         const int64_t tick = pack.state.memory.tick;
         const unsigned long before = instructions();
-        (void)cg_update(&pack, &sample);
+        update(each);
         const cg_estimate found = cg_evaluate(&pack);
         const unsigned long taken = instructions() - before;
         const double number[4] = {(double)found.soc_pct, (double)found.soc_std_pct,
@@ -94,6 +133,7 @@ int main(void)
         printf("instructions: %lu a sample, %lu where its voltage is used, at most %lu\n",
                all[0] / steps[0], all[1] / steps[1], longest);
     }
+    test_reset(&settings, &line);
     printf("%s\n", (failures == 0) ? "PASSED" : "FAILED");
     return (failures == 0) ? 0 : 1;
 }

@@ -15,7 +15,7 @@ from typing import Final
 from cantools.database.can import Message
 from cantools.database.can.c_source import generate
 
-from cangauge._io import write_text_atomic
+from cangauge._io import write_texts_atomic
 from cangauge._resources import shared_file
 from cangauge._version import __version__
 from cangauge.bus.database import load_dbc, signal_codec
@@ -90,7 +90,7 @@ def export_c(model: Model, folder: Path, *, period_s: float = PERIOD_S) -> Expor
             cure="fit the model without it",
         )
     spacing_s = JITTER * 2.0 * period_s
-    line_size = math.ceil(2.0 * constants.longest_s / spacing_s) + 8  # CG_LINE_SIZE
+    line_size = int(2.0 * constants.longest_s / spacing_s) + 9  # CG_LINE_SIZE
     head = f"/* {{}} - of the model {_comment(model.name)}, by cangauge {__version__}. */\n"
     texts = {name: shared_file("core", name).read_text(encoding="utf-8") for name in CORE} | {
         name: shared_file("core/embedded", name).read_text(encoding="utf-8") for name in EMBEDDED
@@ -101,8 +101,7 @@ def export_c(model: Model, folder: Path, *, period_s: float = PERIOD_S) -> Expor
     texts |= _frames()
     texts["golden.h"] = head.format("golden.h") + _golden(model, period_s)
     folder.mkdir(parents=True, exist_ok=True)
-    for name, text in texts.items():
-        write_text_atomic(folder / name, text)
+    write_texts_atomic({folder / name: text for name, text in texts.items()})
     return Exported(folder, tuple(sorted(texts)), 16 * line_size)
 
 

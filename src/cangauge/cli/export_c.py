@@ -7,10 +7,8 @@ from typing import Annotated
 
 import typer
 
-from cangauge.cli.options import JsonOption
+from cangauge.cli.options import JsonOption, check_outputs
 from cangauge.cli.output import emit_json, note
-from cangauge.embedded import PERIOD_S, export_c
-from cangauge.model.model_file import Model
 
 
 def export_c_command(
@@ -20,10 +18,15 @@ def export_c_command(
     ],
     period: Annotated[
         float, typer.Option(metavar="S", help="Time between two samples of the current [s].")
-    ] = PERIOD_S,
+    ] = 0.1,
     as_json: JsonOption = False,
 ) -> None:
     """Write a model and the estimator as C sources, with tests, for a microcontroller."""
+    check_outputs([output / "pack_model.c" if output.is_dir() else output], [model])
+    # Deferred, so that the help page does not wait for numpy and scipy.
+    from cangauge.embedded import export_c  # noqa: PLC0415
+    from cangauge.model.model_file import Model  # noqa: PLC0415
+
     done = export_c(Model.load(model), output, period_s=period)
     if as_json:
         emit_json({
