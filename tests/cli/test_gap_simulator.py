@@ -24,7 +24,7 @@ import numpy as np
 def simulate(time_s, current_a, temperature_c, initial_soc_pct):
     out_ah = np.cumsum(current_a * np.diff(time_s, prepend=time_s[0])) / 3600.0
     soc = initial_soc_pct - 100.0 * out_ah / {CAPACITY_AH}
-    return 330.0 + 0.55 * soc - 0.12 * current_a
+    return 330.0 + 0.2 * soc + 0.003 * soc**2 - 0.12 * current_a
 
 def broken(time_s, current_a, temperature_c, initial_soc_pct):
     raise ValueError("no such cell")
