@@ -85,14 +85,15 @@ def test_a_test_without_information_changes_nothing() -> None:
 
 
 def test_a_test_that_sees_causes_apart_names_the_true_one() -> None:
-    some, much = (min(expected(information(n, 0.0)).expected.values()) for n in (60.0, 6000.0))
-    assert max(expected(np.zeros((2, 2))).expected.values()) < some < much
+    found = expected(information(60.0, 0.0))
+    assert min(found.expected.values()) > 0.95
 
 
 def test_more_of_what_cannot_separate_them_does_not_help() -> None:
     same, apart = expected(information(20.0, 0.999)), expected(information(20.0, 0.0))
-    assert max(same.expected.values()) < min(apart.expected.values())
-    assert same.information_nats < 0.5 * apart.information_nats
+    assert max(same.expected.values()) < 0.65
+    assert min(apart.expected.values()) > 0.85
+    assert same.information_nats < 0.3 * apart.information_nats
 
 
 @settings(max_examples=30)

@@ -10,11 +10,12 @@ from typing import Any
 import typer
 
 from cangauge._formatting import printable
-from cangauge.cli.output import print_table
+from cangauge.cli.output import note, print_table
 from cangauge.diagnosis import Diagnosis
 from cangauge.diagnosis.next_test import AddedTest, NextSteps, plan_test
 from cangauge.diagnosis.profiles import Limits
 from cangauge.diagnosis.verdict import Verdict
+from cangauge.errors import InputError
 from cangauge.model.effects.base import WITHIN_C
 from cangauge.report.summary import PLAN_TITLE, plan_rows
 
@@ -60,8 +61,12 @@ class NextTestOptions:
         added = None if first is None else AddedTest(tuple(tests), first, found.verdict)
         if not self.plan and self.file is None and self.limits is None:
             return NextSteps(added)
-        limits = Limits.of(found.problem).changed(self.limits or "")
-        return NextSteps(added, plan_test(found.problem, found.verdict, limits))
+        try:
+            limits = Limits.of(found.problem).changed(self.limits or "")
+            return NextSteps(added, plan_test(found.problem, found.verdict, limits))
+        except InputError as error:  # the diagnosis stands without it
+            note(f"no plan: {error}")
+            return NextSteps(added)
 
     def texts(self, steps: NextSteps) -> dict[Path, str]:
         """Return the file to write with its content."""

@@ -154,6 +154,7 @@ class Site:
             default_handler_args=context,
             log_function=lambda _: None,
             websocket_ping_interval=PING_S,
+            websocket_max_message_size=MAX_BODY_BYTES,
         )
 
 
@@ -273,7 +274,7 @@ class _Stream(_Page, WebSocketHandler):
         """Take a question: `{"span": "10min", "key": "", "after": 0}`."""
         try:
             question = json.loads(message)
-        except ValueError:
+        except (ValueError, RecursionError):
             question = None
         self._question = question if isinstance(question, dict) else {}
         self._is_asked.set()
@@ -347,7 +348,7 @@ class _Nothing(_Page):
 def _wanted(body: bytes) -> bool | None:
     try:
         content = json.loads(body)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     wanted = content.get("active") if isinstance(content, dict) else None
     return wanted if isinstance(wanted, bool) else None

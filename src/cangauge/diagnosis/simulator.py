@@ -142,8 +142,8 @@ class SimulatorDiagnosis:
         log = run.on(found.model)
         before = found.model.predict(log).residual_v
         start = found.extension.cause.get("initial_soc", {})  # of the log, not of the model
-        moved = replace(log, soc_pct=log.soc_pct + start.get("offset_pct", 0.0))
-        after = found.extended_model.predict(moved).residual_v
+        soc_pct = None if log.soc_pct is None else log.soc_pct + start.get("offset_pct", 0.0)
+        after = found.extended_model.predict(replace(log, soc_pct=soc_pct)).residual_v
         return run.simulated_v + (before - after)
 
     def errors(self) -> list[dict[str, Any]]:

@@ -14,7 +14,6 @@ from typing import Self
 import can
 
 from cangauge._logging import emit
-from cangauge.errors import CangaugeError
 from cangauge.estimation.validity import Estimate, Sample
 from cangauge.service.async_writer import AsyncWriter
 from cangauge.service.recording import CLOSE_WITHIN_S, Recorder, RecordLimits, RecordState
@@ -52,7 +51,7 @@ class RecordControl:
         self._recorder = None if path is None else Recorder(path, limits)
         self._latest = self._recorder
         self.keeps_estimates = self._recorder is not None and self._recorder.keeps_estimates
-        self._is_wanted = self._recorder is not None
+        self._requested: bool | None = None
         self._is_changing = False
         self._files = AsyncWriter("cangauge-record-files")
         self._done: deque[Recorder | RecordState] = deque()
@@ -74,7 +73,7 @@ class RecordControl:
 
     def request(self, *, active: bool) -> None:
         """Ask for a recording, or for its end; it follows with the next `tick`."""
-        self._is_wanted = active
+        self._requested = active
 
     def write(self, message: can.Message) -> None:
         """Record a received frame, and round its stamp; does nothing without a recording."""
@@ -90,7 +89,10 @@ class RecordControl:
         """Do what is due at a monotonic time [s]."""
         self._take_change()
         recorder = self._recorder
-        if not self._is_changing and self._is_wanted is (recorder is None):
+        requested = None if self._is_changing else self._requested
+        if requested is not None:
+            self._requested = None
+        if requested is (recorder is None):
             self._is_changing = True
             if recorder is None:
                 self._files.submit(self._begin)
@@ -128,15 +130,20 @@ class RecordControl:
         path = self._path or Path.cwd() / f"cangauge-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.log"
         try:
             recorder = Recorder(path, self._limits)
-        except (CangaugeError, OSError) as error:
+        except Exception as error:  # noqa: BLE001 - or no later request would be answered
             emit(_LOG, logging.WARNING, "record.refused", f"no recording: {error}")
-            self._is_wanted = False
             self._done.append(RecordState(str(path), 0, 0, 0, str(error), is_active=False))
             return
         emit(_LOG, logging.INFO, "record.began", f"recording to {recorder.path}")
         self._done.append(recorder)
 
     def _end(self, recorder: Recorder) -> None:
-        recorder.close()
-        emit(_LOG, logging.INFO, "record.ended", f"recorded: {recorder.path}")
-        self._done.append(replace(recorder.state, is_active=False))
+        problem = None
+        try:
+            recorder.close()
+            emit(_LOG, logging.INFO, "record.ended", f"recorded: {recorder.path}")
+        except Exception as error:  # noqa: BLE001 - as above
+            problem = str(error)
+            emit(_LOG, logging.WARNING, "record.incomplete", f"{recorder.path}: {error}")
+        state = recorder.state
+        self._done.append(replace(state, is_active=False, problem=problem or state.problem))
