@@ -29,7 +29,7 @@ def logged(log_format: LogFormat, level: str = "info") -> io.StringIO:
         emit(LOG, logging.DEBUG, "bus.detail", "too much")
         emit(LOG, logging.WARNING, "bus.said", "100 % busy")
         logging.getLogger("can.socketcan").warning("libraries chatter")
-        logging.getLogger("tornado").error("oh %s", "no", exc_info=OSError("gone"))
+        logging.getLogger("asyncio").error("oh %s", "no", exc_info=OSError("gone"))
     return stream
 
 
@@ -41,7 +41,7 @@ def test_json_is_one_object_a_line_with_fields_and_event() -> None:
     assert lines[0]["retry_s"] == 0.25
     assert lines[0]["why"] is None
     assert lines[0]["time"].endswith("Z")
-    assert lines[2]["logger"] == "tornado"
+    assert lines[2]["logger"] == "asyncio"
     assert "gone" in lines[2]["message"]
 
 

@@ -44,7 +44,9 @@ from cangauge.diagnosis.error_breakdown import (
     error_map,
     segment_signals,
 )
-from cangauge.diagnosis.verdict import ALARM_BELOW, Ceiling, Verdict
+from cangauge.diagnosis.next_test import design_of
+from cangauge.diagnosis.problem import DiagnosisProblem, build_problem
+from cangauge.diagnosis.verdict import ALARM_BELOW, Ceiling, Verdict, decide
 
 __all__ = [
     "ALARM_BELOW",
@@ -56,12 +58,16 @@ __all__ = [
     "UNKNOWN",
     "Ceiling",
     "Diagnosis",
+    "DiagnosisProblem",
     "ErrorMap",
     "ErrorShare",
     "LogErrors",
     "SegmentSignals",
     "Verdict",
     "WorstSegment",
+    "build_problem",
+    "decide",
+    "design_of",
     "diagnose",
     "error_map",
     "rms",

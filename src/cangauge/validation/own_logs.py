@@ -14,10 +14,14 @@ from typing import Any, Final
 import numpy as np
 
 from cangauge._formatting import NONE_KNOWN, number, significant
-from cangauge.diagnosis import NONE, Verdict
-from cangauge.diagnosis.next_test import design_of
-from cangauge.diagnosis.problem import DiagnosisProblem, build_problem
-from cangauge.diagnosis.verdict import decide
+from cangauge.diagnosis import (
+    NONE,
+    DiagnosisProblem,
+    Verdict,
+    build_problem,
+    decide,
+    design_of,
+)
 from cangauge.errors import InputError
 from cangauge.identify.fit import fit
 from cangauge.identify.starts import start_by_model, with_start
