@@ -103,6 +103,8 @@ class Plan:
     @property
     def sentence(self) -> str:
         """The proposal in an engineer's words."""
+        if f"{self.best.probability:.0%}" == f"{self.probability:.0%}":
+            return "No test within the limits is expected to make the cause more certain."
         best = self.best.profile
         names = [_IN_WORDS.get(name, name) for name in self.causes]
         if len(names) > NAMED:
