@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -22,7 +23,8 @@ def export_c_command(
     as_json: JsonOption = False,
 ) -> None:
     """Write a model and the estimator as C sources, with tests, for a microcontroller."""
-    check_outputs([output / "pack_model.c" if output.is_dir() else output], [model])
+    is_folder = os.path.isdir(output)  # noqa: PTH112 - pathlib raises for an impossible name
+    check_outputs([output / "pack_model.c" if is_folder else output], [model])
     # Deferred, so that the help page does not wait for numpy and scipy.
     from cangauge.embedded import export_c  # noqa: PLC0415
     from cangauge.model.model_file import Model  # noqa: PLC0415
