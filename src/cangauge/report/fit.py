@@ -254,8 +254,8 @@ def _error_table(result: Identification) -> Table:
             ["lasting part (σ)", significant(noise.lasting_std_v, 3), "V",
              "constant over a log: does not average out"],
         ],
-        "The three parts are fitted to the autocovariance of the error and need not add up to the"
-        " RMSE. The filter takes its measurement noise from them.",
+        "The three parts are estimated from the error at each time scale, for a log to come, and"
+        " need not add up to the RMSE. The filter takes its measurement noise from them.",
     )  # fmt: skip
 
 
