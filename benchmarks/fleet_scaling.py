@@ -56,7 +56,7 @@ def _print(
     hours = MILLION * per_log_s / 3600.0
     sys.stdout.write(
         f"{command:9}{workers} workers  {logs / wall_s:6.2f} logs/s  {per_log_s:6.3f} s CPU a log"
-        f"  {hours:7.0f} core hours and € {EURO_PER_CORE_HOUR * hours:.0f} for 10⁶ logs\n"
+        f"  {hours:7.0f} core hours and € {EURO_PER_CORE_HOUR * hours:.2f} for 10⁶ logs\n"
     )
     sys.stdout.flush()
 
