@@ -16,6 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from cangauge.estimation.compiled import CompiledEstimator, make_estimator
+from cangauge.estimation.core_constants import core_constants, effect_fields
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
@@ -144,6 +145,69 @@ def test_error_of_the_health_estimator_is_raised(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("cangauge.estimation.health.HealthEstimator.use", fail)
     with pytest.raises(ArithmeticError, match="no"):
         compiled.step(Sample(0.0, 10.0, 385.0, 23.0))
+
+
+def core_arguments() -> dict[str, Any]:
+    """Arguments of `Core` for the model with every effect, for a test to change."""
+    model, chosen = MODELS["together"], EstimatorSettings()
+    constants = core_constants(model, chosen)
+    assert constants is not None
+    return {
+        "model": constants.model | {"function_v": []}, "settings": constants.settings,
+        "effects": [effect_fields(form) for form in constants.effects], "hook": None,
+        "line_size": 100, "line_block": 1, "spacing_s": 1.0,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "value"),
+    [
+        *(("model", name, -1) for name in ("delays", "knots", "functions", "memories")),
+        *(("model", name, 1000) for name in ("delays", "knots", "functions", "memories")),
+        ("model", "delays", 0), ("model", "effects", 33), ("settings", "method", 3),
+        ("", "line_size", 0), ("", "line_size", -1), ("", "line_block", -2),
+        ("", "line_block", 100),
+    ],
+)  # fmt: skip
+def test_sizes_beyond_the_core_memory_are_refused(part: str, name: str, value: int) -> None:
+    arguments = core_arguments()
+    core.Core(**arguments)
+    (arguments[part] if part else arguments)[name] = value
+    with pytest.raises(ValueError, match=name if part else "line_size"):
+        core.Core(**arguments)
+
+
+@pytest.mark.parametrize(("name", "value"), [("lags", 6), ("lags", -1), ("kind", 99)])
+def test_effect_beyond_the_core_memory_is_refused(name: str, value: int) -> None:
+    arguments = core_arguments()
+    arguments["effects"][0][name] = value
+    with pytest.raises(ValueError, match=name):
+        core.Core(**arguments)
+
+
+@pytest.mark.parametrize("knots", [0, 1])
+def test_curve_functions_without_knots_are_refused(knots: int) -> None:
+    arguments = core_arguments()
+    arguments["model"] |= {"functions": 1, "knots": knots}
+    with pytest.raises(ValueError, match="knots"):
+        core.Core(**arguments)
+
+
+@pytest.mark.parametrize("hypotheses", [-1, 0, 3, 2**31])
+def test_state_with_other_hypotheses_is_refused(hypotheses: int) -> None:
+    made = core.Core(**core_arguments())
+    with pytest.raises(ValueError, match="hypotheses"):
+        made.set("filter", made.get("filter") | {"hypotheses": hypotheses})
+
+
+def test_delay_line_needs_a_current_for_each_time() -> None:
+    with pytest.raises(ValueError, match="currents"):
+        core.Core(**core_arguments()).fill_line([0.0, 1.0], [0.0], 0.0)
+
+
+def test_core_without_a_model_cannot_be_made() -> None:
+    with pytest.raises(TypeError, match="model"):
+        core.Core.__new__(core.Core)
 
 
 def same_table(log: Log, model: Model, chosen: EstimatorSettings) -> None:
