@@ -177,7 +177,7 @@ class _Unit:
         folder.mkdir()
         for name in (*CORE_SOURCES, *CORE_HEADERS):
             shutil.copyfile(shared_file("core", name), folder / name)
-        for name in ("fmu.h", "fmu.c", f"{self.kind}.c", f"fmi{self.version}.c"):
+        for name in ("fmu.h", "fmu.c", "fmi.h", f"{self.kind}.c", f"fmi{self.version}.c"):
             shutil.copyfile(shared_file("core", f"fmi/{name}"), folder / name)
         config = {
             "FMU_TOKEN": f'"{self.token}"',
