@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-import sys
+import runpy
+import shutil
 from collections.abc import Iterable
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from cangauge._core_digest import sources_digest
+from cangauge.estimation import compiled as compiled_module
 from cangauge.estimation.compiled import CompiledEstimator, make_estimator
 from cangauge.estimation.core_constants import core_constants, effect_fields
 from cangauge.estimation.estimator import Estimator
@@ -58,13 +60,33 @@ def state_of(estimator: Estimator) -> Any:
 
 
 def test_extension_is_built_from_these_sources() -> None:
-    sys.path.insert(0, str(ROOT))
-    try:
-        hook = import_module("hatch_build")
-    finally:
-        sys.path.remove(str(ROOT))
-    digest = hook.sources_digest(ROOT / "core")
+    digest = sources_digest(ROOT / "core")
     assert digest == core.SOURCES, "run `python hatch_build.py` again"
+
+
+def test_extension_of_other_sources_is_not_used(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert compiled_module._load(tmp_path) is core  # no sources there
+    shutil.copytree(ROOT / "core", tmp_path / "core")
+    assert compiled_module._load(tmp_path) is core
+    with (tmp_path / "core" / "cangauge.c").open("a", encoding="utf-8") as source:
+        source.write("/* changed */")
+    assert not caplog.records
+    assert compiled_module._load(tmp_path) is None
+    assert ["hatch_build.py" in record.getMessage() for record in caplog.records] == [True]
+
+
+def test_failed_build_leaves_no_earlier_extension(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    build = runpy.run_path(str(ROOT / "hatch_build.py"))["build_extension"]
+    monkeypatch.delenv("LDSHARED", raising=False)
+    monkeypatch.setenv("CC", "cc")
+    assert build(ROOT, tmp_path).is_file()
+    monkeypatch.setenv("CC", "no-such-compiler")
+    assert build(ROOT, tmp_path) is None
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
