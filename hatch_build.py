@@ -6,12 +6,13 @@ Run as a script, it builds the extension in place, for a checkout that was insta
 
 from __future__ import annotations
 
-import hashlib
 import os
+import runpy
 import shlex
 import subprocess
 import sys
 import sysconfig
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -24,22 +25,24 @@ except ImportError:  # run as a script, outside of a build
 FLAGS = ("-std=c99", "-O2", "-fPIC", "-ffp-contract=off")
 
 
-def sources_digest(core: Path) -> str:
-    """Return a digest of the core's sources, which the extension carries."""
-    content = b"".join(each.read_bytes() for each in sorted(core.glob("*.[ch]")))
-    return hashlib.sha256(content).hexdigest()[:16]
+def linker() -> list[str]:
+    """Return the command that links an extension: `LDSHARED`, with the compiler in `CC`."""
+    usual = shlex.split(sysconfig.get_config_var("LDSHARED") or "")
+    if "LDSHARED" in os.environ or "CC" not in os.environ:
+        return shlex.split(os.environ.get("LDSHARED", "")) or usual
+    return [*shlex.split(os.environ["CC"]), *usual[1:]]
 
 
 def build_extension(root: Path, folder: Path) -> Path | None:
-    """Compile the extension into a folder; None without compiler or Python's headers."""
+    """Compile the extension into a folder; None, and none there, if that is not possible."""
     core, include = root / "core", Path(sysconfig.get_paths()["include"])
-    compiler = os.environ.get("LDSHARED") or sysconfig.get_config_var("LDSHARED")
-    if not compiler or not (include / "Python.h").is_file():
-        return None
     target = folder / f"_core{sysconfig.get_config_var('EXT_SUFFIX')}"
-    folder.mkdir(parents=True, exist_ok=True)
+    target.unlink(missing_ok=True)
+    if not linker() or not (include / "Python.h").is_file():
+        return None
+    digest = runpy.run_path(str(root / "src/cangauge/_core_digest.py"))["sources_digest"](core)
     command = [
-        *shlex.split(compiler), *FLAGS, f'-DCG_SOURCES="{sources_digest(core)}"',
+        *linker(), *FLAGS, f'-DCG_SOURCES="{digest}"',
         f"-I{include}", f"-I{core}", *map(str, sorted(core.glob("*.c"))), "-lm", "-o", str(target),
     ]  # fmt: skip
     try:
@@ -61,7 +64,8 @@ class CoreBuildHook(BuildHookInterface):  # type: ignore[type-arg]
             return
         root = Path(self.root)
         is_editable = version == "editable"
-        folder = root / "src" / "cangauge" if is_editable else Path(self.directory) / "core"
+        self.temporary = tempfile.TemporaryDirectory()  # until the wheel holds the extension
+        folder = root / "src" / "cangauge" if is_editable else Path(self.temporary.name)
         built = build_extension(root, folder)
         if built is None:
             return

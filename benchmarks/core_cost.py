@@ -29,13 +29,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from cangauge.embedded import export_c
 from cangauge.errors import InputError
 from cangauge.estimation.compiled import CompiledEstimator, make_estimator
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.validity import Sample
+from cangauge.export.embedded import export_c
 from cangauge.identify.fit import fit
 from cangauge.model.coulomb_counting import capacity_from_reference
 from cangauge.model.published import leaf_2012_model_file

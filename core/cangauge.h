@@ -378,8 +378,8 @@ typedef struct {
 void cg_init(cg_estimator *self, const cg_model *model, const cg_settings *settings,
              const cg_line *line, cg_skew *skew);
 
-/* Continue from a state that was copied, after cg_evaluate. `age_s`: least time since then by another
- * clock; NAN: none measured it. False: implausible numbers, nothing is changed. */
+/* Continue from a state that was copied, after cg_evaluate. `age_s`: least time since then by
+ * another clock; NAN: none measured it. False: implausible numbers, nothing is changed. */
 bool cg_restore(cg_estimator *self, const cg_state *state, cg_time age_s);
 
 /* Process one sample. False: refused (no plausible current, or not later than the last). */

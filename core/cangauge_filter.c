@@ -78,11 +78,13 @@ static void ekf_predict(cg_ekf *ekf, const cg_model *model, const cg_since *sinc
     cg_real *first = ekf->p[CG_X_SOC];
     cg_real *slow = ekf->p[CG_X_SLOW];
     cg_real *lasting = ekf->p[CG_X_LASTING];
-    x[CG_X_SOC] += (by_offset * x[CG_X_OFFSET]) + (by_capacity * x[CG_X_CAPACITY]) - since->discharged_pct;
+    x[CG_X_SOC] += (by_offset * x[CG_X_OFFSET]) + (by_capacity * x[CG_X_CAPACITY]) -
+                   since->discharged_pct;
     x[CG_X_SLOW] *= slow_kept;
     x[CG_X_LASTING] *= lasting_kept;
     for (int32_t k = 0; k < size; ++k) {
-        first[k] = first[k] + (by_offset * ekf->p[CG_X_OFFSET][k]) + (by_capacity * ekf->p[CG_X_CAPACITY][k]);
+        first[k] = first[k] + (by_offset * ekf->p[CG_X_OFFSET][k]) +
+                   (by_capacity * ekf->p[CG_X_CAPACITY][k]);
         slow[k] = slow_kept * slow[k];
         lasting[k] = lasting_kept * lasting[k];
     }
@@ -109,8 +111,8 @@ static void ekf_predict(cg_ekf *ekf, const cg_model *model, const cg_since *sinc
 }
 
 /* The Jacobian at a SoC; returns the voltage without the model's errors. */
-static cg_real ekf_linearize(const cg_estimator *self, const cg_ekf *ekf, const cg_measurement *seen,
-                             cg_real soc_pct, cg_real *jacobian)
+static cg_real ekf_linearize(const cg_estimator *self, const cg_ekf *ekf,
+                             const cg_measurement *seen, cg_real soc_pct, cg_real *jacobian)
 {
     const cg_real steady_ohm = self->model->steady_ohm;
     const cg_real ocv_v = cg_pseudo_ocv(self, soc_pct, &jacobian[CG_X_SOC]);
@@ -238,7 +240,8 @@ static void ekf_set_soc(cg_ekf *ekf, int32_t size, cg_real soc_pct, cg_real std_
     for (int32_t k = 0; k < size; ++k) {
         spread[k] = ekf->p[CG_X_SOC][k];
     }
-    ekf_correct(ekf, size, spread, soc_pct - ekf->x[CG_X_SOC], spread[CG_X_SOC] + cg_square(std_pct));
+    ekf_correct(ekf, size, spread, soc_pct - ekf->x[CG_X_SOC],
+                spread[CG_X_SOC] + cg_square(std_pct));
 }
 
 /* Reduce the slow error after a long rest. */
@@ -480,7 +483,7 @@ void cg_filter_predict(cg_filter *filter, const cg_model *model, const cg_since 
     }
 }
 
-/* Set the log odds from all voltages (Savage-Dickey ratio). Whether the less likely still counts. */
+/* Set the log odds from all voltages (Savage-Dickey ratio); whether the less likely counts. */
 static bool weigh(cg_filter *filter)
 {
     const cg_real first_pct2 = cg_square(soc_std_pct(&filter->ekf[0]));

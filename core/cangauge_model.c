@@ -395,8 +395,9 @@ static void advance_effect(const cg_effect *effect, cg_effect_state *state,
             lag->is_started = true;
             lag->time_s = sample->time_s;
         }
-        state->volts =
-            ((sample->time_s - lag->time_s) >= (cg_time)value[1]) ? (-value[0] * current_a) : R(0.0);
+        state->volts = ((sample->time_s - lag->time_s) >= (cg_time)value[1])
+                           ? (-value[0] * current_a)
+                           : R(0.0);
         break;
     case CG_CHARGE_TRANSFER:
         state->volts = charge_transfer_v(effect, current_a, temperature_c);
@@ -450,7 +451,8 @@ void cg_advance(cg_estimator *self, const cg_sample *sample, cg_real temperature
         const cg_effect *effect = &model->effect[k];
         cg_effect_state *state = &self->state.effect[k];
         if (is_known || !follows_temperature(effect)) {
-            advance_effect(effect, state, sample, is_known ? temperature_c : model->t_ref_c, drop_v);
+            advance_effect(effect, state, sample, is_known ? temperature_c : model->t_ref_c,
+                           drop_v);
         }
         if (!depends_on_soc(effect)) {
             beside_v += state->volts;

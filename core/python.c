@@ -19,157 +19,107 @@ typedef struct {
     char kind; /* d: double, i: int32, u: uint32, l: int64, b: bool */
     size_t offset;
     Py_ssize_t count; /* 0: a number, else the length of a list */
+    int32_t low, high; /* limits of an int32 */
 } field;
 
-#define NUMBER(type, member, kind) {#member, kind, offsetof(type, member), 0}
-#define LIST(type, member, kind, count) {#member, kind, offsetof(type, member), count}
-#define END {NULL, 0, 0, 0}
+/* Fields of the structure OF. */
+#define REAL(member) {#member, 'd', offsetof(OF, member), 0, 0, 0}
+#define LIST(member, count) {#member, 'd', offsetof(OF, member), count, 0, 0}
+#define WITHIN(member, low, high) {#member, 'i', offsetof(OF, member), 0, low, high}
+#define BITS(member) {#member, 'u', offsetof(OF, member), 0, 0, 0}
+#define COUNT(member) {#member, 'l', offsetof(OF, member), 0, 0, 0}
+#define FLAG(member) {#member, 'b', offsetof(OF, member), 0, 0, 0}
+#define END {NULL, 0, 0, 0, 0, 0}
 
+#define OF cg_model
 static const field MODEL[] = {
-    LIST(cg_model, ocv_v, 'd', CG_OCV),
-    NUMBER(cg_model, epsilon, 'd'),
-    LIST(cg_model, slope_beyond, 'd', 2),
-    NUMBER(cg_model, kt_v_per_k, 'd'),
-    NUMBER(cg_model, t_ref_c, 'd'),
-    LIST(cg_model, soc_range_pct, 'd', 2),
-    LIST(cg_model, temperature_range_c, 'd', 2),
-    LIST(cg_model, current_range_a, 'd', 2),
-    NUMBER(cg_model, delays, 'i'),
-    LIST(cg_model, delay_s, 'd', CG_DELAYS),
-    LIST(cg_model, resistance_ohm, 'd', CG_DELAYS),
-    NUMBER(cg_model, rate_hz, 'd'),
-    NUMBER(cg_model, capacity_ah, 'd'),
-    NUMBER(cg_model, charge_efficiency, 'd'),
-    NUMBER(cg_model, initial_offset_pct, 'd'),
-    NUMBER(cg_model, steady_ohm, 'd'),
-    NUMBER(cg_model, nominal_v, 'd'),
-    NUMBER(cg_model, fast_std_v, 'd'),
-    NUMBER(cg_model, slow_std_v, 'd'),
-    NUMBER(cg_model, slow_time_s, 'd'),
-    NUMBER(cg_model, lasting_std_v, 'd'),
-    NUMBER(cg_model, lasting_time_s, 'd'),
-    NUMBER(cg_model, lasting_soc_pct, 'd'),
-    NUMBER(cg_model, mean_c, 'd'),
-    NUMBER(cg_model, kt_std_v_per_k, 'd'),
-    NUMBER(cg_model, resistance_std_per_k, 'd'),
-    NUMBER(cg_model, knots, 'i'),
-    NUMBER(cg_model, functions, 'i'),
-    LIST(cg_model, knot_pct, 'd', CG_KNOTS),
-    LIST(cg_model, function_v, 'd', CG_KNOTS * CG_FUNCTIONS),
-    NUMBER(cg_model, effects, 'i'),
-    NUMBER(cg_model, skew_s, 'd'),
-    NUMBER(cg_model, memories, 'i'),
-    LIST(cg_model, memory_ohm, 'd', CG_MEMORIES),
-    LIST(cg_model, memory_tau_s, 'd', CG_MEMORIES),
-    END,
+    LIST(ocv_v, CG_OCV), REAL(epsilon), LIST(slope_beyond, 2), REAL(kt_v_per_k), REAL(t_ref_c),
+    LIST(soc_range_pct, 2), LIST(temperature_range_c, 2), LIST(current_range_a, 2),
+    WITHIN(delays, 1, CG_DELAYS), LIST(delay_s, CG_DELAYS), LIST(resistance_ohm, CG_DELAYS),
+    REAL(rate_hz), REAL(capacity_ah), REAL(charge_efficiency), REAL(initial_offset_pct),
+    REAL(steady_ohm), REAL(nominal_v), REAL(fast_std_v), REAL(slow_std_v), REAL(slow_time_s),
+    REAL(lasting_std_v), REAL(lasting_time_s), REAL(lasting_soc_pct), REAL(mean_c),
+    REAL(kt_std_v_per_k), REAL(resistance_std_per_k), WITHIN(knots, 0, CG_KNOTS),
+    WITHIN(functions, 0, CG_FUNCTIONS), LIST(knot_pct, CG_KNOTS),
+    LIST(function_v, CG_KNOTS * CG_FUNCTIONS), WITHIN(effects, 0, CG_EFFECTS), REAL(skew_s),
+    WITHIN(memories, 0, CG_MEMORIES), LIST(memory_ohm, CG_MEMORIES),
+    LIST(memory_tau_s, CG_MEMORIES), END,
 };
+#undef OF
+#define OF cg_effect
 static const field EFFECT[] = {
-    NUMBER(cg_effect, kind, 'i'),
-    NUMBER(cg_effect, lags, 'i'),
-    LIST(cg_effect, value, 'd', CG_VALUES),
-    LIST(cg_effect, tau_s, 'd', CG_LAGS),
-    END,
+    WITHIN(kind, CG_NO_EFFECT, CG_WEAK_CELL), WITHIN(lags, 0, CG_LAGS), LIST(value, CG_VALUES),
+    LIST(tau_s, CG_LAGS), END,
 };
+#undef OF
+#define OF cg_settings
 static const field SETTINGS[] = {
-    NUMBER(cg_settings, method, 'i'),
-    NUMBER(cg_settings, initial_soc_pct, 'd'),
-    NUMBER(cg_settings, initial_soc_std_pct, 'd'),
-    NUMBER(cg_settings, valid_std_pct, 'd'),
-    NUMBER(cg_settings, gap_s, 'd'),
-    NUMBER(cg_settings, reasons, 'u'),
-    NUMBER(cg_settings, full_voltage_v, 'd'),
-    NUMBER(cg_settings, full_current_a, 'd'),
-    NUMBER(cg_settings, full_hold_s, 'd'),
-    NUMBER(cg_settings, full_soc_pct, 'd'),
-    NUMBER(cg_settings, full_soc_std_pct, 'd'),
-    NUMBER(cg_settings, rest_after_s, 'd'),
-    NUMBER(cg_settings, rest_soc_std_pct, 'd'),
-    END,
+    WITHIN(method, CG_EKF, CG_COULOMB), REAL(initial_soc_pct), REAL(initial_soc_std_pct),
+    REAL(valid_std_pct), REAL(gap_s), BITS(reasons), REAL(full_voltage_v), REAL(full_current_a),
+    REAL(full_hold_s), REAL(full_soc_pct), REAL(full_soc_std_pct), REAL(rest_after_s),
+    REAL(rest_soc_std_pct), END,
 };
+#undef OF
+#define OF cg_clock
 static const field CLOCK[] = {
-    NUMBER(cg_clock, last_s, 'd'),   NUMBER(cg_clock, shift_s, 'd'),
-    NUMBER(cg_clock, behind, 'l'),   NUMBER(cg_clock, behind_s, 'd'),
-    NUMBER(cg_clock, age_s, 'd'),    NUMBER(cg_clock, is_restored, 'b'),
-    END,
+    REAL(last_s), REAL(shift_s), COUNT(behind), REAL(behind_s), REAL(age_s), FLAG(is_restored), END,
 };
+#undef OF
+#define OF cg_counter
 static const field COUNTER[] = {
-    NUMBER(cg_counter, time_s, 'd'),         NUMBER(cg_counter, current_a, 'd'),
-    NUMBER(cg_counter, mean_square_a2, 'd'), NUMBER(cg_counter, mean_a, 'd'),
-    NUMBER(cg_counter, discharged_pct, 'd'), NUMBER(cg_counter, moved_pct, 'd'),
-    NUMBER(cg_counter, counted_s, 'd'),      NUMBER(cg_counter, is_restored, 'b'),
-    END,
+    REAL(time_s), REAL(current_a), REAL(mean_square_a2), REAL(mean_a), REAL(discharged_pct),
+    REAL(moved_pct), REAL(counted_s), FLAG(is_restored), END,
 };
+#undef OF
+#define OF cg_since
 static const field SINCE[] = {
-    NUMBER(cg_since, seconds, 'd'),        NUMBER(cg_since, away_s, 'd'),
-    NUMBER(cg_since, discharged_pct, 'd'), NUMBER(cg_since, moved_pct, 'd'),
-    NUMBER(cg_since, gap_var_pct2, 'd'),   NUMBER(cg_since, unseen_var_pct2, 'd'),
-    END,
+    REAL(seconds), REAL(away_s), REAL(discharged_pct), REAL(moved_pct), REAL(gap_var_pct2),
+    REAL(unseen_var_pct2), END,
 };
+#undef OF
+#define OF cg_ekf
 static const field EKF[] = {
-    LIST(cg_ekf, x, 'd', CG_STATES),
-    LIST(cg_ekf, p, 'd', CG_LEARNED * CG_STATES),
-    NUMBER(cg_ekf, mean_innovation_v, 'd'),
-    NUMBER(cg_ekf, mean_seconds, 'd'),
-    NUMBER(cg_ekf, was_outlier, 'b'),
-    END,
+    LIST(x, CG_STATES), LIST(p, CG_LEARNED * CG_STATES), REAL(mean_innovation_v),
+    REAL(mean_seconds), FLAG(was_outlier), END,
 };
+#undef OF
+#define OF cg_filter
 static const field FILTER[] = {
-    NUMBER(cg_filter, hypotheses, 'i'),     NUMBER(cg_filter, verdict, 'i'),
-    NUMBER(cg_filter, log_odds, 'd'),       NUMBER(cg_filter, prior_log_odds, 'd'),
-    NUMBER(cg_filter, wide_std_pct, 'd'),   NUMBER(cg_filter, outlier_s, 'd'),
-    NUMBER(cg_filter, stated_pct, 'd'),     NUMBER(cg_filter, is_untested, 'b'),
+    WITHIN(hypotheses, 1, 2), WITHIN(verdict, CG_NO_TEST, CG_UNCLEAR), REAL(log_odds),
+    REAL(prior_log_odds), REAL(wide_std_pct), REAL(outlier_s), REAL(stated_pct), FLAG(is_untested),
     END,
 };
+#undef OF
+#define OF cg_memory
 static const field MEMORY[] = {
-    NUMBER(cg_memory, samples, 'l'),
-    NUMBER(cg_memory, resets, 'l'),
-    NUMBER(cg_memory, first_s, 'd'),
-    NUMBER(cg_memory, tick, 'l'),
-    NUMBER(cg_memory, temperature_c, 'd'),
-    NUMBER(cg_memory, newton_pct, 'd'),
-    NUMBER(cg_memory, newton_inside, 'b'),
-    NUMBER(cg_memory, newton_std_pct, 'd'),
-    NUMBER(cg_memory, coulomb_start_pct, 'd'),
-    NUMBER(cg_memory, coulomb_var_pct2, 'd'),
-    NUMBER(cg_memory, coulomb_counted_s, 'd'),
-    NUMBER(cg_memory, coulomb_moved_pct, 'd'),
-    NUMBER(cg_memory, gap_until_s, 'd'),
-    NUMBER(cg_memory, contradicted_until_s, 'd'),
-    NUMBER(cg_memory, mismatch_until_s, 'd'),
-    NUMBER(cg_memory, bias_pct, 'd'),
-    NUMBER(cg_memory, rest_since_s, 'd'),
-    NUMBER(cg_memory, level_s, 'd'),
-    NUMBER(cg_memory, level_residual_v, 'd'),
-    NUMBER(cg_memory, level_drop_v, 'd'),
-    END,
+    COUNT(samples), COUNT(resets), REAL(first_s), COUNT(tick), REAL(temperature_c),
+    REAL(newton_pct), FLAG(newton_inside), REAL(newton_std_pct), REAL(coulomb_start_pct),
+    REAL(coulomb_var_pct2), REAL(coulomb_counted_s), REAL(coulomb_moved_pct), REAL(gap_until_s),
+    REAL(contradicted_until_s), REAL(mismatch_until_s), REAL(bias_pct), REAL(rest_since_s),
+    REAL(level_s), REAL(level_residual_v), REAL(level_drop_v), END,
 };
 static const field REFERENCES[] = {
-    NUMBER(cg_memory, full_since_s, 'd'),
-    NUMBER(cg_memory, is_full, 'b'),
-    NUMBER(cg_memory, is_rested, 'b'),
-    END,
+    REAL(full_since_s), FLAG(is_full), FLAG(is_rested), END,
 };
+#undef OF
+#define OF cg_estimate
 static const field LATEST[] = {
-    NUMBER(cg_estimate, time_s, 'd'),          NUMBER(cg_estimate, soc_pct, 'd'),
-    NUMBER(cg_estimate, soc_std_pct, 'd'),     NUMBER(cg_estimate, soc_newton_pct, 'd'),
-    NUMBER(cg_estimate, soc_coulomb_pct, 'd'), NUMBER(cg_estimate, voltage_model_v, 'd'),
-    NUMBER(cg_estimate, residual_v, 'd'),      NUMBER(cg_estimate, status, 'i'),
-    NUMBER(cg_estimate, reasons, 'u'),         NUMBER(cg_estimate, samples, 'l'),
-    END,
+    REAL(time_s), REAL(soc_pct), REAL(soc_std_pct), REAL(soc_newton_pct), REAL(soc_coulomb_pct),
+    REAL(voltage_model_v), REAL(residual_v), WITHIN(status, CG_INITIALISING, CG_INVALID),
+    BITS(reasons), COUNT(samples), END,
 };
+#undef OF
+#define OF cg_state
 static const field STATE[] = {
-    NUMBER(cg_state, is_pending, 'b'),         NUMBER(cg_state, is_filtering, 'b'),
-    NUMBER(cg_state, is_refused, 'b'),         NUMBER(cg_state, has_other_capacity, 'b'),
-    NUMBER(cg_state, implausible, 'u'),        NUMBER(cg_state, beside_soc_v, 'd'),
-    END,
+    FLAG(is_pending), FLAG(is_filtering), FLAG(is_refused), FLAG(has_other_capacity),
+    BITS(implausible), REAL(beside_soc_v), END,
 };
+#undef OF
+#define OF cg_lag
 static const field LAG[] = {
-    NUMBER(cg_lag, time_s, 'd'),
-    NUMBER(cg_lag, input, 'd'),
-    NUMBER(cg_lag, value, 'd'),
-    NUMBER(cg_lag, is_started, 'b'),
-    END,
+    REAL(time_s), REAL(input), REAL(value), FLAG(is_started), END,
 };
+#undef OF
 
 static PyObject *get_number(const char *at, char kind)
 {
@@ -187,23 +137,30 @@ static PyObject *get_number(const char *at, char kind)
     }
 }
 
-static int set_number(char *at, char kind, PyObject *value)
+static int set_number(char *at, const field *each, PyObject *value)
 {
-    if (kind == 'd') {
+    if (each->kind == 'd') {
         *(double *)at = PyFloat_AsDouble(value);
-    } else {
-        const long long number = PyLong_AsLongLong(value);
-        if (kind == 'i') {
-            *(int32_t *)at = (int32_t)number;
-        } else if (kind == 'u') {
-            *(uint32_t *)at = (uint32_t)number;
-        } else if (kind == 'l') {
-            *(int64_t *)at = number;
-        } else {
-            *(bool *)at = number != 0;
-        }
+        return PyErr_Occurred() ? -1 : 0;
     }
-    return (PyErr_Occurred() != NULL) ? -1 : 0;
+    const long long number = PyLong_AsLongLong(value);
+    if (PyErr_Occurred()) {
+        return -1;
+    }
+    if (each->kind == 'u') {
+        *(uint32_t *)at = (uint32_t)number;
+    } else if (each->kind == 'l') {
+        *(int64_t *)at = number;
+    } else if (each->kind == 'b') {
+        *(bool *)at = number != 0;
+    } else if ((number < each->low) || (number > each->high)) {
+        PyErr_Format(PyExc_ValueError, "%s: %lld is not within %d ... %d", each->name, number,
+                     (int)each->low, (int)each->high);
+        return -1;
+    } else {
+        *(int32_t *)at = (int32_t)number;
+    }
+    return 0;
 }
 
 static PyObject *get_fields(const void *structure, const field *fields)
@@ -241,7 +198,7 @@ static int set_list(double *at, const field *each, PyObject *value)
         failed = -1;
     }
     for (Py_ssize_t k = 0; (failed == 0) && (k < count); ++k) {
-        failed = set_number((char *)&at[k], 'd', PySequence_Fast_GET_ITEM(items, k));
+        failed = set_number((char *)&at[k], each, PySequence_Fast_GET_ITEM(items, k));
     }
     Py_DECREF(items);
     return failed;
@@ -257,13 +214,27 @@ static int set_fields(void *structure, const field *fields, PyObject *values)
             PyErr_Format(PyExc_KeyError, "%s", each->name);
             return -1;
         }
-        const int failed = (each->count == 0) ? set_number(at, each->kind, value)
+        const int failed = (each->count == 0) ? set_number(at, each, value)
                                               : set_list((double *)at, each, value);
         if (failed != 0) {
             return -1;
         }
     }
     return 0;
+}
+
+static PyObject *none_unless_error(void) { return PyErr_Occurred() ? NULL : Py_NewRef(Py_None); }
+
+/* Numbers of a list or tuple. */
+static double real_at(PyObject *numbers, Py_ssize_t k)
+{
+    return PyFloat_AsDouble(PySequence_Fast_GET_ITEM(numbers, k));
+}
+
+static cg_sample sample_at(PyObject *numbers, Py_ssize_t k)
+{
+    return (cg_sample){real_at(numbers, k), real_at(numbers, k + 1), real_at(numbers, k + 2),
+                       real_at(numbers, k + 3)};
 }
 
 /* ------------------------------------------------------------------ the type Core */
@@ -287,24 +258,26 @@ static bool hooked(Core *self, PyObject *answer)
     return is_other;
 }
 
+static PyObject *charge_of(const cg_since *since)
+{
+    return Py_BuildValue("ddddd", since->seconds, since->away_s, since->discharged_pct,
+                         since->moved_pct, since->gap_var_pct2);
+}
+
 static bool hook_count(void *context, const cg_since *since)
 {
     Core *self = context;
     return !PyErr_Occurred() &&
-           hooked(self, PyObject_CallMethod(self->hook, "count", "ddddd", since->seconds,
-                                            since->away_s, since->discharged_pct, since->moved_pct,
-                                            since->gap_var_pct2));
+           hooked(self, PyObject_CallMethod(self->hook, "count", "N", charge_of(since)));
 }
 
 static bool hook_tick(void *context, const cg_tick *tick)
 {
     Core *self = context;
-    const cg_since *since = &tick->since;
     if (PyErr_Occurred()) {
         return false;
     }
-    PyObject *charge = Py_BuildValue("ddddd", since->seconds, since->away_s, since->discharged_pct,
-                                     since->moved_pct, since->gap_var_pct2);
+    PyObject *charge = charge_of(&tick->since);
     if (!tick->has_voltage) {
         return hooked(self, PyObject_CallMethod(self->hook, "tick", "Nd", charge, tick->seconds));
     }
@@ -326,7 +299,7 @@ static bool hook_correct(void *context, cg_real soc_pct, cg_real std_pct)
 static int set_effects(Core *self, PyObject *effects)
 {
     const Py_ssize_t count = PyList_Check(effects) ? PyList_GET_SIZE(effects) : -1;
-    if (count != self->model.effects || count > CG_EFFECTS) {
+    if (count != self->model.effects) {
         PyErr_SetString(PyExc_ValueError, "effects: not a list of as many dicts");
         return -1;
     }
@@ -338,10 +311,11 @@ static int set_effects(Core *self, PyObject *effects)
     return 0;
 }
 
-static int Core_init(Core *self, PyObject *args, PyObject *kwargs)
+static int begin(Core *self, PyObject *args, PyObject *kwargs)
 {
     static char *names[] = {"model", "effects", "settings", "hook", "line_size", "line_block",
                             "spacing_s", NULL};
+    const cg_model *own = &self->model;
     PyObject *model, *effects, *settings_of, *hook;
     int size, block;
     double spacing_s;
@@ -352,23 +326,36 @@ static int Core_init(Core *self, PyObject *args, PyObject *kwargs)
         (set_fields(&settings, SETTINGS, settings_of) != 0)) {
         return -1;
     }
-    PyMem_Free(self->storage);
-    PyMem_Free(self->skew);
-    self->storage = PyMem_New(cg_current, (size_t)size);
-    self->skew = NULL;
-    if (cg_skew_of(&self->model) < self->model.effects) {
-        self->skew = PyMem_New(cg_skew, 1);
+    if ((size < 1) || (block < 0) || (block >= size)) {
+        PyErr_SetString(PyExc_ValueError, "line_block: not within 0 ... line_size - 1");
+        return -1;
     }
-    if ((self->storage == NULL) ||
-        ((self->skew == NULL) && (cg_skew_of(&self->model) < self->model.effects))) {
+    if ((own->functions > 0) && (own->knots < 2)) {
+        PyErr_SetString(PyExc_ValueError, "knots: functions need two or more");
+        return -1;
+    }
+    const bool has_skew = cg_skew_of(own) < own->effects;
+    self->storage = PyMem_New(cg_current, (size_t)size);
+    self->skew = has_skew ? PyMem_New(cg_skew, 1) : NULL;
+    if ((self->storage == NULL) || (has_skew && (self->skew == NULL))) {
         PyErr_NoMemory();
         return -1;
     }
     const cg_line line = {self->storage, size, 0, 0, block, spacing_s, 0.0};
-    cg_init(&self->estimator, &self->model, &settings, &line, self->skew);
+    cg_init(&self->estimator, own, &settings, &line, self->skew);
     self->estimator.hook = (cg_hook){self, hook_count, hook_tick, hook_correct};
-    Py_XSETREF(self->hook, Py_NewRef(hook));
+    self->hook = Py_NewRef(hook);
     return 0;
+}
+
+/* No `__init__`: an object that exists is ready. */
+static PyObject *Core_new(PyTypeObject *type, PyObject *args, PyObject *kwargs)
+{
+    PyObject *self = type->tp_alloc(type, 0);
+    if ((self != NULL) && (begin((Core *)self, args, kwargs) != 0)) {
+        Py_CLEAR(self);
+    }
+    return self;
 }
 
 static int Core_traverse(Core *self, visitproc visit, void *arg)
@@ -400,18 +387,11 @@ static PyObject *Core_update(Core *self, PyObject *sample)
         PyErr_SetString(PyExc_TypeError, "a sample is a tuple of four numbers");
         return NULL;
     }
-    const cg_sample now = {
-        PyFloat_AsDouble(PyTuple_GET_ITEM(sample, 0)), PyFloat_AsDouble(PyTuple_GET_ITEM(sample, 1)),
-        PyFloat_AsDouble(PyTuple_GET_ITEM(sample, 2)), PyFloat_AsDouble(PyTuple_GET_ITEM(sample, 3)),
-    };
-    if (PyErr_Occurred()) {
-        return NULL;
+    const cg_sample now = sample_at(sample, 0);
+    if (!PyErr_Occurred()) {
+        (void)cg_update(&self->estimator, &now);
     }
-    (void)cg_update(&self->estimator, &now);
-    if (PyErr_Occurred()) {
-        return NULL;
-    }
-    Py_RETURN_NONE;
+    return none_unless_error();
 }
 
 static PyObject *Core_estimate(Core *self, PyObject *Py_UNUSED(none))
@@ -475,10 +455,7 @@ static PyObject *Core_run(Core *self, PyObject *args)
     for (int k = 0; k < taken; ++k) {
         PyBuffer_Release(&column[k]);
     }
-    if (PyErr_Occurred()) {
-        return NULL;
-    }
-    Py_RETURN_NONE;
+    return none_unless_error();
 }
 
 static PyObject *Core_pseudo_ocv_at(Core *self, PyObject *soc)
@@ -555,22 +532,22 @@ static PyObject *Core_fill_line(Core *self, PyObject *args)
     if (!PyArg_ParseTuple(args, "O!O!d", &PyList_Type, &times, &PyList_Type, &currents, &since_s)) {
         return NULL;
     }
-    /* The latest, where a longer delay line left more. */
     const Py_ssize_t given = PyList_GET_SIZE(times);
+    if (PyList_GET_SIZE(currents) != given) {
+        PyErr_SetString(PyExc_ValueError, "not as many currents as times");
+        return NULL;
+    }
+    /* The latest, where a longer delay line left more. */
     const Py_ssize_t kept = (given < line->size) ? given : line->size;
     line->first = 0;
     line->count = (int32_t)kept;
     line->since_s = since_s;
     for (Py_ssize_t k = 0; k < kept; ++k) {
         const Py_ssize_t from = given - kept + k;
-        line->at[k].time_s = PyFloat_AsDouble(PyList_GET_ITEM(times, from));
-        line->at[k].current_a = PyFloat_AsDouble(PyList_GET_ITEM(currents, from));
+        line->at[k] = (cg_current){real_at(times, from), real_at(currents, from)};
     }
     self->estimator.without_ocv_v = NAN;
-    if (PyErr_Occurred()) {
-        return NULL;
-    }
-    Py_RETURN_NONE;
+    return none_unless_error();
 }
 
 /* ------------------------------------------------------------------ state by name */
@@ -626,11 +603,10 @@ static PyObject *Core_set(Core *self, PyObject *args)
         return NULL;
     }
     const part *found = part_named(name);
-    if ((found == NULL) || (set_fields((char *)&self->estimator.state + found->offset,
-                                       found->fields, values) != 0)) {
-        return NULL;
+    if (found != NULL) {
+        (void)set_fields((char *)&self->estimator.state + found->offset, found->fields, values);
     }
-    Py_RETURN_NONE;
+    return none_unless_error();
 }
 
 static cg_effect_state *effect_numbered(Core *self, int effect)
@@ -674,7 +650,7 @@ static PyObject *Core_set_lags(Core *self, PyObject *args)
     Py_RETURN_NONE;
 }
 
-/* Samples that time_skew holds back, as the state of that effect: number, samples, times, currents. */
+/* State of time_skew: the number of samples held back, the samples, times and currents. */
 static PyObject *Core_get_skew(Core *self, PyObject *Py_UNUSED(none))
 {
     const cg_skew *skew = self->skew;
@@ -710,8 +686,8 @@ static PyObject *Core_set_skew(Core *self, PyObject *args)
 {
     cg_skew *skew = self->skew;
     PyObject *waiting, *times, *currents;
-    if (!PyArg_ParseTuple(args, "O!O!O!", &PyList_Type, &waiting, &PyList_Type, &times, &PyList_Type,
-                          &currents)) {
+    if (!PyArg_ParseTuple(args, "O!O!O!", &PyList_Type, &waiting, &PyList_Type, &times,
+                          &PyList_Type, &currents)) {
         return NULL;
     }
     if ((skew == NULL) || (PyList_GET_SIZE(waiting) > 4 * CG_WAITING) ||
@@ -724,19 +700,12 @@ static PyObject *Core_set_skew(Core *self, PyObject *args)
     skew->waiting_count = (int32_t)(PyList_GET_SIZE(waiting) / 4);
     skew->count = (int32_t)PyList_GET_SIZE(times);
     for (int32_t k = 0; k < skew->waiting_count; ++k) {
-        skew->waiting[k].time_s = PyFloat_AsDouble(PyList_GET_ITEM(waiting, 4 * k));
-        skew->waiting[k].current_a = PyFloat_AsDouble(PyList_GET_ITEM(waiting, 4 * k + 1));
-        skew->waiting[k].voltage_v = PyFloat_AsDouble(PyList_GET_ITEM(waiting, 4 * k + 2));
-        skew->waiting[k].temperature_c = PyFloat_AsDouble(PyList_GET_ITEM(waiting, 4 * k + 3));
+        skew->waiting[k] = sample_at(waiting, 4 * (Py_ssize_t)k);
     }
     for (int32_t k = 0; k < skew->count; ++k) {
-        skew->at[k].time_s = PyFloat_AsDouble(PyList_GET_ITEM(times, k));
-        skew->at[k].current_a = PyFloat_AsDouble(PyList_GET_ITEM(currents, k));
+        skew->at[k] = (cg_current){real_at(times, k), real_at(currents, k)};
     }
-    if (PyErr_Occurred()) {
-        return NULL;
-    }
-    Py_RETURN_NONE;
+    return none_unless_error();
 }
 
 /* ------------------------------------------------------------------ module */
@@ -745,7 +714,7 @@ static PyMethodDef METHODS[] = {
     {"update", (PyCFunction)Core_update, METH_O, "Process one sample, a tuple of four numbers."},
     {"estimate", (PyCFunction)Core_estimate, METH_NOARGS, "Return the latest estimate's numbers."},
     {"run", (PyCFunction)Core_run, METH_VARARGS, "Step over columns: 4 in, 7 + 2 out."},
-    {"pseudo_ocv_at", (PyCFunction)Core_pseudo_ocv_at, METH_O, "Return voltage and slope at a SoC."},
+    {"pseudo_ocv_at", (PyCFunction)Core_pseudo_ocv_at, METH_O, "Return voltage and slope."},
     {"offset_a", (PyCFunction)Core_offset_a, METH_NOARGS, "Return the current's offset [A]."},
     {"uncounted_std_pct", (PyCFunction)Core_uncounted_std_pct, METH_O, "After a silence [%]."},
     {"current_at", (PyCFunction)Core_current_at, METH_O, "Return an earlier current [A]."},
@@ -772,8 +741,7 @@ static PyTypeObject CoreType = {
     .tp_doc = "Estimator in C.",
     .tp_basicsize = sizeof(Core),
     .tp_flags = Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC,
-    .tp_new = PyType_GenericNew,
-    .tp_init = (initproc)Core_init,
+    .tp_new = Core_new,
     .tp_dealloc = (destructor)Core_dealloc,
     .tp_traverse = (traverseproc)Core_traverse,
     .tp_clear = (inquiry)Core_clear,

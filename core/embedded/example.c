@@ -1,6 +1,6 @@
 /* example.c - the core in a program: samples from standard input, frames to standard output.
  *
- *     ./example < drive.csv          lines of time [s], current [A], voltage [V], temperature [degC]
+ *     ./example < drive.csv        lines of time [s], current [A], voltage [V], temperature [degC]
  *
  * In a battery management system the loop is a task at the rate of the current sensor.
  */

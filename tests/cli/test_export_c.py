@@ -13,11 +13,12 @@ import pytest
 from typer.testing import CliRunner
 
 from cangauge.cli.app import app
-from cangauge.embedded import CORE, drive_with_events, export_c
 from cangauge.errors import InputError
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.validity import Sample
+from cangauge.export.c_source import CORE_HEADERS, CORE_SOURCES
+from cangauge.export.embedded import drive_with_events, export_c
 from cangauge.identify.fit import fit
 from cangauge.model.model_file import CurveNoise, Model
 from cangauge.model.published import leaf_2012_model_file
@@ -78,19 +79,19 @@ def test_exported_tests_pass_with_equal_bits(folders: dict[str, Path], which: st
 @needs_make
 @pytest.mark.parametrize("real", ["double", "float"])
 def test_core_compiles_without_a_warning(folders: dict[str, Path], real: str) -> None:
-    sources = [name for name in CORE if name.endswith(".c")]
     for folder, config in ((folders["effects"], "-DCANGAUGE_CONFIG"), (folders["plain"], "-DX")):
-        run(folder, "cc", *STRICT, config, f"-DCANGAUGE_REAL={real}", "-fsyntax-only", *sources)
+        run(
+            folder, "cc", *STRICT, config, f"-DCANGAUGE_REAL={real}", "-fsyntax-only", *CORE_SOURCES
+        )
 
 
 @needs_make
 def test_sanitizers_find_nothing(folders: dict[str, Path]) -> None:
-    sources = [name for name in CORE if name.endswith(".c")]
     flags = [*STRICT, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     own = ["pack_model.c", "frames.c", "soc_frames.c", "test.c"]
     folder = folders["effects"]
     flags.remove("-Wconversion")  # cantools' frames
-    run(folder, "cc", *flags, "-DCANGAUGE_CONFIG", *sources, *own, "-lm", "-o", "sanitized")
+    run(folder, "cc", *flags, "-DCANGAUGE_CONFIG", *CORE_SOURCES, *own, "-lm", "-o", "sanitized")
     assert "PASSED" in run(folder, "./sanitized")
 
 
@@ -99,7 +100,7 @@ def test_cppcheck_finds_nothing(folders: dict[str, Path]) -> None:
     run(
         folders["effects"], "cppcheck", "--std=c99", "--quiet", "--error-exitcode=1",
         "--enable=warning,style,performance,portability",
-        *(name for name in CORE if name.endswith(".c")),
+        *CORE_SOURCES,
     )  # fmt: skip
 
 
@@ -145,7 +146,7 @@ def test_floats_estimate_a_held_out_trip_as_python(shared_data: Path, tmp_path: 
 
 
 def test_core_calls_nothing_but_mathematics(folders: dict[str, Path]) -> None:
-    for name in CORE:
+    for name in CORE_HEADERS + CORE_SOURCES:
         text = (folders["plain"] / name).read_text(encoding="utf-8")
         included = set(re.findall(r'#include [<"]([^>"]+)', text))
         assert included <= {

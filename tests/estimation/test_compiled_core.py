@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-import sys
+import runpy
+import shutil
 from collections.abc import Iterable
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from cangauge._core_digest import sources_digest
+from cangauge.estimation import compiled as compiled_module
 from cangauge.estimation.compiled import CompiledEstimator, make_estimator
+from cangauge.estimation.core_constants import core_constants, effect_fields
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
@@ -57,13 +60,33 @@ def state_of(estimator: Estimator) -> Any:
 
 
 def test_extension_is_built_from_these_sources() -> None:
-    sys.path.insert(0, str(ROOT))
-    try:
-        hook = import_module("hatch_build")
-    finally:
-        sys.path.remove(str(ROOT))
-    digest = hook.sources_digest(ROOT / "core")
+    digest = sources_digest(ROOT / "core")
     assert digest == core.SOURCES, "run `python hatch_build.py` again"
+
+
+def test_extension_of_other_sources_is_not_used(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert compiled_module._load(tmp_path) is core  # no sources there
+    shutil.copytree(ROOT / "core", tmp_path / "core")
+    assert compiled_module._load(tmp_path) is core
+    with (tmp_path / "core" / "cangauge.c").open("a", encoding="utf-8") as source:
+        source.write("/* changed */")
+    assert not caplog.records
+    assert compiled_module._load(tmp_path) is None
+    assert ["hatch_build.py" in record.getMessage() for record in caplog.records] == [True]
+
+
+def test_failed_build_leaves_no_earlier_extension(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    build = runpy.run_path(str(ROOT / "hatch_build.py"))["build_extension"]
+    monkeypatch.delenv("LDSHARED", raising=False)
+    monkeypatch.setenv("CC", "cc")
+    assert build(ROOT, tmp_path).is_file()
+    monkeypatch.setenv("CC", "no-such-compiler")
+    assert build(ROOT, tmp_path) is None
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
@@ -144,6 +167,69 @@ def test_error_of_the_health_estimator_is_raised(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("cangauge.estimation.health.HealthEstimator.use", fail)
     with pytest.raises(ArithmeticError, match="no"):
         compiled.step(Sample(0.0, 10.0, 385.0, 23.0))
+
+
+def core_arguments() -> dict[str, Any]:
+    """Arguments of `Core` for the model with every effect, for a test to change."""
+    model, chosen = MODELS["together"], EstimatorSettings()
+    constants = core_constants(model, chosen)
+    assert constants is not None
+    return {
+        "model": constants.model | {"function_v": []}, "settings": constants.settings,
+        "effects": [effect_fields(form) for form in constants.effects], "hook": None,
+        "line_size": 100, "line_block": 1, "spacing_s": 1.0,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "value"),
+    [
+        *(("model", name, -1) for name in ("delays", "knots", "functions", "memories")),
+        *(("model", name, 1000) for name in ("delays", "knots", "functions", "memories")),
+        ("model", "delays", 0), ("model", "effects", 33), ("settings", "method", 3),
+        ("", "line_size", 0), ("", "line_size", -1), ("", "line_block", -2),
+        ("", "line_block", 100),
+    ],
+)  # fmt: skip
+def test_sizes_beyond_the_core_memory_are_refused(part: str, name: str, value: int) -> None:
+    arguments = core_arguments()
+    core.Core(**arguments)
+    (arguments[part] if part else arguments)[name] = value
+    with pytest.raises(ValueError, match=name if part else "line_size"):
+        core.Core(**arguments)
+
+
+@pytest.mark.parametrize(("name", "value"), [("lags", 6), ("lags", -1), ("kind", 99)])
+def test_effect_beyond_the_core_memory_is_refused(name: str, value: int) -> None:
+    arguments = core_arguments()
+    arguments["effects"][0][name] = value
+    with pytest.raises(ValueError, match=name):
+        core.Core(**arguments)
+
+
+@pytest.mark.parametrize("knots", [0, 1])
+def test_curve_functions_without_knots_are_refused(knots: int) -> None:
+    arguments = core_arguments()
+    arguments["model"] |= {"functions": 1, "knots": knots}
+    with pytest.raises(ValueError, match="knots"):
+        core.Core(**arguments)
+
+
+@pytest.mark.parametrize("hypotheses", [-1, 0, 3, 2**31])
+def test_state_with_other_hypotheses_is_refused(hypotheses: int) -> None:
+    made = core.Core(**core_arguments())
+    with pytest.raises(ValueError, match="hypotheses"):
+        made.set("filter", made.get("filter") | {"hypotheses": hypotheses})
+
+
+def test_delay_line_needs_a_current_for_each_time() -> None:
+    with pytest.raises(ValueError, match="currents"):
+        core.Core(**core_arguments()).fill_line([0.0, 1.0], [0.0], 0.0)
+
+
+def test_core_without_a_model_cannot_be_made() -> None:
+    with pytest.raises(TypeError, match="model"):
+        core.Core.__new__(core.Core)
 
 
 def same_table(log: Log, model: Model, chosen: EstimatorSettings) -> None:

@@ -26,7 +26,7 @@ def export_c_command(
     is_folder = os.path.isdir(output)  # noqa: PTH112 - pathlib raises for an impossible name
     check_outputs([output / "pack_model.c" if is_folder else output], [model])
     # Deferred, so that the help page does not wait for numpy and scipy.
-    from cangauge.embedded import export_c  # noqa: PLC0415
+    from cangauge.export.embedded import export_c  # noqa: PLC0415
     from cangauge.model.model_file import Model  # noqa: PLC0415
 
     done = export_c(Model.load(model), output, period_s=period)
@@ -37,5 +37,6 @@ def export_c_command(
             "delay_line_bytes": done.delay_line_bytes,
         })  # fmt: skip
         return
-    note(f"{len(done.files)} files in {done.folder}: `make test` there tries them on this machine.")
+    files = f"{len(done.files)} files in {done.folder}"
+    note(f"{files}: `make test` there runs the tests on this machine.")
     note(f"The delay line takes {done.delay_line_bytes / 1024:.1f} KiB at {period:g} s a sample.")

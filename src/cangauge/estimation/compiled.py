@@ -7,18 +7,22 @@ the extension was built at installation, unless `CANGAUGE_PURE_PYTHON` is set.
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from importlib import import_module
+from pathlib import Path
 from typing import Any, ClassVar, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cangauge._arithmetic import total
+from cangauge._core_digest import sources_digest
+from cangauge._logging import emit
 from cangauge._typing import FloatArray
 from cangauge.estimation.cells import PackTick
 from cangauge.estimation.core_constants import CoreConstants, core_constants, effect_fields
@@ -44,10 +48,26 @@ from cangauge.model.delay_line import BLOCK, SPACING_S, DelayLine
 from cangauge.model.model_file import Model
 from cangauge.model.voltage_model import Curve
 
-try:
-    _core: Any = import_module("cangauge._core")
-except ImportError:  # no compiler at installation
-    _core = None
+_LOG = logging.getLogger(__name__)
+
+
+def _load(root: Path) -> Any:
+    """Return the extension; None without one, or if the sources in a checkout are other ones."""
+    try:
+        core: Any = import_module("cangauge._core")
+    except ImportError:  # no compiler at installation
+        return None
+    if (root / "core" / "cangauge.h").is_file() and sources_digest(root / "core") != core.SOURCES:
+        emit(
+            _LOG, logging.WARNING, "core.stale",
+            "the compiled core is not of these sources: continuing in Python; "
+            "compile it by `python hatch_build.py`",
+        )  # fmt: skip
+        return None
+    return core
+
+
+_core: Final = _load(Path(__file__).parents[3])
 
 VERDICTS: Final[tuple[Verdict, ...]] = ("", "open", "parked", "moved", "unclear")
 """Verdicts, in the order of `cg_verdict`."""

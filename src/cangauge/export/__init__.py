@@ -1,1 +1,1 @@
-"""An identified model in the forms of other simulators."""
+"""An identified model in the forms of other simulators and of a microcontroller."""

@@ -11,7 +11,6 @@ A unit holds a binary for this platform and the sources for others. Its interfac
 from __future__ import annotations
 
 import hashlib
-import math
 import os
 import platform
 import re
@@ -19,18 +18,25 @@ import shutil
 import subprocess
 import tempfile
 import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, Literal
 from xml.etree import ElementTree as ET
 
 from cangauge._io import atomic_path
 from cangauge._resources import shared_file
 from cangauge._version import __version__
 from cangauge.errors import CangaugeError, InputError
-from cangauge.estimation.core_constants import CoreConstants, core_constants, effect_fields
+from cangauge.estimation.core_constants import CoreConstants, core_constants
 from cangauge.estimation.settings import EstimatorSettings
+from cangauge.export.c_source import (
+    CORE_HEADERS,
+    CORE_SOURCES,
+    initialiser,
+    line_size,
+    model_definition,
+)
 from cangauge.model.delay_line import SPACING_S
 from cangauge.model.effects.base import CoreForm
 from cangauge.model.model_file import Model
@@ -38,8 +44,6 @@ from cangauge.model.model_file import Model
 Kind = Literal["pack", "estimator"]
 Version = Literal[2, 3]
 
-CORE_SOURCES: Final = ("cangauge.c", "cangauge_filter.c", "cangauge_model.c")
-CORE_HEADERS: Final = ("cangauge.h", "cangauge_internal.h")
 FLAGS: Final = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-fvisibility=hidden")
 """Without contraction: the same bits as the Python reference."""
 PLATFORMS: Final = {
@@ -68,8 +72,6 @@ VALUES: Final = {
 """Kind of effect → names of its values, in the order of `cg_effect_kind`."""
 SENSORS: Final = ("current_sensor", "voltage_sensor", "time_skew")
 """Kinds that change what is measured, not the pack."""
-PLACES: Final = 12
-"""Number of values of an effect, `CG_VALUES`; its time constants follow."""
 LONGEST_NAME: Final = 60
 """Characters of a unit's name, a C identifier and the name of its binary."""
 UNITS: Final = {
@@ -144,8 +146,8 @@ class _Unit:
     version: Version
     constants: CoreConstants
     variables: tuple[Variable, ...]
-    parameters: tuple[tuple[int, int], ...]
-    """Effect and place of each parameter of an effect: the last of the variables."""
+    parameters: tuple[tuple[int, str], ...]
+    """Effect and place in C of each parameter of an effect: the last of the variables."""
     token: str
 
     @classmethod
@@ -177,34 +179,29 @@ class _Unit:
         folder.mkdir()
         for name in (*CORE_SOURCES, *CORE_HEADERS):
             shutil.copyfile(shared_file("core", name), folder / name)
-        for name in ("fmu.h", "fmu.c", f"{self.kind}.c", f"fmi{self.version}.c"):
+        for name in ("fmu.h", "fmu.c", "fmi.h", f"{self.kind}.c", f"fmi{self.version}.c"):
             shutil.copyfile(shared_file("core", f"fmi/{name}"), folder / name)
         config = {
             "FMU_TOKEN": f'"{self.token}"',
             "FMU_VARIABLES": len(self.variables),
             "FMU_PARAMETERS": len(self.parameters),
             "FMU_SPACING_S": SPACING_S,
-            "FMU_LINE": int(2.0 * self.constants.longest_s / SPACING_S) + 8,
+            "FMU_LINE": line_size(self.constants.longest_s, SPACING_S),
         }
         lines = [f"#define {name} {value}" for name, value in config.items()]
         (folder / "fmu_config.h").write_text("\n".join(lines) + "\n", encoding="utf-8")
         (folder / "fmu_model.c").write_text(self._constants(), encoding="utf-8")
 
     def _constants(self) -> str:
-        effects = [effect_fields(form) for form in self.constants.effects]
-        fields = self.constants.model | {
-            "function_v": [list(row) for row in self.constants.functions],
-            "effect": effects,
-        }
         start = [0.0 if item.start is None else item.start for item in self.variables]
         first = len(self.variables) - len(self.parameters)
         table = [[first + k, *where] for k, where in enumerate(self.parameters)]
         return (
             '#include "fmu.h"\n\n'
-            f"const cg_model FMU_MODEL = {_initialiser(fields)};\n"
-            f"const cg_settings FMU_SETTINGS = {_initialiser(self.constants.settings)};\n"
-            f"const double FMU_START[FMU_VARIABLES] = {_initialiser(start)};\n"
-            f"const fmu_parameter FMU_PARAMETER[FMU_PARAMETERS + 1] = {_initialiser(table)};\n"
+            f"{model_definition('FMU_MODEL', self.constants)}"
+            f"const cg_settings FMU_SETTINGS = {initialiser(self.constants.settings)};\n"
+            f"const double FMU_START[FMU_VARIABLES] = {initialiser(start)};\n"
+            f"const fmu_parameter FMU_PARAMETER[FMU_PARAMETERS + 1] = {initialiser(table)};\n"
         )
 
     def compile(self, root: Path) -> None:
@@ -316,16 +313,16 @@ def _estimator_variables() -> tuple[Variable, ...]:
 
 def _effect_parameters(
     forms: Sequence[CoreForm],
-) -> tuple[list[Variable], list[tuple[int, int]]]:
-    """Return the effects' constants as variables, and the effect and place of each."""
+) -> tuple[list[Variable], list[tuple[int, str]]]:
+    """Return the effects' constants as variables, and the effect and place in C of each."""
     variables, places = [], []
     for number, form in enumerate(forms):
         names = VALUES.get(form.kind, ())
         values = [
-            *enumerate(zip(names, form.values, strict=False)),
-            *((PLACES + k, (f"tau_{k + 1}_s", tau_s)) for k, tau_s in enumerate(form.tau_s)),
+            *((f"{k}", *pair) for k, pair in enumerate(zip(names, form.values, strict=False))),
+            *((f"CG_VALUES + {k}", f"tau_{k + 1}_s", tau_s) for k, tau_s in enumerate(form.tau_s)),
         ]
-        for place, (name, value) in values:
+        for place, name, value in values:
             text = f"effect {number + 1} of the model, as in cangauge.h"
             full = f"effect_{number + 1}_{form.kind}.{name}"
             variables.append(Variable(full, "parameter", None, value, text))
@@ -369,22 +366,6 @@ def _bytes(root: ET.Element) -> bytes:
     ET.indent(root)
     text: bytes = ET.tostring(root, encoding="UTF-8", xml_declaration=True)
     return text
-
-
-def _initialiser(value: Any) -> str:
-    """Return a C initialiser of numbers, lists and structures."""
-    if isinstance(value, dict):
-        fields = (f".{name} = {_initialiser(item)}" for name, item in value.items() if item != [])
-        return "{" + ", ".join(fields) + "}"
-    if isinstance(value, list | tuple):
-        return "{" + (_joined(value) or "0") + "}"
-    if isinstance(value, float) and not math.isfinite(value):
-        return "NAN" if math.isnan(value) else ("-" * (value < 0.0) + "INFINITY")
-    return repr(int(value) if isinstance(value, bool) else value)
-
-
-def _joined(values: Iterable[Any]) -> str:
-    return ", ".join(_initialiser(item) for item in values)
 
 
 def _compiler() -> str:

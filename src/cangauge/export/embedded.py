@@ -7,7 +7,7 @@ cantools' generator, an example, and tests against this package on a drive with 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -25,11 +25,9 @@ from cangauge.estimation.core_constants import CoreConstants, core_constants
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.validity import Estimate, Sample
+from cangauge.export.c_source import CORE_HEADERS, CORE_SOURCES, line_size, model_definition
 from cangauge.model.model_file import Model
 
-CORE: Final = (
-    "cangauge.h", "cangauge_internal.h", "cangauge.c", "cangauge_filter.c", "cangauge_model.c",
-)  # fmt: skip
 EMBEDDED: Final = (
     "Makefile", "example.c", "test.c", "clock.h", "startup.c", "mps2.ld",
 )  # fmt: skip
@@ -45,9 +43,6 @@ GOLDEN_S: Final = 1200.0
 
 FAST_SAMPLES: Final = 200
 """Samples of it that are `period_s` apart."""
-
-_WIDE: Final = ("ocv_v", "epsilon", "skew_s")
-"""Constants that are doubles with floats too."""
 
 _SIGNALS: Final = ("soc_pct", "soc_std_pct", "age_s")
 
@@ -90,19 +85,26 @@ def export_c(model: Model, folder: Path, *, period_s: float = PERIOD_S) -> Expor
             cure="fit the model without it",
         )
     spacing_s = JITTER * 2.0 * period_s
-    line_size = int(2.0 * constants.longest_s / spacing_s) + 9  # CG_LINE_SIZE
+    length = line_size(constants.longest_s, spacing_s)
     head = f"/* {{}} - of the model {_comment(model.name)}, by cangauge {__version__}. */\n"
-    texts = {name: shared_file("core", name).read_text(encoding="utf-8") for name in CORE} | {
-        name: shared_file("core/embedded", name).read_text(encoding="utf-8") for name in EMBEDDED
+    folders = dict.fromkeys(CORE_HEADERS + CORE_SOURCES, "core")
+    folders |= dict.fromkeys(EMBEDDED, "core/embedded")
+    texts = {
+        name: shared_file(place, name).read_text(encoding="utf-8")
+        for name, place in folders.items()
     }
     texts["cangauge_config.h"] = head.format("cangauge_config.h") + _config(constants, period_s)
-    texts["pack_model.h"] = head.format("pack_model.h") + _model_header(line_size, spacing_s)
-    texts["pack_model.c"] = head.format("pack_model.c") + _model_source(constants)
+    texts["pack_model.h"] = head.format("pack_model.h") + _model_header(length, spacing_s)
+    texts["pack_model.c"] = (
+        head.format("pack_model.c")
+        + '#include "pack_model.h"\n\n#include <math.h>\n\n'
+        + model_definition("pack_model", constants)
+    )
     texts |= _frames()
     texts["golden.h"] = head.format("golden.h") + _golden(model, period_s)
     folder.mkdir(parents=True, exist_ok=True)
     write_texts_atomic({folder / name: text for name, text in texts.items()})
-    return Exported(folder, tuple(sorted(texts)), 16 * line_size)
+    return Exported(folder, tuple(sorted(texts)), 16 * length)
 
 
 def _comment(text: str) -> str:
@@ -121,58 +123,20 @@ def _config(constants: CoreConstants, period_s: float) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _model_header(line_size: int, spacing_s: float) -> str:
+def _model_header(length: int, spacing_s: float) -> str:
     return f"""#ifndef PACK_MODEL_H
 #define PACK_MODEL_H
 
 #include "cangauge.h"
 
 /* Memory of the delay line, and least time between every second sample that it keeps. */
-#define PACK_LINE_SIZE {line_size}
+#define PACK_LINE_SIZE {length}
 #define PACK_SPACING_S {spacing_s!r}
 
 extern const cg_model pack_model;
 
 #endif
 """
-
-
-def _number(value: object) -> str:
-    if isinstance(value, int):
-        return str(value)
-    number = float(str(value))
-    if math.isinf(number):
-        return "INFINITY" if number > 0.0 else "-INFINITY"
-    return f"(cg_real){number!r}"
-
-
-def _row(values: Sequence[object], *, is_wide: bool = False) -> str:
-    return "{" + ", ".join(map(repr if is_wide else _number, values)) + "}"
-
-
-def _model_source(constants: CoreConstants) -> str:
-    """Return the constants as an initialized structure."""
-    lines = ['#include "pack_model.h"\n\n#include <math.h>\n\nconst cg_model pack_model = {']
-    for name, value in constants.model.items():
-        if isinstance(value, list):
-            if value:
-                lines.append(f"    .{name} = {_row(value, is_wide=name in _WIDE)},")
-        elif name in _WIDE:
-            lines.append(f"    .{name} = {value!r},")
-        else:
-            lines.append(f"    .{name} = {_number(value)},")
-    if constants.functions:
-        lines += ["    .function_v = {", *(f"        {_row(row)}," for row in constants.functions)]
-        lines.append("    },")
-    if constants.effects:
-        lines.append("    .effect = {")
-        for form in constants.effects:
-            parts = [f".kind = CG_{form.kind.upper()}", f".lags = {len(form.tau_s)}"]
-            parts += [f".value = {_row(form.values)}"] if form.values else []
-            parts += [f".tau_s = {_row(form.tau_s)}"] if form.tau_s else []
-            lines.append("        {" + ", ".join(parts) + "},")
-        lines.append("    },")
-    return "\n".join([*lines, "};", ""])
 
 
 def _frames() -> dict[str, str]:
