@@ -1,4 +1,4 @@
-"""Fit the three numbers of `cangauge.diagnosis.classifier` to labelled cases, and judge them.
+"""Fit the three numbers of `cangauge.diagnosis.posterior` to labelled cases, and judge them.
 
     cangauge gap-check --protocol real-bmw_i3 --per-effect 1 --healthy 8 --seed 101 --keep cases …
     python benchmarks/posterior_numbers.py cases…
@@ -26,7 +26,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from cangauge._typing import FloatArray
-from cangauge.diagnosis.classifier import (
+from cangauge.diagnosis.posterior import (
     FITTED,
     NONE,
     UNKNOWN,
