@@ -1,4 +1,4 @@
-"""The test that would settle it: which next log separates the likely causes best.
+"""Plan of the next test: the log that separates the likely causes best.
 
 A test with the current profile of `profiles` adds the information ΔS to the curvature S of the log
 likelihood of all amplitudes, with everything else marginalised. If a is the cause's amplitude, the
@@ -107,7 +107,7 @@ class Plan:
         names = [_IN_WORDS.get(name, name) for name in self.causes]
         if len(names) > NAMED:
             names[NAMED:] = [f"{len(names) - NAMED} more"]
-        purpose = f"tell {names[0]} from {', '.join(names[1:])}" if names[1:] else (
+        purpose = f"distinguish {names[0]} from {', '.join(names[1:])}" if names[1:] else (
             f"confirm {names[0]}"
         )  # fmt: skip
         return (
@@ -147,7 +147,7 @@ class AddedTest:
 
     @property
     def sentence(self) -> str:
-        """What the test changed."""
+        """Change of each probability."""
         answers = dict.fromkeys([*self.before.credible_set, *self.after.credible_set])
         changes = [
             f"{name} {100.0 * self.before.probabilities[name]:.0f} →"
