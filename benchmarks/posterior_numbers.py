@@ -1,10 +1,10 @@
-"""Fit the three numbers of `cangauge.diagnosis.classifier` to labelled cases, and judge them.
+"""Fit the three numbers of `cangauge.diagnosis.posterior` to labelled cases, and judge them.
 
     cangauge gap-check --protocol real-bmw_i3 --per-effect 1 --healthy 8 --seed 101 --keep cases …
     python benchmarks/posterior_numbers.py cases…
 
 Only cases of development seeds are accepted, with one cause of at least the size that the check
-counts, or none. Each case whose cause is in the library is used a second time without that cause,
+counts, or none. Each case whose cause is in the library is diagnosed a second time without it,
 where `unknown` is right, with a quarter of its weight. Protocols weigh by the square root of their
 number of cases. The printed table is cross-validated in four folds by pack.
 """
@@ -12,6 +12,7 @@ number of cases. The printed table is cross-validated in four folds by pack.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import os
 import pickle
@@ -19,14 +20,16 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
 
+import cangauge
 from cangauge._typing import FloatArray
-from cangauge.diagnosis.classifier import (
+from cangauge.diagnosis.posterior import (
     FITTED,
     NONE,
     UNKNOWN,
@@ -38,6 +41,7 @@ from cangauge.diagnosis.classifier import (
 from cangauge.diagnosis.problem import build_problem
 from cangauge.diagnosis.verdict import ALARM_BELOW, credible_set
 from cangauge.logs.read import read_log
+from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Model
 from cangauge.validation.score import LEAST_GAP
 
@@ -60,25 +64,14 @@ class Case:
     evidence: Evidence
     weight: float = 1.0
 
-    def without_cause(self) -> Case:
-        """Return the case with its cause removed from the library."""
-        effects = self.evidence.effects
-        rest = tuple(each for each in effects if each.score.effect_id != self.truth)
-        return replace(
-            self,
-            truth=UNKNOWN,
-            evidence=replace(self.evidence, effects=rest),
-            weight=OUTSIDE_WEIGHT * self.weight,
-        )
-
 
 def main() -> None:
     """Read or diagnose the cases, fit the numbers, and print them."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("folders", nargs="+", type=Path, help="kept by cangauge gap-check --keep")
     cases = [case for folder in parser.parse_args().folders for case in read_cases(folder)]
-    counts = Counter(case.protocol for case in cases)
-    cases = [replace(case, weight=counts[case.protocol] ** -0.5) for case in cases]
+    counts = Counter(case.protocol for case in cases if case.truth != UNKNOWN)
+    cases = [replace(case, weight=case.weight * counts[case.protocol] ** -0.5) for case in cases]
     print_cross_validation(cases)
     print(fit(cases))
 
@@ -93,37 +86,55 @@ def read_cases(folder: Path) -> list[Case]:
     (folder / "evidence").mkdir(exist_ok=True)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     return [
-        read_case(label, folder)
+        case
         for label in usable
         if not label["effects"] or label.get("gap_v", np.inf) >= LEAST_GAP * label["floor_v"]
+        for case in read_label(label, folder)
     ]
 
 
-def read_case(label: dict[str, Any], folder: Path) -> Case:
-    """Diagnose one case up to the evidence."""
-    kept = folder / "evidence" / f"{label['name']}.pkl"
+def read_label(label: dict[str, Any], folder: Path) -> list[Case]:
+    """Return the case, and the same without its cause in the library."""
+    protocol, cause = label["protocol"], (label["effects"] or [NONE])[0]
+    # Recorded cases, warm or cold, are of one pack for each data set.
+    seed, data_set = label.get("world_seed"), protocol.partition("-")[2]
+    pack = f"{protocol} {seed}" if seed is not None else data_set
+    cases = [Case(protocol, pack, cause, read_evidence(label["name"], folder))]
+    if cause in LIBRARY:
+        without = read_evidence(label["name"], folder, cause)
+        cases.append(Case(protocol, pack, UNKNOWN, without, OUTSIDE_WEIGHT))
+    return cases
+
+
+def read_evidence(name: str, folder: Path, *leave_out: str) -> Evidence:
+    """Diagnose a case up to the evidence, or read it as this version of the package found it."""
+    kept = folder / "evidence" / ".".join([name, *leave_out, sources_hash(), "pkl"])
     if not kept.exists():
-        place = folder / "open" / label["name"]
+        place = folder / "open" / name
         logs, references = (
             [read_log(path) for path in sorted(place.glob(f"{kind}_*.parquet"))]
             for kind in ("log", "reference")
         )
-        problem = build_problem(logs, Model.load(place / "model.json"), references)
+        model = Model.load(place / "model.json")
+        problem = build_problem(logs, model, references, leave_out=leave_out)
         kept.write_bytes(pickle.dumps(evidence_of(problem)))
-    evidence = pickle.loads(kept.read_bytes())  # noqa: S301 - own cache
-    pack = f"{label['protocol']} {label.get('world_seed', label['floor_v'])}"
-    return Case(label["protocol"], pack, (label["effects"] or [NONE])[0], evidence)
+    return pickle.loads(kept.read_bytes())  # type: ignore[no-any-return]  # noqa: S301 - own cache
+
+
+@cache
+def sources_hash() -> str:
+    """Return a short hash of the package's sources."""
+    sources = sorted(Path(cangauge.__file__).parent.rglob("*.py"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:12]
 
 
 def fit(cases: Sequence[Case]) -> Calibration:
     """Return the numbers that make the true answers most probable."""
-    names = {case: {each.score.effect_id for each in case.evidence.effects} for case in cases}
-    everything = [*cases, *(case.without_cause() for case in cases if case.truth in names[case])]
-    weights = np.array([case.weight for case in everything])
+    weights = np.array([case.weight for case in cases])
 
     def loss(numbers: FloatArray) -> float:
         by = Calibration(float(np.exp(numbers[0])), float(numbers[1]), float(numbers[2]))
-        of = [posterior_of(case.evidence, by).get(case.truth, 0.0) for case in everything]
+        of = [posterior_of(case.evidence, by).get(case.truth, 0.0) for case in cases]
         return -float(weights @ np.log(np.maximum(of, LEAST_PROBABILITY)) / weights.sum())
 
     start = [np.log(FITTED.tail), FITTED.log_none, FITTED.log_unknown]
@@ -139,7 +150,7 @@ def print_cross_validation(cases: Sequence[Case]) -> None:
     by_protocol: dict[str, list[tuple[str, dict[str, float]]]] = {}
     for fold in range(FOLDS):
         training = [case for case in cases if fold_of[case.pack] != fold]
-        left_out = [case for case in cases if fold_of[case.pack] == fold]
+        left_out = [case for case in cases if fold_of[case.pack] == fold and case.truth != UNKNOWN]
         if not training or not left_out:
             continue
         by = fit(training)

@@ -58,7 +58,7 @@ def test_plan_goes_to_text_file_json_and_page(
     assert max(currents) <= 60.0
 
 
-def test_added_test_tells_what_it_changed(run: Run, command: list[object], tmp_path: Path) -> None:
+def test_added_test_reports_its_change(run: Run, command: list[object], tmp_path: Path) -> None:
     write_log(drive(22, 55.0, 4.0), tmp_path / "further.csv")
     ran = run(*command, "--add-test", tmp_path / "further.csv", "--json")
     assert ran.code == 0

@@ -27,7 +27,7 @@ def mine(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_own_logs_tell_what_would_be_found(
+def test_own_logs_show_what_would_be_found(
     run: Run, made: Path, mine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kinds = tuple(fault_kind(name) for name in ("resistance_asymmetry", "coulombic_efficiency"))

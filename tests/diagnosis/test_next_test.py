@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cangauge.diagnosis.bayes_factors import scores
-from cangauge.diagnosis.classifier import EffectEvidence, Evidence
 from cangauge.diagnosis.hypotheses import Hypotheses
 from cangauge.diagnosis.linear_gaussian import ErrorModel, Posterior
 from cangauge.diagnosis.next_test import (
@@ -23,6 +22,7 @@ from cangauge.diagnosis.next_test import (
     expected_of,
     nats_by_effect,
 )
+from cangauge.diagnosis.posterior import EffectEvidence, Evidence
 from cangauge.diagnosis.problem import build_problem
 from cangauge.diagnosis.profiles import Limits, Profile, library_of_tests
 from cangauge.diagnosis.verdict import decide

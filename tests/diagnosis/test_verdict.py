@@ -71,7 +71,8 @@ def posterior(correlation: float, nats: float) -> tuple[Posterior, Score]:
     correlated[0, 1] = correlated[1, 0] = correlation
     information = 2.0 * nats / 0.25
     curvature = information * correlated / width / width[:, None]
-    error = ErrorModel((0.25,) * SCALES, (), 0.5)
+    ones = dict.fromkeys((choice.effect.id for choice in CHOICES), 1.0)
+    error = ErrorModel((0.25,) * SCALES, (), 0.5, overdispersion=ones)
     hypotheses = Hypotheses(CHOICES, None, np.ones(1))
     none = np.zeros(3)
     found = Posterior(

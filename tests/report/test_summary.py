@@ -76,7 +76,7 @@ def test_the_size_that_would_be_separable_is_given() -> None:
     unclear = Ceiling({"capacity": math.log(20.0) / 4.0, "hysteresis": 50.0}, 0.7)
     found = diagnosis("current_offset", one("offset_a", 1.5, None), ceiling=unclear)
     text = open_question(found)
-    assert "cannot tell current_offset from capacity below 3.0" in text
+    assert "cannot distinguish current_offset from capacity below 3.0" in text
     assert "70 % of cases" in text
     clear = Ceiling({"capacity": 30.0}, 1.0)
     found = diagnosis("current_offset", one("offset_a", 1.5, None), ceiling=clear)

@@ -88,7 +88,7 @@ class OwnLogsOptions:
     def _show(self, result: dict[str, Any]) -> None:
         if self.report is not None:
             # bokeh takes half a second to import.
-            from cangauge.report.own_logs import own_logs_report  # noqa: PLC0415
+            from cangauge.report.check import own_logs_report  # noqa: PLC0415
 
             write_text_atomic(self.report, own_logs_report(result))
             note(f"report: {self.report}")

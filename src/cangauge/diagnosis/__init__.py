@@ -16,7 +16,7 @@ linear_gaussian     normal equations of logs; posterior of the amplitudes
 error_model         error of healthy logs by time scale, prior scales, overdispersion
 structure           structure that the references need, and the model with it
 bayes_factors       Bayes factor of every effect against no effect
-classifier          effect features → probabilities of `none`, every effect and `unknown`
+posterior           effect features → probabilities of `none`, every effect and `unknown`
 verdict             probabilities → verdict, alarm, credible set, family; ceiling
 cross_validation    errors on held-out rows, closed fraction, SoC error
 extended_model      refined amplitudes, change points; the extended model file
@@ -29,7 +29,6 @@ next_test           which test would separate the likely causes best
 The method is described in docs/diagnosis.md.
 """
 
-from cangauge.diagnosis.classifier import NONE, UNKNOWN
 from cangauge.diagnosis.cross_validation import rms
 from cangauge.diagnosis.diagnose import LIKELY, Diagnosis, diagnose
 from cangauge.diagnosis.error_breakdown import (
@@ -45,6 +44,7 @@ from cangauge.diagnosis.error_breakdown import (
     segment_signals,
 )
 from cangauge.diagnosis.next_test import design_of
+from cangauge.diagnosis.posterior import NONE, UNKNOWN
 from cangauge.diagnosis.problem import DiagnosisProblem, build_problem
 from cangauge.diagnosis.verdict import ALARM_BELOW, Ceiling, Verdict, decide
 

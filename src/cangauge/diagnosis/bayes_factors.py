@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import log_ndtr
+from scipy.special import log_ndtr, logsumexp
 
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.hypotheses import Hypotheses
@@ -74,58 +74,77 @@ def _score(posterior: Posterior, chosen: tuple[int, ...]) -> Score | None:
     hypotheses = posterior.hypotheses
     at, bounds = hypotheses.amplitudes_of(chosen), hypotheses.bounds_of(chosen)
     effect_id = hypotheses.candidates[chosen[0]].effect.id
-    overdispersion = posterior.error.overdispersion.get(effect_id, 1.0)
+    overdispersion = posterior.error.overdispersion_of(effect_id)
     gradient = posterior.gradient[at] / overdispersion
     curvature = posterior.curvature[np.ix_(at, at)] / overdispersion
-    prior = prior_precision(bounds)
-    total = curvature + prior
-    amplitude = np.linalg.solve(total, gradient)
+    widths = np.array(PRIOR_WIDTHS)[:, None, None]
+    factors, modes, covariances = bounded_evidence(
+        gradient[None], curvature, prior_precision(bounds) / widths**2, bounds
+    )
+    amplitude = modes[0, 0]
     within = np.clip(amplitude, bounds[:, 0], bounds[:, 1])
     if len(chosen) > 1 and np.any(within != amplitude):
         return None  # one of the two alone is the best within bounds
-    factors = [
-        _log_bayes_factor(gradient, curvature, prior / width**2, bounds) for width in PRIOR_WIDTHS
-    ]
     return Score(
         effect_id=effect_id,
-        log_bayes_factor=_log_mean(factors),
+        log_bayes_factor=_log_mean(factors[:, 0]),
         candidates=chosen,
         amplitude=within,
-        covariance=np.asarray(np.linalg.inv(total), dtype=np.float64),
+        covariance=covariances[0],
         explained=overdispersion * float(2.0 * gradient @ within - within @ curvature @ within),
     )
 
 
-def _log_bayes_factor(
+def normal_evidence(
+    gradient: FloatArray, curvature: FloatArray, prior: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return ln of the Bayes factor of unbounded amplitudes against none, and their posterior.
+
+    Parameters
+    ----------
+    gradient : array of shape (…, n, k)
+        Of the log likelihood without amplitudes.
+    curvature, prior : array of shape (…, k, k)
+        Of the log likelihood, and prior precision.
+
+    Returns
+    -------
+    log_bayes : array of shape (…, n)
+    mode : array of shape (…, n, k)
+    covariance : array of shape (…, k, k)
+    """
+    total = curvature + prior
+    covariance = np.asarray(np.linalg.inv(total), dtype=np.float64)
+    mode = gradient @ covariance
+    occam = 0.5 * (np.linalg.slogdet(total)[1] - np.linalg.slogdet(prior)[1])
+    return 0.5 * np.sum(gradient * mode, axis=-1) - occam[..., None], mode, covariance
+
+
+def bounded_evidence(
     gradient: FloatArray, curvature: FloatArray, prior: FloatArray, bounds: FloatArray
-) -> float:
-    """Return ln of the Bayes factor of amplitudes with this prior precision against none.
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the same for amplitudes within bounds, shape (…, k, 2).
 
     The integral over one amplitude is bounded, as is its prior. Over two it is that of a normal
     distribution, since mixtures whose mode is out of bounds are left out.
     """
-    total = curvature + prior
-    occam = 0.5 * float(np.linalg.slogdet(np.linalg.solve(prior, total))[1])
-    mode = np.linalg.solve(total, gradient)
-    unbounded = 0.5 * float(gradient @ mode) - occam
-    if gradient.size > 1:
-        return unbounded
-    within = _log_mass((bounds[0] - mode) * np.sqrt(total[0, 0]))
-    return unbounded + within - _log_mass(bounds[0] * np.sqrt(prior[0, 0]))
+    log_bayes, mode, covariance = normal_evidence(gradient, curvature, prior)
+    if bounds.shape[-2] == 1:
+        log_bayes += _log_mass((bounds - mode) * np.sqrt(curvature + prior))
+        log_bayes -= _log_mass(bounds * np.sqrt(prior))
+    return log_bayes, mode, covariance
 
 
-def _log_mass(limits: FloatArray) -> float:
-    """Return ln of the standard normal probability between two limits, exact in the tails too."""
-    low, high = limits.tolist()
-    if low > 0.0:
-        low, high = -high, -low
-    upper, lower = log_ndtr(high), log_ndtr(low)
-    return float(upper + np.log1p(-np.exp(lower - upper)))
+def _log_mass(limits: FloatArray) -> FloatArray:
+    """Return ln of the standard normal probability between limits, shape (…, 2), in tails too."""
+    low, high = limits[..., 0], limits[..., 1]
+    low, high = np.where(low > 0.0, (-high, -low), (low, high))
+    lower, upper = log_ndtr(low), log_ndtr(high)
+    return np.asarray(upper + np.log1p(-np.exp(lower - upper)))
 
 
-def _log_mean(values: Sequence[float]) -> float:
-    array = np.array(values)
-    return float(np.log(np.mean(np.exp(array - array.max()))) + array.max())
+def _log_mean(values: Sequence[float] | FloatArray) -> float:
+    return float(logsumexp(values) - np.log(len(values)))
 
 
 def condition_on(posterior: Posterior, given: Sequence[int]) -> Posterior:

@@ -20,12 +20,6 @@ from cangauge.diagnosis.caveats import (
     reference_fit_caveat,
     temperature_step_caveat,
 )
-from cangauge.diagnosis.classifier import (
-    EXPECTED_BEYOND,
-    MIN_LOG_BAYES,
-    NONE,
-    UNKNOWN,
-)
 from cangauge.diagnosis.cross_validation import (
     Fold,
     HeldOutErrors,
@@ -49,6 +43,12 @@ from cangauge.diagnosis.extended_model import (
     extend,
     extended_model_file,
     parameters_of,
+)
+from cangauge.diagnosis.posterior import (
+    EXPECTED_BEYOND,
+    MIN_LOG_BAYES,
+    NONE,
+    UNKNOWN,
 )
 from cangauge.diagnosis.problem import DiagnosisProblem, build_problem
 from cangauge.diagnosis.verdict import ALARM_BELOW, Verdict, decide
@@ -351,7 +351,7 @@ def diagnose(
             source=logs[0].source or logs[0].name,
             cure="give a log of at least 10 min, better half an hour with changing load and SoC",
         )
-    _LOG.info("classifying the effects")
+    _LOG.info("comparing the effects")
     verdict = decide(problem, alarm_below)
     _LOG.info("cross-validating")
     errors = held_out_errors(problem, held_out, [score.effect_id for score in verdict.accepted])

@@ -15,6 +15,7 @@ The error is correlated in time: products are formed for each time scale of a Ha
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -38,6 +39,10 @@ STRUCTURE_STD = 0.1
 """Standard deviation by which diagnosed logs may change the structure of the references, in parts
 of its bounds. Without this limit, structure would absorb a cause of the same effect."""
 
+USUAL_OVERDISPERSION = 3.4
+"""Median over six development packs (i3, car1, LG at 0, 10 and 25 °C, simulated: 1.5–5.8): used
+where references do not show it."""
+
 JITTER = 1e-10
 """Relative diagonal load: coefficients without information stay at their prior mean."""
 
@@ -54,7 +59,7 @@ class ErrorModel:
     """RMS error of a row without the per-log effects [V]."""
     overdispersion: Mapping[str, float] = field(default_factory=dict)
     """Ratio of each effect's squared evidence on left-out references to its expectation by chance;
-    1 where not listed."""
+    empty where not known."""
     reference_v2: float = 0.0
     """Mean square error of left-out references, per-log effects included [V²]."""
     reference_excess: tuple[float, ...] = ()
@@ -68,6 +73,16 @@ class ErrorModel:
     def lasting_v2(self) -> float:
         """Variance per row of an error that does not average out [V²]."""
         return self.scale_v2[-1]
+
+    @property
+    def usual_overdispersion(self) -> float:
+        """Geometric mean of the overdispersions."""
+        known = [*self.overdispersion.values()]
+        return math.exp(float(np.mean(np.log(known)))) if known else USUAL_OVERDISPERSION
+
+    def overdispersion_of(self, effect_id: str) -> float:
+        """Return an effect's overdispersion, the usual one where its own is not known."""
+        return self.overdispersion.get(effect_id, self.usual_overdispersion)
 
 
 @dataclass(frozen=True, eq=False)

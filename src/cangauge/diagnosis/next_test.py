@@ -1,11 +1,11 @@
-"""The test that would settle it: which next log separates the likely causes best.
+"""Plan of the next test: the log that separates the likely causes best.
 
 A test with the current profile of `profiles` adds the information ΔS to the curvature S of the log
 likelihood of all amplitudes, with everything else marginalised. If a is the cause's amplitude, the
 test adds the gradient Δg = ΔS·a plus noise of covariance ΔS to g: this is exact for a linear
 Gaussian model, and needs the columns of the test alone. For each cause of the credible set,
 amplitudes are drawn from its posterior and gradients from this; the probabilities then follow from
-the nats that each effect explains, as in the classifier. Its other two measures, of the error that
+the nats that each effect explains, as in `posterior`. Its other two measures, of the error that
 remains, are held at their present values. The test with the largest expected information about the
 cause is proposed (Lindley, Annals of Mathematical Statistics 27 (1956) 986).
 
@@ -15,27 +15,25 @@ cause is proposed (Lindley, Annals of Mathematical Statistics 27 (1956) 986).
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.special import log_ndtr, logsumexp
+from scipy.special import logsumexp
 
 from cangauge._typing import FloatArray
-from cangauge.diagnosis.bayes_factors import PRIOR_WIDTHS
-from cangauge.diagnosis.classifier import (
+from cangauge.diagnosis.bayes_factors import PRIOR_WIDTHS, bounded_evidence
+from cangauge.diagnosis.design_matrix import DesignMatrix, candidates_for, design_matrix
+from cangauge.diagnosis.hypotheses import Hypotheses, Indices
+from cangauge.diagnosis.linear_gaussian import Posterior, marginalize, prior_precision
+from cangauge.diagnosis.posterior import (
     NONE,
     UNKNOWN,
-    USUAL_OVERDISPERSION,
     Evidence,
     evidence_of,
     posterior_of,
 )
-from cangauge.diagnosis.design_matrix import DesignMatrix, candidates_for, design_matrix
-from cangauge.diagnosis.hypotheses import Hypotheses, Indices
-from cangauge.diagnosis.linear_gaussian import Posterior, marginalize, prior_precision
 from cangauge.diagnosis.problem import DiagnosisProblem, sampled_for_diagnosis
 from cangauge.diagnosis.profiles import Limits, Profile, library_of_tests
 from cangauge.diagnosis.verdict import Verdict
@@ -109,7 +107,7 @@ class Plan:
         names = [_IN_WORDS.get(name, name) for name in self.causes]
         if len(names) > NAMED:
             names[NAMED:] = [f"{len(names) - NAMED} more"]
-        purpose = f"tell {names[0]} from {', '.join(names[1:])}" if names[1:] else (
+        purpose = f"distinguish {names[0]} from {', '.join(names[1:])}" if names[1:] else (
             f"confirm {names[0]}"
         )  # fmt: skip
         return (
@@ -149,7 +147,7 @@ class AddedTest:
 
     @property
     def sentence(self) -> str:
-        """What the test changed."""
+        """Change of each probability."""
         answers = dict.fromkeys([*self.before.credible_set, *self.after.credible_set])
         changes = [
             f"{name} {100.0 * self.before.probabilities[name]:.0f} →"
@@ -243,17 +241,12 @@ def _information(problem: DiagnosisProblem, profile: Profile) -> FloatArray:
 
 def _tempered(posterior: Posterior) -> Posterior:
     """Return the posterior divided by the mean overdispersion, as the evidence is weighed."""
-    overdispersion = _mean_overdispersion(posterior)
+    overdispersion = posterior.error.usual_overdispersion
     return replace(
         posterior,
         gradient=posterior.gradient / overdispersion,
         curvature=posterior.curvature / overdispersion,
     )
-
-
-def _mean_overdispersion(posterior: Posterior) -> float:
-    known = [*posterior.error.overdispersion.values()]
-    return math.exp(float(np.mean(np.log(known)))) if known else USUAL_OVERDISPERSION
 
 
 def _without_unknown(probabilities: Mapping[str, float]) -> dict[str, float]:
@@ -345,33 +338,18 @@ def evidence(
         by_size.setdefault(len(hypotheses.candidates[k].amplitudes), []).append(k)
     widths = np.array(PRIOR_WIDTHS)[:, None, None, None]
     found = []
-    for size, chosen in by_size.items():
+    for chosen in by_size.values():
         at = np.stack([hypotheses.amplitudes_of([k]) for k in chosen])
         bounds = np.stack([hypotheses.candidates[k].bounds for k in chosen])
         prior = np.stack([prior_precision(each) for each in bounds]) / widths**2
-        total = curvature[at[:, :, None], at[:, None, :]] + prior
-        covariance = np.asarray(np.linalg.inv(total), dtype=np.float64)
+        own = curvature[at[:, :, None], at[:, None, :]]
         gradient = gradients[:, at].transpose(1, 0, 2)
-        mode = gradient @ covariance
+        log_bayes, mode, covariance = bounded_evidence(gradient, own, prior, bounds)
         within = np.clip(mode[0], bounds[:, None, :, 0], bounds[:, None, :, 1])
-        response = within @ curvature[at[:, :, None], at[:, None, :]]
-        nats = np.sum(gradient * within - 0.5 * response * within, axis=-1)
-        occam = 0.5 * (np.linalg.slogdet(total)[1] - np.linalg.slogdet(prior)[1])
-        log_bayes = 0.5 * np.sum(gradient * mode, axis=-1) - occam[..., None]
-        if size == 1:
-            log_bayes += _log_mass((bounds[:, 0, None] - mode) * np.sqrt(total[..., :1, 0, None]))
-            log_bayes -= _log_mass(bounds[:, 0, None] * np.sqrt(prior[..., :1, 0, None]))
+        nats = np.sum((gradient - 0.5 * within @ own) * within, axis=-1)
         ids = tuple(hypotheses.candidates[k].effect.id for k in chosen)
         found.append(CandidateEvidence(ids, at, bounds, log_bayes, mode, covariance, nats))
     return found
-
-
-def _log_mass(limits: FloatArray) -> FloatArray:
-    """Return ln of the standard normal probability between limits, shape (…, 2), in tails too."""
-    low, high = limits[..., 0], limits[..., 1]
-    low, high = np.where(low > 0.0, (-high, -low), (low, high))
-    lower, upper = log_ndtr(low), log_ndtr(high)
-    return np.asarray(upper + np.log1p(-np.exp(lower - upper)))
 
 
 def expected_of(
@@ -389,7 +367,7 @@ def expected_of(
     judged : Evidence
         On the present logs.
     """
-    added = added / _mean_overdispersion(now)
+    added = added / now.error.usual_overdispersion
     values, vectors = np.linalg.eigh(0.5 * (added + added.T))
     noise = (simulated.noise * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     gradients = np.concatenate(
@@ -421,8 +399,11 @@ def nats_by_effect(
         for name, of_shape, nats in zip(each.effect_ids, log_bayes, each.nats, strict=True):
             known, known_nats = best.get(name, (of_shape, nats))
             best[name] = (np.maximum(known, of_shape), np.where(of_shape > known, nats, known_nats))
-    usual, own = _mean_overdispersion(now), now.error.overdispersion
-    return {name: nats * usual / own.get(name, usual) for name, (_, nats) in best.items()}
+    error = now.error
+    return {
+        name: nats * error.usual_overdispersion / error.overdispersion_of(name)
+        for name, (_, nats) in best.items()
+    }
 
 
 def _after(judged: Evidence, gained: Mapping[str, FloatArray], number: int) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Current profiles of tests that could tell causes apart, within the limits of pack and user."""
+"""Current profiles of tests that separate causes, within the limits of pack and user."""
 
 from __future__ import annotations
 

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from cangauge._typing import FloatArray
-from cangauge.diagnosis.bayes_factors import Score, condition_on, scores
-from cangauge.diagnosis.classifier import NONE, UNKNOWN, probabilities
+from cangauge.diagnosis.bayes_factors import Score, condition_on, normal_evidence, scores
 from cangauge.diagnosis.linear_gaussian import Posterior, prior_precision
+from cangauge.diagnosis.posterior import NONE, UNKNOWN, probabilities
 from cangauge.diagnosis.problem import DiagnosisProblem
 from cangauge.model.effects.library import LIBRARY
 
@@ -187,12 +187,13 @@ def ceiling_of(posterior: Posterior, true: Score) -> Ceiling:
     """
     hypotheses = posterior.hypotheses
     at = hypotheses.amplitudes_of(true.candidates)
-    curvature = posterior.curvature / posterior.error.overdispersion.get(true.effect_id, 1.0)
+    curvature = posterior.curvature / posterior.error.overdispersion_of(true.effect_id)
     mean = curvature[:, at] @ true.amplitude
     full = float(true.amplitude @ mean[at])
     values, vectors = np.linalg.eigh(curvature)
     noise = np.random.default_rng(0).standard_normal((DRAWS, values.size))
     drawn = mean + (noise * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    gradients = np.vstack([mean, drawn])
     evidence: dict[str, list[FloatArray]] = {}
     nearest: dict[str, float] = {}
     for k, candidate in enumerate(hypotheses.candidates):
@@ -201,12 +202,11 @@ def ceiling_of(posterior: Posterior, true: Score) -> Ceiling:
             continue
         mine = hypotheses.amplitudes_of([k])
         prior = prior_precision(candidate.bounds)
-        total = curvature[np.ix_(mine, mine)] + prior
-        occam = 0.5 * float(np.linalg.slogdet(np.linalg.solve(prior, total))[1])
-        gradient = drawn[:, mine]
-        squares = np.einsum("ij,ij->i", gradient, np.linalg.solve(total, gradient.T).T)
-        evidence.setdefault(name, []).append(0.5 * squares - occam)
-        explained = 0.5 * float(mean[mine] @ np.linalg.solve(total, mean[mine]))
+        log_bayes, mode, _ = normal_evidence(
+            gradients[:, mine], curvature[np.ix_(mine, mine)], prior
+        )
+        evidence.setdefault(name, []).append(log_bayes[1:])
+        explained = 0.5 * float(mean[mine] @ mode[0])
         nearest[name] = min(nearest.get(name, math.inf), max(0.5 * full - explained, 0.0))
     nearest.pop(true.effect_id, None)
     means = {

@@ -197,8 +197,8 @@ def _separability(diagnosis: Diagnosis) -> list[str]:
     else:
         limit = f"below {significant(part * abs(at[0]), 2)} {at[1]}"
     return [
-        f"These logs cannot tell {verdict.cause} from {rival} {limit}: at the size found the best"
-        f" method would name the right one in {best:.0f} % of cases."
+        f"These logs cannot distinguish {verdict.cause} from {rival} {limit}: at the size found"
+        f" the best method would name the right one in {best:.0f} % of cases."
     ]
 
 

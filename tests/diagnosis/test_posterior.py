@@ -14,7 +14,7 @@ from scipy.integrate import quad
 from scipy.stats import gamma
 
 from cangauge.diagnosis.bayes_factors import Score
-from cangauge.diagnosis.classifier import (
+from cangauge.diagnosis.posterior import (
     FITTED,
     NONE,
     UNEXPLAINED,

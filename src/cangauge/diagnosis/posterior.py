@@ -61,9 +61,9 @@ UNEXPLAINED = 0.15
 a pack's fault, and an unknown cause must not win for explaining that too. Between 0.1 and 0.25 the
 log score of the development cases changes by 0.01."""
 
-USUAL_OVERDISPERSION, USUAL_EXCESS = 3.4, 90.0
-"""Median over six development packs (i3, car1, LG at 0, 10 and 25 °C, simulated: 1.5–5.8, 11–1110):
-used where references do not show it, and as one further reference of the excess."""
+USUAL_EXCESS = 90.0
+"""Median over six development packs (i3, car1, LG at 0, 10 and 25 °C, simulated: 11–1110), used as
+one further reference."""
 
 EXPECTED_BEYOND = frozenset({"resistance_temperature"})
 """Beyond the references' temperatures the resistance of every healthy pack differs, so this has the
@@ -129,8 +129,7 @@ def evidence_of(problem: DiagnosisProblem) -> Evidence:
     hypotheses, error, logs = problem.hypotheses, problem.error, problem.weighted_equations
     posterior = problem.posterior
     references = marginalize(hypotheses, problem.reference_equations, [], error)
-    own = error.overdispersion
-    usual = math.exp(float(np.mean(np.log([*own.values()])))) if own else USUAL_OVERDISPERSION
+    usual = error.usual_overdispersion
     causes = {each.effect.id for each in hypotheses.candidates if each.effect.is_cause}
     shared = replace(posterior, error=replace(error, overdispersion=dict.fromkeys(causes, usual)))
 
@@ -144,7 +143,7 @@ def evidence_of(problem: DiagnosisProblem) -> Evidence:
         effects.append(
             EffectEvidence(
                 score=score,
-                nats=0.5 * score.explained / own.get(score.effect_id, usual),
+                nats=0.5 * score.explained / error.overdispersion_of(score.effect_id),
                 excess=excess_chi_square(posterior, logs, references.chi_square, score),
                 mean_square_v2=mean_square(
                     posterior.mean - posterior.sensitivity[:, at] @ score.amplitude, score
