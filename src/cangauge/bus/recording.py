@@ -199,6 +199,18 @@ def open_with_columns(
     return replace(recording, sign=sign) if isinstance(recording, LogFile) else recording
 
 
+def refuse_sign_of_capture(recording: LogFile | Capture, sign: str | None) -> None:
+    """Raise InputError if the sign of current is stated for a capture."""
+    if sign is not None and not isinstance(recording, LogFile):
+        raise InputError(
+            "this is a capture, whose map states the sign",
+            source=recording.path,
+            field="--sign",
+            value=sign,
+            cure="set sign = -1 under [current] of the map file",
+        )
+
+
 def capture_without_vehicle(path: str | PathLike[str]) -> InputError:
     """Return the error for a capture whose vehicle is not given."""
     return InputError(

@@ -22,7 +22,7 @@ from typing import Any, Final
 
 from cangauge._io import MAX_LOG_BYTES
 from cangauge.bus.captures.capture import Capture
-from cangauge.bus.recording import log_of, open_with_columns
+from cangauge.bus.recording import log_of, open_with_columns, refuse_sign_of_capture
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.identify.starts import with_start
@@ -330,11 +330,7 @@ class ReadOptions:
             If the file cannot be read, or the sign is stated for a capture.
         """
         found = open_with_columns(path, columns=self.columns, mapped=self.mapped, sign=self.sign)
-        if self.sign is not None and not isinstance(found, LogFile):
-            raise InputError(
-                "this is a capture, whose map states the sign", source=path, field="--sign",
-                value=self.sign, cure="set sign = -1 under [current] of the map file",
-            )  # fmt: skip
+        refuse_sign_of_capture(found, self.sign)
         return found
 
     def read(self, path: Path, url: str) -> Log:
