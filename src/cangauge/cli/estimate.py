@@ -15,7 +15,7 @@ from cangauge._formatting import number
 from cangauge._io import atomic_path
 from cangauge.bus.captures.capture import Capture
 from cangauge.bus.publish import PackReport
-from cangauge.bus.recording import capture_without_vehicle
+from cangauge.bus.recording import capture_without_vehicle, refuse_single_row
 from cangauge.cli.options import (
     FiguresOption,
     JsonOption,
@@ -26,7 +26,6 @@ from cangauge.cli.options import (
     known_temperature_source,
     option_groups,
     refuse_inverted_current,
-    refuse_single_row,
     within,
 )
 from cangauge.cli.output import console, emit_json, note, print_table, save_figures

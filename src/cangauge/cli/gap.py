@@ -135,7 +135,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
         typer.Option(
             metavar="LOG",
             help="Log of a further test of the same cause, beside the LOGs of the first diagnosis:"
-            " diagnoses both together and tells what the test changed; repeat the option.",
+            " diagnoses both together and reports what the test changed; repeat the option.",
         ),
     ] = None,
     *,

@@ -167,7 +167,7 @@ def gap_check_command(  # noqa: PLR0917 - typer passes options by name
     temperature.
 
     With LOGs: injects every effect at three sizes into your own logs without a fault, diagnoses
-    each with the others as references, and tells what this diagnosis would find on this pack.
+    each with the others as references, and reports what this diagnosis would find on this pack.
 
     Examples
     --------

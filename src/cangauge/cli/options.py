@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable, Iterable, Sized
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, is_dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -229,8 +229,12 @@ class Reading:
             If the input cannot be read or has a single row, an option has an unknown value, or the
             data show clearly that positive current charges, unless `sign` states it.
         """
-        from cangauge.bus.recording import log_of, refuse_sign_of_capture  # noqa: PLC0415
-        from cangauge.logs.read import LogFile  # noqa: PLC0415 - as in `car`
+        from cangauge.bus.recording import (  # noqa: PLC0415 - as in `car`
+            log_of,
+            refuse_sign_of_capture,
+            refuse_single_row,
+        )
+        from cangauge.logs.read import LogFile  # noqa: PLC0415
 
         source = known_temperature_source(self.temperature_source)
         recording = self.open(path)
@@ -337,16 +341,6 @@ def within(value: _Value, low: float, high: float, *, option: str, unit: str) ->
             f"must lie within {low:g} … {high:g} {unit}".rstrip(), field=option, value=value
         )
     return value
-
-
-def refuse_single_row(recorded: Sized) -> None:
-    """Raise InputError for a log of one row: no charge can be counted."""
-    if len(recorded) < 2:
-        raise InputError(
-            "a single row: charge is counted from one row to the next",
-            source=getattr(recorded, "source", None),
-            cure="give a log of minutes or hours",
-        )
 
 
 def refuse_inverted_current(log: Log, *, is_capture: bool) -> None:
