@@ -71,15 +71,7 @@ CapacityOption = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class Cluster:
-    """What computes, and how its logs name their vehicles.
-
-    Parameters
-    ----------
-    scheduler : str
-    workers : int, optional
-    pattern : str
-        See `find_logs`.
-    """
+    """The options of every fleet command: what computes, and how logs name their vehicles."""
 
     scheduler: Annotated[
         str,
@@ -99,6 +91,10 @@ class Cluster:
             help="The first group finds the vehicle in the name of a log. Default: its folder.",
         ),
     ] = VEHICLE_PATTERN  # fmt: skip
+
+    def find(self, logs: Sequence[str]) -> list[FleetLog]:
+        """Return the logs that paths, globs and manifests name (`find_logs`)."""
+        return find_logs(logs, pattern=self.pattern)
 
     def run(self, work: Callable[[Any], Any]) -> Any:
         """Return what a function of the Dask client returns; show its progress."""
@@ -164,7 +160,7 @@ def fit_fleet_command(
     within(t_ref, -60.0, 120.0, option="--t-ref", unit="°C")
     options = FitOptions(capacity_ah, None, rate_hz, parse_delays(delays), epsilon, t_ref)
     check_outputs([output], [])
-    how, found_logs = _read_options(reading), find_logs(logs, pattern=cluster.pattern)
+    how, found_logs = _read_options(reading), cluster.find(logs)
     result = cluster.run(lambda client: fit_fleet(found_logs, how, options, out, client, name=name))
     write_texts_atomic({output: result.model.to_json()})
     if json_output:
@@ -211,8 +207,7 @@ def estimate_fleet_command(
     """
     settings = EstimatorSettings(capacity_ah=capacity_ah)
     job = EstimateJob(_read_options(reading), Model.load(model), settings)
-    found = find_logs(logs, pattern=cluster.pattern)
-    _run(job, found, out, cluster, report, json_output=json_output)
+    _run(job, cluster.find(logs), out, cluster, report, json_output=json_output)
 
 
 @fleet_app.command("health")
@@ -238,8 +233,7 @@ def health_fleet_command(
     """
     settings = EstimatorSettings(capacity_ah=capacity_ah)
     job = HealthJob(_read_options(reading), Model.load(model), settings)
-    found = find_logs(logs, pattern=cluster.pattern)
-    _run(job, found, out, cluster, report, json_output=json_output)
+    _run(job, cluster.find(logs), out, cluster, report, json_output=json_output)
 
 
 @fleet_app.command("gap")
@@ -286,9 +280,9 @@ def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
     within(float(references), 1, 1000, option="--references", unit="")
     within(float(latest), 1, 1000, option="--latest", unit="")
     within(alarm, 0.0, 1.0, option="--alarm", unit="")
-    known = find_logs(reference or [], pattern=cluster.pattern)
+    known = cluster.find(reference or [])
     healthy = {log.url for log in known}
-    found = [log for log in find_logs(logs, pattern=cluster.pattern) if log.url not in healthy]
+    found = [log for log in cluster.find(logs) if log.url not in healthy]
     suspect, good = suspect_and_healthy(
         [*found, *(replace(log, healthy=True) for log in known)], latest
     )
@@ -355,12 +349,7 @@ def _show(summary: Summary, found: FleetOverview) -> None:
         note(f"set aside: {count} × {reason}")
     if found.gaps:
         rows = [
-            [
-                name,
-                row["verdict"],
-                number(row["probability"], 2),
-                number(row["probability_none"], 3),
-            ]
+            [name, row["verdict"], number(row["probability"], 2), number(row["probability_none"])]
             for name, row in ((name, found.gaps[name]) for name in found.alarms)
         ]
         print_table("Vehicles with a gap", ["vehicle", "<cause", "probability", "P(none)"], rows)
