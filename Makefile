@@ -6,7 +6,10 @@ BIN := $(VENV)/bin
 # Where SocketCAN is not to be had directly, a command that provides it (as in .ci/run).
 SOCKETCAN ?= $(wildcard ../shared/tools/with-socketcan)
 
-.PHONY: help demo test lint coverage check faults trips bench bench-check lowest site wheel clean
+# Folder of the recorded logs (see README for their sources).
+DATA ?= $(wildcard ../shared/data)
+
+.PHONY: help demo test lint coverage check data faults trips bench bench-check lowest site wheel clean
 
 help:
 	@echo "make demo      the whole job on the shipped log: fit, bus, service, report"
@@ -18,8 +21,8 @@ help:
 	@echo "make lowest    the lowest versions that pyproject.toml allows, on every Python here (or PYTHONS=…)"
 	@echo "make site      the documentation as a site, in out/site"
 	@echo "make wheel     build the wheel and run the job from it in an environment of its own"
-	@echo "make bench     time and accuracy beside other packages, and how the cost grows (see README for the data)"
-	@echo "make trips     the table on the real BMW i3 trips (see README for the data)"
+	@echo "make bench     time and accuracy beside other packages, and how the cost grows (DATA=FOLDER, see README)"
+	@echo "make trips     the table on the real BMW i3 trips (DATA=FOLDER, see README)"
 
 $(VENV)/installed: pyproject.toml hatch_build.py $(wildcard core/*.[ch])
 	$(PYTHON) -c 'import sys; sys.exit("cangauge needs Python 3.11 or later (set PYTHON=…)" if sys.version_info < (3, 11) else 0)'
@@ -56,23 +59,26 @@ coverage: $(VENV)/installed-dev
 check: $(VENV)/installed
 	$(BIN)/cangauge gap-check --part small
 
-trips: $(VENV)/installed
-	$(BIN)/python benchmarks/real_trips.py
+data:
+	@test -d "$(DATA)" || { echo "no folder '$(DATA)' of recorded logs: name it, make $(MAKECMDGOALS) DATA=FOLDER (see README for the sources)" >&2; exit 2; }
+
+trips: data $(VENV)/installed
+	$(BIN)/python benchmarks/real_trips.py --data "$(DATA)/bmw_i3"
 
 # The other packages, in an environment of their own.
 PEERS := .venv-peers
 BENCH := out/bench
 
-$(PEERS)/installed:
+$(PEERS)/installed: benchmarks/peers.txt
 	$(PYTHON) -m venv $(PEERS)
-	$(PEERS)/bin/python -m pip install --quiet --disable-pip-version-check numpy filterpy thevenin pybamm progpy pybatteryse
+	$(PEERS)/bin/python -m pip install --quiet --disable-pip-version-check --requirement $<
 	touch $@
 
 bench: export OMP_NUM_THREADS := 1
 bench: export OPENBLAS_NUM_THREADS := 1
-bench: $(VENV)/installed-dev $(PEERS)/installed
+bench: data $(VENV)/installed-dev $(PEERS)/installed
 	mkdir -p $(BENCH)
-	$(BIN)/python benchmarks/peers.py --peers $(PEERS)/bin/python --json $(BENCH)/peers.json --figure $(BENCH)/peers.png
+	$(BIN)/python benchmarks/peers.py --data "$(DATA)" --peers $(PEERS)/bin/python --json $(BENCH)/peers.json --figure $(BENCH)/peers.png
 	$(BIN)/python benchmarks/cost.py --json $(BENCH)/cost.json
 
 # Warns, never fails.

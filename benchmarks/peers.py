@@ -1,13 +1,14 @@
 """Time of a step and accuracy beside other packages, each fitted to the same training logs.
 
-    make bench                                      # or
+    make bench DATA=FOLDER                          # or
     python benchmarks/peers.py --data FOLDER --peers ENVIRONMENT/bin/python [--json FILE]
 
-Packs: the i3's even trips, and every second piece of car1, at 1 Hz, with models of ten training
-logs. The peers' circuit is `cangauge export-ecm` of the model of those logs; PyBatterySE identifies
-its own from them, and takes only the curve. All begin from the first voltage, σ 10 %; the MAE
-counts from the fifth minute on. Times are of the processor, of one process at a time, in turn, the
-median of the rounds. A sample at 10 Hz is 0.1 s; our filter uses the voltage once a second.
+The peers' versions are in peers.txt. Packs: the i3's even trips, and every second piece of car1, at
+1 Hz, with models of ten training logs. The peers' circuit is `cangauge export-ecm` of the model of
+those logs; PyBatterySE identifies its own from them, and takes only the curve. All begin from the
+first voltage, σ 10 %; the MAE counts from the fifth minute on. Times are of the processor, of one
+process at a time, in turn, the median of the rounds. A sample at 10 Hz is 0.1 s; our filter uses
+the voltage once a second.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from cangauge.errors import InputError
 from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import run_estimator, samples_of
@@ -40,7 +42,6 @@ from cangauge.model.coulomb_counting import capacity_from_reference
 from cangauge.model.model_file import Model
 from cangauge.validation.packs import RATE_HZ, load
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 PACKS = ("i3", "car1")
 TRAINING_LOGS, SEED = 10, 0
 SETTLED_S = 300.0
@@ -218,13 +219,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("--data", type=Path, default=DATA, help="folder of the recorded logs")
+    parser.add_argument("--data", type=Path, required=True, help="folder of the recorded logs")
     parser.add_argument("--peers", type=Path, required=True, help="Python with the peers")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here too")
     parser.add_argument("--figure", type=Path, metavar="FILE", help="draw them (PNG)")
     options = parser.parse_args()
-    found = compare(options.data, options.peers, options.rounds)
+    try:
+        found = compare(options.data, options.peers, options.rounds)
+    except InputError as error:
+        parser.error(str(error))
     if options.json:
         options.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     if options.figure:

@@ -620,6 +620,11 @@ def _create_beside(target: Path, *, shown: str | PathLike[str], rights: int = 0o
     return part
 
 
+def text_sha256(text: str) -> str:
+    """Return the SHA-256 of a text in UTF-8, in hexadecimal."""
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
 def file_sha256(path: str | Path) -> str | None:
     """Return the SHA-256 of a file's bytes in hexadecimal; None if it is not a file."""
     if not path or not Path(path).is_file():

@@ -97,6 +97,23 @@ def test_a_resistance_that_bends_with_current_is_in_the_table() -> None:
     assert small - large == pytest.approx(by_hand[0] - by_hand[1], rel=0.02)
 
 
+@pytest.mark.parametrize(
+    "model",
+    [
+        leaf_2012_model_file(),
+        with_effect(
+            "charge_transfer", scale_v=5.0, exchange_a=10.0, bend_only=0.0, activation_k=0.0
+        ),
+    ],
+)
+def test_a_model_of_one_temperature_has_increasing_axes(model: Model) -> None:
+    narrow = model.range.model_copy(update={"temperature_c": (TEMPERATURE_C, TEMPERATURE_C)})
+    circuit = equivalent_circuit(model.model_copy(update={"range": narrow}))
+    assert np.diff(circuit.temperature_c).min() > 0.0
+    assert np.mean(circuit.temperature_c) == pytest.approx(TEMPERATURE_C)
+    assert np.diff(circuit.current_a).min() > 0.0
+
+
 def test_thevenin_computes_the_voltage(exported: dict[str, Any], log: Log) -> None:
     thevenin = pytest.importorskip("thevenin", reason="needs the simulator thevenin")
     run = thevenin.Experiment(max_step=10.0)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
@@ -423,6 +424,22 @@ def test_other_tables_take_the_same_columns(tmp_path: Path, kind: str) -> None:
     assert log.temperature_c == pytest.approx(TEMPERATURE_C)
 
 
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_headings_that_differ_in_case_only_are_two(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"x{suffix}"
+    table = pa.table(
+        {"t": TIME_S, "T": np.full(ROWS, TEMPERATURE_C), "I": CURRENT_A, "U": VOLTAGE_V}
+    )
+    if suffix == ".csv":
+        pacsv.write_csv(table, path)
+    else:
+        pq.write_table(table, path)
+    log = read_log(path, columns="time=t,temperature=T,current=I[A],voltage=u")
+    assert log.time_s == pytest.approx(TIME_S)
+    assert log.temperature_c == pytest.approx(TEMPERATURE_C)
+    assert log.voltage_v == pytest.approx(VOLTAGE_V)
+
+
 @pytest.mark.parametrize(
     ("text", "options", "words"),
     [
@@ -438,6 +455,10 @@ def test_other_tables_take_the_same_columns(tmp_path: Path, kind: str) -> None:
         (
             "Time,Current,Voltage\n" + "1,2,300\n" * 4, {"columns": "current=Curent"},
             r"no column has this heading .*Curent.*did you mean Current\?",
+        ),
+        (
+            "Time,Current,Voltage\n" + "1,2,300\n" * 4, {"columns": "current=Voltage,voltage=#3"},
+            r"is the column of current too .*#3.*give each quantity a column of its own",
         ),
         (
             "Time,Current,Voltage\n" + "1,2,300\n" * 4, {"columns": "currant=Current"},

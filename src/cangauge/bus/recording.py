@@ -7,7 +7,7 @@ samples lack.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sized
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -197,6 +197,28 @@ def open_with_columns(
             return open_log(path, columns=mapped, sign=sign)
     recording = open_recording(path)
     return replace(recording, sign=sign) if isinstance(recording, LogFile) else recording
+
+
+def refuse_single_row(recorded: Sized) -> None:
+    """Raise InputError for a log of one row: no charge can be counted."""
+    if len(recorded) < 2:
+        raise InputError(
+            "a single row: charge is counted from one row to the next",
+            source=getattr(recorded, "source", None),
+            cure="give a log of minutes or hours",
+        )
+
+
+def refuse_sign_of_capture(recording: LogFile | Capture, sign: str | None) -> None:
+    """Raise InputError if the sign of current is stated for a capture."""
+    if sign is not None and not isinstance(recording, LogFile):
+        raise InputError(
+            "this is a capture, whose map states the sign",
+            source=recording.path,
+            field="--sign",
+            value=sign,
+            cure="set sign = -1 under [current] of the map file",
+        )
 
 
 def capture_without_vehicle(path: str | PathLike[str]) -> InputError:

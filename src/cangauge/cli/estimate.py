@@ -15,26 +15,17 @@ from cangauge._formatting import number
 from cangauge._io import atomic_path
 from cangauge.bus.captures.capture import Capture
 from cangauge.bus.publish import PackReport
-from cangauge.bus.recording import capture_without_vehicle
-from cangauge.bus.vehicle import Vehicle
+from cangauge.bus.recording import capture_without_vehicle, refuse_single_row
 from cangauge.cli.options import (
-    ColumnsOption,
-    DbcOption,
     FiguresOption,
     JsonOption,
-    MapOption,
+    Reading,
     ReportOption,
-    SignOption,
-    TableOptions,
-    TemperatureOption,
-    TemperatureSourceOption,
-    VehicleOption,
     assumed_of,
     check_outputs,
     known_temperature_source,
-    load_log,
+    option_groups,
     refuse_inverted_current,
-    refuse_single_row,
     within,
 )
 from cangauge.cli.output import console, emit_json, note, print_table, save_figures
@@ -58,6 +49,7 @@ from cangauge.service.offline import (
 AUTO = "auto"
 
 
+@option_groups()
 def estimate_command(  # noqa: PLR0917 - typer passes options by name
     log_path: Annotated[Path, typer.Argument(metavar="LOG", help="Recorded log or capture.")],
     model_path: Annotated[
@@ -122,13 +114,8 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
             " of its usual steps.",
         ),
     ] = None,
-    vehicle: VehicleOption = None,
-    dbc: DbcOption = None,
-    map_file: MapOption = None,
-    columns: ColumnsOption = None,
-    sign: SignOption = None,
-    temperature: TemperatureOption = None,
-    temperature_source: TemperatureSourceOption = None,
+    *,
+    reading: Reading,
     pack: Annotated[
         Path | None,
         typer.Option(
@@ -177,12 +164,12 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     check_outputs([output, pack, report], [log_path, model_path])
     model = Model.load(model_path)
     assumed: dict[str, list[str]] = {}
-    if isinstance(TableOptions(columns, sign, map_file).open(log_path), Capture):
-        if (vehicle, dbc, map_file) == (None, None, None):
+    if isinstance(reading.open(log_path), Capture):
+        if not reading.names_vehicle:
             raise capture_without_vehicle(log_path)
         _refuse_smoothing(log_path, smooth=smooth)
-        car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature)
-        source = known_temperature_source(temperature_source) or "unknown"
+        car = reading.car()
+        source = known_temperature_source(reading.temperature_source) or "unknown"
         settings = replace(settings, temperature_source=source)
         with _progress(None) as progress:
             done = estimate_recorded_capture(
@@ -190,17 +177,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
             )
         _check_capture(done, model)
     else:
-        log = load_log(
-            log_path,
-            vehicle=vehicle,
-            dbc=dbc,
-            map_file=map_file,
-            temperature_c=temperature,
-            temperature_source=temperature_source,
-            columns=columns,
-            sign=sign,
-            refuse_inverted=True,
-        )
+        log = reading.load(log_path)
         assumed = assumed_of([log])
         cells = read_cells(log_path, log.time_s)
         with _progress(len(log)) as progress:

@@ -11,19 +11,13 @@ import typer
 from cangauge._formatting import number, significant, span
 from cangauge._io import write_texts_atomic
 from cangauge.cli.options import (
-    ColumnsOption,
-    DbcOption,
     FiguresOption,
     JsonOption,
-    MapOption,
+    Reading,
     ReportOption,
-    SignOption,
-    TemperatureOption,
-    TemperatureSourceOption,
-    VehicleOption,
     assumed_of,
     check_outputs,
-    load_log,
+    option_groups,
     within,
 )
 from cangauge.cli.output import console, emit_json, note, print_table, progress_shown, save_figures
@@ -42,6 +36,7 @@ SHOWN_CHOICES = 8
 """Number of delay sets shown, the best first."""
 
 
+@option_groups()
 def fit_command(  # noqa: PLR0917 - typer passes options by name
     logs: Annotated[
         list[Path],
@@ -95,13 +90,8 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
     name: Annotated[
         str | None, typer.Option(help="Name of the model. Default: from the logs' names.")
     ] = None,
-    vehicle: VehicleOption = None,
-    dbc: DbcOption = None,
-    map_file: MapOption = None,
-    columns: ColumnsOption = None,
-    sign: SignOption = None,
-    temperature: TemperatureOption = None,
-    temperature_source: TemperatureSourceOption = None,
+    *,
+    reading: Reading,
     report: ReportOption = None,
     figures: FiguresOption = None,
     json_output: JsonOption = False,
@@ -139,19 +129,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         recorded = []
         for path in logs:
             status.update(f"reading {path}")
-            recorded.append(
-                load_log(
-                    path,
-                    vehicle=vehicle,
-                    dbc=dbc,
-                    map_file=map_file,
-                    temperature_c=temperature,
-                    temperature_source=temperature_source,
-                    columns=columns,
-                    sign=sign,
-                    refuse_inverted=True,
-                )
-            )
+            recorded.append(reading.load(path))
         if capacity_ah == FROM_SOC:
             capacity = capacity_from_reference(recorded)
         search = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Final, cast
 
@@ -13,21 +13,14 @@ import typer
 
 from cangauge._formatting import number, significant
 from cangauge._io import file_sha256, write_texts_atomic
-from cangauge.bus.mapping import columns_of_map
-from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.fit import parse_delays
 from cangauge.cli.options import (
-    ColumnsOption,
-    DbcOption,
     JsonOption,
-    MapOption,
+    Reading,
     ReportOption,
-    SignOption,
-    TemperatureOption,
-    TemperatureSourceOption,
-    VehicleOption,
     check_outputs,
     known_temperature_source,
+    option_groups,
     within,
 )
 from cangauge.cli.output import console, emit_json, note, print_table, progress_shown
@@ -43,7 +36,6 @@ from cangauge.fleet.overview import FleetOverview
 from cangauge.fleet.run import LOCAL, Summary, connected, run_job
 from cangauge.fleet.sources import VEHICLE_PATTERN, FleetLog, ReadOptions, find_logs
 from cangauge.inference.rows import FitOptions
-from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.draft import Sign
 from cangauge.model.model_file import Model
 
@@ -71,28 +63,51 @@ OutOption = Annotated[
         " with the same model and options are skipped.",
     ),
 ]  # fmt: skip
-SchedulerOption = Annotated[
-    str,
-    typer.Option(
-        metavar="ADDRESS|local",
-        help="Dask scheduler (tcp://10.0.0.5:8786), or this machine.",
-    ),
-]
-WorkersOption = Annotated[
-    int | None,
-    typer.Option(metavar="N", help="Worker processes of `local`. Default: one a core."),
-]
-PatternOption = Annotated[
-    str,
-    typer.Option(
-        "--vehicle-pattern", metavar="REGEX",
-        help="The first group finds the vehicle in the name of a log. Default: its folder.",
-    ),
-]  # fmt: skip
 CapacityOption = Annotated[
     float | None,
     typer.Option("--capacity-ah", metavar="A", help="Charge from 100 to 0 % [Ah]."),
 ]
+
+
+@dataclass(frozen=True, slots=True)
+class Cluster:
+    """The options of every fleet command: what computes, and how logs name their vehicles."""
+
+    scheduler: Annotated[
+        str,
+        typer.Option(
+            metavar="ADDRESS|local",
+            help="Dask scheduler (tcp://10.0.0.5:8786), or this machine.",
+        ),
+    ] = LOCAL
+    workers: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Worker processes of `local`. Default: one a core."),
+    ] = None
+    pattern: Annotated[
+        str,
+        typer.Option(
+            "--vehicle-pattern", metavar="REGEX",
+            help="The first group finds the vehicle in the name of a log. Default: its folder.",
+        ),
+    ] = VEHICLE_PATTERN  # fmt: skip
+
+    def find(self, logs: Sequence[str]) -> list[FleetLog]:
+        """Return the logs that paths, globs and manifests name (`find_logs`)."""
+        return find_logs(logs, pattern=self.pattern)
+
+    def run(self, work: Callable[[Any], Any]) -> Any:
+        """Return what a function of the Dask client returns; show its progress."""
+        workers = None if self.workers is None else float(self.workers)
+        within(workers, 1, 1024, option="--workers", unit="")
+        shown: AbstractContextManager[Any] = nullcontext()
+        if console.is_terminal:
+            shown = console.status("starting")
+        with shown as status:
+            step = None if status is None else status.update
+            connection = connected(self.scheduler, self.workers)
+            with progress_shown("cangauge.fleet", step), connection as client:
+                return work(client)
 
 
 @fleet_app.callback()
@@ -106,7 +121,8 @@ def fleet_command() -> None:
 
 
 @fleet_app.command("fit")
-def fit_fleet_command(  # noqa: PLR0917 - typer passes options by name
+@option_groups()
+def fit_fleet_command(
     logs: LogsArgument,
     output: Annotated[
         Path, typer.Option("-m", "--model", metavar="MODEL", help="Model file to write (JSON).")
@@ -115,9 +131,8 @@ def fit_fleet_command(  # noqa: PLR0917 - typer passes options by name
     capacity_ah: Annotated[
         float, typer.Option(metavar="A", help="Charge from 100 to 0 % [Ah], e.g. 51.5.")
     ],
-    scheduler: SchedulerOption = LOCAL,
-    workers: WorkersOption = None,
-    pattern: PatternOption = VEHICLE_PATTERN,
+    *,
+    cluster: Cluster,
     rate_hz: Annotated[
         float, typer.Option(metavar="HZ", help="Rate of the fit [Hz]; faster logs are decimated.")
     ] = 1.0,
@@ -127,13 +142,7 @@ def fit_fleet_command(  # noqa: PLR0917 - typer passes options by name
     epsilon: Annotated[float, typer.Option(metavar="E", help="Margin ε of the scaled SoC.")] = 0.05,
     t_ref: Annotated[float, typer.Option(metavar="C", help="Reference temperature [°C].")] = 20.0,
     name: Annotated[str | None, typer.Option(help="Name of the model.")] = None,
-    vehicle: VehicleOption = None,
-    dbc: DbcOption = None,
-    map_file: MapOption = None,
-    columns: ColumnsOption = None,
-    sign: SignOption = None,
-    temperature: TemperatureOption = None,
-    temperature_source: TemperatureSourceOption = None,
+    reading: Reading,
     json_output: JsonOption = False,
 ) -> None:
     """Identify one model from all logs: the fit of `cangauge fit`, out of core.
@@ -151,16 +160,8 @@ def fit_fleet_command(  # noqa: PLR0917 - typer passes options by name
     within(t_ref, -60.0, 120.0, option="--t-ref", unit="°C")
     options = FitOptions(capacity_ah, None, rate_hz, parse_delays(delays), epsilon, t_ref)
     check_outputs([output], [])
-    reading = _reading(
-        vehicle=vehicle, dbc=dbc, map_file=map_file, columns=columns, sign=sign,
-        temperature=temperature, temperature_source=temperature_source,
-    )  # fmt: skip
-    found_logs = find_logs(logs, pattern=pattern)
-    result = _on_cluster(
-        scheduler,
-        workers,
-        lambda client: fit_fleet(found_logs, reading, options, out, client, name=name),
-    )
+    how, found_logs = _read_options(reading), cluster.find(logs)
+    result = cluster.run(lambda client: fit_fleet(found_logs, how, options, out, client, name=name))
     write_texts_atomic({output: result.model.to_json()})
     if json_output:
         emit_json(result.to_dict() | {"model": str(output), "output": out})
@@ -185,21 +186,15 @@ def fit_fleet_command(  # noqa: PLR0917 - typer passes options by name
 
 
 @fleet_app.command("estimate")
-def estimate_fleet_command(  # noqa: PLR0917 - typer passes options by name
+@option_groups()
+def estimate_fleet_command(
     logs: LogsArgument,
     model: ModelOption,
     out: OutOption,
-    scheduler: SchedulerOption = LOCAL,
-    workers: WorkersOption = None,
-    pattern: PatternOption = VEHICLE_PATTERN,
+    *,
+    cluster: Cluster,
     capacity_ah: CapacityOption = None,
-    vehicle: VehicleOption = None,
-    dbc: DbcOption = None,
-    map_file: MapOption = None,
-    columns: ColumnsOption = None,
-    sign: SignOption = None,
-    temperature: TemperatureOption = None,
-    temperature_source: TemperatureSourceOption = None,
+    reading: Reading,
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:
@@ -210,30 +205,21 @@ def estimate_fleet_command(  # noqa: PLR0917 - typer passes options by name
     `cangauge fleet estimate 's3://drives/*/*.parquet' -m type.json -o s3://results/may
     --scheduler tcp://10.0.0.5:8786`
     """
-    reading = _reading(
-        vehicle=vehicle, dbc=dbc, map_file=map_file, columns=columns, sign=sign,
-        temperature=temperature, temperature_source=temperature_source,
-    )  # fmt: skip
-    job = EstimateJob(reading, Model.load(model), EstimatorSettings(capacity_ah=capacity_ah))
-    _run(job, find_logs(logs, pattern=pattern), out, scheduler, workers, report, json_output)
+    settings = EstimatorSettings(capacity_ah=capacity_ah)
+    job = EstimateJob(_read_options(reading), Model.load(model), settings)
+    _run(job, cluster.find(logs), out, cluster, report, json_output=json_output)
 
 
 @fleet_app.command("health")
-def health_fleet_command(  # noqa: PLR0917 - typer passes options by name
+@option_groups()
+def health_fleet_command(
     logs: LogsArgument,
     model: ModelOption,
     out: OutOption,
-    scheduler: SchedulerOption = LOCAL,
-    workers: WorkersOption = None,
-    pattern: PatternOption = VEHICLE_PATTERN,
+    *,
+    cluster: Cluster,
     capacity_ah: CapacityOption = None,
-    vehicle: VehicleOption = None,
-    dbc: DbcOption = None,
-    map_file: MapOption = None,
-    columns: ColumnsOption = None,
-    sign: SignOption = None,
-    temperature: TemperatureOption = None,
-    temperature_source: TemperatureSourceOption = None,
+    reading: Reading,
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:
@@ -245,15 +231,13 @@ def health_fleet_command(  # noqa: PLR0917 - typer passes options by name
     --------
     `cangauge fleet health manifest.csv -m type.json -o results --report fleet.html`
     """
-    reading = _reading(
-        vehicle=vehicle, dbc=dbc, map_file=map_file, columns=columns, sign=sign,
-        temperature=temperature, temperature_source=temperature_source,
-    )  # fmt: skip
-    job = HealthJob(reading, Model.load(model), EstimatorSettings(capacity_ah=capacity_ah))
-    _run(job, find_logs(logs, pattern=pattern), out, scheduler, workers, report, json_output)
+    settings = EstimatorSettings(capacity_ah=capacity_ah)
+    job = HealthJob(_read_options(reading), Model.load(model), settings)
+    _run(job, cluster.find(logs), out, cluster, report, json_output=json_output)
 
 
 @fleet_app.command("gap")
+@option_groups()
 def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
     logs: LogsArgument,
     model: ModelOption,
@@ -278,16 +262,9 @@ def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
             metavar="P", help="Report a fault where the probability of none is at most this."
         ),
     ] = ALARM_BELOW,
-    scheduler: SchedulerOption = LOCAL,
-    workers: WorkersOption = None,
-    pattern: PatternOption = VEHICLE_PATTERN,
-    vehicle: VehicleOption = None,
-    dbc: DbcOption = None,
-    map_file: MapOption = None,
-    columns: ColumnsOption = None,
-    sign: SignOption = None,
-    temperature: TemperatureOption = None,
-    temperature_source: TemperatureSourceOption = None,
+    *,
+    cluster: Cluster,
+    reading: Reading,
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:
@@ -303,75 +280,53 @@ def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
     within(float(references), 1, 1000, option="--references", unit="")
     within(float(latest), 1, 1000, option="--latest", unit="")
     within(alarm, 0.0, 1.0, option="--alarm", unit="")
-    reading = _reading(
-        vehicle=vehicle, dbc=dbc, map_file=map_file, columns=columns, sign=sign,
-        temperature=temperature, temperature_source=temperature_source,
-    )  # fmt: skip
-    known = find_logs(reference or [], pattern=pattern)
+    known = cluster.find(reference or [])
     healthy = {log.url for log in known}
-    found = [log for log in find_logs(logs, pattern=pattern) if log.url not in healthy]
+    found = [log for log in cluster.find(logs) if log.url not in healthy]
     suspect, good = suspect_and_healthy(
         [*found, *(replace(log, healthy=True) for log in known)], latest
     )
-    job = GapJob(reading, Model.load(model), references, alarm)
-    _run(job, job.vehicles(suspect, good), out, scheduler, workers, report, json_output)
+    job = GapJob(_read_options(reading), Model.load(model), references, alarm)
+    _run(job, job.vehicles(suspect, good), out, cluster, report, json_output=json_output)
 
 
-def _reading(
-    *,
-    vehicle: str | None,
-    dbc: Path | None,
-    map_file: Path | None,
-    columns: str | None,
-    sign: str | None,
-    temperature: float | None,
-    temperature_source: str | None,
-) -> ReadOptions:
+def _read_options(reading: Reading) -> ReadOptions:
     """Return how logs are read; files of the vehicle are read here, not by the workers."""
-    if sign not in {None, "charge", "discharge"}:
-        raise InputError("neither charge nor discharge", field="--sign", value=sign)
-    mapped = None if map_file is None else columns_of_map(map_file)
-    car = None
-    if vehicle is not None or dbc is not None or (map_file is not None and mapped is None):
-        car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature)
-    files = {str(path): file_sha256(path) for path in (dbc, map_file) if path is not None}
-    given = [vehicle, files, columns, sign, temperature, temperature_source]
+    if reading.sign not in {None, "charge", "discharge"}:
+        raise InputError("neither charge nor discharge", field="--sign", value=reading.sign)
+    mapped = reading.mapped_columns()
+    is_map_of_columns = mapped is not None and reading.vehicle is None and reading.dbc is None
+    car = reading.car() if reading.names_vehicle and not is_map_of_columns else None
+    paths = (reading.dbc, reading.map_file)
+    files = {str(path): file_sha256(path) for path in paths if path is not None}
+    given = [
+        reading.vehicle, files, reading.columns, reading.sign, reading.temperature,
+        reading.temperature_source,
+    ]  # fmt: skip
     return ReadOptions(
         vehicle=car,
-        columns=None if columns is None else ColumnMap.of(columns, "--columns"),
+        columns=reading.given_columns(),
         mapped=mapped,
-        sign=cast("Sign | None", sign),
-        temperature_c=temperature,
-        temperature_source=known_temperature_source(temperature_source),
+        sign=cast("Sign | None", reading.sign),
+        temperature_c=reading.temperature,
+        temperature_source=known_temperature_source(reading.temperature_source),
         described=json.dumps(given),
     )
 
 
-def _on_cluster(scheduler: str, workers: int | None, work: Callable[[Any], Any]) -> Any:
-    """Return what a function of the Dask client returns; show its progress."""
-    within(None if workers is None else float(workers), 1, 1024, option="--workers", unit="")
-    shown: AbstractContextManager[Any] = nullcontext()
-    if console.is_terminal:
-        shown = console.status("starting")
-    with shown as status:
-        step = None if status is None else status.update
-        with progress_shown("cangauge.fleet", step), connected(scheduler, workers) as client:
-            return work(client)
-
-
-def _run(  # noqa: PLR0917 - one call of each command
+def _run(
     job: Job,
     logs: Sequence[FleetLog],
     out: str,
-    scheduler: str,
-    workers: int | None,
+    cluster: Cluster,
     report: Path | None,
+    *,
     json_output: bool,
 ) -> None:
     """Run a job over the logs, and print and write what it found of the fleet."""
     check_outputs([report], [])
     dataset = Dataset(out, job.kind, job.columns)
-    summary = _on_cluster(scheduler, workers, lambda client: run_job(job, logs, dataset, client))
+    summary = cluster.run(lambda client: run_job(job, logs, dataset, client))
     found = FleetOverview.read(out)
     if report is not None:
         from cangauge.report.fleet import fleet_report  # noqa: PLC0415 - bokeh is slow to import
@@ -394,12 +349,7 @@ def _show(summary: Summary, found: FleetOverview) -> None:
         note(f"set aside: {count} × {reason}")
     if found.gaps:
         rows = [
-            [
-                name,
-                row["verdict"],
-                number(row["probability"], 2),
-                number(row["probability_none"], 3),
-            ]
+            [name, row["verdict"], number(row["probability"], 2), number(row["probability_none"])]
             for name, row in ((name, found.gaps[name]) for name in found.alarms)
         ]
         print_table("Vehicles with a gap", ["vehicle", "<cause", "probability", "P(none)"], rows)

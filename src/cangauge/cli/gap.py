@@ -12,19 +12,13 @@ from cangauge._formatting import NONE_KNOWN, number, printable
 from cangauge._io import write_texts_atomic
 from cangauge.cli.next_test import NextTestOptions, show_tests
 from cangauge.cli.options import (
-    ColumnsOption,
-    DbcOption,
     FiguresOption,
     JsonOption,
-    MapOption,
+    Reading,
     ReportOption,
-    SignOption,
-    TemperatureOption,
-    TemperatureSourceOption,
-    VehicleOption,
     assumed_of,
     check_outputs,
-    load_log,
+    option_groups,
     within,
 )
 from cangauge.cli.output import emit_json, note, print_table, progress_shown, save_figures
@@ -44,6 +38,7 @@ SHORTEST_S = 300.0
 """Shortest log to diagnose [s]; a shorter one is mostly transient."""
 
 
+@option_groups()
 def gap_command(  # noqa: PLR0917 - typer passes options by name
     logs: Annotated[
         list[Path],
@@ -140,16 +135,11 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
         typer.Option(
             metavar="LOG",
             help="Log of a further test of the same cause, beside the LOGs of the first diagnosis:"
-            " diagnoses both together and reports the change; repeat the option.",
+            " diagnoses both together and reports what the test changed; repeat the option.",
         ),
     ] = None,
-    vehicle: VehicleOption = None,
-    dbc: DbcOption = None,
-    map_file: MapOption = None,
-    columns: ColumnsOption = None,
-    sign: SignOption = None,
-    temperature: TemperatureOption = None,
-    temperature_source: TemperatureSourceOption = None,
+    *,
+    reading: Reading,
     report: ReportOption = None,
     figures: FiguresOption = None,
     json_output: JsonOption = False,
@@ -177,7 +167,9 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     """
     given, added = list(reference or []), list(add_test or [])
     paths = [*logs, *added]
-    options = SimulatorOptions(simulated, simulator, columns, temperature, capacity_ah)
+    options = SimulatorOptions(
+        simulated, simulator, reading.columns, reading.temperature, capacity_ah
+    )
     next_test = NextTestOptions(plan, plan_file, limits)
     _refuse_common(paths, given)
     outputs = [] if corrected is None else [corrected_path(log, corrected) for log in paths]
@@ -188,22 +180,8 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     within(alarm, 0.0, 1.0, option="--alarm", unit="")
     within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
     model_file = _model(model, options, corrected)
-
-    def read(path: Path) -> Log:
-        return load_log(
-            path,
-            vehicle=vehicle,
-            dbc=dbc,
-            map_file=map_file,
-            temperature_c=temperature,
-            temperature_source=temperature_source,
-            columns=columns,
-            sign=sign,
-            refuse_inverted=True,
-        )
-
-    diagnosed = [_long_enough(read(path)) for path in paths]
-    references = [read(path) for path in given]
+    diagnosed = [_long_enough(reading.load(path)) for path in paths]
+    references = [reading.load(path) for path in given]
     if model_file is not None:
         _note_differences([*diagnosed, *references], model_file.capacity_ah)
     if initial_soc is not None:  # an added test has its own start

@@ -8,7 +8,6 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,16 +24,11 @@ from rich.progress import (
 from cangauge._formatting import duration
 from cangauge._io import write_text_atomic
 from cangauge.cli.options import (
-    ColumnsOption,
-    DbcOption,
     JsonOption,
-    MapOption,
+    Reading,
     ReportOption,
-    SignOption,
-    TemperatureOption,
-    VehicleOption,
     check_outputs,
-    load_log,
+    option_groups,
 )
 from cangauge.cli.output import console, emit_json, note
 from cangauge.cli.own_logs import OwnLogsOptions
@@ -67,6 +61,7 @@ from cangauge.validation.twin.pybamm_plant import import_pybamm
 PROTOCOLS = (*FULL, OPEN_SET)
 
 
+@option_groups("temperature_source")
 def gap_check_command(  # noqa: PLR0917 - typer passes options by name
     own: Annotated[
         list[Path] | None,
@@ -154,12 +149,8 @@ def gap_check_command(  # noqa: PLR0917 - typer passes options by name
         int | None,
         typer.Option(metavar="N", min=1, help="Parallel processes. Default: one per core."),
     ] = None,
-    vehicle: VehicleOption = None,
-    dbc: DbcOption = None,
-    map_file: MapOption = None,
-    columns: ColumnsOption = None,
-    sign: SignOption = None,
-    temperature: TemperatureOption = None,
+    *,
+    reading: Reading,
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:
@@ -200,13 +191,9 @@ def gap_check_command(  # noqa: PLR0917 - typer passes options by name
         for_own={"--reference": reference, "--model": model, "--capacity-ah": capacity_ah},
     )  # fmt: skip
     if own is not None or own_logs:
-        read = partial(
-            load_log, vehicle=vehicle, dbc=dbc, map_file=map_file, temperature_c=temperature,
-            columns=columns, sign=sign, refuse_inverted=True,
-        )  # fmt: skip
         OwnLogsOptions(
             own or [], reference or [], model, capacity_ah, at_most, report, json_output
-        ).check(read, _progress())
+        ).check(reading.load, _progress())
         return
     check_outputs([report], [])
     jobs = jobs or os.cpu_count() or 1

@@ -13,18 +13,13 @@ from rich.table import Table
 
 from cangauge._io import write_texts_atomic
 from cangauge.cli.options import (
-    ColumnsOption,
-    DbcOption,
     FiguresOption,
     JsonOption,
-    MapOption,
+    Reading,
     ReportOption,
-    SignOption,
-    TableOptions,
-    TemperatureOption,
-    VehicleOption,
     assumed_of,
     check_outputs,
+    option_groups,
 )
 from cangauge.cli.output import PlainConsole, emit_json, note, save_figures
 from cangauge.errors import InputError
@@ -40,7 +35,8 @@ _NESTED = (Mapping, list, tuple)
 _MARKS = {"yes": "[green]yes[/]", "partly": "[yellow]partly[/]", "no": "[red]no[/]"}
 
 
-def inspect_command(  # noqa: PLR0917 - typer fills the arguments by name
+@option_groups("temperature_source")
+def inspect_command(
     path: Annotated[
         Path,
         typer.Argument(
@@ -50,12 +46,8 @@ def inspect_command(  # noqa: PLR0917 - typer fills the arguments by name
             show_default=False,
         ),
     ],
-    vehicle: VehicleOption = None,
-    dbc: DbcOption = None,
-    map_file: MapOption = None,
-    columns: ColumnsOption = None,
-    sign: SignOption = None,
-    temperature: TemperatureOption = None,
+    *,
+    reading: Reading,
     report: ReportOption = None,
     figures: FiguresOption = None,
     json_output: JsonOption = False,
@@ -82,20 +74,17 @@ def inspect_command(  # noqa: PLR0917 - typer fills the arguments by name
     `cangauge inspect capture.log --vehicle leaf_ze0`
     """
     # Deferred: the readers and the decoder take half a second to import.
-    from cangauge.bus.mapping import columns_of_map  # noqa: PLC0415
-    from cangauge.bus.vehicle import Vehicle  # noqa: PLC0415
     from cangauge.inspect.capture import inspect_capture  # noqa: PLC0415
     from cangauge.inspect.log import LogInspection, inspect_log  # noqa: PLC0415
     from cangauge.logs.read import LogFile  # noqa: PLC0415
 
     check_outputs([report], [path])
-    recording = TableOptions(columns, sign, map_file).open(path)
+    recording = reading.open(path)
     assumed: dict[str, list[str]] = {}
-    options = {"--vehicle": vehicle, "--dbc": dbc, "--map": map_file}
+    options = {"--vehicle": reading.vehicle, "--dbc": reading.dbc, "--map": reading.map_file}
     given = {option: str(value) for option, value in options.items() if value is not None}
     if isinstance(recording, LogFile):
-        is_of_columns = map_file is not None and columns_of_map(map_file) is not None
-        if given and not (is_of_columns and list(given) == ["--map"]):
+        if given and not (list(given) == ["--map"] and reading.mapped_columns() is not None):
             option, value = next(iter(given.items()))
             raise InputError(
                 "this is a log; the option is for captures",
@@ -104,7 +93,7 @@ def inspect_command(  # noqa: PLR0917 - typer fills the arguments by name
                 value=value,
                 cure="omit it",
             )
-        log = recording.read(temperature_c=temperature)
+        log = recording.read(temperature_c=reading.temperature)
         assumed = assumed_of([log])
         if log.assumed:
             note(f"{path}: read as {', '.join(log.assumed)}")
@@ -121,8 +110,7 @@ def inspect_command(  # noqa: PLR0917 - typer fills the arguments by name
                 value=str(report or figures),
                 cure="omit it, or use cangauge estimate --report",
             )
-        car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature) if given else None
-        found = inspect_capture(path, car)
+        found = inspect_capture(path, reading.car() if given else None)
     if json_output:
         emit_json(found.to_dict() | {"assumed": assumed})
         return

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 import os
-from collections.abc import Iterable, Sized
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields, is_dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast, get_type_hints
 
 import typer
 
@@ -20,6 +21,9 @@ from cangauge.logs.units import TEMPERATURE_SOURCES, TemperatureSource
 
 if TYPE_CHECKING:
     from cangauge.bus.captures.capture import Capture
+    from cangauge.bus.vehicle import Vehicle
+    from cangauge.logs.column_map import ColumnMap
+    from cangauge.logs.draft import Sign
     from cangauge.logs.read import LogFile
 
 _Value = TypeVar("_Value", bound=float | None)
@@ -140,25 +144,55 @@ FiguresOption = Annotated[
 
 
 @dataclass(frozen=True, slots=True)
-class TableOptions:
-    """Options on the columns of a log: `--columns`, `--sign`, and `[columns]` of a map file.
+class Reading:
+    """The options of every command that reads a log or a capture.
 
     Parameters
     ----------
-    columns : str, optional
-    sign : str, optional
-    map_file : Path, optional
-        Its `[columns]` apply to a log unless `columns` is given.
+    vehicle : str, optional
+        Preset of the car (captures only).
+    dbc, map_file : Path, optional
+        DBC and map of signals, in place of a preset (captures only); `[columns]` of the map apply
+        to a log unless `columns` is given.
+    columns, sign : str, optional
+        Values of `--columns` and `--sign`.
+    temperature : float, optional
+        Constant temperature [°C].
+    temperature_source : str, optional
+        Location of the temperature sensor.
     """
 
-    columns: str | None = None
-    sign: str | None = None
-    map_file: Path | None = None
+    vehicle: VehicleOption = None
+    dbc: DbcOption = None
+    map_file: MapOption = None
+    columns: ColumnsOption = None
+    sign: SignOption = None
+    temperature: TemperatureOption = None
+    temperature_source: TemperatureSourceOption = None
 
     @property
-    def are_given(self) -> bool:
-        """Whether the user states columns: the file is then a table, not a capture."""
-        return self.columns is not None
+    def names_vehicle(self) -> bool:
+        """Whether an option for captures is given."""
+        return (self.vehicle, self.dbc, self.map_file) != (None, None, None)
+
+    def car(self) -> Vehicle:
+        """Return the vehicle that decodes a capture; may raise InputError."""
+        # Deferred: the service shares these options, but needs neither pyarrow nor the readers.
+        from cangauge.bus.vehicle import Vehicle  # noqa: PLC0415
+
+        return Vehicle.load(self.vehicle, self.dbc, self.map_file, temperature_c=self.temperature)
+
+    def given_columns(self) -> ColumnMap | None:
+        """Return the columns of `--columns`; may raise InputError."""
+        from cangauge.logs.column_map import ColumnMap  # noqa: PLC0415 - as in `car`
+
+        return None if self.columns is None else ColumnMap.of(self.columns, "--columns")
+
+    def mapped_columns(self) -> ColumnMap | None:
+        """Return the columns of the map file; may raise InputError."""
+        from cangauge.bus.mapping import columns_of_map  # noqa: PLC0415 - as in `car`
+
+        return None if self.map_file is None else columns_of_map(self.map_file)
 
     def open(self, path: Path) -> LogFile | Capture:
         """Open a log by these columns, or any recording by its content.
@@ -168,92 +202,91 @@ class TableOptions:
         InputError
             If the file cannot be read, or an option is wrong.
         """
-        # Deferred: the service shares these options, but needs neither pyarrow nor the readers.
-        from cangauge.bus.mapping import columns_of_map  # noqa: PLC0415
-        from cangauge.bus.recording import open_with_columns  # noqa: PLC0415
-        from cangauge.logs.column_map import ColumnMap  # noqa: PLC0415
+        from cangauge.bus.recording import open_with_columns  # noqa: PLC0415 - as in `car`
 
         return open_with_columns(
             path,
-            columns=None if self.columns is None else ColumnMap.of(self.columns, "--columns"),
-            mapped=None if self.map_file is None else columns_of_map(self.map_file),
-            sign=cast("Literal['charge', 'discharge'] | None", self.sign),
+            columns=self.given_columns(),
+            mapped=self.mapped_columns(),
+            sign=cast("Sign | None", self.sign),
         )
 
+    def load(self, path: Path) -> Log:
+        """Read a log, or decode a capture; print the reader's remarks on stderr.
 
-def load_log(
-    path: Path,
-    *,
-    vehicle: str | None = None,
-    dbc: Path | None = None,
-    map_file: Path | None = None,
-    temperature_c: float | None = None,
-    temperature_source: str | None = None,
-    columns: str | None = None,
-    sign: str | None = None,
-    refuse_inverted: bool = False,
-) -> Log:
-    """Read a log, or decode a capture by its vehicle; print the reader's remarks on stderr.
+        Parameters
+        ----------
+        path : Path
+
+        Returns
+        -------
+        Log
+            Positive current discharges, where the format defines the sign.
+
+        Raises
+        ------
+        InputError
+            If the input cannot be read or has a single row, an option has an unknown value, or the
+            data show clearly that positive current charges, unless `sign` states it.
+        """
+        from cangauge.bus.recording import (  # noqa: PLC0415 - as in `car`
+            log_of,
+            refuse_sign_of_capture,
+            refuse_single_row,
+        )
+        from cangauge.logs.read import LogFile  # noqa: PLC0415
+
+        source = known_temperature_source(self.temperature_source)
+        recording = self.open(path)
+        is_capture = not isinstance(recording, LogFile)
+        car = self.car() if is_capture and self.names_vehicle else None
+        if not is_capture and self.names_vehicle and self.mapped_columns() is None:
+            note(f"{path}: a log, not a capture: --vehicle, --dbc and --map do not apply to it")
+        refuse_sign_of_capture(recording, self.sign)
+        log = log_of(recording, car, temperature_c=self.temperature, temperature_source=source)
+        refuse_single_row(log)
+        if self.sign is None:
+            refuse_inverted_current(log, is_capture=is_capture)
+        note_reading(log)
+        return log
+
+
+def option_groups(*omitted: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Replace each parameter of a command that is a dataclass of options by those options.
 
     Parameters
     ----------
-    path : Path
-    vehicle : str, optional
-        Preset of the car (captures only).
-    dbc, map_file : Path, optional
-        DBC and map of signals, in place of a preset (captures only); `[columns]` of the map apply
-        to a log.
-    temperature_c : float, optional
-        Constant temperature [°C].
-    temperature_source : str, optional
-        Location of the temperature sensor.
-    columns, sign : str, optional
-        Values of `--columns` and `--sign`.
-    refuse_inverted : bool
-        Refuse a single row, and a log whose data show clearly that positive current charges, unless
-        `sign` states it.
-
-    Returns
-    -------
-    Log
-        Positive current discharges, where the format defines the sign.
-
-    Raises
-    ------
-    InputError
-        If the input cannot be read, an option has an unknown value, or (with `refuse_inverted`)
-        the sign of current is inverted.
+    *omitted : str
+        Fields that are no options of this command, but keep their defaults.
     """
-    # Deferred as in `TableOptions.open`.
-    from cangauge.bus.mapping import columns_of_map  # noqa: PLC0415
-    from cangauge.bus.recording import log_of  # noqa: PLC0415
-    from cangauge.bus.vehicle import Vehicle  # noqa: PLC0415
-    from cangauge.logs.read import LogFile  # noqa: PLC0415
 
-    source = known_temperature_source(temperature_source)
-    recording = TableOptions(columns, sign, map_file).open(path)
-    is_capture = not isinstance(recording, LogFile)
-    car = None
-    if vehicle is not None or dbc is not None or map_file is not None:
-        if is_capture:
-            car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature_c)
-        elif map_file is None or columns_of_map(map_file) is None:
-            note(f"{path}: a log, not a capture: --vehicle, --dbc and --map do not apply to it")
-    if is_capture and sign is not None:
-        raise InputError(
-            "this is a capture, whose map states the sign",
-            source=path,
-            field="--sign",
-            value=sign,
-            cure="set sign = -1 under [current] of the map file",
-        )
-    log = log_of(recording, car, temperature_c=temperature_c, temperature_source=source)
-    if refuse_inverted:
-        refuse_single_row(log)
-        if sign is None:
-            refuse_inverted_current(log, is_capture=is_capture)
-    note_reading(log)
-    return log
+    def spread(command: Callable[..., None]) -> Callable[..., None]:
+        groups: dict[str, tuple[type, list[str]]] = {}
+        parameters: list[inspect.Parameter] = []
+        for parameter in inspect.signature(command, eval_str=True).parameters.values():
+            kind = parameter.annotation
+            if not (isinstance(kind, type) and is_dataclass(kind)):
+                parameters.append(parameter)
+                continue
+            hints = get_type_hints(kind, include_extras=True)
+            offered = [each for each in fields(kind) if each.name not in omitted]
+            groups[parameter.name] = kind, [each.name for each in offered]
+            parameters += [
+                parameter.replace(name=each.name, default=each.default, annotation=hints[each.name])
+                for each in offered
+            ]
+
+        def run(**given: Any) -> None:
+            for name, (kind, names) in groups.items():
+                given[name] = kind(**{each: given.pop(each) for each in names})
+            command(**given)
+
+        run.__doc__ = command.__doc__
+        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        run.__annotations__ = {each.name: each.annotation for each in parameters}
+        return run
+
+    return spread
 
 
 def note_reading(log: Log) -> None:
@@ -310,19 +343,9 @@ def within(value: _Value, low: float, high: float, *, option: str, unit: str) ->
     return value
 
 
-def refuse_single_row(recorded: Sized) -> None:
-    """Raise InputError for a log of one row: no charge can be counted."""
-    if len(recorded) < 2:
-        raise InputError(
-            "a single row: charge is counted from one row to the next",
-            source=getattr(recorded, "source", None),
-            cure="give a log of minutes or hours",
-        )
-
-
 def refuse_inverted_current(log: Log, *, is_capture: bool) -> None:
     """Raise InputError if the data show clearly that positive current charges."""
-    # Deferred as in `load_log`.
+    # Deferred as in `Reading`.
     from cangauge.logs.sign import require_discharge_positive  # noqa: PLC0415
 
     try:

@@ -32,8 +32,8 @@ from cangauge.cli.config_options import (
 from cangauge.cli.options import (
     ColumnsOption,
     JsonOption,
+    Reading,
     SignOption,
-    TableOptions,
     assumed_of,
     note_reading,
 )
@@ -120,11 +120,8 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
         acknowledge_s=_seconds(acknowledge_s, "--acknowledge-within") or 0.0,
         ids=ids,
     )
-    car: Vehicle | None = None
-    if (vehicle, dbc, map_file) != (None, None, None):
-        car = Vehicle.load(vehicle, dbc, map_file, temperature_c=temperature)
-    options = TableOptions(columns, sign, map_file)
-    source = _source(recorded, options, car, ids, temperature_c=temperature)
+    reading = Reading(vehicle, dbc, map_file, columns, sign, temperature)
+    source = _source(recorded, reading, ids)
     address = bus_address(interface, channel, parse_bus_options(bus_option or []))
     with ExitStack() as stack:
         stop = stack.enter_context(stop_on_signals())
@@ -143,18 +140,12 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
         raise KeyboardInterrupt
 
 
-def _source(
-    recorded: Path,
-    options: TableOptions,
-    car: Vehicle | None,
-    ids: FrameIds,
-    *,
-    temperature_c: float | None,
-) -> Source:
-    recording = options.open(recorded)
+def _source(recorded: Path, reading: Reading, ids: FrameIds) -> Source:
+    car = reading.car() if reading.names_vehicle else None
+    recording = reading.open(recorded)
     if not isinstance(recording, LogFile):
         return CaptureSource(recorded, car, ids)
-    log = recording.read(temperature_c=temperature_c)
+    log = recording.read(temperature_c=reading.temperature)
     note_reading(log)
     return LogSource(log, car or Vehicle.load(DEFAULT_VEHICLE))
 

@@ -41,6 +41,9 @@ USUAL_C_RATE: Final = 1.0 / 3.0
 """Current at which the time constants are found [1/h]."""
 TEMPERATURES: Final = 5
 """Temperatures over the identified range."""
+NARROWEST_C: Final = 1.0
+"""Least width of the tables [K]: simulators interpolate between different temperatures, and a model
+may have been identified at a single one."""
 FASTEST_S: Final = 0.5
 """Shortest time constant and time of the step response [s]: a few samples of a fast log."""
 PER_DECADE: Final = 12
@@ -101,7 +104,9 @@ def equivalent_circuit(model: Model) -> EquivalentCircuit:
     """
     extended = model.extended_model()
     counting = extended.counting(50.0)
-    temperatures = np.linspace(*model.range.temperature_c, TEMPERATURES)
+    low_c, high_c = model.range.temperature_c
+    half_c = max(0.5 * (high_c - low_c), 0.5 * NARROWEST_C)
+    temperatures = 0.5 * (low_c + high_c) + half_c * np.linspace(-1.0, 1.0, TEMPERATURES)
     if not extended.effects:
         temperatures = temperatures[[0, -1]]
     curve_soc = np.linspace(0.0, 100.0, CURVE_POINTS)

@@ -9,7 +9,6 @@ them. At the end of a run the files of each vehicle become one, with the latest 
 
 from __future__ import annotations
 
-import hashlib
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -22,7 +21,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from cangauge._io import atomic_path
+from cangauge._io import atomic_path, text_sha256
 from cangauge.errors import InputError
 from cangauge.fleet.sources import FleetLog, filesystem
 
@@ -172,7 +171,7 @@ class Dataset:
         pq.write_table(pa.table(columns, schema=schema), content)
         # The same rows have the same name: a file that is written again replaces itself.
         keys = "".join(f"{row['log']}{row['run']}{row['made_at']}" for row in rows)
-        name = hashlib.sha256(keys.encode()).hexdigest()[:16]
+        name = text_sha256(keys)[:16]
         folder = self._folder(table, vehicle)
         path = f"{folder}/{name}.parquet"
         self._fs.makedirs(folder, exist_ok=True)

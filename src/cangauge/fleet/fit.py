@@ -6,14 +6,12 @@ second pass is computed again for all, since each log changes the model.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 
-from cangauge._version import __version__
 from cangauge.errors import InputError
 from cangauge.fleet.dataset import Dataset
 from cangauge.fleet.passes import (
@@ -26,9 +24,12 @@ from cangauge.fleet.run import Summary, run_id, run_job
 from cangauge.fleet.sources import FleetLog, ReadOptions
 from cangauge.identify.assemble import (
     WHOLE_LOGS,
-    coefficients_of,
+    coefficient_names,
     common_name,
+    common_temperature_source,
     information_of_rows,
+    made_of,
+    model_file_of,
     noise_of,
 )
 from cangauge.identify.pooled import (
@@ -47,8 +48,8 @@ from cangauge.inference.rows import (
     LOGS_AT_LEAST,
     FitOptions,
 )
-from cangauge.model.model_file import Made, Model, Ranges, SourceLog, resistance_names
-from cangauge.model.voltage_model import BASIS_NAMES, VoltageModel
+from cangauge.model.model_file import Made, Model, SourceLog
+from cangauge.model.voltage_model import VoltageModel
 
 LISTED_LOGS: Final = 4096
 """Source logs that a model file names; of more, it states the number."""
@@ -196,12 +197,7 @@ def _usable(logs: Sequence[FleetLog], dataset: Dataset, run: str) -> tuple[_Used
             source=dataset.out,
             cure=f"see the reasons in {dataset.tables[1]}; one or two logs: `cangauge fit`",
         )
-    sources = sorted({row["temperature_source"] for _, row in used.values()})
-    if len(sources) > 1:
-        raise InputError(
-            "the temperatures of the logs have different sources", field="temperature_source",
-            value=sources, cure="fit logs with the same temperature source together",
-        )  # fmt: skip
+    common_temperature_source(row["temperature_source"] for _, row in used.values())
     number = min(len(used), FOLDS_AT_MOST)
     for k, (url, (log, found)) in enumerate(used.items()):
         used[url] = (replace(log, fold=k % number), found)
@@ -266,7 +262,6 @@ def _model_file(
     used: _Used,
     name: str | None,
 ) -> Model:
-    names = [*BASIS_NAMES, "kt", *resistance_names(len(fit.delay_s))]
     sums = errors.sums
     time_error, curve = describe_error_of(
         errors.equations,
@@ -278,20 +273,12 @@ def _model_file(
     )
     prior, root = solution.kt_prior, whole.root
     rows = [row for _, row in used.values()]
-    return Model(
+    return model_file_of(
+        model,
+        solution,
+        fit,
         name=name or common_name([row["name"] for row in rows]),
-        coefficients=coefficients_of(names, solution),
-        epsilon=model.epsilon,
-        t_ref_c=model.t_ref_c,
-        delays_s=list(model.delay_s),
-        rate_hz=fit.rate_hz,
-        capacity_ah=fit.capacity_ah,
         temperature_source=rows[0]["temperature_source"],
-        range=Ranges(
-            soc_pct=model.soc_range_pct,
-            temperature_c=model.temperature_range_c,
-            current_a=model.current_range_a,
-        ),
         noise=noise_of(
             time_error,
             curve,
@@ -303,7 +290,7 @@ def _model_file(
         ),
         effects=[],
         information=information_of_rows(
-            root[:, :-1], np.empty((len(root), 0)), root[:, -1], names,
+            root[:, :-1], np.empty((len(root), 0)), root[:, -1], coefficient_names(fit),
             0.0 if prior is None else prior.row_weight,
         ),
         made=_made(rows, fit),
@@ -311,22 +298,8 @@ def _model_file(
 
 
 def _made(rows: Sequence[Mapping[str, Any]], fit: FitOptions) -> Made:
-    listed = rows if len(rows) <= LISTED_LOGS else []
-    fingerprint = hashlib.sha256("".join(row["data_sha256"] for row in rows).encode())
-    return Made(
-        by=f"cangauge {__version__}",
-        options={
-            "capacity_ah": fit.capacity_ah,
-            "initial_soc_pct": None,
-            "rate_hz": fit.rate_hz,
-            "delay_s": list(fit.delay_s),
-            "epsilon": fit.epsilon,
-            "t_ref_c": fit.t_ref_c,
-            "fleet_logs": len(rows),
-        },
-        logs=[
-            SourceLog(name=row["name"], rows=row["rows"], sha256=row["data_sha256"])
-            for row in listed
-        ],
-        fingerprint=fingerprint.hexdigest(),
-    )
+    listed = [
+        SourceLog(name=row["name"], rows=row["rows"], sha256=row["data_sha256"])
+        for row in (rows if len(rows) <= LISTED_LOGS else [])
+    ]
+    return made_of(fit, listed, [row["data_sha256"] for row in rows], fleet_logs=len(rows))

@@ -7,7 +7,6 @@ the others follow, one of each vehicle in turn.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from typing import Any, ClassVar, Final, cast
 
 import pyarrow as pa
 
+from cangauge._io import text_sha256
 from cangauge.diagnosis import ALARM_BELOW, NONE, UNKNOWN, Diagnosis, diagnose
 from cangauge.errors import InputError
 from cangauge.fleet.jobs import COUNT, REAL, TEXT, Job
@@ -81,13 +81,9 @@ class GapJob(Job):
     }  # fmt: skip
 
     def identity(self) -> dict[str, Any]:
-        """Return model, references and reading options."""
-        return {
-            "model": self.model.to_json(),
-            "references": self.references,
-            "alarm": self.alarm_below,
-            "read": self.options.described,
-        }
+        """Return model, references and alarm."""
+        model = self.model.to_json()
+        return {"model": model, "references": self.references, "alarm": self.alarm_below}
 
     def vehicles(
         self,
@@ -115,7 +111,7 @@ class GapJob(Job):
             usable = (log for log in chain(own, others) if log.url not in tested)
             chosen = tuple(islice(usable, self.references))
             text = "".join(f"{each.url}{each.stamp}{each.stated}" for each in (*logs, *chosen))
-            stamp = hashlib.sha256(text.encode()).hexdigest()[:16]
+            stamp = text_sha256(text)[:16]
             found.append(VehicleLogs(vehicle, vehicle, stamp, logs=logs, references=chosen))
         return found
 
@@ -181,7 +177,7 @@ def _columns_of(found: Diagnosis) -> dict[str, Any]:
 
 def _order(log: FleetLog) -> str:
     """Return a key that shuffles logs, by their names only."""
-    return hashlib.sha256(log.url.encode()).hexdigest()
+    return text_sha256(log.url)
 
 
 def suspect_and_healthy(

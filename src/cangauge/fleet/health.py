@@ -69,12 +69,8 @@ class HealthJob(Job):
     }  # fmt: skip
 
     def identity(self) -> dict[str, Any]:
-        """Return model, settings and reading options."""
-        return {
-            "model": self.model.to_json(),
-            "settings": repr(self.settings),
-            "read": self.options.described,
-        }
+        """Return model and settings."""
+        return {"model": self.model.to_json(), "settings": repr(self.settings)}
 
     def row(self, log: FleetLog, path: Path | None, state: str | None) -> dict[str, Any]:
         """Return capacity, resistance and offset with their deviations at the log's end."""

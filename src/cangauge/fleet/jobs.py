@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -13,6 +12,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 import pyarrow as pa
 
+from cangauge._io import text_sha256
 from cangauge.errors import InputError
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.validity import Status
@@ -65,11 +65,11 @@ class Job(ABC):
         given = f"{log.stamp}{log.stated}"
         if self.is_chained:
             given = f"{before}{given}"
-        return hashlib.sha256(given.encode()).hexdigest()[:16]
+        return text_sha256(given)[:16]
 
     @abstractmethod
     def identity(self) -> dict[str, Any]:
-        """Return what the rows depend on beside the log, as JSON."""
+        """Return what the rows depend on beside the log and how it is read, as JSON."""
 
     @abstractmethod
     def row(self, log: FleetLog, path: Path | None, state: str | None) -> dict[str, Any]:
@@ -115,12 +115,8 @@ class EstimateJob(Job):
     }  # fmt: skip
 
     def identity(self) -> dict[str, Any]:
-        """Return model, settings and reading options."""
-        return {
-            "model": self.model.to_json(),
-            "settings": repr(self.settings),
-            "read": self.options.described,
-        }
+        """Return model and settings."""
+        return {"model": self.model.to_json(), "settings": repr(self.settings)}
 
     def row(self, log: FleetLog, path: Path | None, state: str | None) -> dict[str, Any]:
         """Return SoC at both ends, errors where the log has SoC, and the shares of each status."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.fleet.jobs import COUNT, REAL, TEXT, Job, required
 from cangauge.fleet.sources import FleetLog, ReadOptions
-from cangauge.identify.assemble import log_sha256
+from cangauge.identify.assemble import log_sha256, signals_sha256
 from cangauge.identify.evaluate import evaluate
 from cangauge.identify.pooled import LogErrors, LogInformation, errors_of, information_of
 from cangauge.identify.starts import unknown_start
@@ -55,15 +54,14 @@ class InformationJob(Job):
     }  # fmt: skip
 
     def identity(self) -> dict[str, Any]:
-        """Return the options of the fit and of reading."""
-        return {"fit": repr(self.fit), "read": self.options.described}
+        """Return the options of the fit."""
+        return {"fit": repr(self.fit)}
 
     def row(self, log: FleetLog, path: Path | None, state: str | None) -> dict[str, Any]:
         """Return the log's information, flattened."""
         del state
         recorded, rows = rows_of(self.options, self.fit, log, required(path, log))
         found = information_of(rows, self.fit)
-        signals = recorded.current_a.tobytes() + recorded.voltage_v.tobytes()
         arrays = {
             name: np.ravel(getattr(found, name)).tolist()
             for name, kind in self.columns.items()
@@ -72,7 +70,7 @@ class InformationJob(Job):
         return {
             "name": recorded.name,
             "data_sha256": log_sha256(recorded),
-            "signals_sha256": hashlib.sha256(signals).hexdigest(),
+            "signals_sha256": signals_sha256(recorded),
             "temperature_source": recorded.temperature_source,
             "rows": found.rows,
             "temperature_sum": found.temperature_sum,
@@ -110,12 +108,9 @@ class ErrorsJob(Job):
     }  # fmt: skip
 
     def identity(self) -> dict[str, Any]:
-        """Return the models, and the options of the fit and of reading."""
-        return {
-            "fit": repr(self.fit),
-            "models": repr((self.model, self.without, self.mean_c)),
-            "read": self.options.described,
-        }
+        """Return the models, and the options of the fit."""
+        models = repr((self.model, self.without, self.mean_c))
+        return {"fit": repr(self.fit), "models": models}
 
     def row(self, log: FleetLog, path: Path | None, state: str | None) -> dict[str, Any]:
         """Return the log's errors, flattened."""

@@ -9,7 +9,6 @@ The client alone writes the results, at most `FLUSH_S` after they are done.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import os
@@ -20,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
-from cangauge._io import file_sha256
+from cangauge._io import file_sha256, text_sha256
 from cangauge._version import __version__
 from cangauge.errors import CangaugeError, InputError
 from cangauge.fleet.dataset import Dataset, keys_of
@@ -117,9 +116,9 @@ class Summary:
 
 
 def run_id(job: Job) -> str:
-    """Return what tells runs apart: job, model, options and version."""
-    text = json.dumps([job.kind, __version__, job.identity()], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:32]
+    """Return what identifies a run: job, model, options and version."""
+    identity = job.identity() | {"read": job.options.described}
+    return text_sha256(json.dumps([job.kind, __version__, identity], sort_keys=True))[:32]
 
 
 @contextmanager
@@ -301,7 +300,7 @@ class _Run:
     def _submit(self, lane: _Lane, done: Any, job: Any) -> None:
         log, sha256 = lane.waiting.popleft()
         lane.log = log
-        key = hashlib.sha256(f"{self._id}{log.url}{log.stamp}".encode()).hexdigest()
+        key = text_sha256(f"{self._id}{log.url}{log.stamp}")
         future = self._client.submit(
             perform, job, log, sha256, lane.state, key=f"{self._job.kind}-{key[:24]}", pure=False
         )

@@ -8,7 +8,6 @@ take files.
 from __future__ import annotations
 
 import csv
-import hashlib
 import io
 import json
 import re
@@ -20,9 +19,14 @@ from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
-from cangauge._io import MAX_LOG_BYTES
+from cangauge._io import MAX_LOG_BYTES, text_sha256
 from cangauge.bus.captures.capture import Capture
-from cangauge.bus.recording import log_of, open_with_columns
+from cangauge.bus.recording import (
+    log_of,
+    open_with_columns,
+    refuse_sign_of_capture,
+    refuse_single_row,
+)
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.identify.starts import with_start
@@ -285,14 +289,13 @@ def _stamps(urls: Sequence[str]) -> dict[str, str]:
 
 
 def _stamp(info: Mapping[str, Any]) -> str:
-    """Return what tells two contents of a file apart, from its entry in a listing."""
+    """Return what identifies the content of a file, from its entry in a listing."""
     tag = info.get("ETag") or info.get("etag") or info.get("md5Hash")
     when = next(
         (info[key] for key in ("mtime", "LastModified", "last_modified", "created") if key in info),
         "",
     )
-    text = json.dumps([info.get("size"), str(tag or when)])
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    return text_sha256(json.dumps([info.get("size"), str(tag or when)]))[:16]
 
 
 @dataclass(frozen=True, eq=False)
@@ -330,11 +333,7 @@ class ReadOptions:
             If the file cannot be read, or the sign is stated for a capture.
         """
         found = open_with_columns(path, columns=self.columns, mapped=self.mapped, sign=self.sign)
-        if self.sign is not None and not isinstance(found, LogFile):
-            raise InputError(
-                "this is a capture, whose map states the sign", source=path, field="--sign",
-                value=self.sign, cure="set sign = -1 under [current] of the map file",
-            )  # fmt: skip
+        refuse_sign_of_capture(found, self.sign)
         return found
 
     def read(self, path: Path, url: str) -> Log:
@@ -351,8 +350,7 @@ class ReadOptions:
             temperature_c=self.temperature_c,
             temperature_source=self.temperature_source,
         )
-        if len(log) < 2:
-            raise InputError("a single row", source=url, cure="give a log of minutes or hours")
+        refuse_single_row(log)
         if self.sign is None:
             require_discharge_positive(log)
         return replace(log, source=url)

@@ -4,17 +4,32 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Sequence
-from typing import Final, Literal
+from collections.abc import Iterable, Sequence
+from typing import Any, Final, Literal
 
 import numpy as np
 
+from cangauge._io import text_sha256
 from cangauge._typing import FloatArray
+from cangauge._version import __version__
+from cangauge.errors import InputError
 from cangauge.identify.voltage_fit import KT
 from cangauge.inference.error_model import CurveError, TimeError
 from cangauge.inference.least_squares import Solution
-from cangauge.logs.log import Log
-from cangauge.model.model_file import Coefficient, CurveNoise, Information, ModelNoise
+from cangauge.inference.rows import FitOptions
+from cangauge.logs.log import Log, TemperatureSource
+from cangauge.model.model_file import (
+    Coefficient,
+    CurveNoise,
+    Information,
+    Made,
+    Model,
+    ModelNoise,
+    Ranges,
+    SourceLog,
+    resistance_names,
+)
+from cangauge.model.voltage_model import BASIS_NAMES, VoltageModel
 
 WHOLE_LOGS: Final = "whole logs left out in turn"
 """How the held-out error of three logs or more was made."""
@@ -32,6 +47,64 @@ def _unit(name: str) -> Literal["V", "V/K", "ohm"]:
     if name == "kt":
         return "V/K"
     return "ohm" if name.startswith("R") else "V"
+
+
+def model_file_of(
+    voltage_model: VoltageModel, solution: Solution, options: FitOptions, **parts: Any
+) -> Model:
+    """Return the model file of a fit; the keywords are the other fields of `Model`."""
+    return Model(
+        coefficients=coefficients_of(coefficient_names(options), solution),
+        epsilon=voltage_model.epsilon,
+        t_ref_c=voltage_model.t_ref_c,
+        delays_s=list(voltage_model.delay_s),
+        rate_hz=options.rate_hz,
+        capacity_ah=options.capacity_ah,
+        range=Ranges(
+            soc_pct=voltage_model.soc_range_pct,
+            temperature_c=voltage_model.temperature_range_c,
+            current_a=voltage_model.current_range_a,
+        ),
+        **parts,
+    )
+
+
+def coefficient_names(options: FitOptions) -> list[str]:
+    """Return the names of the coefficients, in the order of the design matrix."""
+    return [*BASIS_NAMES, "kt", *resistance_names(len(options.delay_s))]
+
+
+def made_of(
+    options: FitOptions, logs: list[SourceLog], sha256: Sequence[str], **further: Any
+) -> Made:
+    """Return how a model file was made: further options, logs listed, `log_sha256` of all."""
+    return Made(
+        by=f"cangauge {__version__}",
+        options={
+            "capacity_ah": options.capacity_ah,
+            "initial_soc_pct": None,
+            "rate_hz": options.rate_hz,
+            "delay_s": list(options.delay_s),
+            "epsilon": options.epsilon,
+            "t_ref_c": options.t_ref_c,
+            **further,
+        },
+        logs=logs,
+        fingerprint=text_sha256("".join(sha256)),
+    )
+
+
+def common_temperature_source(sources: Iterable[TemperatureSource]) -> TemperatureSource:
+    """Return the source of all logs' temperatures; raise InputError if they differ."""
+    found = sorted(set(sources))
+    if len(found) > 1:
+        raise InputError(
+            "the temperatures of the logs have different sources",
+            field="temperature_source",
+            value=found,
+            cure="fit logs with the same temperature source together",
+        )
+    return found[0]
 
 
 def noise_of(
@@ -96,6 +169,11 @@ def information_of_rows(
         root=root[:n, :n].tolist(),
         projected=root[:n, n].tolist(),
     )
+
+
+def signals_sha256(log: Log) -> str:
+    """Return what identifies the rows of a log: the SHA-256 of its current and voltage."""
+    return hashlib.sha256(log.current_a.tobytes() + log.voltage_v.tobytes()).hexdigest()
 
 
 def log_sha256(log: Log) -> str:

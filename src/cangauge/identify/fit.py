@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,15 +12,18 @@ import numpy as np
 from cangauge._display import figure
 from cangauge._formatting import duration
 from cangauge._typing import FloatArray
-from cangauge._version import __version__
 from cangauge.errors import InputError
 from cangauge.identify.assemble import (
     WHOLE_LOGS,
-    coefficients_of,
+    coefficient_names,
     common_name,
+    common_temperature_source,
     information_of_rows,
     log_sha256,
+    made_of,
+    model_file_of,
     noise_of,
+    signals_sha256,
 )
 from cangauge.identify.effect_search import FittedEffects, fit_effects, parse_effect_ids
 from cangauge.identify.evaluate import (
@@ -58,11 +60,9 @@ from cangauge.model.model_file import (
     Made,
     Model,
     ModelNoise,
-    Ranges,
     SourceLog,
-    resistance_names,
 )
-from cangauge.model.voltage_model import BASIS_NAMES, VoltageModel
+from cangauge.model.voltage_model import VoltageModel
 
 _LOG = logging.getLogger(__name__)
 
@@ -232,21 +232,13 @@ def fit(
     rows = [item.rows for item in fits]
     slope, expected = slope_resistance(voltage_model, rows)
     newton_error = np.concatenate([item.soc_newton_pct - item.rows.soc_pct for item in fits])
-    names = [*BASIS_NAMES, "kt", *resistance_names(len(options.delay_s))]
-    model = Model(
+    names = coefficient_names(options)
+    model = model_file_of(
+        voltage_model,
+        solution,
+        options,
         name=name or common_name([log.name for log in logs]),
-        coefficients=coefficients_of(names, solution),
-        epsilon=voltage_model.epsilon,
-        t_ref_c=voltage_model.t_ref_c,
-        delays_s=list(voltage_model.delay_s),
-        rate_hz=options.rate_hz,
-        capacity_ah=capacity_ah,
         temperature_source=logs[0].temperature_source,
-        range=Ranges(
-            soc_pct=voltage_model.soc_range_pct,
-            temperature_c=voltage_model.temperature_range_c,
-            current_a=voltage_model.current_range_a,
-        ),
         noise=_noise(voltage_model, fits, held_out, options.rate_hz),
         effects=[] if found is None else effect_entries(found.model.effects),
         information=_information(rows, options, names, solution, found),
@@ -291,9 +283,9 @@ def _check_logs(logs: Sequence[Log]) -> None:
                 source=log.source or log.name,
                 cure="give a log of minutes or hours",
             )
-    by_rows: dict[bytes, Log] = {}
+    by_rows: dict[str, Log] = {}
     for log in logs:
-        digest = hashlib.sha256(log.current_a.tobytes() + log.voltage_v.tobytes()).digest()
+        digest = signals_sha256(log)
         if digest in by_rows:
             raise InputError(
                 f"same rows as {by_rows[digest].source or by_rows[digest].name}: they would count"
@@ -302,14 +294,7 @@ def _check_logs(logs: Sequence[Log]) -> None:
                 cure="give each log once",
             )
         by_rows[digest] = log
-    sources = {log.temperature_source for log in logs}
-    if len(sources) > 1:
-        raise InputError(
-            "the temperatures of the logs have different sources",
-            field="temperature_source",
-            value=sorted(sources),
-            cure="fit logs with the same temperature source together",
-        )
+    common_temperature_source(log.temperature_source for log in logs)
 
 
 def _noise(
@@ -385,23 +370,13 @@ def _made(
     initial_soc_pct: float | Sequence[float | None] | None,
 ) -> Made:
     hashes = [log_sha256(log) for log in logs]
-    return Made(
-        by=f"cangauge {__version__}",
-        options={
-            "capacity_ah": options.capacity_ah,
-            "initial_soc_pct": initial_soc_pct if isinstance(initial_soc_pct, float) else None,
-            "rate_hz": options.rate_hz,
-            "delay_s": list(options.delay_s),
-            "epsilon": options.epsilon,
-            "t_ref_c": options.t_ref_c,
-        }
-        | ({"effects": ", ".join(effect_ids)} if effect_ids else {}),
-        logs=[
-            SourceLog(name=log.name, rows=len(item), sha256=digest)
-            for log, item, digest in zip(logs, rows, hashes, strict=True)
-        ],
-        fingerprint=hashlib.sha256("".join(hashes).encode()).hexdigest(),
-    )
+    listed = [
+        SourceLog(name=log.name, rows=len(item), sha256=digest)
+        for log, item, digest in zip(logs, rows, hashes, strict=True)
+    ]
+    given = initial_soc_pct if isinstance(initial_soc_pct, float) else None
+    effects = {"effects": ", ".join(effect_ids)} if effect_ids else {}
+    return made_of(options, listed, hashes, initial_soc_pct=given, **effects)
 
 
 def _remarks_on_time(

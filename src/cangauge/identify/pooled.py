@@ -26,6 +26,7 @@ from cangauge.identify.voltage_fit import (
     check_identifiable,
     design_matrix,
     rising,
+    voltage_model_of,
     with_prior_errors,
     with_prior_row,
 )
@@ -38,7 +39,7 @@ from cangauge.inference.least_squares import (
 )
 from cangauge.inference.rows import FitOptions, FitRows, block_numbers
 from cangauge.inference.time_scales import SCALES, haar_transform
-from cangauge.model.voltage_model import BASIS_NAMES, VoltageModel
+from cangauge.model.voltage_model import VoltageModel
 
 LEVELS_AT_MOST = 4096
 """Different voltages that are counted one by one; with more they are rounded, …"""
@@ -199,18 +200,7 @@ def fit_information(
     block = np.arange(len(volts))
     solution = rising(columns, volts, block, soc_range, options.epsilon, nominal_v=nominal_v)
     solution = replace(solution, kt_prior=prior)
-    x = [float(value) for value in solution.coefficients]
-    return VoltageModel(
-        ocv_v=tuple(x[: len(BASIS_NAMES)]),
-        kt_v_per_k=x[KT],
-        resistance_ohm=tuple(x[KT + 1 :]),
-        delay_s=options.delay_s,
-        epsilon=options.epsilon,
-        t_ref_c=options.t_ref_c,
-        soc_range_pct=soc_range,
-        temperature_range_c=(float(information.low[1]), float(information.high[1])),
-        current_range_a=(float(information.low[2]), float(information.high[2])),
-    ), solution
+    return voltage_model_of(solution, options, information.low, information.high), solution
 
 
 def _with_residual(root: FloatArray, coefficients: FloatArray) -> FloatArray:

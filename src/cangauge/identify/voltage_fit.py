@@ -82,18 +82,27 @@ def fit_voltage_model(
     else:
         nominal_v = float(np.median(volts))
         solution = rising(columns, volts, block, span, options.epsilon, nominal_v=nominal_v)
-    x = [float(value) for value in solution.coefficients]
+    low, high = (np.array([of(x) for x in (soc, temperature, current)]) for of in (np.min, np.max))
+    return voltage_model_of(solution, options, low, high), solution
+
+
+def voltage_model_of(
+    solution: Solution, options: FitOptions, low: FloatArray, high: FloatArray
+) -> VoltageModel:
+    """Return the model of a solution; low and high of SoC [%], temperature [°C], current [A]."""
+    x = solution.coefficients.tolist()
+    soc, temperature, current = zip(low.tolist(), high.tolist(), strict=True)
     return VoltageModel(
-        ocv_v=tuple(x[: len(BASIS_NAMES)]),
-        kt_v_per_k=x[len(BASIS_NAMES)],
-        resistance_ohm=tuple(x[len(BASIS_NAMES) + 1 :]),
+        ocv_v=tuple(x[:KT]),
+        kt_v_per_k=x[KT],
+        resistance_ohm=tuple(x[KT + 1 :]),
         delay_s=options.delay_s,
         epsilon=options.epsilon,
         t_ref_c=options.t_ref_c,
-        soc_range_pct=span,
-        temperature_range_c=(float(temperature.min()), float(temperature.max())),
-        current_range_a=(float(current.min()), float(current.max())),
-    ), solution
+        soc_range_pct=soc,
+        temperature_range_c=temperature,
+        current_range_a=current,
+    )
 
 
 def rising(

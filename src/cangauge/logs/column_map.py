@@ -220,14 +220,23 @@ def choose_columns(
     Raises
     ------
     InputError
-        If a column of the user is not in the table.
+        If a column of the user is not in the table, or is named for two quantities.
     """
     below = [*units_below, *[""] * (len(headings) - len(units_below))]
     meanings = [meaning_of(text, unit) for text, unit in zip(headings, below, strict=False)]
     chosen: dict[str, ChosenColumn] = {}
     for quantity, spec in (given.specs if given else {}).items():
         where = given.where if given else ""
-        chosen[quantity] = _given_column(quantity, spec, headings, meanings, where)
+        found = _given_column(quantity, spec, headings, meanings, where)
+        for other, before in chosen.items():
+            if set(before.places) & set(found.places):
+                raise InputError(
+                    f"is the column of {other} too",
+                    field=f"{where} {quantity}".strip(),
+                    value=spec.text,
+                    cure="give each quantity a column of its own, as headings or as #1, #2, …",
+                )
+        chosen[quantity] = found
     taken = {place for item in chosen.values() for place in item.places}
     guesses: dict[str, int] = {}
     for quantity in FIELDS:
@@ -337,6 +346,8 @@ def _places(text: str, headings: Sequence[str]) -> tuple[int, ...] | None:
 
 
 def _one_place(text: str, headings: Sequence[str]) -> int | None:
+    if text in headings:  # `t` beside `T`
+        return headings.index(text)
     wanted = _simple(text)
     names = [_simple(heading) for heading in headings]
     if wanted in names:

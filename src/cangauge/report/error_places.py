@@ -159,9 +159,9 @@ def _digits(width: float) -> int:
 
 
 def share_figures(places: Sequence[ErrorShare]) -> list[Figure]:
-    """Return the shares of the squared error over every axis, the most telling one first.
+    """Return the shares of the squared error over every axis, the most informative one first.
 
-    An axis tells most where one of its ranges has far more than an equal part of the error.
+    An axis is informative where one of its ranges has far more than an equal part of the error.
     """
     by_axis = {axis: [place for place in places if place.axis == axis] for axis in _AXES}
     figures = []
@@ -185,7 +185,7 @@ def share_figures(places: Sequence[ErrorShare]) -> list[Figure]:
 
 
 def _concentration(places: Sequence[ErrorShare]) -> float:
-    """Return the largest share in equal parts; below two places nothing is told."""
+    """Return the largest share in equal parts; 0 below two places."""
     return len(places) * max((place.share for place in places), default=0.0) if places[1:] else 0.0
 
 

@@ -6,7 +6,6 @@ no network and stays readable.
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -20,7 +19,7 @@ from bokeh.resources import Resources
 from bokeh.themes import Theme
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from cangauge._io import file_sha256
+from cangauge._io import file_sha256, text_sha256
 from cangauge._version import __version__
 from cangauge.model.model_file import Model
 from cangauge.report.charts import MAX_POINTS
@@ -95,7 +94,7 @@ class InputFile:
         """Hash a model's file, or without one the file that it would be written as."""
         if path is not None:
             return cls.of_path("model", model.name, path)
-        return cls("model", model.name, hashlib.sha256(model.to_json().encode()).hexdigest())
+        return cls("model", model.name, text_sha256(model.to_json()))
 
 
 @dataclass(frozen=True)

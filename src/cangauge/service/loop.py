@@ -486,7 +486,7 @@ class Housekeeping:
 
 
 class OwnEchoes:
-    """Tell own frames that a bus returns from those of others.
+    """Distinguish own frames that a bus returns from those of others.
 
     Parameters
     ----------

@@ -173,14 +173,16 @@ class Service:
                 f"{port.name}: no expected frame arrived; check channel, bit rate and vehicle"
                 " (--vehicle, or --dbc and --map)",
             )
-        recorded = recording.written
-        written = {
-            "record": None if recorded is None else str(recorded),
-            "output": None if table is None or table.failed else config.output,
-        }
-        for path in filter(None, written.values()):
+        records = [str(path) for path in recording.written]
+        output = None if table is None or table.failed else config.output
+        for path in filter(None, (*records, output)):
             emit(_LOG, logging.INFO, "file.written", f"written: {path}", limit=path, path=path)
-        return _summary_json(pipeline, port, summary) | {"state": config.state} | written
+        return _summary_json(pipeline, port, summary) | {
+            "state": config.state,
+            "record": records[-1] if records else None,
+            "records": records,
+            "output": output,
+        }
 
     def reconfigure(self) -> LoopSettings | None:
         """Read the configuration again in this process and apply it; the SoC continues.

@@ -9,7 +9,6 @@ cannot be read or written never stops the estimator: the error is logged and the
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import math
@@ -28,7 +27,7 @@ from typing import Annotated, Any, Final, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from cangauge._formatting import duration, number
-from cangauge._io import PRIVATE, open_regular, refuse_foreign, write_text_atomic
+from cangauge._io import PRIVATE, open_regular, refuse_foreign, text_sha256, write_text_atomic
 from cangauge._logging import emit
 from cangauge.errors import CangaugeError, InputError
 from cangauge.estimation.state import EstimatorState
@@ -375,7 +374,7 @@ class StateContent(BaseModel):
 
 def model_fingerprint(model: Model) -> str:
     """Return the hash of a model's content."""
-    return hashlib.sha256(model.to_json().encode()).hexdigest()
+    return text_sha256(model.to_json())
 
 
 def state_text(content: StateContent) -> str:
@@ -457,7 +456,7 @@ def _canonical(content: dict[str, Any]) -> str:
 
 
 def _hash(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()
+    return text_sha256(text)
 
 
 def _content_hash(content: dict[str, Any]) -> str:

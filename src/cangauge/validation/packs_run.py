@@ -42,7 +42,7 @@ from cangauge.validation.packs_score import Bench, Failure, LogScore, pool_score
 
 
 class Case(NamedTuple):
-    """What is wrong, or not told, while a log is estimated."""
+    """Error or withheld input with which a log is estimated."""
 
     name: str
     start_error_pct: float | None = 0.0
