@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from cangauge.diagnosis.caveats import (
+    extended_soc_caveat,
     extension_caveat,
     log_caveats,
     reference_fit_caveat,
@@ -216,3 +217,13 @@ def test_a_poor_fit_of_references_is_a_caveat() -> None:
 def test_a_worse_extended_model_is_a_caveat() -> None:
     assert extension_caveat(2.05, 0.5) == ""
     assert "2.90 V, the given one 2.05 V. Do not use it" in extension_caveat(2.05, 2.90)
+
+
+@pytest.mark.parametrize(
+    ("baseline_pct", "extended_pct", "warned"),
+    [(1.0, 2.4, True), (2.4, 1.0, False), (None, 2.4, False)],
+)
+def test_an_extended_model_with_a_worse_soc_is_not_silent(
+    baseline_pct: float | None, extended_pct: float | None, warned: bool
+) -> None:
+    assert ("farther" in extended_soc_caveat(baseline_pct, extended_pct)) is warned

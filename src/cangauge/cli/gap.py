@@ -165,6 +165,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     `cangauge gap day1.csv --simulated "V sim [V]" --capacity-ah 60 --reference good1.csv
     --reference good2.csv --reference good3.csv --corrected .`
     """
+    from cangauge.diagnosis.caveats import extended_soc_caveat
     from cangauge.identify.starts import with_start
     from cangauge.report.summary import next_step
 
@@ -198,6 +199,9 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     texts = next_test.texts(steps)
     if extended is not None:
         texts[extended] = found.extended_model.to_json()
+        soc = extended_soc_caveat(found.baseline_soc_mae_pct, found.extended_soc_mae_pct)
+        if soc:
+            note(f"warning: {soc}")
     if report is not None:
         texts[report] = _page(found, model, steps)
     write_texts_atomic(texts)
@@ -214,7 +218,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     if of_simulator is not None:
         _show_simulator(of_simulator)
     show_tests(steps)
-    for written in filter(None, (extended, report, plan_file, *outputs)):
+    for written in (*texts, *outputs):
         note(f"wrote {written}")
 
 

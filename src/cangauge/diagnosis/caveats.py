@@ -128,6 +128,21 @@ def extension_caveat(baseline_v: float, extended_v: float) -> str:
     )
 
 
+def extended_soc_caveat(baseline_pct: float | None, extended_pct: float | None) -> str:
+    """Return the caveat of an extended model with a larger SoC error on the diagnosed logs [%].
+
+    `None` where the logs have no reference SoC.
+    """
+    if baseline_pct is None or extended_pct is None or extended_pct <= baseline_pct:
+        return ""
+    return (
+        f"On these logs the extended model's SoC is farther from the logs' own SoC"
+        f" ({extended_pct:.1f} %) than the given model's ({baseline_pct:.1f} %). Compare both on a"
+        " log of another day with the same fault before you use it; where the fault can be mended"
+        " (a sensor, a time stamp), mend it instead."
+    )
+
+
 def _duration(logs: Sequence[SampledLog]) -> str:
     short = [item.log for item in logs if item.log.duration_s < SHORT_S]
     if not short:

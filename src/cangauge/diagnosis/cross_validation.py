@@ -1,8 +1,8 @@
 """Cross-validation of the gap: errors on rows that the fit of the effects did not see.
 
 Of several logs each is left out in turn. A single log is divided into blocks of 240 s, of which
-every fourth is left out in turn, except for the last; the error is evaluated on the middle 120 s of
-a left-out block, separated by 60 s on either side from the rows of the fit.
+every fourth is left out in turn, with 60 s on either side that neither fit nor evaluation uses; so
+each row is evaluated once.
 """
 
 from __future__ import annotations
@@ -72,15 +72,14 @@ def folds(problem: DiagnosisProblem) -> list[Fold]:
             rest = [log for k, log in enumerate(equations) if k != number]
             held_out.append((rest, number, np.ones(matrix.residual_v.size, dtype=bool)))
     else:
-        time_s = logs[0].sampled.rows.time_s
-        elapsed = time_s - time_s[0]
-        block = (elapsed // BLOCK_S).astype(np.intp)
-        since = elapsed % BLOCK_S
+        elapsed = logs[0].sampled.rows.time_s - logs[0].sampled.rows.time_s[0]
+        around = [elapsed - BLOCK_GUARD_S, elapsed, elapsed + BLOCK_GUARD_S]
+        fold_of = [(time_s // BLOCK_S) % FOLDS for time_s in around]
         for fold in range(FOLDS):
-            left_out = (block % FOLDS == fold) & (block < block[-1])
-            core = left_out & (since >= BLOCK_GUARD_S) & (since < BLOCK_S - BLOCK_GUARD_S)
-            if core.any():
-                held_out.append(([problem.equations_of(logs[0], 1.0 - left_out)], 0, core))
+            rows = fold_of[1] == fold
+            fitted = np.all([each != fold for each in fold_of], axis=0)
+            if rows.any() and fitted.any():
+                held_out.append(([problem.equations_of(logs[0], 1.0 * fitted)], 0, rows))
     references = problem.reference_equations
     return [
         Fold(marginalize(problem.hypotheses, references, rest, problem.error), number, rows)

@@ -99,11 +99,20 @@ class Plan:
         return self.tests[0]
 
     @property
+    def helps(self) -> bool:
+        """Whether the proposed test is expected to add a percent or more of probability."""
+        return self.best.probability >= self.probability + 0.01
+
+    @property
     def sentence(self) -> str:
         """The proposal in an engineer's words."""
-        if f"{self.best.probability:.0%}" == f"{self.probability:.0%}":
-            return "No test within the limits is expected to make the cause more certain."
         best = self.best.profile
+        if not self.helps:
+            return (
+                "No test within the limits is expected to make the cause more certain: the"
+                f" probability of the right one is {self.probability:.0%} now, and expected to be"
+                f" {self.best.probability:.0%} after the best, {best.name}."
+            )
         names = [_IN_WORDS.get(name, name) for name in self.causes]
         if len(names) > NAMED:
             names[NAMED:] = [f"{len(names) - NAMED} more"]

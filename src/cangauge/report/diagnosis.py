@@ -9,6 +9,7 @@ import numpy as np
 
 from cangauge._formatting import number, significant, span
 from cangauge.diagnosis import NONE, UNKNOWN, Diagnosis, LogErrors, rms
+from cangauge.diagnosis.caveats import extended_soc_caveat
 from cangauge.diagnosis.next_test import NextSteps, Plan
 from cangauge.model.effects.library import LIBRARY
 from cangauge.report.charts import (
@@ -133,7 +134,7 @@ def _next_test(plan: Plan) -> list[Block]:
     return [
         Paragraph(plan.sentence),
         Figure(
-            f"Proposed test: {best.name}",
+            f"{'Proposed test' if plan.helps else 'Best of the tests'}: {best.name}",
             plot,
             f"From {number(best.start_soc_pct, 0, '%')} to"
             f" {number(float(best.soc_pct[-1]), 0, '%')} SoC, from"
@@ -373,7 +374,8 @@ def _closing(diagnosis: Diagnosis) -> Paragraph:
             f" The extended model has {cause}what the references show: adjusted coefficients, and"
             " structure that logs without a fault share."
         )
-    return Paragraph(text)
+    soc = extended_soc_caveat(diagnosis.baseline_soc_mae_pct, diagnosis.extended_soc_mae_pct)
+    return Paragraph(f"{text} {soc}".rstrip())
 
 
 def _over_time(errors: Sequence[LogErrors], extended: str) -> tuple[Figure, Figure]:

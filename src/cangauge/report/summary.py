@@ -160,10 +160,20 @@ def open_question(diagnosis: Diagnosis) -> str:
         )
     if verdict.cause == UNKNOWN:
         floor = "references" if references else "the model file states"
+        sizes = f"{baseline}, {floor} {number(diagnosis.floor_v, 2, 'V')}"
+        stated = verdict.probabilities
+        together = 1.0 - stated[NONE] - stated[UNKNOWN]
+        if together > stated[UNKNOWN]:
+            return (
+                f"No cause can be named ({sizes}): a cause outside the library is the likeliest"
+                f" single answer, but all effects of the library together have"
+                f" {100.0 * together:.0f} %; none of them stands out. The best,"
+                f" {verdict.candidates[0].effect_id}, has"
+                f" {100.0 * stated[verdict.candidates[0].effect_id]:.0f} %."
+            )
         return (
-            f"No cause can be named: the gap is real ({baseline}, {floor}"
-            f" {number(diagnosis.floor_v, 2, 'V')}), but no effect of the library is a likely"
-            f" cause. The best, {verdict.candidates[0].effect_id}, explains"
+            f"No cause can be named: the gap is real ({sizes}), but no effect of the library is a"
+            f" likely cause. The best, {verdict.candidates[0].effect_id}, explains"
             f" {100.0 * verdict.explained:.0f} % of it. The cause is not in the library, or several"
             " act at once, or the model is not of this pack."
         )
@@ -243,7 +253,7 @@ def percent_span(low: float, high: float) -> str:
     return span(100.0 * low, 100.0 * high, 0, "%")
 
 
-PLAN_TITLE: Final = "Next test: expected probability of each cause where it is the true one"
+PLAN_TITLE: Final = "Tests: expected probability of each cause where it is the true one"
 
 
 def plan_rows(plan: Plan) -> tuple[list[str], Rows]:
