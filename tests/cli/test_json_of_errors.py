@@ -116,7 +116,7 @@ def test_a_service_that_fails(made: Path, monkeypatch: pytest.MonkeyPatch, log_f
     def fail(*_: object) -> None:
         raise CangaugeError("the bus is on fire")
 
-    monkeypatch.setattr("cangauge.cli.run.Service.run", fail)
+    monkeypatch.setattr("cangauge.service.run.Service.run", fail)
     ended = in_process("run", "-m", made / "model.json", "--log-format", log_format, "--json")
     assert error_of(ended, 1) == dict.fromkeys(PARTS) | {"message": "the bus is on fire"}
     (line,) = ended.err.splitlines()
@@ -131,7 +131,7 @@ def test_a_disk_that_is_full(made: Path, tmp_path: Path, monkeypatch: pytest.Mon
         with atomic_path(tmp_path / "soc.csv"):
             raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("cangauge.cli.estimate.write_estimates", full)
+    monkeypatch.setattr("cangauge.service.estimate_table.write_estimates", full)
     error = failed(
         "estimate", made / "part.csv", "-m", made / "model.json", "-o", tmp_path / "soc.csv", code=1
     )

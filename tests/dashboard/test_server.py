@@ -245,7 +245,7 @@ def test_the_option_alone_means_a_loopback_address(
         raise InputError("enough")
 
     given: dict[str, Any] = {}
-    monkeypatch.setattr("cangauge.cli.run.load_config", note)
+    monkeypatch.setattr("cangauge.service.config.load_config", note)
     assert "enough" in in_process("run", "-m", "m.json", "--dashboard", *after).err
     assert given["dashboard"] == "127.0.0.1:8642"
     assert given["channel"] == ("x" if "x" in after else None)

@@ -1,26 +1,66 @@
-"""Options of the commands on a bus, made from the keys of `RunConfig`."""
+"""Options of the commands on a bus, made from the keys of `RunConfig`.
+
+The keys are read from a table beside this file, so that a help page needs neither pydantic nor the
+bus: `python -m cangauge.cli.config_options > src/cangauge/cli/config_options.json` writes it.
+"""
 
 from __future__ import annotations
 
 import inspect
+import json
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, NamedTuple
 
 import typer
 from typer.core import TyperCommand
 
-from cangauge.bus.open import parse_bus_options
 from cangauge.errors import InputError
-from cangauge.service.config import config_keys
-from cangauge.service.config_tables import ConfigKey
 
-_KEYS: Final = {key.name: key for key in config_keys() if key.option}
+
+class OptionKey(NamedTuple):
+    """What the command line needs of a key of the configuration (`ConfigKey`)."""
+
+    name: str
+    option: str
+    kind: str
+    help: str
+    metavar: str
+    is_path: bool
+    bare: str
+
+
+_FILE: Final = Path(__file__).with_suffix(".json")
+
+
+def option_table() -> str:
+    """Return the options as JSON, made from `RunConfig`, which is slow to import."""
+    from cangauge.service.config import config_keys
+
+    keys = [
+        OptionKey(
+            key.name, key.option, key.kind, key.help,
+            key.info.metavar, key.info.is_path, key.info.bare,
+        )
+        for key in config_keys()
+        if key.option
+    ]  # fmt: skip
+    rows = [json.dumps(key._asdict(), ensure_ascii=False) for key in keys]
+    return "[\n" + ",\n".join(rows) + "\n]\n"
+
+
+def _kept_keys() -> Iterator[OptionKey]:
+    for row in json.loads(_FILE.read_text(encoding="utf-8")):
+        yield OptionKey(**row)
+
+
+_KEYS: Final = {key.name: key for key in _kept_keys()}
 _TYPES: Final[Mapping[str, type]] = {"number": float, "true or false": bool}
 
 
-_BARE: Final = {key.option: key.info.bare for key in _KEYS.values() if key.info.bare}
+_BARE: Final = {key.option: key.bare for key in _KEYS.values() if key.bare}
 
 
 class ConfigCommand(TyperCommand):
@@ -41,7 +81,7 @@ def _with_values(arguments: Sequence[str]) -> Iterator[str]:
 def config_option(name: str) -> Any:
     """Return the typer option of a key, such as "ids.soc_detail"."""
     key = _KEYS[name]
-    return typer.Option(*key.option.split(", "), metavar=key.info.metavar or None, help=key.help)
+    return typer.Option(*key.option.split(", "), metavar=key.metavar or None, help=key.help)
 
 
 def config_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -77,6 +117,8 @@ def config_values(options: Mapping[str, Any]) -> dict[str, Any]:
     InputError
         If a bus option is not K=V, or an id is not a number.
     """
+    from cangauge.bus.open import parse_bus_options
+
     values = {name: options[_parameter(name)] for name in _KEYS if "." not in name}
     values = {name: str(v) if isinstance(v, Path) else v for name, v in values.items()}
     values["bus_options"] = parse_bus_options(values["bus_options"] or [])
@@ -112,10 +154,10 @@ def _parameter(name: str) -> str:
     return f"{name.removeprefix('ids.')}_id" if name.startswith("ids.") else name
 
 
-def _type(key: ConfigKey) -> Any:
+def _type(key: OptionKey) -> Any:
     if key.name == "bus_options":
         return list[str]
-    if key.info.is_path:
+    if key.is_path:
         return Path
     # Checked by the configuration, for the same message as in a file; "auto" is no number.
     return str if key.name == "initial_soc" else _TYPES.get(key.kind, str)
@@ -131,3 +173,7 @@ BusTemperatureOption = Annotated[float | None, config_option("temperature")]
 EstimateIdOption = Annotated[str | None, config_option("ids.soc_estimate")]
 DetailIdOption = Annotated[str | None, config_option("ids.soc_detail")]
 ClockIdOption = Annotated[str | None, config_option("ids.replay_clock")]
+
+
+if __name__ == "__main__":
+    sys.stdout.write(option_table())

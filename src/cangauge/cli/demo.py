@@ -8,30 +8,20 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
 from cangauge._formatting import number, significant
 from cangauge._io import check_writable, write_text_atomic
 from cangauge._resources import shared_file
-from cangauge.bus.open import has_socketcan
-from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.options import JsonOption
 from cangauge.cli.output import emit_json, note, print_table
 from cangauge.errors import CangaugeError, InputError
-from cangauge.estimation.offline import Scores, estimate_log, score
-from cangauge.estimation.settings import EstimatorSettings
-from cangauge.identify.fit import Identification, fit
-from cangauge.logs.read import read_log
-from cangauge.model.published import SOC_NEWTON_MAE_PCT, VOLTAGE_MAE_PCT
-from cangauge.replay.steps import quantization_bound
-from cangauge.report.estimate import estimate_report
-from cangauge.report.fit import fit_report
-from cangauge.service.addresses import LOOPBACK
-from cangauge.service.estimate_table import read_estimates
-from cangauge.service.offline import RecordedEstimate
+
+if TYPE_CHECKING:
+    from cangauge.estimation.offline import Scores
+    from cangauge.identify.fit import Identification
 
 TRAINED_ON = "leaf2012_reconstruction_white.parquet"
 PLAYED = "leaf2012_reconstruction_correlated.parquet"
@@ -57,6 +47,20 @@ def demo_command(
 
     `cangauge demo --folder /tmp/demo --json`
     """
+    import numpy as np
+
+    from cangauge.bus.vehicle import Vehicle
+    from cangauge.estimation.offline import estimate_log, score
+    from cangauge.estimation.settings import EstimatorSettings
+    from cangauge.identify.fit import fit
+    from cangauge.logs.read import read_log
+    from cangauge.replay.steps import quantization_bound
+    from cangauge.report.estimate import estimate_report
+    from cangauge.report.fit import fit_report
+    from cangauge.service.addresses import LOOPBACK
+    from cangauge.service.estimate_table import read_estimates
+    from cangauge.service.offline import RecordedEstimate
+
     began = time.monotonic()
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -105,6 +109,8 @@ def demo_command(
 
 
 def _free_port() -> int:
+    from cangauge.service.addresses import LOOPBACK
+
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
         return int(probe.getsockname()[1])
@@ -112,6 +118,8 @@ def _free_port() -> int:
 
 def _play(model: Path, log: Path, live: Path, port: int | None) -> float:
     """Replay a log to the service, each in its own process; return the duration [s]."""
+    from cangauge.bus.open import has_socketcan
+
     bus = ["--interface", "socketcan", "--channel", "vcan0"]
     if not has_socketcan("vcan0"):
         bus = []  # the default, which takes nothing from other machines
@@ -164,6 +172,8 @@ def _result(
 
 
 def _show(result: dict[str, Any]) -> None:
+    from cangauge.model.published import SOC_NEWTON_MAE_PCT, VOLTAGE_MAE_PCT
+
     rows = [
         [name, significant(result[key], 3, "%"), "" if published is None else f"{published:.2f} %"]
         for name, key, published in (

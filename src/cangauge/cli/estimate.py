@@ -6,16 +6,13 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 from rich.progress import Progress
 
 from cangauge._formatting import number
 from cangauge._io import atomic_path
-from cangauge.bus.captures.capture import Capture
-from cangauge.bus.publish import PackReport
-from cangauge.bus.recording import capture_without_vehicle, refuse_single_row
 from cangauge.cli.options import (
     FiguresOption,
     JsonOption,
@@ -29,22 +26,14 @@ from cangauge.cli.options import (
     within,
 )
 from cangauge.cli.output import console, emit_json, note, print_table, save_figures
+from cangauge.cli.shown import VALID_STD_PCT
 from cangauge.errors import InputError
-from cangauge.estimation.settings import VALID_STD_PCT, EstimatorSettings, Filter, Method
-from cangauge.logs.canonical import write_table
-from cangauge.logs.cells import read_cells
-from cangauge.model.delay_line import GAP_S
-from cangauge.model.model_file import Model
-from cangauge.service.estimate_mcap import write_estimates_mcap
-from cangauge.service.estimate_table import require_table_suffix, write_estimates
-from cangauge.service.offline import (
-    PackHistory,
-    RecordedCapture,
-    RecordedEstimate,
-    estimate_recorded_capture,
-    estimate_recorded_log,
-    require_same_pack,
-)
+
+if TYPE_CHECKING:
+    from cangauge.bus.publish import PackReport
+    from cangauge.estimation.settings import Filter, Method
+    from cangauge.model.model_file import Model
+    from cangauge.service.offline import RecordedEstimate
 
 AUTO = "auto"
 
@@ -146,8 +135,20 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge estimate drive.log --vehicle leaf_ze0 -m leaf.json -o soc.csv --method newton`
     """
-    is_mcap = output.suffix.lower() == ".mcap"
-    if not is_mcap:
+    from cangauge.bus.captures.capture import Capture
+    from cangauge.bus.recording import capture_without_vehicle
+    from cangauge.estimation.settings import EstimatorSettings
+    from cangauge.logs.cells import read_cells
+    from cangauge.model.delay_line import GAP_S
+    from cangauge.model.model_file import Model
+    from cangauge.service.estimate_table import require_table_suffix
+    from cangauge.service.offline import (
+        PackHistory,
+        estimate_recorded_capture,
+        estimate_recorded_log,
+    )
+
+    if not _is_mcap(output):
         require_table_suffix(output)
     require_table_suffix(pack or Path("pack.csv"), option="--pack")
     settings = EstimatorSettings(
@@ -196,21 +197,8 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
                 f"note: {log.source}: its usual step is {done.settings.gap_s / 3.0:g} s; steps over"
                 f" {done.settings.gap_s:g} s count as gaps (--max-gap-s)"
             )
-    page = None
-    if report is not None:
-        # bokeh takes half a second to import.
-        from cangauge.report.estimate import estimate_report  # noqa: PLC0415
-
-        page = estimate_report(done, model_path)
     _write_pack(done, pack)
-    with ExitStack() as both:  # table and report, or neither
-        part = both.enter_context(atomic_path(output))
-        if is_mcap:
-            write_estimates_mcap(part, done.recorded, done.table)
-        else:
-            write_estimates(part, done.recorded.time_s, done.table)
-        if report is not None and page is not None:
-            both.enter_context(atomic_path(report)).write_text(page, encoding="utf-8")
+    _write_output(done, output, report, model_path)
     save_figures(figures, "estimate.estimate_page", done, model_path)
     for warning in done.warnings:
         note(f"warning: {done.recorded.source}: {warning}")
@@ -226,7 +214,36 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     )
 
 
+def _is_mcap(output: Path) -> bool:
+    return output.suffix.lower() == ".mcap"
+
+
+def _write_output(
+    done: RecordedEstimate, output: Path, report: Path | None, model_path: Path
+) -> None:
+    """Write table and report, or neither."""
+    from cangauge.service.estimate_mcap import write_estimates_mcap
+    from cangauge.service.estimate_table import write_estimates
+
+    page = None
+    if report is not None:
+        # bokeh takes half a second to import.
+        from cangauge.report.estimate import estimate_report
+
+        page = estimate_report(done, model_path)
+    with ExitStack() as both:
+        part = both.enter_context(atomic_path(output))
+        if _is_mcap(output):
+            write_estimates_mcap(part, done.recorded, done.table)
+        else:
+            write_estimates(part, done.recorded.time_s, done.table)
+        if report is not None and page is not None:
+            both.enter_context(atomic_path(report)).write_text(page, encoding="utf-8")
+
+
 def _write_pack(done: RecordedEstimate, pack: Path | None) -> None:
+    from cangauge.logs.canonical import write_table
+
     if pack is not None:
         write_table(done.pack.columns, pack)
 
@@ -240,6 +257,8 @@ def _refuse_smoothing(capture: Path, *, smooth: bool) -> None:
 
 
 def _filter(given: str, *, smooth: bool) -> Filter:
+    from cangauge.estimation.settings import Filter
+
     for name in get_args(Filter):
         if given == name:
             if smooth and given != "own":
@@ -251,6 +270,8 @@ def _filter(given: str, *, smooth: bool) -> Filter:
 
 
 def _method(given: str) -> Method:
+    from cangauge.estimation.settings import Method
+
     for method in get_args(Method):
         if given == method:
             return method  # type: ignore[no-any-return]
@@ -279,6 +300,9 @@ def _progress(total: int | None) -> Iterator[Callable[[int], None]]:
 
 def _check_capture(done: RecordedEstimate, model: Model) -> None:
     """Refuse a capture of one sample, of another pack, or with inverted current."""
+    from cangauge.bus.recording import refuse_single_row
+    from cangauge.service.offline import RecordedCapture, require_same_pack
+
     recorded = done.recorded
     refuse_single_row(recorded)
     for remark in recorded.remarks:

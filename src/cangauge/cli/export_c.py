@@ -26,8 +26,8 @@ def export_c_command(
     is_folder = os.path.isdir(output)  # noqa: PTH112 - pathlib raises for an impossible name
     check_outputs([output / "pack_model.c" if is_folder else output], [model])
     # Deferred, so that the help page does not wait for numpy and scipy.
-    from cangauge.export.embedded import export_c  # noqa: PLC0415
-    from cangauge.model.model_file import Model  # noqa: PLC0415
+    from cangauge.export.embedded import export_c
+    from cangauge.model.model_file import Model
 
     done = export_c(Model.load(model), output, period_s=period)
     if as_json:

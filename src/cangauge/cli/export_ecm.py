@@ -40,8 +40,8 @@ def export_ecm_command(
         )
     check_outputs([output], [model])
     # Deferred, so that the help page does not wait for numpy and scipy.
-    from cangauge.export.equivalent_circuit import equivalent_circuit  # noqa: PLC0415
-    from cangauge.model.model_file import Model  # noqa: PLC0415
+    from cangauge.export.equivalent_circuit import equivalent_circuit
+    from cangauge.model.model_file import Model
 
     circuit = equivalent_circuit(Model.load(model))
     text = circuit.to_module() if output.suffix == ".py" else circuit.to_json()

@@ -46,8 +46,8 @@ def export_fmu_command(
         raise InputError("not .fmu", field="-o", value=str(output), cure="name a .fmu file")
     check_outputs([output], [model])
     # Deferred, so that the help page does not wait for numpy and scipy.
-    from cangauge.export.fmu import Kind, Version, export_fmu  # noqa: PLC0415
-    from cangauge.model.model_file import Model  # noqa: PLC0415
+    from cangauge.export.fmu import Kind, Version, export_fmu
+    from cangauge.model.model_file import Model
 
     export_fmu(Model.load(model), output, kind=cast("Kind", kind), version=cast("Version", fmi))
     if json_output:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,13 +22,10 @@ from cangauge.cli.options import (
 )
 from cangauge.cli.output import console, emit_json, note, print_table, progress_shown, save_figures
 from cangauge.errors import InputError
-from cangauge.identify.delays import DelaySearch, search_delays
-from cangauge.identify.effect_search import parse_effect_ids
-from cangauge.identify.fit import Identification, fit
-from cangauge.identify.starts import find_starts, given_starts
-from cangauge.inference.rows import DELAYS_S, FitOptions
-from cangauge.model.coulomb_counting import capacity_from_full_discharge, capacity_from_reference
-from cangauge.report.summary import effect_rows, rounded, search_rows
+
+if TYPE_CHECKING:
+    from cangauge.identify.delays import DelaySearch
+    from cangauge.identify.fit import Identification
 
 FROM_SOC = "from-soc"
 AUTO = "auto"
@@ -117,6 +114,16 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
 
     Model file and report are written together, or neither.
     """
+    from cangauge.identify.delays import search_delays
+    from cangauge.identify.effect_search import parse_effect_ids
+    from cangauge.identify.fit import fit
+    from cangauge.identify.starts import find_starts, given_starts
+    from cangauge.inference.rows import DELAYS_S, FitOptions
+    from cangauge.model.coulomb_counting import (
+        capacity_from_full_discharge,
+        capacity_from_reference,
+    )
+
     capacity = _capacity(capacity_ah)
     initial = _initial_soc(initial_soc, len(logs))
     within(rate_hz, 0.01, 1000.0, option="--rate-hz", unit="Hz")
@@ -156,7 +163,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         if report is not None:
             status.update("writing the report")
             # bokeh takes half a second to import.
-            from cangauge.report.fit import fit_report  # noqa: PLC0415
+            from cangauge.report.fit import fit_report
 
             page = fit_report(result)
     write_texts_atomic(
@@ -243,6 +250,8 @@ def _best(search: DelaySearch) -> list[tuple[tuple[float, ...], float]]:
 
 
 def _show(result: Identification, search: DelaySearch | None) -> None:
+    from cangauge.report.summary import effect_rows, rounded, search_rows
+
     model, energy = result.model, result.energy
     if search is not None:
         print_table(

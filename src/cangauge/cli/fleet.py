@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Final, cast
+from typing import TYPE_CHECKING, Annotated, Any, Final, cast
 
 import typer
 
@@ -24,20 +24,15 @@ from cangauge.cli.options import (
     within,
 )
 from cangauge.cli.output import console, emit_json, note, print_table, progress_shown
-from cangauge.diagnosis import ALARM_BELOW
+from cangauge.cli.shown import ALARM_BELOW, FLEET_LOGS, FLEET_REFERENCES, LOCAL, VEHICLE_PATTERN
 from cangauge.errors import InputError
-from cangauge.estimation.settings import EstimatorSettings
-from cangauge.fleet.dataset import Dataset
-from cangauge.fleet.fit import fit_fleet
-from cangauge.fleet.gap import LOGS, REFERENCES, GapJob, suspect_and_healthy
-from cangauge.fleet.health import HealthJob
-from cangauge.fleet.jobs import EstimateJob, Job
-from cangauge.fleet.overview import FleetOverview
-from cangauge.fleet.run import LOCAL, Summary, connected, run_job
-from cangauge.fleet.sources import VEHICLE_PATTERN, FleetLog, ReadOptions, find_logs
-from cangauge.inference.rows import FitOptions
-from cangauge.logs.draft import Sign
-from cangauge.model.model_file import Model
+
+if TYPE_CHECKING:
+    from cangauge.fleet.jobs import Job
+    from cangauge.fleet.overview import FleetOverview
+    from cangauge.fleet.run import Summary
+    from cangauge.fleet.sources import FleetLog, ReadOptions
+    from cangauge.logs.draft import Sign
 
 fleet_app: Final = typer.Typer(
     name="fleet", rich_markup_mode="markdown", add_completion=False, no_args_is_help=True,
@@ -94,10 +89,14 @@ class Cluster:
 
     def find(self, logs: Sequence[str]) -> list[FleetLog]:
         """Return the logs that paths, globs and manifests name (`find_logs`)."""
+        from cangauge.fleet.sources import find_logs
+
         return find_logs(logs, pattern=self.pattern)
 
     def run(self, work: Callable[[Any], Any]) -> Any:
         """Return what a function of the Dask client returns; show its progress."""
+        from cangauge.fleet.run import connected
+
         workers = None if self.workers is None else float(self.workers)
         within(workers, 1, 1024, option="--workers", unit="")
         shown: AbstractContextManager[Any] = nullcontext()
@@ -154,6 +153,9 @@ def fit_fleet_command(
     --------
     `cangauge fleet fit 'logs/*/*.parquet' -m type.json -o results --capacity-ah 51.5`
     """
+    from cangauge.fleet.fit import fit_fleet
+    from cangauge.inference.rows import FitOptions
+
     within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
     within(rate_hz, 0.01, 1000.0, option="--rate-hz", unit="Hz")
     within(epsilon, 1e-4, 0.49, option="--epsilon", unit="")
@@ -205,6 +207,10 @@ def estimate_fleet_command(
     `cangauge fleet estimate 's3://drives/*/*.parquet' -m type.json -o s3://results/may
     --scheduler tcp://10.0.0.5:8786`
     """
+    from cangauge.estimation.settings import EstimatorSettings
+    from cangauge.fleet.jobs import EstimateJob
+    from cangauge.model.model_file import Model
+
     settings = EstimatorSettings(capacity_ah=capacity_ah)
     job = EstimateJob(_read_options(reading), Model.load(model), settings)
     _run(job, cluster.find(logs), out, cluster, report, json_output=json_output)
@@ -231,6 +237,10 @@ def health_fleet_command(
     --------
     `cangauge fleet health manifest.csv -m type.json -o results --report fleet.html`
     """
+    from cangauge.estimation.settings import EstimatorSettings
+    from cangauge.fleet.health import HealthJob
+    from cangauge.model.model_file import Model
+
     settings = EstimatorSettings(capacity_ah=capacity_ah)
     job = HealthJob(_read_options(reading), Model.load(model), settings)
     _run(job, cluster.find(logs), out, cluster, report, json_output=json_output)
@@ -252,10 +262,10 @@ def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
     ] = None,
     references: Annotated[
         int, typer.Option(metavar="N", help="References of a diagnosis at most.")
-    ] = REFERENCES,
+    ] = FLEET_REFERENCES,
     latest: Annotated[
         int, typer.Option(metavar="N", help="Latest logs of a vehicle, diagnosed together.")
-    ] = LOGS,
+    ] = FLEET_LOGS,
     alarm: Annotated[
         float,
         typer.Option(
@@ -277,6 +287,9 @@ def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
     `cangauge fleet gap 'may/*/*.parquet' --reference 'april/*/*.parquet' -m type.json -o results
     --report fleet.html`
     """
+    from cangauge.fleet.gap import GapJob, suspect_and_healthy
+    from cangauge.model.model_file import Model
+
     within(float(references), 1, 1000, option="--references", unit="")
     within(float(latest), 1, 1000, option="--latest", unit="")
     within(alarm, 0.0, 1.0, option="--alarm", unit="")
@@ -292,6 +305,8 @@ def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
 
 def _read_options(reading: Reading) -> ReadOptions:
     """Return how logs are read; files of the vehicle are read here, not by the workers."""
+    from cangauge.fleet.sources import ReadOptions
+
     if reading.sign not in {None, "charge", "discharge"}:
         raise InputError("neither charge nor discharge", field="--sign", value=reading.sign)
     mapped = reading.mapped_columns()
@@ -324,12 +339,16 @@ def _run(
     json_output: bool,
 ) -> None:
     """Run a job over the logs, and print and write what it found of the fleet."""
+    from cangauge.fleet.dataset import Dataset
+    from cangauge.fleet.overview import FleetOverview
+    from cangauge.fleet.run import run_job
+
     check_outputs([report], [])
     dataset = Dataset(out, job.kind, job.columns)
     summary = cluster.run(lambda client: run_job(job, logs, dataset, client))
     found = FleetOverview.read(out)
     if report is not None:
-        from cangauge.report.fleet import fleet_report  # noqa: PLC0415 - bokeh is slow to import
+        from cangauge.report.fleet import fleet_report
 
         write_texts_atomic({report: fleet_report(found)})
     if json_output:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,16 +22,16 @@ from cangauge.cli.options import (
     within,
 )
 from cangauge.cli.output import emit_json, note, print_table, progress_shown, save_figures
+from cangauge.cli.shown import ALARM_BELOW
 from cangauge.cli.simulator import SimulatorOptions, corrected_path, write_corrected
-from cangauge.diagnosis import ALARM_BELOW, NONE, UNKNOWN, Diagnosis, diagnose
-from cangauge.diagnosis.next_test import NextSteps
-from cangauge.diagnosis.simulator import SimulatorDiagnosis, diagnose_simulator
 from cangauge.errors import InputError
-from cangauge.identify.starts import with_start
-from cangauge.logs.log import Log
-from cangauge.model.coulomb_counting import difference_from_reference
-from cangauge.model.model_file import Model
-from cangauge.report.summary import headline, next_step, open_question, parameters_text
+
+if TYPE_CHECKING:
+    from cangauge.diagnosis import Diagnosis
+    from cangauge.diagnosis.next_test import NextSteps
+    from cangauge.diagnosis.simulator import SimulatorDiagnosis
+    from cangauge.logs.log import Log
+    from cangauge.model.model_file import Model
 
 SHOWN_CANDIDATES = 5
 SHORTEST_S = 300.0
@@ -165,6 +165,9 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     `cangauge gap day1.csv --simulated "V sim [V]" --capacity-ah 60 --reference good1.csv
     --reference good2.csv --reference good3.csv --corrected .`
     """
+    from cangauge.identify.starts import with_start
+    from cangauge.report.summary import next_step
+
     given, added = list(reference or []), list(add_test or [])
     paths = [*logs, *added]
     options = SimulatorOptions(
@@ -229,6 +232,9 @@ class _Task:
         self, number: int, model: Model | None, options: SimulatorOptions
     ) -> tuple[Diagnosis, SimulatorDiagnosis | None]:
         """Diagnose the first logs, that many."""
+        from cangauge.diagnosis import diagnose
+        from cangauge.diagnosis.simulator import diagnose_simulator
+
         logs, references = self.logs[:number], self.references
         if model is not None and not options.are_given:
             return diagnose(logs, model, references, alarm_below=self.alarm_below), None
@@ -243,6 +249,8 @@ class _Task:
 
 
 def _note_differences(logs: list[Log], capacity_ah: float) -> None:
+    from cangauge.model.coulomb_counting import difference_from_reference
+
     for log in logs:
         if (difference := difference_from_reference(log, capacity_ah)) is not None:
             note(f"warning: {difference}")
@@ -250,14 +258,16 @@ def _note_differences(logs: list[Log], capacity_ah: float) -> None:
 
 def _page(found: Diagnosis, model: Path | None, steps: NextSteps) -> str:
     # bokeh takes half a second to import.
-    from cangauge.report.diagnosis import gap_report  # noqa: PLC0415
-    from cangauge.report.page import InputFile  # noqa: PLC0415
+    from cangauge.report.diagnosis import gap_report
+    from cangauge.report.page import InputFile
 
     return gap_report(found, InputFile.of_model(found.model, model), steps)
 
 
 def _model(path: Path | None, options: SimulatorOptions, corrected: Path | None) -> Model | None:
     """Return the given model; None for a simulator without one."""
+    from cangauge.model.model_file import Model
+
     if corrected is not None and not options.are_given:
         raise InputError(
             "needs a simulator", field="--corrected", value=str(corrected),
@@ -299,6 +309,9 @@ def _long_enough(log: Log) -> Log:
 
 
 def _show(found: Diagnosis, next_words: str) -> None:
+    from cangauge.diagnosis import NONE, UNKNOWN
+    from cangauge.report.summary import headline, open_question, parameters_text
+
     for sentence in (
         headline(found),
         found.summary,

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.progress import (
@@ -32,33 +32,11 @@ from cangauge.cli.options import (
 )
 from cangauge.cli.output import console, emit_json, note
 from cangauge.cli.own_logs import OwnLogsOptions
+from cangauge.cli.shown import PROTOCOLS
 from cangauge.errors import InputError
-from cangauge.validation.check import (
-    OPEN_SET,
-    diagnose_tasks,
-    draw_all,
-    evaluate_held_out,
-    load_answers,
-    load_files,
-    sample_tasks,
-    score_answers,
-)
-from cangauge.validation.final_seeds import FINAL_SEED
-from cangauge.validation.plan import (
-    FULL,
-    NEEDS_DATA,
-    SMALL,
-    Sizes,
-    estimated_seconds,
-    open_set_size,
-    plan,
-)
-from cangauge.validation.recordings import folder_of
-from cangauge.validation.score import score
-from cangauge.validation.tables import judge_targets, print_result
-from cangauge.validation.twin.pybamm_plant import import_pybamm
 
-PROTOCOLS = (*FULL, OPEN_SET)
+if TYPE_CHECKING:
+    from cangauge.validation.plan import Sizes
 
 
 @option_groups("temperature_source")
@@ -181,6 +159,21 @@ def gap_check_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge gap-check --logs mine/*.csv -m pack.json --report mine.html`
     """
+    from cangauge.validation.check import (
+        OPEN_SET,
+        diagnose_tasks,
+        draw_all,
+        evaluate_held_out,
+        load_answers,
+        load_files,
+        sample_tasks,
+        score_answers,
+    )
+    from cangauge.validation.final_seeds import FINAL_SEED
+    from cangauge.validation.plan import estimated_seconds, open_set_size, plan
+    from cangauge.validation.score import score
+    from cangauge.validation.tables import judge_targets
+
     _refuse_mixed(
         own=own is not None or own_logs,
         for_drawn={
@@ -268,10 +261,12 @@ def gap_check_command(  # noqa: PLR0917 - typer passes options by name
 
 
 def _show(result: dict[str, Any], report: Path | None, *, json_output: bool) -> None:
+    from cangauge.validation.tables import print_result
+
     print_result(result, console)
     if report is not None:
         # Slow to import.
-        from cangauge.report.check import check_report  # noqa: PLC0415
+        from cangauge.report.check import check_report
 
         write_text_atomic(report, check_report(result))
         note(f"report: {report}")
@@ -325,6 +320,9 @@ def _sizes(
     healthy: int | None,
     data: Path | None,
 ) -> dict[str, Sizes]:
+    from cangauge.validation.check import OPEN_SET
+    from cangauge.validation.plan import FULL, NEEDS_DATA, SMALL
+
     table = {"full": FULL, "small": SMALL}.get(part)
     if table is None:
         raise InputError("unknown part", field="--part", value=part, cure="use full or small")
@@ -361,6 +359,10 @@ def _check_protocols(protocol: Sequence[str] | None) -> None:
 
 def _can_run(name: str, data: Path | None, *, required: bool) -> bool:
     """Whether a protocol can run here; raise InputError if it is required."""
+    from cangauge.validation.plan import NEEDS_DATA
+    from cangauge.validation.recordings import folder_of
+    from cangauge.validation.twin.pybamm_plant import import_pybamm
+
     try:
         if name == "pybamm":
             import_pybamm()

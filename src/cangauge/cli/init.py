@@ -11,37 +11,24 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
-import can
 import typer
 
 from cangauge._io import check_writable, write_texts_atomic
 from cangauge._resources import shared_file
-from cangauge.bus.captures.capture import open_capture
-from cangauge.bus.connection import BusConnection
-from cangauge.bus.open import bus_address, open_bus, parse_bus_options
-from cangauge.bus.vehicle import PRESETS, Vehicle
 from cangauge.cli.config_options import BusOptionOption, ChannelOption, InterfaceOption
 from cangauge.cli.options import JsonOption, within
 from cangauge.cli.output import console, emit_json, note, print_table, progress_shown
-from cangauge.discovery.by_name import NamedSignal, named_signals
-from cangauge.discovery.pairs import Candidate
-from cangauge.discovery.proposal import (
-    SIGNALS,
-    UNITS,
-    Assignment,
-    Proposal,
-    config_text,
-    dbc_text,
-    map_text,
-    mapped,
-    message_name,
-    scale_line,
-)
-from cangauge.discovery.search import BETWEEN_S, Findings, search
 from cangauge.errors import CangaugeError, InputError
-from cangauge.inspect.capture import inspect_capture
+
+if TYPE_CHECKING:
+    import can
+
+    from cangauge.discovery.by_name import NamedSignal
+    from cangauge.discovery.pairs import Candidate
+    from cangauge.discovery.proposal import Proposal
+    from cangauge.discovery.search import Findings
 
 ROLES: Final = {
     "current": "current",
@@ -121,6 +108,8 @@ def init_command(  # noqa: PLR0917 - typer fills the arguments by name
 
     `cangauge init drive.log --choose current=2 -o mycar`
     """
+    from cangauge.bus.open import bus_address, parse_bus_options
+
     picks = _picks(choose or [])
     within(seconds, 1.0, 86400.0, option="--seconds", unit="s")
     if nominal_voltage is not None:
@@ -241,6 +230,10 @@ class _Found:
         bus_options: Mapping[str, object],
     ) -> dict[Path, str]:
         """Return the texts by file."""
+        from cangauge.bus.vehicle import PRESETS
+        from cangauge.discovery.pairs import Candidate
+        from cangauge.discovery.proposal import config_text, dbc_text, map_text, mapped
+
         texts = {}
         if self.vehicle is not None:
             preset = PRESETS[self.vehicle]
@@ -266,6 +259,8 @@ class _Found:
         return texts
 
     def _by_name(self, targets: _Targets) -> Proposal:
+        from cangauge.discovery.proposal import Assignment, Proposal
+
         roles = {}
         for role, number in self.chosen.items():
             each = self.named[role][number]
@@ -292,6 +287,15 @@ class _Found:
 def _by_physics(
     chosen: Mapping[str, Candidate], findings: Findings, dbc: str, nominal_v: float | None
 ) -> Proposal:
+    from cangauge.discovery.proposal import (
+        SIGNALS,
+        UNITS,
+        Assignment,
+        Proposal,
+        message_name,
+        scale_line,
+    )
+
     roles = {}
     for role, each in chosen.items():
         unit = UNITS[role].replace("degC", "°C")
@@ -356,6 +360,11 @@ def _picks(given: Sequence[str]) -> dict[str, int]:
 
 def _listen(address: Any, seconds: float, path: Path) -> Path:
     """Record a live bus to a file."""
+    import can
+
+    from cangauge.bus.connection import BusConnection
+    from cangauge.bus.open import open_bus
+
     frames = 0
     with (
         BusConnection(open_bus(address), str(address)) as port,
@@ -376,6 +385,9 @@ def _listen(address: Any, seconds: float, path: Path) -> Path:
 
 def _joined(paths: Sequence[Path]) -> Iterator[can.Message]:
     """Yield the frames of captures, one after the other in time."""
+    from cangauge.bus.captures.capture import open_capture
+    from cangauge.discovery.search import BETWEEN_S
+
     end_s = None
     for path in paths:
         shift_s = None
@@ -399,6 +411,10 @@ def _find(
     quiet: bool,
     nominal_v: float | None,
 ) -> _Found:
+    from cangauge.bus.captures.capture import open_capture
+    from cangauge.discovery.by_name import named_signals
+    from cangauge.discovery.search import search
+
     if dbc is not None:
         messages = chain.from_iterable(open_capture(path) for path in paths)
         found = _Found("dbc", named=named_signals(dbc, messages), dbc=dbc)
@@ -415,6 +431,8 @@ def _find(
 
 def _known(paths: Sequence[Path]) -> str | None:
     """Return the preset that matches all captures; None without."""
+    from cangauge.inspect.capture import inspect_capture
+
     matching = [set(inspect_capture(path).matching) for path in paths]
     common = sorted(set.intersection(*matching)) if matching else []
     if len(common) > 1:
@@ -492,6 +510,8 @@ def _prove(
     InputError
         If the files do not decode the captures.
     """
+    from cangauge.bus.vehicle import Vehicle
+
     for path, text in files.items():
         (folder / path.name).write_text(text, encoding="utf-8")
     if found.dbc is not None:
@@ -499,7 +519,7 @@ def _prove(
     car = Vehicle.load(map=folder / targets.map.name)
     if not paths:
         return {}
-    from cangauge.bus.recording import capture_samples  # noqa: PLC0415 - imports the readers
+    from cangauge.bus.recording import capture_samples
 
     samples = capture_samples(paths[0], car)
     if len(samples) < 2:
@@ -517,6 +537,8 @@ def _prove(
 
 
 def _show(found: _Found) -> None:
+    from cangauge.bus.vehicle import PRESETS
+
     if found.vehicle is not None:
         about = PRESETS[found.vehicle].about
         print_table("Known vehicle", ["preset", "<about"], [[found.vehicle, about]])
@@ -533,6 +555,9 @@ def _show(found: _Found) -> None:
 
 
 def _show_role(found: _Found, role: str) -> None:
+    from cangauge.discovery.pairs import Candidate
+    from cangauge.discovery.proposal import UNITS
+
     rows = []
     for number, each in enumerate(found.candidates(role), 1):
         mark = f"{number}{' ✓' if found.chosen.get(role) == number - 1 else ''}"

@@ -74,9 +74,9 @@ def inspect_command(
     `cangauge inspect capture.log --vehicle leaf_ze0`
     """
     # Deferred: the readers and the decoder take half a second to import.
-    from cangauge.inspect.capture import inspect_capture  # noqa: PLC0415
-    from cangauge.inspect.log import LogInspection, inspect_log  # noqa: PLC0415
-    from cangauge.logs.read import LogFile  # noqa: PLC0415
+    from cangauge.inspect.capture import inspect_capture
+    from cangauge.inspect.log import LogInspection, inspect_log
+    from cangauge.logs.read import LogFile
 
     check_outputs([report], [path])
     recording = reading.open(path)
@@ -129,7 +129,7 @@ def _write_report(path: Path | None, found: LogInspection, log: Log) -> None:
     if path is None:
         return
     # bokeh takes half a second to import.
-    from cangauge.report.inspection import inspect_report  # noqa: PLC0415
+    from cangauge.report.inspection import inspect_report
 
     write_texts_atomic({path: inspect_report(found, log)})
     note(f"report: {path}")

@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from datetime import UTC, datetime
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -15,8 +15,9 @@ from cangauge.cli.options import EndpointOption, TokenFileOption
 from cangauge.cli.output import print_table
 from cangauge.cli.status import USABLE, status_rows
 from cangauge.errors import CangaugeError, InputError
-from cangauge.service.status_client import NotRunningError
-from cangauge.service.status_feed import StatusFeed, View, alarm
+
+if TYPE_CHECKING:
+    from cangauge.service.status_feed import StatusFeed, View
 
 LINE_EVERY_S: Final = 1.0
 """Interval of the lines where stdout is no terminal [s]."""
@@ -46,6 +47,8 @@ def monitor_command(
 
     `cangauge monitor --once`
     """
+    from cangauge.service.status_feed import StatusFeed
+
     feed = StatusFeed(endpoint, token_file)
     if once:
         feed.poll()
@@ -62,13 +65,15 @@ def monitor_command(
             _print_lines(feed)
         return
     # textual is an extra, and slow to import.
-    from cangauge.cli.monitor_screen import MonitorScreen  # noqa: PLC0415
+    from cangauge.cli.monitor_screen import MonitorScreen
 
     with feed:
         MonitorScreen(feed).run()
 
 
 def _print_once(view: View) -> None:
+    from cangauge.service.status_client import NotRunningError
+
     status = view.status
     if status is None:
         raise NotRunningError(view.problem)
@@ -92,6 +97,8 @@ def _print_lines(feed: StatusFeed) -> None:
 
 def status_line(view: View) -> str:
     """Return a view in one line."""
+    from cangauge.service.status_feed import alarm
+
     trouble = alarm(view)
     status = view.status
     if status is None or not view.is_answered:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from rich.text import Text
 
@@ -12,7 +12,9 @@ from cangauge._formatting import NONE_KNOWN, duration, number, printable
 from cangauge.cli.status import with_std
 from cangauge.errors import InputError
 from cangauge.estimation.validity import REASON_WORDS, reason_name
-from cangauge.service.status_feed import Point, StatusFeed, View, alarm
+
+if TYPE_CHECKING:
+    from cangauge.service.status_feed import Point, StatusFeed, View
 
 try:
     from textual.app import App, ComposeResult
@@ -103,6 +105,8 @@ def timeline(columns: Sequence[Sequence[Point]]) -> str:
 
 def lines(view: View, width: int, height: int, range_s: float, *, is_paused: bool) -> list[str]:
     """Return the rows of the screen."""
+    from cangauge.service.status_feed import alarm
+
     status = view.status
     state = "PAUSED" if is_paused else ""
     if status is None:

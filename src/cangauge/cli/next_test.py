@@ -5,19 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from cangauge._formatting import printable
 from cangauge.cli.output import note, print_table
-from cangauge.diagnosis import Diagnosis
-from cangauge.diagnosis.next_test import AddedTest, NextSteps, plan_test
-from cangauge.diagnosis.profiles import Limits
-from cangauge.diagnosis.verdict import Verdict
 from cangauge.errors import InputError
-from cangauge.model.effects.base import WITHIN_C
-from cangauge.report.summary import PLAN_TITLE, plan_rows
+
+if TYPE_CHECKING:
+    from cangauge.diagnosis import Diagnosis
+    from cangauge.diagnosis.next_test import NextSteps
+    from cangauge.diagnosis.verdict import Verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +43,9 @@ class NextTestOptions:
 
     def __post_init__(self) -> None:
         # Before any long work; the defaults are those of the diagnosis.
+        from cangauge.diagnosis.profiles import Limits
+        from cangauge.model.effects.base import WITHIN_C
+
         Limits(0.0, 0.0, (0.0, 100.0), WITHIN_C).changed(self.limits or "")
 
     def steps(self, found: Diagnosis, first: Verdict | None, tests: Sequence[str]) -> NextSteps:
@@ -58,6 +60,9 @@ class NextTestOptions:
         tests : sequence of str
             Their names.
         """
+        from cangauge.diagnosis.next_test import AddedTest, NextSteps, plan_test
+        from cangauge.diagnosis.profiles import Limits
+
         added = None if first is None else AddedTest(tuple(tests), first, found.verdict)
         if not self.plan and self.file is None and self.limits is None:
             return NextSteps(added)
@@ -84,6 +89,8 @@ class NextTestOptions:
 
 def show_tests(steps: NextSteps) -> None:
     """Print what an added test changed, and the planned tests."""
+    from cangauge.report.summary import PLAN_TITLE, plan_rows
+
     if steps.added is not None:
         typer.echo(printable(steps.added.sentence))
     if steps.plan is not None:

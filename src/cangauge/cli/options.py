@@ -14,17 +14,17 @@ import typer
 
 from cangauge._io import check_writable
 from cangauge.cli.output import note
+from cangauge.cli.shown import TEMPERATURE_SOURCES
 from cangauge.errors import InputError
-from cangauge.logs import units
-from cangauge.logs.log import Log
-from cangauge.logs.units import TEMPERATURE_SOURCES, TemperatureSource
 
 if TYPE_CHECKING:
     from cangauge.bus.captures.capture import Capture
     from cangauge.bus.vehicle import Vehicle
     from cangauge.logs.column_map import ColumnMap
     from cangauge.logs.draft import Sign
+    from cangauge.logs.log import Log
     from cangauge.logs.read import LogFile
+    from cangauge.logs.units import TemperatureSource
 
 _Value = TypeVar("_Value", bound=float | None)
 
@@ -178,19 +178,19 @@ class Reading:
     def car(self) -> Vehicle:
         """Return the vehicle that decodes a capture; may raise InputError."""
         # Deferred: the service shares these options, but needs neither pyarrow nor the readers.
-        from cangauge.bus.vehicle import Vehicle  # noqa: PLC0415
+        from cangauge.bus.vehicle import Vehicle
 
         return Vehicle.load(self.vehicle, self.dbc, self.map_file, temperature_c=self.temperature)
 
     def given_columns(self) -> ColumnMap | None:
         """Return the columns of `--columns`; may raise InputError."""
-        from cangauge.logs.column_map import ColumnMap  # noqa: PLC0415 - as in `car`
+        from cangauge.logs.column_map import ColumnMap
 
         return None if self.columns is None else ColumnMap.of(self.columns, "--columns")
 
     def mapped_columns(self) -> ColumnMap | None:
         """Return the columns of the map file; may raise InputError."""
-        from cangauge.bus.mapping import columns_of_map  # noqa: PLC0415 - as in `car`
+        from cangauge.bus.mapping import columns_of_map
 
         return None if self.map_file is None else columns_of_map(self.map_file)
 
@@ -202,7 +202,7 @@ class Reading:
         InputError
             If the file cannot be read, or an option is wrong.
         """
-        from cangauge.bus.recording import open_with_columns  # noqa: PLC0415 - as in `car`
+        from cangauge.bus.recording import open_with_columns
 
         return open_with_columns(
             path,
@@ -229,12 +229,12 @@ class Reading:
             If the input cannot be read or has a single row, an option has an unknown value, or the
             data show clearly that positive current charges, unless `sign` states it.
         """
-        from cangauge.bus.recording import (  # noqa: PLC0415 - as in `car`
+        from cangauge.bus.recording import (
             log_of,
             refuse_sign_of_capture,
             refuse_single_row,
         )
-        from cangauge.logs.read import LogFile  # noqa: PLC0415
+        from cangauge.logs.read import LogFile
 
         source = known_temperature_source(self.temperature_source)
         recording = self.open(path)
@@ -346,7 +346,7 @@ def within(value: _Value, low: float, high: float, *, option: str, unit: str) ->
 def refuse_inverted_current(log: Log, *, is_capture: bool) -> None:
     """Raise InputError if the data show clearly that positive current charges."""
     # Deferred as in `Reading`.
-    from cangauge.logs.sign import require_discharge_positive  # noqa: PLC0415
+    from cangauge.logs.sign import require_discharge_positive
 
     try:
         require_discharge_positive(log)
@@ -362,6 +362,8 @@ def refuse_inverted_current(log: Log, *, is_capture: bool) -> None:
 
 def known_temperature_source(given: str | None) -> TemperatureSource | None:
     """Check the value of --temperature-source; raise InputError if it is not a known one."""
+    from cangauge.logs import units
+
     if given is None:
         return None
     return units.known_temperature_source(given, field="--temperature-source")

@@ -142,7 +142,7 @@ def save_figures(folder: Path | None, page: str, *result: Any) -> None:
     if folder is None:
         return
     # bokeh and matplotlib take a second to import.
-    from cangauge.report.export import write_figures  # noqa: PLC0415
+    from cangauge.report.export import write_figures
 
     module, function = page.split(".")
     make_page = getattr(import_module(f"cangauge.report.{module}"), function)

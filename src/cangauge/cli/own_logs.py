@@ -5,24 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.progress import Progress
 
 from cangauge._io import write_text_atomic
 from cangauge.cli.options import assumed_of, check_outputs, within
 from cangauge.cli.output import emit_json, note, print_table
-from cangauge.logs.log import Log
-from cangauge.model.model_file import Model
-from cangauge.validation.own_logs import (
-    PER_LOG,
-    Finding,
-    Healthy,
-    OwnLogs,
-    summarize,
-    summary,
-    table,
-)
+
+if TYPE_CHECKING:
+    from cangauge.logs.log import Log
+    from cangauge.model.model_file import Model
+    from cangauge.validation.own_logs import Finding, Healthy
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +51,8 @@ class OwnLogsOptions:
         InputError
             If a log cannot be read or diagnosed, or there are too few.
         """
+        from cangauge.validation.own_logs import PER_LOG, OwnLogs, summarize
+
         inputs = [*self.logs, *self.references, *([self.model] if self.model else [])]
         check_outputs([self.report], inputs)
         within(self.capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
@@ -78,6 +74,8 @@ class OwnLogsOptions:
         self._show(result | {"assumed": assumed_of([*own.logs, *own.references])})
 
     def _model(self) -> Model | None:
+        from cangauge.model.model_file import Model
+
         if self.model is None:
             return None
         model = Model.load(self.model)
@@ -86,9 +84,11 @@ class OwnLogsOptions:
         return model.model_copy(update={"capacity_ah": self.capacity_ah})
 
     def _show(self, result: dict[str, Any]) -> None:
+        from cangauge.validation.own_logs import summary, table
+
         if self.report is not None:
             # bokeh takes half a second to import.
-            from cangauge.report.check import own_logs_report  # noqa: PLC0415
+            from cangauge.report.check import own_logs_report
 
             write_text_atomic(self.report, own_logs_report(result))
             note(f"report: {self.report}")

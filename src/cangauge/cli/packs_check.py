@@ -11,10 +11,8 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 from cangauge.cli.options import JsonOption
 from cangauge.cli.output import PlainConsole, console, emit_json
+from cangauge.cli.shown import CASES, PACKS
 from cangauge.errors import InputError
-from cangauge.identify.effect_search import parse_effect_ids
-from cangauge.validation import packs, packs_run
-from cangauge.validation.packs_score import WIDTH, print_bench
 
 
 def packs_check_command(  # noqa: PLR0917 - typer passes options by name
@@ -30,16 +28,14 @@ def packs_check_command(  # noqa: PLR0917 - typer passes options by name
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help=f"Pack; repeat for several: {', '.join(packs.PACKS)}. Default: all that are"
-            " there.",
+            help=f"Pack; repeat for several: {', '.join(PACKS)}. Default: all that are there.",
         ),
     ] = None,
     case: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help=f"Case; repeat for several: {', '.join(each.name for each in packs_run.CASES)}."
-            " Default: all.",
+            help=f"Case; repeat for several: {', '.join(CASES)}. Default: all.",
         ),
     ] = None,
     logs: Annotated[
@@ -96,6 +92,10 @@ def packs_check_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge packs-check --data recorded --json > packs.json 2> packs.txt`
     """
+    from cangauge.identify.effect_search import parse_effect_ids
+    from cangauge.validation import packs, packs_run
+    from cangauge.validation.packs_score import WIDTH, print_bench
+
     by_name = {each.name: each for each in packs_run.CASES}
     for name in case or ():
         if name not in by_name:

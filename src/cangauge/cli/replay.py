@@ -5,17 +5,12 @@ from __future__ import annotations
 import math
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from cangauge._formatting import duration, number
-from cangauge.bus.connection import BusConnection
-from cangauge.bus.encoder import FrameEncoder
-from cangauge.bus.open import bus_address, open_bus, parse_bus_options
-from cangauge.bus.publish import FrameIds, standard_filter
-from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.config_options import (
     BusDbcOption,
     BusMapOption,
@@ -39,11 +34,12 @@ from cangauge.cli.options import (
 )
 from cangauge.cli.output import console, emit_json, note
 from cangauge.errors import InputError
-from cangauge.logs.read import LogFile
-from cangauge.replay.player import ReplaySettings, ReplayState, play
-from cangauge.replay.steps import CaptureSource, LogSource, Source
-from cangauge.service.config import DEFAULT_VEHICLE
-from cangauge.service.lifecycle import stop_on_signals
+
+if TYPE_CHECKING:
+    from cangauge.bus.connection import BusConnection
+    from cangauge.bus.publish import FrameIds
+    from cangauge.replay.player import ReplayState
+    from cangauge.replay.steps import Source
 
 MAX = "max"
 
@@ -108,6 +104,12 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge replay candump.log.gz --speed 10 --interface socketcan --channel vcan0 --loop`
     """
+    from cangauge.bus.connection import BusConnection
+    from cangauge.bus.open import bus_address, open_bus, parse_bus_options
+    from cangauge.bus.publish import FrameIds, standard_filter
+    from cangauge.replay.player import ReplaySettings, play
+    from cangauge.service.lifecycle import stop_on_signals
+
     ids = FrameIds(
         **frame_ids(
             soc_estimate=soc_estimate_id, soc_detail=soc_detail_id, replay_clock=replay_clock_id
@@ -141,6 +143,11 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
 
 
 def _source(recorded: Path, reading: Reading, ids: FrameIds) -> Source:
+    from cangauge.bus.vehicle import Vehicle
+    from cangauge.logs.read import LogFile
+    from cangauge.replay.steps import CaptureSource, LogSource
+    from cangauge.service.config import DEFAULT_VEHICLE
+
     car = reading.car() if reading.names_vehicle else None
     recording = reading.open(recorded)
     if not isinstance(recording, LogFile):
@@ -215,6 +222,9 @@ def _summary_line(state: ReplayState) -> str:
 
 
 def _as_json(state: ReplayState, bus: BusConnection, source: Source) -> dict[str, Any]:
+    from cangauge.bus.encoder import FrameEncoder
+    from cangauge.replay.steps import CaptureSource, LogSource
+
     result: dict[str, Any] = {
         "bus": bus.name,
         "frames": state.frames,

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Final, Self
+from typing import TYPE_CHECKING, Annotated, Any, Final, Self
 
 import typer
 from rich.console import Console
@@ -20,11 +20,10 @@ from cangauge.cli.config_options import config_options, config_values
 from cangauge.cli.options import JsonOption
 from cangauge.cli.output import console, emit_json
 from cangauge.errors import CangaugeError
-from cangauge.estimation.validity import Status, reason_names
-from cangauge.service.config import load_config
-from cangauge.service.lifecycle import deadline_after_signal
-from cangauge.service.run import Service
-from cangauge.service.status import Snapshot
+from cangauge.estimation.validity import Status
+
+if TYPE_CHECKING:
+    from cangauge.service.status import Snapshot
 
 _LOG = logging.getLogger(__name__)
 
@@ -66,6 +65,10 @@ def run_command(
 
     `cangauge run --config car.toml --dashboard`  (the live page at http://127.0.0.1:8642/)
     """
+    from cangauge.service.config import load_config
+    from cangauge.service.lifecycle import deadline_after_signal
+    from cangauge.service.run import Service
+
     given = config_values(options)
     loaded = load_config(config, given)
     with ExitStack() as stack:
@@ -75,7 +78,7 @@ def run_command(
         shown_on = [stack.enter_context(LiveLine(console)).show] if console.is_terminal else []
         if (address := loaded.dashboard_address()) is not None:
             # bokeh is slow to import, and few services serve the page.
-            from cangauge.dashboard.launch import LivePage  # noqa: PLC0415
+            from cangauge.dashboard.launch import LivePage
 
             page = LivePage(address, lambda active: service.record(active=active))
             shown_on.append(stack.enter_context(page).show)
@@ -145,6 +148,8 @@ class LiveLine:
 
 def live_text(snapshot: Snapshot) -> Text:
     """Return the line."""
+    from cangauge.estimation.validity import reason_names
+
     estimate, sample = snapshot.estimate, snapshot.sample
     text = Text("SoC ", no_wrap=True, overflow="ellipsis")
     soc = f"{number(estimate.soc_pct, 2)} ± {number(estimate.soc_std_pct, 2, '%')}"

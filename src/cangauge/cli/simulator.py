@@ -9,16 +9,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from cangauge.diagnosis.simulator import Run, SimulatorDiagnosis, start_of
 from cangauge.errors import InputError
-from cangauge.logs.canonical import write_table
-from cangauge.logs.column_map import ColumnMap, ColumnSpec
-from cangauge.logs.log import Log
-from cangauge.logs.read import open_log
+
+if TYPE_CHECKING:
+    from cangauge.diagnosis.simulator import Run, SimulatorDiagnosis
+    from cangauge.logs.log import Log
 
 SYNTAX = "give MODULE:FUNCTION or path/to/file.py:FUNCTION"
 
@@ -79,11 +76,18 @@ class SimulatorOptions:
         InputError
             If the column or function is missing, or the voltages do not fit the log.
         """
+        from cangauge.diagnosis.simulator import Run, start_of
+
         if self.column is not None:
             return Run(log, self._of_column(log, path))
         return Run(log, self._of_function(log, start_of(log)))
 
     def _of_column(self, log: Log, path: Path) -> Any:
+        import numpy as np
+
+        from cangauge.logs.column_map import ColumnMap, ColumnSpec
+        from cangauge.logs.read import open_log
+
         specs = dict(ColumnMap.of(self.columns or {}, "--columns").specs)
         specs["voltage"] = ColumnSpec(str(self.column))
         file = open_log(path, columns=ColumnMap(specs, "--simulated"))
@@ -97,6 +101,8 @@ class SimulatorOptions:
         return simulated.voltage_v
 
     def _of_function(self, log: Log, start_pct: float) -> Any:
+        import numpy as np
+
         function = load_function(str(self.function))
         try:
             volts = function(log.time_s, log.current_a, log.temperature_c, start_pct)
@@ -159,6 +165,8 @@ def corrected_path(log: Path, folder: Path) -> Path:
 
 def write_corrected(found: SimulatorDiagnosis, logs: list[Path], folder: Path) -> list[Path]:
     """Write each diagnosed log with the simulated and the corrected voltage; return the files."""
+    from cangauge.logs.canonical import write_table
+
     written = []
     for run, log in zip(found.runs, logs, strict=True):
         path = corrected_path(log, folder)

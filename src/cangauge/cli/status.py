@@ -10,7 +10,6 @@ from cangauge._formatting import NONE_KNOWN, duration, number
 from cangauge.cli.options import EndpointOption, JsonOption, TokenFileOption
 from cangauge.cli.output import emit_json, print_table
 from cangauge.errors import CangaugeError
-from cangauge.service.status_client import NotRunningError, fetch_status, find_socket
 
 USABLE: Final = frozenset({"valid", "degraded"})
 
@@ -33,6 +32,8 @@ def status_command(
 
     `cangauge status --endpoint http://127.0.0.1:9464`
     """
+    from cangauge.service.status_client import NotRunningError, fetch_status, find_socket
+
     try:
         place = endpoint or str(find_socket())
         status = fetch_status(place, token_file)

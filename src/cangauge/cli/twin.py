@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -13,10 +13,9 @@ from cangauge._io import write_text_atomic
 from cangauge.cli.options import JsonOption, check_outputs, within
 from cangauge.cli.output import console, emit_json, note, print_table
 from cangauge.errors import InputError
-from cangauge.logs.canonical import write_log
-from cangauge.validation.twin.drive import read_speed
-from cangauge.validation.twin.faults import fault_kinds
-from cangauge.validation.twin.simulation import PlantName, simulate
+
+if TYPE_CHECKING:
+    from cangauge.validation.twin.simulation import PlantName
 
 
 def twin_command(  # noqa: PLR0917 - typer passes options by name
@@ -112,6 +111,10 @@ def twin_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge twin --list`
     """
+    from cangauge.logs.canonical import write_log
+    from cangauge.validation.twin.drive import read_speed
+    from cangauge.validation.twin.simulation import simulate
+
     if list_effects:
         _list(json_output)
         return
@@ -177,6 +180,8 @@ def _show(result: dict[str, Any]) -> None:
 
 
 def _list(json_output: bool) -> None:
+    from cangauge.validation.twin.faults import fault_kinds
+
     kinds = (*fault_kinds(), *fault_kinds(outside=True))
     if json_output:
         emit_json(

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import enum
 import math
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-from cangauge.logs.log import TemperatureSource
-from cangauge.model.voltage_model import VoltageModel
+if TYPE_CHECKING:
+    from cangauge.logs.log import TemperatureSource
+    from cangauge.model.voltage_model import VoltageModel
 
 CURRENT_AT_MOST_A = 5000.0
 """Largest plausible absolute current [A]."""

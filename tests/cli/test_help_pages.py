@@ -1,0 +1,67 @@
+"""Help pages: quick, since they import nothing that computes, and true to what they repeat."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from cangauge.cli import config_options, shown
+from cangauge.cli.app import COMMANDS
+from cangauge.diagnosis import ALARM_BELOW
+from cangauge.estimation.settings import VALID_STD_PCT
+from cangauge.fleet import gap, run, sources
+from cangauge.logs.units import TEMPERATURE_SOURCES
+from cangauge.validation import packs, packs_run
+from cangauge.validation.check import OPEN_SET
+from cangauge.validation.plan import FULL
+
+SLOW_TO_IMPORT = {
+    "numpy", "scipy", "pandas", "pyarrow", "bokeh", "matplotlib", "clarabel", "can", "cantools",
+    "dask", "distributed", "fsspec", "jinja2", "asyncio", "multiprocessing", "concurrent",
+    "cangauge.service", "cangauge.bus", "cangauge.model", "cangauge.diagnosis",
+}  # fmt: skip
+FLEET = ("fit", "estimate", "gap", "health")
+ALL_PAGES = """
+import contextlib, io, json, sys
+from cangauge.cli.app import main
+slow, found = json.loads(sys.argv[1])
+for words in json.loads(sys.argv[2]):
+    sys.argv = ["cangauge", *words, "--help"]
+    page = io.StringIO()
+    with contextlib.redirect_stdout(page), contextlib.suppress(SystemExit):
+        main()
+    assert "Usage: " + " ".join(["cangauge", *words]) in page.getvalue(), page.getvalue()
+    found[" ".join(words)] = sorted(set(slow) & set(sys.modules))
+print(json.dumps(found))
+"""
+
+
+def test_no_help_page_imports_what_computes() -> None:
+    pages = [[], *([name] for name in COMMANDS), *(["fleet", name] for name in FLEET)]
+    given = json.dumps([sorted(SLOW_TO_IMPORT), {}]), json.dumps(pages)
+    done = subprocess.run(
+        [sys.executable, "-c", ALL_PAGES, *given],
+        capture_output=True, text=True, check=False, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert {page: names for page, names in found.items() if names} == {}
+    assert len(found) == len(COMMANDS) + len(FLEET) + 1
+
+
+def test_help_pages_repeat_names_and_defaults_truly() -> None:
+    assert shown.TEMPERATURE_SOURCES == TEMPERATURE_SOURCES
+    assert shown.VALID_STD_PCT == VALID_STD_PCT
+    assert shown.ALARM_BELOW == ALARM_BELOW
+    assert (run.LOCAL, sources.VEHICLE_PATTERN) == (shown.LOCAL, shown.VEHICLE_PATTERN)
+    assert (gap.LOGS, gap.REFERENCES) == (shown.FLEET_LOGS, shown.FLEET_REFERENCES)
+    assert (*FULL, OPEN_SET) == shown.PROTOCOLS
+    assert tuple(packs.PACKS) == shown.PACKS
+    assert tuple(each.name for each in packs_run.CASES) == shown.CASES
+
+
+def test_the_options_of_a_bus_are_those_of_the_configuration(project: Path) -> None:
+    kept = project / "src/cangauge/cli/config_options.json"
+    assert kept.read_text(encoding="utf-8") == config_options.option_table()
