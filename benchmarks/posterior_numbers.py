@@ -5,8 +5,9 @@
 
 Only cases of development seeds are accepted, with one cause of at least the size that the check
 counts, or none. Each case whose cause is in the library is diagnosed a second time without it,
-where `unknown` is right, with a quarter of its weight. Protocols weigh by the square root of their
-number of cases. The printed table is cross-validated in four folds by pack.
+where `unknown` is right, with a quarter of its weight. Causes outside the library are judged, but
+not part of the fit. Protocols weigh by the square root of their number of cases. The printed table
+is cross-validated in four folds by pack.
 """
 
 from __future__ import annotations
@@ -62,6 +63,8 @@ class Case:
     pack: str
     truth: str
     evidence: Evidence
+    again: bool = False
+    """A case that is used a second time, without its cause in the library."""
     weight: float = 1.0
 
 
@@ -70,8 +73,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("folders", nargs="+", type=Path, help="kept by cangauge gap-check --keep")
     cases = [case for folder in parser.parse_args().folders for case in read_cases(folder)]
-    counts = Counter(case.protocol for case in cases if case.truth != UNKNOWN)
-    cases = [replace(case, weight=case.weight * counts[case.protocol] ** -0.5) for case in cases]
+    counts = Counter(case.protocol for case in cases if not case.again)
+    cases = [
+        replace(
+            case,
+            weight=(OUTSIDE_WEIGHT if case.again else 1.0) * counts[case.protocol] ** -0.5,
+        )
+        for case in cases
+    ]
     print_cross_validation(cases)
     print(fit(cases))
 
@@ -99,10 +108,12 @@ def read_label(label: dict[str, Any], folder: Path) -> list[Case]:
     # Recorded cases, warm or cold, are of one pack for each data set.
     seed, data_set = label.get("world_seed"), protocol.partition("-")[2]
     pack = f"{protocol} {seed}" if seed is not None else data_set
-    cases = [Case(protocol, pack, cause, read_evidence(label["name"], folder))]
-    if cause in LIBRARY:
+    known = cause in LIBRARY
+    truth = cause if known or cause == NONE else UNKNOWN
+    cases = [Case(protocol, pack, truth, read_evidence(label["name"], folder))]
+    if known:
         without = read_evidence(label["name"], folder, cause)
-        cases.append(Case(protocol, pack, UNKNOWN, without, OUTSIDE_WEIGHT))
+        cases.append(Case(protocol, pack, UNKNOWN, without, again=True))
     return cases
 
 
@@ -130,6 +141,7 @@ def sources_hash() -> str:
 
 def fit(cases: Sequence[Case]) -> Calibration:
     """Return the numbers that make the true answers most probable."""
+    cases = [case for case in cases if case.again or case.truth != UNKNOWN]
     weights = np.array([case.weight for case in cases])
 
     def loss(numbers: FloatArray) -> float:
@@ -150,7 +162,7 @@ def print_cross_validation(cases: Sequence[Case]) -> None:
     by_protocol: dict[str, list[tuple[str, dict[str, float]]]] = {}
     for fold in range(FOLDS):
         training = [case for case in cases if fold_of[case.pack] != fold]
-        left_out = [case for case in cases if fold_of[case.pack] == fold and case.truth != UNKNOWN]
+        left_out = [case for case in cases if fold_of[case.pack] == fold and not case.again]
         if not training or not left_out:
             continue
         by = fit(training)
@@ -158,13 +170,17 @@ def print_cross_validation(cases: Sequence[Case]) -> None:
             by_protocol.setdefault(case.protocol, []).append(
                 (case.truth, posterior_of(case.evidence, by))
             )
-    print(f"{'':24s}cases  top 1  alarms  false alarms  set holds  set size  p of truth  log score")
+    head = "cases  top 1  alarms  false alarms  set holds  set size  p of truth  log score  misled"
+    print(f"{'':24s}{head}")
     for protocol, rows in sorted(by_protocol.items()):
         print(f"{protocol:24s}{len(rows):5d}", *(f"{each:7.2f}" for each in shares_of(rows)))
 
 
 def shares_of(rows: Sequence[tuple[str, dict[str, float]]]) -> list[float]:
-    """Return top 1 of faults, alarms, false alarms, set coverage and size, p, log score."""
+    """Return top 1 of faults, alarms, false alarms, set coverage and size, p, log score, misled.
+
+    The last is the part in which a wrong effect has a probability above one half.
+    """
     faults = [row for row in rows if row[0] != NONE]
     healthy = [row for row in rows if row[0] == NONE]
     sets = [credible_set(of) for _, of in rows]
@@ -177,6 +193,12 @@ def shares_of(rows: Sequence[tuple[str, dict[str, float]]]) -> list[float]:
         _mean([len(chosen) for chosen in sets]),
         float(truth.mean()),
         float(np.log(np.maximum(truth, LEAST_PROBABILITY)).mean()),
+        _mean(
+            [
+                max(of[name] for name in of if name not in {NONE, UNKNOWN, right}) > 0.5
+                for right, of in rows
+            ]
+        ),
     ]
 
 

@@ -54,7 +54,7 @@ class Calibration:
     """ln of that of `unknown`, with its Occam factor: it may fit any error."""
 
 
-FITTED = Calibration(tail=1.21, log_none=1.35, log_unknown=-6.04)
+FITTED = Calibration(tail=1.085, log_none=1.085, log_unknown=-5.45)
 
 UNEXPLAINED = 0.15
 """Part of the error that an unknown cause leaves. No effect of the library has exactly the shape of
