@@ -9,13 +9,8 @@ import numpy as np
 from scipy.special import log_ndtr, logsumexp
 
 from cangauge._typing import FloatArray
-from cangauge.diagnosis.hypotheses import Hypotheses
-from cangauge.diagnosis.linear_gaussian import (
-    NormalEquations,
-    Posterior,
-    marginalize_per_log,
-    prior_precision,
-)
+from cangauge.diagnosis.hypotheses import Hypotheses, prior_precision
+from cangauge.diagnosis.linear_gaussian import NormalEquations, Posterior
 from cangauge.inference.time_scales import SCALES
 
 PRIOR_WIDTHS = (1.0, 0.3, 0.1, 0.03)
@@ -231,18 +226,13 @@ def _residual_squares_v2(
     at = hypotheses.amplitudes_of(() if score is None else score.candidates)
     amplitude = np.zeros(0) if score is None else score.amplitude
     solution = posterior.mean - posterior.sensitivity[:, at] @ amplitude
-    known = np.zeros(solution.size + int(hypotheses.offsets[-1]) + 1)
-    known[: solution.size] = -solution
-    known[solution.size + at] = -amplitude
-    known[-1] = 1.0
     total = np.zeros(SCALES)
     for log in diagnosed:
-        _, response, _ = marginalize_per_log(log, hypotheses, posterior.error, is_reference=False)
         weights = np.zeros(log.products.shape[1])
         # A candidate may be structure, per-log effect and cause at once.
         weights[layout.shared] -= solution
-        weights[layout.per_log] -= response @ known
         weights[layout.effects[at]] -= amplitude
         weights[layout.residual] = 1.0
+        weights[layout.per_log] -= log.per_log_amplitudes(posterior.error, layout, weights)
         total += (log.products @ weights) @ weights
     return total

@@ -18,12 +18,12 @@ from cangauge._typing import FloatArray
 from cangauge._version import __version__
 from cangauge.diagnosis.bayes_factors import Score
 from cangauge.diagnosis.design_matrix import DesignMatrix
+from cangauge.diagnosis.hypotheses import prior_precision
 from cangauge.diagnosis.linear_gaussian import (
     NormalEquations,
     constrained_mode,
     marginalize,
     normal_equations,
-    prior_precision,
     with_change,
 )
 from cangauge.diagnosis.problem import DiagnosisProblem
