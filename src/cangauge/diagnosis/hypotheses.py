@@ -114,6 +114,14 @@ class Hypotheses:
         return tuple(pairs)
 
     @cached_property
+    def shapes(self) -> dict[int, list[tuple[int, ...]]]:
+        """Candidates and mixtures by their number of amplitudes."""
+        found: dict[int, list[tuple[int, ...]]] = {}
+        for chosen in (*((k,) for k in range(len(self.candidates))), *self.mixtures):
+            found.setdefault(self.amplitudes_of(chosen).size, []).append(chosen)
+        return found
+
+    @cached_property
     def diagnosed_layout(self) -> Layout:
         """Columns of a diagnosed log: those of all candidates."""
         p, amplitudes = self.column_scale.size, int(self.offsets[-1])

@@ -104,6 +104,8 @@ class NormalEquations:
 
     def inflated(self, factor: float) -> NormalEquations:
         """Return the products for an error variance `factor` times as large."""
+        if factor == 1.0:
+            return self
         return NormalEquations(self.products / factor, self.counts)
 
     def weighted(self, error: ErrorModel) -> FloatArray:
@@ -190,24 +192,59 @@ def normal_equations(
     weight : array of shape (m,), optional
         Weight of each row: ½ means twice the error, 0 leaves the row out.
     """
-    columns = np.column_stack(
-        [
-            matrix.coefficients / column_scale,
-            *matrix.effects,
-            matrix.per_log_states,
-            matrix.residual_v,
-        ]
-    )
+    columns = columns_of(matrix, column_scale)
     count_factor = 1.0
     if weight is not None:
         keep = weight > 0.0
         columns = columns[keep] * weight[keep, None]
         count_factor = float(np.mean(weight[keep] ** 2))
-    scales = haar_transform(columns)
-    return NormalEquations(
-        np.stack([each.T @ each for each in scales]),
-        count_factor * np.array([float(len(each)) for each in scales]),
+    return products_of(haar_transform(columns), count_factor)
+
+
+def columns_of(matrix: DesignMatrix, column_scale: FloatArray) -> FloatArray:
+    """Return the columns of the normal equations, the residual last."""
+    coefficients = matrix.coefficients / column_scale
+    return np.column_stack(
+        [coefficients, *matrix.effects, matrix.per_log_states, matrix.residual_v]
     )
+
+
+def products_of(scales: Sequence[FloatArray], count_factor: float = 1.0) -> NormalEquations:
+    """Return the normal equations of transformed columns (`haar_transform`)."""
+    products = np.empty((len(scales), scales[0].shape[1], scales[0].shape[1]))
+    for number, each in enumerate(scales):
+        np.matmul(each.T, each, out=products[number])
+    return NormalEquations(products, count_factor * np.array([float(len(each)) for each in scales]))
+
+
+class ExchangedColumns:
+    """Normal equations of a log with some of its columns exchanged; the others' products stay.
+
+    Parameters
+    ----------
+    matrix : DesignMatrix
+    column_scale : array of shape (p,)
+    at : array of int
+        Columns that are exchanged.
+    """
+
+    def __init__(
+        self, matrix: DesignMatrix, column_scale: FloatArray, at: NDArray[np.intp]
+    ) -> None:
+        self._at = at
+        self._scales = haar_transform(columns_of(matrix, column_scale))
+        self._given = products_of(self._scales)
+
+    def equations(self, columns: FloatArray) -> NormalEquations:
+        """Return the normal equations with other columns, shape (m, columns exchanged)."""
+        products, at = self._given.products.copy(), self._at
+        for number, (given, new) in enumerate(
+            zip(self._scales, haar_transform(columns), strict=True)
+        ):
+            cross = given.T @ new
+            products[number][:, at], products[number][at] = cross, cross.T
+            products[number][np.ix_(at, at)] = new.T @ new
+        return NormalEquations(products, self._given.counts)
 
 
 def marginalize(
