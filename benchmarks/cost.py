@@ -5,8 +5,8 @@
 ratios    a step at 10 and 1 Hz, a row offline, and a wanted frame, as multiples of what does the
           same at its barest in the same run (filterpy's extended Kalman filter of an equivalent
           circuit; receiving and decoding by python-can and cantools): the machine cancels.
-growth    with delays, effects, cells, frames/s; rows and logs of a fit with its memory; logs of a
-          diagnosis.
+growth    with delays, effects, cells, frames/s; rows and logs of a fit with its memory; logs,
+          references and effects of a diagnosis.
 start     `--help` of every command.
 
 --keep writes the ratios to `ratios.json`; --check measures them alone and warns where one is 20 %
@@ -49,6 +49,7 @@ from cangauge.export.equivalent_circuit import equivalent_circuit
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
+from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Coefficient, Model
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.validation import simulate
@@ -270,15 +271,28 @@ def _long_logs(number: int) -> Iterator[Log]:
 
 
 def diagnoses() -> Result:
-    """Return the time of a diagnosis by the number of logs [s]."""
+    """Return the time of a diagnosis by the numbers of logs, references and effects [s]."""
     simulated = [simulate(seed=1, drive=day, hours=1.0).log for day in range(1, 9)]
     known = fit(simulated[:2], capacity_ah=60.0).model
-    result = {}
-    for number in (1, 2, 4):
+    references = simulated[5:8]
+
+    def seconds(logs: list[Log], references: list[Log], effects: int = len(LIBRARY)) -> float:
         began = time.process_time()
-        diagnose(simulated[5 - number : 5], known, simulated[5:8])
-        result[number] = time.process_time() - began
-    return result
+        diagnose(logs, known, references, leave_out=list(LIBRARY)[effects:])
+        return time.process_time() - began
+
+    seconds(simulated[4:5], references)  # the first one imports the solvers
+    return {
+        "seconds by logs, 3 references": {
+            number: seconds(simulated[5 - number : 5], references) for number in (1, 2, 4)
+        },
+        "seconds by references, one log": {
+            number: seconds(simulated[4:5], references[:number]) for number in (0, 1, 2)
+        },
+        "seconds by effects, one log, 3 references": {
+            number: seconds(simulated[4:5], references, number) for number in (11, 16)
+        },
+    }
 
 
 def starts() -> Result:

@@ -9,13 +9,8 @@ import numpy as np
 from scipy.special import log_ndtr, logsumexp
 
 from cangauge._typing import FloatArray
-from cangauge.diagnosis.hypotheses import Hypotheses
-from cangauge.diagnosis.linear_gaussian import (
-    NormalEquations,
-    Posterior,
-    marginalize_per_log,
-    prior_precision,
-)
+from cangauge.diagnosis.hypotheses import Hypotheses, prior_precision
+from cangauge.diagnosis.linear_gaussian import NormalEquations, Posterior
 from cangauge.inference.time_scales import SCALES
 
 PRIOR_WIDTHS = (1.0, 0.3, 0.1, 0.03)
@@ -54,13 +49,10 @@ def scores(posterior: Posterior, leave_out: Sequence[str] = ()) -> list[Score]:
     """
     hypotheses = posterior.hypotheses
     by_effect: dict[str, list[Score]] = {}
-    singles = [(k,) for k in range(len(hypotheses.candidates))]
-    for chosen in (*singles, *hypotheses.mixtures):
-        effect = hypotheses.candidates[chosen[0]].effect
-        if effect.is_cause and effect.id not in leave_out:
-            score = _score(posterior, chosen)
-            if score is not None:
-                by_effect.setdefault(effect.id, []).append(score)
+    for group in hypotheses.shapes.values():
+        kept = [each for each in group if _is_tested(hypotheses, each, leave_out)]
+        for score in _scores_of(posterior, kept):
+            by_effect.setdefault(score.effect_id, []).append(score)
     best = []
     for shapes in by_effect.values():
         top = max(shapes, key=lambda score: score.log_bayes_factor)
@@ -69,30 +61,51 @@ def scores(posterior: Posterior, leave_out: Sequence[str] = ()) -> list[Score]:
     return sorted(best, key=lambda score: -score.log_bayes_factor)
 
 
-def _score(posterior: Posterior, chosen: tuple[int, ...]) -> Score | None:
-    """Score a candidate or a mixture of two; None where bounds exclude the mixture."""
+def _is_tested(hypotheses: Hypotheses, chosen: Sequence[int], leave_out: Sequence[str]) -> bool:
+    effect = hypotheses.candidates[chosen[0]].effect
+    return effect.is_cause and effect.id not in leave_out
+
+
+def _scores_of(posterior: Posterior, group: Sequence[tuple[int, ...]]) -> list[Score]:
+    """Score candidates or mixtures of two, all with as many amplitudes.
+
+    A mixture that the bounds exclude has no score: one of the two alone is the best within bounds.
+    """
+    if not group:
+        return []
     hypotheses = posterior.hypotheses
-    at, bounds = hypotheses.amplitudes_of(chosen), hypotheses.bounds_of(chosen)
-    effect_id = hypotheses.candidates[chosen[0]].effect.id
-    overdispersion = posterior.error.overdispersion_of(effect_id)
-    gradient = posterior.gradient[at] / overdispersion
-    curvature = posterior.curvature[np.ix_(at, at)] / overdispersion
+    at = np.stack([hypotheses.amplitudes_of(chosen) for chosen in group])
+    bounds = np.stack([hypotheses.bounds_of(chosen) for chosen in group])
+    names = [hypotheses.candidates[chosen[0]].effect.id for chosen in group]
+    overdispersion = np.array([posterior.error.overdispersion_of(name) for name in names])
+    gradient = posterior.gradient[at] / overdispersion[:, None]
+    curvature = posterior.curvature[at[:, :, None], at[:, None, :]] / overdispersion[:, None, None]
+    prior = np.array([prior_precision(each) for each in bounds])
     widths = np.array(PRIOR_WIDTHS)[:, None, None]
     factors, modes, covariances = bounded_evidence(
-        gradient[None], curvature, prior_precision(bounds) / widths**2, bounds
+        gradient[:, None, None],
+        curvature[:, None],
+        prior[:, None] / widths**2,
+        bounds[:, None],
     )
-    amplitude = modes[0, 0]
-    within = np.clip(amplitude, bounds[:, 0], bounds[:, 1])
-    if len(chosen) > 1 and np.any(within != amplitude):
-        return None  # one of the two alone is the best within bounds
-    return Score(
-        effect_id=effect_id,
-        log_bayes_factor=_log_mean(factors[:, 0]),
-        candidates=chosen,
-        amplitude=within,
-        covariance=covariances[0],
-        explained=overdispersion * float(2.0 * gradient @ within - within @ curvature @ within),
+    amplitude = modes[:, 0, 0]
+    within = np.clip(amplitude, bounds[..., 0], bounds[..., 1])
+    factor = logsumexp(factors[..., 0], axis=1) - np.log(len(PRIOR_WIDTHS))
+    explained = np.sum(
+        within * (2.0 * gradient - np.einsum("gij,gj->gi", curvature, within)), axis=1
     )
+    return [
+        Score(
+            effect_id=names[k],
+            log_bayes_factor=float(factor[k]),
+            candidates=chosen,
+            amplitude=within[k],
+            covariance=covariances[k, 0],
+            explained=float(overdispersion[k] * explained[k]),
+        )
+        for k, chosen in enumerate(group)
+        if len(chosen) == 1 or np.all(within[k] == amplitude[k])
+    ]
 
 
 def normal_evidence(
@@ -231,18 +244,13 @@ def _residual_squares_v2(
     at = hypotheses.amplitudes_of(() if score is None else score.candidates)
     amplitude = np.zeros(0) if score is None else score.amplitude
     solution = posterior.mean - posterior.sensitivity[:, at] @ amplitude
-    known = np.zeros(solution.size + int(hypotheses.offsets[-1]) + 1)
-    known[: solution.size] = -solution
-    known[solution.size + at] = -amplitude
-    known[-1] = 1.0
     total = np.zeros(SCALES)
     for log in diagnosed:
-        _, response, _ = marginalize_per_log(log, hypotheses, posterior.error, is_reference=False)
         weights = np.zeros(log.products.shape[1])
         # A candidate may be structure, per-log effect and cause at once.
         weights[layout.shared] -= solution
-        weights[layout.per_log] -= response @ known
         weights[layout.effects[at]] -= amplitude
         weights[layout.residual] = 1.0
+        weights[layout.per_log] -= log.per_log_amplitudes(posterior.error, layout, weights)
         total += (log.products @ weights) @ weights
     return total

@@ -101,20 +101,20 @@ def held_out_errors(
     """
     result = []
     for fold in held_out:
-        matrix = problem.diagnosed[fold.log].rows(fold.rows)
-        columns = np.column_stack([matrix.coefficients, *matrix.effects])
+        matrix = problem.diagnosed[fold.log]
+        extended_v = matrix.residual_v - matrix.voltage(*_solution(fold.posterior, effects))
         result.append(
             HeldOutErrors(
                 matrix.sampled.rows.time_s[fold.rows],
                 problem.diagnosed_errors_v[fold.log][fold.rows],
-                matrix.residual_v - columns @ _solution(fold.posterior, effects),
+                extended_v[fold.rows],
             )
         )
     return result
 
 
-def _solution(posterior: Posterior, effects: Sequence[str]) -> FloatArray:
-    """Return coefficients and all amplitudes with some effects, shape (p + amplitudes,)."""
+def _solution(posterior: Posterior, effects: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+    """Return coefficients (p,) and all candidates' amplitudes with some effects."""
     hypotheses = posterior.hypotheses
     p = hypotheses.column_scale.size
     known = {choice.effect.id for choice in hypotheses.candidates}
@@ -128,12 +128,10 @@ def _solution(posterior: Posterior, effects: Sequence[str]) -> FloatArray:
     )
     amplitude = np.clip(amplitude, bounds[:, 0], bounds[:, 1])
     shared = posterior.mean - posterior.sensitivity[:, at] @ amplitude
-    whole = np.zeros(p + int(hypotheses.offsets[-1]))
-    whole[:p] = shared[:p]
-    whole[p + hypotheses.amplitudes_of(hypotheses.structure)] = shared[p:]
-    whole[p + at] += amplitude
-    whole[:p] /= hypotheses.column_scale
-    return whole
+    amplitudes = np.zeros(int(hypotheses.offsets[-1]))
+    amplitudes[hypotheses.amplitudes_of(hypotheses.structure)] = shared[p:]
+    amplitudes[at] += amplitude
+    return shared[:p] / hypotheses.column_scale, amplitudes
 
 
 def rms(values: FloatArray) -> float:

@@ -53,6 +53,17 @@ class DesignMatrix:
     """Columns of each candidate, shape (m, amplitudes) each; of a reference those of
     `Hypotheses.reference_columns`."""
 
+    def voltage(self, coefficients: FloatArray, amplitudes: FloatArray) -> FloatArray:
+        """Return the voltage of coefficients (p,) and all amplitudes in order [V], shape (m,)."""
+        volts = self.coefficients @ coefficients
+        first = 0
+        for columns in self.effects:
+            of_effect = amplitudes[first : first + columns.shape[1]]
+            first += columns.shape[1]
+            if np.any(of_effect):
+                volts += columns @ of_effect
+        return volts
+
     def rows(self, keep: NDArray[np.bool_]) -> DesignMatrix:
         """Return the matrix restricted to some rows."""
         return replace(

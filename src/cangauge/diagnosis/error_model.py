@@ -10,7 +10,8 @@ the references (automatic relevance determination: MacKay, Neural Computation 4 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,18 +20,18 @@ from numpy.typing import NDArray
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.bayes_factors import excess_chi_square, mean_square_v2
 from cangauge.diagnosis.design_matrix import PER_LOG_STATES
-from cangauge.diagnosis.hypotheses import Hypotheses
+from cangauge.diagnosis.hypotheses import Hypotheses, prior_precision
 from cangauge.diagnosis.linear_gaussian import (
     ErrorModel,
     NormalEquations,
+    inverse,
     log_gaussian_integral,
     log_likelihood,
     marginalize,
     prior_information,
-    prior_precision,
     structure_precision,
 )
-from cangauge.inference.time_scales import SCALES, scale_variances
+from cangauge.inference.time_scales import scale_variances
 from cangauge.model.model_file import ModelNoise
 
 EM_ROUNDS = 4
@@ -225,14 +226,17 @@ def _information_weight(
     right = found.precision @ found.mean
     information = prior_information(hypotheses, replace(error, information_weight=1.0))
     mean = np.zeros(p) if hypotheses.prior_mean is None else hypotheses.prior_mean
+    # The structure does not depend on the weight: it is integrated out once.
+    known = np.linalg.solve(found.precision[p:, p:], found.precision[p:, :p])
+    coefficients = found.precision[:p, :p] - found.precision[:p, p:] @ known
+    toward_them = right[:p] - known.T @ right[p:]
 
     def log_probability(weight: float) -> float:
-        precision, toward = found.precision.copy(), right.copy()
-        precision[:p, :p] += (weight - error.information_weight) * information
-        toward[:p] += (weight - error.information_weight) * information @ mean
+        more = (weight - error.information_weight) * information
         agreed = AGREEING_COEFFICIENTS * (np.log(weight) - weight)
         prior = p * np.log(weight) - weight * mean @ information @ mean
-        return log_gaussian_integral(precision, toward) + 0.5 * float(prior + agreed)
+        integral = log_gaussian_integral(coefficients + more, toward_them + more @ mean)
+        return integral + 0.5 * float(prior + agreed)
 
     return max((weight for weight in INFORMATION_WEIGHTS if weight >= least), key=log_probability)
 
@@ -245,43 +249,61 @@ def _structure_scales(
     First one scale for all, then that of each given the others: a scale that one effect needs would
     leave the others unconstrained at operating points without references.
     """
-    found = marginalize(hypotheses, references, [], error)
-    p = hypotheses.column_scale.size
-    at = p + np.arange(found.mean.size - p)
-    right = found.precision @ found.mean
-    current = structure_precision(hypotheses, error)
-
-    def log_probability(scales: dict[str, float]) -> float:
-        prior = structure_precision(hypotheses, replace(error, structure=scales))
-        precision = found.precision.copy()
-        precision[at, at] += prior - current
-        return log_gaussian_integral(precision, right) + 0.5 * float(np.sum(np.log(prior)))
-
     effects = list(error.structure)
     if not effects:
         return {}
-    together = [dict.fromkeys(effects, scale) for scale in STRUCTURE_SCALES]
-    best, scales = _most_probable(together, log_probability)
+    found = marginalize(hypotheses, references, [], error)
+    right = found.precision @ found.mean
+    names, unit = hypotheses.structure_prior
+    places = {effect: np.flatnonzero([name == effect for name in names]) for effect in effects}
+    at = hypotheses.column_scale.size + np.arange(unit.size)
+    without = found.precision.copy()
+    without[at, at] -= structure_precision(hypotheses, error)
+
+    def with_scales(scales: Mapping[str, float]) -> FloatArray:
+        precision = without.copy()
+        precision[at, at] += structure_precision(hypotheses, replace(error, structure=scales))
+        return precision
+
+    def together(scale: float) -> float:
+        integral = log_gaussian_integral(with_scales(dict.fromkeys(effects, scale)), right)
+        return integral - unit.size * math.log(scale)
+
+    scales = dict.fromkeys(effects, max(STRUCTURE_SCALES, key=together))
+    covariance = inverse(with_scales(scales))
     for _ in range(STRUCTURE_ROUNDS):
-        before = scales
+        before = dict(scales)
         for effect in effects:
-            others = [scale for scale in STRUCTURE_SCALES if scale != scales[effect]]
-            trials = [{**scales, effect: scale} for scale in others]
-            probability, trial = _most_probable(trials, log_probability)
-            if probability > best:
-                best, scales = probability, trial
+            place = at[places[effect]]
+            best = _best_scale(covariance, right, place, unit[places[effect]], scales[effect])
+            if best != scales[effect]:
+                scales[effect] = best
+                covariance = inverse(with_scales(scales))
         if scales == before:
             break
     return scales
 
 
-def _most_probable(
-    trials: Sequence[dict[str, float]], log_probability: Callable[[dict[str, float]], float]
-) -> tuple[float, dict[str, float]]:
-    """Return the largest log probability and its trial."""
-    values = [log_probability(trial) for trial in trials]
-    at = int(np.argmax(values))
-    return values[at], trials[at]
+def _best_scale(
+    covariance: FloatArray,
+    right: FloatArray,
+    at: NDArray[np.intp],
+    unit: FloatArray,
+    current: float,
+) -> float:
+    """Return the most probable prior scale of the amplitudes at some places of a solution.
+
+    All other amplitudes are integrated out once for all scales. `unit` is the prior precision at
+    scale 1; the covariance holds for the current scale, which stays where none is better.
+    """
+    marginal = inverse(covariance[np.ix_(at, at)])
+    toward = marginal @ (covariance[at] @ right)
+
+    def log_probability(scale: float) -> float:
+        precision = marginal + np.diag(unit * (scale**-2 - current**-2))
+        return log_gaussian_integral(precision, toward) - unit.size * math.log(scale)
+
+    return max((current, *STRUCTURE_SCALES), key=log_probability)
 
 
 def _common_per_log(
@@ -350,20 +372,12 @@ def _left_out_squares_v2(
     weighted = log.weighted(error)
     centre = np.concatenate((others.mean, np.zeros(per_log.size)))
     precision = prior + weighted[:-1, :-1]
-    balance = 1.0 / np.sqrt(np.diag(precision))
-    inverse = np.linalg.inv(precision * balance * balance[:, None])
-    covariance = inverse * balance * balance[:, None]
+    covariance = inverse(precision)
     mean = covariance @ (prior @ centre + weighted[:-1, -1])
-    squares = np.empty(SCALES)
-    for scale, products in enumerate(log.products):
-        block = products[:-1, :-1]
-        squares[scale] = (
-            products[-1, -1]
-            - 2.0 * mean @ products[:-1, -1]
-            + mean @ block @ mean
-            + np.sum(block * covariance)
-        )
-    return np.maximum(squares, 0.0)
+    weights = np.append(-mean, 1.0)
+    squares = (log.products @ weights) @ weights
+    squares += np.tensordot(log.products[:, :-1, :-1], covariance, axes=2)
+    return np.asarray(np.maximum(squares, 0.0))
 
 
 def _positive(variance: FloatArray) -> tuple[float, ...]:

@@ -18,17 +18,20 @@ from cangauge._typing import FloatArray
 from cangauge._version import __version__
 from cangauge.diagnosis.bayes_factors import Score
 from cangauge.diagnosis.design_matrix import DesignMatrix
+from cangauge.diagnosis.hypotheses import prior_precision
 from cangauge.diagnosis.linear_gaussian import (
+    ExchangedColumns,
     NormalEquations,
+    columns_of,
     constrained_mode,
     marginalize,
-    normal_equations,
-    prior_precision,
+    products_of,
     with_change,
 )
 from cangauge.diagnosis.problem import DiagnosisProblem
 from cangauge.diagnosis.structure import select_structure, with_structure
 from cangauge.inference.linearized import pack_state, residual, with_modelled_voltage
+from cangauge.inference.time_scales import haar_transform
 from cangauge.model.effects.base import BOUND_MARGIN, Effect, Pack, PackState, Values
 from cangauge.model.effects.library import STEP, Candidate, effect_entries, shape_key
 from cangauge.model.extended import ExtendedModel
@@ -105,11 +108,15 @@ def extend(problem: DiagnosisProblem, accepted: Sequence[Score]) -> Extension:
     """
     pieces = select_structure(problem.hypotheses, problem.reference_equations, problem.error)
     reduced = _with_structure_of(problem, pieces)
+    logs = problem.diagnosed_equations
     if not accepted:
-        return Extension(*_healthy_model(reduced))
+        return Extension(*_healthy_model(reduced, logs))
     # All structure is marginalised here, not only what the extended model has.
-    causes, covariance, explained = _refine_amplitudes(problem, _initial_causes(reduced, accepted))
-    base, remarks = _healthy_model(_with_structure_of(explained, pieces))
+    causes, covariance, explained = _refine_amplitudes(
+        problem, _initial_causes(reduced, logs, accepted)
+    )
+    logs = explained.diagnosed_equations
+    base, remarks = _healthy_model(_with_structure_of(explained, pieces), logs)
     # Bounds depend on the pack, which has changed with the coefficients.
     causes = [
         replace(cause, values=cause.candidate.effect.clipped(cause.values, base.pack))
@@ -149,11 +156,11 @@ def _with_structure_of(problem: DiagnosisProblem, structure: tuple[int, ...]) ->
     )
 
 
-def _healthy_model(problem: DiagnosisProblem) -> tuple[ExtendedModel, tuple[str, ...]]:
+def _healthy_model(
+    problem: DiagnosisProblem, logs: Sequence[NormalEquations]
+) -> tuple[ExtendedModel, tuple[str, ...]]:
     """Return the model with coefficients and structure for logs without a cause, and remarks."""
-    posterior = marginalize(
-        problem.hypotheses, problem.reference_equations, problem.diagnosed_equations, problem.error
-    )
+    posterior = marginalize(problem.hypotheses, problem.reference_equations, logs, problem.error)
     solution, _ = constrained_mode(posterior, problem.model.model, [])
     return _with_solution(problem, solution)
 
@@ -178,11 +185,11 @@ def _with_causes(model: ExtendedModel, causes: Sequence[Cause]) -> ExtendedModel
     return model
 
 
-def _initial_causes(problem: DiagnosisProblem, accepted: Sequence[Score]) -> list[Cause]:
+def _initial_causes(
+    problem: DiagnosisProblem, logs: Sequence[NormalEquations], accepted: Sequence[Score]
+) -> list[Cause]:
     """Return the causes of the linear solution, with amplitudes and shapes fitted from there."""
-    posterior = marginalize(
-        problem.hypotheses, problem.reference_equations, problem.diagnosed_equations, problem.error
-    )
+    posterior = marginalize(problem.hypotheses, problem.reference_equations, logs, problem.error)
     chosen = [k for score in accepted for k in score.candidates]
     solution, amplitudes = constrained_mode(posterior, problem.model.model, chosen)
     model, _ = _with_solution(problem, solution)
@@ -357,11 +364,22 @@ def _refine_amplitudes(
         gradient = posterior.gradient[at] / overdispersion - prior @ amplitude
         return np.linalg.solve(total, gradient), total
 
+    layout = hypotheses.diagnosed_layout
+    moving = np.append(layout.effects[at], layout.residual)
+    others = [
+        ExchangedColumns(matrix, hypotheses.column_scale, moving) for matrix in problem.diagnosed
+    ]
     found = list(causes)
     for _ in range(GAUSS_NEWTON_ROUNDS):
         matrices = [_at_causes(matrix, problem, found) for matrix in problem.diagnosed]
         amplitude = np.concatenate([cause.amplitude for cause in found])
-        step, total = step_of([problem.equations_of(matrix) for matrix in matrices], amplitude)
+        logs = [
+            log.equations(
+                np.column_stack([*(matrix.effects[k] for k in numbers), matrix.residual_v])
+            ).inflated(problem.noise_scale(matrix))
+            for log, matrix in zip(others, matrices, strict=True)
+        ]
+        step, total = step_of(logs, amplitude)
         parts = np.split(amplitude + step, np.cumsum(widths)[:-1])
         found = [cause.with_amplitude(part) for cause, part in zip(found, parts, strict=True)]
     jackknife = _jackknife_variance(
@@ -391,10 +409,11 @@ def _jackknife_variance(
     by_band: list[dict[int, NormalEquations]] = []
     for matrix in matrices:
         band = np.searchsorted(edges, matrix.sampled.rows.soc_pct)
-        scale, factor = problem.hypotheses.column_scale, problem.noise_scale(matrix)
+        columns = columns_of(matrix, problem.hypotheses.column_scale)
+        factor = problem.noise_scale(matrix)
         by_band.append(
             {
-                number: normal_equations(matrix.rows(band == number), scale).inflated(factor)
+                number: products_of(haar_transform(columns[band == number])).inflated(factor)
                 for number in range(SOC_BANDS)
                 if np.count_nonzero(band == number) >= MIN_BAND_ROWS
             }

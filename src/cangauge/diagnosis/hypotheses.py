@@ -23,6 +23,14 @@ from cangauge.model.effects.library import Candidate
 
 Indices = NDArray[np.intp]
 
+PRIOR_SIGMAS = 2.0
+"""Half the width of an amplitude's bounds in prior standard deviations."""
+
+
+def prior_precision(bounds: FloatArray) -> FloatArray:
+    """Return the prior precision of amplitudes with bounds of shape (k, 2), shape (k, k)."""
+    return np.diag((2.0 * PRIOR_SIGMAS / (bounds[:, 1] - bounds[:, 0])) ** 2)
+
 
 @dataclass(frozen=True, eq=False)
 class Layout:
@@ -38,10 +46,16 @@ class Layout:
     """Amplitudes of the per-log effects, then `PER_LOG_STATES`."""
     residual: int
 
-    @property
+    @cached_property
     def shared(self) -> Indices:
         """Columns whose amplitudes all logs share, in the order of a solution."""
         return np.concatenate((self.coefficients, self.structure))
+
+    @cached_property
+    def kept(self) -> Indices:
+        """Columns that remain without the per-log amplitudes; each stays at its index."""
+        last = max(int(self.shared.max()), int(self.effects.max(initial=0)))
+        return np.append(np.arange(last + 1), self.residual)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +86,13 @@ class Hypotheses:
         return np.concatenate(([0], np.cumsum(widths))).astype(np.intp)
 
     @cached_property
+    def structure_prior(self) -> tuple[tuple[str, ...], FloatArray]:
+        """Effect and prior precision of each amplitude of the shared structure."""
+        candidates = [self.candidates[k] for k in self.structure]
+        names = tuple(each.effect.id for each in candidates for _ in each.amplitudes)
+        return names, np.diag(prior_precision(self.bounds_of(self.structure)))
+
+    @cached_property
     def mixtures(self) -> tuple[tuple[int, int], ...]:
         """Pairs of candidates adjacent in one shape parameter.
 
@@ -91,6 +112,14 @@ class Hypotheses:
                     if abs(places[0] - places[1]) == 1:
                         pairs.append((a, b))
         return tuple(pairs)
+
+    @cached_property
+    def shapes(self) -> dict[int, list[tuple[int, ...]]]:
+        """Candidates and mixtures by their number of amplitudes."""
+        found: dict[int, list[tuple[int, ...]]] = {}
+        for chosen in (*((k,) for k in range(len(self.candidates))), *self.mixtures):
+            found.setdefault(self.amplitudes_of(chosen).size, []).append(chosen)
+        return found
 
     @cached_property
     def diagnosed_layout(self) -> Layout:

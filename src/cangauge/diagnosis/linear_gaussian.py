@@ -25,15 +25,12 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.design_matrix import DesignMatrix
-from cangauge.diagnosis.hypotheses import Hypotheses
+from cangauge.diagnosis.hypotheses import Hypotheses, Layout, prior_precision
 from cangauge.errors import InputError
 from cangauge.inference.least_squares import nearest_rising
 from cangauge.inference.linearized import SLOPE_CHECKS
 from cangauge.inference.time_scales import haar_transform
 from cangauge.model.voltage_model import BASIS_NAMES, SLOPE_AT_LEAST, VoltageModel, ocv_basis_slope
-
-PRIOR_SIGMAS = 2.0
-"""Half the width of an amplitude's bounds in prior standard deviations."""
 
 STRUCTURE_STD = 0.1
 """Standard deviation by which diagnosed logs may change the structure of the references, in parts
@@ -98,7 +95,8 @@ class NormalEquations:
     """Shape (SCALES, columns, columns)."""
     counts: FloatArray
     """Haar coefficients of each scale, shape (SCALES,); reduced where rows have less weight."""
-    _last_weighted: dict[tuple[float, ...], FloatArray] = field(default_factory=dict, repr=False)
+    _last_weighted: dict[object, FloatArray] = field(default_factory=dict, repr=False)
+    _last_marginal: dict[object, tuple[FloatArray, float]] = field(default_factory=dict, repr=False)
 
     def columns(self, kept: NDArray[np.intp]) -> NormalEquations:
         """Return the products of some columns."""
@@ -106,6 +104,8 @@ class NormalEquations:
 
     def inflated(self, factor: float) -> NormalEquations:
         """Return the products for an error variance `factor` times as large."""
+        if factor == 1.0:
+            return self
         return NormalEquations(self.products / factor, self.counts)
 
     def weighted(self, error: ErrorModel) -> FloatArray:
@@ -116,6 +116,42 @@ class NormalEquations:
             factors = 1.0 / np.array(error.scale_v2)
             known[error.scale_v2] = np.asarray(np.tensordot(factors, self.products, axes=1))
         return known[error.scale_v2]
+
+    def marginal(self, error: ErrorModel, layout: Layout) -> tuple[FloatArray, float]:
+        """Integrate out the per-log amplitudes.
+
+        Returns
+        -------
+        products : array
+            Weighted products of the columns `Layout.kept`.
+        log_det : float
+            ln det of the amplitudes' posterior precision over their prior's.
+        """
+        known, key = self._last_marginal, (error.scale_v2, error.per_log_std, layout)
+        if key not in known:  # a reference's is the same whatever it is compared with
+            weighted, kept = self.weighted(error), layout.kept
+            std, root = self._per_log_root(error, layout)
+            toward = std[:, None] * weighted[np.ix_(layout.per_log, kept)]
+            gained = solve_triangular(root, toward, lower=True, check_finite=False)
+            log_det = 2.0 * float(np.sum(np.log(np.diag(root))))
+            known.clear()
+            known[key] = (weighted[np.ix_(kept, kept)] - gained.T @ gained, log_det)
+        return known[key]
+
+    def per_log_amplitudes(
+        self, error: ErrorModel, layout: Layout, weights: FloatArray
+    ) -> FloatArray:
+        """Return the most probable per-log amplitudes for a residual of weighted columns."""
+        std, root = self._per_log_root(error, layout)
+        right = std * (self.weighted(error)[layout.per_log] @ weights)
+        return np.asarray(std * cho_solve((root, True), right, check_finite=False))
+
+    def _per_log_root(self, error: ErrorModel, layout: Layout) -> tuple[FloatArray, FloatArray]:
+        """Return standard deviations, and the lower root of the precision in units of these."""
+        std = np.array(error.per_log_std)
+        block = self.weighted(error)[np.ix_(layout.per_log, layout.per_log)] * std * std[:, None]
+        block[np.diag_indices(std.size)] += 1.0
+        return std, np.linalg.cholesky(block)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,24 +192,59 @@ def normal_equations(
     weight : array of shape (m,), optional
         Weight of each row: ½ means twice the error, 0 leaves the row out.
     """
-    columns = np.column_stack(
-        [
-            matrix.coefficients / column_scale,
-            *matrix.effects,
-            matrix.per_log_states,
-            matrix.residual_v,
-        ]
-    )
+    columns = columns_of(matrix, column_scale)
     count_factor = 1.0
     if weight is not None:
         keep = weight > 0.0
         columns = columns[keep] * weight[keep, None]
         count_factor = float(np.mean(weight[keep] ** 2))
-    scales = haar_transform(columns)
-    return NormalEquations(
-        np.stack([each.T @ each for each in scales]),
-        count_factor * np.array([float(len(each)) for each in scales]),
+    return products_of(haar_transform(columns), count_factor)
+
+
+def columns_of(matrix: DesignMatrix, column_scale: FloatArray) -> FloatArray:
+    """Return the columns of the normal equations, the residual last."""
+    coefficients = matrix.coefficients / column_scale
+    return np.column_stack(
+        [coefficients, *matrix.effects, matrix.per_log_states, matrix.residual_v]
     )
+
+
+def products_of(scales: Sequence[FloatArray], count_factor: float = 1.0) -> NormalEquations:
+    """Return the normal equations of transformed columns (`haar_transform`)."""
+    products = np.empty((len(scales), scales[0].shape[1], scales[0].shape[1]))
+    for number, each in enumerate(scales):
+        np.matmul(each.T, each, out=products[number])
+    return NormalEquations(products, count_factor * np.array([float(len(each)) for each in scales]))
+
+
+class ExchangedColumns:
+    """Normal equations of a log with some of its columns exchanged; the others' products stay.
+
+    Parameters
+    ----------
+    matrix : DesignMatrix
+    column_scale : array of shape (p,)
+    at : array of int
+        Columns that are exchanged.
+    """
+
+    def __init__(
+        self, matrix: DesignMatrix, column_scale: FloatArray, at: NDArray[np.intp]
+    ) -> None:
+        self._at = at
+        self._scales = haar_transform(columns_of(matrix, column_scale))
+        self._given = products_of(self._scales)
+
+    def equations(self, columns: FloatArray) -> NormalEquations:
+        """Return the normal equations with other columns, shape (m, columns exchanged)."""
+        products, at = self._given.products.copy(), self._at
+        for number, (given, new) in enumerate(
+            zip(self._scales, haar_transform(columns), strict=True)
+        ):
+            cross = given.T @ new
+            products[number][:, at], products[number][at] = cross, cross.T
+            products[number][np.ix_(at, at)] = new.T @ new
+        return NormalEquations(products, self._given.counts)
 
 
 def marginalize(
@@ -192,30 +263,27 @@ def marginalize(
     error : ErrorModel
     """
     amplitudes = int(hypotheses.offsets[-1])
-    shared = hypotheses.reference_layout.shared.size
-    effects = shared + np.arange(amplitudes)
-    precision, right = np.zeros((shared, shared)), np.zeros(shared)
-    cross = np.zeros((shared, amplitudes))
+    of_references, _ = _of_references(hypotheses, references, error)
+    precision, right = of_references[:-1, :-1].copy(), of_references[:-1, -1].copy()
+    chi_square = float(of_references[-1, -1])
+    cross = np.zeros((right.size, amplitudes))
     curvature, gradient = np.zeros((amplitudes, amplitudes)), np.zeros(amplitudes)
-    chi_square = 0.0
-    for number, log in enumerate((*references, *diagnosed)):
-        is_reference = number < len(references)
-        products, _, _ = marginalize_per_log(log, hypotheses, error, is_reference=is_reference)
-        precision += products[:shared, :shared]
-        right += products[:shared, -1]
+    layout = hypotheses.diagnosed_layout
+    shared, effects = layout.shared, layout.effects
+    for log in diagnosed:
+        products, _ = log.marginal(error, layout)
+        precision += products[np.ix_(shared, shared)]
+        right += products[shared, -1]
         chi_square += float(products[-1, -1])
-        if not is_reference:
-            cross += products[np.ix_(np.arange(shared), effects)]
-            curvature += products[np.ix_(effects, effects)]
-            gradient += products[effects, -1]
+        cross += products[np.ix_(shared, effects)]
+        curvature += products[np.ix_(effects, effects)]
+        gradient += products[effects, -1]
     chi_square += _add_priors(precision, right, hypotheses, error)
     if references and diagnosed and hypotheses.structure:
         healthy = marginalize(hypotheses, references, [], error).mean
         chi_square += _hold_structure(precision, right, hypotheses, healthy)
-    balance = 1.0 / np.sqrt(np.diag(precision))
-    factor = cho_factor(precision * balance * balance[:, None])
-    mean = np.asarray(balance * cho_solve(factor, balance * right))
-    sensitivity = np.asarray(balance[:, None] * cho_solve(factor, balance[:, None] * cross))
+    solved = _solved(precision, np.column_stack([right, cross]) if diagnosed else right[:, None])
+    mean, sensitivity = solved[:, 0], solved[:, 1:] if diagnosed else cross
     return Posterior(
         hypotheses=hypotheses,
         error=error,
@@ -228,50 +296,42 @@ def marginalize(
     )
 
 
-def marginalize_per_log(
-    log: NormalEquations, hypotheses: Hypotheses, error: ErrorModel, *, is_reference: bool
-) -> tuple[FloatArray, FloatArray, float]:
-    """Integrate out the per-log amplitudes.
+def _of_references(
+    hypotheses: Hypotheses, references: Sequence[NormalEquations], error: ErrorModel
+) -> tuple[FloatArray, float]:
+    """Return the references' products of the shared columns and the residual, and their ln det."""
+    layout = hypotheses.reference_layout
+    total, log_det = np.zeros((layout.kept.size, layout.kept.size)), 0.0
+    for log in references:
+        products, per_log_det = log.marginal(error, layout)
+        total += products
+        log_det += per_log_det + float(log.counts @ np.log(error.scale_v2))
+    return total, log_det
 
-    Returns
-    -------
-    products : array
-        Weighted products of the shared columns, all amplitudes (not of a reference), residual.
-    response : array
-        Change of the per-log amplitudes with each of these, shape (per-log amplitudes, …).
-    log_det : float
-        ln det of their posterior precision over their prior's.
-    """
-    weighted = log.weighted(error)
-    layout = hypotheses.reference_layout if is_reference else hypotheses.diagnosed_layout
-    per_log = layout.per_log
-    kept = np.concatenate((layout.shared, layout.effects, [layout.residual]))
-    # In units of their standard deviation, so that the prior precision is 1.
-    std = np.array(error.per_log_std)
-    block = weighted[np.ix_(per_log, per_log)] * std * std[:, None]
-    block[np.diag_indices(per_log.size)] += 1.0
-    toward = std[:, None] * weighted[np.ix_(per_log, kept)]
-    factor = cho_factor(block)
-    response = cho_solve(factor, toward)
-    log_det = 2.0 * float(np.sum(np.log(np.diag(factor[0]))))
-    products = weighted[np.ix_(kept, kept)] - toward.T @ response
-    return products, std[:, None] * response, log_det
+
+def _solved(precision: FloatArray, right: FloatArray) -> FloatArray:
+    """Return the solution of positive equations, balanced by their diagonal."""
+    balance = 1.0 / np.sqrt(np.diag(precision))
+    factor = cho_factor(precision * balance * balance[:, None], check_finite=False)
+    return np.asarray(
+        balance[:, None] * cho_solve(factor, balance[:, None] * right, check_finite=False)
+    )
+
+
+def inverse(precision: FloatArray) -> FloatArray:
+    """Return the inverse of a positive matrix, balanced by its diagonal."""
+    balance = 1.0 / np.sqrt(np.diag(precision))
+    balanced = np.linalg.inv(precision * balance * balance[:, None])
+    return np.asarray(balanced * balance * balance[:, None])
 
 
 def log_likelihood(
     hypotheses: Hypotheses, references: Sequence[NormalEquations], error: ErrorModel
 ) -> float:
     """Return the log marginal likelihood of the references, up to a constant."""
-    shared = hypotheses.reference_layout.shared.size
-    precision, right, squares = np.zeros((shared, shared)), np.zeros(shared), 0.0
-    log_det = 0.0
-    for log in references:
-        products, _, per_log_det = marginalize_per_log(log, hypotheses, error, is_reference=True)
-        precision += products[:shared, :shared]
-        right += products[:shared, -1]
-        squares += float(products[-1, -1])
-        log_det += per_log_det + float(log.counts @ np.log(error.scale_v2))
-    squares += _add_priors(precision, right, hypotheses, error)
+    products, log_det = _of_references(hypotheses, references, error)
+    precision, right = products[:-1, :-1], products[:-1, -1]
+    squares = float(products[-1, -1]) + _add_priors(precision, right, hypotheses, error)
     log_det -= float(np.sum(np.log(structure_precision(hypotheses, error))))
     return log_gaussian_integral(precision, right) - 0.5 * (squares + log_det)
 
@@ -298,11 +358,9 @@ def _add_priors(
 
 def structure_precision(hypotheses: Hypotheses, error: ErrorModel) -> FloatArray:
     """Return the prior precision of each structure amplitude, shape (amplitudes,)."""
-    candidates = [hypotheses.candidates[k] for k in hypotheses.structure]
-    scales = [error.structure.get(each.effect.id, 1.0) for each in candidates
-              for _ in each.amplitudes]  # fmt: skip
-    prior = np.diag(prior_precision(hypotheses.bounds_of(hypotheses.structure)))
-    return np.asarray(prior / np.array(scales) ** 2)
+    names, precision = hypotheses.structure_prior
+    scales = np.array([error.structure.get(name, 1.0) for name in names])
+    return np.asarray(precision / scales**2)
 
 
 def prior_information(hypotheses: Hypotheses, error: ErrorModel) -> FloatArray:
@@ -339,11 +397,6 @@ def log_gaussian_integral(precision: FloatArray, right: FloatArray) -> float:
     gained = solve_triangular(root, balance * right, lower=True, check_finite=False)
     volume = np.sum(np.log(np.diag(root))) - np.sum(np.log(balance))
     return float(0.5 * gained @ gained - volume)
-
-
-def prior_precision(bounds: FloatArray) -> FloatArray:
-    """Return the prior precision of amplitudes with bounds of shape (k, 2), shape (k, k)."""
-    return np.diag((2.0 * PRIOR_SIGMAS / (bounds[:, 1] - bounds[:, 0])) ** 2)
 
 
 def constrained_mode(

@@ -25,8 +25,8 @@ from scipy.special import logsumexp
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.bayes_factors import PRIOR_WIDTHS, bounded_evidence
 from cangauge.diagnosis.design_matrix import DesignMatrix, candidates_for, design_matrix
-from cangauge.diagnosis.hypotheses import Hypotheses, Indices
-from cangauge.diagnosis.linear_gaussian import Posterior, marginalize, prior_precision
+from cangauge.diagnosis.hypotheses import Hypotheses, Indices, prior_precision
+from cangauge.diagnosis.linear_gaussian import Posterior, marginalize
 from cangauge.diagnosis.posterior import (
     NONE,
     UNKNOWN,

@@ -35,8 +35,8 @@ from cangauge.diagnosis.bayes_factors import (
     mean_square_v2,
     scores,
 )
-from cangauge.diagnosis.hypotheses import Hypotheses
-from cangauge.diagnosis.linear_gaussian import Posterior, marginalize, prior_precision
+from cangauge.diagnosis.hypotheses import Hypotheses, prior_precision
+from cangauge.diagnosis.linear_gaussian import Posterior, marginalize
 from cangauge.diagnosis.problem import DiagnosisProblem
 
 NONE, UNKNOWN = "none", "unknown"

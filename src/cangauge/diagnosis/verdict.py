@@ -16,7 +16,8 @@ import numpy as np
 
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.bayes_factors import Score, condition_on, normal_evidence, scores
-from cangauge.diagnosis.linear_gaussian import Posterior, prior_precision
+from cangauge.diagnosis.hypotheses import prior_precision
+from cangauge.diagnosis.linear_gaussian import Posterior
 from cangauge.diagnosis.posterior import NONE, UNKNOWN, probabilities
 from cangauge.diagnosis.problem import DiagnosisProblem
 from cangauge.model.effects.library import LIBRARY

@@ -40,7 +40,8 @@ def haar_transform(columns: FloatArray, scales: int = SCALES) -> list[FloatArray
     while len(sums) > 1:
         pairs = len(sums) // 2
         left, right = sums[: 2 * pairs : 2], sums[1 : 2 * pairs : 2]
-        differences = (left - right) / np.sqrt(2.0 * size)
+        differences = left - right
+        differences /= np.sqrt(2.0 * size)
         is_odd = len(sums) % 2 == 1
         full = pairs if is_odd or last == size else pairs - 1
         parts[min(size.bit_length() - 1, scales - 1)].append(differences[:full])
@@ -49,8 +50,10 @@ def haar_transform(columns: FloatArray, scales: int = SCALES) -> list[FloatArray
             scale = int(np.rint(np.log2(size + last))) - 1
             shorter = gain * (left[-1:] / size - right[-1:] / last)
             parts[min(scale, scales - 1)].append(shorter)
-        added = left + right
-        sums = np.concatenate((added, sums[-1:])) if is_odd else added
+        added = np.empty((pairs + is_odd, *columns.shape[1:]))
+        np.add(left, right, out=added[:pairs])
+        added[pairs:] = sums[2 * pairs :]
+        sums = added
         last = last if is_odd else size + last
         size *= 2
     parts[-1].append(sums / np.sqrt(columns.shape[0]))  # the mean

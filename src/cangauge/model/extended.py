@@ -149,7 +149,8 @@ class ExtendedModel:
         if counted is corrected.current_a:
             out = corrected.history.out_ah
         else:
-            out = discharged_ah(corrected.time_s, counted)
+            steps_s = corrected.history.counted_s
+            out = discharged_ah(corrected.time_s, counted, steps_s)
         moved = 100.0 * (out - out[initial_row]) / counting.capacity_ah
         return np.asarray(counting.initial_soc_pct - moved)
 

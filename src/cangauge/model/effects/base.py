@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from cangauge._arithmetic import total
 from cangauge._typing import FloatArray
-from cangauge.model.coulomb_counting import BRIDGE_S, discharged_ah
+from cangauge.logs.gaps import BRIDGE_S, counted_steps_s, discharged_ah
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.effects.first_order import NO_LAG_S, LowPass, decaying_sum, low_passed
 from cangauge.model.voltage_model import VoltageModel
@@ -186,6 +186,8 @@ class CurrentHistory:
     current_a: FloatArray
     rows: NDArray[np.intp] | None = None
     """Samples at which lagged and delayed currents are returned; all if None."""
+    like: CurrentHistory | None = None
+    """History of another current at the same times, whose steps of time are shared."""
     _lagged: dict[tuple[float, bool], FloatArray] = field(
         default_factory=dict, init=False, repr=False
     )
@@ -211,7 +213,7 @@ class CurrentHistory:
         found = self._shifted.pop(seconds, None)
         if found is None:
             current_a = np.interp(self.time_s + seconds, self.time_s, self.current_a)
-            found = CurrentHistory(self.time_s, current_a)
+            found = CurrentHistory(self.time_s, current_a, like=self)
             while len(self._shifted) >= MOST_SHIFTS:
                 del self._shifted[next(iter(self._shifted))]
         self._shifted[seconds] = found  # the latest one last
@@ -269,16 +271,23 @@ class CurrentHistory:
     @cached_property
     def out_ah(self) -> FloatArray:
         """Charge discharged since the first sample [Ah], shape (n,)."""
-        return discharged_ah(self.time_s, self.current_a)
+        return discharged_ah(self.time_s, self.current_a, self.counted_s)
+
+    @cached_property
+    def counted_s(self) -> FloatArray:
+        """Steps over which charge is counted [s], shape (n − 1,)."""
+        return counted_steps_s(self.time_s) if self.like is None else self.like.counted_s
 
 
 def _history_of(
     time_s: FloatArray, current_a: FloatArray, cached: CurrentHistory | None
 ) -> CurrentHistory:
     """Return the cached history if it was made of the same array objects, else a new one."""
-    if cached is not None and cached.current_a is current_a and cached.time_s is time_s:
-        return cached
-    return CurrentHistory(time_s, current_a)
+    if cached is None or cached.time_s is not time_s:
+        return CurrentHistory(time_s, current_a)
+    return (
+        cached if cached.current_a is current_a else CurrentHistory(time_s, current_a, like=cached)
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,13 +41,19 @@ def decaying_sum(decay: FloatArray, drive: FloatArray, start: float) -> FloatArr
     result = np.empty(decay.size + 1)
     result[0] = start
     # Limiting each step to `FULL_DECAY` keeps e^elapsed finite.
-    elapsed = np.concatenate(([0.0], np.cumsum(np.minimum(decay, FULL_DECAY))))
+    elapsed = np.zeros(decay.size + 1)
+    np.cumsum(np.minimum(decay, FULL_DECAY), out=elapsed[1:])
     blocks = np.arange(BLOCK_TIME_CONSTANTS, elapsed[-1], BLOCK_TIME_CONSTANTS)
     edges = np.concatenate(([0], np.searchsorted(elapsed[1:], blocks), [decay.size]))
     last = start
     for first, after in itertools.pairwise(edges.tolist()):
-        grown = np.exp(elapsed[first + 1 : after + 1] - elapsed[first])
-        result[first + 1 : after + 1] = (last + np.cumsum(drive[first:after] * grown)) / grown
+        grown = elapsed[first + 1 : after + 1] - elapsed[first]
+        np.exp(grown, out=grown)
+        part = result[first + 1 : after + 1]
+        np.multiply(drive[first:after], grown, out=part)
+        np.cumsum(part, out=part)
+        part += last
+        part /= grown
         last = float(result[after])
     return result
 
@@ -75,11 +81,16 @@ def low_passed(
         return values
     seconds = np.diff(time_s)
     step = seconds / tau_s
-    rest = -np.expm1(-step)  # 1 − a
-    b = rest / step - (1.0 - rest)
-    drive = rest * values[1:] + b * (values[:-1] - values[1:])
+    rest = np.expm1(-step)
+    np.negative(rest, out=rest)  # 1 − a
+    drive = rest / step
+    drive -= 1.0 - rest  # b
+    drive *= values[:-1] - values[1:]
+    rest *= values[1:]
+    drive += rest
+    drive[seconds > rest_s] = 0.0
     first = float(values[0]) if start is None else start
-    return decaying_sum(step, np.where(seconds > rest_s, 0.0, drive), first)
+    return decaying_sum(step, drive, first)
 
 
 class LowPass:

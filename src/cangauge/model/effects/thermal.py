@@ -21,7 +21,7 @@ from cangauge.model.effects.base import (
     Signals,
     Values,
 )
-from cangauge.model.effects.first_order import LowPass, low_passed
+from cangauge.model.effects.first_order import LowPass
 from cangauge.model.voltage_model import VoltageModel
 
 SMOOTHING_S = 200.0
@@ -44,7 +44,7 @@ class TemperatureLag(Effect):
 
     def correct(self, signals: Signals, values: Values, pack: Pack) -> Signals:
         measured = signals.temperature_c
-        smooth = low_passed(signals.time_s, measured, SMOOTHING_S)
+        smooth = signals.history.lagged_c(measured, SMOOTHING_S)
         ahead = values["tau_s"] / SMOOTHING_S
         return replace(signals, temperature_c=measured + ahead * (measured - smooth))
 
@@ -109,7 +109,7 @@ class CoreTemperature(Effect):
         outside = signals.temperature_c
         core = outside + values["rise_k"] * above
         if values["late"]:
-            followed = low_passed(signals.time_s, outside, values["tau_s"])
+            followed = signals.history.lagged_c(outside, values["tau_s"])
             core = core + values["late"] * (followed - outside)
         return replace(signals, temperature_c=core)
 
