@@ -8,18 +8,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cangauge.identify.evaluate import evaluate
 from cangauge.identify.fit import Identification, fit
-from cangauge.identify.pooled import (
-    LEVELS_AT_MOST,
-    LogInformation,
+from cangauge.identify.log_errors import (
     errors_of,
-    fit_information,
-    information_of,
-    pooled,
+    held_out_error,
     slope_resistances,
     summed,
     with_std_errors,
+)
+from cangauge.identify.passes import RowsOfLogs, fit_logs, fit_voltage_model, held_out_models
+from cangauge.identify.voltage_fit import (
+    LEVELS_AT_MOST,
+    LogInformation,
+    design_matrix,
+    fit_information,
+    information_of,
+    pooled,
 )
 from cangauge.inference.rows import FitOptions, FitRows, fit_rows
 from cangauge.logs.log import Log
@@ -87,9 +91,9 @@ def test_standard_errors_and_slope_are_those_of_the_rows(
     whole = pooled(parts)
     model, solution = fit_information(whole, options)
     errors = summed(
-        [errors_of(evaluate(model, item), options, solution, None, whole.mean_c) for item in rows]
+        [errors_of(item, options, model, solution, mean_c=whole.mean_c) for item in rows]
     )
-    found = with_std_errors(solution, errors)
+    found = with_std_errors(solution, errors.sums, errors.scores)
     assert np.allclose(found.std_error, plain.solution.std_error, rtol=SAME)
     slopes = slope_resistances(errors, model.resistance_ohm)
     assert np.allclose(slopes, (plain.slope_ohm, plain.slope_expected_ohm), rtol=SAME)
