@@ -21,7 +21,14 @@ from cangauge.inference.least_squares import (
     Solution,
     sandwich_std_error,
 )
-from cangauge.inference.rows import FitOptions, FitRows, Mask, block_numbers, row_blocks
+from cangauge.inference.rows import (
+    FitOptions,
+    FitRows,
+    Mask,
+    block_numbers,
+    row_blocks,
+    stacked_columns,
+)
 from cangauge.model.voltage_model import VoltageModel
 
 HeldOut = Sequence[tuple[Mask | None, VoltageModel]]
@@ -213,7 +220,7 @@ def errors_of_fit(
         part, volts, residual_v = fitted.rows, fitted.rows.voltage_v, fitted.residual_v
         residuals.append(residual_v)
         drop_v = volts - fitted.pseudo_ocv_v
-        table = np.column_stack([np.ones(len(part)), drop_v, part.delayed_current_a])
+        table = stacked_columns(np.ones(len(part)), drop_v, part.delayed_current_a)
         currents += table.T @ table
         known = np.isfinite(error_v)
         sums.append(

@@ -28,7 +28,7 @@ from cangauge.inference.least_squares import (
     triangular_factor,
 )
 from cangauge.inference.linearized import SLOPE_CHECKS
-from cangauge.inference.rows import FitOptions, FitRows, row_blocks
+from cangauge.inference.rows import FitOptions, FitRows, row_blocks, stacked_columns
 from cangauge.inference.time_scales import SCALES, HaarBlocks
 from cangauge.model.voltage_model import (
     BASIS_NAMES,
@@ -57,8 +57,8 @@ LEVEL_STEP = 1e-4
 
 def design_matrix(rows: FitRows, epsilon: float, t_ref_c: float) -> FloatArray:
     """Return the columns k0 … k7, kt, R1 … Rn on the rows of a log, shape (m, 9 + n)."""
-    return np.column_stack(
-        [ocv_basis(rows.soc_pct, epsilon), rows.dequantized_c - t_ref_c, rows.delayed_current_a]
+    return stacked_columns(
+        ocv_basis(rows.soc_pct, epsilon), rows.dequantized_c - t_ref_c, rows.delayed_current_a
     )
 
 
@@ -159,7 +159,7 @@ def table_of(
     part = rows.part(block)
     columns = design_matrix(part, options.epsilon, options.t_ref_c)
     more = [] if extra is None else [extra[block]]
-    return np.column_stack([columns, *more, part.voltage_v])
+    return stacked_columns(columns, *more, part.voltage_v)
 
 
 def _levels(volts: FloatArray, rows: FloatArray) -> tuple[FloatArray, FloatArray]:

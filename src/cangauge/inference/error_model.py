@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from cangauge._typing import FloatArray
-from cangauge.inference.rows import row_blocks
+from cangauge.inference.rows import row_blocks, stacked_columns
 from cangauge.inference.time_scales import HaarBlocks
 
 SCALES: Final = 14
@@ -440,7 +440,7 @@ def error_equations(
         Rate of the rows.
     """
     blocks = (
-        np.column_stack([_columns(part, mean_c, resistance_ohm), part.residual_v])
+        stacked_columns(_columns(part, mean_c, resistance_ohm), part.residual_v)
         for part in map(log.part, row_blocks(len(log.residual_v)))
     )
     return ErrorEquations.of_blocks(blocks, 2 ** fast_scales(rate_hz))
@@ -569,9 +569,9 @@ def _columns(log: LogResidual, mean_c: float, resistance_ohm: Sequence[float]) -
     soc = np.clip(log.soc_pct, KNOTS_PCT[0], KNOTS_PCT[-1])
     at = np.clip(np.searchsorted(KNOTS_PCT, soc, side="right") - 1, 0, KNOTS_PCT.size - 2)
     part = (soc - KNOTS_PCT[at]) / (KNOTS_PCT[at + 1] - KNOTS_PCT[at])
-    hats = np.zeros((soc.size, KNOTS_PCT.size))
+    hats = np.zeros((KNOTS_PCT.size, soc.size)).T
     row = np.arange(soc.size)
     hats[row, at], hats[row, at + 1] = 1.0 - part, part
     warmer_k = log.temperature_c - mean_c
     drop_v = log.delayed_current_a @ np.array(resistance_ohm)
-    return np.column_stack([hats, warmer_k, warmer_k * drop_v, log.delayed_current_a])
+    return stacked_columns(hats, warmer_k, warmer_k * drop_v, log.delayed_current_a)

@@ -67,6 +67,12 @@ def row_blocks(rows: int) -> Iterator[slice]:
         yield slice(start, min(start + BLOCK_ROWS, rows))
 
 
+def stacked_columns(*parts: FloatArray) -> FloatArray:
+    """Return arrays of shape (n, k) or (n,) beside each other; each column is contiguous."""
+    table = np.vstack([part.T for part in parts])
+    return np.asarray(table.T)
+
+
 @dataclass(frozen=True)
 class FitOptions:
     """How logs become rows and columns of a fit; the defaults are the published choices."""
