@@ -11,16 +11,13 @@ import pytest
 from cangauge.identify.fit import Identification, fit
 from cangauge.identify.log_errors import (
     errors_of,
-    held_out_error,
     slope_resistances,
     summed,
     with_std_errors,
 )
-from cangauge.identify.passes import RowsOfLogs, fit_logs, fit_voltage_model, held_out_models
 from cangauge.identify.voltage_fit import (
     LEVELS_AT_MOST,
     LogInformation,
-    design_matrix,
     fit_information,
     information_of,
     pooled,
@@ -65,7 +62,7 @@ def rows(logs: list[Log], options: FitOptions) -> list[FitRows]:
 
 @pytest.fixture(scope="module")
 def parts(rows: list[FitRows], options: FitOptions) -> list[LogInformation]:
-    return [information_of(item, options) for item in rows]
+    return [information_of(item, options, with_levels=True) for item in rows]
 
 
 @pytest.mark.parametrize("order", [[0, 1, 2, 3, 4], [3, 1, 4, 0, 2]])
@@ -112,7 +109,7 @@ def test_pooled_voltages_do_not_grow_with_the_logs(
         replace(item, voltage_v=item.voltage_v + rng.normal(0.0, 1e-3, len(item)))
         for item in rows * 2
     ]
-    parts = [information_of(item, options) for item in noisy]
+    parts = [information_of(item, options, with_levels=True) for item in noisy]
     volts = np.concatenate([item.voltage_v for item in noisy])
     assert max(part.levels_v.size for part in parts) <= LEVELS_AT_MOST < np.unique(volts).size
     whole = pooled([pooled(parts[:3]), *parts[3:]])
@@ -130,6 +127,6 @@ def test_voltages_of_many_levels_are_rounded_for_the_median(options: FitOptions)
         soc_pct=np.where(time_s == 0.0, 60.0, np.nan),
     )  # fmt: skip
     rows = fit_rows(log, options)
-    found = information_of(rows, options).nominal_v
+    found = information_of(rows, options, with_levels=True).nominal_v
     assert found != np.median(rows.voltage_v)
     assert found == pytest.approx(np.median(rows.voltage_v), rel=1e-4)

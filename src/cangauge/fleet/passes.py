@@ -61,7 +61,7 @@ class InformationJob(Job):
         """Return the log's information, flattened."""
         del state
         recorded, rows = rows_of(self.options, self.fit, log, required(path, log))
-        found = information_of(rows, self.fit)
+        found = information_of(rows, self.fit, with_levels=True)
         arrays = {
             name: np.ravel(getattr(found, name)).tolist()
             for name, kind in self.columns.items()

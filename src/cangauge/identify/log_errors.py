@@ -129,7 +129,7 @@ def score_sums(
     scores, numbers = [], []
     cluster = block_numbers([rows], CLUSTER_S)
     for block in row_blocks(len(rows)):
-        table = table_of(rows, options, extra, block)
+        table = table_of(rows.part(block), options, None if extra is None else extra[block])
         error_v = table[:, -1] - table[:, :-1] @ solution.coefficients
         square_v2 += float(error_v @ error_v)
         first = np.flatnonzero(np.diff(cluster[block], prepend=-1))

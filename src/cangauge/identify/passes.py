@@ -108,7 +108,7 @@ def fit_logs(rows: Sequence[FitRows], options: FitOptions) -> RowsFit:
     Parameters
     ----------
     rows : sequence of FitRows
-        Gone through twice: `RowsOfLogs`, or a list.
+        Three or more are gone through twice: `RowsOfLogs` makes them at each access.
     options : FitOptions
 
     Raises
@@ -116,6 +116,8 @@ def fit_logs(rows: Sequence[FitRows], options: FitOptions) -> RowsFit:
     InputError
         If the rows cannot identify the model.
     """
+    if len(rows) < LOGS_AT_LEAST:
+        rows = list(rows)  # their blocks are held out
     first = _FirstPass(rows, options)
     model, solution = first.solve()
     _LOG.debug("cross-validation")
@@ -158,7 +160,7 @@ def held_out_models(
     InputError
         If no fold leaves training rows that identify a model.
     """
-    return _FirstPass(rows, options, with_kt_prior=with_kt_prior).held_out()
+    return _FirstPass(list(rows), options, with_kt_prior=with_kt_prior).held_out()
 
 
 class _FirstPass:
@@ -211,16 +213,20 @@ class _FirstPass:
         return tuple([] if model is None else [(None, model)] for model in without)
 
     def _by_blocks(self) -> tuple[HeldOut, ...]:
-        rows = list(self._rows)  # one or two
-        ends = np.cumsum([len(item) for item in rows])[:-1]
-        found: tuple[list[tuple[Mask | None, VoltageModel]], ...] = tuple([] for _ in rows)
-        for training, held_out in folds(rows):
-            kept = np.split(training, ends)
-            parts = [item.part(mask) for item, mask in zip(rows, kept, strict=True) if mask.any()]
+        ends = np.cumsum([len(item) for item in self._rows])[:-1]
+        found: tuple[list[tuple[Mask | None, VoltageModel]], ...] = tuple([] for _ in self._rows)
+        for number, (training, held_out) in enumerate(folds(self._rows), start=1):
+            _LOG.debug("cross-validation: fold %d", number)
+            kept = [
+                (item, mask)
+                for item, mask in zip(self._rows, np.split(training, ends), strict=True)
+                if mask.any()
+            ]
+            volts = np.concatenate([item.voltage_v[mask] for item, mask in kept])
             model, _ = fit_information(
-                pooled([information_of(part, self._options) for part in parts]),
+                pooled([information_of(item, self._options, keep=mask) for item, mask in kept]),
                 self._options,
-                nominal_v=float(np.median(np.concatenate([part.voltage_v for part in parts]))),
+                nominal_v=float(np.median(volts, overwrite_input=True)),
                 with_kt_prior=self._with_kt_prior,
             )
             for of_log, mask in zip(found, np.split(held_out, ends), strict=True):

@@ -261,7 +261,7 @@ class _JointFit:
             np.outer(slope, np.array(self._unknown) == k) for k, slope in enumerate(slopes)
         ]  # one column for each unknown start
         each = list(zip(rows, extra, strict=True))
-        parts = [information_of(item, options, of_log) for item, of_log in each]
+        parts = [information_of(item, options, extra=of_log) for item, of_log in each]
         volts = np.concatenate([item.voltage_v for item in rows])
         solution = solve_information(
             pooled(parts), options.epsilon, nominal_v=float(np.median(volts))
@@ -282,7 +282,8 @@ def _cluster_means(
     rows: FitRows, extra: FloatArray, options: FitOptions, solution: Solution
 ) -> FloatArray:
     """Return the mean error of each cluster of a log's rows [V]."""
-    tables = (table_of(rows, options, extra, block) for block in row_blocks(len(rows)))
+    blocks = row_blocks(len(rows))
+    tables = (table_of(rows.part(block), options, extra[block]) for block in blocks)
     error_v = np.concatenate(
         [each[:, -1] - each[:, :-1] @ solution.coefficients for each in tables]
     )

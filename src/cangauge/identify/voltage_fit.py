@@ -28,7 +28,7 @@ from cangauge.inference.least_squares import (
     triangular_factor,
 )
 from cangauge.inference.linearized import SLOPE_CHECKS
-from cangauge.inference.rows import FitOptions, FitRows, row_blocks, stacked_columns
+from cangauge.inference.rows import FitOptions, FitRows, Mask, row_blocks, stacked_columns
 from cangauge.inference.time_scales import SCALES, HaarBlocks
 from cangauge.model.voltage_model import (
     BASIS_NAMES,
@@ -78,7 +78,7 @@ class LogInformation:
     low, high : array of shape (3,)
         Range of SoC [%], temperature [°C] and current [A].
     levels_v, level_rows : array of shape (m,)
-        Voltages [V], increasing, and how many rows have them.
+        Voltages [V], increasing, and how many rows have them; empty where they are not counted.
     temperature_sum : float
         Sum of the rows' temperatures [°C].
     spans : array of shape (2,)
@@ -112,7 +112,12 @@ class LogInformation:
 
 
 def information_of(
-    rows: FitRows, options: FitOptions, extra: FloatArray | None = None
+    rows: FitRows,
+    options: FitOptions,
+    *,
+    extra: FloatArray | None = None,
+    keep: Mask | None = None,
+    with_levels: bool = False,
 ) -> LogInformation:
     """Return what the fit needs of one log's rows, from blocks of `BLOCK_ROWS`.
 
@@ -122,44 +127,58 @@ def information_of(
     options : FitOptions
     extra : array of shape (m, k), optional
         Further columns, before the voltage.
+    keep : array of bool, shape (m,), optional
+        Rows to fit; all by default.
+    with_levels : bool
+        Whether to count the levels of the voltage.
     """
+    indices = None if keep is None else np.flatnonzero(keep)
+    number = len(rows) if indices is None else indices.size
     transform = HaarBlocks(SCALES)
     roots: list[list[FloatArray]] = [[] for _ in range(SCALES)]
     counts = np.zeros(SCALES)
-    for block in (*row_blocks(len(rows)), None):
+    lows, highs, temperature_sum = [], [], 0.0
+    for block in (*row_blocks(number), None):
         if block is None:
             by_scale = transform.end()
         else:
-            by_scale = transform.add(table_of(rows, options, extra, block))
+            some = block if indices is None else indices[block]
+            part = rows.part(some)
+            by_scale = transform.add(
+                table_of(part, options, None if extra is None else extra[some])
+            )
+            channels = (part.soc_pct, part.temperature_c, part.delayed_current_a[:, 0])
+            lows.append([values.min() for values in channels])
+            highs.append([values.max() for values in channels])
+            temperature_sum += float(part.temperature_c.sum())
         counts += [len(each) for each in by_scale]
         for root, each in zip(roots, by_scale, strict=True):
             root[:] = [triangular_factor([*root, each])]
-    channels = (rows.soc_pct, rows.temperature_c, rows.delayed_current_a[:, 0])
-    levels, level_rows = _levels(np.sort(rows.voltage_v), np.ones(len(rows)))
     scale_roots = np.array([root for (root,) in roots])
+    low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+    levels, level_rows = np.empty(0), np.empty(0)
+    if with_levels:
+        levels, level_rows = _levels(np.sort(rows.voltage_v), np.ones(len(rows)))
+    first, last = (0, -1) if indices is None else indices[[0, -1]]
     return LogInformation(
-        rows=len(rows),
+        rows=number,
         logs=1,
         root=triangular_factor([np.vstack(list(scale_roots))]),  # the transform is orthonormal
         scale_roots=scale_roots,
         counts=counts,
-        low=np.array([values.min() for values in channels]),
-        high=np.array([values.max() for values in channels]),
+        low=low,
+        high=high,
         levels_v=levels,
         level_rows=level_rows,
-        temperature_sum=float(rows.temperature_c.sum()),
-        spans=np.array([np.ptp(rows.time_s), np.ptp(rows.soc_pct)]),
+        temperature_sum=temperature_sum,
+        spans=np.array([rows.time_s[last] - rows.time_s[first], high[0] - low[0]]),
     )
 
 
-def table_of(
-    rows: FitRows, options: FitOptions, extra: FloatArray | None, block: slice
-) -> FloatArray:
+def table_of(rows: FitRows, options: FitOptions, extra: FloatArray | None = None) -> FloatArray:
     """Return [columns, extra columns, voltage] of a block of rows."""
-    part = rows.part(block)
-    columns = design_matrix(part, options.epsilon, options.t_ref_c)
-    more = [] if extra is None else [extra[block]]
-    return stacked_columns(columns, *more, part.voltage_v)
+    columns = design_matrix(rows, options.epsilon, options.t_ref_c)
+    return stacked_columns(columns, *([] if extra is None else [extra]), rows.voltage_v)
 
 
 def _levels(volts: FloatArray, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -170,6 +189,8 @@ def _levels(volts: FloatArray, rows: FloatArray) -> tuple[FloatArray, FloatArray
     volts, rows : array of shape (m,)
         Voltages in increasing order, and the rows that have them.
     """
+    if not volts.size:
+        return volts, rows
     for step in (None, np.log1p(LEVEL_STEP)):
         if step is not None:
             volts = np.exp(np.round(np.log(volts) / step) * step)
@@ -223,7 +244,7 @@ def fit_information(
     source : str
         Name of the logs, for messages.
     nominal_v : float, optional
-        Median of the voltage [V]; by default that of the information, which may be rounded.
+        Median of the voltage [V]; by default that of the counted levels, which may be rounded.
     with_kt_prior : bool
         Whether to use the prior on kt (`least_squares.kt_prior`).
 

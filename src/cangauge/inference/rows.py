@@ -109,7 +109,7 @@ class FitRows:
         """Return the number of rows."""
         return int(self.time_s.size)
 
-    def part(self, keep: slice | Mask) -> FitRows:
+    def part(self, keep: slice | Mask | NDArray[np.intp]) -> FitRows:
         """Return some of the rows."""
         return replace(
             self,

@@ -123,7 +123,7 @@ def draft_from_table(
     Parameters
     ----------
     table : pyarrow.Table
-        Holds at least the columns of `places`.
+        Holds at least the columns of `places`; anything with `num_rows`, `schema` and `column`.
     places : mapping of str to int
         Index in `names` by canonical field.
     names : sequence of str

@@ -59,14 +59,33 @@ def read_parquet(content: FileContent) -> DraftLog:
         if texts:
             # As dictionaries: a long text repeated in millions of rows is small in the file only.
             file = _open_parquet(data, *texts)
-        table = file.read(columns=[names[index] for index in places.values()])
-        table.validate(full=True)  # damaged indices may exceed a dictionary
+        columns = _ParquetColumns(file)
+        return draft_from_table(columns, places, names, name=content.name, source=source)
     except (pa.ArrowException, OSError, ValueError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise InputError(
             f"the Parquet file is cut off or damaged ({reason})", source=source, cure="export again"
         ) from error
-    return draft_from_table(table, places, names, name=content.name, source=source)
+
+
+class _ParquetColumns:
+    """The part of a pyarrow.Table that a canonical log needs: one column is held at a time."""
+
+    def __init__(self, file: Any) -> None:
+        self._file = file
+        self.num_rows, self.schema = file.metadata.num_rows, file.schema_arrow
+
+    def column(self, name: str) -> Any:
+        """Read a column.
+
+        Raises
+        ------
+        ValueError
+            If it is damaged.
+        """
+        table = self._file.read(columns=[name])
+        table.validate(full=True)  # damaged indices may exceed a dictionary
+        return table.column(0)
 
 
 def read_any_parquet(content: FileContent, given: ColumnMap | None) -> DraftLog:

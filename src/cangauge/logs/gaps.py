@@ -53,9 +53,14 @@ def discharged_ah(time_s: FloatArray, current_a: FloatArray) -> FloatArray:
         Time [s] and current [A], positive = discharge. Steps longer than `bridge_s` count nothing.
     """
     step_s = np.diff(time_s)
-    step_ah = (current_a[1:] + current_a[:-1]) * step_s / 7200.0
-    step_ah = np.where(step_s > bridge_s(time_s), 0.0, step_ah)
-    return np.concatenate(([0.0], np.cumsum(step_ah)))
+    total_ah = np.zeros(time_s.size)
+    step_ah = total_ah[1:]  # in place: a log may have millions of rows
+    np.add(current_a[1:], current_a[:-1], out=step_ah)
+    step_ah *= step_s
+    step_ah /= 7200.0
+    step_ah[step_s > bridge_s(time_s)] = 0.0
+    np.cumsum(step_ah, out=step_ah)
+    return total_ah
 
 
 def uncounted_gaps(time_s: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
