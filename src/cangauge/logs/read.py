@@ -81,6 +81,7 @@ class LogFile:
                 value=temperature_c,
             )
         draft = self.reader(self.content)
+        arrow.free_unused()
         if self.sign is not None:
             draft.state_sign(self.sign)
         log = Log(**draft.checked(temperature_c))
