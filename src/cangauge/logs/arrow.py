@@ -206,7 +206,7 @@ def _as_float64(column: Any, label: str, where: str) -> FloatArray:
             value=str(column.type),
             cure="store it as floating point",
         ) from error
-    return np.array(numbers, dtype=np.float64)  # of its own, so that the table can be freed
+    return np.array(numbers.to_numpy())  # of its own, so that the table can be freed
 
 
 def free_unused() -> None:

@@ -188,7 +188,7 @@ def read_plain_numbers(
             return None
         rows += table.num_rows
         for name, column in include.items():
-            parts[name].append(np.array(table.column(column), dtype=np.float64))
+            parts[name].append(np.array(table.column(column).to_numpy()))
     if not rows or not piece.endswith(b"\n"):
         return None
     return {name: np.concatenate(parts.pop(name)) for name in wanted}
