@@ -26,6 +26,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -230,17 +231,18 @@ def fits() -> Result:
     """Return what `cangauge fit` takes by its rows: in logs of 50,000, and all in one."""
     found: Result = {}
     with TemporaryDirectory() as folder:
-        for suffix in ("parquet", "csv"):
-            for rows in FIT_ROWS:
-                for a_log in dict.fromkeys((ROWS_A_LOG, rows)):
-                    paths = []
-                    for log in _long_logs(rows // a_log, a_log):
-                        paths.append(str(Path(folder, f"{log.name}.{suffix}")))
-                        write_log(log, paths[-1])
-                    used = _fit(paths, Path(folder, "model.json"))
-                    found[f"{suffix}, {rows:,} rows in {len(paths)} logs"] = used
-                    for path in paths:
-                        Path(path).unlink()
+        for suffix, rows, whole in product(("parquet", "csv"), FIT_ROWS, (False, True)):
+            paths = []
+            for log in _long_logs(
+                1 if whole else rows // ROWS_A_LOG, rows if whole else ROWS_A_LOG
+            ):
+                paths.append(str(Path(folder, f"{log.name}.{suffix}")))
+                write_log(log, paths[-1])
+            name = f"{suffix}, {rows:,} rows in {len(paths)} logs"
+            found[name] = _fit(paths, Path(folder, "model.json"))
+            sys.stderr.write(f"{name}: {found[name]}\n")
+            for path in paths:
+                Path(path).unlink()
     return found
 
 
