@@ -5,8 +5,9 @@
 ratios    a step at 10 and 1 Hz, a row offline, and a wanted frame, as multiples of what does the
           same at its barest in the same run (filterpy's extended Kalman filter of an equivalent
           circuit; receiving and decoding by python-can and cantools): the machine cancels.
-growth    with delays, effects, cells, frames/s; rows and logs of a fit with its memory; logs,
-          references and effects of a diagnosis.
+growth    with delays, effects, cells, frames/s.
+fit       processor time and memory of `cangauge fit` by rows, read from Parquet and from CSV.
+diagnosis by its logs, references and effects.
 start     `--help` of every command.
 
 --keep writes the ratios to `ratios.json`; --check measures them alone and warns where one is 20 %
@@ -17,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import resource
 import statistics
 import subprocess
@@ -24,9 +26,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
-from multiprocessing import get_context
-from multiprocessing.connection import Connection
+from itertools import product
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import can
@@ -47,6 +49,7 @@ from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.validity import Sample
 from cangauge.export.equivalent_circuit import equivalent_circuit
 from cangauge.identify.fit import fit
+from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.effects.library import LIBRARY
@@ -62,7 +65,7 @@ WORSE = 1.2
 ROUNDS = 7
 ROWS = 2000
 """Rows of a timed log: 200 s at 10 Hz."""
-FIT_ROWS = (100_000, 300_000, 1_000_000)
+FIT_ROWS = (100_000, 300_000, 1_000_000, 3_000_000, 5_000_000)
 ROWS_A_LOG = 50_000
 EFFECTS = (
     {"id": "fast_polarization", "parameters": {"ohm": 0.01, "tau_s": 3.0, "activation_k": 0.0}},
@@ -226,43 +229,45 @@ def cells_us(count: int) -> float:
 
 
 def fits() -> Result:
-    """Return time and memory of a fit by its rows, in logs of 50,000."""
-    return {rows: _in_a_process(_fit, rows) for rows in FIT_ROWS}
+    """Return what `cangauge fit` takes by its rows: in logs of 50,000, and all in one."""
+    found: Result = {}
+    with TemporaryDirectory() as folder:
+        for suffix, rows, whole in product(("parquet", "csv"), FIT_ROWS, (False, True)):
+            paths = []
+            for log in _long_logs(
+                1 if whole else rows // ROWS_A_LOG, rows if whole else ROWS_A_LOG
+            ):
+                paths.append(str(Path(folder, f"{log.name}.{suffix}")))
+                write_log(log, paths[-1])
+            name = f"{suffix}, {rows:,} rows in {len(paths)} logs"
+            found[name] = _fit(paths, Path(folder, "model.json"))
+            sys.stderr.write(f"{name}: {found[name]}\n")
+            for path in paths:
+                Path(path).unlink()
+    return found
 
 
-def _in_a_process(work: Callable[[Connection, int], None], number: int) -> Result:
-    ours, theirs = get_context("spawn").Pipe()
-    process = get_context("spawn").Process(target=work, args=(theirs, number))
-    process.start()
-    result: Result = ours.recv()
-    process.join()
-    return result
+def _fit(paths: list[str], model_file: Path) -> Result:
+    """Return processor time [s], its part per million rows, and peak memory of a fit."""
+    script = "import sys; from cangauge.cli.app import main; main()"
+    command = [sys.executable, "-c", script, "fit", *paths, "-o", str(model_file)]
+    process = subprocess.Popen([*command, "--capacity-ah", "60"], stdout=subprocess.DEVNULL)
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise SystemExit("the fit failed")
+    return {"seconds": usage.ru_utime + usage.ru_stime, "peak_mib": usage.ru_maxrss / 1024.0}
 
 
-def _fit(pipe: Connection, rows: int) -> None:
-    logs = list(_long_logs(rows // ROWS_A_LOG))
-    before_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    began = time.process_time()
-    fit(logs, capacity_ah=60.0)
-    peak_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    pipe.send(
-        {
-            "seconds": time.process_time() - began,
-            "peak_mib": peak_kib / 1024.0,
-            "of_logs_mib": before_kib / 1024.0,
-        }
-    )
-
-
-def _long_logs(number: int) -> Iterator[Log]:
-    """Yield logs of 50,000 rows at 1 Hz by the published equation with noise."""
+def _long_logs(number: int, rows: int) -> Iterator[Log]:
+    """Yield logs at 1 Hz by the published equation with noise."""
     known = model().voltage_model()
     for seed in range(number):
         rng = np.random.default_rng(seed)
-        time_s = np.arange(float(ROWS_A_LOG))
-        pulses_a = 25.0 * rng.standard_normal(ROWS_A_LOG // 20)
+        time_s = np.arange(float(rows))
+        pulses_a = 25.0 * rng.standard_normal(rows // 20)
         pairs_a = np.repeat(np.column_stack([pulses_a, -pulses_a]).ravel(), 10)
-        current_a = 60.0 * 3600.0 * 0.9 / ROWS_A_LOG + pairs_a
+        current_a = 60.0 * 3600.0 * 0.9 / rows + pairs_a
         soc_pct = 95.0 - np.cumsum(current_a) / 36.0 / 60.0
         temperature_c = 23.0 + 2.0 * np.sin(time_s / 700.0)
         delayed = np.column_stack([np.interp(time_s - d, time_s, current_a) for d in known.delay_s])

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cangauge.errors import InputError
-from cangauge.identify.voltage_fit import fit_voltage_model
+from cangauge.identify.passes import fit_voltage_model
 from cangauge.inference.rows import FitOptions, fit_rows
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log

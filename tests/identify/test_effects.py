@@ -16,7 +16,8 @@ from cangauge.estimation.settings import EstimatorSettings
 from cangauge.identify.cross_validation import CrossValidation, HeldOutErrors, compare
 from cangauge.identify.effect_search import NOT_IDENTIFIABLE, SEARCHED, parse_effect_ids
 from cangauge.identify.fit import Identification, fit
-from cangauge.identify.voltage_fit import fit_voltage_model, held_out_errors
+from cangauge.identify.log_errors import held_out_error
+from cangauge.identify.passes import fit_voltage_model, held_out_models
 from cangauge.inference.linearized import (
     changed_model,
     free_parameters,
@@ -258,7 +259,8 @@ def test_held_out_errors_come_from_fits_without_the_row(monkeypatch: pytest.Monk
     assert seen.mean() > 0.5
     rows = [item.rows for item in logs]
     plain, _ = fit_voltage_model(rows, OPTIONS, with_kt_prior=False)
-    expected = np.concatenate(held_out_errors(rows, OPTIONS, with_kt_prior=False))
+    models = held_out_models(rows, OPTIONS, with_kt_prior=False)
+    expected = np.concatenate(list(map(held_out_error, rows, models)))
     found = validation.errors(ExtendedModel(plain, CAPACITY_AH)).error_v
     np.testing.assert_allclose(found, expected, atol=1e-6)
 

@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cangauge.inference.time_scales import SCALES, haar_transform, scale_variances
+from cangauge.inference.time_scales import SCALES, HaarBlocks, haar_transform, scale_variances
 
 FloatArray = NDArray[np.float64]
 ROWS = 2048
@@ -47,6 +47,24 @@ def test_a_constant_is_slow_and_an_alternation_is_fast(rows: int, level: float) 
     assert float(np.sum(constant[-1] ** 2)) == pytest.approx(rows * level**2, rel=1e-9, abs=1e-9)
     alternating = haar_transform(np.where(np.arange(rows) % 2, 1.0, -1.0)[:, None])
     assert float(np.sum(alternating[0] ** 2)) > 0.6 * rows
+
+
+@settings(deadline=None)
+@given(st.integers(1, 3000), st.integers(3, 12), st.integers(0, 3), st.integers(0, 2**31))
+def test_blocks_have_the_coefficients_of_the_whole(
+    rows: int, exponent: int, finest: int, seed: int
+) -> None:
+    values = np.random.default_rng(seed).normal(3.0, 1.0, (rows, 2))
+    transform = HaarBlocks(SCALES, 2**finest)
+    size = 2**exponent
+    parts = [transform.add(values[first : first + size]) for first in range(0, rows, size)]
+    parts.append(transform.end())
+    found = [np.vstack(of_scale) for of_scale in zip(*parts, strict=True)]
+    for scale, expected in enumerate(haar_transform(values)):
+        if scale >= finest:
+            np.testing.assert_allclose(
+                np.sort(found[scale], axis=0), np.sort(expected, axis=0), atol=1e-9
+            )
 
 
 def test_a_step_lies_on_the_scale_of_its_stretches() -> None:

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cangauge.identify.fit import fit
-from cangauge.identify.voltage_fit import fit_voltage_model
+from cangauge.identify.passes import fit_voltage_model
 from cangauge.inference.rows import FitOptions, fit_rows
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log

@@ -273,7 +273,7 @@ def _show(result: Identification, search: DelaySearch | None) -> None:
             ["condition number", significant(result.solution.condition_number, 2), ""],
             ["identified at SoC", span(*model.range.soc_pct, 1), "%"],
             ["identified at temperature", span(*model.range.temperature_c, 1), "°C"],
-            ["rows used", str(sum(len(item.rows) for item in result.fits)), ""],
+            ["rows used", str(sum(item.rows for item in result.figures)), ""],
         ],
     )
     print_table(

@@ -1,4 +1,4 @@
-"""`fleet fit`: one model from all logs, by two passes over them (`identify.pooled`).
+"""`fleet fit`: one model from all logs, by two passes over them (`identify.voltage_fit`).
 
 The rows of both passes are kept. A further log costs the reading of itself in the first pass; the
 second pass is computed again for all, since each log changes the model.
@@ -23,7 +23,6 @@ from cangauge.fleet.passes import (
 from cangauge.fleet.run import Summary, run_id, run_job
 from cangauge.fleet.sources import FleetLog, ReadOptions
 from cangauge.identify.assemble import (
-    WHOLE_LOGS,
     coefficient_names,
     common_name,
     common_temperature_source,
@@ -32,16 +31,13 @@ from cangauge.identify.assemble import (
     model_file_of,
     noise_of,
 )
-from cangauge.identify.pooled import (
-    LogErrors,
+from cangauge.identify.log_errors import LogErrors, slope_resistances, summed, with_std_errors
+from cangauge.identify.voltage_fit import (
     LogInformation,
     fit_information,
+    models_without,
     pooled,
-    slope_resistances,
-    summed,
-    with_std_errors,
 )
-from cangauge.inference.error_model import KNOTS_PCT, describe_error_of
 from cangauge.inference.least_squares import Solution
 from cangauge.inference.rows import (
     FOLDS_AT_MOST,
@@ -143,7 +139,7 @@ def fit_fleet(
     by_fold = _pooled_by_fold(used, dataset, run_id(first))
     whole = pooled(by_fold)
     model, solution = fit_information(whole, fit, source=out)
-    second = ErrorsJob(options, fit, model, solution, _models_without(by_fold, fit), whole.mean_c)
+    second = ErrorsJob(options, fit, model, solution, models_without(by_fold, fit), whole.mean_c)
     errors_set = Dataset(out, second.kind, second.columns)
     later = run_job(second, [log for log, _ in used.values()], errors_set, client)
     errors = _summed(errors_set.rows(run_id(second)), used, solution)
@@ -159,7 +155,7 @@ def fit_fleet(
             source=out,
             cure="give logs that overlap in SoC",
         )
-    solution = with_std_errors(solution, errors)
+    solution = with_std_errors(solution, errors.sums, errors.scores)
     slope, expected = slope_resistances(errors, model.resistance_ohm)
     return FleetFit(
         _model_file(whole, model, solution, errors=errors, fit=fit, used=used, name=name),
@@ -216,30 +212,6 @@ def _pooled_by_fold(used: _Used, dataset: Dataset, run: str) -> list[LogInformat
     return [pooled(waiting[fold]) for fold in sorted(waiting)]
 
 
-def _models_without(
-    by_fold: Sequence[LogInformation], fit: FitOptions
-) -> tuple[VoltageModel | None, ...]:
-    """Return the model without each fold; None where the rest identifies none.
-
-    Raises
-    ------
-    InputError
-        If that is so for every fold.
-    """
-    found: list[VoltageModel | None] = []
-    refused: InputError | None = None
-    for k in range(len(by_fold)):
-        rest = pooled([part for j, part in enumerate(by_fold) if j != k])
-        try:
-            found.append(fit_information(rest, fit)[0])
-        except InputError as error:
-            refused = error
-            found.append(None)
-    if refused is not None and not any(found):
-        raise refused
-    return tuple(found)
-
-
 def _summed(rows: Iterable[Mapping[str, Any]], used: _Used, solution: Solution) -> LogErrors | None:
     """Return the errors of all used logs together; None if there is no row."""
     kept = solution.back.shape[1]
@@ -262,15 +234,6 @@ def _model_file(
     used: _Used,
     name: str | None,
 ) -> Model:
-    sums = errors.sums
-    time_error, curve = describe_error_of(
-        errors.equations,
-        rms_v=float(np.sqrt(sums["square_v2"] / sums["rows"])),
-        mean_c=whole.mean_c,
-        ocv_v=model.pseudo_ocv(KNOTS_PCT),
-        resistance_ohm=model.resistance_ohm,
-        rate_hz=fit.rate_hz,
-    )
     prior, root = solution.kt_prior, whole.root
     rows = [row for _, row in used.values()]
     return model_file_of(
@@ -280,13 +243,11 @@ def _model_file(
         name=name or common_name([row["name"] for row in rows]),
         temperature_source=rows[0]["temperature_source"],
         noise=noise_of(
-            time_error,
-            curve,
-            lasting_time_s=float(whole.spans[0]) / whole.logs,
-            lasting_soc_pct=float(whole.spans[1]) / whole.logs,
-            voltage_mae_pct=sums["held_out_pct"] / sums["held_out"],
-            voltage_rmse_v=float(np.sqrt(sums["held_out_v2"] / sums["held_out"])),
-            judged_on=WHOLE_LOGS,
+            errors,
+            model,
+            rate_hz=fit.rate_hz,
+            mean_c=whole.mean_c,
+            spans=whole.spans / whole.logs,
         ),
         effects=[],
         information=information_of_rows(

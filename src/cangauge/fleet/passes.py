@@ -1,4 +1,4 @@
-"""Both passes of `fleet fit`: rows of a data set ↔ summaries of `identify.pooled`."""
+"""Both passes of `fleet fit`: rows of a data set ↔ summaries of `identify`."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from cangauge.errors import InputError
 from cangauge.fleet.jobs import COUNT, REAL, TEXT, Job, required
 from cangauge.fleet.sources import FleetLog, ReadOptions
 from cangauge.identify.assemble import log_sha256, signals_sha256
-from cangauge.identify.evaluate import evaluate
-from cangauge.identify.pooled import LogErrors, LogInformation, errors_of, information_of
+from cangauge.identify.log_errors import LogErrors, LogFigures, errors_of
 from cangauge.identify.starts import unknown_start
+from cangauge.identify.voltage_fit import LogInformation, information_of
 from cangauge.inference.error_model import SCALES as ERROR_SCALES
 from cangauge.inference.error_model import ErrorEquations
 from cangauge.inference.least_squares import Solution
@@ -61,7 +61,7 @@ class InformationJob(Job):
         """Return the log's information, flattened."""
         del state
         recorded, rows = rows_of(self.options, self.fit, log, required(path, log))
-        found = information_of(rows, self.fit)
+        found = information_of(rows, self.fit, with_levels=True)
         arrays = {
             name: np.ravel(getattr(found, name)).tolist()
             for name, kind in self.columns.items()
@@ -116,11 +116,19 @@ class ErrorsJob(Job):
         """Return the log's errors, flattened."""
         del state
         _, rows = rows_of(self.options, self.fit, log, required(path, log))
-        fitted = evaluate(self.model, rows)
-        found = errors_of(fitted, self.fit, self.solution, self.without[log.fold], self.mean_c)
+        without = self.without[log.fold]
+        found = errors_of(
+            rows,
+            self.fit,
+            self.model,
+            self.solution,
+            held_out=[] if without is None else [(None, without)],
+            mean_c=self.mean_c,
+        )
+        figures = LogFigures(rows.name, rows.removed, found.sums)
         return {
-            "voltage_mae_pct": fitted.voltage_mae_pct,
-            "soc_newton_mae_pct": fitted.soc_newton_mae_pct,
+            "voltage_mae_pct": figures.voltage_mae_pct,
+            "soc_newton_mae_pct": figures.soc_newton_mae_pct,
             **found.sums,
             "scores": np.ravel(found.scores).tolist(),
             "currents": np.ravel(found.currents).tolist(),

@@ -1,4 +1,4 @@
-"""Parts of a model file that the fit of rows and the fit of summaries (`pooled`) share."""
+"""Parts of a model file, of one fit or of a fleet's."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from cangauge._io import text_sha256
 from cangauge._typing import FloatArray
 from cangauge._version import __version__
 from cangauge.errors import InputError
+from cangauge.identify.log_errors import LogErrors
 from cangauge.identify.voltage_fit import KT
-from cangauge.inference.error_model import CurveError, TimeError
+from cangauge.inference.error_model import KNOTS_PCT, describe_error_of
 from cangauge.inference.least_squares import Solution
-from cangauge.inference.rows import FitOptions
+from cangauge.inference.rows import LOGS_AT_LEAST, FitOptions
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.model.model_file import (
     Coefficient,
@@ -31,8 +32,10 @@ from cangauge.model.model_file import (
 )
 from cangauge.model.voltage_model import BASIS_NAMES, VoltageModel
 
+FITTED_ROWS: Final = "the rows of the fit itself (too short a log to hold any out)"
+BLOCKS: Final = "interleaved blocks of 240 s left out in turn"
 WHOLE_LOGS: Final = "whole logs left out in turn"
-"""How the held-out error of three logs or more was made."""
+"""How the held-out error was made: of no rows, of one or two logs, of three or more."""
 
 
 def coefficients_of(names: Sequence[str], solution: Solution) -> dict[str, Coefficient]:
@@ -108,20 +111,46 @@ def common_temperature_source(sources: Iterable[TemperatureSource]) -> Temperatu
 
 
 def noise_of(
-    time_error: TimeError,
-    curve: CurveError,
+    errors: LogErrors,
+    model: VoltageModel,
     *,
-    lasting_time_s: float,
-    lasting_soc_pct: float,
-    voltage_mae_pct: float,
-    voltage_rmse_v: float,
-    judged_on: str,
+    rate_hz: float,
+    mean_c: float,
+    spans: FloatArray,
 ) -> ModelNoise:
-    """Return the error model as it is written; the keywords are fields of `ModelNoise`."""
+    """Return the error model and the held-out error of a fit.
+
+    Parameters
+    ----------
+    errors : LogErrors
+        Of all logs.
+    model : VoltageModel
+    rate_hz : float
+        Rate of the rows.
+    mean_c : float
+        Mean temperature of the rows [°C].
+    spans : array of shape (2,)
+        Duration [s] and range of SoC [%], the mean of the logs.
+    """
+    sums = errors.sums
+    rmse_v = float(np.sqrt(sums["square_v2"] / sums["rows"]))
+    time_error, curve = describe_error_of(
+        errors.equations,
+        rms_v=rmse_v,
+        mean_c=mean_c,
+        ocv_v=model.pseudo_ocv(KNOTS_PCT),
+        resistance_ohm=model.resistance_ohm,
+        rate_hz=rate_hz,
+    )
+    mae_pct, judged_on = sums["voltage_pct"] / sums["rows"], FITTED_ROWS
+    if held_out := sums["held_out"]:
+        mae_pct = sums["held_out_pct"] / held_out
+        rmse_v = float(np.sqrt(sums["held_out_v2"] / held_out))
+        judged_on = WHOLE_LOGS if len(errors.equations.rows) >= LOGS_AT_LEAST else BLOCKS
     return ModelNoise(
         **vars(time_error),
-        lasting_time_s=lasting_time_s,
-        lasting_soc_pct=lasting_soc_pct,
+        lasting_time_s=float(spans[0]),
+        lasting_soc_pct=float(spans[1]),
         curve=CurveNoise(
             soc_pct=curve.soc_pct.tolist(),
             functions_v=curve.function_v.tolist(),
@@ -129,8 +158,8 @@ def noise_of(
             kt_std_v_per_k=curve.kt_std_v_per_k,
             resistance_std_per_k=curve.resistance_std_per_k,
         ),
-        voltage_mae_pct=voltage_mae_pct,
-        voltage_rmse_v=voltage_rmse_v,
+        voltage_mae_pct=mae_pct,
+        voltage_rmse_v=rmse_v,
         judged_on=judged_on,
     )
 
@@ -173,14 +202,18 @@ def information_of_rows(
 
 def signals_sha256(log: Log) -> str:
     """Return what identifies the rows of a log: the SHA-256 of its current and voltage."""
-    return hashlib.sha256(log.current_a.tobytes() + log.voltage_v.tobytes()).hexdigest()
+    return _sha256(log.current_a, log.voltage_v)
 
 
 def log_sha256(log: Log) -> str:
     """Return the SHA-256 of a log's channels in hexadecimal."""
+    return _sha256(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
+
+
+def _sha256(*channels: FloatArray) -> str:
     digest = hashlib.sha256()
-    for channel in (log.time_s, log.current_a, log.voltage_v, log.temperature_c):
-        digest.update(channel.tobytes())
+    for channel in channels:
+        digest.update(np.ascontiguousarray(channel).data)
     return digest.hexdigest()
 
 

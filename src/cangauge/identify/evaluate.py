@@ -74,6 +74,15 @@ class LogFit:
     voltage_model_v: FloatArray
     soc_newton_pct: FloatArray
 
+    def part(self, keep: slice) -> LogFit:
+        """Return some of the rows."""
+        return LogFit(
+            self.rows.part(keep),
+            self.pseudo_ocv_v[keep],
+            self.voltage_model_v[keep],
+            self.soc_newton_pct[keep],
+        )
+
     @property
     def residual_v(self) -> FloatArray:
         """Measured minus modelled voltage [V]."""
@@ -92,13 +101,14 @@ class LogFit:
 
 def evaluate(model: VoltageModel, rows: FitRows) -> LogFit:
     """Return the fit of a voltage model to the rows of a log."""
-    voltage_v = model.voltage(rows.soc_pct, rows.temperature_c, rows.delayed_current_a)
-    without_ocv_v = voltage_v - model.pseudo_ocv(rows.soc_pct)
+    at_reference_v = model.pseudo_ocv(rows.soc_pct)
+    pseudo_ocv_v = model.pseudo_ocv(rows.soc_pct, rows.temperature_c)
+    voltage_v = pseudo_ocv_v + rows.delayed_current_a @ np.array(model.resistance_ohm)
     return LogFit(
         rows=rows,
-        pseudo_ocv_v=model.pseudo_ocv(rows.soc_pct, rows.temperature_c),
+        pseudo_ocv_v=pseudo_ocv_v,
         voltage_model_v=voltage_v,
-        soc_newton_pct=socs_from_ocv(model, rows.voltage_v - without_ocv_v),
+        soc_newton_pct=socs_from_ocv(model, rows.voltage_v - (voltage_v - at_reference_v)),
     )
 
 
@@ -141,16 +151,3 @@ def _newton(model: ExtendedModel, prediction: Prediction, delayed_a: FloatArray)
             guess = soc_from_ocv(online, voltage_v - offset_v, guess).soc_pct
             newton[wanted[k]] = guess
     return newton
-
-
-def slope_resistance(model: VoltageModel, rows: Sequence[FitRows]) -> tuple[float, float]:
-    """Return minus the slope of (U − pseudo-OCV) over I, and −(R1 + Σ Rj·ρj), [Ω] each."""
-    drop = np.concatenate(
-        [item.voltage_v - model.pseudo_ocv(item.soc_pct, item.temperature_c) for item in rows]
-    )
-    delayed = np.concatenate([item.delayed_current_a for item in rows])
-    centred = delayed - delayed.mean(axis=0)
-    variance = float(centred[:, 0] @ centred[:, 0])
-    correlation = centred.T @ centred[:, 0] / variance
-    slope = float(centred[:, 0] @ (drop - drop.mean())) / variance
-    return -slope, -float(np.array(model.resistance_ohm) @ correlation)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from cangauge._formatting import duration
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.identify.assemble import (
-    WHOLE_LOGS,
     coefficient_names,
     common_name,
     common_temperature_source,
@@ -23,7 +23,6 @@ from cangauge.identify.assemble import (
     made_of,
     model_file_of,
     noise_of,
-    signals_sha256,
 )
 from cangauge.identify.effect_search import FittedEffects, fit_effects, parse_effect_ids
 from cangauge.identify.evaluate import (
@@ -32,18 +31,24 @@ from cangauge.identify.evaluate import (
     energy_balance,
     evaluate,
     evaluate_extended,
-    slope_resistance,
 )
+from cangauge.identify.log_errors import (
+    HeldOut,
+    LogFigures,
+    errors_of_fit,
+    held_out_error,
+    slope_resistances,
+    summed,
+)
+from cangauge.identify.passes import RowsFit, RowsOfLogs, fit_logs, fit_voltage_model
 from cangauge.identify.starts import Start, find_starts, given_starts
-from cangauge.identify.voltage_fit import fit_voltage_model, held_out_errors, stacked
-from cangauge.inference.error_model import KNOTS_PCT, LogResidual, describe_error
 from cangauge.inference.least_squares import Solution
 from cangauge.inference.rows import (
     DELAYS_S,
-    LOGS_AT_LEAST,
     FitOptions,
     FitRows,
-    fit_rows,
+    SampledLog,
+    row_blocks,
     sample_log,
     usable_delays,
 )
@@ -59,7 +64,6 @@ from cangauge.model.model_file import (
     Information,
     Made,
     Model,
-    ModelNoise,
     SourceLog,
 )
 from cangauge.model.voltage_model import VoltageModel
@@ -77,10 +81,12 @@ class Identification:
     model: Model
     voltage_model: VoltageModel
     logs: tuple[Log, ...]
-    fits: tuple[LogFit, ...]
-    held_out_error_v: tuple[FloatArray, ...]
-    """Measured minus predicted voltage of each log's rows, by fits without the row [V]; NaN where
-    no fold holds it out."""
+    figures: tuple[LogFigures, ...]
+    """Of each log."""
+    rows: Sequence[FitRows] = field(repr=False)
+    """Rows of each log, made at each access."""
+    held_out: tuple[HeldOut, ...] = field(repr=False)
+    """Models that hold rows of each log out; () with effects."""
     solution: Solution
     energy: Energy
     slope_ohm: float
@@ -95,6 +101,23 @@ class Identification:
     """Fitted effects; None if none were requested."""
     starts: tuple[Start, ...] = ()
     """SoC at the start of each log, and how it is known."""
+    extended_fits: tuple[LogFit, ...] = field(default=(), repr=False)
+    """`fits` of a model with effects."""
+
+    @cached_property
+    def fits(self) -> tuple[LogFit, ...]:
+        """Model and measurement of each log, on the rows of the fit."""
+        return self.extended_fits or tuple(evaluate(self.voltage_model, each) for each in self.rows)
+
+    @cached_property
+    def held_out_error_v(self) -> tuple[FloatArray, ...]:
+        """Measured minus predicted voltage of each log's rows, by fits without the row [V].
+
+        NaN where no fold holds the row out.
+        """
+        if self.effects is not None and self.extended_fits:
+            return self.effects.held_out_error_v
+        return tuple(map(held_out_error, self.rows, self.held_out))
 
     def plot(self) -> Any:
         """Return pseudo-OCV and residuals, for `bokeh.plotting.show`."""
@@ -122,19 +145,19 @@ class Identification:
                 "judged_on": noise.judged_on,
             },
             "delays_s": list(self.model.delays_s),
-            "rows": sum(len(item.rows) for item in self.fits),
+            "rows": sum(item.rows for item in self.figures),
             "logs": [
                 {
-                    "name": item.rows.name,
-                    "rows": len(item.rows),
+                    "name": item.name,
+                    "rows": item.rows,
                     "voltage_mae_pct": item.voltage_mae_pct,
                     "soc_newton_mae_pct": item.soc_newton_mae_pct,
-                    "removed": item.rows.removed,
+                    "removed": item.removed,
                     "initial_soc_pct": start.soc_pct,
                     "initial_soc_std_pct": start.std_pct,
                     "initial_soc_from": start.origin,
                 }
-                for item, start in zip(self.fits, self.starts, strict=True)
+                for item, start in zip(self.figures, self.starts, strict=True)
             ],
             "remarks": list(self.remarks),
         } | ({} if self.effects is None else self.effects.to_dict())
@@ -207,8 +230,7 @@ def fit(
     options = FitOptions(capacity_ah, None, rate_hz, usable, epsilon, t_ref_c)
     found_starts = find_starts(logs, given, options)
     logs = found_starts.logs
-    rows = [fit_rows(log, options) for log in logs]
-    _LOG.debug("fitting %d rows of %d logs", sum(map(len, rows)), len(rows))
+    rows = RowsOfLogs(logs, options)
     found = None
     if effect_ids:
         # With effects, cross-validation tests kt too, so its tight prior is not used.
@@ -216,49 +238,47 @@ def fit(
         sampled = [sample_log(log, options) for log in logs]
         found = fit_effects(ExtendedModel(plain, capacity_ah), sampled, effect_ids)
     if found is not None and found.model.effects:
-        voltage_model, solution = found.model.model, found.solution
-        fits = tuple(evaluate_extended(found.model, item) for item in sampled)
-        held_out = found.held_out_error_v
+        fitted, extended_fits = _with_effects(found, sampled, options)
     else:
-        voltage_model, solution = fit_voltage_model(rows, options)
+        fitted, extended_fits = fit_logs(rows, options), ()
         if found_starts.std_error is not None:
-            wider = np.maximum(solution.std_error, found_starts.std_error)
-            solution = replace(solution, std_error=wider)
-        _LOG.debug("cross-validation")
-        held_out = tuple(held_out_errors(rows, options))
-        fits = tuple(evaluate(voltage_model, item) for item in rows)
-    residual = np.concatenate([item.residual_v for item in fits])
-    volts = np.concatenate([item.rows.voltage_v for item in fits])
-    rows = [item.rows for item in fits]
-    slope, expected = slope_resistance(voltage_model, rows)
-    newton_error = np.concatenate([item.soc_newton_pct - item.rows.soc_pct for item in fits])
-    names = coefficient_names(options)
+            wider = np.maximum(fitted.solution.std_error, found_starts.std_error)
+            fitted = replace(fitted, solution=replace(fitted.solution, std_error=wider))
+    voltage_model, solution, sums = fitted.model, fitted.solution, fitted.errors.sums
+    slope, expected = slope_resistances(fitted.errors, voltage_model.resistance_ohm)
     model = model_file_of(
         voltage_model,
         solution,
         options,
         name=name or common_name([log.name for log in logs]),
         temperature_source=logs[0].temperature_source,
-        noise=_noise(voltage_model, fits, held_out, options.rate_hz),
+        noise=noise_of(
+            fitted.errors,
+            voltage_model,
+            rate_hz=rate_hz,
+            mean_c=fitted.mean_c,
+            spans=fitted.spans,
+        ),
         effects=[] if found is None else effect_entries(found.model.effects),
-        information=_information(rows, options, names, solution, found),
-        made=_made(logs, options, effect_ids, rows, initial_soc_pct),
+        information=_information(fitted, options, found),
+        made=_made(logs, options, effect_ids, fitted.figures, initial_soc_pct),
     )
     return Identification(
         model=model,
         voltage_model=voltage_model,
         logs=tuple(logs),
-        fits=fits,
-        held_out_error_v=held_out,
+        figures=fitted.figures,
+        rows=rows,
+        held_out=fitted.held_out,
         solution=solution,
         energy=energy_balance(logs, slope),
         slope_ohm=slope,
         slope_expected_ohm=expected,
-        voltage_mae_pct=100.0 * float(np.mean(np.abs(residual) / volts)),
-        voltage_rmse_v=float(np.sqrt(np.mean(residual**2))),
-        soc_newton_mae_pct=float(np.mean(np.abs(newton_error))),
+        voltage_mae_pct=sums["voltage_pct"] / sums["rows"],
+        voltage_rmse_v=float(np.sqrt(sums["square_v2"] / sums["rows"])),
+        soc_newton_mae_pct=sums["newton_pct"] / sums["rows"],
         remarks=(
-            *_remarks(voltage_model, solution, rows),
+            *_remarks(voltage_model, solution, fitted.figures),
             *_remarks_on_time(logs, delay_s, usable),
             *found_starts.remarks(),
             *(
@@ -270,7 +290,36 @@ def fit(
         ),
         effects=found,
         starts=found_starts.starts,
+        extended_fits=extended_fits,
     )
+
+
+def _with_effects(
+    found: FittedEffects, logs: Sequence[SampledLog], options: FitOptions
+) -> tuple[RowsFit, tuple[LogFit, ...]]:
+    """Return figures of a model with effects, and its fit of each log."""
+    model = found.model.model
+    fits = tuple(evaluate_extended(found.model, item) for item in logs)
+    mean_c = float(np.mean(np.concatenate([item.rows.temperature_c for item in fits])))
+    errors = [
+        errors_of_fit(
+            item.rows,
+            ((item.part(block), error_v[block]) for block in row_blocks(len(item.rows))),
+            model.resistance_ohm,
+            options.rate_hz,
+            mean_c=mean_c,
+        )
+        for item, error_v in zip(fits, found.held_out_error_v, strict=True)
+    ]
+    spans = [(np.ptp(item.rows.time_s), np.ptp(item.rows.soc_pct)) for item in fits]
+    figures = tuple(
+        LogFigures(item.rows.name, item.rows.removed, each.sums)
+        for item, each in zip(fits, errors, strict=True)
+    )
+    fitted = RowsFit(
+        model, found.solution, None, mean_c, np.mean(spans, axis=0), (), summed(errors), figures
+    )
+    return fitted, fits
 
 
 def _check_logs(logs: Sequence[Log]) -> None:
@@ -283,80 +332,40 @@ def _check_logs(logs: Sequence[Log]) -> None:
                 source=log.source or log.name,
                 cure="give a log of minutes or hours",
             )
-    by_rows: dict[str, Log] = {}
+    by_sums: dict[tuple[float, ...], list[Log]] = {}
     for log in logs:
-        digest = signals_sha256(log)
-        if digest in by_rows:
-            raise InputError(
-                f"same rows as {by_rows[digest].source or by_rows[digest].name}: they would count"
-                " twice",
-                source=log.source or log.name,
-                cure="give each log once",
-            )
-        by_rows[digest] = log
+        sums = (float(len(log)), float(log.current_a.sum()), float(log.voltage_v.sum()))
+        for other in by_sums.setdefault(sums, []):
+            if _has_rows_of(log, other):
+                raise InputError(
+                    f"same rows as {other.source or other.name}: they would count twice",
+                    source=log.source or log.name,
+                    cure="give each log once",
+                )
+        by_sums[sums].append(log)
     common_temperature_source(log.temperature_source for log in logs)
 
 
-def _noise(
-    voltage_model: VoltageModel,
-    fits: Sequence[LogFit],
-    held_out_error_v: Sequence[FloatArray],
-    rate_hz: float,
-) -> ModelNoise:
-    errors = np.concatenate(held_out_error_v)
-    volts = np.concatenate([item.rows.voltage_v for item in fits])
-    known = np.isfinite(errors)
-    if not known.any():
-        errors = np.concatenate([item.residual_v for item in fits])
-        known = np.isfinite(errors)
-        judged_on = "the rows of the fit itself (too short a log to hold any out)"
-    elif len(fits) >= LOGS_AT_LEAST:
-        judged_on = WHOLE_LOGS
-    else:
-        judged_on = "interleaved blocks of 240 s left out in turn"
-    time_error, curve = describe_error(
-        [
-            LogResidual(
-                item.residual_v,
-                item.rows.soc_pct,
-                item.rows.temperature_c,
-                item.rows.delayed_current_a,
-            )
-            for item in fits
-        ],
-        voltage_model.pseudo_ocv(KNOTS_PCT),
-        voltage_model.resistance_ohm,
-        rate_hz,
-    )
-    return noise_of(
-        time_error,
-        curve,
-        lasting_time_s=float(np.mean([np.ptp(item.rows.time_s) for item in fits])),
-        lasting_soc_pct=float(np.mean([np.ptp(item.rows.soc_pct) for item in fits])),
-        voltage_mae_pct=100.0 * float(np.mean(np.abs(errors[known]) / volts[known])),
-        voltage_rmse_v=float(np.sqrt(np.mean(errors[known] ** 2))),
-        judged_on=judged_on,
-    )
+def _has_rows_of(log: Log, other: Log) -> bool:
+    """Return whether two logs have the same current and voltage."""
+    same = np.array_equal
+    return same(log.current_a, other.current_a) and same(log.voltage_v, other.voltage_v)
 
 
-def _information(
-    rows: Sequence[FitRows],
-    options: FitOptions,
-    names: Sequence[str],
-    solution: Solution,
-    found: FittedEffects | None,
-) -> Information:
+def _information(fitted: RowsFit, options: FitOptions, found: FittedEffects | None) -> Information:
     """Return the square root of the information of the rows on the coefficients."""
-    if found is None or not found.model.effects:
-        columns, volts, _ = stacked(rows, options)
+    names, prior = coefficient_names(options), fitted.solution.kt_prior
+    if fitted.information is not None:
+        root = fitted.information.root
+        columns, volts = root[:, :-1], root[:, -1]
         effect_columns = np.empty((volts.size, 0))
-    else:
+    elif found is not None:
         n = len(names)
         columns, effect_columns = found.linear.columns[:, :n], found.linear.columns[:, n:]
         volts = found.linear.residual_v + columns @ found.linear.model.model.coefficients
     kt_weight = 0.0
-    if solution.kt_prior is not None:
-        kt_weight = solution.kt_prior.row_weight
+    if prior is not None:
+        kt_weight = prior.row_weight
     elif found is not None:
         kt_weight = found.linear.kt_weight
     return information_of_rows(columns, effect_columns, volts, names, kt_weight)
@@ -366,13 +375,13 @@ def _made(
     logs: Sequence[Log],
     options: FitOptions,
     effect_ids: Sequence[str],
-    rows: Sequence[FitRows],
+    figures: Sequence[LogFigures],
     initial_soc_pct: float | Sequence[float | None] | None,
 ) -> Made:
     hashes = [log_sha256(log) for log in logs]
     listed = [
-        SourceLog(name=log.name, rows=len(item), sha256=digest)
-        for log, item, digest in zip(logs, rows, hashes, strict=True)
+        SourceLog(name=log.name, rows=item.rows, sha256=digest)
+        for log, item, digest in zip(logs, figures, hashes, strict=True)
     ]
     given = initial_soc_pct if isinstance(initial_soc_pct, float) else None
     effects = {"effects": ", ".join(effect_ids)} if effect_ids else {}
@@ -401,7 +410,7 @@ def _remarks_on_time(
     return remarks
 
 
-def _remarks(model: VoltageModel, solution: Solution, rows: Sequence[FitRows]) -> list[str]:
+def _remarks(model: VoltageModel, solution: Solution, figures: Sequence[LogFigures]) -> list[str]:
     remarks = []
     lo, hi = model.soc_range_pct
     if hi - lo < 50.0:
@@ -424,7 +433,7 @@ def _remarks(model: VoltageModel, solution: Solution, rows: Sequence[FitRows]) -
         )
     if solution.constrained:
         remarks.append("the pseudo-OCV of the plain fit would fall somewhere: constrained to rise")
-    removed = sum(item.removed["start_up_or_shut_down"] for item in rows)
+    removed = sum(item.removed["start_up_or_shut_down"] for item in figures)
     if removed:
         remarks.append(f"{removed} start-up or shut-down rows removed")
     if any(resistance > 0.0 for resistance in model.resistance_ohm[:1]):

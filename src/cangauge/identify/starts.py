@@ -22,8 +22,11 @@ from scipy import optimize
 from cangauge._formatting import significant
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.identify.voltage_fit import fit_voltage_model, rising_with_kt_prior, stacked
-from cangauge.inference.rows import FitOptions, FitRows, fit_rows
+from cangauge.identify.log_errors import score_sums, summed_scores, with_std_errors
+from cangauge.identify.passes import fit_voltage_model
+from cangauge.identify.voltage_fit import information_of, pooled, solve_information, table_of
+from cangauge.inference.least_squares import CLUSTER_S, Solution
+from cangauge.inference.rows import FitOptions, FitRows, block_numbers, fit_rows, row_blocks
 from cangauge.logs.gaps import split_where_moved
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import discharged_ah
@@ -250,29 +253,42 @@ class _JointFit:
 
     def _step(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         options, rows = self._options, self._rows()
-        columns, volts, block = stacked(rows, options)
-        soc = np.concatenate([item.soc_pct for item in rows])
-        number = np.repeat(np.arange(len(rows)), [len(item) for item in rows])
         model, _ = fit_voltage_model(rows, options)
-        slope = ocv_basis_slope(soc, options.epsilon) @ np.array(model.ocv_v)
-        of_starts = np.column_stack([np.where(number == k, slope, 0.0) for k in self._unknown])
-        n = columns.shape[1]
-        table = np.hstack([columns, of_starts])
-        span = float(soc.min()), float(soc.max())
-        lengths = [len(item) for item in rows]
-        solution, _ = rising_with_kt_prior(
-            table, volts, block, span, options.epsilon, lengths=lengths
+        slopes = [
+            ocv_basis_slope(item.soc_pct, options.epsilon) @ np.array(model.ocv_v) for item in rows
+        ]
+        extra = [
+            np.outer(slope, np.array(self._unknown) == k) for k, slope in enumerate(slopes)
+        ]  # one column for each unknown start
+        each = list(zip(rows, extra, strict=True))
+        parts = [information_of(item, options, extra=of_log) for item, of_log in each]
+        volts = np.concatenate([item.voltage_v for item in rows])
+        solution = solve_information(
+            pooled(parts), options.epsilon, nominal_v=float(np.median(volts))
         )
-        std_pct = solution.std_error[n:]
+        scores = [score_sums(item, options, solution, of_log) for item, of_log in each]
+        solution = with_std_errors(solution, *summed_scores(scores))
         # The least squares does not model an error that lasts as long as a log and shifts its whole
         # voltage. Residuals averaged over five minutes show how large those that last are.
-        error_v = volts - table @ solution.coefficients
-        _, of_block, rows_of = np.unique(block, return_inverse=True, return_counts=True)
-        means_v = np.bincount(of_block, weights=error_v) / rows_of
+        means_v = np.concatenate([_cluster_means(*of_log, options, solution) for of_log in each])
         lasting_v = float(np.sqrt(np.mean(means_v**2)))
-        slopes = np.array([float(np.mean(slope[number == k])) for k in self._unknown])
-        std_pct = np.hypot(std_pct, lasting_v / np.maximum(slopes, 1e-9))
+        mean_slopes = np.array([float(np.mean(slopes[k])) for k in self._unknown])
+        n = len(solution.coefficients) - len(self._unknown)
+        std_pct = np.hypot(solution.std_error[n:], lasting_v / np.maximum(mean_slopes, 1e-9))
         return solution.coefficients[n:], std_pct, solution.std_error[:n]
+
+
+def _cluster_means(
+    rows: FitRows, extra: FloatArray, options: FitOptions, solution: Solution
+) -> FloatArray:
+    """Return the mean error of each cluster of a log's rows [V]."""
+    blocks = row_blocks(len(rows))
+    tables = (table_of(rows.part(block), options, extra[block]) for block in blocks)
+    error_v = np.concatenate(
+        [each[:, -1] - each[:, :-1] @ solution.coefficients for each in tables]
+    )
+    first = np.flatnonzero(np.diff(block_numbers([rows], CLUSTER_S), prepend=-1))
+    return np.asarray(np.add.reduceat(error_v, first) / np.diff(first, append=len(rows)))
 
 
 def _limits(log: Log, capacity_ah: float) -> tuple[float, float]:

@@ -1,25 +1,35 @@
-"""Fit of the voltage model's coefficients to rows of logs, and its held-out error."""
+"""Fit of the voltage model's coefficients from summaries of blocks of rows: exact, and out of core.
+
+Least squares needs of a log only the triangular factor R of the QR decomposition of its rows
+[columns, voltage] (square-root information, RᵀR = the normal equations). The factor of several
+blocks or logs is that of their factors stacked, and has the condition of the rows, not its square
+as the normal equations have (Golub, Van Loan, Matrix Computations, 4th ed., §5.3; Bierman,
+Factorization Methods for Discrete Sequential Estimation, 1977, ch. 5). The prior on kt needs one
+factor per time scale; since the Haar transform is orthonormal, their stack is that of the rows.
+
+First pass: `LogInformation` of each log; their sum gives the coefficients, and those without each
+fold of logs. Second pass: `log_errors`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.inference.least_squares import CLUSTER_S, KtPrior, Solution, kt_prior, solve
-from cangauge.inference.linearized import SLOPE_CHECKS
-from cangauge.inference.rows import (
-    LOGS_AT_LEAST,
-    FitOptions,
-    FitRows,
-    Mask,
-    block_numbers,
-    folds,
+from cangauge.inference.least_squares import (
+    KtPrior,
+    Solution,
+    kt_prior,
+    solve,
+    triangular_factor,
 )
+from cangauge.inference.linearized import SLOPE_CHECKS
+from cangauge.inference.rows import FitOptions, FitRows, Mask, row_blocks, stacked_columns
+from cangauge.inference.time_scales import SCALES, HaarBlocks
 from cangauge.model.voltage_model import (
     BASIS_NAMES,
     SLOPE_AT_LEAST,
@@ -38,214 +48,296 @@ KT = len(BASIS_NAMES)
 SOC_SPAN_AT_LEAST_PCT = 2.0
 """Least SoC span of a fit [%]."""
 
+LEVELS_AT_MOST = 4096
+"""Different voltages that are counted one by one; with more they are rounded, …"""
 
-def fit_voltage_model(
-    rows: Sequence[FitRows],
+LEVEL_STEP = 1e-4
+"""… to this part of the voltage [-]: they only scale two priors."""
+
+
+def design_matrix(rows: FitRows, epsilon: float, t_ref_c: float) -> FloatArray:
+    """Return the columns k0 … k7, kt, R1 … Rn on the rows of a log, shape (m, 9 + n)."""
+    return stacked_columns(
+        ocv_basis(rows.soc_pct, epsilon), rows.dequantized_c - t_ref_c, rows.delayed_current_a
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class LogInformation:
+    """What the fit needs of one or more logs.
+
+    Parameters
+    ----------
+    rows, logs : int
+    root : array of shape (p + 1, p + 1)
+        Triangular factor of [columns, voltage].
+    scale_roots : array of shape (SCALES, p + 1, p + 1)
+        The same of the Haar coefficients of each time scale.
+    counts : array of int, shape (SCALES,)
+        Numbers of coefficients.
+    low, high : array of shape (3,)
+        Range of SoC [%], temperature [°C] and current [A].
+    levels_v, level_rows : array of shape (m,)
+        Voltages [V], increasing, and how many rows have them; empty where they are not counted.
+    temperature_sum : float
+        Sum of the rows' temperatures [°C].
+    spans : array of shape (2,)
+        Duration [s] and range of SoC [%], summed over the logs.
+    """
+
+    rows: int
+    logs: int
+    root: FloatArray
+    scale_roots: FloatArray
+    counts: FloatArray
+    low: FloatArray
+    high: FloatArray
+    levels_v: FloatArray
+    level_rows: FloatArray
+    temperature_sum: float
+    spans: FloatArray
+
+    @property
+    def nominal_v(self) -> float:
+        """Median of the voltage [V]; to `LEVEL_STEP` where there are more than LEVELS_AT_MOST."""
+        ends = np.cumsum(self.level_rows)
+        below, above = (self.rows - 1) // 2, self.rows // 2
+        at = np.searchsorted(ends, [below, above], side="right")
+        return float(np.mean(self.levels_v[at]))
+
+    @property
+    def mean_c(self) -> float:
+        """Mean temperature of the rows [°C]."""
+        return self.temperature_sum / self.rows
+
+
+def information_of(
+    rows: FitRows,
     options: FitOptions,
-    keep: Mask | None = None,
     *,
+    extra: FloatArray | None = None,
+    keep: Mask | None = None,
+    with_levels: bool = False,
+) -> LogInformation:
+    """Return what the fit needs of one log's rows, from blocks of `BLOCK_ROWS`.
+
+    Parameters
+    ----------
+    rows : FitRows
+    options : FitOptions
+    extra : array of shape (m, k), optional
+        Further columns, before the voltage.
+    keep : array of bool, shape (m,), optional
+        Rows to fit; all by default.
+    with_levels : bool
+        Whether to count the levels of the voltage.
+    """
+    indices = None if keep is None else np.flatnonzero(keep)
+    number = len(rows) if indices is None else indices.size
+    transform = HaarBlocks(SCALES)
+    roots: list[list[FloatArray]] = [[] for _ in range(SCALES)]
+    counts = np.zeros(SCALES)
+    lows, highs, temperature_sum = [], [], 0.0
+    for block in (*row_blocks(number), None):
+        if block is None:
+            by_scale = transform.end()
+        else:
+            some = block if indices is None else indices[block]
+            part = rows.part(some)
+            by_scale = transform.add(
+                table_of(part, options, None if extra is None else extra[some])
+            )
+            channels = (part.soc_pct, part.temperature_c, part.delayed_current_a[:, 0])
+            lows.append([values.min() for values in channels])
+            highs.append([values.max() for values in channels])
+            temperature_sum += float(part.temperature_c.sum())
+        counts += [len(each) for each in by_scale]
+        for root, each in zip(roots, by_scale, strict=True):
+            root[:] = [triangular_factor([*root, each])]
+    scale_roots = np.array([root for (root,) in roots])
+    low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+    levels, level_rows = np.empty(0), np.empty(0)
+    if with_levels:
+        levels, level_rows = _levels(np.sort(rows.voltage_v), np.ones(len(rows)))
+    first, last = (0, -1) if indices is None else indices[[0, -1]]
+    return LogInformation(
+        rows=number,
+        logs=1,
+        root=triangular_factor([np.vstack(list(scale_roots))]),  # the transform is orthonormal
+        scale_roots=scale_roots,
+        counts=counts,
+        low=low,
+        high=high,
+        levels_v=levels,
+        level_rows=level_rows,
+        temperature_sum=temperature_sum,
+        spans=np.array([rows.time_s[last] - rows.time_s[first], high[0] - low[0]]),
+    )
+
+
+def table_of(rows: FitRows, options: FitOptions, extra: FloatArray | None = None) -> FloatArray:
+    """Return [columns, extra columns, voltage] of a block of rows."""
+    columns = design_matrix(rows, options.epsilon, options.t_ref_c)
+    return stacked_columns(columns, *([] if extra is None else [extra]), rows.voltage_v)
+
+
+def _levels(volts: FloatArray, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the different voltages, rounded if they are many, and the rows of each.
+
+    Parameters
+    ----------
+    volts, rows : array of shape (m,)
+        Voltages in increasing order, and the rows that have them.
+    """
+    if not volts.size:
+        return volts, rows
+    for step in (None, np.log1p(LEVEL_STEP)):
+        if step is not None:
+            volts = np.exp(np.round(np.log(volts) / step) * step)
+        first = np.flatnonzero(np.diff(volts, prepend=-np.inf))
+        volts, rows = volts[first], np.add.reduceat(rows, first)
+        if volts.size <= LEVELS_AT_MOST:
+            break
+    return volts, rows
+
+
+def pooled(parts: Sequence[LogInformation]) -> LogInformation:
+    """Return the information of several logs together."""
+    volts = np.concatenate([each.levels_v for each in parts])
+    order = np.argsort(volts, kind="stable")
+    level_rows = np.concatenate([each.level_rows for each in parts])
+    levels, level_rows = _levels(volts[order], level_rows[order])
+    return LogInformation(
+        rows=sum(each.rows for each in parts),
+        logs=sum(each.logs for each in parts),
+        root=triangular_factor([np.vstack([each.root for each in parts])]),
+        scale_roots=np.array(
+            [
+                triangular_factor([np.vstack([each.scale_roots[j] for each in parts])])
+                for j in range(SCALES)
+            ]
+        ),
+        counts=np.sum([each.counts for each in parts], axis=0),
+        low=np.min([each.low for each in parts], axis=0),
+        high=np.max([each.high for each in parts], axis=0),
+        levels_v=levels,
+        level_rows=level_rows,
+        temperature_sum=float(np.sum([each.temperature_sum for each in parts])),
+        spans=np.sum([each.spans for each in parts], axis=0),
+    )
+
+
+def fit_information(
+    information: LogInformation,
+    options: FitOptions,
+    *,
+    source: str = "",
+    nominal_v: float | None = None,
     with_kt_prior: bool = True,
 ) -> tuple[VoltageModel, Solution]:
     """Fit the coefficients by least squares with a rising pseudo-OCV.
 
     Parameters
     ----------
-    rows : sequence of FitRows
+    information : LogInformation
     options : FitOptions
-    keep : array of bool, optional
-        Rows of all logs, in order, to fit; all by default.
+    source : str
+        Name of the logs, for messages.
+    nominal_v : float, optional
+        Median of the voltage [V]; by default that of the counted levels, which may be rounded.
     with_kt_prior : bool
         Whether to use the prior on kt (`least_squares.kt_prior`).
 
+    Returns
+    -------
+    VoltageModel
+    Solution
+        `with_std_errors` completes it.
+
     Raises
     ------
     InputError
-        If the rows cannot identify the model.
+        If the logs cannot identify the model.
     """
-    columns, volts, block = stacked(rows, options)
-    soc = np.concatenate([item.soc_pct for item in rows])
-    temperature = np.concatenate([item.temperature_c for item in rows])
-    current = np.concatenate([item.delayed_current_a[:, 0] for item in rows])
-    number = np.repeat(np.arange(len(rows)), [len(item) for item in rows])
-    if keep is not None:
-        columns, volts, block, number = columns[keep], volts[keep], block[keep], number[keep]
-        soc, temperature, current = soc[keep], temperature[keep], current[keep]
-    source = ", ".join(item.name for item in rows)
-    check_identifiable(source, columns.shape, float(np.ptp(soc)), float(np.ptp(current)))
-    span = float(soc.min()), float(soc.max())
-    if with_kt_prior:
-        lengths = np.bincount(number, minlength=len(rows)).tolist()
-        solution, prior = rising_with_kt_prior(
-            columns, volts, block, span, options.epsilon, lengths=lengths
-        )
-        solution = with_prior_errors(solution, prior)
-    else:
-        nominal_v = float(np.median(volts))
-        solution = rising(columns, volts, block, span, options.epsilon, nominal_v=nominal_v)
-    low, high = (np.array([of(x) for x in (soc, temperature, current)]) for of in (np.min, np.max))
-    return voltage_model_of(solution, options, low, high), solution
-
-
-def voltage_model_of(
-    solution: Solution, options: FitOptions, low: FloatArray, high: FloatArray
-) -> VoltageModel:
-    """Return the model of a solution; low and high of SoC [%], temperature [°C], current [A]."""
-    x = solution.coefficients.tolist()
-    soc, temperature, current = zip(low.tolist(), high.tolist(), strict=True)
-    return VoltageModel(
-        ocv_v=tuple(x[:KT]),
-        kt_v_per_k=x[KT],
-        resistance_ohm=tuple(x[KT + 1 :]),
-        delay_s=options.delay_s,
-        epsilon=options.epsilon,
-        t_ref_c=options.t_ref_c,
-        soc_range_pct=soc,
-        temperature_range_c=temperature,
-        current_range_a=current,
+    span = information.high - information.low
+    shape = information.rows, information.root.shape[1] - 1
+    check_identifiable(source, shape, float(span[0]), float(span[2]))
+    solution = solve_information(
+        information, options.epsilon, nominal_v=nominal_v, with_kt_prior=with_kt_prior
     )
+    return voltage_model_of(solution, options, information.low, information.high), solution
 
 
-def rising(
-    columns: FloatArray,
-    volts: FloatArray,
-    block: NDArray[np.intp],
-    span_pct: tuple[float, float],
+def solve_information(
+    information: LogInformation,
     epsilon: float,
     *,
-    nominal_v: float,
+    nominal_v: float | None = None,
+    with_kt_prior: bool = True,
 ) -> Solution:
-    """Return the least-squares solution whose pseudo-OCV rises over a span of SoC [%].
-
-    Columns beyond those of `design_matrix` may follow. In place of rows there may be a triangular
-    factor of their QR decomposition: the standard errors are then meaningless.
-
-    Parameters
-    ----------
-    columns, volts, block, span_pct, epsilon
-        As `rising_with_kt_prior`.
-    nominal_v : float
-        Median of the voltage [V], for the least slope.
-    """
-    at_least = SLOPE_AT_LEAST * nominal_v
-    grid = np.linspace(*span_pct, SLOPE_CHECKS)
-    between = np.linspace(*span_pct, SLOPE_POINTS)
-    for _ in range(REFINED_AT_MOST):
-        bounds = np.zeros((grid.size, columns.shape[1]))
-        bounds[:, : len(BASIS_NAMES)] = ocv_basis_slope(grid, epsilon)
-        solution = solve(columns, volts, block, bounds, at_least)
-        slope = ocv_basis_slope(between, epsilon) @ solution.coefficients[: len(BASIS_NAMES)]
-        if np.all(slope > 0.0):
-            break
-        # Near empty the curve bends so sharply that it may fall between two constraints.
-        grid = np.union1d(grid, between[slope < at_least])
-    return solution
+    """Return the coefficients of all columns, extra ones too; else as `fit_information`."""
+    root = information.root
+    span = float(information.low[0]), float(information.high[0])
+    nominal_v = information.nominal_v if nominal_v is None else nominal_v
+    solution = rising(root, span, epsilon, nominal_v=nominal_v)
+    if not with_kt_prior:
+        return solution
+    coefficients = solution.coefficients
+    error_v = root[:, -1] - root[:, :-1] @ coefficients
+    prior = kt_prior(
+        root[:, :-1],
+        [
+            np.column_stack([each[:, :-1], each[:, -1] - each[:, :-1] @ coefficients])
+            for each in information.scale_roots
+        ],
+        information.counts.astype(int).tolist(),
+        KT,
+        nominal_v=nominal_v,
+        residual_std_v=float(np.sqrt(error_v @ error_v / information.rows)),
+    )
+    solution = rising(with_prior_row(root, prior), span, epsilon, nominal_v=nominal_v)
+    return replace(solution, kt_prior=prior)
 
 
-def rising_with_kt_prior(
-    columns: FloatArray,
-    volts: FloatArray,
-    block: NDArray[np.intp],
-    span_pct: tuple[float, float],
-    epsilon: float,
+def models_without(
+    by_fold: Sequence[LogInformation],
+    options: FitOptions,
     *,
-    lengths: Sequence[int],
-) -> tuple[Solution, KtPrior]:
-    """Return the least-squares solution with a rising pseudo-OCV and the prior on kt.
+    nominal_v: Sequence[float] | None = None,
+    with_kt_prior: bool = True,
+) -> tuple[VoltageModel | None, ...]:
+    """Return the model without each fold of logs; None where the rest identifies none.
 
     Parameters
     ----------
-    columns : array of shape (n, m)
-        Those of `design_matrix`; others may follow.
-    volts : array of shape (n,)
-    block : array of int of shape (n,)
-        Block of correlated rows that each row belongs to.
-    span_pct : pair of float
-        SoC over which the pseudo-OCV rises [%].
-    epsilon : float
-    lengths : sequence of int
-        Rows of each log.
-    """
-    nominal_v = float(np.median(volts))
-    solution = rising(columns, volts, block, span_pct, epsilon, nominal_v=nominal_v)
-    prior = kt_prior(columns, volts - columns @ solution.coefficients, volts, lengths, KT)
-    columns, volts = with_prior_row(columns, volts, prior)
-    block = np.append(block, block.max() + 1)
-    return rising(columns, volts, block, span_pct, epsilon, nominal_v=nominal_v), prior
-
-
-def with_prior_row(
-    columns: FloatArray, volts: FloatArray, prior: KtPrior
-) -> tuple[FloatArray, FloatArray]:
-    """Return columns and voltage with a further row, kt = 0 V/K by its weight."""
-    row = np.zeros(columns.shape[1])
-    row[KT] = prior.row_weight
-    return np.vstack([columns, row]), np.append(volts, 0.0)
-
-
-def with_prior_errors(solution: Solution, prior: KtPrior) -> Solution:
-    """Return the solution with standard errors that include the uncertainty of kt.
-
-    The other coefficients shift with kt: the pseudo-OCV absorbs what the prior takes from it.
-    """
-    more = max(prior.posterior_std_v_per_k**2 - float(solution.std_error[KT]) ** 2, 0.0)
-    shift = prior.shift_per_kt.copy()
-    shift[KT] = 1.0
-    std_error = np.sqrt(solution.std_error**2 + more * shift**2)
-    return replace(solution, std_error=std_error, kt_prior=prior)
-
-
-def held_out_errors(
-    rows: Sequence[FitRows], options: FitOptions, *, with_kt_prior: bool = True
-) -> list[FloatArray]:
-    """Return the held-out errors of each log's rows [V], shape (m,) each.
-
-    NaN where no fold holds a row out, where the row's SoC lies outside that of the training rows
-    (an estimate is flagged there), and for a whole log without which the others identify no model.
+    by_fold : sequence of LogInformation
+    options : FitOptions
+    nominal_v : sequence of float, optional
+        Median of the voltage without each fold [V].
+    with_kt_prior : bool
 
     Raises
     ------
     InputError
-        If no fold leaves training rows that identify a model.
+        If that is so for every fold.
     """
-    volts = np.concatenate([item.voltage_v for item in rows])
-    soc = np.concatenate([item.soc_pct for item in rows])
-    temperature = np.concatenate([item.temperature_c for item in rows])
-    delayed = np.concatenate([item.delayed_current_a for item in rows])
-    errors = np.full(volts.size, np.nan)
+    found: list[VoltageModel | None] = []
     refused: InputError | None = None
-    for training, held_out in folds(rows):
-        shape = int(training.sum()), KT + 1 + delayed.shape[1]
+    for k in range(len(by_fold)):
+        rest = pooled([part for j, part in enumerate(by_fold) if j != k])
+        median_v = None if nominal_v is None else nominal_v[k]
         try:
-            current = delayed[training, 0]
-            check_identifiable("", shape, float(np.ptp(soc[training])), float(np.ptp(current)))
+            model, _ = fit_information(
+                rest, options, nominal_v=median_v, with_kt_prior=with_kt_prior
+            )
         except InputError as error:
-            if len(rows) < LOGS_AT_LEAST:
-                raise  # a log that identifies a model does so without one of its blocks
             refused = error
-            continue
-        model, _ = fit_voltage_model(rows, options, training, with_kt_prior=with_kt_prior)
-        lo, hi = model.soc_range_pct
-        seen = held_out & (soc > lo - 1.0) & (soc < hi + 1.0)
-        errors[seen] = volts[seen] - model.voltage(soc[seen], temperature[seen], delayed[seen])
-    if refused is not None and not np.isfinite(errors).any():
+            found.append(None)
+        else:
+            found.append(model)
+    if refused is not None and not any(found):
         raise refused
-    return np.split(errors, np.cumsum([len(item) for item in rows])[:-1])
-
-
-def design_matrix(rows: FitRows, epsilon: float, t_ref_c: float) -> FloatArray:
-    """Return the columns k0 … k7, kt, R1 … Rn on the rows of a log, shape (m, 9 + n)."""
-    return np.column_stack(
-        [ocv_basis(rows.soc_pct, epsilon), rows.dequantized_c - t_ref_c, rows.delayed_current_a]
-    )
-
-
-def stacked(
-    rows: Sequence[FitRows], options: FitOptions
-) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
-    """Return design matrix (n, 9 + delays), voltage [V] and block number (n,) of all logs."""
-    columns = np.vstack([design_matrix(item, options.epsilon, options.t_ref_c) for item in rows])
-    volts = np.concatenate([item.voltage_v for item in rows])
-    return columns, volts, block_numbers(rows, CLUSTER_S)
+    return tuple(found)
 
 
 def check_identifiable(
@@ -286,3 +378,63 @@ def check_identifiable(
             field="current_a",
             cure="give a log with changing load",
         )
+
+
+def rising(
+    root: FloatArray, span_pct: tuple[float, float], epsilon: float, *, nominal_v: float
+) -> Solution:
+    """Return the least-squares solution whose pseudo-OCV rises over a span of SoC [%].
+
+    Its standard errors are meaningless.
+
+    Parameters
+    ----------
+    root : array of shape (n, p + 1)
+        Columns of `design_matrix`, others that may follow, and the voltage; or the triangular
+        factor of their QR decomposition.
+    span_pct : pair of float
+        SoC over which the pseudo-OCV rises [%].
+    epsilon : float
+    nominal_v : float
+        Median of the voltage [V], for the least slope.
+    """
+    columns, volts, block = root[:, :-1], root[:, -1], np.arange(len(root))
+    at_least = SLOPE_AT_LEAST * nominal_v
+    grid = np.linspace(*span_pct, SLOPE_CHECKS)
+    between = np.linspace(*span_pct, SLOPE_POINTS)
+    for _ in range(REFINED_AT_MOST):
+        bounds = np.zeros((grid.size, columns.shape[1]))
+        bounds[:, : len(BASIS_NAMES)] = ocv_basis_slope(grid, epsilon)
+        solution = solve(columns, volts, block, bounds, at_least)
+        slope = ocv_basis_slope(between, epsilon) @ solution.coefficients[: len(BASIS_NAMES)]
+        if np.all(slope > 0.0):
+            break
+        # Near empty the curve bends so sharply that it may fall between two constraints.
+        grid = np.union1d(grid, between[slope < at_least])
+    return solution
+
+
+def with_prior_row(root: FloatArray, prior: KtPrior) -> FloatArray:
+    """Return columns and voltage with a further row, kt = 0 V/K by its weight."""
+    row = np.zeros((1, root.shape[1]))
+    row[0, KT] = prior.row_weight
+    return np.vstack([root, row])
+
+
+def voltage_model_of(
+    solution: Solution, options: FitOptions, low: FloatArray, high: FloatArray
+) -> VoltageModel:
+    """Return the model of a solution; low and high of SoC [%], temperature [°C], current [A]."""
+    x = solution.coefficients.tolist()
+    soc, temperature, current = zip(low.tolist(), high.tolist(), strict=True)
+    return VoltageModel(
+        ocv_v=tuple(x[:KT]),
+        kt_v_per_k=x[KT],
+        resistance_ohm=tuple(x[KT + 1 :]),
+        delay_s=options.delay_s,
+        epsilon=options.epsilon,
+        t_ref_c=options.t_ref_c,
+        soc_range_pct=soc,
+        temperature_range_c=temperature,
+        current_range_a=current,
+    )

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -35,7 +35,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from cangauge._typing import FloatArray
-from cangauge.inference.time_scales import haar_transform
+from cangauge.inference.rows import row_blocks, stacked_columns
+from cangauge.inference.time_scales import HaarBlocks
 
 SCALES: Final = 14
 """Time scales: stretches of 2, 4, … 16,384 rows; longer ones count as the last."""
@@ -153,6 +154,10 @@ class LogResidual:
     delayed_current_a: FloatArray
     """Shape (n, delays) [A]."""
 
+    def part(self, rows: slice) -> LogResidual:
+        """Return some of the rows."""
+        return LogResidual(**{name: values[rows] for name, values in vars(self).items()})
+
 
 @dataclass(frozen=True, eq=False)
 class ErrorEquations:
@@ -176,21 +181,50 @@ class ErrorEquations:
     products: FloatArray
 
     @classmethod
-    def of_tables(cls, tables: Sequence[FloatArray]) -> ErrorEquations:
-        """Return the equations of tables, shape (n, p + 1): columns of the shared errors, residual.
+    def of_blocks(cls, blocks: Iterable[FloatArray], finest: int = 1) -> ErrorEquations:
+        """Return the equations of one log from blocks of its table (`HaarBlocks.add`).
 
-        Each table is of one log, in order of time.
+        Parameters
+        ----------
+        blocks : iterable of arrays of shape (m, p + 1)
+            Columns of the shared errors, residual.
+        finest : int
+            Rows of the shortest stretches of which the columns count, a power of two; of shorter
+            ones only the residual's squares do.
         """
-        transforms = [haar_transform(table, SCALES) for table in tables]
-        by_scale = [
-            np.vstack([each[j][: -1 if j == SCALES - 1 else None] for each in transforms])
-            for j in range(SCALES)
-        ]
+        table, residual = HaarBlocks(SCALES, finest), HaarBlocks(SCALES)
+        fast = finest.bit_length() - 1
+        sums: list[FloatArray] = []
+        counts, rows = np.zeros(SCALES), 0
+        for block in itertools.chain(blocks, [None]):
+            of_table = table.end() if block is None else table.add(block)
+            of_residual = residual.end() if block is None else residual.add(block[:, -1:])
+            of_scale = [*of_residual[:fast], *of_table[fast:]]
+            rows += 0 if block is None else len(block)
+            counts += [len(each) for each in of_scale]
+            if not sums:
+                sums = [np.zeros((of_table[-1].shape[1],) * 2) for _ in range(SCALES)]
+            for j, each in enumerate(of_scale):
+                width = each.shape[1]
+                sums[j][-width:, -width:] += each.T @ each
+        mean = of_table[-1][-1]
+        counts[-1] -= 1.0
+        sums[-1] -= np.outer(mean, mean)
+        return cls(np.array([float(rows)]), mean[None], counts, np.array(sums))
+
+    @classmethod
+    def of_tables(cls, tables: Sequence[FloatArray]) -> ErrorEquations:
+        """Return the equations of tables, shape (n, p + 1): one of each log, in order of time."""
+        return cls.of_all([cls.of_blocks([table]) for table in tables])
+
+    @classmethod
+    def of_all(cls, parts: Sequence[ErrorEquations]) -> ErrorEquations:
+        """Return the equations of several logs together."""
         return cls(
-            rows=np.array([len(table) for table in tables], dtype=np.float64),
-            means=np.array([each[-1][-1] for each in transforms]),
-            counts=np.array([len(item) for item in by_scale], dtype=np.float64),
-            products=np.array([item.T @ item for item in by_scale]),
+            rows=np.concatenate([each.rows for each in parts]),
+            means=np.vstack([each.means for each in parts]),
+            counts=np.sum([each.counts for each in parts], axis=0),
+            products=np.sum([each.products for each in parts], axis=0),
         )
 
 
@@ -218,7 +252,7 @@ class RestrictedLikelihood:
         self._rows, self._counts = logs.rows, logs.counts
         self._means, self._products = logs.means, logs.products.copy()
         # Only the residual's own squares count at scales that the delayed currents explain.
-        fast = 2.0 ** np.arange(1, SCALES + 1) < CURVE_FROM_S * rate_hz
+        fast = np.arange(SCALES) < fast_scales(rate_hz)
         self._products[fast, :-1, :] = 0.0
         self._products[fast, :, :-1] = 0.0
         # Relative to the prior mean.
@@ -373,12 +407,11 @@ def describe_error(
         Rate of the rows.
     """
     mean_c = float(np.mean(np.concatenate([log.temperature_c for log in logs])))
-    equations = error_equations(logs, mean_c, resistance_ohm)
+    parts = [error_equations(log, mean_c, resistance_ohm, rate_hz) for log in logs]
     residual_v = np.concatenate([log.residual_v for log in logs])
-    rms_v = float(np.sqrt(np.mean(residual_v**2)))
     return describe_error_of(
-        equations,
-        rms_v=rms_v,
+        ErrorEquations.of_all(parts),
+        rms_v=float(np.sqrt(np.mean(residual_v**2))),
         mean_c=mean_c,
         ocv_v=ocv_v,
         resistance_ohm=resistance_ohm,
@@ -386,22 +419,31 @@ def describe_error(
     )
 
 
+def fast_scales(rate_hz: float) -> int:
+    """Return the number of scales that say nothing of the curve (`CURVE_FROM_S`)."""
+    return int(np.sum(2.0 ** np.arange(1, SCALES + 1) < CURVE_FROM_S * rate_hz))
+
+
 def error_equations(
-    logs: Sequence[LogResidual], mean_c: float, resistance_ohm: Sequence[float]
+    log: LogResidual, mean_c: float, resistance_ohm: Sequence[float], rate_hz: float
 ) -> ErrorEquations:
-    """Return the normal equations that the error model is estimated from.
+    """Return the normal equations that the error model is estimated from, of one log.
 
     Parameters
     ----------
-    logs : sequence of LogResidual
+    log : LogResidual
     mean_c : float
         Mean temperature of all logs [°C].
     resistance_ohm : sequence of float
         Rj [Ω], negative.
+    rate_hz : float
+        Rate of the rows.
     """
-    return ErrorEquations.of_tables(
-        [np.column_stack([_columns(log, mean_c, resistance_ohm), log.residual_v]) for log in logs]
+    blocks = (
+        stacked_columns(_columns(part, mean_c, resistance_ohm), part.residual_v)
+        for part in map(log.part, row_blocks(len(log.residual_v)))
     )
+    return ErrorEquations.of_blocks(blocks, 2 ** fast_scales(rate_hz))
 
 
 def describe_error_of(
@@ -527,9 +569,9 @@ def _columns(log: LogResidual, mean_c: float, resistance_ohm: Sequence[float]) -
     soc = np.clip(log.soc_pct, KNOTS_PCT[0], KNOTS_PCT[-1])
     at = np.clip(np.searchsorted(KNOTS_PCT, soc, side="right") - 1, 0, KNOTS_PCT.size - 2)
     part = (soc - KNOTS_PCT[at]) / (KNOTS_PCT[at + 1] - KNOTS_PCT[at])
-    hats = np.zeros((soc.size, KNOTS_PCT.size))
+    hats = np.zeros((KNOTS_PCT.size, soc.size)).T
     row = np.arange(soc.size)
     hats[row, at], hats[row, at + 1] = 1.0 - part, part
     warmer_k = log.temperature_c - mean_c
     drop_v = log.delayed_current_a @ np.array(resistance_ohm)
-    return np.column_stack([hats, warmer_k, warmer_k * drop_v, log.delayed_current_a])
+    return stacked_columns(hats, warmer_k, warmer_k * drop_v, log.delayed_current_a)

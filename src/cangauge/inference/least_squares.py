@@ -14,17 +14,18 @@ kt a zero-mean prior, weighted against the data with the residual's variance per
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import clarabel
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.linalg import lapack
 
 from cangauge._typing import FloatArray
 from cangauge.errors import CangaugeError
-from cangauge.inference.time_scales import SCALES, haar_transform
+from cangauge.inference.time_scales import SCALES
 
 SINGULAR = 1e-11
 """Singular values below this, relative to the largest, are truncated."""
@@ -121,6 +122,31 @@ def solve(
         constrained=constrained,
         back=back,
     )
+
+
+def triangular_factor(tables: Iterable[FloatArray]) -> FloatArray:
+    """Return R of the QR decomposition of tables below each other, which need not fit in memory.
+
+    Parameters
+    ----------
+    tables : iterable of arrays of shape (m, p)
+
+    Returns
+    -------
+    array of shape (p, p)
+        Filled up with rows of zeros if there are fewer rows than columns.
+    """
+    root: FloatArray | None = None
+    for table in tables:
+        kept = 0 if root is None else len(root)
+        stacked = np.zeros((max(kept + len(table), table.shape[1]), table.shape[1]), order="F")
+        if root is not None:
+            stacked[:kept] = root
+        stacked[kept : kept + len(table)] = table
+        root = np.triu(lapack.dgeqrf(stacked, overwrite_a=True)[0][: table.shape[1]])
+    if root is None:
+        raise ValueError("no table is given")
+    return root
 
 
 def nearest_rising(
@@ -260,40 +286,6 @@ class KtPrior:
 
 
 def kt_prior(
-    columns: FloatArray,
-    residual_v: FloatArray,
-    volts: FloatArray,
-    lengths: Sequence[int],
-    kt: int,
-) -> KtPrior:
-    """Return the prior on kt with the information that the logs hold on it.
-
-    Parameters
-    ----------
-    columns : array of shape (n, p)
-        Design matrix; rows of all logs, each in order of time.
-    residual_v, volts : array of shape (n,)
-        Residual of plain least squares, and measured voltage [V].
-    lengths : sequence of int
-        Number of rows of each log.
-    kt : int
-        Index of the temperature column.
-    """
-    ends = np.cumsum(lengths)[:-1]
-    table = np.column_stack([columns, residual_v])
-    transforms = [haar_transform(item, SCALES) for item in np.split(table, ends) if len(item)]
-    by_scale = [np.vstack([each[j] for each in transforms]) for j in range(SCALES)]
-    return kt_prior_by_scale(
-        columns,
-        by_scale,
-        [len(item) for item in by_scale],
-        kt,
-        nominal_v=float(np.median(volts)),
-        residual_std_v=float(np.sqrt(np.mean(residual_v**2))),
-    )
-
-
-def kt_prior_by_scale(
     columns: FloatArray,
     by_scale: Sequence[FloatArray],
     counts: Sequence[int],

@@ -54,7 +54,23 @@ BLOCK_S, BLOCK_GUARD_S = 240.0, 60.0
 BLOCK_FOLDS = 5
 """One block in this number is held out in turn."""
 
+BLOCK_ROWS = 1 << 14
+"""Rows of a block that is held with all its columns: 16,384 of 32 columns take 4 MiB, and it is the
+longest stretch of the error model's time scales."""
+
 Mask = NDArray[np.bool_]
+
+
+def row_blocks(rows: int) -> Iterator[slice]:
+    """Yield the blocks of so many rows, in order."""
+    for start in range(0, rows, BLOCK_ROWS):
+        yield slice(start, min(start + BLOCK_ROWS, rows))
+
+
+def stacked_columns(*parts: FloatArray) -> FloatArray:
+    """Return arrays of shape (n, k) or (n,) beside each other; each column is contiguous."""
+    table = np.vstack([part.T for part in parts])
+    return np.asarray(table.T)
 
 
 @dataclass(frozen=True)
@@ -92,6 +108,18 @@ class FitRows:
     def __len__(self) -> int:
         """Return the number of rows."""
         return int(self.time_s.size)
+
+    def part(self, keep: slice | Mask | NDArray[np.intp]) -> FitRows:
+        """Return some of the rows."""
+        return replace(
+            self,
+            time_s=self.time_s[keep],
+            voltage_v=self.voltage_v[keep],
+            temperature_c=self.temperature_c[keep],
+            dequantized_c=self.dequantized_c[keep],
+            soc_pct=self.soc_pct[keep],
+            delayed_current_a=self.delayed_current_a[keep],
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,22 +185,26 @@ def fit_rows(
             cure="check --capacity-ah, the SoC at the start (soc_pct, --initial-soc) and the sign"
             " of current (positive must discharge; see `cangauge inspect`)",
         )
-    keep, removed = usable_rows(log, delay_s, options.rate_hz, gap_s)
-    if keep.size < 2:
+    indices, removed = usable_rows(log, delay_s, options.rate_hz, gap_s)
+    if indices.size < 2:
         raise InputError(
             f"no rows are left for the fit: the log lasts {log.duration_s:.0f} s, and the first"
             f" {max(delay_s):.0f} s, and as long after each gap, fill the delay line",
             source=source,
             cure="give a longer log",
         )
+    first, last = int(indices[0]), int(indices[-1])
+    # Of consecutive rows nothing is copied.
+    keep = slice(first, last + 1) if last - first + 1 == indices.size else indices
+    time_s = log.time_s[keep]
     return FitRows(
         name=log.name,
-        time_s=log.time_s[keep],
+        time_s=time_s,
         voltage_v=log.voltage_v[keep],
         temperature_c=log.temperature_c[keep],
         dequantized_c=dequantize(log).temperature_c[keep],
         soc_pct=soc[keep],
-        delayed_current_a=delayed_currents(log.time_s, log.current_a, delay_s, log.time_s[keep]),
+        delayed_current_a=delayed_currents(log.time_s, log.current_a, delay_s, time_s),
         removed=removed,
     )
 

@@ -35,30 +35,80 @@ def haar_transform(columns: FloatArray, scales: int = SCALES) -> list[FloatArray
         `scales` arrays of shape (n_j, k) with Σ n_j = n. The transform is orthonormal: sums of
         squares and products are those of the rows.
     """
-    parts: list[list[FloatArray]] = [[] for _ in range(scales)]
-    sums, size, last = columns, 1, 1  # of stretches of `size` rows; the last one may be shorter
-    while len(sums) > 1:
-        pairs = len(sums) // 2
-        left, right = sums[: 2 * pairs : 2], sums[1 : 2 * pairs : 2]
-        differences = left - right
-        differences /= np.sqrt(2.0 * size)
-        is_odd = len(sums) % 2 == 1
-        full = pairs if is_odd or last == size else pairs - 1
-        parts[min(size.bit_length() - 1, scales - 1)].append(differences[:full])
-        if full < pairs:
-            gain = np.sqrt(size * last / (size + last))
-            scale = int(np.rint(np.log2(size + last))) - 1
-            shorter = gain * (left[-1:] / size - right[-1:] / last)
-            parts[min(scale, scales - 1)].append(shorter)
-        added = np.empty((pairs + is_odd, *columns.shape[1:]))
-        np.add(left, right, out=added[:pairs])
-        added[pairs:] = sums[2 * pairs :]
-        sums = added
-        last = last if is_odd else size + last
-        size *= 2
-    parts[-1].append(sums / np.sqrt(columns.shape[0]))  # the mean
-    none = columns[:0]
-    return [np.concatenate(part) if len(part) > 1 else [*part, none][0] for part in parts]
+    transform = HaarBlocks(scales)
+    parts = [transform.add(columns), transform.end()]
+    return [np.concatenate(of_scale) for of_scale in zip(*parts, strict=True)]
+
+
+class HaarBlocks:
+    """Haar transform of columns that come in blocks of rows, in order of time.
+
+    The coefficients are those of `haar_transform` of all rows: stretches of a block end with it.
+
+    Parameters
+    ----------
+    scales : int
+        Number of scales.
+    finest : int
+        Rows of the shortest stretches that are compared, a power of two: the coefficients of
+        shorter ones are left out.
+    """
+
+    def __init__(self, scales: int, finest: int = 1) -> None:
+        self._scales, self._finest = scales, finest
+        self._sums: list[FloatArray] = []
+        self._rows = self._size = self._last = 0
+
+    def add(self, block: FloatArray) -> list[FloatArray]:
+        """Return the coefficients within a block, one array of shape (n_j, k) per scale.
+
+        Parameters
+        ----------
+        block : array of shape (m, k)
+            m is the same power of two in every block but the last, at least `finest`.
+        """
+        rows, size = len(block), self._finest
+        sums, last = block, 1
+        if size > 1:
+            sums = np.add.reduceat(block, np.arange(0, rows, size), axis=0)
+            last = rows - size * (len(sums) - 1)
+        parts, total = self._compare(sums, size, last)
+        self._size = self._size or rows
+        self._last, self._rows = rows, self._rows + rows
+        self._sums.append(total)
+        return parts
+
+    def end(self) -> list[FloatArray]:
+        """Return the coefficients between blocks; the last row of the last scale is the mean."""
+        parts, total = self._compare(np.concatenate(self._sums), self._size, self._last)
+        parts[-1] = np.concatenate((parts[-1], total / np.sqrt(self._rows)))
+        return parts
+
+    def _compare(
+        self, sums: FloatArray, size: int, last: int
+    ) -> tuple[list[FloatArray], FloatArray]:
+        """Return coefficients and total of stretches of `size` rows, the last one of `last`."""
+        parts: list[list[FloatArray]] = [[sums[:0]] for _ in range(self._scales)]
+        while len(sums) > 1:
+            pairs = len(sums) // 2
+            left, right = sums[: 2 * pairs : 2], sums[1 : 2 * pairs : 2]
+            differences = left - right
+            differences /= np.sqrt(2.0 * size)
+            is_odd = len(sums) % 2 == 1
+            full = pairs if is_odd or last == size else pairs - 1
+            parts[min(size.bit_length() - 1, self._scales - 1)].append(differences[:full])
+            if full < pairs:
+                gain = np.sqrt(size * last / (size + last))
+                scale = int(np.rint(np.log2(size + last))) - 1
+                shorter = gain * (left[-1:] / size - right[-1:] / last)
+                parts[min(scale, self._scales - 1)].append(shorter)
+            added = np.empty((pairs + is_odd, *sums.shape[1:]))
+            np.add(left, right, out=added[:pairs])
+            added[pairs:] = sums[2 * pairs :]
+            sums = added
+            last = last if is_odd else size + last
+            size *= 2
+        return [part[-1] if len(part) == 2 else np.concatenate(part) for part in parts], sums
 
 
 def scale_variances(

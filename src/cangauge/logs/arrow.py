@@ -8,7 +8,7 @@ schema or a column that repeats the word; it is omitted when unknown.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -123,7 +123,7 @@ def draft_from_table(
     Parameters
     ----------
     table : pyarrow.Table
-        Holds at least the columns of `places`.
+        Holds at least the columns of `places`; anything with `num_rows`, `schema` and `column`.
     places : mapping of str to int
         Index in `names` by canonical field.
     names : sequence of str
@@ -206,7 +206,12 @@ def _as_float64(column: Any, label: str, where: str) -> FloatArray:
             value=str(column.type),
             cure="store it as floating point",
         ) from error
-    return cast("FloatArray", np.asarray(numbers.to_numpy(), dtype=np.float64))
+    return np.array(numbers.to_numpy())  # of its own, so that the table can be freed
+
+
+def free_unused() -> None:
+    """Return to the system what pyarrow keeps of freed tables: as much as a long log."""
+    pa.default_memory_pool().release_unused()
 
 
 def _plain(column: Any) -> Any:

@@ -6,7 +6,8 @@ both.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from cangauge.logs.arrow import (
     is_text,
 )
 from cangauge.logs.column_map import ColumnMap
-from cangauge.logs.columns import read_columns
+from cangauge.logs.columns import read_columns, read_plain_numbers
 from cangauge.logs.draft import DraftLog
 from cangauge.logs.file_content import FileContent, delimiter_of, split_cells
 from cangauge.logs.formats import BDF_LABELS
@@ -45,8 +46,7 @@ def read_parquet(content: FileContent) -> DraftLog:
         If it is damaged, lacks a column or holds anything but numbers.
     """
     source = str(content.path)
-    data = pa.BufferReader(content.read())
-    try:
+    with content.open_seekable() as data, _damage_as_input_error(source):
         file = _open_parquet(data)
         schema = file.schema_arrow
         names = schema.names
@@ -59,14 +59,39 @@ def read_parquet(content: FileContent) -> DraftLog:
         if texts:
             # As dictionaries: a long text repeated in millions of rows is small in the file only.
             file = _open_parquet(data, *texts)
-        table = file.read(columns=[names[index] for index in places.values()])
-        table.validate(full=True)  # damaged indices may exceed a dictionary
+        columns = _ParquetColumns(file)
+        return draft_from_table(columns, places, names, name=content.name, source=source)
+
+
+@contextmanager
+def _damage_as_input_error(source: str) -> Iterator[None]:
+    try:
+        yield
     except (pa.ArrowException, OSError, ValueError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise InputError(
             f"the Parquet file is cut off or damaged ({reason})", source=source, cure="export again"
         ) from error
-    return draft_from_table(table, places, names, name=content.name, source=source)
+
+
+class _ParquetColumns:
+    """The part of a pyarrow.Table that a canonical log needs: one column is held at a time."""
+
+    def __init__(self, file: Any) -> None:
+        self._file = file
+        self.num_rows, self.schema = file.metadata.num_rows, file.schema_arrow
+
+    def column(self, name: str) -> Any:
+        """Read a column.
+
+        Raises
+        ------
+        ValueError
+            If it is damaged.
+        """
+        table = self._file.read(columns=[name])
+        table.validate(full=True)  # damaged indices may exceed a dictionary
+        return table.column(0)
 
 
 def read_any_parquet(content: FileContent, given: ColumnMap | None) -> DraftLog:
@@ -78,8 +103,7 @@ def read_any_parquet(content: FileContent, given: ColumnMap | None) -> DraftLog:
         If it is damaged, or a column is not found or does not hold its quantity.
     """
     source = str(content.path)
-    data = pa.BufferReader(content.read())
-    try:
+    with content.open_seekable() as data, _damage_as_input_error(source):
         file = _open_parquet(data)
         _check_size(file.metadata, source)
         schema = file.schema_arrow
@@ -92,11 +116,6 @@ def read_any_parquet(content: FileContent, given: ColumnMap | None) -> DraftLog:
             return table
 
         return draft_of_arrow(schema.names, given, name=content.name, source=source, read=read)
-    except (pa.ArrowException, OSError, ValueError) as error:
-        reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise InputError(
-            f"the Parquet file is cut off or damaged ({reason})", source=source, cure="export again"
-        ) from error
 
 
 def _open_parquet(data: Any, *dictionaries: str) -> Any:
@@ -143,13 +162,18 @@ def read_csv(content: FileContent) -> DraftLog:
     delimiter = delimiter_of(line) or ","
     header = split_cells(line, delimiter)
     places = find_fields(header, str(content.path))
-    columns = read_columns(
-        content,
-        places,
-        header=header,
-        delimiter=delimiter,
-        skip_lines=content.head.index(line) + 1,
-    )
+    layout: dict[str, Any] = {
+        "header": header,
+        "delimiter": delimiter,
+        "skip_lines": content.head.index(line) + 1,
+    }
+    plain = None if SOURCE in places else read_plain_numbers(content, places, **layout)
+    if plain is not None:
+        labels = {field: header[index] for field, index in places.items()}
+        draft = DraftLog(content.name, str(content.path), plain, labels)
+        describe(draft, pa.array([], pa.string()), header)
+        return draft
+    columns = read_columns(content, places, **layout)
     values = {field: columns.numbers(field) for field in places if field != SOURCE}
     draft = DraftLog(content.name, str(content.path), values, columns.label)
     describe(draft, columns.text.get(SOURCE, pa.array([], pa.string())), header)

@@ -107,6 +107,8 @@ class DraftLog:
         self._set_temperature(temperature_c)
         self._check_missing()
         self._check_time()
+        for values in self.values.values():
+            values.flags.writeable = False  # the log need not copy them
         self.remarks.extend(refuse_wrong_units(self.values, source=self._where, labels=self.labels))
         return {
             **self.values,

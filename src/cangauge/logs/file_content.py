@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 import struct
 import zipfile
 import zlib
@@ -11,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, BinaryIO, Final, cast
 
 from cangauge._io import (
     MAX_LOG_BYTES,
@@ -33,6 +34,8 @@ _MDF: Final = (b"MDF     ", b"UnFinMF ")
 _DELIMITERS: Final = ("\t", ";", ",")
 _HEAD_BYTES: Final = 64 * 1024
 _HEAD_LINES: Final = 160
+_PIECE_BYTES: Final = 4 << 20
+_UTF16: Final = (b"\xff\xfe", b"\xfe\xff")
 _MAGIC_BYTES: Final = 64
 MAX_WORKBOOK_TEXTS: Final = 64 << 20
 """Distinct texts of a workbook [bytes]: all are held in memory, and a log holds numbers."""
@@ -107,6 +110,32 @@ class FileContent:
         with self._open() as file:
             data = read_all(file, self.path, MAX_LOG_BYTES, "a log")
         return data if self.is_parquet else _as_utf8(data)
+
+    @contextmanager
+    def open_seekable(self) -> Iterator[BinaryIO]:
+        """Open the unpacked content: a plain file itself, which is then not held in memory."""
+        with self._open() as file:
+            if file.seekable() and os.fstat(file.fileno()).st_size <= MAX_LOG_BYTES:
+                yield file
+            else:
+                yield io.BytesIO(read_all(file, self.path, MAX_LOG_BYTES, "a log"))
+
+    def read_pieces(self) -> Iterator[bytes]:
+        """Yield a text in pieces of whole lines; the whole of a workbook's or a UTF-16 text."""
+        if self._sheet is not None or b"\0" in self.magic or self.magic[:2] in _UTF16:
+            yield self.read()
+            return
+        rest = b""
+        with self._open() as file:
+            while piece := file.read(_PIECE_BYTES):
+                end = piece.rfind(b"\n") + 1
+                if end:
+                    yield rest + piece[:end]
+                    rest = piece[end:]
+                else:
+                    rest += piece
+        if rest:
+            yield rest
 
     @contextmanager
     def _open(self) -> Iterator[io.BufferedReader]:
@@ -239,7 +268,7 @@ def _only_member(archive: zipfile.ZipFile, path: Path) -> zipfile.ZipInfo:
 
 def _as_utf8(data: bytes) -> bytes:
     data = data.removeprefix(b"\xef\xbb\xbf")
-    if data[:2] in {b"\xff\xfe", b"\xfe\xff"}:  # "Unicode text" of spreadsheets
+    if data[:2] in _UTF16:  # "Unicode text" of spreadsheets
         return data.decode("utf-16", errors="replace").encode()
     nul = data[:_HEAD_BYTES].count(0)
     for first, codec in ((1, "utf-16-le"), (0, "utf-16-be")):  # without a BOM: every second byte

@@ -62,9 +62,13 @@ def discharged_ah(
     step_s : array of shape (n − 1,), optional
         `counted_steps_s` of the times, where they are known.
     """
-    step_s = counted_steps_s(time_s) if step_s is None else step_s
-    step_ah = (current_a[1:] + current_a[:-1]) * step_s / 7200.0
-    return np.concatenate(([0.0], np.cumsum(step_ah)))
+    total_ah = np.zeros(time_s.size)
+    step_ah = total_ah[1:]  # in place: a log may have millions of rows
+    np.add(current_a[1:], current_a[:-1], out=step_ah)
+    step_ah *= counted_steps_s(time_s) if step_s is None else step_s
+    step_ah /= 7200.0
+    np.cumsum(step_ah, out=step_ah)
+    return total_ah
 
 
 def uncounted_gaps(time_s: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.intp]]:

@@ -86,9 +86,10 @@ class LogFile:
         log = Log(**draft.checked(temperature_c))
         if temperature_source is not None:
             log = replace(log, temperature_source=temperature_source)
-        return resolve_sign(
-            log, stored_sign_unknown=draft.sign_unknown, is_stated=self.sign is not None
-        )
+        is_stated = self.sign is not None
+        log = resolve_sign(log, stored_sign_unknown=draft.sign_unknown, is_stated=is_stated)
+        arrow.free_unused()
+        return log
 
 
 def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:

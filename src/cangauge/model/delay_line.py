@@ -33,7 +33,10 @@ def delayed_currents(
         Times t [s] to evaluate at.
     """
     at = np.asarray(at_s, dtype=np.float64)
-    return np.column_stack([np.interp(at - delay, time_s, current_a) for delay in delay_s])
+    delayed = np.empty((at.size, len(delay_s)))
+    for column, delay in zip(delayed.T, delay_s, strict=True):
+        column[:] = np.interp(at - delay, time_s, current_a)
+    return delayed
 
 
 def filled_at(

@@ -381,8 +381,11 @@ def soc_from_ocv(model: Curve, ocv_v: float, guess_pct: float = 50.0) -> Inverse
     return Inverse(soc, inside=True)
 
 
-INVERTED_AT_ONCE = 1 << 16
+INVERTED_AT_ONCE = 1 << 14
 """Voltages inverted together: bounds the memory of `socs_from_ocv`."""
+
+INVERSE_POINTS = 4001
+"""Points of the curve between which the first guess is interpolated: two steps follow, not four."""
 
 
 def socs_from_ocv(model: VoltageModel, ocv_v: FloatArray) -> FloatArray:
@@ -400,17 +403,23 @@ def socs_from_ocv(model: VoltageModel, ocv_v: FloatArray) -> FloatArray:
 
 
 def _roots(model: VoltageModel, ocv_v: FloatArray) -> FloatArray:
-    grid = np.linspace(0.0, 100.0, SLOPE_POINTS)
-    soc = np.interp(ocv_v, model.pseudo_ocv(grid), grid)
+    grid = np.linspace(0.0, 100.0, INVERSE_POINTS)
+    curve_v = model.pseudo_ocv(grid)
+    found = np.where(ocv_v <= curve_v[0], 0.0, np.where(ocv_v >= curve_v[-1], 100.0, np.nan))
+    at = np.flatnonzero((ocv_v > curve_v[0]) & (ocv_v < curve_v[-1]))
+    target = ocv_v[at]
+    soc = np.interp(target, curve_v, grid)
     low, high = np.zeros_like(soc), np.full_like(soc, 100.0)
-    empty_v, full_v = model.pseudo_ocv([0.0, 100.0])
     for _ in range(STEPS_AT_MOST):
-        error = model.pseudo_ocv(soc) - ocv_v
+        error = model.pseudo_ocv(soc) - target
         high, low = np.where(error > 0.0, soc, high), np.where(error > 0.0, low, soc)
         following = soc - error / model.pseudo_ocv_slope(soc)
         is_bracketed = (low < following) & (following < high)
         following = np.where(is_bracketed, following, 0.5 * (low + high))
-        moved, soc = np.abs(following - soc), following
-        if np.all(moved < TOLERANCE_PCT):
+        moves = np.abs(following - soc) >= TOLERANCE_PCT
+        found[at] = following
+        if not moves.any():
             break
-    return np.where(ocv_v <= empty_v, 0.0, np.where(ocv_v >= full_v, 100.0, soc))
+        at, target, soc = at[moves], target[moves], following[moves]
+        low, high = low[moves], high[moves]
+    return found
