@@ -1,6 +1,6 @@
 """Smallest fault that a diagnosis can see, against the number of healthy logs of the fleet.
 
-    python benchmarks/fleet_detection.py [--references 1 3 10 30 100 300 1000] [--plot FILE]
+    python benchmarks/fleet_detection.py [--references 1 3 10 30 100 300 1000] [--figure FILE]
 
 Simulated vehicles of one type, each with its own capacity and resistance; healthy logs of unseen
 vehicles are diagnosed, one each. First with a model of ten logs and a growing number of references,
@@ -18,11 +18,6 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-
-from bokeh.embed import file_html
-from bokeh.palettes import Category10
-from bokeh.plotting import figure
-from bokeh.resources import INLINE
 
 from cangauge.diagnosis import diagnose, learn_references
 from cangauge.identify.fit import fit
@@ -46,7 +41,7 @@ def main() -> None:
     parser.add_argument("--models", type=int, nargs="*", default=[])
     parser.add_argument("--tested", type=int, default=TESTED, help="vehicles that are diagnosed")
     parser.add_argument("--json", type=Path, help="file of the sizes, a row for each number")
-    parser.add_argument("--plot", type=Path, help="file of the plot (HTML)")
+    parser.add_argument("--figure", type=Path, metavar="FILE", help="draw them (PNG)")
     options = parser.parse_args()
     scenario = draw_scenario(SEED, climate="mild")
     tested = [vehicle_logs(scenario, 10_000 + k, 1, HOURS)[0] for k in range(options.tested)]
@@ -58,8 +53,8 @@ def main() -> None:
         rows.append({"references": number, **row})
         if options.json:
             options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
-    if options.plot:
-        _plot(rows, options.plot)
+    if options.figure:
+        draw(rows, options.figure)
     references = _healthy(scenario, REFERENCES, 5000)
     for number in options.models:
         _row(f"model of {number} logs", tested, _model(scenario, number), references)
@@ -105,20 +100,28 @@ def _row(
     return row
 
 
-def _plot(rows: Sequence[dict[str, float]], path: Path) -> None:
+def draw(rows: Sequence[dict[str, float]], path: Path) -> None:
     """Draw the smallest visible sizes over the number of references."""
-    drawn = figure(
-        width=720, height=420, x_axis_type="log", y_axis_type="log",
-        x_axis_label="references, each of another vehicle",
-        y_axis_label="smallest visible size [% of the physical range]",
-    )  # fmt: skip
+    import matplotlib as mpl  # noqa: PLC0415 - of the extra `figures`
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt  # noqa: PLC0415
+
+    chart, axes = plt.subplots(figsize=(8, 4.4), dpi=110)
     numbers = [row["references"] for row in rows]
-    for name, colour in zip(SHOWN, Category10[len(SHOWN)], strict=True):
-        label = name.replace("_", " ")
-        drawn.line(numbers, [row[name] for row in rows], color=colour, legend_label=label)
-        drawn.scatter(numbers, [row[name] for row in rows], color=colour)
-    drawn.legend.location = "bottom_left"
-    path.write_text(file_html(drawn, INLINE, "Detection by number of references"), encoding="utf-8")
+    for name in SHOWN:
+        axes.plot(numbers, [row[name] for row in rows], marker="o", label=name.replace("_", " "))
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlabel("references, each of another vehicle")
+    axes.set_ylabel("smallest visible size [% of physical range]")
+    for axis, ticks in ((axes.xaxis, numbers), (axes.yaxis, (2, 5, 10, 20, 50, 100))):
+        axis.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
+        axis.minorticks_off()
+    axes.grid(alpha=0.3)
+    axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
+    chart.tight_layout()
+    chart.savefig(path)
 
 
 def _median(values: Sequence[float]) -> float:
