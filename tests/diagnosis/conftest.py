@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 import pytest
 from days import day, short_day
 
-from cangauge.diagnosis import problem as problem_module
+from cangauge.diagnosis import references as references_module
 from cangauge.diagnosis.error_model import error_from_references
 from cangauge.diagnosis.hypotheses import Hypotheses
 from cangauge.diagnosis.linear_gaussian import ErrorModel, NormalEquations
@@ -67,5 +67,5 @@ def error_models() -> Iterator[None]:
         return known[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(problem_module, "error_from_references", estimate)
+        patch.setattr(references_module, "error_from_references", estimate)
         yield

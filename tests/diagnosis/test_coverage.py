@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cangauge.diagnosis.problem import BEYOND_WEIGHT, soc_weight, temperatures_covered
+from cangauge.diagnosis.references import BEYOND_WEIGHT, soc_weight, temperatures_covered
 from cangauge.model.effects.base import Pack
 from cangauge.model.effects.library import LIBRARY, candidates
 

@@ -9,7 +9,8 @@ import pytest
 
 from cangauge.diagnosis import diagnose
 from cangauge.diagnosis.design_matrix import design_matrix
-from cangauge.diagnosis.problem import build_problem, with_wider_range
+from cangauge.diagnosis.problem import build_problem
+from cangauge.diagnosis.references import with_wider_range
 from cangauge.diagnosis.verdict import decide
 from cangauge.identify.fit import fit
 from cangauge.inference.linearized import residual

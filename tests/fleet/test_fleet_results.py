@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.dataset as pds
 import pytest
 
@@ -18,6 +19,8 @@ from cangauge.fleet.jobs import REAL, EstimateJob
 from cangauge.fleet.overview import FleetOverview
 from cangauge.fleet.run import perform, run_id
 from cangauge.fleet.sources import FleetLog, ReadOptions
+from cangauge.logs.canonical import write_log
+from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.report.fleet import fleet_page, fleet_report
 from report_html import Html
@@ -169,20 +172,34 @@ def test_references_come_from_all_vehicles(logs: list[FleetLog], model: Model) -
         suspect_and_healthy(logs, 1)
 
 
-def test_a_vehicle_is_diagnosed_with_references_of_others(
+def test_a_vehicle_without_own_references_has_the_common_ones(
     logs: list[FleetLog], model: Model, tmp_path: Path
 ) -> None:
     broken = tmp_path / "broken.csv"
     broken.write_text("x\n")
     suspect = {"car1": (logs[3], FleetLog(str(broken), "car1", "s"))}
-    healthy = {"car2": (logs[5],)}
-    job = GapJob(ReadOptions(), model, references=1)
+    dead = tmp_path / "dead.parquet"
+    still = read_log(logs[6].url)
+    write_log(replace(still, current_a=np.zeros(len(still))), dead)
+    healthy = {"car2": (logs[5],), "car3": (logs[7], FleetLog(str(dead), "car3", "s"))}
+    job = GapJob(ReadOptions(), model, references=3).with_common(suspect, healthy)
     (vehicle,) = job.vehicles(suspect, healthy)
-    row = perform(job, vehicle, "", None).row
+    assert len(job.common) == 3
+    assert not vehicle.references
+    row = perform(job.prepared(), vehicle, "", None).row
     assert row is not None
-    assert (row["references"], row["reference_vehicles"]) == (1, 1)
+    assert (row["references"], row["reference_vehicles"]) == (2, 2)
     assert row["unread"][0].startswith(str(broken))
-    assert 0.0 <= row["probability_none"] <= 1.0
+    assert "constant" in row["unread"][1]
+
+
+def test_nothing_is_learned_for_vehicles_with_own_references(
+    logs: list[FleetLog], model: Model
+) -> None:
+    suspect, healthy = {"car1": (logs[3],)}, {"car1": (logs[4],), "car2": (logs[5],)}
+    job = GapJob(ReadOptions(), model).with_common(suspect, healthy)
+    assert job.common == ()
+    assert job.prepared() is job
 
 
 def test_the_page_says_which_vehicle_has_which_gap() -> None:

@@ -261,7 +261,7 @@ def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
         ),
     ] = None,
     references: Annotated[
-        int, typer.Option(metavar="N", help="References of a diagnosis at most.")
+        int, typer.Option(metavar="N", help="References at most of vehicles without own ones.")
     ] = FLEET_REFERENCES,
     latest: Annotated[
         int, typer.Option(metavar="N", help="Latest logs of a vehicle, diagnosed together.")
@@ -280,7 +280,8 @@ def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
 ) -> None:
     """Diagnose each vehicle against references of the whole fleet.
 
-    Its own healthy logs come first, then one of each other vehicle in turn.
+    Its own healthy logs come first, then one of each other vehicle in turn, 30 at most. Vehicles
+    without healthy logs of their own have N common references, which are learned from once.
 
     Examples
     --------
@@ -299,7 +300,8 @@ def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
     suspect, good = suspect_and_healthy(
         [*found, *(replace(log, healthy=True) for log in known)], latest
     )
-    job = GapJob(_read_options(reading), Model.load(model), references, alarm)
+    options = _read_options(reading)
+    job = GapJob(options, Model.load(model), references, alarm).with_common(suspect, good)
     _run(job, job.vehicles(suspect, good), out, cluster, report, json_output=json_output)
 
 

@@ -8,7 +8,8 @@ Modules, in the order in which a diagnosis uses them:
 
 ==================  ==============================================================================
 diagnose            `diagnose` and its result, `Diagnosis`
-problem             checked logs, hypotheses, error model and coverage: the basis of the verdict
+problem             checked logs, linearised: the basis of the verdict
+references          what references show of healthy logs: error, structure, coverage
 input_checks        errors for logs of another pack, dead channels, duplicates; removes outliers
 hypotheses          candidate effects: cause, shared structure, per-log effects
 design_matrix       sensitivity of a log's voltage residual to every amplitude
@@ -46,6 +47,7 @@ from cangauge.diagnosis.error_breakdown import (
 from cangauge.diagnosis.next_test import design_of
 from cangauge.diagnosis.posterior import NONE, UNKNOWN
 from cangauge.diagnosis.problem import DiagnosisProblem, build_problem
+from cangauge.diagnosis.references import LearnedReferences, learn_references
 from cangauge.diagnosis.verdict import ALARM_BELOW, Ceiling, Verdict, decide
 
 __all__ = [
@@ -61,6 +63,7 @@ __all__ = [
     "DiagnosisProblem",
     "ErrorMap",
     "ErrorShare",
+    "LearnedReferences",
     "LogErrors",
     "SegmentSignals",
     "Verdict",
@@ -70,6 +73,7 @@ __all__ = [
     "design_of",
     "diagnose",
     "error_map",
+    "learn_references",
     "rms",
     "segment_signals",
 ]

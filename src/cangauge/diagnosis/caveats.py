@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cangauge.diagnosis.error_breakdown import REST_C_RATE
-from cangauge.diagnosis.problem import COVERED_K, COVERED_PCT
+from cangauge.diagnosis.references import COVERED_K, COVERED_PCT
 from cangauge.inference.rows import SampledLog
 from cangauge.logs.gaps import bridge_s
 from cangauge.logs.log import TemperatureSource

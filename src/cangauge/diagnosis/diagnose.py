@@ -30,7 +30,6 @@ from cangauge.diagnosis.cross_validation import (
     rms,
     soc_mae_pct,
 )
-from cangauge.diagnosis.design_matrix import DesignMatrix
 from cangauge.diagnosis.error_breakdown import (
     ErrorShare,
     LogErrors,
@@ -51,9 +50,11 @@ from cangauge.diagnosis.posterior import (
     UNKNOWN,
 )
 from cangauge.diagnosis.problem import DiagnosisProblem, build_problem
+from cangauge.diagnosis.references import LearnedReferences
 from cangauge.diagnosis.verdict import ALARM_BELOW, Verdict, decide
 from cangauge.errors import InputError
 from cangauge.inference.linearized import residual
+from cangauge.inference.rows import SampledLog
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 
@@ -172,8 +173,8 @@ class Diagnosis:
         """Limits of what these logs can show, whatever the verdict; one or two sentences each."""
         problem = self.problem
         fits = [
-            (matrix.sampled.log.name, rms(errors))
-            for matrix, errors in zip(problem.references, problem.reference_errors_v, strict=True)
+            (sampled.log.name, rms(errors))
+            for sampled, errors in zip(problem.references, problem.reference_errors_v, strict=True)
         ]
         stated_v = self.model.noise.voltage_rmse_v
         worse = ""
@@ -185,7 +186,7 @@ class Diagnosis:
             reference_fit_caveat(fits, stated_v, problem.given.pack.voltage_v),
             *log_caveats(
                 [matrix.sampled for matrix in problem.diagnosed],
-                [matrix.sampled for matrix in problem.references],
+                problem.references,
                 problem.model.capacity_ah,
                 problem.temperature_source,
             ),
@@ -215,14 +216,14 @@ class Diagnosis:
     def _inputs(self) -> dict[str, Any]:
         """Return what was compared: model, logs and references, with the hashes of their files."""
 
-        def described(matrices: Sequence[DesignMatrix]) -> list[dict[str, Any]]:
-            logs = [matrix.sampled.log for matrix in matrices]
+        def described(sampled: Sequence[SampledLog]) -> list[dict[str, Any]]:
+            logs = [each.log for each in sampled]
             return [{"name": log.name, "sha256": file_sha256(log.source)} for log in logs]
 
         text = self.model.to_json().encode()
         return {
             "model": {"name": self.model.name, "sha256": hashlib.sha256(text).hexdigest()},
-            "logs": described(self.problem.diagnosed),
+            "logs": described([matrix.sampled for matrix in self.problem.diagnosed]),
             "references": described(self.problem.references),
         }
 
@@ -285,7 +286,7 @@ class Diagnosis:
 def diagnose(
     logs: Sequence[Log],
     model: Model,
-    references: Sequence[Log] = (),
+    references: Sequence[Log] | LearnedReferences = (),
     *,
     leave_out: Sequence[str] = (),
     initial_soc_pct: float | None = None,
@@ -299,9 +300,10 @@ def diagnose(
         Logs with a gap, which share one cause; at least 10 min each.
     model : Model
         Model of this pack, from `fit` or a model file.
-    references : sequence of Log
+    references : sequence of Log, or LearnedReferences
         Logs on which the model is good, at least three for reliable probabilities. They show the
         error to expect without a cause. The start of one without SoC is found from its voltage.
+        For many diagnoses with the same references: what `learn_references` returns.
     leave_out : sequence of str
         Effects to leave out of the library.
     initial_soc_pct : float, optional

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,8 @@ from cangauge.diagnosis.hypotheses import Hypotheses, prior_precision
 from cangauge.diagnosis.linear_gaussian import (
     ErrorModel,
     NormalEquations,
+    SharedEquations,
+    each_left_out,
     inverse,
     log_gaussian_integral,
     log_likelihood,
@@ -128,7 +130,10 @@ def error_from_references(
     stated_counts = STATED_LOGS * counts / len(references) + 1e-9
     for _ in range(EM_ROUNDS):
         squares = [
-            _left_out_squares_v2(hypotheses, references, k, error) for k in range(len(references))
+            _left_out_squares_v2(hypotheses, log, others, error)
+            for log, others in zip(
+                references, each_left_out(hypotheses, references, error), strict=True
+            )
         ]
         variance = (np.sum(squares, axis=0) + stated_counts * stated_v2) / (counts + stated_counts)
         error = replace(
@@ -142,19 +147,26 @@ def error_from_references(
     return replace(error, per_log_std=_per_log_by_effect(hypotheses, references, error))
 
 
-def with_overdispersion(
+@dataclass(frozen=True, eq=False)
+class HealthyEvidence:
+    """Evidence for each effect on each of n references, diagnosed with the others."""
+
+    ratios: dict[str, FloatArray]
+    """Squared evidence relative to that expected by chance, by effect, shape (n,)."""
+    mean_squares_v2: FloatArray
+    """Mean square error, per-log effects included, shape (n,) [V²]."""
+    excess: tuple[float, ...]
+    """Excess chi-square of each (`bayes_factors.excess_chi_square`)."""
+
+
+def healthy_evidence(
     hypotheses: Hypotheses,
     references: Sequence[NormalEquations],
     error: ErrorModel,
-    weights: Sequence[float],
     diagnosed: Sequence[NormalEquations],
-) -> ErrorModel:
-    """Return the error model with the overdispersion of each effect's evidence.
-
-    Structure that the model lacks resembles an effect, more on one day than on another. Each
-    reference is diagnosed with the others as references. The mean of an effect's squared evidence,
-    relative to that expected by chance, divides the effect's evidence (quasi-likelihood: McCullagh,
-    Nelder, Generalized Linear Models, 2nd ed. 1989, ch. 9).
+    further: SharedEquations | None = None,
+) -> HealthyEvidence:
+    """Return the evidence for each effect on references, which have none.
 
     Parameters
     ----------
@@ -163,12 +175,11 @@ def with_overdispersion(
         At least two.
     error : ErrorModel
         From `error_from_references`.
-    weights : sequence of float
-        Weight of each reference.
     diagnosed : sequence of NormalEquations
         The same references as they count when diagnosed.
+    further : SharedEquations, optional
+        Of references that are not diagnosed.
     """
-    weight = np.array(weights)
     columns = hypotheses.reference_columns
     size = len(hypotheses.structure)
     subset = replace(
@@ -179,8 +190,8 @@ def with_overdispersion(
     )
     ratios: dict[str, list[float]] = {}
     mean_squares, excess = [], []
-    for number, log in enumerate(diagnosed):
-        others = [other for k, other in enumerate(references) if k != number]
+    all_others = each_left_out(subset, references, error, further)
+    for log, others in zip(diagnosed, all_others, strict=True):
         posterior = marginalize(subset, others, [log], error)
         without = marginalize(subset, others, [], error)
         mean_squares.append(mean_square_v2(subset, log, without.mean))
@@ -192,19 +203,43 @@ def with_overdispersion(
             chance = float(np.trace(np.linalg.solve(total, curvature)))
             square = float(gradient @ np.linalg.solve(total, gradient))
             ratios.setdefault(candidate.effect.id, []).append(square / max(chance, 1e-9))
+    # All shapes of the first reference, then of the next.
+    shape = (len(references), -1)
+    by_effect = {name: np.reshape(seen, shape).mean(axis=1) for name, seen in ratios.items()}
+    return HealthyEvidence(by_effect, np.array(mean_squares), tuple(excess))
+
+
+def with_overdispersion(
+    error: ErrorModel, healthy: HealthyEvidence, weights: Sequence[float]
+) -> ErrorModel:
+    """Return the error model with the overdispersion of each effect's evidence.
+
+    Structure that the model lacks resembles an effect, more on one day than on another. The mean of
+    an effect's squared evidence on references, relative to that expected by chance, divides the
+    effect's evidence (quasi-likelihood: McCullagh, Nelder, Generalized Linear Models, 2nd ed. 1989,
+    ch. 9).
+
+    Parameters
+    ----------
+    error : ErrorModel
+    healthy : HealthyEvidence
+    weights : sequence of float
+        Weight of each reference.
+    """
+    weight = np.array(weights)
     few = 1.0 + FEW_REFERENCES / float(weight.sum())
-    overdispersion = {}
-    for effect_id, seen in ratios.items():  # all shapes of the first reference, then of the next
-        each = np.reshape(seen, (len(references), -1)).mean(axis=1)
-        overdispersion[effect_id] = max(1.0, few * float(np.average(each, weights=weight)))
+    overdispersion = {
+        name: max(1.0, few * float(np.average(each, weights=weight)))
+        for name, each in healthy.ratios.items()
+    }
     # A model with some errors has others too. The median, since a large deviation of one effect is
     # no evidence on another.
     usual = float(np.median([*overdispersion.values()]))
     return replace(
         error,
         overdispersion={name: max(value, usual) for name, value in overdispersion.items()},
-        reference_v2=float(np.average(mean_squares, weights=weight)),
-        reference_excess=tuple(excess),
+        reference_v2=float(np.average(healthy.mean_squares_v2, weights=weight)),
+        reference_excess=healthy.excess,
     )
 
 
@@ -357,18 +392,16 @@ def _per_log_groups(hypotheses: Hypotheses) -> list[NDArray[np.intp]]:
 
 def _left_out_squares_v2(
     hypotheses: Hypotheses,
-    references: Sequence[NormalEquations],
-    number: int,
+    log: NormalEquations,
+    rest: SharedEquations,
     error: ErrorModel,
 ) -> FloatArray:
-    """Return the expected squared errors of one reference given the others, shape (SCALES,)."""
-    rest = [log for k, log in enumerate(references) if k != number]
+    """Return the expected squared errors of one reference given the rest, shape (SCALES,)."""
     others = marginalize(hypotheses, rest, [], error)
     shared, per_log = others.mean.size, hypotheses.reference_layout.per_log
     prior = np.zeros((shared + per_log.size, shared + per_log.size))
     prior[:shared, :shared] = others.precision
     prior[per_log, per_log] = np.array(error.per_log_std) ** -2.0
-    log = references[number]
     weighted = log.weighted(error)
     centre = np.concatenate((others.mean, np.zeros(per_log.size)))
     precision = prior + weighted[:-1, :-1]

@@ -143,16 +143,12 @@ def _with_structure_of(problem: DiagnosisProblem, structure: tuple[int, ...]) ->
     """
     before = problem.hypotheses
     hypotheses = replace(before, structure=structure)
-    at = [before.reference_columns.index(k) for k in hypotheses.reference_columns]
-    columns = before.reference_amplitudes(at)
     return replace(
         problem,
         hypotheses=hypotheses,
-        references=tuple(
-            replace(matrix, effects=tuple(matrix.effects[k] for k in at))
-            for matrix in problem.references
+        reference_equations=problem.reference_equations.columns(
+            before.shared_amplitudes(structure)
         ),
-        reference_equations=tuple(log.columns(columns) for log in problem.reference_equations),
     )
 
 

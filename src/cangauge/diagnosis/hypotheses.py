@@ -168,13 +168,13 @@ class Hypotheses:
         """Candidates with columns in the references: shared structure, then per-log effects."""
         return (*self.structure, *self.per_log)
 
-    def reference_amplitudes(self, kept: Sequence[int]) -> Indices:
-        """Return a reference's columns with only some of `reference_columns`, by their place."""
-        p, widths = self.column_scale.size, np.diff(self.offsets)[list(self.reference_columns)]
+    def shared_amplitudes(self, structure: Sequence[int]) -> Indices:
+        """Return the places of a solution, and the residual's, with some of the structure only."""
+        p, widths = self.column_scale.size, np.diff(self.offsets)[list(self.structure)]
         first = p + np.concatenate(([0], np.cumsum(widths)))
-        parts = [np.arange(first[k], first[k + 1]) for k in kept]
-        states = first[-1] + np.arange(len(PER_LOG_STATES) + 1)  # and the residual
-        return np.concatenate([np.arange(p), *parts, states]).astype(np.intp)
+        at = [self.structure.index(k) for k in structure]
+        parts = [np.arange(first[k], first[k + 1]) for k in at]
+        return np.concatenate([np.arange(p), *parts, first[-1:]]).astype(np.intp)
 
     def amplitudes_of(self, chosen: Sequence[int]) -> Indices:
         """Return the amplitude indices of some candidates."""

@@ -16,8 +16,8 @@ The error is correlated in time: products are formed for each time scale of a Ha
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,7 +100,7 @@ class NormalEquations:
 
     def columns(self, kept: NDArray[np.intp]) -> NormalEquations:
         """Return the products of some columns."""
-        return NormalEquations(self.products[:, kept[:, None], kept], self.counts)
+        return NormalEquations(self.products.take(kept, 1).take(kept, 2), self.counts)
 
     def inflated(self, factor: float) -> NormalEquations:
         """Return the products for an error variance `factor` times as large."""
@@ -152,6 +152,33 @@ class NormalEquations:
         block = self.weighted(error)[np.ix_(layout.per_log, layout.per_log)] * std * std[:, None]
         block[np.diag_indices(std.size)] += 1.0
         return std, np.linalg.cholesky(block)
+
+
+@dataclass(frozen=True, eq=False)
+class SharedEquations:
+    """Normal equations of the shared amplitudes from logs without an effect; they add up.
+
+    The per-log amplitudes are integrated out, by the error model that they were formed with.
+    """
+
+    products: FloatArray
+    """Of the shared columns and the residual, shape (shared + 1, shared + 1) [-]."""
+    log_det: float
+    """ln det of the error's variances and of the per-log amplitudes' precision over their prior."""
+    logs: int
+
+    def __add__(self, other: SharedEquations) -> SharedEquations:
+        """Return the equations of the logs of both."""
+        log_det = self.log_det + other.log_det
+        return SharedEquations(self.products + other.products, log_det, self.logs + other.logs)
+
+    def columns(self, kept: NDArray[np.intp]) -> SharedEquations:
+        """Return the equations without some of the shared amplitudes."""
+        return replace(self, products=self.products[np.ix_(kept, kept)])
+
+
+References = Sequence[NormalEquations] | SharedEquations
+"""Logs without an effect, each or their sum."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,9 +274,45 @@ class ExchangedColumns:
         return NormalEquations(products, self._given.counts)
 
 
-def marginalize(
+def shared_equations(
+    hypotheses: Hypotheses, references: References, error: ErrorModel
+) -> SharedEquations:
+    """Return the sum of the references' equations of the shared amplitudes."""
+    if isinstance(references, SharedEquations):
+        return references
+    layout = hypotheses.reference_layout
+    total, log_det = np.zeros((layout.kept.size, layout.kept.size)), 0.0
+    for log in references:
+        products, per_log_det = log.marginal(error, layout)
+        total += products
+        log_det += per_log_det + float(log.counts @ np.log(error.scale_v2))
+    return SharedEquations(total, log_det, len(references))
+
+
+def each_left_out(
     hypotheses: Hypotheses,
     references: Sequence[NormalEquations],
+    error: ErrorModel,
+    further: SharedEquations | None = None,
+) -> Iterator[SharedEquations]:
+    """Yield the sum of all references but one, for each in order; of `further` ones in any case.
+
+    The sum before it plus the sum after it: a difference from the sum of all would lose digits.
+    """
+    each = [shared_equations(hypotheses, [log], error) for log in references]
+    none = shared_equations(hypotheses, [], error)
+    after = [none if further is None else further]
+    for item in reversed(each[1:]):
+        after.append(item + after[-1])
+    before = none
+    for item in each:
+        yield before + after.pop()
+        before += item
+
+
+def marginalize(
+    hypotheses: Hypotheses,
+    references: References,
     diagnosed: Sequence[NormalEquations],
     error: ErrorModel,
 ) -> Posterior:
@@ -258,14 +321,16 @@ def marginalize(
     Parameters
     ----------
     hypotheses : Hypotheses
-    references, diagnosed : sequence of NormalEquations
-        Logs without and with the tested effect.
+    references : sequence of NormalEquations, or SharedEquations
+        Logs without the tested effect; a sum of them is by its own error model.
+    diagnosed : sequence of NormalEquations
+        Logs with it.
     error : ErrorModel
     """
     amplitudes = int(hypotheses.offsets[-1])
-    of_references, _ = _of_references(hypotheses, references, error)
-    precision, right = of_references[:-1, :-1].copy(), of_references[:-1, -1].copy()
-    chi_square = float(of_references[-1, -1])
+    known = shared_equations(hypotheses, references, error)
+    precision, right = known.products[:-1, :-1].copy(), known.products[:-1, -1].copy()
+    chi_square = float(known.products[-1, -1])
     cross = np.zeros((right.size, amplitudes))
     curvature, gradient = np.zeros((amplitudes, amplitudes)), np.zeros(amplitudes)
     layout = hypotheses.diagnosed_layout
@@ -279,8 +344,8 @@ def marginalize(
         curvature += products[np.ix_(effects, effects)]
         gradient += products[effects, -1]
     chi_square += _add_priors(precision, right, hypotheses, error)
-    if references and diagnosed and hypotheses.structure:
-        healthy = marginalize(hypotheses, references, [], error).mean
+    if known.logs and diagnosed and hypotheses.structure:
+        healthy = marginalize(hypotheses, known, [], error).mean
         chi_square += _hold_structure(precision, right, hypotheses, healthy)
     solved = _solved(precision, np.column_stack([right, cross]) if diagnosed else right[:, None])
     mean, sensitivity = solved[:, 0], solved[:, 1:] if diagnosed else cross
@@ -294,19 +359,6 @@ def marginalize(
         sensitivity=sensitivity,
         precision=precision,
     )
-
-
-def _of_references(
-    hypotheses: Hypotheses, references: Sequence[NormalEquations], error: ErrorModel
-) -> tuple[FloatArray, float]:
-    """Return the references' products of the shared columns and the residual, and their ln det."""
-    layout = hypotheses.reference_layout
-    total, log_det = np.zeros((layout.kept.size, layout.kept.size)), 0.0
-    for log in references:
-        products, per_log_det = log.marginal(error, layout)
-        total += products
-        log_det += per_log_det + float(log.counts @ np.log(error.scale_v2))
-    return total, log_det
 
 
 def _solved(precision: FloatArray, right: FloatArray) -> FloatArray:
@@ -325,13 +377,12 @@ def inverse(precision: FloatArray) -> FloatArray:
     return np.asarray(balanced * balance * balance[:, None])
 
 
-def log_likelihood(
-    hypotheses: Hypotheses, references: Sequence[NormalEquations], error: ErrorModel
-) -> float:
+def log_likelihood(hypotheses: Hypotheses, references: References, error: ErrorModel) -> float:
     """Return the log marginal likelihood of the references, up to a constant."""
-    products, log_det = _of_references(hypotheses, references, error)
-    precision, right = products[:-1, :-1], products[:-1, -1]
-    squares = float(products[-1, -1]) + _add_priors(precision, right, hypotheses, error)
+    known = shared_equations(hypotheses, references, error)
+    precision, right = known.products[:-1, :-1].copy(), known.products[:-1, -1].copy()
+    squares, log_det = float(known.products[-1, -1]), known.log_det
+    squares += _add_priors(precision, right, hypotheses, error)
     log_det -= float(np.sum(np.log(structure_precision(hypotheses, error))))
     return log_gaussian_integral(precision, right) - 0.5 * (squares + log_det)
 

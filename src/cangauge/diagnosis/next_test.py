@@ -34,8 +34,9 @@ from cangauge.diagnosis.posterior import (
     evidence_of,
     posterior_of,
 )
-from cangauge.diagnosis.problem import DiagnosisProblem, sampled_for_diagnosis
+from cangauge.diagnosis.problem import DiagnosisProblem
 from cangauge.diagnosis.profiles import Limits, Profile, library_of_tests
+from cangauge.diagnosis.references import sampled_for_diagnosis
 from cangauge.diagnosis.verdict import Verdict
 from cangauge.logs.log import Log
 
@@ -233,8 +234,8 @@ def design_of(problem: DiagnosisProblem, log: Log) -> DesignMatrix:
 
 
 def _profiles(problem: DiagnosisProblem, limits: Limits) -> list[Profile]:
-    known = problem.references or problem.diagnosed
-    usual_c = float(np.median(np.concatenate([m.sampled.rows.temperature_c for m in known])))
+    known = problem.references or [matrix.sampled for matrix in problem.diagnosed]
+    usual_c = float(np.median(np.concatenate([each.rows.temperature_c for each in known])))
     lead_s = max(problem.options.delay_s)
     return library_of_tests(limits, problem.model.pack, usual_c=usual_c, lead_s=lead_s)
 

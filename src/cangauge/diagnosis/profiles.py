@@ -71,7 +71,8 @@ class Limits:
         Beyond that the error of the model is not known, so that a test there shows little. Without
         references it is what the diagnosed logs show.
         """
-        logs = [each.sampled.rows for each in problem.references or problem.diagnosed]
+        sampled = problem.references or [matrix.sampled for matrix in problem.diagnosed]
+        logs = [each.rows for each in sampled]
         usual = (RARE, 1.0 - RARE)
         current = np.concatenate([rows.delayed_current_a[:, 0] for rows in logs])
         soc = np.quantile(np.concatenate([rows.soc_pct for rows in logs]), usual)

@@ -12,7 +12,7 @@ references are no less probable than under the first one.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,10 +24,13 @@ from cangauge.diagnosis.hypotheses import Hypotheses
 from cangauge.diagnosis.linear_gaussian import (
     ErrorModel,
     NormalEquations,
+    References,
+    SharedEquations,
     constrained_mode,
     log_likelihood,
     marginalize,
     normal_equations,
+    shared_equations,
     structure_precision,
     with_change,
 )
@@ -50,22 +53,24 @@ MAX_STEPS = 3
 
 @dataclass(frozen=True, eq=False)
 class ReferenceModel:
-    """Model as the references know it, and the references linearised about it."""
+    """Model as the references know it, and their equations about it."""
 
     model: ExtendedModel
     """With their coefficients, without their structure."""
     structured: ExtendedModel | None
     """With both; None if its pseudo-OCV would not rise."""
     hypotheses: Hypotheses
-    matrices: tuple[DesignMatrix, ...]
-    equations: tuple[NormalEquations, ...]
+    total: SharedEquations
+    """Of all references."""
+    equations: tuple[NormalEquations, ...] = ()
+    """Of each; empty where only the sum is kept."""
 
 
 def learn_structure(
     references: Sequence[SampledLog],
     model: ExtendedModel,
     hypotheses: Hypotheses,
-    equations: Sequence[NormalEquations],
+    equations: SharedEquations,
     error: ErrorModel,
 ) -> ReferenceModel:
     """Learn coefficients and structure from the references.
@@ -76,45 +81,40 @@ def learn_structure(
     model : ExtendedModel
         Model as given.
     hypotheses : Hypotheses
-    equations : sequence of NormalEquations
+    equations : SharedEquations
         Of the references, linearised about `model`.
     error : ErrorModel
     """
     target, best = log_likelihood(hypotheses, equations, error) - MIN_LOG_GAIN, -np.inf
     # Coefficients first: with too small a kt in the columns, a temperature rise is overestimated.
-    start = ReferenceModel(model, None, hypotheses, (), tuple(equations))
+    start = ReferenceModel(model, None, hypotheses, equations)
     moved, about = _with_coefficients(start, error)
-    matrices = reference_matrices(references, moved, about)
-    last = found = ReferenceModel(moved, None, about, (), reference_equations(matrices, about))
-    del matrices
+    last = found = replace(_linearized(references, moved, None, about, error), equations=())
     for left in reversed(range(MAX_STEPS)):
         step = _step(references, last, error)
-        probability = log_likelihood(step.hypotheses, step.equations, error)
+        probability = log_likelihood(step.hypotheses, step.total, error)
         if probability >= target or (probability > best and left == 0):
             return step
-        last = replace(step, matrices=())
-        del step  # one set of matrices takes hundreds of megabytes with long references
+        last = replace(step, equations=())
+        del step  # the products of each reference take ten megabytes
         if probability > best:
             found, best = last, probability
-    matrices = reference_matrices(references, found.model, found.hypotheses, found.structured)
-    return replace(found, matrices=matrices)
+    return _linearized(references, found.model, found.structured, found.hypotheses, error)
 
 
 def _step(
     references: Sequence[SampledLog], last: ReferenceModel, error: ErrorModel
 ) -> ReferenceModel:
     """Solve for coefficients and structure with columns about the last solution."""
-    structured = _structured(last.model, last.hypotheses, last.equations, error)
+    structured = _structured(last.model, last.hypotheses, last.total, error)
     model, hypotheses = _with_coefficients(last, error)
-    matrices = reference_matrices(references, model, hypotheses, structured)
-    equations = reference_equations(matrices, hypotheses)
-    return ReferenceModel(model, structured, hypotheses, matrices, equations)
+    return _linearized(references, model, structured, hypotheses, error)
 
 
 def _with_coefficients(last: ReferenceModel, error: ErrorModel) -> tuple[ExtendedModel, Hypotheses]:
     """Return the model with the references' coefficients, and the hypotheses about it."""
     hypotheses = last.hypotheses
-    posterior = marginalize(hypotheses, last.equations, [], error)
+    posterior = marginalize(hypotheses, last.total, [], error)
     solution, _ = constrained_mode(posterior, last.model.model, [])
     change = solution[: hypotheses.column_scale.size]
     voltage_model = with_change(last.model.model, change)
@@ -131,7 +131,7 @@ def _with_coefficients(last: ReferenceModel, error: ErrorModel) -> tuple[Extende
 def _structured(
     model: ExtendedModel,
     hypotheses: Hypotheses,
-    references: Sequence[NormalEquations],
+    references: References,
     error: ErrorModel,
 ) -> ExtendedModel | None:
     """Return the model with the references' coefficients and needed structure, or None."""
@@ -160,7 +160,7 @@ def _structured(
 
 
 def select_structure(
-    hypotheses: Hypotheses, references: Sequence[NormalEquations], error: ErrorModel
+    hypotheses: Hypotheses, references: References, error: ErrorModel
 ) -> tuple[int, ...]:
     """Return the pieces of structure that the references need, most needed first.
 
@@ -246,28 +246,42 @@ def _spans(hypotheses: Hypotheses) -> list[tuple[int, int]]:
     return list(itertools.pairwise(ends.tolist()))
 
 
-def reference_matrices(
-    references: Sequence[SampledLog],
+def reference_matrix(
+    reference: SampledLog,
     model: ExtendedModel,
     hypotheses: Hypotheses,
     structured: ExtendedModel | None = None,
-) -> tuple[DesignMatrix, ...]:
-    """Return the references' design matrices, with the columns `Hypotheses.reference_columns`."""
+) -> DesignMatrix:
+    """Return a reference's design matrix, with the columns `Hypotheses.reference_columns`."""
     columns = hypotheses.reference_columns
     unique = tuple(dict.fromkeys(columns))
-    at = [unique.index(k) for k in columns]
-    found = []
-    for item in references:
-        candidates = candidates_for(hypotheses.candidates, model.pack, item)
-        found.append(design_matrix(item, model, [candidates[k] for k in unique], structured))
-    return tuple(replace(matrix, effects=tuple(matrix.effects[k] for k in at)) for matrix in found)
+    candidates = candidates_for(hypotheses.candidates, model.pack, reference)
+    matrix = design_matrix(reference, model, [candidates[k] for k in unique], structured)
+    return replace(matrix, effects=tuple(matrix.effects[unique.index(k)] for k in columns))
 
 
 def reference_equations(
-    matrices: Sequence[DesignMatrix], hypotheses: Hypotheses
-) -> tuple[NormalEquations, ...]:
-    """Return the references' normal equations."""
-    return tuple(reference_normal_equations(matrix, hypotheses) for matrix in matrices)
+    references: Iterable[SampledLog],
+    model: ExtendedModel,
+    hypotheses: Hypotheses,
+    structured: ExtendedModel | None = None,
+) -> Iterator[NormalEquations]:
+    """Yield each reference's normal equations; one design matrix is in memory at a time."""
+    for item in references:
+        matrix = reference_matrix(item, model, hypotheses, structured)
+        yield reference_normal_equations(matrix, hypotheses)
+
+
+def _linearized(
+    references: Sequence[SampledLog],
+    model: ExtendedModel,
+    structured: ExtendedModel | None,
+    hypotheses: Hypotheses,
+    error: ErrorModel,
+) -> ReferenceModel:
+    equations = tuple(reference_equations(references, model, hypotheses, structured))
+    total = shared_equations(hypotheses, equations, error)
+    return ReferenceModel(model, structured, hypotheses, total, equations)
 
 
 def reference_normal_equations(

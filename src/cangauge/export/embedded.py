@@ -30,6 +30,7 @@ from cangauge.model.model_file import Model
 
 EMBEDDED: Final = (
     "Makefile", "example.c", "test.c", "clock.h", "startup.c", "mps2.ld",
+    "foxbms_soc.c", "foxbms_soc.h",
 )  # fmt: skip
 
 PERIOD_S: Final = 0.1

@@ -2,22 +2,31 @@
 
 What healthy vehicles of a type have in common, and how much their errors differ, is learned from
 references of many vehicles. A vehicle's own healthy logs come first, since they show its own pack;
-the others follow, one of each vehicle in turn.
+the others follow, one of each vehicle in turn. Vehicles without healthy logs of their own have the
+same references: what these show is learned once, and a diagnosis then takes no longer with more.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, islice, zip_longest
 from pathlib import Path
-from typing import Any, ClassVar, Final, cast
+from typing import Any, ClassVar, Final, Self, cast
 
 import pyarrow as pa
 
 from cangauge._io import text_sha256
-from cangauge.diagnosis import ALARM_BELOW, NONE, UNKNOWN, Diagnosis, diagnose
+from cangauge.diagnosis import (
+    ALARM_BELOW,
+    NONE,
+    UNKNOWN,
+    Diagnosis,
+    LearnedReferences,
+    diagnose,
+    learn_references,
+)
 from cangauge.errors import InputError
 from cangauge.fleet.jobs import COUNT, REAL, TEXT, Job
 from cangauge.fleet.sources import FleetLog, local_file
@@ -25,8 +34,12 @@ from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 
 REFERENCES: Final = 30
-"""References of a diagnosis by default: each takes a second and 40 MB; more gain little (see
-docs/fleet.md)."""
+"""References of a diagnosis by default; more gain little, and learning from a hundred takes 1.8 GB
+(see docs/fleet.md)."""
+
+WITH_OWN: Final = 30
+"""References at most of a vehicle that has healthy logs of its own, or whose logs lie beyond the
+common references: they are learned from for this vehicle alone, in half a second each."""
 
 LOGS: Final = 3
 """Latest logs of a vehicle that are diagnosed together by default."""
@@ -43,7 +56,7 @@ class VehicleLogs(FleetLog):
     logs : tuple of FleetLog
         Logs to diagnose.
     references : tuple of FleetLog
-        Logs without a fault, its own first.
+        Logs without a fault, its own first; empty: those of the job.
     """
 
     logs: tuple[FleetLog, ...] = ()
@@ -62,11 +75,20 @@ class GapJob(Job):
         Largest number of references of a diagnosis.
     alarm_below : float
         Probability of `none` up to which a fault is reported.
+    common : tuple of FleetLog
+        References of every vehicle without healthy logs of its own.
+    learned : LearnedReferences, optional
+        From these.
+    unread : tuple of str
+        Those that could not be used, with the reason.
     """
 
     model: Model
     references: int = REFERENCES
     alarm_below: float = ALARM_BELOW
+    common: tuple[FleetLog, ...] = ()
+    learned: LearnedReferences | None = None
+    unread: tuple[str, ...] = ()
 
     kind: ClassVar[str] = "gap"
     of: ClassVar[str] = "vehicles"
@@ -85,6 +107,35 @@ class GapJob(Job):
         model = self.model.to_json()
         return {"model": model, "references": self.references, "alarm": self.alarm_below}
 
+    def with_common(
+        self,
+        suspect: Mapping[str, tuple[FleetLog, ...]],
+        healthy: Mapping[str, tuple[FleetLog, ...]],
+    ) -> Self:
+        """Return the job with the references of vehicles without own ones, if there are any."""
+        if all(vehicle in healthy for vehicle in suspect):
+            return self
+        return replace(self, common=tuple(islice(_in_turn(healthy), self.references)))
+
+    def prepared(self) -> Self:
+        """Return the job with what the common references show."""
+        if not self.common:
+            return self
+        unread: list[str] = []
+        logs = list(self._read(self.common, unread))
+        while logs:
+            try:
+                learned = learn_references(logs, self.model)
+            except InputError as error:
+                left = [log for log in logs if error.source not in {log.source, log.name}]
+                if len(left) == len(logs):
+                    raise
+                unread.append(str(error))
+                logs = left
+            else:
+                return replace(self, learned=learned, unread=tuple(unread))
+        raise InputError(f"no reference can be used: {unread[0]}", field="--reference")
+
     def vehicles(
         self,
         suspect: Mapping[str, tuple[FleetLog, ...]],
@@ -93,24 +144,26 @@ class GapJob(Job):
         """Return each vehicle with its logs and references; its stamp is that of all of these.
 
         References are the vehicle's own healthy logs, at most half, then one of each other vehicle
-        in turn.
+        in turn; or the common ones.
 
         Parameters
         ----------
         suspect, healthy : mapping of str to tuple of FleetLog
             Logs to diagnose, and logs without a fault, by vehicle.
         """
-        shuffled = {name: sorted(logs, key=_order) for name, logs in healthy.items()}
-        by_order = sorted(shuffled.values(), key=lambda logs: _order(logs[0]))
-        in_turn = [log for log in chain(*zip_longest(*by_order)) if log is not None]
+        most = min(self.references, WITH_OWN)
+        in_turn = list(_in_turn(healthy))
         found = []
         for vehicle, logs in sorted(suspect.items()):
-            tested = {log.url for log in logs}
-            own = shuffled.get(vehicle, [])[: max(self.references // 2, 1)]
-            others = (log for log in in_turn if log.vehicle != vehicle)
-            usable = (log for log in chain(own, others) if log.url not in tested)
-            chosen = tuple(islice(usable, self.references))
-            text = "".join(f"{each.url}{each.stamp}{each.stated}" for each in (*logs, *chosen))
+            chosen: tuple[FleetLog, ...] = ()
+            if vehicle in healthy:
+                tested = {log.url for log in logs}
+                own = sorted(healthy[vehicle], key=_order)[: max(most // 2, 1)]
+                others = (log for log in in_turn if log.vehicle != vehicle)
+                usable = (log for log in chain(own, others) if log.url not in tested)
+                chosen = tuple(islice(usable, most))
+            read = (*logs, *(chosen or self.common))
+            text = "".join(f"{each.url}{each.stamp}{each.stated}" for each in read)
             stamp = text_sha256(text)[:16]
             found.append(VehicleLogs(vehicle, vehicle, stamp, logs=logs, references=chosen))
         return found
@@ -123,12 +176,19 @@ class GapJob(Job):
         logs = list(self._read(vehicle.logs, unread))
         if not logs:
             raise InputError(f"none of its logs can be read: {unread[0]}")
-        references = list(self._read(vehicle.references, unread))
+        of = vehicle.references or self.common
+        references: list[Log] | LearnedReferences
+        if not vehicle.references and self.learned is not None and self.learned.covers(logs):
+            references = self.learned
+            unread += self.unread
+        else:
+            of = of[:WITH_OWN]
+            references = list(self._read(of, unread))
         found = diagnose(logs, self.model, references, alarm_below=self.alarm_below)
         return {
             "logs": [each.url for each in vehicle.logs],
-            "references": len(references),
-            "reference_vehicles": len({each.vehicle for each in vehicle.references}),
+            "references": len(found.problem.references),
+            "reference_vehicles": len({each.vehicle for each in of}),
             "unread": unread,
             **_columns_of(found),
         }
@@ -173,6 +233,13 @@ def _columns_of(found: Diagnosis) -> dict[str, Any]:
         "summary": found.summary,
         "limits": found.caveats,
     }
+
+
+def _in_turn(healthy: Mapping[str, tuple[FleetLog, ...]]) -> Iterator[FleetLog]:
+    """Yield one healthy log of each vehicle in turn; logs and vehicles are shuffled."""
+    shuffled = [sorted(logs, key=_order) for logs in healthy.values()]
+    by_order = sorted(shuffled, key=lambda logs: _order(logs[0]))
+    return (log for log in chain(*zip_longest(*by_order)) if log is not None)
 
 
 def _order(log: FleetLog) -> str:

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, Self
 
 import numpy as np
 import pyarrow as pa
@@ -66,6 +66,10 @@ class Job(ABC):
         if self.is_chained:
             given = f"{before}{given}"
         return text_sha256(given)[:16]
+
+    def prepared(self) -> Self:
+        """Return the job with what all its rows share, computed once on a worker."""
+        return self
 
     @abstractmethod
     def identity(self) -> dict[str, Any]:

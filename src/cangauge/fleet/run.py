@@ -237,14 +237,15 @@ class _Run:
         self.touched: list[FleetLog] = []
         self._job, self._dataset, self._client = job, dataset, client
         self._id = run_id(job)
-        self._lanes: Iterator[_Lane] = iter(self._to_do(logs))
+        self._to_do = self._lanes_of(logs)
+        self._lanes = iter(self._to_do)
         self._in_flight: dict[str, _Lane] = {}
         self._rows: list[dict[str, Any]] = []
         self._bad: list[dict[str, Any]] = []
         self._flushed = self._reported = self._asked = self.began
         self._threads = 0
 
-    def _to_do(self, logs: Sequence[FleetLog]) -> list[_Lane]:
+    def _lanes_of(self, logs: Sequence[FleetLog]) -> list[_Lane]:
         known = self._dataset.known(self._id, *self._job.resumes_with)
         lanes: dict[str, _Lane] = {}
         for log in logs:
@@ -265,8 +266,10 @@ class _Run:
     def compute(self) -> None:
         from distributed import as_completed  # noqa: PLC0415 - an extra
 
+        if not self._to_do:
+            return
         # A task, not scattered data: it is computed again if its worker is lost.
-        job = self._client.submit(_identity, self._job, key=f"job-{self._id}")
+        job = self._client.submit(_prepared, self._job, key=f"job-{self._id}")
         done = as_completed(loop=self._client.loop, with_results=True, raise_errors=False)
         if not self._ask_workers():
             _LOG.info("waiting for workers")
@@ -376,8 +379,8 @@ def _valid_for(row: dict[str, Any] | None, log: FleetLog) -> str:
     return str(row["sha256"])
 
 
-def _identity(job: Job) -> Job:
-    return job
+def _prepared(job: Job) -> Job:
+    return job.prepared()
 
 
 def perform(job: Job, log: FleetLog, known_sha256: str, state: str | None) -> Outcome:

@@ -81,7 +81,7 @@ def gap_page(
     """Return the report's content (see `gap_report`); `figures` holds the bokeh figures."""
     problem = diagnosis.problem
     logs = [matrix.sampled.log for matrix in problem.diagnosed]
-    references = [matrix.sampled.log for matrix in problem.references]
+    references = [sampled.log for sampled in problem.references]
     errors = diagnosis.log_errors()
     extended = _extended_name(diagnosis)
     places = share_figures(diagnosis.error_breakdown)
@@ -330,12 +330,13 @@ def _compared(diagnosis: Diagnosis) -> Table:
     """Return the diagnosed logs and the references with ranges, error and hash."""
     problem = diagnosis.problem
     rows = []
-    for role, matrices, errors in (
-        ("log", problem.diagnosed, problem.diagnosed_errors_v),
+    diagnosed = [matrix.sampled for matrix in problem.diagnosed]
+    for role, logs, errors in (
+        ("log", diagnosed, problem.diagnosed_errors_v),
         ("reference", problem.references, problem.reference_errors_v),
     ):
-        for matrix, error_v in zip(matrices, errors, strict=True):
-            log, seen = matrix.sampled.log, matrix.sampled.rows
+        for sampled, error_v in zip(logs, errors, strict=True):
+            log, seen = sampled.log, sampled.rows
             file = InputFile.of_path(role, log.name, log.source)
             rows.append(
                 [
