@@ -7,6 +7,7 @@
 #include <stddef.h>
 
 #include "cangauge_internal.h"
+#include "python_health.h"
 
 #ifndef CG_SOURCES
 #define CG_SOURCES "" /* digest of the sources that this was built from */
@@ -118,6 +119,16 @@ static const field STATE[] = {
 #define OF cg_lag
 static const field LAG[] = {
     REAL(time_s), REAL(input), REAL(value), FLAG(is_started), END,
+};
+#undef OF
+
+#define OF health
+static const field HEALTH[] = {
+    REAL(seconds), REAL(away_s), REAL(discharged_pct), REAL(moved_pct), REAL(gap_var_pct2),
+    FLAG(is_started), REAL(sum_v), REAL(sum_drop_v), REAL(window_s), COUNT(ticks),
+    LIST(block, HEALTH_BLOCK), LIST(waiting, 2 * HEALTH_SCALES), LIST(sums, 4 * HEALTH_SCALES),
+    REAL(soc_pct), REAL(gain), REAL(offset_a), REAL(pct_per_as), REAL(full_window_s),
+    REAL(full_block_s), REAL(memory_s), END,
 };
 #undef OF
 
@@ -245,6 +256,7 @@ typedef struct {
     cg_model model;
     cg_skew *skew;
     cg_current *storage;
+    health health;
     PyObject *hook; /* object with count, tick and correct */
 } Core;
 
@@ -276,6 +288,10 @@ static bool hook_tick(void *context, const cg_tick *tick)
     Core *self = context;
     if (PyErr_Occurred()) {
         return false;
+    }
+    if (health_takes(&self->health, tick)) {
+        health_take(&self->health, &self->estimator, tick);
+        return self->estimator.state.has_other_capacity;
     }
     PyObject *charge = charge_of(&tick->since);
     if (!tick->has_voltage) {
@@ -609,6 +625,17 @@ static PyObject *Core_set(Core *self, PyObject *args)
     return none_unless_error();
 }
 
+static PyObject *Core_get_health(Core *self, PyObject *Py_UNUSED(none))
+{
+    return get_fields(&self->health, HEALTH);
+}
+
+static PyObject *Core_set_health(Core *self, PyObject *values)
+{
+    (void)set_fields(&self->health, HEALTH, values);
+    return none_unless_error();
+}
+
 static cg_effect_state *effect_numbered(Core *self, int effect)
 {
     if ((effect < 0) || (effect >= self->model.effects)) {
@@ -723,6 +750,8 @@ static PyMethodDef METHODS[] = {
     {"fill_line", (PyCFunction)Core_fill_line, METH_VARARGS, "Set times, currents and start."},
     {"get", (PyCFunction)Core_get, METH_VARARGS, "Return a part of the state."},
     {"set", (PyCFunction)Core_set, METH_VARARGS, "Set a part of the state."},
+    {"get_health", (PyCFunction)Core_get_health, METH_NOARGS, "Return the sums of the health."},
+    {"set_health", (PyCFunction)Core_set_health, METH_O, "Set the sums of the health."},
     {"get_lags", (PyCFunction)Core_get_lags, METH_O, "Return the lags of an effect."},
     {"set_lags", (PyCFunction)Core_set_lags, METH_VARARGS, "Set voltage and lags of an effect."},
     {"get_skew", (PyCFunction)Core_get_skew, METH_NOARGS, "Return what time_skew holds back."},

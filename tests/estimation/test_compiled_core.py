@@ -158,15 +158,29 @@ def test_environment_switches_the_core_off(monkeypatch: pytest.MonkeyPatch) -> N
     assert type(make_estimator(MODELS["plain"])) is Estimator
 
 
+def test_health_has_the_same_bits_at_every_sample() -> None:
+    reference, compiled = pair(MODELS["plain"], EstimatorSettings(initial_soc_pct=85.0))
+    for number, sample in enumerate(eventful_samples()):
+        reference.step(sample)
+        compiled.step(sample)
+        assert bits(reference.health) == bits(compiled.health), f"sample {number}"
+        if not number % 97:
+            assert state_of(reference) == state_of(compiled)
+
+
 def test_error_of_the_health_estimator_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
     _, compiled = pair(MODELS["plain"], EstimatorSettings())
 
     def fail(*_: object) -> None:
         raise ArithmeticError("no")
 
+    columns = np.tile([[0.0], [10.0], [385.0], [23.0]], 100)
+    columns[0] = np.arange(
+        100.0
+    )  # [s]: the first with a full delay line starts the health's filter
     monkeypatch.setattr("cangauge.estimation.health.HealthEstimator.use", fail)
     with pytest.raises(ArithmeticError, match="no"):
-        compiled.step(Sample(0.0, 10.0, 385.0, 23.0))
+        compiled.run(columns)
 
 
 def core_arguments() -> dict[str, Any]:
