@@ -258,6 +258,9 @@ typedef struct {
     cg_current *storage;
     health health;
     PyObject *hook; /* object with count, tick and correct */
+    PyTypeObject *estimate; /* a tuple of ten */
+    PyObject *statuses; /* tuple */
+    PyObject *reasons; /* by their bits */
 } Core;
 
 static bool hooked(Core *self, PyObject *answer)
@@ -330,16 +333,21 @@ static int set_effects(Core *self, PyObject *effects)
 static int begin(Core *self, PyObject *args, PyObject *kwargs)
 {
     static char *names[] = {"model", "effects", "settings", "hook", "line_size", "line_block",
-                            "spacing_s", NULL};
+                            "spacing_s", "estimate", "statuses", "reasons", NULL};
     const cg_model *own = &self->model;
-    PyObject *model, *effects, *settings_of, *hook;
+    PyObject *model, *effects, *settings_of, *hook, *estimate, *statuses, *reasons;
     int size, block;
     double spacing_s;
     cg_settings settings;
-    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "OOOOiid", names, &model, &effects, &settings_of,
-                                     &hook, &size, &block, &spacing_s) ||
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "OOOOiidO!O!O", names, &model, &effects,
+                                     &settings_of, &hook, &size, &block, &spacing_s, &PyType_Type,
+                                     &estimate, &PyTuple_Type, &statuses, &reasons) ||
         (set_fields(&self->model, MODEL, model) != 0) || (set_effects(self, effects) != 0) ||
         (set_fields(&settings, SETTINGS, settings_of) != 0)) {
+        return -1;
+    }
+    if (!PyType_IsSubtype((PyTypeObject *)estimate, &PyTuple_Type)) {
+        PyErr_SetString(PyExc_TypeError, "estimate: not a type of tuples");
         return -1;
     }
     if ((size < 1) || (block < 0) || (block >= size)) {
@@ -361,6 +369,9 @@ static int begin(Core *self, PyObject *args, PyObject *kwargs)
     cg_init(&self->estimator, own, &settings, &line, self->skew);
     self->estimator.hook = (cg_hook){self, hook_count, hook_tick, hook_correct};
     self->hook = Py_NewRef(hook);
+    self->estimate = (PyTypeObject *)Py_NewRef(estimate);
+    self->statuses = Py_NewRef(statuses);
+    self->reasons = Py_NewRef(reasons);
     return 0;
 }
 
@@ -377,12 +388,18 @@ static PyObject *Core_new(PyTypeObject *type, PyObject *args, PyObject *kwargs)
 static int Core_traverse(Core *self, visitproc visit, void *arg)
 {
     Py_VISIT(self->hook);
+    Py_VISIT(self->estimate);
+    Py_VISIT(self->statuses);
+    Py_VISIT(self->reasons);
     return 0;
 }
 
 static int Core_clear(Core *self)
 {
     Py_CLEAR(self->hook);
+    Py_CLEAR(self->estimate);
+    Py_CLEAR(self->statuses);
+    Py_CLEAR(self->reasons);
     return 0;
 }
 
@@ -413,9 +430,28 @@ static PyObject *Core_update(Core *self, PyObject *sample)
 static PyObject *Core_estimate(Core *self, PyObject *Py_UNUSED(none))
 {
     const cg_estimate now = cg_evaluate(&self->estimator);
-    return Py_BuildValue("dddddddikL", now.time_s, now.soc_pct, now.soc_std_pct, now.soc_newton_pct,
-                         now.soc_coulomb_pct, now.voltage_model_v, now.residual_v, (int)now.status,
-                         (unsigned long)now.reasons, (long long)now.samples);
+    const double number[7] = {
+        now.time_s,          now.soc_pct,         now.soc_std_pct, now.soc_newton_pct,
+        now.soc_coulomb_pct, now.voltage_model_v, now.residual_v,
+    };
+    PyObject *bits = PyLong_FromUnsignedLong(now.reasons);
+    PyObject *item[10] = {NULL};
+    for (int k = 0; k < 7; ++k) {
+        item[k] = PyFloat_FromDouble(number[k]);
+    }
+    item[7] = PySequence_GetItem(self->statuses, now.status);
+    item[8] = (bits == NULL) ? NULL : PyObject_GetItem(self->reasons, bits);
+    item[9] = PyLong_FromLongLong(now.samples);
+    Py_XDECREF(bits);
+    PyObject *found = PyErr_Occurred() ? NULL : self->estimate->tp_alloc(self->estimate, 10);
+    for (int k = 0; k < 10; ++k) {
+        if (found != NULL) {
+            PyTuple_SET_ITEM(found, k, item[k]);
+        } else {
+            Py_XDECREF(item[k]);
+        }
+    }
+    return found;
 }
 
 #define COLUMNS_IN 4
@@ -739,7 +775,7 @@ static PyObject *Core_set_skew(Core *self, PyObject *args)
 
 static PyMethodDef METHODS[] = {
     {"update", (PyCFunction)Core_update, METH_O, "Process one sample, a tuple of four numbers."},
-    {"estimate", (PyCFunction)Core_estimate, METH_NOARGS, "Return the latest estimate's numbers."},
+    {"estimate", (PyCFunction)Core_estimate, METH_NOARGS, "Return the latest estimate."},
     {"run", (PyCFunction)Core_run, METH_VARARGS, "Step over columns: 4 in, 7 + 2 out."},
     {"pseudo_ocv_at", (PyCFunction)Core_pseudo_ocv_at, METH_O, "Return voltage and slope."},
     {"offset_a", (PyCFunction)Core_offset_a, METH_NOARGS, "Return the current's offset [A]."},

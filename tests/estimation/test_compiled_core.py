@@ -22,7 +22,7 @@ from cangauge.estimation.core_constants import core_constants, effect_fields
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Sample
+from cangauge.estimation.validity import Estimate, Sample, Status
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import capacity_from_reference
@@ -192,6 +192,7 @@ def core_arguments() -> dict[str, Any]:
         "model": constants.model | {"function_v": []}, "settings": constants.settings,
         "effects": [effect_fields(form) for form in constants.effects], "hook": None,
         "line_size": 100, "line_block": 1, "spacing_s": 1.0,
+        "estimate": Estimate, "statuses": tuple(Status), "reasons": {},
     }  # fmt: skip
 
 

@@ -147,6 +147,9 @@ class CompiledEstimator(Estimator):
             int(2.0 * constants.longest_s / SPACING_S) + 2 * BLOCK,
             BLOCK,
             SPACING_S,
+            Estimate,
+            _STATUSES,
+            _REASONS,
         )
         super().__init__(model, settings)
         self._hook.core, self._hook.health = self._core, self._health
@@ -205,8 +208,7 @@ class CompiledEstimator(Estimator):
     @property
     def estimate(self) -> Estimate:
         """The estimate after the latest sample; see `Estimator.estimate`."""
-        *numbers, status, reasons, samples = self._core.estimate()
-        return Estimate._make([*numbers, _STATUSES[status], _REASONS[reasons], samples])
+        return cast("Estimate", self._core.estimate())
 
     @property
     def health(self) -> Health:
