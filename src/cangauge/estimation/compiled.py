@@ -51,7 +51,7 @@ from cangauge.estimation.state import (
     ResistanceState,
     Verdict,
 )
-from cangauge.estimation.validity import Estimate, Reason, Sample, Status
+from cangauge.estimation.validity import REASONS, Estimate, Reason, Sample, Status
 from cangauge.model.delay_line import BLOCK, SPACING_S, DelayLine
 from cangauge.model.model_file import Model
 from cangauge.model.voltage_model import Curve
@@ -81,14 +81,6 @@ VERDICTS: Final[tuple[Verdict, ...]] = ("", "open", "parked", "moved", "unclear"
 """Verdicts, in the order of `cg_verdict`."""
 
 
-class _Reasons(dict[int, Reason]):
-    """Sets of reasons by their bits: slow to make, and read for every sample."""
-
-    def __missing__(self, bits: int) -> Reason:
-        return self.setdefault(bits, Reason(bits))
-
-
-_REASONS: Final = _Reasons()
 _STATUSES: Final = tuple(Status)
 
 _LAG: Final = ("time_s", "input", "value")
@@ -149,7 +141,7 @@ class CompiledEstimator(Estimator):
             SPACING_S,
             Estimate,
             _STATUSES,
-            _REASONS,
+            REASONS,
         )
         super().__init__(model, settings)
         self._hook.core, self._hook.health = self._core, self._health
