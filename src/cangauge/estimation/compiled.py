@@ -373,6 +373,9 @@ class _CoreLine(DelayLine):
     def filled_s(self) -> float:
         return float(self._core.filled_s())
 
+    def currents(self) -> list[float]:
+        return [self.current_at(delay_s) for delay_s in self._delays]
+
     def current_at(self, ago_s: float) -> float:
         return float(self._core.current_at(ago_s))
 

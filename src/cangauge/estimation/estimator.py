@@ -466,16 +466,16 @@ class Estimator:
             voltage_model_v = ocv_v + self._voltage_without_ocv_v()
         reasons = self._reasons(sample, soc_pct, std_pct)
         self._latest = Estimate(
-            time_s=stamp_s,
-            soc_pct=soc_pct,
-            soc_std_pct=std_pct,
-            soc_newton_pct=self._memory.newton_pct,
-            soc_coulomb_pct=_clip(self._coulomb_pct()),
-            voltage_model_v=voltage_model_v,
-            residual_v=sample.voltage_v - voltage_model_v,
-            status=status_of(reasons),
-            reasons=reasons,
-            samples=self._memory.samples,
+            stamp_s,
+            soc_pct,
+            std_pct,
+            self._memory.newton_pct,
+            _clip(self._coulomb_pct()),
+            voltage_model_v,
+            sample.voltage_v - voltage_model_v,
+            status_of(reasons),
+            reasons,
+            self._memory.samples,
         )
         return self._latest
 
