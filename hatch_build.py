@@ -22,7 +22,7 @@ except ImportError:  # run as a script, outside of a build
     BuildHookInterface = object  # type: ignore[assignment, misc]
 
 # Every operation is rounded by itself, as in Python: no fused multiply-add.
-FLAGS = ("-std=c99", "-O2", "-fPIC", "-ffp-contract=off")
+FLAGS = ("-std=c99", "-O3", "-fPIC", "-ffp-contract=off")
 
 
 def linker() -> list[str]:

@@ -7,6 +7,7 @@
 #include <stddef.h>
 
 #include "cangauge_internal.h"
+#include "python_health.h"
 
 #ifndef CG_SOURCES
 #define CG_SOURCES "" /* digest of the sources that this was built from */
@@ -118,6 +119,16 @@ static const field STATE[] = {
 #define OF cg_lag
 static const field LAG[] = {
     REAL(time_s), REAL(input), REAL(value), FLAG(is_started), END,
+};
+#undef OF
+
+#define OF health
+static const field HEALTH[] = {
+    REAL(seconds), REAL(away_s), REAL(discharged_pct), REAL(moved_pct), REAL(gap_var_pct2),
+    FLAG(is_started), REAL(sum_v), REAL(sum_drop_v), REAL(window_s), COUNT(ticks),
+    LIST(block, HEALTH_BLOCK), LIST(waiting, 2 * HEALTH_SCALES), LIST(sums, 4 * HEALTH_SCALES),
+    REAL(soc_pct), REAL(gain), REAL(offset_a), REAL(pct_per_as), REAL(full_window_s),
+    REAL(full_block_s), REAL(memory_s), END,
 };
 #undef OF
 
@@ -245,7 +256,11 @@ typedef struct {
     cg_model model;
     cg_skew *skew;
     cg_current *storage;
+    health health;
     PyObject *hook; /* object with count, tick and correct */
+    PyTypeObject *estimate; /* a tuple of ten */
+    PyObject *statuses; /* tuple */
+    PyObject *reasons; /* by their bits */
 } Core;
 
 static bool hooked(Core *self, PyObject *answer)
@@ -276,6 +291,10 @@ static bool hook_tick(void *context, const cg_tick *tick)
     Core *self = context;
     if (PyErr_Occurred()) {
         return false;
+    }
+    if (health_takes(&self->health, tick)) {
+        health_take(&self->health, &self->estimator, tick);
+        return self->estimator.state.has_other_capacity;
     }
     PyObject *charge = charge_of(&tick->since);
     if (!tick->has_voltage) {
@@ -314,16 +333,21 @@ static int set_effects(Core *self, PyObject *effects)
 static int begin(Core *self, PyObject *args, PyObject *kwargs)
 {
     static char *names[] = {"model", "effects", "settings", "hook", "line_size", "line_block",
-                            "spacing_s", NULL};
+                            "spacing_s", "estimate", "statuses", "reasons", NULL};
     const cg_model *own = &self->model;
-    PyObject *model, *effects, *settings_of, *hook;
+    PyObject *model, *effects, *settings_of, *hook, *estimate, *statuses, *reasons;
     int size, block;
     double spacing_s;
     cg_settings settings;
-    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "OOOOiid", names, &model, &effects, &settings_of,
-                                     &hook, &size, &block, &spacing_s) ||
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "OOOOiidO!O!O", names, &model, &effects,
+                                     &settings_of, &hook, &size, &block, &spacing_s, &PyType_Type,
+                                     &estimate, &PyTuple_Type, &statuses, &reasons) ||
         (set_fields(&self->model, MODEL, model) != 0) || (set_effects(self, effects) != 0) ||
         (set_fields(&settings, SETTINGS, settings_of) != 0)) {
+        return -1;
+    }
+    if (!PyType_IsSubtype((PyTypeObject *)estimate, &PyTuple_Type)) {
+        PyErr_SetString(PyExc_TypeError, "estimate: not a type of tuples");
         return -1;
     }
     if ((size < 1) || (block < 0) || (block >= size)) {
@@ -345,6 +369,9 @@ static int begin(Core *self, PyObject *args, PyObject *kwargs)
     cg_init(&self->estimator, own, &settings, &line, self->skew);
     self->estimator.hook = (cg_hook){self, hook_count, hook_tick, hook_correct};
     self->hook = Py_NewRef(hook);
+    self->estimate = (PyTypeObject *)Py_NewRef(estimate);
+    self->statuses = Py_NewRef(statuses);
+    self->reasons = Py_NewRef(reasons);
     return 0;
 }
 
@@ -361,12 +388,18 @@ static PyObject *Core_new(PyTypeObject *type, PyObject *args, PyObject *kwargs)
 static int Core_traverse(Core *self, visitproc visit, void *arg)
 {
     Py_VISIT(self->hook);
+    Py_VISIT(self->estimate);
+    Py_VISIT(self->statuses);
+    Py_VISIT(self->reasons);
     return 0;
 }
 
 static int Core_clear(Core *self)
 {
     Py_CLEAR(self->hook);
+    Py_CLEAR(self->estimate);
+    Py_CLEAR(self->statuses);
+    Py_CLEAR(self->reasons);
     return 0;
 }
 
@@ -397,9 +430,28 @@ static PyObject *Core_update(Core *self, PyObject *sample)
 static PyObject *Core_estimate(Core *self, PyObject *Py_UNUSED(none))
 {
     const cg_estimate now = cg_evaluate(&self->estimator);
-    return Py_BuildValue("dddddddikL", now.time_s, now.soc_pct, now.soc_std_pct, now.soc_newton_pct,
-                         now.soc_coulomb_pct, now.voltage_model_v, now.residual_v, (int)now.status,
-                         (unsigned long)now.reasons, (long long)now.samples);
+    const double number[7] = {
+        now.time_s,          now.soc_pct,         now.soc_std_pct, now.soc_newton_pct,
+        now.soc_coulomb_pct, now.voltage_model_v, now.residual_v,
+    };
+    PyObject *bits = PyLong_FromUnsignedLong(now.reasons);
+    PyObject *item[10] = {NULL};
+    for (int k = 0; k < 7; ++k) {
+        item[k] = PyFloat_FromDouble(number[k]);
+    }
+    item[7] = PySequence_GetItem(self->statuses, now.status);
+    item[8] = (bits == NULL) ? NULL : PyObject_GetItem(self->reasons, bits);
+    item[9] = PyLong_FromLongLong(now.samples);
+    Py_XDECREF(bits);
+    PyObject *found = PyErr_Occurred() ? NULL : self->estimate->tp_alloc(self->estimate, 10);
+    for (int k = 0; k < 10; ++k) {
+        if (found != NULL) {
+            PyTuple_SET_ITEM(found, k, item[k]);
+        } else {
+            Py_XDECREF(item[k]);
+        }
+    }
+    return found;
 }
 
 #define COLUMNS_IN 4
@@ -609,6 +661,17 @@ static PyObject *Core_set(Core *self, PyObject *args)
     return none_unless_error();
 }
 
+static PyObject *Core_get_health(Core *self, PyObject *Py_UNUSED(none))
+{
+    return get_fields(&self->health, HEALTH);
+}
+
+static PyObject *Core_set_health(Core *self, PyObject *values)
+{
+    (void)set_fields(&self->health, HEALTH, values);
+    return none_unless_error();
+}
+
 static cg_effect_state *effect_numbered(Core *self, int effect)
 {
     if ((effect < 0) || (effect >= self->model.effects)) {
@@ -712,7 +775,7 @@ static PyObject *Core_set_skew(Core *self, PyObject *args)
 
 static PyMethodDef METHODS[] = {
     {"update", (PyCFunction)Core_update, METH_O, "Process one sample, a tuple of four numbers."},
-    {"estimate", (PyCFunction)Core_estimate, METH_NOARGS, "Return the latest estimate's numbers."},
+    {"estimate", (PyCFunction)Core_estimate, METH_NOARGS, "Return the latest estimate."},
     {"run", (PyCFunction)Core_run, METH_VARARGS, "Step over columns: 4 in, 7 + 2 out."},
     {"pseudo_ocv_at", (PyCFunction)Core_pseudo_ocv_at, METH_O, "Return voltage and slope."},
     {"offset_a", (PyCFunction)Core_offset_a, METH_NOARGS, "Return the current's offset [A]."},
@@ -723,6 +786,8 @@ static PyMethodDef METHODS[] = {
     {"fill_line", (PyCFunction)Core_fill_line, METH_VARARGS, "Set times, currents and start."},
     {"get", (PyCFunction)Core_get, METH_VARARGS, "Return a part of the state."},
     {"set", (PyCFunction)Core_set, METH_VARARGS, "Set a part of the state."},
+    {"get_health", (PyCFunction)Core_get_health, METH_NOARGS, "Return the sums of the health."},
+    {"set_health", (PyCFunction)Core_set_health, METH_O, "Set the sums of the health."},
     {"get_lags", (PyCFunction)Core_get_lags, METH_O, "Return the lags of an effect."},
     {"set_lags", (PyCFunction)Core_set_lags, METH_VARARGS, "Set voltage and lags of an effect."},
     {"get_skew", (PyCFunction)Core_get_skew, METH_NOARGS, "Return what time_skew holds back."},

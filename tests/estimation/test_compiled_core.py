@@ -22,7 +22,7 @@ from cangauge.estimation.core_constants import core_constants, effect_fields
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Sample
+from cangauge.estimation.validity import Estimate, Sample, Status
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import capacity_from_reference
@@ -158,15 +158,29 @@ def test_environment_switches_the_core_off(monkeypatch: pytest.MonkeyPatch) -> N
     assert type(make_estimator(MODELS["plain"])) is Estimator
 
 
+def test_health_has_the_same_bits_at_every_sample() -> None:
+    reference, compiled = pair(MODELS["plain"], EstimatorSettings(initial_soc_pct=85.0))
+    for number, sample in enumerate(eventful_samples()):
+        reference.step(sample)
+        compiled.step(sample)
+        assert bits(reference.health) == bits(compiled.health), f"sample {number}"
+        if not number % 97:
+            assert state_of(reference) == state_of(compiled)
+
+
 def test_error_of_the_health_estimator_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
     _, compiled = pair(MODELS["plain"], EstimatorSettings())
 
     def fail(*_: object) -> None:
         raise ArithmeticError("no")
 
+    columns = np.tile([[0.0], [10.0], [385.0], [23.0]], 100)
+    columns[0] = np.arange(
+        100.0
+    )  # [s]: the first with a full delay line starts the health's filter
     monkeypatch.setattr("cangauge.estimation.health.HealthEstimator.use", fail)
     with pytest.raises(ArithmeticError, match="no"):
-        compiled.step(Sample(0.0, 10.0, 385.0, 23.0))
+        compiled.run(columns)
 
 
 def core_arguments() -> dict[str, Any]:
@@ -178,6 +192,7 @@ def core_arguments() -> dict[str, Any]:
         "model": constants.model | {"function_v": []}, "settings": constants.settings,
         "effects": [effect_fields(form) for form in constants.effects], "hook": None,
         "line_size": 100, "line_block": 1, "spacing_s": 1.0,
+        "estimate": Estimate, "statuses": tuple(Status), "reasons": {},
     }  # fmt: skip
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import ClassVar, Final
+from typing import ClassVar, Final, NamedTuple
 
 import can
 
@@ -28,6 +28,9 @@ _MISSING: Final = {
     "voltage": Reason.VOLTAGE_MISSING,
     "temperature": Reason.TEMPERATURE_MISSING,
 }
+# Read for every sample; enum members are slow to look up.
+_DUPLICATE: Final = Reason.DUPLICATE_SENDER
+_NO_REASON: Final = Reason.NONE
 _REASONS: Final = {
     Fault.NONE: Reason.NONE,
     Fault.PROTECTION: Reason.PROTECTION_FAILED,
@@ -176,13 +179,14 @@ class Pairing:
         return sample
 
 
-@dataclass(slots=True)
-class _Input:
-    """A signal of a message: its decoder and its health."""
+class _Input(NamedTuple):
+    """A signal of a message: its decoder and its health, unpacked for every frame."""
 
     decode: Callable[[bytes | bytearray], float]
     is_present: Callable[[bytes | bytearray], bool] | None
     """Multiplexed signals only."""
+    check: Callable[[float, float], float]
+    """`SignalHealth.update`."""
     health: SignalHealth
     is_current: bool
     is_voltage: bool
@@ -347,6 +351,11 @@ class SampleDecoder:
             # Slow signals first: a sample uses the temperature of its own frame.
             route.inputs.sort(key=lambda each: each.is_current + 2 * each.is_voltage)
         self._temperature = self.health.get("temperature")
+        self._needed = [
+            (self.health[role], missing)
+            for role, missing in _MISSING.items()
+            if role in self.health
+        ]
 
     def _add(
         self,
@@ -375,6 +384,7 @@ class SampleDecoder:
             _Input(
                 signal.decode,
                 signal.codec.is_in if is_multiplexed else None,
+                health.update,
                 health,
                 is_current=signal.role == "current",
                 is_voltage=signal.role == "voltage",
@@ -419,13 +429,13 @@ class SampleDecoder:
         if route.read_cells is not None:
             route.read_cells(payload, time_s)
         current_a = voltage_v = math.nan
-        for signal in route.inputs:
-            if signal.is_present is not None and not signal.is_present(payload):
+        for decode, is_present, check, _, is_current, is_voltage in route.inputs:
+            if is_present is not None and not is_present(payload):
                 continue
-            value = signal.health.update(signal.decode(payload), time_s)
-            if signal.is_current:
+            value = check(decode(payload), time_s)
+            if is_current:
                 current_a = value
-            elif signal.is_voltage:
+            elif is_voltage:
                 voltage_v = value
         sample = None
         if not math.isnan(current_a):
@@ -514,10 +524,9 @@ class SampleDecoder:
         A missing signal without a further reason is old, never came, or is sent as "not
         available".
         """
-        reasons = Reason.DUPLICATE_SENDER if now_s < self._suspected_until_s else Reason.NONE
-        for role, missing in _MISSING.items():
-            health = self.health.get(role)
-            if health is not None and not health.is_usable(now_s):
+        reasons = _DUPLICATE if now_s < self._suspected_until_s else _NO_REASON
+        for health, missing in self._needed:
+            if not health.is_usable(now_s):
                 reasons |= missing
                 if health.is_failing:
                     reasons |= _REASONS[health.fault]

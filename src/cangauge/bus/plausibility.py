@@ -257,11 +257,11 @@ class SignalHealth:
         self._is_cyclic = is_cyclic
         self._is_stuck = is_stuck
         self._statistics = statistics or MessageStatistics()
-        # Lower bound of `timeout_s` for any period: usually decides `is_old` by itself.
+        # Lower bound of `timeout_s`, which usually decides alone: the same for a known period.
         self._shortest_timeout_s = (
             min(checks.usual_timeout_s, TIMEOUT_AT_LEAST_S)
-            if checks.timeout_s is None
-            else checks.timeout_s
+            if checks.timeout_s is None and period_s is None
+            else self.timeout_s
         )
         self.state = SignalState.UNKNOWN
         self.fault = Fault.NONE
@@ -289,7 +289,6 @@ class SignalHealth:
             if math.isnan(learned_s):
                 self._learned_s = interval_s
             else:
-                # One branch instead of `min`: this runs for every value.
                 interval_s = min(interval_s, _LONGEST_INTERVAL * learned_s)
                 self._learned_s = learned_s + _LEARN_WEIGHT * (interval_s - learned_s)
         if math.isnan(value):

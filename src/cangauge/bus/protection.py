@@ -159,7 +159,13 @@ class ProtectionRule:
 
     def is_whole(self, data: bytes | bytearray) -> bool:
         """Return whether the CRC agrees."""
-        return self.crc(data) == data[self.crc_byte]
+        if self.crc_byte != -1:
+            return self.crc(data) == data[self.crc_byte]
+        # As `crc`, without a call: this runs for every frame.
+        table, crc = self._table, self.initial
+        for byte in data[:-1]:
+            crc = table[crc ^ byte]
+        return crc ^ self.xor_out == data[-1]
 
     def counter(self, data: bytes | bytearray) -> int:
         """Return the counter of a payload; 0 without a counter."""

@@ -28,7 +28,14 @@ from cangauge.estimation.cells import PackTick
 from cangauge.estimation.core_constants import CoreConstants, core_constants, effect_fields
 from cangauge.estimation.ekf import KT, LEARNED, SocEkf
 from cangauge.estimation.estimator import Estimator
-from cangauge.estimation.health import Health, HealthEstimator, VoltageTick
+from cangauge.estimation.health import (
+    RESISTANCE_TIME_S,
+    SHORTEST_BLOCK_S,
+    WINDOW_S,
+    Health,
+    HealthEstimator,
+    VoltageTick,
+)
 from cangauge.estimation.hypothesis_filter import HypothesisFilter
 from cangauge.estimation.power import Power
 from cangauge.estimation.settings import EstimatorSettings
@@ -41,9 +48,10 @@ from cangauge.estimation.state import (
     EstimatorState,
     HypothesisFilterState,
     ReferenceState,
+    ResistanceState,
     Verdict,
 )
-from cangauge.estimation.validity import Estimate, Reason, Sample, Status
+from cangauge.estimation.validity import REASONS, Estimate, Reason, Sample, Status
 from cangauge.model.delay_line import BLOCK, SPACING_S, DelayLine
 from cangauge.model.model_file import Model
 from cangauge.model.voltage_model import Curve
@@ -71,6 +79,9 @@ _core: Final = _load(Path(__file__).parents[3])
 
 VERDICTS: Final[tuple[Verdict, ...]] = ("", "open", "parked", "moved", "unclear")
 """Verdicts, in the order of `cg_verdict`."""
+
+
+_STATUSES: Final = tuple(Status)
 
 _LAG: Final = ("time_s", "input", "value")
 _HYPOTHESES: Final = ("first", "second")
@@ -128,9 +139,14 @@ class CompiledEstimator(Estimator):
             int(2.0 * constants.longest_s / SPACING_S) + 2 * BLOCK,
             BLOCK,
             SPACING_S,
+            Estimate,
+            _STATUSES,
+            REASONS,
         )
         super().__init__(model, settings)
-        self._hook.health, self._hook.is_other = self._health, self._has_other_capacity
+        self._hook.core, self._hook.health = self._core, self._health
+        self._hook.is_other = self._has_other_capacity
+        self._hook.push()
         self._line = _CoreLine(self._voltage_model.delay_s, self._core)
         self._in_python = False
 
@@ -184,12 +200,12 @@ class CompiledEstimator(Estimator):
     @property
     def estimate(self) -> Estimate:
         """The estimate after the latest sample; see `Estimator.estimate`."""
-        *numbers, status, reasons, samples = self._core.estimate()
-        return Estimate._make([*numbers, Status(status), Reason(reasons), samples])
+        return cast("Estimate", self._core.estimate())
 
     @property
     def health(self) -> Health:
         """Capacity, resistance and current offset, with standard deviations."""
+        self._hook.pull()
         health = self._health.health
         is_filtering = self._core.get("state")["is_filtering"]
         return health._replace(offset_a=self._core.offset_a()) if is_filtering else health
@@ -221,6 +237,7 @@ class CompiledEstimator(Estimator):
     def snapshot(self) -> EstimatorState:
         """Return a copy of everything needed to continue as if not interrupted."""
         self._pull()
+        self._hook.pull()
         state = super().snapshot()
         effects = [self._effect_state(number) for number in range(len(self._forms))]
         return state.model_copy(update={"effects": effects})
@@ -239,6 +256,7 @@ class CompiledEstimator(Estimator):
     def _python(self) -> Iterator[None]:
         """Let the reference change its own state, which the core then continues from."""
         self._in_python = True
+        self._hook.pull()
         try:
             yield
         finally:
@@ -297,6 +315,7 @@ class CompiledEstimator(Estimator):
             "has_other_capacity": self._has_other_capacity(), "implausible": 0, "beside_soc_v": 0.0,
         })  # fmt: skip
         self._push_filter()
+        self._hook.push()
         for number, state in enumerate(self._online.state()):
             self._push_effect(number, state)
 
@@ -354,6 +373,9 @@ class _CoreLine(DelayLine):
     def filled_s(self) -> float:
         return float(self._core.filled_s())
 
+    def currents(self) -> list[float]:
+        return [self.current_at(delay_s) for delay_s in self._delays]
+
     def current_at(self, ago_s: float) -> float:
         return float(self._core.current_at(ago_s))
 
@@ -366,28 +388,72 @@ class _CoreLine(DelayLine):
         self._core.fill_line(list(time_s), list(current_a), since_s)
 
 
-class _Hook:
-    """What the core calls, to learn capacity and resistance from the voltages that it used."""
+_SUMS: Final = (
+    "seconds", "away_s", "discharged_pct", "moved_pct", "gap_var_pct2",
+    "is_started", "sum_v", "sum_drop_v", "window_s", "ticks",
+)  # fmt: skip
+"""Fields of `HealthState` that the core adds to."""
 
+
+class _Hook:
+    """What the core calls where a voltage does more to the health than add to its sums."""
+
+    core: Any
     health: HealthEstimator
     is_other: Callable[[], bool]
 
     def count(self, *since: float) -> bool:
         """Take the charge before and in an unobserved interval."""
-        self.health.count(ChargeSinceUpdate(*since))
+        with self._in_python():
+            self.health.count(ChargeSinceUpdate(*since))
         return self.is_other()
 
     def tick(self, since: tuple[float, ...], passed_s: float, *tick: Any) -> bool:
         """Take charge and, where there is one, voltage at a tick of the model's rate."""
-        self.health.count(ChargeSinceUpdate(*since))
-        if tick:
-            self.health.use(VoltageTick(*tick), passed_s)
+        with self._in_python():
+            self.health.count(ChargeSinceUpdate(*since))
+            if tick:
+                self.health.use(VoltageTick(*tick), passed_s)
         return self.is_other()
 
     def correct(self, soc_pct: float, std_pct: float) -> bool:
         """Take a SoC that is known other than by voltage."""
-        self.health.correct(soc_pct, std_pct)
+        with self._in_python():
+            self.health.correct(soc_pct, std_pct)
         return self.is_other()
+
+    @contextmanager
+    def _in_python(self) -> Iterator[None]:
+        self.pull()
+        yield
+        self.push()
+
+    def pull(self) -> None:
+        """Copy the core's sums into the reference."""
+        sums = self.core.get_health()
+        for name in _SUMS:
+            setattr(self.health.state, name, sums[name])
+        waiting, details = iter(sums["waiting"]), iter(sums["sums"])
+        self.health.resistance.state = ResistanceState(
+            sums["block"],
+            [[first, next(waiting)] for first in waiting],
+            [[first, next(details), next(details), next(details)] for first in details],
+        )
+
+    def push(self) -> None:
+        """Let the core continue from the sums of the reference."""
+        health = self.health
+        resistance = health.resistance.state
+        soc_pct, gain, offset_a = health.propagated
+        sums: dict[str, Any] = {name: getattr(health.state, name) for name in _SUMS}
+        self.core.set_health(sums | {
+            "block": resistance.block,
+            "waiting": [number for pair in resistance.waiting for number in pair],
+            "sums": [number for scale in resistance.sums for number in scale],
+            "soc_pct": soc_pct, "gain": gain, "offset_a": offset_a,
+            "pct_per_as": health.pct_per_as, "full_window_s": WINDOW_S,
+            "full_block_s": SHORTEST_BLOCK_S, "memory_s": RESISTANCE_TIME_S,
+        })  # fmt: skip
 
 
 def _with_stride(rows: Sequence[Sequence[float]], stride: int) -> list[float]:

@@ -33,6 +33,7 @@ from cangauge.estimation.state import (
 )
 from cangauge.estimation.validity import (
     CURRENT_AT_MOST_A,
+    REASONS,
     Estimate,
     Reason,
     Sample,
@@ -465,16 +466,16 @@ class Estimator:
             voltage_model_v = ocv_v + self._voltage_without_ocv_v()
         reasons = self._reasons(sample, soc_pct, std_pct)
         self._latest = Estimate(
-            time_s=stamp_s,
-            soc_pct=soc_pct,
-            soc_std_pct=std_pct,
-            soc_newton_pct=self._memory.newton_pct,
-            soc_coulomb_pct=_clip(self._coulomb_pct()),
-            voltage_model_v=voltage_model_v,
-            residual_v=sample.voltage_v - voltage_model_v,
-            status=status_of(reasons),
-            reasons=reasons,
-            samples=self._memory.samples,
+            stamp_s,
+            soc_pct,
+            std_pct,
+            self._memory.newton_pct,
+            _clip(self._coulomb_pct()),
+            voltage_model_v,
+            sample.voltage_v - voltage_model_v,
+            status_of(reasons),
+            reasons,
+            self._memory.samples,
         )
         return self._latest
 
@@ -515,31 +516,31 @@ class Estimator:
     def _reasons(  # noqa: C901 - one line a reason
         self, sample: Sample, soc_pct: float, std_pct: float
     ) -> Reason:
-        # Operations on flags are slow, and usually none is set. Comparisons with NaN are false.
+        # In plain bits: operations on flags are slow. Comparisons with NaN are false.
         memory = self._memory
-        reasons = self._permanent_reasons
+        bits = int(self._permanent_reasons)
         if self._implausible:
-            reasons |= self._implausible
+            bits |= int(self._implausible)
         if math.isnan(soc_pct):
-            reasons |= Reason.NO_INITIAL_SOC
+            bits |= int(Reason.NO_INITIAL_SOC)
         if std_pct > self.settings.valid_std_pct:
-            reasons |= Reason.SOC_UNCERTAIN
+            bits |= int(Reason.SOC_UNCERTAIN)
         if self._line.filled_s < self._voltage_model.delay_s[-1]:
-            reasons |= Reason.DELAY_LINE_FILLING
+            bits |= int(Reason.DELAY_LINE_FILLING)
         if sample.time_s < memory.gap_until_s:
-            reasons |= Reason.CURRENT_GAP
+            bits |= int(Reason.CURRENT_GAP)
         if math.isnan(sample.voltage_v):
-            reasons |= Reason.VOLTAGE_MISSING
+            bits |= int(Reason.VOLTAGE_MISSING)
         if math.isnan(sample.temperature_c):
-            reasons |= Reason.TEMPERATURE_MISSING
+            bits |= int(Reason.TEMPERATURE_MISSING)
         if not memory.newton_inside:
-            reasons |= Reason.VOLTAGE_OUTSIDE_MODEL
+            bits |= int(Reason.VOLTAGE_OUTSIDE_MODEL)
         if sample.time_s < memory.contradicted_until_s:
-            reasons |= Reason.INNOVATION_LARGE
+            bits |= int(Reason.INNOVATION_LARGE)
         if sample.time_s < memory.mismatch_until_s:
-            reasons |= Reason.MODEL_MISMATCH
+            bits |= int(Reason.MODEL_MISMATCH)
         outside = outside_model(self._voltage_model, soc_pct, sample)
-        return reasons | outside if outside else reasons
+        return REASONS[bits | int(outside) if outside else bits]
 
     def snapshot(self) -> EstimatorState:
         """Return a copy of everything needed to continue as if not interrupted."""

@@ -174,6 +174,14 @@ class HealthEstimator:
         Voltage at half charge [V].
     capacity_ah : float
         Reference capacity [Ah], which the charge is counted in.
+
+    Attributes
+    ----------
+    state : HealthState
+        Without filter and resistance.
+    resistance : ResistanceEstimator
+    pct_per_as : float
+        SoC of a charge [%/(A s)].
     """
 
     def __init__(
@@ -194,12 +202,12 @@ class HealthEstimator:
         self._lasting_var = noise.lasting_std_v**2
         self._functions = CurveFunctions(noise)
         self._reference_ah = capacity_ah
-        self._pct_per_as = 100.0 / (3600.0 * capacity_ah)
+        self.pct_per_as = 100.0 / (3600.0 * capacity_ah)
         self._offset_std_a = OFFSET_STD_PER_AH * capacity_ah
         self._prior = self._prior_covariance(VOLTAGE_GAIN_STD * nominal_v)
         self.state = HealthState(capacity_ah=capacity_ah)
         self._forget()
-        self._resistance = ResistanceEstimator()
+        self.resistance = ResistanceEstimator()
 
     def count(self, since: ChargeSinceUpdate) -> None:
         """Take the charge counted since the last call."""
@@ -218,11 +226,11 @@ class HealthEstimator:
     def use(self, tick: VoltageTick, seconds: float) -> None:
         """Take one voltage, `seconds` after the last one [s]."""
         if not tick.is_filled:
-            self._resistance.restart()
+            self.resistance.restart()
             return
         counted_v = self._curve.pseudo_ocv_at(tick.soc_counted_pct)[0]
         residual_v = tick.voltage_v - tick.without_ocv_v - counted_v
-        self._resistance.add(residual_v, tick.drop_v, seconds)
+        self.resistance.add(residual_v, tick.drop_v, seconds)
         if not tick.is_inside:
             return
         state = self.state
@@ -254,6 +262,11 @@ class HealthEstimator:
         self._fuse(row, soc_pct - float(self._x[_S]), std_pct**2)
 
     @property
+    def propagated(self) -> tuple[float, float, float]:
+        """SoC [%], gain [-] and offset [A] before the charge counted since the last update."""
+        return float(self._x[_S]), float(self._x[_G]), float(self._x[_O])
+
+    @property
     def capacity(self) -> tuple[float, float]:
         """Capacity and its standard deviation as known now [Ah]."""
         gain = float(self._x[_G])
@@ -265,7 +278,7 @@ class HealthEstimator:
         """Capacity, resistance and offset as known now."""
         return Health(
             *self.capacity,
-            *self._resistance.ratio(),
+            *self.resistance.ratio(),
             float(self._x[_O]),
             math.sqrt(float(self._p[_O, _O])),
         )
@@ -277,7 +290,7 @@ class HealthEstimator:
             capacity_ah=self._reference_ah,
             x=self._x.tolist(),
             p=self._p[np.tril_indices(STATES)].tolist(),
-            resistance=self._resistance.snapshot(),
+            resistance=self.resistance.snapshot(),
         )
 
     def restore(self, state: HealthState) -> None:
@@ -303,7 +316,7 @@ class HealthEstimator:
             )
         self._x, self._p = np.array(state.x), covariance
         self.state = replace(state, x=[], p=[], resistance=ResistanceState())
-        self._resistance.restore(state.resistance)
+        self.resistance.restore(state.resistance)
         if state.capacity_ah != self._reference_ah:
             self._rescale(self._reference_ah / state.capacity_ah)
 
@@ -358,7 +371,7 @@ class HealthEstimator:
     def _soc_pct(self) -> float:
         """Return the SoC after the charge counted since the last update [%]."""
         state = self.state
-        offset_pct = self._pct_per_as * (state.seconds - state.away_s) * float(self._x[_O])
+        offset_pct = self.pct_per_as * (state.seconds - state.away_s) * float(self._x[_O])
         return float(self._x[_S]) - float(self._x[_G]) * (state.discharged_pct - offset_pct)
 
     def _advance(self) -> None:
@@ -367,7 +380,7 @@ class HealthEstimator:
         seconds, moved_pct = state.seconds, state.moved_pct
         if seconds <= 0.0:
             return
-        per_a = self._pct_per_as * (seconds - state.away_s)
+        per_a = self.pct_per_as * (seconds - state.away_s)
         gain = float(self._x[_G])
         charge_pct = state.discharged_pct - per_a * float(self._x[_O])
         slow_kept = math.exp(-seconds / self._slow_time_s - moved_pct / SLOW_SPAN_PCT)

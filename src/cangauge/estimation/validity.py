@@ -107,6 +107,17 @@ REASON_WORDS: Final = {
 _NO_REASON = Reason.NONE  # used for every sample; looking up an enum member is slow
 
 
+class _Reasons(dict[int, Reason]):
+    def __missing__(self, bits: int) -> Reason:
+        return self.setdefault(bits, Reason(bits))
+
+
+REASONS: Final = _Reasons()
+"""Sets of reasons by their bits: slow to combine, and read for every sample."""
+_UNKNOWN_BITS: Final = int(Reason.NO_INITIAL_SOC)
+_INVALID_BITS: Final = int(Reason.INPUT_STALE | Reason.CURRENT_MISSING)
+
+
 def reason_name(reason: Reason) -> str:
     """Return the name of one reason in words, such as "delay line filling"."""
     return (reason.name or "").lower().replace("_", " ")
@@ -147,11 +158,12 @@ class Estimate(NamedTuple):
 
 def status_of(reasons: Reason) -> Status:
     """Return the status that follows from the reasons."""
-    if not reasons:
+    bits = int(reasons)
+    if not bits:
         return Status.VALID
-    if reasons & Reason.NO_INITIAL_SOC:
+    if bits & _UNKNOWN_BITS:
         return Status.INITIALISING
-    if reasons & (Reason.INPUT_STALE | Reason.CURRENT_MISSING):
+    if bits & _INVALID_BITS:
         return Status.INVALID
     return Status.DEGRADED
 

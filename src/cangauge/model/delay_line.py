@@ -121,7 +121,21 @@ class DelayLine:
 
     def currents(self) -> list[float]:
         """Return I(t − dj) [A] for each delay, t being the newest sample's time."""
-        return [self.current_at(delay) for delay in self._delays]
+        # As `current_at`, without its calls: this runs for every estimate.
+        times, currents = self._times, self._currents
+        latest_s, count = times[-1], len(times)
+        found = []
+        for delay_s in self._delays:
+            at = latest_s - delay_s
+            right = bisect_right(times, at)
+            if right == 0:
+                found.append(currents[0])
+            elif right == count:
+                found.append(currents[-1])
+            else:
+                t0, c0 = times[right - 1], currents[right - 1]
+                found.append(c0 + (currents[right] - c0) * (at - t0) / (times[right] - t0))
+        return found
 
     def current_at(self, ago_s: float) -> float:
         """Return I(t − `ago_s`) [A], t being the newest sample's time; see `currents`."""
