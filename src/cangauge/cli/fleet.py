@@ -34,6 +34,9 @@ if TYPE_CHECKING:
     from cangauge.fleet.sources import FleetLog, ReadOptions
     from cangauge.logs.draft import Sign
 
+SHOWN_REASONS: Final = 10
+"""Reasons that are printed, the most frequent first; a page has all."""
+
 fleet_app: Final = typer.Typer(
     name="fleet", rich_markup_mode="markdown", add_completion=False, no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -300,7 +303,8 @@ def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
         [*found, *(replace(log, healthy=True) for log in known)], latest
     )
     job = GapJob(_read_options(reading), Model.load(model), references, alarm)
-    _run(job, job.vehicles(suspect, good), out, cluster, report, json_output=json_output)
+    vehicles = job.vehicles(suspect, good)
+    _run(job, vehicles, out, cluster, report, among=[*found, *known], json_output=json_output)
 
 
 def _read_options(reading: Reading) -> ReadOptions:
@@ -336,9 +340,13 @@ def _run(
     cluster: Cluster,
     report: Path | None,
     *,
+    among: Sequence[FleetLog] | None = None,
     json_output: bool,
 ) -> None:
-    """Run a job over the logs, and print and write what it found of the fleet."""
+    """Run a job over the logs, and print and write what it found of the fleet.
+
+    Results are those of the logs in `among`; by default of all that the job reads.
+    """
     from cangauge.fleet.dataset import Dataset
     from cangauge.fleet.overview import FleetOverview
     from cangauge.fleet.run import run_job
@@ -346,7 +354,7 @@ def _run(
     check_outputs([report], [])
     dataset = Dataset(out, job.kind, job.columns)
     summary = cluster.run(lambda client: run_job(job, logs, dataset, client))
-    found = FleetOverview.read(out)
+    found = FleetOverview.read(out, logs if among is None else among)
     if report is not None:
         from cangauge.report.fleet import fleet_report
 
@@ -362,16 +370,29 @@ def _run(
         raise typer.Exit(1)
 
 
+def _note_reasons(summary: Summary) -> None:
+    ordered = sorted(summary.reasons.items(), key=lambda item: -item[1])
+    for reason, count in ordered[:SHOWN_REASONS]:
+        note(f"set aside: {count} × {reason}")
+    if len(ordered) > SHOWN_REASONS:
+        note(f"set aside: {sum(n for _, n in ordered[SHOWN_REASONS:])} for other reasons")
+
+
 def _show(summary: Summary, found: FleetOverview) -> None:
     typer.echo(f"{summary} ({summary.seconds:.0f} s, {summary.workers} workers)")
-    for reason, count in sorted(summary.reasons.items(), key=lambda item: -item[1])[:10]:
-        note(f"set aside: {count} × {reason}")
-    if found.gaps:
+    _note_reasons(summary)
+    if found.elsewhere_text:
+        note(f"note: {found.elsewhere_text}")
+    if found.alarms:
         rows = [
             [name, row["verdict"], number(row["probability"], 2), number(row["probability_none"])]
             for name, row in ((name, found.gaps[name]) for name in found.alarms)
         ]
         print_table("Vehicles with a gap", ["vehicle", "<cause", "probability", "P(none)"], rows)
-    if found.z:
+    elif found.gaps:
+        typer.echo(f"No alarm in {len(found.gaps)} vehicles; {found.nearest_text}")
+    if found.outlying:
         rows = [[vehicle, quantity, number(z, 1)] for vehicle, quantity, z in found.outlying]
         print_table("Outliers in health", ["vehicle", "<quantity", "robust z"], rows)
+    elif found.health:
+        typer.echo(found.no_outlier_text)

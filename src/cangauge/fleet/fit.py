@@ -207,7 +207,7 @@ def _usable(logs: Sequence[FleetLog], dataset: Dataset, run: str) -> tuple[_Used
 def _pooled_by_fold(used: _Used, dataset: Dataset, run: str) -> list[LogInformation]:
     waiting: dict[int, list[LogInformation]] = {}
     for row in dataset.rows(run):
-        if (found := used.get(row["log"])) is None:
+        if (found := used.get(row["log"])) is None or found[0].vehicle != row["vehicle"]:
             continue
         parts = waiting.setdefault(found[0].fold, [])
         parts.append(information_of_row(row))
@@ -245,7 +245,7 @@ def _summed(rows: Iterable[Mapping[str, Any]], used: _Used, solution: Solution) 
     kept = solution.back.shape[1]
     waiting: list[LogErrors] = []
     for row in rows:
-        if row["log"] in used:
+        if row["log"] in used and used[row["log"]][0].vehicle == row["vehicle"]:
             waiting.append(errors_of_row(row, kept))
         if len(waiting) >= POOLED_AT_ONCE:
             waiting = [summed(waiting)]

@@ -82,8 +82,8 @@ class FleetLog:
 
     @property
     def stated(self) -> str:
-        """What a manifest states of the log: its start, and the SoC there."""
-        return f"{self.start} {self.initial_soc_pct}"
+        """What a manifest or pattern states of the log: vehicle, start, and the SoC there."""
+        return f"{self.vehicle} {self.start} {self.initial_soc_pct}"
 
     @property
     def start_s(self) -> float | None:
