@@ -12,14 +12,9 @@ from cangauge._formatting import number
 from cangauge.diagnosis import NONE
 from cangauge.fleet.dataset import Dataset
 from cangauge.fleet.gap import GapJob
-from cangauge.fleet.health import (
-    OUTLIER_Z,
-    VEHICLES_AT_LEAST,
-    HealthJob,
-    latest_health,
-    outliers,
-)
+from cangauge.fleet.health import HealthJob, latest_health, outliers
 from cangauge.fleet.jobs import EstimateJob
+from cangauge.fleet.outliers import OUTLIER_Z, VALUES_AT_LEAST
 from cangauge.fleet.sources import FleetLog
 
 _JOBS: Final = (EstimateJob, HealthJob, GapJob)
@@ -172,7 +167,7 @@ class FleetOverview:
         """Why no vehicle is an outlier, in a sentence."""
         if self.z:
             return f"No outlier in health: every robust z lies within ±{OUTLIER_Z}."
-        return f"Fewer than {VEHICLES_AT_LEAST} vehicles: the spread of their health is not known."
+        return f"Fewer than {VALUES_AT_LEAST} vehicles: the spread of their health is not known."
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `--json` prints of the vehicles."""

@@ -123,6 +123,16 @@ def find_logs(given: Sequence[str], *, pattern: str = VEHICLE_PATTERN) -> list[F
     return sorted(found, key=lambda log: (log.vehicle, log.start_s or 0.0, log.url))
 
 
+def short_names(urls: Sequence[str]) -> list[str]:
+    """Return paths or URLs without the folders that all of them share."""
+    parts = [url.split("/") for url in urls]
+    most = min(map(len, parts), default=1) - 1
+    shared = 0
+    while shared < most and len({each[shared] for each in parts}) == 1:
+        shared += 1
+    return ["/".join(each[shared:]) for each in parts]
+
+
 def filesystem(url: str) -> tuple[Any, str]:
     """Return the fsspec file system of a URL, and the path in it.
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from cangauge._formatting import number
 from cangauge.fleet.dataset import reason_of
-from cangauge.fleet.health import OUTLIER_Z, QUANTITIES
+from cangauge.fleet.health import QUANTITIES
+from cangauge.fleet.outliers import OUTLIER_Z
 from cangauge.fleet.overview import FleetOverview
 from cangauge.report.charts import BLUE, GREY, ORANGE, Pen, Plot, add_line, bars, new_figure
 from cangauge.report.page import (
