@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.dataset as pds
 import pytest
 
@@ -15,6 +16,7 @@ from cangauge.fleet.dataset import Dataset, keys_of
 from cangauge.fleet.gap import GapJob, suspect_and_healthy
 from cangauge.fleet.health import HealthJob, outliers
 from cangauge.fleet.jobs import REAL, EstimateJob
+from cangauge.fleet.outliers import ErrorsByLog
 from cangauge.fleet.overview import FleetOverview
 from cangauge.fleet.run import perform, run_id
 from cangauge.fleet.sources import FleetLog, ReadOptions
@@ -153,6 +155,17 @@ def test_one_vehicle_apart_from_the_others_is_an_outlier() -> None:
     assert set(z) == {"capacity_ah", "resistance_ratio"}
     assert z["capacity_ah"]["v3"] < -3.5 < z["capacity_ah"]["v5"] < 0.0
     assert outliers({name: rows[name] for name in list(rows)[:4]}) == {}
+
+
+def test_few_logs_do_not_show_which_one_does_not_fit() -> None:
+    names, zeros = [f"{k}.csv" for k in range(5)], np.zeros(5)
+    mean_v = np.array([0.1, 0.2, 0.0, 0.1, 3.0])
+    five = ErrorsByLog(names, names, mean_v, zeros, mean_v)
+    assert five.misfits == [4]
+    four = ErrorsByLog(names[1:], names[1:], mean_v[1:], zeros[1:], mean_v[1:])
+    assert four.misfits == []
+    assert four.to_dict() == {"misfits": None}
+    assert four.rule_text.startswith("Fewer than 5 logs")
 
 
 def test_references_come_from_all_vehicles(logs: list[FleetLog], model: Model) -> None:

@@ -225,7 +225,7 @@ def _show_fit(result: FleetFit) -> None:
             ["slope resistance", significant(result.slope_ohm, 3), "Ω"],
             ["condition number", significant(result.solution.condition_number, 2), ""],
             ["rows used", str(figures["rows"]), ""],
-            ["logs that do not fit", f"{len(by_log.misfits)} of {len(by_log.logs)}", ""],
+            ["logs that do not fit", by_log.count_text, ""],
         ],
     )
     _note_reasons("set aside", Counter(reason_of(each) for each in result.bad))
@@ -245,6 +245,7 @@ def _show_fit(result: FleetFit) -> None:
                 for name, k in zip(names, misfits, strict=True)
             ],
         )
+    if misfits or not by_log.is_known:
         note(by_log.rule_text)
 
 

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from cangauge._formatting import NONE_KNOWN
 from cangauge._typing import FloatArray
 from cangauge.inference.error_model import variance_of_sum
 from cangauge.model.model_file import Model
@@ -92,11 +93,17 @@ class ErrorsByLog:
         )
         return cls(logs, vehicles, np.array(mean_v), np.sqrt(variance_v2), np.array(rmse_v))
 
+    @property
+    def is_known(self) -> bool:
+        """Whether there are enough logs to show which one does not fit the others."""
+        return len(self.logs) >= VALUES_AT_LEAST
+
     @cached_property
     def z(self) -> FloatArray:
-        """Robust z of the mean error among the logs; 0 below `VALUES_AT_LEAST` logs."""
-        is_known = len(self.logs) >= VALUES_AT_LEAST
-        return robust_z(self.mean_v, self.mean_std_v) if is_known else np.zeros(len(self.logs))
+        """Robust z of the mean error among the logs; 0 if their spread is not known."""
+        if not self.is_known:
+            return np.zeros(len(self.logs))
+        return robust_z(self.mean_v, self.mean_std_v)
 
     @cached_property
     def order(self) -> list[int]:
@@ -110,9 +117,14 @@ class ErrorsByLog:
         return [k for k in self.order if z[k] >= OUTLIER_Z]
 
     @property
+    def count_text(self) -> str:
+        """The number of logs that do not fit, or a dash."""
+        return f"{len(self.misfits)} of {len(self.logs)}" if self.is_known else NONE_KNOWN
+
+    @property
     def rule_text(self) -> str:
         """Which logs do not fit the others, and what to do with them, in sentences."""
-        if len(self.logs) < VALUES_AT_LEAST:
+        if not self.is_known:
             return (
                 f"Fewer than {VALUES_AT_LEAST} logs do not show which one does not fit the others."
             )
@@ -129,10 +141,12 @@ class ErrorsByLog:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the logs that do not fit as JSON."""
+        """Return the logs that do not fit as JSON; None if that is not known."""
         numbers = {"mean_v": self.mean_v, "rmse_v": self.rmse_v, "z": self.z}
         return {
-            "misfits": [
+            "misfits": None
+            if not self.is_known
+            else [
                 {
                     "log": self.logs[k],
                     "vehicle": self.vehicles[k],

@@ -73,7 +73,7 @@ def _lead(result: FleetFit) -> str:
     by_log = result.by_log
     names = [by_log.logs[k] for k in by_log.misfits]
     if not names:
-        return "Every log fits the others."
+        return "Every log fits the others." if by_log.is_known else by_log.rule_text
     return f"{len(names)} of {len(by_log.logs)} logs do not fit the others: {joined(names)}."
 
 
@@ -87,7 +87,7 @@ def _tiles(result: FleetFit) -> list[Tile]:
         Tile("SoC by Newton (MAE)", number(figures["soc_newton_mae_pct"], 2, "%"),
              "against counting"),
         Tile("Logs used", str(result.logs_used), f"{figures['rows']:,} rows"),
-        Tile("Do not fit the others", str(len(result.by_log.misfits)), "used all the same"),
+        Tile("Do not fit the others", result.by_log.count_text, "used all the same"),
         Tile("Logs set aside", str(len(result.bad) + len(result.left_out)), "not used"),
     ]  # fmt: skip
 
