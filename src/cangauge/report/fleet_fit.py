@@ -74,7 +74,8 @@ def _lead(result: FleetFit) -> str:
     names = [by_log.logs[k] for k in by_log.misfits]
     if not names:
         return "Every log fits the others." if by_log.is_known else by_log.rule_text
-    return f"{len(names)} of {len(by_log.logs)} logs do not fit the others: {joined(names)}."
+    verb = "does" if len(names) == 1 else "do"
+    return f"{by_log.count_text} logs {verb} not fit the others: {joined(names)}."
 
 
 def _tiles(result: FleetFit) -> list[Tile]:
