@@ -16,6 +16,7 @@ from cangauge.fleet.dataset import Dataset, keys_of
 from cangauge.fleet.gap import GapJob, suspect_and_healthy
 from cangauge.fleet.health import HealthJob, outliers
 from cangauge.fleet.jobs import REAL, EstimateJob
+from cangauge.fleet.outliers import ErrorsByLog
 from cangauge.fleet.overview import FleetOverview
 from cangauge.fleet.run import perform, run_id
 from cangauge.fleet.sources import FleetLog, ReadOptions
@@ -158,6 +159,17 @@ def test_one_vehicle_apart_from_the_others_is_an_outlier() -> None:
     assert outliers({name: rows[name] for name in list(rows)[:4]}) == {}
 
 
+def test_few_logs_do_not_show_which_one_does_not_fit() -> None:
+    names, zeros = [f"{k}.csv" for k in range(5)], np.zeros(5)
+    mean_v = np.array([0.1, 0.2, 0.0, 0.1, 3.0])
+    five = ErrorsByLog(names, names, mean_v, zeros, mean_v)
+    assert five.misfits == [4]
+    four = ErrorsByLog(names[1:], names[1:], mean_v[1:], zeros[1:], mean_v[1:])
+    assert four.misfits == []
+    assert four.to_dict() == {"misfits": None}
+    assert four.rule_text.startswith("Fewer than 5 logs")
+
+
 def test_references_come_from_all_vehicles(logs: list[FleetLog], model: Model) -> None:
     marked = [replace(log, healthy="trip1" not in log.url) for log in logs]
     suspect, healthy = suspect_and_healthy(marked, 1)
@@ -206,7 +218,7 @@ def test_the_page_says_which_vehicle_has_which_gap() -> None:
     gap = {
         "detected": True, "verdict": "voltage_offset", "probability": 0.9, "probability_none": 0.01,
         "baseline_rmse_v": 2.0, "floor_v": 0.5, "closed_fraction": 0.8,
-        "credible_set": ["voltage_offset"],
+        "credible_set": ["voltage_offset"], "family": "voltage_sensing", "family_probability": 0.9,
     }  # fmt: skip
     healthy = {
         "end_s": 3600.0, "capacity_ah": 60.0, "capacity_std_ah": 1.0, "resistance_ratio": 1.0,

@@ -74,6 +74,14 @@ def test_a_corrected_soc_is_computed_again(fleet: Fleet) -> None:
     assert fleet.states(job) == ["a90", "b", "c"]
 
 
+def test_a_log_of_another_vehicle_is_computed_again(fleet: Fleet) -> None:
+    job = NotingJob()
+    fleet.run(job)
+    moved = [replace(log, vehicle="B") for log in fleet.logs()]
+    assert fleet.run(job, *moved).done == 3
+    assert fleet.run(job, *moved).skipped == 3
+
+
 def test_a_touched_log_is_read_once(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     job = NotingJob()
     fleet.run(job)

@@ -46,12 +46,22 @@ def test_a_manifest_orders_by_start_and_names_what_is_absent(tmp_path: Path) -> 
     assert ABSENT not in {found[0].stamp, found[1].stamp}
 
 
+@pytest.mark.parametrize("codec", ["utf-8-sig", "cp1252", "utf-16"])
+def test_a_manifest_is_read_as_a_german_spreadsheet_writes_it(tmp_path: Path, codec: str) -> None:
+    (tmp_path / "a.csv").write_text(HEAD)
+    text = '"log";vehicle;initial_soc_pct\r\na.csv;Käfer;90,5\r\n'
+    (tmp_path / "manifest.csv").write_bytes(text.encode(codec))
+    (log,) = find_logs([str(tmp_path / "manifest.csv")])
+    assert (Path(log.url).name, log.vehicle, log.initial_soc_pct) == ("a.csv", "Käfer", 90.5)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ("log,colour\na.csv,red\n", "not a column of a manifest: colour"),
         ("log,start\na.csv,yesterday\n", "line 2.*yesterday"),
         ("log,initial_soc_pct\na.csv,140\n", "0 … 100"),
+        ("log;initial_soc_pct\na.csv;full\n", "initial_soc_pct: not a number"),
         ("log,healthy\na.csv,perhaps\n", "neither yes nor no"),
         ("log,vehicle\n,X\n", "names no log"),
         ("log,vehicle\na.csv,X\na.csv,X\n", "named twice"),

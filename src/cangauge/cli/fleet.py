@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,11 +29,18 @@ from cangauge.cli.shown import ALARM_BELOW, FLEET_LOGS, FLEET_REFERENCES, LOCAL,
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
+    from cangauge.fleet.fit import FleetFit
     from cangauge.fleet.jobs import Job
     from cangauge.fleet.overview import FleetOverview
     from cangauge.fleet.run import Summary
     from cangauge.fleet.sources import FleetLog, ReadOptions
     from cangauge.logs.draft import Sign
+
+SHOWN_REASONS: Final = 10
+"""Reasons that are printed, the most frequent first; a page has all."""
+
+SHOWN_LOGS: Final = 20
+"""Logs that are printed; a page and JSON have more."""
 
 fleet_app: Final = typer.Typer(
     name="fleet", rich_markup_mode="markdown", add_completion=False, no_args_is_help=True,
@@ -141,17 +149,27 @@ def fit_fleet_command(
     epsilon: Annotated[float, typer.Option(metavar="E", help="Margin ε of the scaled SoC.")] = 0.05,
     t_ref: Annotated[float, typer.Option(metavar="C", help="Reference temperature [°C].")] = 20.0,
     name: Annotated[str | None, typer.Option(help="Name of the model.")] = None,
+    leave_out: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="LOGS", help="Those of LOGS that are not fitted, as LOGS; repeat the option."
+        ),
+    ] = None,
     reading: Reading,
+    report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:
     """Identify one model from all logs: the fit of `cangauge fit`, out of core.
 
     Each log is reduced to its information matrix, and these add up. Every log needs its SoC, or
-    initial_soc_pct in the manifest.
+    initial_soc_pct in the manifest. Logs that do not fit the others are named.
 
     Examples
     --------
     `cangauge fleet fit 'logs/*/*.parquet' -m type.json -o results --capacity-ah 51.5`
+
+    `cangauge fleet fit 'logs/*/*.parquet' -m type.json -o results --capacity-ah 51.5 --leave-out
+    logs/A17/trip4.parquet`
     """
     from cangauge.fleet.fit import fit_fleet
     from cangauge.inference.rows import FitOptions
@@ -161,14 +179,41 @@ def fit_fleet_command(
     within(epsilon, 1e-4, 0.49, option="--epsilon", unit="")
     within(t_ref, -60.0, 120.0, option="--t-ref", unit="°C")
     options = FitOptions(capacity_ah, None, rate_hz, parse_delays(delays), epsilon, t_ref)
-    check_outputs([output], [])
-    how, found_logs = _read_options(reading), cluster.find(logs)
-    result = cluster.run(lambda client: fit_fleet(found_logs, how, options, out, client, name=name))
-    write_texts_atomic({output: result.model.to_json()})
+    how, found = _read_options(reading), cluster.find(logs)
+    _check_outputs([output, report], found, *map(Path, logs))
+    fitted = _without(found, cluster.find(leave_out or []))
+    result = cluster.run(lambda client: fit_fleet(fitted, how, options, out, client, name=name))
+    texts = {output: result.model.to_json()}
+    if report is not None:
+        from cangauge.report.fleet_fit import fleet_fit_report
+
+        texts[report] = fleet_fit_report(result)
+    write_texts_atomic(texts)
     if json_output:
-        emit_json(result.to_dict() | {"model": str(output), "output": out})
+        written = {"model": str(output), "output": out, "report": report and str(report)}
+        emit_json(result.to_dict() | written)
         return
-    figures = result.to_dict()
+    _show_fit(result)
+    note(f"model: {output}" + (f"\nreport: {report}" if report else ""))
+
+
+def _without(logs: Sequence[FleetLog], left_out: Sequence[FleetLog]) -> list[FleetLog]:
+    """Return the logs that are not left out; raise InputError for one that is not among them."""
+    among = {log.url for log in logs}
+    for log in left_out:
+        if log.url not in among:
+            raise InputError(
+                "is not among LOGS", source=log.url, field="--leave-out", cure="check its path"
+            )
+    names = {log.url for log in left_out}
+    return [log for log in logs if log.url not in names]
+
+
+def _show_fit(result: FleetFit) -> None:
+    from cangauge.fleet.dataset import reason_of
+    from cangauge.fleet.sources import short_names
+
+    figures, by_log = result.to_dict(), result.by_log
     print_table(
         f"Model {result.model.name}",
         ["", "value", "<unit"],
@@ -180,11 +225,28 @@ def fit_fleet_command(
             ["slope resistance", significant(result.slope_ohm, 3), "Ω"],
             ["condition number", significant(result.solution.condition_number, 2), ""],
             ["rows used", str(figures["rows"]), ""],
+            ["logs that do not fit", by_log.count_text, ""],
         ],
     )
-    for remark in result.remarks:
-        note(f"note: {remark}")
-    note(f"model: {output}")
+    _note_reasons("set aside", Counter(reason_of(each) for each in result.bad))
+    _note_reasons("left out", Counter(each["reason"] for each in result.left_out))
+    if misfits := by_log.misfits[:SHOWN_LOGS]:
+        names = short_names([by_log.logs[k] for k in misfits])
+        print_table(
+            "Logs that do not fit the others",
+            ["log", "mean error [V]", "RMSE [V]", "robust z"],
+            [
+                [
+                    name,
+                    number(float(by_log.mean_v[k]), 2),
+                    number(float(by_log.rmse_v[k]), 2),
+                    number(float(by_log.z[k]), 1),
+                ]
+                for name, k in zip(names, misfits, strict=True)
+            ],
+        )
+    if misfits or not by_log.is_known:
+        note(by_log.rule_text)
 
 
 @fleet_app.command("estimate")
@@ -211,9 +273,11 @@ def estimate_fleet_command(
     from cangauge.fleet.jobs import EstimateJob
     from cangauge.model.model_file import Model
 
+    found = cluster.find(logs)
+    _check_outputs([report], found, model, *map(Path, logs))
     settings = EstimatorSettings(capacity_ah=capacity_ah)
     job = EstimateJob(_read_options(reading), Model.load(model), settings)
-    _run(job, cluster.find(logs), out, cluster, report, json_output=json_output)
+    _run(job, found, out, cluster, report, json_output=json_output)
 
 
 @fleet_app.command("health")
@@ -241,9 +305,11 @@ def health_fleet_command(
     from cangauge.fleet.health import HealthJob
     from cangauge.model.model_file import Model
 
+    found = cluster.find(logs)
+    _check_outputs([report], found, model, *map(Path, logs))
     settings = EstimatorSettings(capacity_ah=capacity_ah)
     job = HealthJob(_read_options(reading), Model.load(model), settings)
-    _run(job, cluster.find(logs), out, cluster, report, json_output=json_output)
+    _run(job, found, out, cluster, report, json_output=json_output)
 
 
 @fleet_app.command("gap")
@@ -297,12 +363,14 @@ def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
     known = cluster.find(reference or [])
     healthy = {log.url for log in known}
     found = [log for log in cluster.find(logs) if log.url not in healthy]
+    _check_outputs([report], [*found, *known], model, *map(Path, [*logs, *(reference or [])]))
     suspect, good = suspect_and_healthy(
         [*found, *(replace(log, healthy=True) for log in known)], latest
     )
     options = _read_options(reading)
     job = GapJob(options, Model.load(model), references, alarm).with_common(suspect, good)
-    _run(job, job.vehicles(suspect, good), out, cluster, report, json_output=json_output)
+    vehicles = job.vehicles(suspect, good)
+    _run(job, vehicles, out, cluster, report, among=[*found, *known], json_output=json_output)
 
 
 def _read_options(reading: Reading) -> ReadOptions:
@@ -338,17 +406,20 @@ def _run(
     cluster: Cluster,
     report: Path | None,
     *,
+    among: Sequence[FleetLog] | None = None,
     json_output: bool,
 ) -> None:
-    """Run a job over the logs, and print and write what it found of the fleet."""
+    """Run a job over the logs, and print and write what it found of the fleet.
+
+    Results are those of the logs in `among`; by default of all that the job reads.
+    """
     from cangauge.fleet.dataset import Dataset
     from cangauge.fleet.overview import FleetOverview
     from cangauge.fleet.run import run_job
 
-    check_outputs([report], [])
     dataset = Dataset(out, job.kind, job.columns)
     summary = cluster.run(lambda client: run_job(job, logs, dataset, client))
-    found = FleetOverview.read(out)
+    found = FleetOverview.read(out, logs if among is None else among)
     if report is not None:
         from cangauge.report.fleet import fleet_report
 
@@ -364,16 +435,36 @@ def _run(
         raise typer.Exit(1)
 
 
+def _note_reasons(what: str, reasons: Mapping[str, int]) -> None:
+    ordered = sorted(reasons.items(), key=lambda item: -item[1])
+    for reason, count in ordered[:SHOWN_REASONS]:
+        note(f"{what}: {count} × {reason}")
+    if len(ordered) > SHOWN_REASONS:
+        note(f"{what}: {sum(n for _, n in ordered[SHOWN_REASONS:])} for other reasons")
+
+
+def _check_outputs(outputs: Sequence[Path | None], logs: Sequence[FleetLog], *files: Path) -> None:
+    """Refuse outputs that cannot be written, or would overwrite a log or another input."""
+    names = {output.name for output in outputs if output is not None}
+    read = [Path(log.url) for log in logs if log.url.rpartition("/")[2] in names]
+    check_outputs(outputs, [*read, *files])
+
+
 def _show(summary: Summary, found: FleetOverview) -> None:
     typer.echo(f"{summary} ({summary.seconds:.0f} s, {summary.workers} workers)")
-    for reason, count in sorted(summary.reasons.items(), key=lambda item: -item[1])[:10]:
-        note(f"set aside: {count} × {reason}")
-    if found.gaps:
+    _note_reasons("set aside", summary.reasons)
+    if found.elsewhere_text:
+        note(f"note: {found.elsewhere_text}")
+    if found.alarms:
         rows = [
             [name, row["verdict"], number(row["probability"], 2), number(row["probability_none"])]
             for name, row in ((name, found.gaps[name]) for name in found.alarms)
         ]
         print_table("Vehicles with a gap", ["vehicle", "<cause", "probability", "P(none)"], rows)
-    if found.z:
+    elif found.gaps:
+        typer.echo(f"No alarm in {len(found.gaps)} vehicles; {found.nearest_text}")
+    if found.outlying:
         rows = [[vehicle, quantity, number(z, 1)] for vehicle, quantity, z in found.outlying]
         print_table("Outliers in health", ["vehicle", "<quantity", "robust z"], rows)
+    elif found.health:
+        typer.echo(found.no_outlier_text)

@@ -230,6 +230,11 @@ def _vehicle_of(path: str) -> str:
     return unquote(path.rpartition("/")[0].rpartition("vehicle=")[2])
 
 
+def reason_of(row: Row) -> str:
+    """Return why a log was set aside, without its name: the same for all logs of a kind."""
+    return str(row["reason"]).removeprefix(f"{row['log']}: ")
+
+
 def keys_of(log: FleetLog, run: str, sha256: str, seconds: float) -> dict[str, Any]:
     """Return the columns that every row of a log has.
 

@@ -6,6 +6,7 @@ second pass is computed again for all, since each log changes the model.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -14,6 +15,7 @@ import numpy as np
 
 from cangauge.errors import InputError
 from cangauge.fleet.dataset import Dataset
+from cangauge.fleet.outliers import ErrorsByLog
 from cangauge.fleet.passes import (
     ErrorsJob,
     InformationJob,
@@ -25,7 +27,6 @@ from cangauge.fleet.sources import FleetLog, ReadOptions
 from cangauge.identify.assemble import (
     coefficient_names,
     common_name,
-    common_temperature_source,
     information_of_rows,
     made_of,
     model_file_of,
@@ -68,7 +69,11 @@ class FleetFit:
         As of `cangauge.Identification` [Ω].
     summaries : tuple of Summary
         Of both passes.
-    remarks : tuple of str
+    by_log : ErrorsByLog
+    left_out : list of dict
+        Logs that could be read but are not of the fit, each with `log` and `reason`.
+    bad : list of dict
+        Logs set aside, each with `table`, `log` and `reason`.
     """
 
     model: Model
@@ -77,7 +82,14 @@ class FleetFit:
     slope_ohm: float
     slope_expected_ohm: float
     summaries: tuple[Summary, ...]
-    remarks: tuple[str, ...]
+    by_log: ErrorsByLog
+    left_out: list[dict[str, str]]
+    bad: list[dict[str, str]]
+
+    @property
+    def logs_used(self) -> int:
+        """Number of logs of the fit."""
+        return len(self.errors.equations.rows)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the object that `cangauge fleet fit --json` prints."""
@@ -99,9 +111,11 @@ class FleetFit:
                 "voltage_rmse_v": noise.voltage_rmse_v,
                 "judged_on": noise.judged_on,
             },
+            **self.by_log.to_dict(),
             "rows": int(sums["rows"]),
             "passes": [summary.to_dict() for summary in self.summaries],
-            "remarks": list(self.remarks),
+            "logs": self.logs_used,
+            "left_out": self.left_out,
         }
 
 
@@ -135,7 +149,7 @@ def fit_fleet(
     first = InformationJob(options, fit)
     dataset = Dataset(out, first.kind, first.columns)
     summary = run_job(first, logs, dataset, client)
-    used, remarks = _usable(logs, dataset, run_id(first))
+    used, left_out = _usable(logs, dataset, run_id(first))
     by_fold = _pooled_by_fold(used, dataset, run_id(first))
     whole = pooled(by_fold)
     model, solution = fit_information(whole, fit, source=out)
@@ -157,26 +171,54 @@ def fit_fleet(
         )
     solution = with_std_errors(solution, errors.sums, errors.scores)
     slope, expected = slope_resistances(errors, model.resistance_ohm)
+    rows = errors_set.rows(run_id(second), without=_NOT_BY_LOG)
+    found = _model_file(whole, model, solution, errors=errors, fit=fit, used=used, name=name)
     return FleetFit(
-        _model_file(whole, model, solution, errors=errors, fit=fit, used=used, name=name),
+        found,
         solution,
         errors,
         slope,
         expected,
         (summary, later),
-        tuple(remarks),
+        by_log=ErrorsByLog.of_rows((row for row in rows if _is_of(row, used)), found),
+        left_out=left_out,
+        bad=_bad(logs, dataset, run_id(first)),
     )
 
 
 _Used = dict[str, tuple[FleetLog, Mapping[str, Any]]]
 
 
-def _usable(logs: Sequence[FleetLog], dataset: Dataset, run: str) -> tuple[_Used, list[str]]:
-    """Return the logs with information, by URL in their order, each with a fold."""
+_NOT_BY_LOG: Final = ("scores", "means", "counts", "products")
+"""Columns of `ErrorsJob` that the errors by log do not need."""
+
+
+def _is_of(row: Mapping[str, Any], used: _Used) -> bool:
+    """Return whether a row is of a used log, and of the vehicle that it has now."""
+    found = used.get(row["log"])
+    return found is not None and found[0].vehicle == row["vehicle"]
+
+
+def _bad(logs: Sequence[FleetLog], dataset: Dataset, run: str) -> list[dict[str, str]]:
+    among = {log.url for log in logs}
+    return [
+        {"table": dataset.kind, "log": row["log"], "reason": row["reason"]}
+        for row in dataset.rows(run, bad=True)
+        if row["log"] in among
+    ]
+
+
+def _usable(
+    logs: Sequence[FleetLog], dataset: Dataset, run: str
+) -> tuple[_Used, list[dict[str, str]]]:
+    """Return the logs with information, by URL in their order, each with a fold; and the others.
+
+    The others have the same rows as one before, or temperatures measured elsewhere.
+    """
     wanted = ("name", "rows", "data_sha256", "signals_sha256", "temperature_source")
     known = {url: row for url, row in dataset.known(run, *wanted).items() if "data_sha256" in row}
     used: _Used = {}
-    remarks: list[str] = []
+    left_out: list[dict[str, str]] = []
     by_signals: dict[str, str] = {}
     for log in logs:
         if log.url not in known:
@@ -184,28 +226,53 @@ def _usable(logs: Sequence[FleetLog], dataset: Dataset, run: str) -> tuple[_Used
         row = known[log.url]
         twin = by_signals.setdefault(row["signals_sha256"], log.url)
         if twin != log.url:
-            remarks.append(f"{log.url}: same rows as {twin}: left out")
+            left_out.append({"log": log.url, "reason": f"same rows as {twin}"})
             continue
         used[log.url] = (log, row)
+    left_out += _measured_elsewhere(used)
     if len(used) < LOGS_AT_LEAST:
+        reasons = Counter(each["reason"] for each in left_out)
         raise InputError(
             f"only {len(used)} logs can be used, {LOGS_AT_LEAST} are needed",
             source=dataset.out,
-            cure=f"see the reasons in {dataset.tables[1]}; one or two logs: `cangauge fit`",
+            cure="; ".join(
+                [
+                    f"see the reasons in {dataset.tables[1]}; one or two logs: `cangauge fit`",
+                    *(f"{number} left out: {text}" for text, number in reasons.most_common(1)),
+                ]
+            ),
         )
-    common_temperature_source(row["temperature_source"] for _, row in used.values())
     number = min(len(used), FOLDS_AT_MOST)
     for k, (url, (log, found)) in enumerate(used.items()):
         used[url] = (replace(log, fold=k % number), found)
-    return used, remarks
+    return used, left_out
+
+
+def _measured_elsewhere(used: _Used) -> list[dict[str, str]]:
+    """Take the logs out whose temperature source is not that of the most, and return them."""
+    counts = Counter(row["temperature_source"] for _, row in used.values())
+    # A known place before "unknown" where both are as frequent.
+    most = max(counts, key=lambda name: (counts[name], name != "unknown"), default="")
+    others = {url: row["temperature_source"] for url, (_, row) in used.items()}
+    others = {url: source for url, source in others.items() if source != most}
+    for url in others:
+        del used[url]
+    return [
+        {
+            "log": url,
+            "reason": f"its temperature source is {source}, that of {counts[most]} others {most};"
+            " --temperature-source states it where a log does not",
+        }
+        for url, source in others.items()
+    ]
 
 
 def _pooled_by_fold(used: _Used, dataset: Dataset, run: str) -> list[LogInformation]:
     waiting: dict[int, list[LogInformation]] = {}
     for row in dataset.rows(run):
-        if (found := used.get(row["log"])) is None:
+        if not _is_of(row, used):
             continue
-        parts = waiting.setdefault(found[0].fold, [])
+        parts = waiting.setdefault(used[row["log"]][0].fold, [])
         parts.append(information_of_row(row))
         if len(parts) >= POOLED_AT_ONCE:
             parts[:] = [pooled(parts)]
@@ -217,7 +284,7 @@ def _summed(rows: Iterable[Mapping[str, Any]], used: _Used, solution: Solution) 
     kept = solution.back.shape[1]
     waiting: list[LogErrors] = []
     for row in rows:
-        if row["log"] in used:
+        if _is_of(row, used):
             waiting.append(errors_of_row(row, kept))
         if len(waiting) >= POOLED_AT_ONCE:
             waiting = [summed(waiting)]

@@ -17,6 +17,7 @@ from cangauge.estimation.offline import gap_of, initial_soc_of, update_all
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.state import EstimatorState
 from cangauge.fleet.jobs import COUNT, REAL, TEXT, Job, known, required
+from cangauge.fleet.outliers import VALUES_AT_LEAST, robust_z
 from cangauge.fleet.sources import FleetLog
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
@@ -24,16 +25,6 @@ from cangauge.service.offline import require_same_pack
 
 PARKED_S: Final = 8.0 * 3600.0
 """Time between two logs of a vehicle without a known start [s]: a car parked overnight."""
-
-OUTLIER_Z: Final = 3.5
-"""Robust z from which a vehicle is an outlier (Iglewicz, Hoaglin, How to Detect and Handle
-Outliers, 1993)."""
-
-MAD_TO_STD: Final = 1.4826
-"""Standard deviation over median absolute deviation, of a normal distribution."""
-
-VEHICLES_AT_LEAST: Final = 5
-"""Vehicles from which the spread of a fleet is known."""
 
 QUANTITIES: Final = {
     "capacity_ah": "capacity_std_ah",
@@ -133,9 +124,6 @@ def latest_health(rows: Iterable[Mapping[str, Any]]) -> dict[str, Mapping[str, A
 def outliers(latest: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, float]]:
     """Return the robust z of each vehicle's capacity, resistance and offset over the fleet.
 
-    z = (x − median) / √(s² + σ²), with s the scaled median absolute deviation over the fleet and σ
-    the vehicle's own standard deviation: one that is badly known is no outlier.
-
     Parameters
     ----------
     latest : mapping
@@ -144,7 +132,7 @@ def outliers(latest: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, flo
     Returns
     -------
     dict
-        Quantity → z by vehicle; empty below `VEHICLES_AT_LEAST` vehicles.
+        Quantity → z by vehicle; empty below `VALUES_AT_LEAST` vehicles.
     """
     found: dict[str, dict[str, float]] = {}
     for quantity, deviation in QUANTITIES.items():
@@ -153,12 +141,8 @@ def outliers(latest: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, flo
             for vehicle, row in latest.items()
             if row[quantity] is not None
         }
-        if len(values) < VEHICLES_AT_LEAST:
+        if len(values) < VALUES_AT_LEAST:
             continue
-        x, std = np.array([*values.values()]).T
-        middle = float(np.median(x))
-        spread = MAD_TO_STD * float(np.median(np.abs(x - middle)))
-        scale = np.hypot(spread, std)
-        z = np.divide(x - middle, scale, out=np.zeros_like(x), where=scale > 0.0)
+        z = robust_z(*np.array([*values.values()]).T)
         found[quantity] = dict(zip(values, z.tolist(), strict=True))
     return found

@@ -151,7 +151,9 @@ def rows_of(
     """
     recorded = options.read_log(log, path)
     if recorded.first_soc() is None:
-        raise unknown_start(recorded, others=False)
+        unknown = unknown_start(recorded, others=False)
+        cure = "state initial_soc_pct in a manifest, or name the SoC (--columns soc=…)"
+        raise InputError(unknown.problem, field=unknown.field, cure=cure)
     if len(split_where_moved(recorded)) > 1:
         raise InputError(
             "the pack was charged or driven in a gap of this log",

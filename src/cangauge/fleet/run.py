@@ -22,7 +22,7 @@ from typing import Any, Final
 from cangauge._io import file_sha256, text_sha256
 from cangauge._version import __version__
 from cangauge.errors import CangaugeError, InputError
-from cangauge.fleet.dataset import Dataset, keys_of
+from cangauge.fleet.dataset import Dataset, keys_of, reason_of
 from cangauge.fleet.jobs import Job
 from cangauge.fleet.sources import FleetLog, local_file
 
@@ -330,9 +330,9 @@ class _Run:
         keys = keys_of(outcome.log, self._id, outcome.sha256, outcome.seconds)
         if outcome.reason:
             self.summary.bad += 1
-            kind = outcome.reason.rpartition(": ")[2][:80]
-            self.summary.reasons[kind] = self.summary.reasons.get(kind, 0) + 1
             self._bad.append(keys | {"reason": outcome.reason, "is_final": outcome.is_final})
+            kind = reason_of(self._bad[-1])
+            self.summary.reasons[kind] = self.summary.reasons.get(kind, 0) + 1
             _LOG.debug("set aside: %s", outcome.reason)
         elif outcome.row is None:
             self.summary.skipped += 1

@@ -32,6 +32,7 @@ from cangauge.errors import InputError
 from cangauge.identify.starts import with_start
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.draft import Sign
+from cangauge.logs.file_content import as_utf8, delimiter_of, split_cells
 from cangauge.logs.log import Log
 from cangauge.logs.read import LogFile
 from cangauge.logs.sign import require_discharge_positive
@@ -81,8 +82,8 @@ class FleetLog:
 
     @property
     def stated(self) -> str:
-        """What a manifest states of the log: its start, and the SoC there."""
-        return f"{self.start} {self.initial_soc_pct}"
+        """What a manifest or pattern states of the log: vehicle, start, and the SoC there."""
+        return f"{self.vehicle} {self.start} {self.initial_soc_pct}"
 
     @property
     def start_s(self) -> float | None:
@@ -120,6 +121,16 @@ def find_logs(given: Sequence[str], *, pattern: str = VEHICLE_PATTERN) -> list[F
             raise InputError("is named twice", source=log.url, cure="give each log once")
         by_url[log.url] = log
     return sorted(found, key=lambda log: (log.vehicle, log.start_s or 0.0, log.url))
+
+
+def short_names(urls: Sequence[str]) -> list[str]:
+    """Return paths or URLs without the folders that all of them share."""
+    parts = [url.split("/") for url in urls]
+    most = min(map(len, parts), default=1) - 1
+    shared = 0
+    while shared < most and len({each[shared] for each in parts}) == 1:
+        shared += 1
+    return ["/".join(each[shared:]) for each in parts]
 
 
 def filesystem(url: str) -> tuple[Any, str]:
@@ -214,16 +225,24 @@ def _url(fs: Any, given: str, name: str) -> str:
 
 def _is_manifest(fs: Any, path: str) -> bool:
     with fs.open(path, "rb") as file:
-        first = file.read(4096).split(b"\n")[0].decode("utf-8-sig", "replace")
-    return "log" in {name.strip() for name in first.split(",")}
+        return "log" in _headings(as_utf8(file.read(4096)).decode())[0]
+
+
+def _headings(text: str) -> tuple[list[str], str]:
+    """Return the headings of a table as spreadsheets write it, and its delimiter."""
+    first = text.partition("\n")[0]
+    delimiter = delimiter_of(first) or ","
+    return split_cells(first, delimiter), delimiter
 
 
 def _of_manifest(fs: Any, path: str, url: str, expression: re.Pattern[str]) -> list[FleetLog]:
     if fs.size(path) > MAX_MANIFEST_BYTES:
         raise InputError(f"larger than {MAX_MANIFEST_BYTES >> 20} MiB", source=url)
-    text = fs.cat_file(path).decode("utf-8-sig")
-    reader = csv.DictReader(io.StringIO(text, newline=""), restkey="")
-    unknown = sorted(set(reader.fieldnames or ()) - set(MANIFEST_COLUMNS))
+    text = as_utf8(fs.cat_file(path)).decode()
+    headings, delimiter = _headings(text)
+    rows_text = io.StringIO(text.partition("\n")[2], newline="")
+    reader = csv.DictReader(rows_text, headings, restkey="", delimiter=delimiter)
+    unknown = sorted(set(headings) - set(MANIFEST_COLUMNS))
     if unknown:
         raise InputError(
             f"not a column of a manifest: {', '.join(unknown)}", source=url, field=unknown[0],
@@ -256,17 +275,32 @@ def _manifest_log(row: Mapping[str, str | None], url: str, at: str) -> FleetLog:
     initial, healthy, start = cell("initial_soc_pct"), cell("healthy").lower(), cell("start")
     if healthy not in TRUE | FALSE:
         raise InputError("neither yes nor no", source=at, field="healthy", value=healthy)
+    log = FleetLog(url, cell("vehicle"), "", start, _soc_pct(initial, at), healthy in TRUE)
     try:
-        soc_pct = float(initial) if initial else None
-        log = FleetLog(url, cell("vehicle"), "", start, soc_pct, healthy in TRUE)
         _ = log.start_s
     except ValueError as error:
-        raise InputError(str(error), source=at, cure="a date as 2024-05-01T08:30:00Z") from error
-    if soc_pct is not None and not 0.0 <= soc_pct <= 100.0:
+        raise InputError(
+            "not a date", source=at, field="start", value=start,
+            cure="give it as 2024-05-01T08:30:00Z",
+        ) from error  # fmt: skip
+    return log
+
+
+def _soc_pct(cell: str, at: str) -> float | None:
+    """Return the SoC of a cell, with a decimal point or comma [%]; None if it is empty."""
+    if not cell:
+        return None
+    try:
+        soc_pct = float(cell.replace(",", "."))
+    except ValueError as error:
+        raise InputError(
+            "not a number of %", source=at, field="initial_soc_pct", value=cell
+        ) from error
+    if not 0.0 <= soc_pct <= 100.0:
         raise InputError(
             "must lie within 0 … 100 %", source=at, field="initial_soc_pct", value=soc_pct
         )
-    return log
+    return soc_pct
 
 
 def _stamps(urls: Sequence[str]) -> dict[str, str]:

@@ -105,7 +105,8 @@ def common_temperature_source(sources: Iterable[TemperatureSource]) -> Temperatu
             "the temperatures of the logs have different sources",
             field="temperature_source",
             value=found,
-            cure="fit logs with the same temperature source together",
+            cure="state it for the logs that do not (--temperature-source), or fit logs of one"
+            " source together",
         )
     return found[0]
 

@@ -109,7 +109,7 @@ class FileContent:
             return self._sheet
         with self._open() as file:
             data = read_all(file, self.path, MAX_LOG_BYTES, "a log")
-        return data if self.is_parquet else _as_utf8(data)
+        return data if self.is_parquet else as_utf8(data)
 
     @contextmanager
     def open_seekable(self) -> Iterator[BinaryIO]:
@@ -266,7 +266,8 @@ def _only_member(archive: zipfile.ZipFile, path: Path) -> zipfile.ZipInfo:
     return chosen[0]
 
 
-def _as_utf8(data: bytes) -> bytes:
+def as_utf8(data: bytes) -> bytes:
+    """Return text of UTF-8, UTF-16 or latin-1 as UTF-8 without a byte order mark."""
     data = data.removeprefix(b"\xef\xbb\xbf")
     if data[:2] in _UTF16:  # "Unicode text" of spreadsheets
         return data.decode("utf-16", errors="replace").encode()
@@ -286,7 +287,7 @@ def _first_lines(beginning: bytes) -> tuple[str, ...]:
     if len(beginning) >= _HEAD_BYTES:
         # The last line may be cut within a character, which would make it look like latin-1.
         beginning = beginning[: beginning.rfind(b"\n") + 1] or beginning
-    text = _as_utf8(beginning).decode("utf-8", errors="ignore")
+    text = as_utf8(beginning).decode("utf-8", errors="ignore")
     if "\x00" in text:
         return ()
     return tuple(text.replace("\r\n", "\n").replace("\r", "\n").split("\n")[:_HEAD_LINES])

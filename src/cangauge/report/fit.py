@@ -13,9 +13,12 @@ from cangauge._formatting import duration, number, significant, span
 from cangauge._typing import FloatArray
 from cangauge.identify.evaluate import LogFit
 from cangauge.identify.fit import Identification
+from cangauge.inference.least_squares import Solution
 from cangauge.inference.rows import running_rows
 from cangauge.model.coulomb_counting import discharged_ah
 from cangauge.model.effects.library import LIBRARY
+from cangauge.model.model_file import Model
+from cangauge.model.voltage_model import VoltageModel
 from cangauge.report.charts import (
     BLACK,
     BLUE,
@@ -77,7 +80,7 @@ def fit_page(result: Identification) -> Page:
         Section("State of charge from voltage", _newton_figures(result, time)),
         Section("Resistance", [_resistance_figure(result)]),
         Section("Energy", _energy(result)),
-        Section("Coefficients", [_coefficients(result)]),
+        Section("Coefficients", [coefficient_table(result.model, result.solution)]),
         *([Section("Effects", _effects(result))] if result.effects is not None else []),
         Section("Recorded data", _recorded_figures(result, time)),
         Section("How the model was made", _method(result)),
@@ -146,7 +149,7 @@ def _fit_figures(result: Identification, time: TimeFigures) -> list[Block]:
                 ),
                 Figure(
                     "Slope of the pseudo-OCV",
-                    _slope_plot(result),
+                    slope_plot(result.voltage_model),
                     "A voltage error divided by this slope is the SoC error: where the slope is"
                     " small, the voltage hardly determines the SoC.",
                 ),
@@ -184,8 +187,8 @@ def _ocv_plot(result: Identification) -> Plot:
     return plot
 
 
-def _slope_plot(result: Identification) -> Plot:
-    model = result.voltage_model
+def slope_plot(model: VoltageModel) -> Plot:
+    """Return the slope of the pseudo-OCV over SoC."""
     plot = new_figure(
         ("state of charge", "dU/dS"),
         "@y{0.000} V per %<br>at @x{0.0} %",
@@ -348,8 +351,8 @@ def _energy(result: Identification) -> list[Block]:
     ]
 
 
-def _coefficients(result: Identification) -> Table:
-    model = result.model
+def coefficient_table(model: Model, solution: Solution) -> Table:
+    """Return the coefficients of a model with their standard errors."""
     factors = {
         "k0": "1", "k1": "1/s", "k2": "1/s²", "k3": "1/s³", "k4": "1/s⁴", "k5": "s",
         "k6": "ln s", "k7": "ln(1 − s)", "kt": f"T − {model.t_ref_c:g} °C",
@@ -370,7 +373,7 @@ def _coefficients(result: Identification) -> Table:
         )
     bounded = (
         " The bounds that keep the pseudo-OCV rising are active; the standard errors ignore them."
-        if result.solution.constrained
+        if solution.constrained
         else ""
     )
     return Table(
@@ -379,7 +382,7 @@ def _coefficients(result: Identification) -> Table:
         "U = k0 + k1/s + k2/s² + k3/s³ + k4/s⁴ + k5·s + k6·ln s + k7·ln(1 − s) + kt·(T − Tr)"
         " + Σ Rj·I(t − dj),  s = S/100·(1 − 2ε) + ε. Standard errors allow for residuals that are"
         " correlated within 300 s. k0 … k7 are strongly correlated (condition number"
-        f" {significant(result.solution.condition_number, 2)}): use their sum, the curve, not"
+        f" {significant(solution.condition_number, 2)}): use their sum, the curve, not"
         f" single values.{bounded}",
     )
 
@@ -454,7 +457,11 @@ def _recorded_figures(result: Identification, time: TimeFigures) -> list[Block]:
 
 
 def _method(result: Identification) -> list[Block]:
-    blocks: list[Block] = [_settings(result), _logs(result), _removed(result)]
+    blocks: list[Block] = [
+        settings_table(result.model, result.solution),
+        _logs(result),
+        _removed(result),
+    ]
     by_text: dict[str, list[str]] = {}
     for log in result.logs:
         for remark in log.remarks:
@@ -465,8 +472,8 @@ def _method(result: Identification) -> list[Block]:
     return blocks
 
 
-def _settings(result: Identification) -> Table:
-    model = result.model
+def settings_table(model: Model, solution: Solution) -> Table:
+    """Return how a model was made, and the range that it is known in."""
     return Table(
         ["model", ""],
         [
@@ -479,8 +486,8 @@ def _settings(result: Identification) -> Table:
             ["identified at SoC", span(*model.range.soc_pct, 1, "%")],
             ["identified at temperature", span(*model.range.temperature_c, 1, "°C")],
             ["identified at current", span(*model.range.current_a, 0, "A")],
-            ["condition number", significant(result.solution.condition_number, 2)],
-            ["rising pseudo-OCV", "enforced" if result.solution.constrained else "by itself"],
+            ["condition number", significant(solution.condition_number, 2)],
+            ["rising pseudo-OCV", "enforced" if solution.constrained else "by itself"],
             ["made by", model.made.by],
         ],
     )

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from cangauge._formatting import number
-from cangauge.fleet.health import OUTLIER_Z, QUANTITIES, VEHICLES_AT_LEAST
+from cangauge.fleet.dataset import reason_of
+from cangauge.fleet.health import QUANTITIES
+from cangauge.fleet.outliers import OUTLIER_Z
 from cangauge.fleet.overview import FleetOverview
 from cangauge.report.charts import BLUE, GREY, ORANGE, Pen, Plot, add_line, bars, new_figure
 from cangauge.report.page import (
@@ -75,7 +78,7 @@ def _lead(found: FleetOverview) -> str:
         sentences.append(
             f"{len(causes)} of {len(found.gaps)} vehicles have a gap: {joined(causes, 5)}."
             if causes
-            else f"None of {len(found.gaps)} vehicles has a significant gap."
+            else f"None of {len(found.gaps)} vehicles has a significant gap; {found.nearest_text}."
         )
     if found.health:
         names = list(dict.fromkeys(vehicle for vehicle, _, _ in found.outlying))
@@ -191,10 +194,8 @@ def _over_time(found: FleetOverview, quantity: str, marked: set[str]) -> Plot:
 def _outliers(found: FleetOverview) -> list[Block]:
     if not found.health:
         return []
-    if not found.z:
-        return [Paragraph(f"Fewer than {VEHICLES_AT_LEAST} vehicles: their spread is not known.")]
     if not found.outlying:
-        return [Paragraph(f"None: every robust z lies within ±{OUTLIER_Z}.")]
+        return [Paragraph(found.no_outlier_text)]
     rows = []
     for vehicle, quantity, z in found.outlying[:SHOWN]:
         label, unit, digits = _LABELS[quantity]
@@ -240,12 +241,24 @@ def _estimates(found: FleetOverview) -> list[Block]:
 
 
 def _bad(found: FleetOverview) -> list[Block]:
-    if not found.bad:
+    text = found.elsewhere_text
+    return [*bad_table(found.bad), *([Paragraph(text)] if text else [])]
+
+
+def bad_table(bad: Sequence[Mapping[str, Any]]) -> list[Block]:
+    """Return a table of the reasons for which logs were set aside, if any were.
+
+    Parameters
+    ----------
+    bad : sequence of mapping
+        Each with `table`, `log` and `reason`.
+    """
+    if not bad:
         return []
     kinds: Counter[tuple[str, str]] = Counter()
     example: dict[tuple[str, str], str] = {}
-    for row in found.bad:
-        kind = row["table"], row["reason"].removeprefix(f"{row['log']}: ")
+    for row in bad:
+        kind = row["table"], reason_of(row)
         kinds[kind] += 1
         example.setdefault(kind, row["log"])
     rows = [

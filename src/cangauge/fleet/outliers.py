@@ -1,0 +1,163 @@
+"""What lies far from the others of a fleet: values, and logs that the common model does not fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+
+from cangauge._formatting import NONE_KNOWN
+from cangauge._typing import FloatArray
+from cangauge.inference.error_model import variance_of_sum
+from cangauge.model.model_file import Model
+
+OUTLIER_Z: Final = 3.5
+"""Robust z from which a value is an outlier (Iglewicz, Hoaglin, How to Detect and Handle Outliers,
+1993)."""
+
+MAD_TO_STD: Final = 1.4826
+"""Standard deviation over median absolute deviation, of a normal distribution."""
+
+VALUES_AT_LEAST: Final = 5
+"""Vehicles, or logs, from which the spread of a fleet is known."""
+
+
+def robust_z(values: FloatArray, std: FloatArray | float = 0.0) -> FloatArray:
+    """Return z = (x − median)/√(s² + σ²), with s the scaled median absolute deviation.
+
+    Parameters
+    ----------
+    values : array of shape (n,)
+    std : array of shape (n,) or float
+        Own standard deviation σ of each value: one that is badly known is no outlier.
+    """
+    apart = values - np.median(values)
+    scale = np.hypot(
+        MAD_TO_STD * float(np.median(np.abs(apart))), np.broadcast_to(std, apart.shape)
+    )
+    return np.asarray(np.divide(apart, scale, out=np.zeros_like(apart), where=scale > 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorsByLog:
+    """Mean error of the voltage of each log under the model of all logs.
+
+    The mean is what a wrong sensor, unit, temperature or SoC at the start leaves; a harder drive
+    has a larger error, but not a larger mean. A log that alone covers a range of SoC shapes the
+    model there, and so fits it.
+
+    Parameters
+    ----------
+    logs, vehicles : sequence of n str
+    mean_v : array of shape (n,)
+        Mean of measured minus modelled voltage [V].
+    mean_std_v : array of shape (n,)
+        Its standard deviation by the fast and slow parts of the error model [V].
+    rmse_v : array of shape (n,)
+        Root mean square of the error [V].
+    """
+
+    logs: Sequence[str]
+    vehicles: Sequence[str]
+    mean_v: FloatArray
+    mean_std_v: FloatArray
+    rmse_v: FloatArray
+
+    @classmethod
+    def of_rows(cls, rows: Iterable[Mapping[str, Any]], model: Model) -> ErrorsByLog:
+        """Collect the errors of rows of `ErrorsJob` under a model."""
+        resistance_ohm = model.voltage_model().resistance_ohm
+        logs, vehicles, numbers, mean_v, rmse_v = zip(
+            *sorted(
+                (
+                    row["log"],
+                    row["vehicle"],
+                    row["rows"],
+                    _mean_v(row["currents"], resistance_ohm),
+                    float(np.sqrt(row["square_v2"] / row["rows"])),
+                )
+                for row in rows
+            ),
+            strict=True,
+        )
+        number, noise = np.array(numbers), model.noise
+        variance_v2 = sum(
+            std_v**2 * variance_of_sum(number, time_s * model.rate_hz) / number**2
+            for std_v, time_s in (
+                (noise.fast_std_v, noise.fast_time_s),
+                (noise.slow_std_v, noise.slow_time_s),
+            )
+        )
+        return cls(logs, vehicles, np.array(mean_v), np.sqrt(variance_v2), np.array(rmse_v))
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there are enough logs to show which one does not fit the others."""
+        return len(self.logs) >= VALUES_AT_LEAST
+
+    @cached_property
+    def z(self) -> FloatArray:
+        """Robust z of the mean error among the logs; 0 if their spread is not known."""
+        if not self.is_known:
+            return np.zeros(len(self.logs))
+        return robust_z(self.mean_v, self.mean_std_v)
+
+    @cached_property
+    def order(self) -> list[int]:
+        """The logs, the farthest from the others first."""
+        return [int(k) for k in np.argsort(-np.abs(self.z), kind="stable")]
+
+    @cached_property
+    def misfits(self) -> list[int]:
+        """The logs that do not fit the others, the farthest first."""
+        z = np.abs(self.z)
+        return [k for k in self.order if z[k] >= OUTLIER_Z]
+
+    @property
+    def count_text(self) -> str:
+        """The number of logs that do not fit, or a dash."""
+        return f"{len(self.misfits)} of {len(self.logs)}" if self.is_known else NONE_KNOWN
+
+    @property
+    def rule_text(self) -> str:
+        """Which logs do not fit the others, and what to do with them, in sentences."""
+        if not self.is_known:
+            return (
+                f"Fewer than {VALUES_AT_LEAST} logs do not show which one does not fit the others."
+            )
+        rule = (
+            "A log does not fit the others where its mean error is an outlier among theirs (robust"
+            f" |z| from {OUTLIER_Z}, with the deviation that the error model states for a mean)."
+        )
+        if not self.misfits:
+            return rule
+        return (
+            f"{rule} Check it (sensor, unit, temperature, SoC at its start), and fit again without"
+            f" it: --leave-out '{self.logs[self.misfits[0]]}'. The farthest first, since it also"
+            " distorts the errors of the others."
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the logs that do not fit as JSON; None if that is not known."""
+        numbers = {"mean_v": self.mean_v, "rmse_v": self.rmse_v, "z": self.z}
+        return {
+            "misfits": None
+            if not self.is_known
+            else [
+                {
+                    "log": self.logs[k],
+                    "vehicle": self.vehicles[k],
+                    **{name: float(values[k]) for name, values in numbers.items()},
+                }
+                for k in self.misfits
+            ]
+        }
+
+
+def _mean_v(currents: Sequence[float], resistance_ohm: Sequence[float]) -> float:
+    """Return the mean error of a log from its flattened `LogErrors.currents` [V]."""
+    number, drop_v, *amperes = currents[: len(resistance_ohm) + 2]
+    return float(drop_v - np.dot(amperes, resistance_ohm)) / number
