@@ -175,6 +175,15 @@ def test_command_names_what_it_wrote(tmp_path: Path) -> None:
     assert '"delay_line_bytes"' in done.output
 
 
+def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
+    PLAIN.save(tmp_path / "pack.json")
+    (tmp_path / "ecm.py").write_text("kept")
+    arguments = ["export-c", str(tmp_path / "pack.json"), "-o", str(tmp_path / "ecm.py")]
+    with pytest.raises(InputError, match="is a file"):
+        CliRunner().invoke(app, arguments, catch_exceptions=False)
+    assert (tmp_path / "ecm.py").read_text() == "kept"
+
+
 def test_period_out_of_range_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"0\.001"):
         export_c(PLAIN, tmp_path, period_s=0.0)

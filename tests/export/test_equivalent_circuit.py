@@ -13,6 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cangauge.cli.app import app
+from cangauge.errors import InputError
 from cangauge.export.equivalent_circuit import equivalent_circuit
 from cangauge.logs.log import Log
 from cangauge.model.effects.first_order import low_passed
@@ -145,3 +146,11 @@ def test_the_command_writes_tables_or_a_module(tmp_path: Path) -> None:
     module = tmp_path / "pack.py"
     assert CliRunner().invoke(app, ["export-ecm", str(model), "-o", str(module)]).exit_code == 0
     assert callable(runpy.run_path(str(module))["pybamm_parameters"])
+
+
+@pytest.mark.parametrize("name", ["my-pack.py", "class.py", "pack.txt"])
+def test_a_module_that_cannot_be_imported_is_refused(tmp_path: Path, name: str) -> None:
+    leaf_2012_model_file().save(tmp_path / "model.json")
+    arguments = ["export-ecm", str(tmp_path / "model.json"), "-o", str(tmp_path / name)]
+    assert isinstance(CliRunner().invoke(app, arguments).exception, InputError)
+    assert not (tmp_path / name).exists()

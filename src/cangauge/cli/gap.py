@@ -18,7 +18,10 @@ from cangauge.cli.options import (
     ReportOption,
     assumed_of,
     check_outputs,
+    folder_to_write,
+    note_starts,
     option_groups,
+    suffixed,
     within,
 )
 from cangauge.cli.output import emit_json, note, print_table, progress_shown, save_figures
@@ -74,7 +77,11 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     ] = None,
     extended: Annotated[
         Path | None,
-        typer.Option(metavar="MODEL", help="Write the model, extended by the cause, to this file."),
+        typer.Option(
+            metavar="MODEL.json",
+            callback=suffixed(".json"),
+            help="Write the model, extended by the cause, to this file.",
+        ),
     ] = None,
     simulated: Annotated[
         str | None,
@@ -97,6 +104,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
         Path | None,
         typer.Option(
             metavar="FOLDER",
+            callback=folder_to_write,
             help="With a simulator: write each LOG with its simulated and corrected voltage to"
             " FOLDER/NAME.corrected.csv.",
         ),
@@ -118,7 +126,9 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     plan_file: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE.csv", help="Write the current profile of that test: time_s, current_a."
+            metavar="FILE.csv",
+            callback=suffixed(".csv"),
+            help="Write the current profile of that test: time_s, current_a.",
         ),
     ] = None,
     limits: Annotated[
@@ -176,18 +186,22 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     next_test = NextTestOptions(plan, plan_file, limits)
     _refuse_common(paths, given)
     outputs = [] if corrected is None else [corrected_path(log, corrected) for log in paths]
-    check_outputs(
-        [report, extended, plan_file, *outputs], [*paths, *given, *([model] if model else [])]
-    )
     within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
     within(alarm, 0.0, 1.0, option="--alarm", unit="")
     within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
     model_file = _model(model, options, corrected)
+    if corrected is not None:
+        corrected.mkdir(exist_ok=True)
+    check_outputs(
+        [report, extended, plan_file, *outputs], [*paths, *given, *([model] if model else [])]
+    )
     diagnosed = [_long_enough(reading.load(path)) for path in paths]
     references = [reading.load(path) for path in given]
     if model_file is not None:
         _note_differences([*diagnosed, *references], model_file.capacity_ah)
     if initial_soc is not None:  # an added test has its own start
+        capacity = capacity_ah if model_file is None else model_file.capacity_ah
+        note_starts(diagnosed[: len(logs)], initial_soc, capacity)
         started = [with_start(log, initial_soc) for log in diagnosed[: len(logs)]]
         diagnosed = [*started, *diagnosed[len(logs) :]]
     task = _Task(diagnosed, paths, references, given, alarm)
@@ -280,6 +294,11 @@ def _model(path: Path | None, options: SimulatorOptions, corrected: Path | None)
     if path is None:
         return None
     found = Model.load(path)
+    if options.are_given:
+        note(
+            f"note: the simulator is diagnosed; {path} is taken as the voltage model of its output,"
+            " in place of one identified on it"
+        )
     if options.capacity_ah is None:
         return found
     return found.model_copy(update={"capacity_ah": options.capacity_ah})

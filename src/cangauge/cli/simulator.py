@@ -107,7 +107,7 @@ class SimulatorOptions:
         try:
             volts = function(log.time_s, log.current_a, log.temperature_c, start_pct)
             return np.asarray(volts, dtype=np.float64)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise InputError(
                 f"raised {type(error).__name__}: {error}",
                 source=log.source or log.name, field="--simulator", value=self.function,
@@ -128,9 +128,12 @@ def load_function(text: str) -> Callable[..., Any]:
         raise InputError("not a function", field="--simulator", value=text, cure=SYNTAX)
     try:
         module = _file(Path(place)) if place.endswith(".py") else _module(place)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise InputError(
-            f"cannot be imported: {error}", field="--simulator", value=text, cure=SYNTAX
+            f"cannot be imported: {type(error).__name__}: {error}",
+            field="--simulator",
+            value=text,
+            cure=SYNTAX,
         ) from error
     function = getattr(module, name, None)
     if not callable(function):
@@ -167,6 +170,7 @@ def write_corrected(found: SimulatorDiagnosis, logs: list[Path], folder: Path) -
     """Write each diagnosed log with the simulated and the corrected voltage; return the files."""
     from cangauge.logs.canonical import write_table
 
+    folder.mkdir(exist_ok=True)
     written = []
     for run, log in zip(found.runs, logs, strict=True):
         path = corrected_path(log, folder)

@@ -8,6 +8,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
+from cangauge._formatting import counted
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.column_map import shown_headings
@@ -155,7 +156,7 @@ class DraftLog:
                 cure="check the export",
             )
         self.remarks.append(
-            f"{count} rows without time, current, voltage or temperature dropped"
+            f"{counted(count, 'row')} without time, current, voltage or temperature dropped"
             f" (the first is row {int(np.argmax(incomplete)) + 1})"
         )
         self.keep(~incomplete)
@@ -186,7 +187,7 @@ class DraftLog:
         same = np.concatenate(([False], step == 0.0))
         if same.any():
             self.remarks.append(
-                f"{same.sum()} rows with the time stamp of the row before dropped"
+                f"{counted(int(same.sum()), 'row')} with the time stamp of the row before dropped"
                 f" (the first is row {int(np.argmax(same)) + 1})"
             )
             self.keep(~same)
