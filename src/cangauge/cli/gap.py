@@ -195,8 +195,9 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     check_outputs(
         [report, extended, plan_file, *outputs], [*paths, *given, *([model] if model else [])]
     )
-    diagnosed = [_long_enough(reading.load(path)) for path in paths]
-    references = [reading.load(path) for path in given]
+    used = [] if simulated is None else [simulated]
+    diagnosed = [_long_enough(reading.load(path, used)) for path in paths]
+    references = [reading.load(path, used) for path in given]
     if model_file is not None:
         _note_differences([*diagnosed, *references], model_file.capacity_ah)
     if initial_soc is not None:  # an added test has its own start

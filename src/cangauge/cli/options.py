@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast, get_type_hints
@@ -233,12 +233,14 @@ class Reading:
             sign=cast("Sign | None", self.sign),
         )
 
-    def load(self, path: Path) -> Log:
+    def load(self, path: Path, used: Sequence[str] = ()) -> Log:
         """Read a log, or decode a capture; print the reader's remarks on stderr.
 
         Parameters
         ----------
         path : Path
+        used : sequence of str
+            Columns of a log that the command reads besides.
 
         Returns
         -------
@@ -261,6 +263,8 @@ class Reading:
         source = known_temperature_source(self.temperature_source)
         recording = self.open(path)
         is_capture = not isinstance(recording, LogFile)
+        if isinstance(recording, LogFile):
+            recording = replace(recording, used=tuple(used))
         car = self.car() if is_capture and self.names_vehicle else None
         if not is_capture and self.names_vehicle and self.mapped_columns() is None:
             note(f"{path}: a log, not a capture: --vehicle, --dbc and --map do not apply to it")

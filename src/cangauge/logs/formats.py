@@ -427,7 +427,9 @@ def _take_sensors(draft: DraftLog, sensors: dict[str, FloatArray]) -> None:
     filled = {name: values for name, values in sensors.items() if np.isfinite(values).any()}
     ambient = filled.pop("ambient", None)
     if filled:
-        draft.values["temperature_c"] = np.mean(list(filled.values()), axis=0)
+        draft.values["temperature_c"] = draft.mean_of_probes(
+            [draft.labels.get(name, name) for name in filled], list(filled.values())
+        )
         draft.temperature_source = "cell"
         draft.remarks.append(f"temperature: mean of {len(filled)} sensors")
     elif ambient is not None:
