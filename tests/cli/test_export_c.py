@@ -115,9 +115,22 @@ def test_cortex_m4f_gives_the_numbers_in_qemu(folders: dict[str, Path]) -> None:
 
 
 @needs_make
+@pytest.mark.parametrize("text", ["", "time,current\n", "0,1,385,23\nlast line\n"])
+def test_example_tells_what_is_no_sample(folders: dict[str, Path], text: str) -> None:
+    run(folders["plain"], "make", "example")
+    done = subprocess.run(
+        ["./example"], check=False, cwd=folders["plain"], input=text, capture_output=True,
+        text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "time,current,voltage,temperature" in done.stderr
+
+
+@needs_make
 def test_example_writes_a_frame_for_each_sample(folders: dict[str, Path]) -> None:
     run(folders["plain"], "make", "example")
-    rows = "".join(f"{k},{10.0},{385.0},{23.0}\n" for k in range(20))
+    rows = "time_s,current_a,voltage_v,temperature_c\n"
+    rows += "".join(f"{k},{10.0},{385.0},{23.0}\n" for k in range(20))
     done = subprocess.run(
         ["./example"], check=True, cwd=folders["plain"], input=rows, capture_output=True, text=True,
         timeout=60,

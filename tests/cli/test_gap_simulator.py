@@ -119,3 +119,13 @@ def test_what_cannot_be_simulated_is_refused(
     ran = run("gap", *given(drives), "--sign", "discharge", *words)
     assert ran.code == 2
     assert problem in " ".join(ran.err.split())
+
+
+def test_what_is_diagnosed_and_from_where_is_told(run: Run, drives: Path, made: Path) -> None:
+    ran = run(
+        "gap", *given(drives), "--sign", "discharge", "-m", made / "model.json",
+        "--simulator", f"{drives / 'cell.py'}:broken", "--initial-soc", "0.85",
+    )  # fmt: skip
+    assert "the simulator is diagnosed" in ran.err
+    assert "trip: the initial SoC is 0.85 % as given; its own SoC is 85.0 %" in ran.err
+    assert "as 85" in ran.err

@@ -137,6 +137,14 @@ def test_pybamm_computes_the_voltage(exported: dict[str, Any], log: Log) -> None
     assert mean_error_pct(np.asarray(found["Voltage [V]"](t=log.time_s)), log) < 0.1
 
 
+@pytest.mark.parametrize("soc_pct", [190.0, -1.0, float("nan")])
+def test_an_initial_soc_beyond_the_pack_is_refused(
+    exported: dict[str, Any], soc_pct: float
+) -> None:
+    with pytest.raises(ValueError, match="initial_soc_pct"):
+        exported["thevenin_parameters"](soc_pct)
+
+
 def test_the_command_writes_tables_or_a_module(tmp_path: Path) -> None:
     model, tables = tmp_path / "model.json", tmp_path / "tables.json"
     leaf_2012_model_file().save(model)
