@@ -476,6 +476,7 @@ def test_other_tables_take_the_same_columns(tmp_path: Path, kind: str) -> None:
             "U_batt": VOLTAGE_V,
             "T1": np.full(ROWS, 21.0),
             "T2": np.full(ROWS, 22.0),
+            "SoC": [f"{value}%" for value in SOC_PCT],
         }
     )
     columns = {"time": "when", "current": "I_batt[mA]:-1"}
@@ -487,6 +488,7 @@ def test_other_tables_take_the_same_columns(tmp_path: Path, kind: str) -> None:
     assert log.time_s - log.time_s[0] == pytest.approx(TIME_S)
     assert log.current_a == pytest.approx(CURRENT_A)
     assert log.temperature_c == pytest.approx(TEMPERATURE_C)
+    assert log.soc_pct == pytest.approx(SOC_PCT)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])

@@ -16,6 +16,7 @@ import pyarrow.compute as pc
 
 from cangauge._typing import FloatArray, IntArray
 from cangauge.errors import InputError
+from cangauge.logs.arrow import is_text
 from cangauge.logs.column_map import (
     Choice,
     ChosenColumn,
@@ -25,6 +26,7 @@ from cangauge.logs.column_map import (
     shown_headings,
     suggestion,
 )
+from cangauge.logs.columns import without_unit
 from cangauge.logs.draft import MAX_INCOMPLETE, PROBES_APART_K, DraftLog
 from cangauge.logs.headings import FIELDS
 from cangauge.logs.stamps import (
@@ -325,6 +327,10 @@ class ArrowColumns:
         """Return a column as numbers, NaN where missing."""
         column = self.table.column(self.place[name])
         label = self.table.column_names[self.place[name]]
+        if is_text(column.type):
+            text = pc.utf8_trim_whitespace(column.cast(pa.string()))
+            bare = without_unit(text)
+            column = text if bare is None else bare
         try:
             plain = column.cast(pa.float64(), safe=False)
         except (pa.ArrowException, OSError) as error:
@@ -347,7 +353,7 @@ class ArrowColumns:
             return np.asarray(counts.to_numpy(), dtype=np.float64) / per_second
         if pa.types.is_date(kind):
             return column.cast(pa.string())
-        if pa.types.is_string(kind) or pa.types.is_large_string(kind) or "string" in str(kind):
+        if is_text(kind):
             text = pc.utf8_trim_whitespace(column.cast(pa.string()))
             try:
                 return np.asarray(text.cast(pa.float64()).to_numpy(), dtype=np.float64)
