@@ -363,18 +363,18 @@ def test_a_probe_far_from_the_others_is_told(
 
 
 @pytest.mark.parametrize(
-    ("begins", "problem"),
-    [("2024-03-31T01:59:30", "ahead at row 31"), ("2024-10-27T02:59:30", "back at row 31"),
-     ("2024-03-31T04:59:30", "")],
+    ("begins", "problem", "rate"),
+    [("2024-03-31T01:59:30", "ahead at row 31", 1), ("2024-10-27T02:59:30", "back at row 31", 1),
+     ("2024-03-31T04:59:30", "", 1), ("2024-03-31T01:59:50", "ahead at row 31", 3)],
 )  # fmt: skip
 def test_an_hour_of_daylight_saving_names_the_cure(
-    tmp_path: Path, begins: str, problem: str
+    tmp_path: Path, begins: str, problem: str, rate: int
 ) -> None:
     began = dt.datetime.fromisoformat(begins)
     hours = {"ahead": 1, "back": -1}.get(problem.partition(" ")[0], 0)
 
     def row(k: int) -> str:
-        now = began + dt.timedelta(seconds=k, hours=hours if k >= 30 else 0)
+        now = began + dt.timedelta(seconds=k // rate, hours=hours if k >= 30 else 0)
         return f"{now:%F %T},{at(k)[1]},{at(k)[2]},21.5"
 
     table = Table("Stamp time,current,voltage,temperature", row)
@@ -386,7 +386,7 @@ def test_an_hour_of_daylight_saving_names_the_cure(
     assert any("[Europe/Berlin]" in text for text in remarks) == bool(problem)
     assert any(problem in text for text in remarks) or not problem
     zoned = read(tmp_path, table, columns="time=Stamp time[Europe/Berlin]")
-    assert np.diff(zoned.time_s) == pytest.approx(1.0)
+    assert np.diff(zoned.time_s) == pytest.approx(1.0)  # repeated stamps are dropped
 
 
 def test_sign_is_found_from_the_data(tmp_path: Path) -> None:

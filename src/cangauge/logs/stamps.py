@@ -151,11 +151,11 @@ def hour_jump(time_s: FloatArray) -> tuple[int, bool] | None:
     more, or less, than a usual step.
     """
     known = np.flatnonzero(np.isfinite(time_s))
-    if known.size < 3:
-        return None
     stamps = time_s[known]
     step = np.diff(stamps)
-    usual_s = float(np.median(step))
+    if not np.any(step > 0.0):
+        return None
+    usual_s = float(np.median(step[step > 0.0]))  # stamps of whole seconds repeat
     near_s = 2.0 * usual_s
     at_hour = stamps[1:] % HOUR_S <= near_s
     jumps = np.flatnonzero(at_hour & (np.abs(np.abs(step - usual_s) - HOUR_S) <= usual_s))
