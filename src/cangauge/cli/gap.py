@@ -175,7 +175,6 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     `cangauge gap day1.csv --simulated "V sim [V]" --capacity-ah 60 --reference good1.csv
     --reference good2.csv --reference good3.csv --corrected .`
     """
-    from cangauge.identify.starts import with_start
     from cangauge.report.summary import next_step
 
     given, added = list(reference or []), list(add_test or [])
@@ -200,11 +199,10 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     references = [reading.load(path, used) for path in given]
     if model_file is not None:
         _note_differences([*diagnosed, *references], model_file.capacity_ah)
+        options.note_model(model)
     if initial_soc is not None:  # an added test has its own start
         capacity = capacity_ah if model_file is None else model_file.capacity_ah
-        note_starts(diagnosed[: len(logs)], initial_soc, capacity)
-        started = [with_start(log, initial_soc) for log in diagnosed[: len(logs)]]
-        diagnosed = [*started, *diagnosed[len(logs) :]]
+        diagnosed[: len(logs)] = _started(diagnosed[: len(logs)], initial_soc, capacity)
     task = _Task(diagnosed, paths, references, given, alarm)
     with progress_shown("cangauge.diagnosis"):
         first = task.run(len(logs), model_file, options)[0].verdict if added else None
@@ -263,6 +261,13 @@ class _Task:
         return found.diagnosis, found
 
 
+def _started(logs: list[Log], initial_soc_pct: float, capacity_ah: float | None) -> list[Log]:
+    from cangauge.identify.starts import with_start
+
+    note_starts(logs, initial_soc_pct, capacity_ah)
+    return [with_start(log, initial_soc_pct) for log in logs]
+
+
 def _note_differences(logs: list[Log], capacity_ah: float) -> None:
     from cangauge.model.coulomb_counting import difference_from_reference
 
@@ -295,11 +300,6 @@ def _model(path: Path | None, options: SimulatorOptions, corrected: Path | None)
     if path is None:
         return None
     found = Model.load(path)
-    if options.are_given:
-        note(
-            f"note: the simulator is diagnosed; {path} is taken as the voltage model of its output,"
-            " in place of one identified on it"
-        )
     if options.capacity_ah is None:
         return found
     return found.model_copy(update={"capacity_ah": options.capacity_ah})

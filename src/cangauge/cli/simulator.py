@@ -11,6 +11,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from cangauge.cli.output import note
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -61,6 +62,14 @@ class SimulatorOptions:
     def are_given(self) -> bool:
         """Whether a simulator takes the model's place."""
         return self.column is not None or self.function is not None
+
+    def note_model(self, model: Path | None) -> None:
+        """Print on stderr what a model is for, beside a simulator."""
+        if self.are_given:
+            note(
+                f"note: the simulator is diagnosed; {model} is taken as the voltage model of its"
+                " output, in place of one identified on it"
+            )
 
     def run(self, log: Log, path: Path) -> Run:
         """Return a log with its simulated voltage.
