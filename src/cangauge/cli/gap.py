@@ -26,7 +26,7 @@ from cangauge.cli.options import (
 )
 from cangauge.cli.output import emit_json, note, print_table, progress_shown, save_figures
 from cangauge.cli.shown import ALARM_BELOW
-from cangauge.cli.simulator import SimulatorOptions, corrected_path, write_corrected
+from cangauge.cli.simulator import SimulatorOptions, corrected_paths, write_corrected
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -184,13 +184,11 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     )
     next_test = NextTestOptions(plan, plan_file, limits)
     _refuse_common(paths, given)
-    outputs = [] if corrected is None else [corrected_path(log, corrected) for log in paths]
     within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
     within(alarm, 0.0, 1.0, option="--alarm", unit="")
     within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
     model_file = _model(model, options, corrected)
-    if corrected is not None:
-        corrected.mkdir(exist_ok=True)
+    outputs = corrected_paths(paths, corrected)
     check_outputs(
         [report, extended, plan_file, *outputs], [*paths, *given, *([model] if model else [])]
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -170,19 +170,20 @@ def _file(path: Path) -> ModuleType:
     return module
 
 
-def corrected_path(log: Path, folder: Path) -> Path:
-    """Return where `--corrected` writes a log: `FOLDER/NAME.corrected.csv`."""
-    return folder / f"{log.stem}.corrected.csv"
+def corrected_paths(logs: Sequence[Path], folder: Path | None) -> list[Path]:
+    """Return where `--corrected` writes each log, `FOLDER/NAME.corrected.csv`; make the folder."""
+    if folder is None:
+        return []
+    folder.mkdir(exist_ok=True)
+    return [folder / f"{log.stem}.corrected.csv" for log in logs]
 
 
 def write_corrected(found: SimulatorDiagnosis, logs: list[Path], folder: Path) -> list[Path]:
     """Write each diagnosed log with the simulated and the corrected voltage; return the files."""
     from cangauge.logs.canonical import write_table
 
-    folder.mkdir(exist_ok=True)
-    written = []
-    for run, log in zip(found.runs, logs, strict=True):
-        path = corrected_path(log, folder)
+    written = corrected_paths(logs, folder)
+    for run, path in zip(found.runs, written, strict=True):
         columns = {
             "time_s": run.log.time_s,
             "current_a": run.log.current_a,
@@ -193,5 +194,4 @@ def write_corrected(found: SimulatorDiagnosis, logs: list[Path], folder: Path) -
             "corrected_v": found.corrected_v(run),
         }
         write_table({name: values for name, values in columns.items() if values is not None}, path)
-        written.append(path)
     return written
