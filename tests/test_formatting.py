@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from cangauge._formatting import duration, number, significant, span
+from cangauge._formatting import counted, duration, number, significant, span
 from cangauge.estimation.validity import REASON_WORDS, Reason, reason_names
 
 
@@ -45,6 +45,10 @@ def test_span_and_duration() -> None:
     assert duration(70.0) == "70 s"
     assert duration(1800.0) == "30.0 min"
     assert duration(9273.0) == "2.58 h"
+
+
+def test_one_thing_is_singular() -> None:
+    assert [counted(count, "gap") for count in (0, 1, 2)] == ["0 gaps", "1 gap", "2 gaps"]
 
 
 def test_every_reason_has_a_name_and_a_meaning() -> None:

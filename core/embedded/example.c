@@ -2,6 +2,8 @@
  *
  *     ./example < drive.csv        lines of time [s], current [A], voltage [V], temperature [degC]
  *
+ * in this order; a first line of headings is skipped, any other line without numbers is an error.
+ *
  * In a battery management system the loop is a task at the rate of the current sensor.
  */
 #include <stdio.h>
@@ -18,9 +20,20 @@ int main(void)
     const cg_settings settings = cg_default_settings();
     const cg_line line = {storage, PACK_LINE_SIZE, 0, 0, 0, PACK_SPACING_S, 0.0};
     double time_s, current_a, voltage_v, temperature_c;
+    char text[256];
+    unsigned long lines = 0, samples = 0;
     uint8_t counter = 0;
     cg_init(&pack, &pack_model, &settings, &line, &skew);
-    while (scanf("%lf,%lf,%lf,%lf", &time_s, &current_a, &voltage_v, &temperature_c) == 4) {
+    while (fgets(text, sizeof(text), stdin) != NULL) {
+        lines++;
+        if (sscanf(text, "%lf,%lf,%lf,%lf", &time_s, &current_a, &voltage_v, &temperature_c) != 4) {
+            if (lines > 1) {
+                fprintf(stderr, "line %lu is not time,current,voltage,temperature\n", lines);
+                return 1;
+            }
+            continue;
+        }
+        samples++;
         const cg_sample sample = {time_s, (cg_real)current_a, (cg_real)voltage_v,
                                   (cg_real)temperature_c};
         uint8_t data[8];
@@ -36,6 +49,10 @@ int main(void)
             printf(" %02X", (unsigned)data[k]);
         }
         printf("\n");
+    }
+    if (samples == 0) {
+        fprintf(stderr, "no samples: lines of time,current,voltage,temperature are needed\n");
+        return 1;
     }
     return 0;
 }

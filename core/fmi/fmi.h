@@ -13,6 +13,33 @@ typedef enum { OK = 0, ERROR = 3 } status;
         return ERROR; \
     }
 
+/* Give the simulator the message of a unit. */
+static void report(const fmu *self);
+
+/* A new unit that reports to the simulator. */
+static fmu *instantiated(const char *name, const char *token, void (*logger)(void),
+                         void *environment)
+{
+    fmu *self = fmu_new(token);
+    if (self != NULL) {
+        strncpy(self->name, (name != NULL) ? name : "", FMU_TEXT - 1U);
+        self->logger = logger;
+        self->environment = environment;
+    }
+    return self;
+}
+
+static status set_reals(fmu *self, const uint32_t *reference, size_t count, const double *value)
+{
+    if (fmu_set(self, reference, count, value)) {
+        return OK;
+    }
+    if (self->logger != NULL) {
+        report(self);
+    }
+    return ERROR;
+}
+
 FMU_API void FMI(FreeInstance)(fmu *self) { free(self); }
 
 FMU_API status FMI(SetDebugLogging)(fmu *self, flag on, size_t count, const char *const *category)

@@ -4,14 +4,32 @@ typedef int flag;
 #define STATE(name) fmi2##name##FMUstate
 #include "fmi.h"
 
+typedef void (*logger)(void *environment, const char *name, int status, const char *category,
+                       const char *message, ...);
+
+typedef struct {
+    logger log;
+    void (*others[3])(void); /* memory, end of a step: not used */
+    void *environment;
+} callbacks;
+
+static void report(const fmu *self)
+{
+    ((logger)self->logger)(self->environment, self->name, ERROR, "error", self->message);
+}
+
 FMU_API const char *fmi2GetTypesPlatform(void) { return "default"; }
 FMU_API const char *fmi2GetVersion(void) { return "2.0"; }
 
 FMU_API fmu *fmi2Instantiate(const char *name, int type, const char *token, const char *resources,
-                             const void *callbacks, int visible, int logging)
+                             const callbacks *of, int visible, int logging)
 {
-    (void)name, (void)resources, (void)callbacks, (void)visible, (void)logging;
-    return (type == 1) ? fmu_new(token) : NULL; /* co-simulation only */
+    (void)resources, (void)visible, (void)logging;
+    if (type != 1) {
+        return NULL; /* co-simulation only */
+    }
+    return (of == NULL) ? instantiated(name, token, NULL, NULL)
+                        : instantiated(name, token, (void (*)(void))of->log, of->environment);
 }
 
 FMU_API status fmi2SetupExperiment(fmu *self, int has_tolerance, double tolerance, double start,
@@ -31,7 +49,7 @@ FMU_API status fmi2GetReal(fmu *self, const uint32_t *reference, size_t count, d
 
 FMU_API status fmi2SetReal(fmu *self, const uint32_t *reference, size_t count, const double *value)
 {
-    return fmu_set(self, reference, count, value) ? OK : ERROR;
+    return set_reals(self, reference, count, value);
 }
 
 FMU_API status fmi2GetInteger(fmu *self, const uint32_t *reference, size_t count, int *value)

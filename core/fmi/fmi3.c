@@ -6,6 +6,13 @@ typedef bool flag;
 #define STATE(name) fmi3##name##FMUState
 #include "fmi.h"
 
+typedef void (*logger)(void *environment, int status, const char *category, const char *message);
+
+static void report(const fmu *self)
+{
+    ((logger)self->logger)(self->environment, ERROR, "error", self->message);
+}
+
 #define NO_INSTANCE(name) \
     FMU_API fmu *name(void) { return NULL; }
 
@@ -14,11 +21,11 @@ FMU_API const char *fmi3GetVersion(void) { return "3.0"; }
 FMU_API fmu *fmi3InstantiateCoSimulation(
     const char *name, const char *token, const char *resources, bool visible, bool logging,
     bool event_mode, bool early_return, const uint32_t *intermediate, size_t intermediates,
-    void *environment, void *log, void *update)
+    void *environment, logger log, void *update)
 {
-    (void)name, (void)resources, (void)visible, (void)logging, (void)early_return;
-    (void)intermediate, (void)intermediates, (void)environment, (void)log, (void)update;
-    return event_mode ? NULL : fmu_new(token);
+    (void)resources, (void)visible, (void)logging, (void)early_return;
+    (void)intermediate, (void)intermediates, (void)update;
+    return event_mode ? NULL : instantiated(name, token, (void (*)(void))log, environment);
 }
 
 FMU_API status fmi3EnterInitializationMode(fmu *self, bool has_tolerance, double tolerance,
@@ -38,7 +45,7 @@ FMU_API status fmi3GetFloat64(fmu *self, const uint32_t *reference, size_t refer
 FMU_API status fmi3SetFloat64(fmu *self, const uint32_t *reference, size_t references,
                               const double *value, size_t values)
 {
-    return ((references == values) && fmu_set(self, reference, values, value)) ? OK : ERROR;
+    return (references == values) ? set_reals(self, reference, values, value) : ERROR;
 }
 
 FMU_API status fmi3GetInt32(fmu *self, const uint32_t *reference, size_t references,

@@ -1,6 +1,7 @@
 /* fmu.c - what both units and both interfaces share; see fmu.h. */
 #include "fmu.h"
 
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -36,6 +37,15 @@ bool fmu_set(fmu *self, const uint32_t *reference, size_t count, const double *v
 {
     for (size_t k = 0; k < count; ++k) {
         if (reference[k] >= FMU_VARIABLES) {
+            (void)snprintf(self->message, FMU_TEXT, "no variable has the value reference %lu",
+                           (unsigned long)reference[k]);
+            return false;
+        }
+        const double *range = FMU_RANGE[reference[k]];
+        if (!isnan(range[0]) && !((value[k] >= range[0]) && (value[k] <= range[1]))) {
+            (void)snprintf(self->message, FMU_TEXT,
+                           "the value %g of value reference %lu is outside %g ... %g", value[k],
+                           (unsigned long)reference[k], range[0], range[1]);
             return false;
         }
         self->value[reference[k]] = value[k];

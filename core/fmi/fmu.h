@@ -4,7 +4,7 @@
  * simulator calls it; `fmu_config.h` and `fmu_model.c` are written by `cangauge export-fmu`.
  *
  * An input that is set before a step is the sample at the end of that step; between two samples the
- * current is linear.
+ * current is linear. A parameter outside its range is refused with a message.
  */
 #ifndef CANGAUGE_FMU_H
 #define CANGAUGE_FMU_H
@@ -37,6 +37,8 @@ enum {
     FMU_VOLTAGE_MODEL_V = 11
 };
 
+#define FMU_TEXT 128 /* longest name and message */
+
 typedef struct {
     double value[FMU_VARIABLES];
     cg_model model; /* with the parameters that the simulator sets */
@@ -45,6 +47,10 @@ typedef struct {
     cg_skew skew;
     cg_sample last; /* pack */
     cg_sum discharged_ah; /* pack */
+    char name[FMU_TEXT]; /* of the instance */
+    char message[FMU_TEXT]; /* why values were refused */
+    void (*logger)(void); /* of the simulator, NULL without; its type is that of the interface */
+    void *environment;
 } fmu;
 
 /* A parameter of an effect: its effect, and its place among the values, then the time constants. */
@@ -57,6 +63,7 @@ typedef struct {
 extern const cg_model FMU_MODEL;
 extern const cg_settings FMU_SETTINGS;
 extern const double FMU_START[FMU_VARIABLES];
+extern const double FMU_RANGE[FMU_VARIABLES][2]; /* lowest and highest value; NAN: any */
 extern const fmu_parameter FMU_PARAMETER[FMU_PARAMETERS + 1];
 
 /* The unit: begin at a time with the values that are set, take a sample at a later time. */
@@ -67,6 +74,7 @@ void fmu_sample(fmu *self, double time_s);
 fmu *fmu_new(const char *token);
 void fmu_reset(fmu *self);
 bool fmu_get(const fmu *self, const uint32_t *reference, size_t count, double *value);
+/* On failure `message` says why. */
 bool fmu_set(fmu *self, const uint32_t *reference, size_t count, const double *value);
 
 #endif

@@ -34,6 +34,11 @@ def span(low: float, high: float, digits: int = 1, unit: str = "") -> str:
     return f"{number(low, digits)} … {number(high, digits)} {unit}".rstrip()
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a number of things, such as "1 gap" or "3 gaps"."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def duration(seconds: float) -> str:
     """Return a time span in seconds, minutes or hours."""
     if seconds < 120.0:

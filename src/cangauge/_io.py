@@ -450,6 +450,30 @@ def check_writable(path: str | PathLike[str]) -> None:
         _create_beside(Path(os.path.realpath(path)), shown=path).unlink()
 
 
+def require_suffix(path: str | PathLike[str], *suffixes: str, field: str) -> None:
+    """Raise InputError unless a file to write has one of these suffixes, or is a device.
+
+    Parameters
+    ----------
+    path : path-like
+    *suffixes : str
+        With their dot, in lower case.
+    field : str
+        Option or field that names it, for the message.
+    """
+    output = Path(path)
+    if output.suffix.lower() in suffixes or _is_device(output):
+        return
+    names = " or ".join(part for part in (", ".join(suffixes[:-1]), suffixes[-1]) if part)
+    raise InputError(
+        f"the suffix is not {names}",
+        source=output,
+        field=field,
+        value=output.suffix,
+        cure=f"name a {names} file",
+    )
+
+
 def refuse_pipe(path: str | PathLike[str]) -> None:
     """Raise InputError for a pipe that a service would write: whoever reads it could stop it.
 

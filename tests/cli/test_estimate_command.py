@@ -122,11 +122,19 @@ def test_the_first_reference_is_counted_back_to_the_first_row(
     assert json.loads(ran.out)["initial_soc_pct"] == pytest.approx(log.soc_pct[0], abs=1e-6)
 
 
-@pytest.mark.parametrize("case", [("auto", None, "voltage"), ("55", 55.0, "given")])
+@pytest.mark.parametrize(
+    "case",
+    [
+        ("auto", None, "voltage", ""),
+        ("80.4", 80.4, "given", ""),
+        ("55", 55.0, "given", "its own SoC is 80.0 %"),
+        ("0.8", 0.8, "given", "a fraction is given in percent, as 80"),
+    ],
+)
 def test_initial_soc(
-    run: Run, made: Path, tmp_path: Path, case: tuple[str, float | None, str]
+    run: Run, made: Path, tmp_path: Path, case: tuple[str, float | None, str, str]
 ) -> None:
-    given, start, origin = case
+    given, start, origin, doubt = case
     ran = run(
         "estimate", made / "part.csv", "-m", made / "model.json", "-o", tmp_path / "soc.parquet",
         "--initial-soc", given, "--initial-soc-std", "20", "--json",
@@ -134,7 +142,9 @@ def test_initial_soc(
     found = json.loads(ran.out)
     assert (found["initial_soc_pct"], found["initial_soc_from"]) == (start, origin)
     counted = pa.parquet.read_table(tmp_path / "soc.parquet")["soc_coulomb_pct"][0].as_py()
-    assert counted == pytest.approx(55.0 if start else 80.0, abs=1e-9 if start else 10.0)
+    assert counted == pytest.approx(start or 80.0, abs=1e-9 if start else 10.0)
+    assert doubt in ran.err
+    assert ("the initial SoC is" in ran.err) is bool(doubt)
 
 
 def test_each_method_gives_its_own_soc(run: Run, made: Path, tmp_path: Path) -> None:
@@ -203,10 +213,12 @@ def test_a_slow_log_has_no_gaps_by_default(run: Run, made: Path, tmp_path: Path)
         (["--initial-soc-std", "-1"], ["--initial-soc-std", "-1"]),
         (["--capacity-ah", "0"], ["--capacity-ah"]),
         (["--max-gap-s", "nan"], ["--max-gap-s"]),
-        (["-o", "soc.txt"], ["soc.txt", ".csv or .parquet"]),
+        (["-o", "soc.txt"], ["soc.txt", ".csv, .parquet or .mcap"]),
+        (["--pack", "pack.mcap"], ["--pack", ".csv or .parquet"]),
+        (["--report", "soc.csv"], ["--report", ".html"]),
         (["-o", "no/such/soc.csv"], ["no/such/soc.csv"]),
         (["-m", "none.json"], ["none.json", "no such file"]),
-        (["--report", "soc.csv"], ["two outputs"]),
+        (["--pack", "soc.csv"], ["two outputs"]),
     ],
 )
 def test_bad_options_get_one_line_and_write_nothing(

@@ -115,9 +115,22 @@ def test_cortex_m4f_gives_the_numbers_in_qemu(folders: dict[str, Path]) -> None:
 
 
 @needs_make
+@pytest.mark.parametrize("text", ["", "time,current\n", "0,1,385,23\nlast line\n"])
+def test_example_tells_what_is_no_sample(folders: dict[str, Path], text: str) -> None:
+    run(folders["plain"], "make", "example")
+    done = subprocess.run(
+        ["./example"], check=False, cwd=folders["plain"], input=text, capture_output=True,
+        text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "time,current,voltage,temperature" in done.stderr
+
+
+@needs_make
 def test_example_writes_a_frame_for_each_sample(folders: dict[str, Path]) -> None:
     run(folders["plain"], "make", "example")
-    rows = "".join(f"{k},{10.0},{385.0},{23.0}\n" for k in range(20))
+    rows = "time_s,current_a,voltage_v,temperature_c\n"
+    rows += "".join(f"{k},{10.0},{385.0},{23.0}\n" for k in range(20))
     done = subprocess.run(
         ["./example"], check=True, cwd=folders["plain"], input=rows, capture_output=True, text=True,
         timeout=60,
@@ -173,6 +186,15 @@ def test_command_names_what_it_wrote(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     assert (tmp_path / "c" / "pack_model.c").is_file()
     assert '"delay_line_bytes"' in done.output
+
+
+def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
+    PLAIN.save(tmp_path / "pack.json")
+    (tmp_path / "ecm.py").write_text("kept")
+    arguments = ["export-c", str(tmp_path / "pack.json"), "-o", str(tmp_path / "ecm.py")]
+    with pytest.raises(InputError, match="is a file"):
+        CliRunner().invoke(app, arguments, catch_exceptions=False)
+    assert (tmp_path / "ecm.py").read_text() == "kept"
 
 
 def test_period_out_of_range_is_refused(tmp_path: Path) -> None:

@@ -28,6 +28,9 @@ def simulate(time_s, current_a, temperature_c, initial_soc_pct):
 
 def broken(time_s, current_a, temperature_c, initial_soc_pct):
     raise ValueError("no such cell")
+
+def leaves(time_s, current_a, temperature_c, initial_soc_pct):
+    raise SystemExit(0)
 """
 
 
@@ -61,7 +64,7 @@ def given(drives: Path) -> list[object]:
 def test_a_column_is_diagnosed_and_corrected(run: Run, drives: Path, tmp_path: Path) -> None:
     ran = run(
         "gap", *given(drives), "--simulated", "U model [V]", "--sign", "discharge",
-        "--corrected", tmp_path, "--json",
+        "--corrected", tmp_path / "corrected", "--json",
     )  # fmt: skip
     assert ran.code == 0, ran.err
     found = json.loads(ran.out)
@@ -71,7 +74,8 @@ def test_a_column_is_diagnosed_and_corrected(run: Run, drives: Path, tmp_path: P
     assert errors["simulated_rmse_v"] == pytest.approx(5.0, abs=0.1)
     assert errors["corrected_rmse_v"] < 0.4
     assert "measured voltage" in found["simulator"]["correction"]
-    with (tmp_path / "trip.corrected.csv").open(encoding="utf-8") as file:
+    assert "ignored: U model" not in ran.err
+    with (tmp_path / "corrected" / "trip.corrected.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     gap_v = [float(row["voltage_v"]) - float(row["corrected_v"]) for row in rows]
     assert np.sqrt(np.mean(np.square(gap_v))) == pytest.approx(errors["corrected_rmse_v"], rel=1e-6)
@@ -98,6 +102,11 @@ def test_a_function_gives_the_same_as_its_column(run: Run, drives: Path) -> None
         (["--simulator", "nowhere_at_all:simulate"], "cannot be imported"),
         (["--simulator", "cell.py:other"], "no function other"),
         (["--simulator", "cell.py:broken"], "no such cell"),
+        (["--simulator", "cell.py:leaves"], "SystemExit"),
+        (["--simulator", "leaves.py:simulate"], "SystemExit"),
+        (["--extended", "trip.csv"], "--extended"),
+        (["--plan-file", "plan.json"], "--plan-file"),
+        (["--simulated", "U model [V]", "--corrected", "cell.py"], "is a file"),
         (["--simulator", "cell.py"], "MODULE:FUNCTION"),
         (["--corrected", "."], "needs a simulator"),
     ],
@@ -106,6 +115,17 @@ def test_what_cannot_be_simulated_is_refused(
     run: Run, drives: Path, words: list[str], problem: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(drives)
+    (drives / "leaves.py").write_text("raise SystemExit(0)\n", encoding="utf-8")
     ran = run("gap", *given(drives), "--sign", "discharge", *words)
     assert ran.code == 2
     assert problem in " ".join(ran.err.split())
+
+
+def test_what_is_diagnosed_and_from_where_is_told(run: Run, drives: Path, made: Path) -> None:
+    ran = run(
+        "gap", *given(drives), "--sign", "discharge", "-m", made / "model.json",
+        "--simulator", f"{drives / 'cell.py'}:broken", "--initial-soc", "0.85",
+    )  # fmt: skip
+    assert "the simulator is diagnosed" in ran.err
+    assert "trip: the initial SoC is 0.85 % as given; its own SoC is 85.0 %" in ran.err
+    assert "as 85" in ran.err

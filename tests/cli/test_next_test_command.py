@@ -76,8 +76,12 @@ def test_added_test_reports_its_change(run: Run, command: list[object], tmp_path
     )
 
 
-def test_limits_are_checked_before_the_logs_are_read(run: Run, command: list[object]) -> None:
-    ran = run(*command, "--limits", "current=lots")
+@pytest.mark.parametrize("given", ["current=lots", "current=60:-60", "current=0:0", "soc=50:50.5"])
+def test_limits_are_checked_before_the_logs_are_read(
+    run: Run, command: list[object], given: str
+) -> None:
+    ran = run(*command, "--limits", given)
     assert ran.code == 2
+    assert given in ran.err
     assert "--limits" in ran.err
     assert "learning" not in ran.err

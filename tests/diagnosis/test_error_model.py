@@ -189,8 +189,10 @@ def test_contradicting_references_overrule_the_model_file(
 def test_a_noisier_sensor_is_no_gap(noise_v: float, model: Model, references: list[Log]) -> None:
     for seed in (41, 42):
         verdict = decide(build_problem([short_day(seed, noise_v)], model, references))
-        assert verdict.cause == "none"
+        assert not verdict.detected
         assert verdict.accepted == ()
+        # Twice the healthy variance has no cause in the library.
+        assert verdict.cause == "none" or (noise_v == 0.75 and verdict.cause == "unknown")
 
 
 def test_one_reference_leaves_the_model_files_noise(

@@ -13,6 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cangauge.cli.app import app
+from cangauge.errors import InputError
 from cangauge.export.equivalent_circuit import equivalent_circuit
 from cangauge.logs.log import Log
 from cangauge.model.effects.first_order import low_passed
@@ -136,6 +137,14 @@ def test_pybamm_computes_the_voltage(exported: dict[str, Any], log: Log) -> None
     assert mean_error_pct(np.asarray(found["Voltage [V]"](t=log.time_s)), log) < 0.1
 
 
+@pytest.mark.parametrize("soc_pct", [190.0, -1.0, float("nan")])
+def test_an_initial_soc_beyond_the_pack_is_refused(
+    exported: dict[str, Any], soc_pct: float
+) -> None:
+    with pytest.raises(ValueError, match="initial_soc_pct"):
+        exported["thevenin_parameters"](soc_pct)
+
+
 def test_the_command_writes_tables_or_a_module(tmp_path: Path) -> None:
     model, tables = tmp_path / "model.json", tmp_path / "tables.json"
     leaf_2012_model_file().save(model)
@@ -145,3 +154,11 @@ def test_the_command_writes_tables_or_a_module(tmp_path: Path) -> None:
     module = tmp_path / "pack.py"
     assert CliRunner().invoke(app, ["export-ecm", str(model), "-o", str(module)]).exit_code == 0
     assert callable(runpy.run_path(str(module))["pybamm_parameters"])
+
+
+@pytest.mark.parametrize("name", ["my-pack.py", "class.py", "pack.txt"])
+def test_a_module_that_cannot_be_imported_is_refused(tmp_path: Path, name: str) -> None:
+    leaf_2012_model_file().save(tmp_path / "model.json")
+    arguments = ["export-ecm", str(tmp_path / "model.json"), "-o", str(tmp_path / name)]
+    assert isinstance(CliRunner().invoke(app, arguments).exception, InputError)
+    assert not (tmp_path / name).exists()

@@ -55,14 +55,21 @@ def units(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[Kind, Version]
     }
 
 
-def simulate(unit: Path, outputs: list[str], more: dict[str, Any], **start: float) -> Any:
-    columns = {"time": TIME_S, "current_a": CURRENT_A, "temperature_c": TEMPERATURE_C} | more
+def simulate(
+    unit: Path, outputs: list[str], more: dict[str, Any], *, logger: Any = None, **start: float
+) -> Any:
+    columns = {
+        "time": TIME_S,
+        "current_a": CURRENT_A,
+        "temperature_c": TEMPERATURE_C,
+    } | more
     given = np.array(
         list(zip(*columns.values(), strict=True)), dtype=[(name, "f8") for name in columns]
     )
     return fmpy.simulate_fmu(
         str(unit), stop_time=TIME_S[-1], step_size=1.0, output_interval=1.0, input=given,
         output=outputs, start_values=start, fmi_type="CoSimulation",
+        logger=logger,
     )  # fmt: skip
 
 
@@ -128,6 +135,56 @@ def test_a_diagnosed_effect_is_a_parameter(units: dict[Any, Path]) -> None:
     changed = [*EFFECTS[:2], {"id": "fast_polarization", "parameters": polarization}]
     model = repaired().model_copy(update={"effects": changed})
     assert found["voltage_v"].tolist() == pack_voltage(model, 81.0)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize(
+    ("kind", "name", "value"),
+    [
+        ("pack", "capacity_ah", -5.0), ("pack", "capacity_ah", 0.0),
+        ("pack", "initial_soc_pct", 175.0), ("pack", "effect_3_rc.tau_1_s", 0.0),
+        ("pack", "effect_3_rc.ohm_1", float("inf")),
+        ("estimator", "initial_soc_pct", 150.0), ("estimator", "initial_soc_pct", float("nan")),
+    ],
+)  # fmt: skip
+def test_a_parameter_out_of_range_is_refused(
+    units: dict[Any, Path], kind: Kind, name: str, value: float, version: Version
+) -> None:
+    told: list[str] = []
+
+    def log(*arguments: Any) -> None:
+        told.append(b" ".join(each for each in arguments if isinstance(each, bytes)).decode())
+
+    more = {"voltage_v": 0.0 * TIME_S} if kind == "estimator" else {}
+    with pytest.raises(fmpy.fmi1.FMICallException):
+        simulate(units[kind, version], ["soc_pct"], more, logger=log, **{name: value})
+    assert any("is outside" in text for text in told)
+
+
+def test_the_range_of_a_parameter_is_stated(units: dict[Any, Path]) -> None:
+    for version in (2, 3):
+        found = fmpy.read_model_description(str(units["pack", version])).modelVariables
+        limits = {item.name: (item.min, item.max) for item in found}
+        assert [float(end) for end in limits["initial_soc_pct"]] == [0.0, 100.0]
+        assert [float(end) for end in limits["capacity_ah"]] == [1e-3, 1e5]
+        assert limits["effect_3_rc.ohm_1"] == (None, None)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_inputs_of_the_end_of_a_step_estimate_the_log(
+    units: dict[Any, Path], version: Version
+) -> None:
+    volts = np.array(pack_voltage(repaired(), 80.0))
+    columns = {"current_a": CURRENT_A, "temperature_c": TEMPERATURE_C, "voltage_v": volts}
+    # The recipe of docs/howto/export.md.
+    earlier = {"time": np.concatenate(([TIME_S[0] - 1.0, TIME_S[0]], TIME_S[:-1]))}
+    earlier |= {name: np.concatenate((values[:1], values)) for name, values in columns.items()}
+    found = simulate(units["estimator", version], ["soc_pct"], earlier)
+    estimator = Estimator(repaired(), EstimatorSettings())
+    samples = zip(TIME_S.tolist(), CURRENT_A, volts, TEMPERATURE_C, strict=True)
+    for row, sample in zip(found, samples, strict=True):
+        estimator.update(Sample(*sample))
+        assert row["soc_pct"] == estimator.estimate.soc_pct
 
 
 def test_a_saved_state_continues_as_it_was(units: dict[Any, Path], tmp_path: Path) -> None:

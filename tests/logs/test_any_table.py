@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import datetime as dt
 import math
+import re
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -94,6 +95,18 @@ TABLES: dict[str, Table] = {
     "plain with brackets": Table(
         "Time [s],Pack Current [A],Pack Voltage [V],Battery Temperature [°C],SoC [%]",
         line("{t},{i},{u},21.5,{s}"), has_soc=True,
+    ),
+    "months as words, units in the cells": Table(
+        "time,amps,volts,fahrenheit,Disp SoC",
+        lambda k: (
+            f'"{stamp(k, "%b %d, %Y %I:%M:%S")}\u202f{stamp(k, "%p")}",{at(k)[1]},{at(k)[2]},70.7,'
+            f"{at(k)[3]}%"
+        ),
+        has_soc=True,
+    ),
+    "day before the month's name": Table(
+        "time,current,voltage,celsius",
+        lambda k: f"{stamp(k, '%d %B %Y %H:%M:%S')},{at(k)[1]},{at(k)[2]},21.5",
     ),
     "plain without units": Table(
         "time,current,voltage,temperature,soc", line("{t},{i},{u},21.5,{s}"), has_soc=True
@@ -324,6 +337,58 @@ def test_what_was_assumed_is_told(tmp_path: Path) -> None:
     )
 
 
+def test_columns_that_are_not_read_are_told(tmp_path: Path) -> None:
+    table = Table("time,current,voltage,temperature,driver,Motor rpm", line("{t},{i},{u},21.5,A,9"))
+    assert "2 other columns ignored: driver, Motor rpm" in read(tmp_path, table).remarks
+
+
+@pytest.mark.parametrize(
+    ("head", "row", "mean_c", "words"),
+    [
+        ("T1,T2,T3", "21,22,-40", 21.5, "T3 left out in 60 rows, .*20 K.*first -40"),
+        ("T1 [°F],T2 [°F],T3 [°F]", "69.8,71.6,419", 21.5, r"T3 \[°F\] left out"),
+        ("T1,T2,T3", "15,21,27", 21.0, ""),
+        ("T1,T2", "31,-40", -4.5, "T1 and T2 are 31 and -40 in row 1: one of the probes fails"),
+        ("T1,T2", "15,27", 21.0, ""),
+    ],
+)
+def test_a_probe_far_from_the_others_is_told(
+    tmp_path: Path, head: str, row: str, mean_c: float, words: str
+) -> None:
+    log = read(tmp_path, Table(f"time,current,voltage,{head}", line("{t},{i},{u}," + row)))
+    assert log.temperature_c == pytest.approx(mean_c, abs=0.01)
+    told = [text for text in log.remarks if "probe" in text]
+    assert len(told) == bool(words)
+    assert re.search(words, "".join(told))
+
+
+@pytest.mark.parametrize(
+    ("begins", "problem", "rate"),
+    [("2024-03-31T01:59:30", "ahead at row 31", 1), ("2024-10-27T02:59:30", "back at row 31", 1),
+     ("2024-03-31T04:59:30", "", 1), ("2024-03-31T01:59:50", "ahead at row 31", 3)],
+)  # fmt: skip
+def test_an_hour_of_daylight_saving_names_the_cure(
+    tmp_path: Path, begins: str, problem: str, rate: int
+) -> None:
+    began = dt.datetime.fromisoformat(begins)
+    hours = {"ahead": 1, "back": -1}.get(problem.partition(" ")[0], 0)
+
+    def row(k: int) -> str:
+        now = began + dt.timedelta(seconds=k // rate, hours=hours if k >= 30 else 0)
+        return f"{now:%F %T},{at(k)[1]},{at(k)[2]},21.5"
+
+    table = Table("Stamp time,current,voltage,temperature", row)
+    remarks: list[str] = []
+    try:
+        remarks += read(tmp_path, table).remarks
+    except InputError as error:
+        remarks += [str(error)]
+    assert any("[Europe/Berlin]" in text for text in remarks) == bool(problem)
+    assert any(problem in text for text in remarks) or not problem
+    zoned = read(tmp_path, table, columns="time=Stamp time[Europe/Berlin]")
+    assert np.diff(zoned.time_s) == pytest.approx(1.0)  # repeated stamps are dropped
+
+
 def test_sign_is_found_from_the_data(tmp_path: Path) -> None:
     log = read(tmp_path, TABLES["Basytec"])
     assert log.assumed[-1] == "positive current charges, found from the data"
@@ -411,6 +476,7 @@ def test_other_tables_take_the_same_columns(tmp_path: Path, kind: str) -> None:
             "U_batt": VOLTAGE_V,
             "T1": np.full(ROWS, 21.0),
             "T2": np.full(ROWS, 22.0),
+            "SoC": [f"{value}%" for value in SOC_PCT],
         }
     )
     columns = {"time": "when", "current": "I_batt[mA]:-1"}
@@ -422,6 +488,7 @@ def test_other_tables_take_the_same_columns(tmp_path: Path, kind: str) -> None:
     assert log.time_s - log.time_s[0] == pytest.approx(TIME_S)
     assert log.current_a == pytest.approx(CURRENT_A)
     assert log.temperature_c == pytest.approx(TEMPERATURE_C)
+    assert log.soc_pct == pytest.approx(SOC_PCT)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])

@@ -71,7 +71,7 @@ def test_dataframes_of_other_types_and_columns(package: str) -> None:
     log = Log.from_dataframe(frame, temperature_c=21.0)
     np.testing.assert_array_equal(log.voltage_v, [380.0, 379.0, 378.0])
     assert set(log.temperature_c) == {21.0}
-    assert "1 other columns ignored: driver" in log.remarks
+    assert "1 other column ignored: driver" in log.remarks
 
 
 def test_a_pandas_index_is_no_column(small_log: Log) -> None:

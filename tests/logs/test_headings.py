@@ -69,6 +69,11 @@ SPELLINGS = {
         "TIME,CHARGE_STATUS,SPEED,SUM_MILE,SUM_VOLTAGE,SUM_CURRENT,SOC,MAX_CELL_VOLT,MAX_TEMP",
         "TIME|SUM_CURRENT|SUM_VOLTAGE||SOC",
     ),
+    "car scanner": (
+        "seconds,HV Battery Current,HV Battery Voltage,battery_celsius,Disp SoC,Disp Temp",
+        "seconds|HV Battery Current|HV Battery Voltage|battery_celsius|Disp SoC",
+    ),
+    "a unit as the heading": ("seconds,amps,volts,celsius", "seconds|amps|volts|celsius|"),
     "Torque": (
         "GPS Time,Device Time,Longitude,GPS Speed (Meters/second),HV Battery Current(A),"
         "HV Battery Voltage(V),State of Charge(%)",

@@ -76,7 +76,7 @@ def test_extra_columns_are_ignored_with_a_remark(tmp_path: Path) -> None:
     lines = CSV.splitlines()
     text = "\n".join(f"{a},{b}" for a, b in zip(lines, ["speed", "3", "fast"], strict=True)) + "\n"
     log = read_log(write(tmp_path / "x.csv", text))
-    assert log.remarks == ("1 other columns ignored: speed",)
+    assert log.remarks == ("1 other column ignored: speed",)
 
 
 def test_soc_may_be_missing_anywhere(tmp_path: Path) -> None:

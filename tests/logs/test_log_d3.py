@@ -127,7 +127,7 @@ def test_incomplete_rows_are_dropped_up_to_a_limit(tmp_path: Path, d3: D3) -> No
     holed[5] = "0.4\t0\t23.5\t90\t\t381"
     log = read_log(write(tmp_path, "\r\n".join(holed)))
     assert len(log) == 399
-    assert any("1 rows without time, current, voltage" in text for text in log.remarks)
+    assert any("1 row without time, current, voltage" in text for text in log.remarks)
     for row in range(1, 60):
         cells = lines[row].split("\t")
         cells[4] = "NaN"

@@ -35,7 +35,7 @@ def test_i3_rows_without_a_value_are_dropped_with_a_remark(
     (tmp_path / "x.csv").write_bytes(build_i3(rows))
     log = read_log(tmp_path / "x.csv")
     assert len(log) == 39
-    assert any("1 rows without time, current" in text for text in log.remarks)
+    assert any("1 row without time, current" in text for text in log.remarks)
 
 
 def test_i3_without_its_columns_is_refused(
@@ -79,7 +79,7 @@ def test_rows_that_bitrode_excludes_are_dropped(
     path.write_text("\r\n".join(text), newline="")
     log = read_log(path)
     np.testing.assert_array_equal(log.time_s, [1.0, 2.0, 4.0])
-    assert "1 rows that the cycler excludes dropped" in log.remarks
+    assert "1 row that the cycler excludes dropped" in log.remarks
 
 
 # ---- the recorded logs ---------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -166,8 +167,16 @@ def test_figures_are_written_as_png_and_svg(log: Log, tmp_path: Path) -> None:
     image = pytest.importorskip("matplotlib.image")
     path, folder = tmp_path / "drive.csv", tmp_path / "figures"
     write_log(log, path)
+    folder.mkdir()
+    (folder / "05-own.png").write_bytes(b"\x89PNG of the user")
     done = CliRunner().invoke(app, ["inspect", str(path), "--figures", str(folder)])
     assert done.exit_code == 0, done.output
+    # As an earlier run with more figures left them.
+    shutil.copy(folder / "02-voltage.svg", folder / "06-cells.svg")
+    shutil.copy(folder / "02-voltage.png", folder / "06-cells.png")
+    assert CliRunner().invoke(app, ["inspect", str(path), "--figures", str(folder)]).exit_code == 0
+    assert not list(folder.glob("06-*"))
+    (folder / "05-own.png").unlink()  # kept until now
     names = ["01-current", "02-voltage", "03-temperature", "04-state-of-charge"]
     assert sorted(each.stem for each in folder.glob("*.png")) == names
     for name in names:

@@ -21,8 +21,10 @@ from cangauge.cli.options import (
     assumed_of,
     check_outputs,
     known_temperature_source,
+    note_starts,
     option_groups,
     refuse_inverted_current,
+    suffixed,
     within,
 )
 from cangauge.cli.output import console, emit_json, note, print_table, save_figures
@@ -47,7 +49,11 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     output: Annotated[
         Path,
         typer.Option(
-            "-o", "--output", metavar="OUT", help="Table of estimates, .csv, .parquet or .mcap."
+            "-o",
+            "--output",
+            metavar="OUT",
+            callback=suffixed(".csv", ".parquet", ".mcap"),
+            help="Table of estimates, .csv, .parquet or .mcap.",
         ),
     ],
     method: Annotated[
@@ -109,6 +115,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
         Path | None,
         typer.Option(
             metavar="PACK",
+            callback=suffixed(".csv", ".parquet"),
             help="Table of health, power and cells, once a second, .csv or .parquet.",
         ),
     ] = None,
@@ -141,16 +148,12 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     from cangauge.logs.cells import read_cells
     from cangauge.model.delay_line import GAP_S
     from cangauge.model.model_file import Model
-    from cangauge.service.estimate_table import require_table_suffix
     from cangauge.service.offline import (
         PackHistory,
         estimate_recorded_capture,
         estimate_recorded_log,
     )
 
-    if not _is_mcap(output):
-        require_table_suffix(output)
-    require_table_suffix(pack or Path("pack.csv"), option="--pack")
     settings = EstimatorSettings(
         method=_method(method),
         filter=_filter(filter_, smooth=smooth),
@@ -180,6 +183,8 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     else:
         log = reading.load(log_path)
         assumed = assumed_of([log])
+        if settings.initial_soc_pct is not None:
+            note_starts([log], settings.initial_soc_pct, capacity_ah or model.capacity_ah)
         cells = read_cells(log_path, log.time_s)
         with _progress(len(log)) as progress:
             done = estimate_recorded_log(

@@ -8,14 +8,21 @@ from typing import Annotated
 
 import typer
 
-from cangauge.cli.options import JsonOption, check_outputs
+from cangauge.cli.options import JsonOption, check_outputs, folder_to_write
 from cangauge.cli.output import emit_json, note
 
 
 def export_c_command(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file of `cangauge fit`.")],
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the sources.")
+        Path,
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="DIR",
+            callback=folder_to_write,
+            help="Folder for the sources.",
+        ),
     ],
     period: Annotated[
         float, typer.Option(metavar="S", help="Time between two samples of the current [s].")
@@ -23,8 +30,8 @@ def export_c_command(
     as_json: JsonOption = False,
 ) -> None:
     """Write a model and the estimator as C sources, with tests, for a microcontroller."""
-    is_folder = os.path.isdir(output)  # noqa: PTH112 - pathlib raises for an impossible name
-    check_outputs([output / "pack_model.c" if is_folder else output], [model])
+    if os.path.isdir(output):  # noqa: PTH112 - pathlib raises for an impossible name
+        check_outputs([output / "pack_model.c"], [model])
     # Deferred, so that the help page does not wait for numpy and scipy.
     from cangauge.export.embedded import export_c
     from cangauge.model.model_file import Model

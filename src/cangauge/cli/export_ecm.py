@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from keyword import iskeyword
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +10,7 @@ import typer
 
 from cangauge._formatting import number, significant
 from cangauge._io import write_text_atomic
-from cangauge.cli.options import JsonOption, check_outputs
+from cangauge.cli.options import JsonOption, check_outputs, suffixed
 from cangauge.cli.output import emit_json, note, print_table
 from cangauge.errors import InputError
 
@@ -19,7 +20,7 @@ def export_ecm_command(
     output: Annotated[
         Path,
         typer.Option(
-            "-o", "--output", metavar="FILE",
+            "-o", "--output", metavar="FILE", callback=suffixed(".py", ".json"),
             help=".py: a module with the parameters of PyBaMM's Thevenin model and of `thevenin`;"
             " .json: the tables alone.",
         ),
@@ -34,17 +35,19 @@ def export_ecm_command(
     --------
     `cangauge export-ecm pack.json -o pack_ecm.py`
     """
-    if output.suffix not in {".py", ".json"}:
+    is_module = output.suffix.lower() == ".py"
+    if is_module and (not output.stem.isidentifier() or iskeyword(output.stem)):
         raise InputError(
-            "neither .py nor .json", field="-o", value=str(output), cure="name a .py or .json file"
-        )
+            "Python cannot import a module of this name", field="--output", value=output.name,
+            cure="use letters, digits and _, as in pack_ecm.py",
+        )  # fmt: skip
     check_outputs([output], [model])
     # Deferred, so that the help page does not wait for numpy and scipy.
     from cangauge.export.equivalent_circuit import equivalent_circuit
     from cangauge.model.model_file import Model
 
     circuit = equivalent_circuit(Model.load(model))
-    text = circuit.to_module() if output.suffix == ".py" else circuit.to_json()
+    text = circuit.to_module() if is_module else circuit.to_json()
     write_text_atomic(output, text)
     if json_output:
         emit_json(

@@ -7,7 +7,7 @@ from typing import Annotated, cast
 
 import typer
 
-from cangauge.cli.options import JsonOption, check_outputs
+from cangauge.cli.options import JsonOption, check_outputs, suffixed
 from cangauge.cli.output import emit_json, note
 from cangauge.errors import InputError
 
@@ -15,7 +15,10 @@ from cangauge.errors import InputError
 def export_fmu_command(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file (JSON).")],
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="FILE.fmu", help="Unit to write.")
+        Path,
+        typer.Option(
+            "-o", "--output", metavar="FILE.fmu", callback=suffixed(".fmu"), help="Unit to write."
+        ),
     ],
     kind: Annotated[
         str,
@@ -42,8 +45,6 @@ def export_fmu_command(
         raise InputError("neither pack nor estimator", field="--kind", value=kind)
     if fmi not in {2, 3}:
         raise InputError("neither 2 nor 3", field="--fmi", value=fmi)
-    if output.suffix != ".fmu":
-        raise InputError("not .fmu", field="-o", value=str(output), cure="name a .fmu file")
     check_outputs([output], [model])
     # Deferred, so that the help page does not wait for numpy and scipy.
     from cangauge.export.fmu import Kind, Version, export_fmu

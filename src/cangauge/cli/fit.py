@@ -18,6 +18,7 @@ from cangauge.cli.options import (
     assumed_of,
     check_outputs,
     option_groups,
+    suffixed,
     within,
 )
 from cangauge.cli.output import console, emit_json, note, print_table, progress_shown, save_figures
@@ -40,7 +41,14 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         typer.Argument(metavar="LOG", help="Recorded logs or captures of one pack."),
     ],
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="MODEL", help="Model file to write (JSON).")
+        Path,
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="MODEL.json",
+            callback=suffixed(".json"),
+            help="Model file to write.",
+        ),
     ],
     capacity_ah: Annotated[
         str | None,

@@ -22,6 +22,7 @@ from cangauge.cli.options import (
     check_outputs,
     known_temperature_source,
     option_groups,
+    suffixed,
     within,
 )
 from cangauge.cli.output import console, emit_json, note, print_table, progress_shown
@@ -132,7 +133,14 @@ def fleet_command() -> None:
 def fit_fleet_command(
     logs: LogsArgument,
     output: Annotated[
-        Path, typer.Option("-m", "--model", metavar="MODEL", help="Model file to write (JSON).")
+        Path,
+        typer.Option(
+            "-m",
+            "--model",
+            metavar="MODEL.json",
+            callback=suffixed(".json"),
+            help="Model file to write.",
+        ),
     ],
     out: OutOption,
     capacity_ah: Annotated[

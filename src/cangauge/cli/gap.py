@@ -18,12 +18,15 @@ from cangauge.cli.options import (
     ReportOption,
     assumed_of,
     check_outputs,
+    folder_to_write,
+    note_starts,
     option_groups,
+    suffixed,
     within,
 )
 from cangauge.cli.output import emit_json, note, print_table, progress_shown, save_figures
 from cangauge.cli.shown import ALARM_BELOW
-from cangauge.cli.simulator import SimulatorOptions, corrected_path, write_corrected
+from cangauge.cli.simulator import SimulatorOptions, corrected_paths, write_corrected
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -74,7 +77,11 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     ] = None,
     extended: Annotated[
         Path | None,
-        typer.Option(metavar="MODEL", help="Write the model, extended by the cause, to this file."),
+        typer.Option(
+            metavar="MODEL.json",
+            callback=suffixed(".json"),
+            help="Write the model, extended by the cause, to this file.",
+        ),
     ] = None,
     simulated: Annotated[
         str | None,
@@ -97,6 +104,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
         Path | None,
         typer.Option(
             metavar="FOLDER",
+            callback=folder_to_write,
             help="With a simulator: write each LOG with its simulated and corrected voltage to"
             " FOLDER/NAME.corrected.csv.",
         ),
@@ -118,7 +126,9 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     plan_file: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE.csv", help="Write the current profile of that test: time_s, current_a."
+            metavar="FILE.csv",
+            callback=suffixed(".csv"),
+            help="Write the current profile of that test: time_s, current_a.",
         ),
     ] = None,
     limits: Annotated[
@@ -166,7 +176,6 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     --reference good2.csv --reference good3.csv --corrected .`
     """
     from cangauge.diagnosis.caveats import extended_soc_caveat
-    from cangauge.identify.starts import with_start
     from cangauge.report.summary import next_step
 
     given, added = list(reference or []), list(add_test or [])
@@ -176,21 +185,23 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     )
     next_test = NextTestOptions(plan, plan_file, limits)
     _refuse_common(paths, given)
-    outputs = [] if corrected is None else [corrected_path(log, corrected) for log in paths]
-    check_outputs(
-        [report, extended, plan_file, *outputs], [*paths, *given, *([model] if model else [])]
-    )
     within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
     within(alarm, 0.0, 1.0, option="--alarm", unit="")
     within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
     model_file = _model(model, options, corrected)
-    diagnosed = [_long_enough(reading.load(path)) for path in paths]
-    references = [reading.load(path) for path in given]
+    outputs = corrected_paths(paths, corrected)
+    check_outputs(
+        [report, extended, plan_file, *outputs], [*paths, *given, *([model] if model else [])]
+    )
+    used = [] if simulated is None else [simulated]
+    diagnosed = [_long_enough(reading.load(path, used)) for path in paths]
+    references = [reading.load(path, used) for path in given]
     if model_file is not None:
         _note_differences([*diagnosed, *references], model_file.capacity_ah)
+        options.note_model(model)
     if initial_soc is not None:  # an added test has its own start
-        started = [with_start(log, initial_soc) for log in diagnosed[: len(logs)]]
-        diagnosed = [*started, *diagnosed[len(logs) :]]
+        capacity = capacity_ah if model_file is None else model_file.capacity_ah
+        diagnosed[: len(logs)] = _started(diagnosed[: len(logs)], initial_soc, capacity)
     task = _Task(diagnosed, paths, references, given, alarm)
     with progress_shown("cangauge.diagnosis"):
         first = task.run(len(logs), model_file, options)[0].verdict if added else None
@@ -250,6 +261,13 @@ class _Task:
             alarm_below=self.alarm_below,
         )
         return found.diagnosis, found
+
+
+def _started(logs: list[Log], initial_soc_pct: float, capacity_ah: float | None) -> list[Log]:
+    from cangauge.identify.starts import with_start
+
+    note_starts(logs, initial_soc_pct, capacity_ah)
+    return [with_start(log, initial_soc_pct) for log in logs]
 
 
 def _note_differences(logs: list[Log], capacity_ah: float) -> None:

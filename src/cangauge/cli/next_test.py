@@ -46,7 +46,7 @@ class NextTestOptions:
         from cangauge.diagnosis.profiles import Limits
         from cangauge.model.effects.base import WITHIN_C
 
-        Limits(0.0, 0.0, (0.0, 100.0), WITHIN_C).changed(self.limits or "")
+        Limits(1.0, 1.0, (0.0, 100.0), WITHIN_C).changed(self.limits or "").require_room()
 
     def steps(self, found: Diagnosis, first: Verdict | None, tests: Sequence[str]) -> NextSteps:
         """Return what an added test changed, and the plan, as far as asked for.

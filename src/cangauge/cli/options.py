@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast, get_type_hints
 
 import typer
 
-from cangauge._io import check_writable
+from cangauge._io import check_writable, require_suffix
 from cangauge.cli.output import note
 from cangauge.cli.shown import TEMPERATURE_SOURCES
 from cangauge.errors import InputError
@@ -104,32 +104,54 @@ JsonOption = Annotated[
     bool,
     typer.Option("--json", help="Print exactly one JSON object on stdout, also for an error."),
 ]
+
+
+def suffixed(*suffixes: str) -> Callable[[typer.CallbackParam, Path | None], Path | None]:
+    """Return the callback of an option for a file to write: it must have one of these suffixes."""
+
+    def check(param: typer.CallbackParam, value: Path | None) -> Path | None:
+        if value is not None:
+            require_suffix(value, *suffixes, field=param.opts[-1])
+        return value
+
+    return check
+
+
+def folder_to_write(param: typer.CallbackParam, folder: Path | None) -> Path | None:
+    """Refuse, before any long work, a folder to write that is a file or cannot be made.
+
+    A callback of options; whoever writes into the folder makes it.
+    """
+    if folder is not None and not os.path.isdir(folder):  # noqa: PTH112 - False, not an error, for a name too long
+        if os.path.exists(folder):  # noqa: PTH110 - likewise
+            raise InputError(
+                "is a file", field=param.opts[-1], value=str(folder), cure="name a folder"
+            )
+        check_writable(folder)
+    return folder
+
+
 ReportOption = Annotated[
     Path | None,
     typer.Option(
-        "--report", metavar="FILE.html", help="Write a report as one self-contained page."
+        "--report",
+        metavar="FILE.html",
+        callback=suffixed(".html", ".htm"),
+        help="Write a report as one self-contained page.",
     ),
 ]
 
 
-def _drawable(folder: Path | None) -> Path | None:
+def _drawable(param: typer.CallbackParam, folder: Path | None) -> Path | None:
     """Refuse `--figures` before any long work if nothing could draw them."""
-    if folder is None:
-        return None
-    if find_spec("matplotlib") is None:
+    if folder is not None and find_spec("matplotlib") is None:
         raise InputError(
             "figures are drawn by matplotlib, which is not installed",
             field="--figures",
             value=str(folder),
             cure="pip install 'cangauge[figures]'",
         )
-    if not os.path.isdir(folder):  # noqa: PTH112 - False, not an error, for a name too long
-        if os.path.exists(folder):  # noqa: PTH110 - likewise
-            raise InputError(
-                "is a file", field="--figures", value=str(folder), cure="name a folder"
-            )
-        check_writable(folder)
-    return folder
+    return folder_to_write(param, folder)
 
 
 FiguresOption = Annotated[
@@ -211,12 +233,14 @@ class Reading:
             sign=cast("Sign | None", self.sign),
         )
 
-    def load(self, path: Path) -> Log:
+    def load(self, path: Path, used: Sequence[str] = ()) -> Log:
         """Read a log, or decode a capture; print the reader's remarks on stderr.
 
         Parameters
         ----------
         path : Path
+        used : sequence of str
+            Columns of a log that the command reads besides.
 
         Returns
         -------
@@ -239,6 +263,8 @@ class Reading:
         source = known_temperature_source(self.temperature_source)
         recording = self.open(path)
         is_capture = not isinstance(recording, LogFile)
+        if isinstance(recording, LogFile):
+            recording = replace(recording, used=tuple(used))
         car = self.car() if is_capture and self.names_vehicle else None
         if not is_capture and self.names_vehicle and self.mapped_columns() is None:
             note(f"{path}: a log, not a capture: --vehicle, --dbc and --map do not apply to it")
@@ -295,6 +321,15 @@ def note_reading(log: Log) -> None:
         note(f"{log.source or log.name}: read as {', '.join(log.assumed)}")
     for remark in log.remarks:
         note(f"{log.source or log.name}: {remark}")
+
+
+def note_starts(logs: Iterable[Log], initial_soc_pct: float, capacity_ah: float | None) -> None:
+    """Print on stderr what speaks against a given SoC at the first row of logs."""
+    from cangauge.model.coulomb_counting import doubt_of_start
+
+    for log in logs:
+        if (doubt := doubt_of_start(log, initial_soc_pct, capacity_ah)) is not None:
+            note(f"warning: {doubt}")
 
 
 def assumed_of(logs: Iterable[Log]) -> dict[str, list[str]]:

@@ -146,5 +146,5 @@ def save_figures(folder: Path | None, page: str, *result: Any) -> None:
 
     module, function = page.split(".")
     make_page = getattr(import_module(f"cangauge.report.{module}"), function)
-    write_figures(make_page(*result), folder)
+    write_figures(make_page(*result), folder, page)
     note(f"figures: {folder}")

@@ -5,12 +5,13 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from cangauge.cli.output import note
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -62,6 +63,14 @@ class SimulatorOptions:
         """Whether a simulator takes the model's place."""
         return self.column is not None or self.function is not None
 
+    def note_model(self, model: Path | None) -> None:
+        """Print on stderr what a model is for, beside a simulator."""
+        if self.are_given:
+            note(
+                f"note: the simulator is diagnosed; {model} is taken as the voltage model of its"
+                " output, in place of one identified on it"
+            )
+
     def run(self, log: Log, path: Path) -> Run:
         """Return a log with its simulated voltage.
 
@@ -107,7 +116,7 @@ class SimulatorOptions:
         try:
             volts = function(log.time_s, log.current_a, log.temperature_c, start_pct)
             return np.asarray(volts, dtype=np.float64)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise InputError(
                 f"raised {type(error).__name__}: {error}",
                 source=log.source or log.name, field="--simulator", value=self.function,
@@ -128,9 +137,12 @@ def load_function(text: str) -> Callable[..., Any]:
         raise InputError("not a function", field="--simulator", value=text, cure=SYNTAX)
     try:
         module = _file(Path(place)) if place.endswith(".py") else _module(place)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise InputError(
-            f"cannot be imported: {error}", field="--simulator", value=text, cure=SYNTAX
+            f"cannot be imported: {type(error).__name__}: {error}",
+            field="--simulator",
+            value=text,
+            cure=SYNTAX,
         ) from error
     function = getattr(module, name, None)
     if not callable(function):
@@ -158,18 +170,20 @@ def _file(path: Path) -> ModuleType:
     return module
 
 
-def corrected_path(log: Path, folder: Path) -> Path:
-    """Return where `--corrected` writes a log: `FOLDER/NAME.corrected.csv`."""
-    return folder / f"{log.stem}.corrected.csv"
+def corrected_paths(logs: Sequence[Path], folder: Path | None) -> list[Path]:
+    """Return where `--corrected` writes each log, `FOLDER/NAME.corrected.csv`; make the folder."""
+    if folder is None:
+        return []
+    folder.mkdir(exist_ok=True)
+    return [folder / f"{log.stem}.corrected.csv" for log in logs]
 
 
 def write_corrected(found: SimulatorDiagnosis, logs: list[Path], folder: Path) -> list[Path]:
     """Write each diagnosed log with the simulated and the corrected voltage; return the files."""
     from cangauge.logs.canonical import write_table
 
-    written = []
-    for run, log in zip(found.runs, logs, strict=True):
-        path = corrected_path(log, folder)
+    written = corrected_paths(logs, folder)
+    for run, path in zip(found.runs, written, strict=True):
         columns = {
             "time_s": run.log.time_s,
             "current_a": run.log.current_a,
@@ -180,5 +194,4 @@ def write_corrected(found: SimulatorDiagnosis, logs: list[Path], folder: Path) -
             "corrected_v": found.corrected_v(run),
         }
         write_table({name: values for name, values in columns.items() if values is not None}, path)
-        written.append(path)
     return written

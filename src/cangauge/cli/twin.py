@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from cangauge._io import write_text_atomic
-from cangauge.cli.options import JsonOption, check_outputs, within
+from cangauge.cli.options import JsonOption, check_outputs, suffixed, within
 from cangauge.cli.output import console, emit_json, note, print_table
 from cangauge.errors import InputError
 
@@ -21,7 +21,13 @@ if TYPE_CHECKING:
 def twin_command(  # noqa: PLR0917 - typer passes options by name
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="LOG", help="Log to write: .parquet or .csv."),
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="LOG",
+            callback=suffixed(".parquet", ".pq", ".csv", ".bdf"),
+            help="Log to write: .parquet or .csv.",
+        ),
     ] = None,
     seed: Annotated[
         int, typer.Option(metavar="N", min=0, help="Selects the pack. Same seed, same log.")
@@ -88,7 +94,12 @@ def twin_command(  # noqa: PLR0917 - typer passes options by name
         ),
     ] = "full",
     truth: Annotated[
-        Path | None, typer.Option(metavar="FILE.json", help="Write the truth to this file too.")
+        Path | None,
+        typer.Option(
+            metavar="FILE.json",
+            callback=suffixed(".json"),
+            help="Write the truth to this file too.",
+        ),
     ] = None,
     list_effects: Annotated[
         bool, typer.Option("--list", help="List the effects and their parameters.")

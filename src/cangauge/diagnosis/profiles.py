@@ -64,6 +64,18 @@ class Limits:
                     value=f"{name}={low:g}:{high:g}",
                 )
 
+    def require_room(self) -> None:
+        """Raise InputError if no current at all is allowed, or less than 1 % SoC."""
+        low, high = self.soc_pct
+        if self.discharge_a <= 0.0 and self.charge_a <= 0.0:
+            raise InputError("no current is allowed", field="--limits", value="current=0:0")
+        if high - low < 1.0:
+            raise InputError(
+                "the SoC window is narrower than 1 %",
+                field="--limits",
+                value=f"soc={low:g}:{high:g}",
+            )
+
     @classmethod
     def of(cls, problem: DiagnosisProblem) -> Limits:
         """Return what the references usually show: all but `RARE` of their rows on either side.
@@ -139,6 +151,11 @@ def _numbers(text: str, kind: _LimitKind, part: str) -> list[float]:
     if len(values) != kind.numbers or not all(low <= value <= high for value in values):
         shape = "LOW:HIGH" if kind.numbers == 2 else "a number"
         raise InputError(f"needs {shape} within {low:g} … {high:g}", field="--limits", value=part)
+    if values[0] > values[-1]:
+        raise InputError(
+            "the lower limit is above the upper one", field="--limits", value=part,
+            cure=f"give {part.partition('=')[0]}={values[-1]:g}:{values[0]:g}",
+        )  # fmt: skip
     return values
 
 
@@ -291,13 +308,8 @@ def library_of_tests(limits: Limits, pack: Pack, *, usual_c: float, lead_s: floa
     InputError
         If the limits allow no current at all, or the SoC window is narrower than 1 %.
     """
+    limits.require_room()
     low, high = limits.soc_pct
-    if limits.discharge_a <= 0.0 and limits.charge_a <= 0.0:
-        raise InputError("no current is allowed", field="--limits", value="current=0:0")
-    if high - low < 1.0:
-        raise InputError(
-            "the SoC window is narrower than 1 %", field="--limits", value=f"soc={low:g}:{high:g}"
-        )
     coldest, hottest = limits.temperature_c
     usual_c = float(np.clip(usual_c, coldest, hottest))
     found = []

@@ -11,11 +11,13 @@ A unit holds a binary for this platform and the sources for others. Its interfac
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import platform
 import re
 import shutil
 import subprocess
+import sys
 import tempfile
 import zipfile
 from collections.abc import Sequence
@@ -85,6 +87,16 @@ UNITS: Final = {
 """Unit → its base units, in the attributes of FMI."""
 
 
+STEP_S: Final = 0.1
+"""Step that a unit proposes [s], the period of a current sensor: the inputs of a step are those of
+its beginning, so that outputs are late by one step."""
+FINITE: Final = (-sys.float_info.max, sys.float_info.max)
+AMPERE_HOURS: Final = (1e-3, 1e5)
+"""Capacities that the commands take too [A h]."""
+TAU_S: Final = (1e-3, FINITE[1])
+"""Time constants [s]: a shorter one is over within any step."""
+
+
 @dataclass(frozen=True)
 class Variable:
     """A variable of a unit; its value reference is its place."""
@@ -95,6 +107,8 @@ class Variable:
     start: float | None
     description: str
     is_integer: bool = False
+    range: tuple[float, float] | None = None
+    """Lowest and highest value that can be set; None: any, NaN too."""
 
 
 def export_fmu(model: Model, path: Path, *, kind: Kind = "pack", version: Version = 3) -> Path:
@@ -193,6 +207,7 @@ class _Unit:
         (folder / "fmu_model.c").write_text(self._constants(), encoding="utf-8")
 
     def _constants(self) -> str:
+        ranges = [item.range or (math.nan, math.nan) for item in self.variables]
         start = [0.0 if item.start is None else item.start for item in self.variables]
         first = len(self.variables) - len(self.parameters)
         table = [[first + k, *where] for k, where in enumerate(self.parameters)]
@@ -201,6 +216,7 @@ class _Unit:
             f"{model_definition('FMU_MODEL', self.constants)}"
             f"const cg_settings FMU_SETTINGS = {initialiser(self.constants.settings)};\n"
             f"const double FMU_START[FMU_VARIABLES] = {initialiser(start)};\n"
+            f"const double FMU_RANGE[FMU_VARIABLES][2] = {initialiser(ranges)};\n"
             f"const fmu_parameter FMU_PARAMETER[FMU_PARAMETERS + 1] = {initialiser(table)};\n"
         )
 
@@ -247,7 +263,7 @@ class _Unit:
         units = ET.SubElement(root, "UnitDefinitions")
         for name, base in UNITS.items():
             ET.SubElement(ET.SubElement(units, "Unit", name=name), "BaseUnit", base)
-        ET.SubElement(root, "DefaultExperiment", startTime="0", stepSize="1")
+        ET.SubElement(root, "DefaultExperiment", startTime="0", stepSize=str(STEP_S))
         variables = ET.SubElement(root, "ModelVariables")
         structure = ET.SubElement(root, "ModelStructure")
         outputs = [k for k, item in enumerate(self.variables) if item.causality == "output"]
@@ -281,10 +297,13 @@ def _pack_variables(model: Model) -> tuple[Variable, ...]:
         Variable("temperature_c", "input", "degC", model.t_ref_c, "measured temperature"),
         Variable("voltage_v", "output", "V", None, "voltage at the terminals"),
         Variable("soc_pct", "output", "%", None, "state of charge"),
-        Variable("initial_soc_pct", "parameter", "%", 50.0, "state of charge at the start"),
+        Variable(
+            "initial_soc_pct", "parameter", "%", 50.0, "state of charge at the start",
+            range=(0.0, 100.0),
+        ),
         Variable(
             "capacity_ah", "parameter", "A.h", model.extended_model().counting(50.0).capacity_ah,
-            "charge from full to empty",
+            "charge from full to empty", range=AMPERE_HOURS,
         ),
     )  # fmt: skip
 
@@ -298,7 +317,7 @@ def _estimator_variables() -> tuple[Variable, ...]:
         Variable("soc_pct", "output", "%", None, "state of charge"),
         Variable(
             "initial_soc_pct", "parameter", "%", -1.0,
-            "state of charge at the start; negative: found from the first voltages",
+            "state of charge at the start; -1: found from the first voltages", range=(-1.0, 100.0),
         ),
         Variable("soc_std_pct", "output", "%", None, "its standard deviation"),
         Variable(
@@ -325,7 +344,8 @@ def _effect_parameters(
         for place, name, value in values:
             text = f"effect {number + 1} of the model, as in cangauge.h"
             full = f"effect_{number + 1}_{form.kind}.{name}"
-            variables.append(Variable(full, "parameter", None, value, text))
+            bounds = TAU_S if name.startswith("tau_") else FINITE
+            variables.append(Variable(full, "parameter", None, value, text, range=bounds))
             places.append((number, place))
     return variables, places
 
@@ -334,7 +354,7 @@ def _second(parent: ET.Element, reference: int, item: Variable) -> None:
     """Add a variable as FMI 2 states it."""
     attributes = _attributes(reference, item)
     outer = ET.SubElement(parent, "ScalarVariable", attributes)
-    inner = {} if item.start is None else {"start": repr(item.start)}
+    inner = _limits(item) | ({} if item.start is None else {"start": repr(item.start)})
     if item.unit is not None:
         inner["unit"] = item.unit
     ET.SubElement(outer, "Integer" if item.is_integer else "Real", inner)
@@ -342,12 +362,18 @@ def _second(parent: ET.Element, reference: int, item: Variable) -> None:
 
 def _third(parent: ET.Element, reference: int, item: Variable) -> None:
     """Add a variable as FMI 3 states it."""
-    attributes = _attributes(reference, item)
+    attributes = _attributes(reference, item) | _limits(item)
     if item.start is not None:
         attributes["start"] = repr(item.start)
     if item.unit is not None:
         attributes["unit"] = item.unit
     ET.SubElement(parent, "Int32" if item.is_integer else "Float64", attributes)
+
+
+def _limits(item: Variable) -> dict[str, str]:
+    """Return the attributes min and max, as far as the range has ends."""
+    named = zip(("min", "max"), item.range or FINITE, FINITE, strict=True)
+    return {name: repr(value) for name, value, end in named if value != end}
 
 
 def _attributes(reference: int, item: Variable) -> dict[str, str]:

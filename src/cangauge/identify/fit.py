@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from cangauge._display import figure
-from cangauge._formatting import duration
+from cangauge._formatting import counted, duration
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.identify.assemble import (
@@ -403,9 +403,9 @@ def _remarks_on_time(
         if gaps.size:
             longest = float(np.max(np.diff(log.time_s)[gaps]))
             remarks.append(
-                f"{log.name}: {gaps.size} gaps of more than {bridge_s(log.time_s):.0f} s, the"
-                f" longest {duration(longest)}: no charge is counted over them (a rest); split the"
-                " log there if the pack was used"
+                f"{log.name}: {counted(gaps.size, 'gap')} of more than"
+                f" {bridge_s(log.time_s):.0f} s, the longest {duration(longest)}: no charge is"
+                " counted over them (a rest); split the log there if the pack was used"
             )
     return remarks
 

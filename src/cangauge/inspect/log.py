@@ -7,7 +7,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from cangauge._formatting import duration
+from cangauge._formatting import counted, duration
 from cangauge.errors import InputError
 from cangauge.identify.voltage_fit import SOC_SPAN_AT_LEAST_PCT
 from cangauge.inference.rows import DELAYS_S as FIT_DELAYS_S
@@ -219,7 +219,7 @@ def _gap_warnings(timing: Timing, charge: Charge) -> list[str]:
     if timing.gap_count:
         longest = timing.longest_gaps[0]
         found.append(
-            f"{timing.gap_count} gaps of more than {timing.gap_limit_s:g} s, the longest"
+            f"{counted(timing.gap_count, 'gap')} of more than {timing.gap_limit_s:g} s, the longest"
             f" {longest.length_s:.4g} s at {longest.start_s:.1f} s; {charge.in_gaps_ah:.3g} Ah are"
             " interpolated over gaps"
         )

@@ -148,7 +148,7 @@ def draft_from_table(
 
 
 def describe(draft: DraftLog, words: Any, names: Sequence[str]) -> None:
-    """Set a draft's temperature source from the column's words; remark on ignored columns.
+    """Set a draft's temperature source from the column's words, and the ignored columns.
 
     Raises
     ------
@@ -168,10 +168,7 @@ def describe(draft: DraftLog, words: Any, names: Sequence[str]) -> None:
     word = distinct.pop() if distinct else "unknown"
     draft.temperature_source = known_temperature_source(word, source=where, field=SOURCE)
     draft.headings = tuple(names)
-    extra = [name for name in names if name and name.strip().lower() not in _FIELDS]
-    if extra:
-        shown = ", ".join(extra[:6]) + (", …" if len(extra) > 6 else "")
-        draft.remarks.append(f"{len(extra)} other columns ignored: {shown}")
+    draft.ignored = tuple(name for name in names if name and name.strip().lower() not in _FIELDS)
 
 
 def build_table(

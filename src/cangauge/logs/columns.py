@@ -74,7 +74,7 @@ class Columns:
         try:
             return np.asarray(pc.cast(trimmed, pa.float64()).to_numpy(), dtype=np.float64)
         except pa.ArrowInvalid as error:
-            bare = _without_unit(trimmed)
+            bare = without_unit(trimmed)
             if bare is not None:
                 return np.asarray(pc.cast(bare, pa.float64()).to_numpy(), dtype=np.float64)
             row, value = next(
@@ -121,7 +121,7 @@ def _with_decimal_point(cells: Any) -> Any:
     return pc.replace_substring(cells, ",", ".")
 
 
-def _without_unit(cells: Any) -> Any | None:
+def without_unit(cells: Any) -> Any | None:
     """Return cells without a unit that all of them carry (`53.2 V`), or None."""
     parts = pc.extract_regex(
         cells, r"^(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(?P<unit>\D{1,4})$"

@@ -8,6 +8,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
+from cangauge._formatting import counted
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.column_map import shown_headings
@@ -18,6 +19,11 @@ Sign = Literal["charge", "discharge"]
 
 MAX_INCOMPLETE: Final = 0.05
 """Largest fraction of incomplete rows to drop, in formats that allow it [-]."""
+
+PROBES_APART_K: Final = 20.0
+"""Distance from the median of its row beyond which a temperature probe fails [K]: packs are cooled
+so that their cells differ by less than 5 K (Pesaran, J. Power Sources 110, 2002), and codes of
+invalid values are -40, 127 or 215 °C."""
 
 
 @dataclass(slots=True)
@@ -49,6 +55,8 @@ class DraftLog:
         Changes and findings of the reader.
     headings : tuple of str
         All columns of the file, for messages.
+    ignored : tuple of str
+        Those that hold no quantity of the log.
     """
 
     name: str
@@ -62,6 +70,7 @@ class DraftLog:
     assumed: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
     headings: tuple[str, ...] = ()
+    ignored: tuple[str, ...] = ()
 
     def require(self, *fields: str, headings: Sequence[str]) -> None:
         """Raise InputError if one of these fields was not found under any heading."""
@@ -89,7 +98,51 @@ class DraftLog:
             self.negate_current(f"positive {sign}s in the file, as stated")
         self.sign_unknown = False
 
-    def checked(self, temperature_c: float | None = None) -> dict[str, Any]:
+    def mean_of_probes(
+        self, names: Sequence[str], parts: Sequence[FloatArray], apart: float = PROBES_APART_K
+    ) -> FloatArray:
+        """Return the mean of temperature probes, shape (n,); remark on those that are far off.
+
+        Of three probes or more, a value further from the median of its row is left out; of two,
+        none is known to be the good one.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Headings.
+        parts : sequence of arrays of shape (n,)
+            Temperatures, NaN where missing.
+        apart : float
+            `PROBES_APART_K` in the unit of `parts`; infinity for other quantities.
+        """
+        stacked = np.vstack(parts)
+        known = np.isfinite(stacked)
+        blank = ~known.any(axis=0)
+        median = np.nanmedian(np.where(blank, 0.0, stacked), axis=0)
+        far = known & (np.abs(stacked - median) > (apart if len(parts) > 2 else 0.5 * apart))
+        if len(parts) > 2:
+            known &= ~far
+            for name, rows, values in zip(names, far, stacked, strict=True):
+                if rows.any():
+                    self.remarks.append(
+                        f"temperature: {name} left out in {counted(int(rows.sum()), 'row')}, where"
+                        f" it is over {PROBES_APART_K:g} K from the other probes (first"
+                        f" {values[rows][0]:g})"
+                    )
+        elif far.any():
+            row = int(np.argmax(far.any(axis=0)))
+            shown = " and ".join(f"{values[row]:g}" for values in stacked)
+            self.remarks.append(
+                f"temperature: {' and '.join(names)} are {shown} in row {row + 1}: one of the"
+                " probes fails; name the good one with --columns temperature=…"
+            )
+        count = np.sum(known, axis=0)
+        total = np.sum(np.where(known, stacked, 0.0), axis=0)
+        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+    def checked(
+        self, temperature_c: float | None = None, used: Sequence[str] = ()
+    ) -> dict[str, Any]:
         """Check all values and return the arguments of `Log`.
 
         Rows that repeat the time stamp of the row before are dropped, with a remark.
@@ -98,12 +151,18 @@ class DraftLog:
         ----------
         temperature_c : float, optional
             Constant temperature [°C], in place of the file's.
+        used : sequence of str
+            Columns that the caller reads besides.
 
         Raises
         ------
         InputError
             No temperature, missing or infinite values, wrong units, time that runs backwards.
         """
+        ignored = [name for name in self.ignored if name not in used]
+        if ignored:
+            shown = ", ".join(ignored[:6]) + (", …" if len(ignored) > 6 else "")
+            self.remarks.append(f"{counted(len(ignored), 'other column')} ignored: {shown}")
         self._set_temperature(temperature_c)
         self._check_missing()
         self._check_time()
@@ -157,7 +216,7 @@ class DraftLog:
                 cure="check the export",
             )
         self.remarks.append(
-            f"{count} rows without time, current, voltage or temperature dropped"
+            f"{counted(count, 'row')} without time, current, voltage or temperature dropped"
             f" (the first is row {int(np.argmax(incomplete)) + 1})"
         )
         self.keep(~incomplete)
@@ -188,7 +247,7 @@ class DraftLog:
         same = np.concatenate(([False], step == 0.0))
         if same.any():
             self.remarks.append(
-                f"{same.sum()} rows with the time stamp of the row before dropped"
+                f"{counted(int(same.sum()), 'row')} with the time stamp of the row before dropped"
                 f" (the first is row {int(np.argmax(same)) + 1})"
             )
             self.keep(~same)

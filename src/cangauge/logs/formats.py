@@ -12,6 +12,7 @@ from typing import Final
 
 import numpy as np
 
+from cangauge._formatting import counted
 from cangauge._io import MAX_HEADING
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
@@ -221,7 +222,7 @@ def _drop_wait(draft: DraftLog) -> None:
         )
     if waiting.any():
         draft.remarks.append(
-            f"{waiting.sum()} rows before time 0 (the wait before the test) dropped"
+            f"{counted(int(waiting.sum()), 'row')} before time 0 (the wait before the test) dropped"
         )
         draft.keep(~waiting)
 
@@ -415,7 +416,8 @@ def read_cycler(content: FileContent) -> DraftLog:
         cells = columns.text["exclude"].to_pylist()
         excluded = np.array([cell.strip() == "Yes" for cell in cells])
         if excluded.any():
-            draft.remarks.append(f"{excluded.sum()} rows that the cycler excludes dropped")
+            rows = counted(int(excluded.sum()), "row")
+            draft.remarks.append(f"{rows} that the cycler excludes dropped")
             draft.keep(~excluded)
     return draft
 
@@ -425,7 +427,9 @@ def _take_sensors(draft: DraftLog, sensors: dict[str, FloatArray]) -> None:
     filled = {name: values for name, values in sensors.items() if np.isfinite(values).any()}
     ambient = filled.pop("ambient", None)
     if filled:
-        draft.values["temperature_c"] = np.mean(list(filled.values()), axis=0)
+        draft.values["temperature_c"] = draft.mean_of_probes(
+            [draft.labels.get(name, name) for name in filled], list(filled.values())
+        )
         draft.temperature_source = "cell"
         draft.remarks.append(f"temperature: mean of {len(filled)} sensors")
     elif ambient is not None:

@@ -42,7 +42,8 @@ _NEUTRAL: Final = _words(
     "messwert system sys device ctrl v b var the of in raw data test rec record id sensor "
     "usable bus line overall current present averaged volume gesamt klemmen klemm"
 )
-_CELL: Final = _words("cell cells module mod zelle zellen zell string display displayed dash")
+_CELL: Final = _words("cell cells module mod zelle zellen zell string")
+_DISPLAY: Final = _words("display displayed disp dash dashboard anzeige")
 _AMBIENT: Final = _words(
     "ambient chamber room environment env umgebung raum kammer lab oven klimakammer"
 )
@@ -89,12 +90,15 @@ _COMPOUND: Final = re.compile(
     r"(\w{3,}?)(strom|spannung|temperatur|zeit|stroom|spanning|temperatuur)"
 )
 """A Germanic noun whose last word is the quantity: `Batteriespannung`, `Motorstrom`."""
+_TEMPERATURE_UNITS: Final = _words("celsius fahrenheit kelvin degc degf")
+"""Units that name the quantity where no word does: `celsius`, `battery_celsius`."""
 _AUXILIARY: Final = frozenset({"aux", "auxiliary"})
 _PACK_WORD: Final = frozenset({"battery"})
 _MEAN: Final = frozenset({"avg", "average", "mean"})
 _DATES: Final = frozenset({"date", "datum", "日期"})
 _DATE_ONLY: Final = "(date)"
-_FIRST_PARTS: Final = _PACK | _NEUTRAL | _CELL | _AMBIENT | _EXCLUDED | _TIME_EXCLUDED | _ELAPSED
+_PLACES: Final = _PACK | _NEUTRAL | _CELL | _DISPLAY | _AMBIENT
+_FIRST_PARTS: Final = _PLACES | _EXCLUDED | _TIME_EXCLUDED | _ELAPSED
 _SYMBOLS: Final = {"i": "current", "u": "voltage", "v": "voltage", "e": "voltage", "t": "time"}
 _TOKEN: Final = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_A-Za-z]+")
 _BRACKETS: Final = re.compile(r"^(?P<name>.*?)[\s_]*[\[({](?P<unit>[^\[\](){}]*)[\])}]?\s*$")
@@ -154,6 +158,8 @@ def meaning_of(heading: str, unit_below: str = "") -> Meaning | None:
 
 def _splits(heading: str, unit_below: str) -> list[tuple[str, str]]:
     """Return (name, unit) as the heading may be meant, the most explicit first."""
+    if heading.strip().lower() in _TEMPERATURE_UNITS:
+        return [("", heading.strip())]
     found = []
     for pattern in (_BRACKETS, _SLASH, _TAIL):
         match = pattern.match(heading.strip())
@@ -247,10 +253,12 @@ def _quantity(tokens: list[str], name: str, unit: str) -> tuple[str | None, list
 
 
 def _symbol(tokens: list[str], name: str, unit: str) -> tuple[str | None, list[str]]:
-    """Return the quantity of a formula letter that stands alone or with a word for the pack."""
+    """Return the quantity of a unit, or of a formula letter alone or with a word for the pack."""
+    if unit.lower() in _TEMPERATURE_UNITS:
+        return "temperature", tokens
     symbols = [token for token in tokens if token in _SYMBOLS]
     others = [token for token in tokens if token not in _SYMBOLS]
-    plain = _PACK | _CELL | _MEAN
+    plain = _PACK | _CELL | _DISPLAY | _MEAN
     if len(symbols) != 1 or not all(each in plain or each.isdigit() for each in others):
         return None, tokens
     quantity = _SYMBOLS[symbols[0]]
@@ -274,7 +282,7 @@ def _rank(quantity: str, rest: list[str]) -> tuple[int, bool, TemperatureSource]
         if words & _AUXILIARY:  # a cycler's thermocouple
             words, numbered = words - _AUXILIARY | {"thermocouple"} | _PACK_WORD, True
     is_one = not numbered or quantity == "temperature" or bool(words & _PACK) or "1" in rest
-    unknown = words - _PACK - _NEUTRAL - _CELL - _AMBIENT
+    unknown = words - _PLACES
     if words & _EXCLUDED or "12" in rest:
         rank = GUESS + 1
     elif words & _AMBIENT:
@@ -284,7 +292,7 @@ def _rank(quantity: str, rest: list[str]) -> tuple[int, bool, TemperatureSource]
     elif unknown or (numbered and quantity != "temperature"):
         rank = 3
     else:
-        rank = 2 if words & _CELL else 0 if words & _PACK else 1
+        rank = 2 if words & (_CELL | _DISPLAY) else 0 if words & _PACK else 1
     return rank, numbered, source
 
 

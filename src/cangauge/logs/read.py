@@ -45,11 +45,14 @@ class LogFile:
         Of its format; None if it is not a log.
     sign : {"charge", "discharge"}, optional
         What a positive current in the file does, as the user states it.
+    used : tuple of str
+        Columns that the caller reads besides those of a log.
     """
 
     content: FileContent
     reader: _Reader | None
     sign: Sign | None = None
+    used: tuple[str, ...] = ()
 
     @property
     def is_any_table(self) -> bool:
@@ -83,7 +86,7 @@ class LogFile:
         draft = self.reader(self.content)
         if self.sign is not None:
             draft.state_sign(self.sign)
-        log = Log(**draft.checked(temperature_c))
+        log = Log(**draft.checked(temperature_c, self.used))
         if temperature_source is not None:
             log = replace(log, temperature_source=temperature_source)
         is_stated = self.sign is not None

@@ -18,6 +18,8 @@ from cangauge._typing import BoolArray, FloatArray
 from cangauge.logs.units import unit_of
 
 DAY_S: Final = 86400.0
+HOUR_S: Final = 3600.0
+WITHOUT_ZONE: Final = "without zone"
 
 _DAYS: Final = r"(?:(?P<d>\d+)\s*(?:[dD]|[dD]ays?)?\s+)?"
 _CLOCK: Final = (
@@ -28,6 +30,10 @@ _ZONE: Final = r"(?P<z>Z|z|UTC|GMT|[+-]\d{2}:?\d{2}|[+-]\d{2})?"
 _DATE: Final = (
     r"(?:[A-Za-z]{3},?\s+)?(?P<a>\d{1,4})[-/.](?P<b>\d{1,2}|[A-Za-z]{3})[-/.](?P<c>\d{1,4})"
 )
+_MONTH_FIRST: Final = (
+    r"^(?:[A-Za-z]{3,9},?\s+)?([A-Za-z]{3})[a-z]*\.?\s+(\d{1,2})(?:st|nd|rd|th)?,?\s+(\d{4}),?\s*"
+)
+_MONTH_WORD: Final = r"^(\d{1,2})\.?\s+([A-Za-z]{3})[a-z]*\.?,?\s+(\d{4}),?\s*"
 _DATE_TIME: Final = rf"^{_DATE}(?:(?:[T,_]|\s)\s*{_CLOCK})?\s*{_ZONE}$"
 _CLOCK_TIME: Final = rf"^{_DAYS}{_CLOCK}$"
 _MONTHS: Final = (
@@ -49,7 +55,7 @@ class UnreadableStampError(Exception):
 
 def is_stamp(text: str) -> bool:
     """Return whether a cell holds a date or a clock time."""
-    one = pa.array([text.strip()], pa.string())
+    one = _with_short_dates(pa.array([text.strip()], pa.string()))
     return any(
         pc.match_substring_regex(one, pattern)[0].as_py() for pattern in (_DATE_TIME, _CLOCK_TIME)
     )
@@ -114,6 +120,7 @@ def seconds_of_text(cells: Any, unit: str = "") -> tuple[FloatArray, str]:
     """
     if isinstance(cells, pa.ChunkedArray):
         cells = cells.combine_chunks()
+    stated, cells = cells, _with_short_dates(cells)
     known = ~np.asarray(pc.is_null(cells).to_numpy(zero_copy_only=False), dtype=bool)
     first = next((cell.as_py() for cell in cells if cell.is_valid), "")
     is_of_day = is_clock(first)
@@ -121,13 +128,40 @@ def seconds_of_text(cells: Any, unit: str = "") -> tuple[FloatArray, str]:
     bad = known & np.asarray(pc.is_null(parts).to_numpy(zero_copy_only=False), dtype=bool)
     if bad.any():
         row = int(np.argmax(bad))
-        raise UnreadableStampError(row, str(cells[row].as_py()))
+        raise UnreadableStampError(row, str(stated[row].as_py()))
     of_day_s = _time_of_day_s(parts)
     if is_of_day:
         days = _numbers(parts, "d")
         values = np.where(np.isnan(days), 0.0, days) * DAY_S + of_day_s
         return _unwrapped(values), "clock time" if values.size else ""
     return _dates(parts, of_day_s, unit)
+
+
+def _with_short_dates(cells: Any) -> Any:
+    """Return stamps with dates such as `Mar 31, 2024` or `31 March 2024` as `31-Mar-2024`."""
+    cells = pc.replace_substring_regex(cells, "[\u00a0\u202f]", " ")  # before AM and PM
+    cells = pc.replace_substring_regex(cells, _MONTH_FIRST, r"\2-\1-\3 ")
+    return pc.utf8_trim_whitespace(pc.replace_substring_regex(cells, _MONTH_WORD, r"\1-\2-\3 "))
+
+
+def hour_jump(time_s: FloatArray) -> tuple[int, bool] | None:
+    """Return the first row at which local time jumps an hour, and whether forward; or None.
+
+    Such a row begins within two usual steps of a full hour and follows the row before by one hour
+    more, or less, than a usual step.
+    """
+    known = np.flatnonzero(np.isfinite(time_s))
+    stamps = time_s[known]
+    step = np.diff(stamps)
+    if not np.any(step > 0.0):
+        return None
+    usual_s = float(np.median(step[step > 0.0]))  # stamps of whole seconds repeat
+    near_s = 2.0 * usual_s
+    at_hour = stamps[1:] % HOUR_S <= near_s
+    jumps = np.flatnonzero(at_hour & (np.abs(np.abs(step - usual_s) - HOUR_S) <= usual_s))
+    if not jumps.size or near_s >= HOUR_S:
+        return None
+    return int(known[jumps[0] + 1]), bool(step[jumps[0]] > 0.0)
 
 
 def _time_of_day_s(parts: Any) -> FloatArray:
@@ -168,7 +202,7 @@ def _dates(parts: Any, of_day_s: FloatArray, unit: str) -> tuple[FloatArray, str
     zone = zone_of(unit)
     if zone is not None:
         return _in_zone(values, zone), f"date{how} in {zone.key}"
-    return values, f"date{how} without zone"
+    return values, f"date{how} {WITHOUT_ZONE}"
 
 
 def _order(

@@ -319,6 +319,7 @@ def read_long_format(content: FileContent, given: ColumnMap | None) -> DraftLog:
     if not choice.is_complete:
         raise unknown_columns(str(content.path), headings, choice)
     draft = DraftLog(content.name, str(content.path), remarks=[*columns.remarks])
+    draft.headings = tuple(headings)
     cells = pc.utf8_trim_whitespace(columns.text["last_changed"])
     stamps, how = read_stamps(cells, "", columns.source, "last_changed")
     order = np.argsort(stamps, kind="stable")

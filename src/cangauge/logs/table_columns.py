@@ -16,6 +16,7 @@ import pyarrow.compute as pc
 
 from cangauge._typing import FloatArray, IntArray
 from cangauge.errors import InputError
+from cangauge.logs.arrow import is_text
 from cangauge.logs.column_map import (
     Choice,
     ChosenColumn,
@@ -25,15 +26,18 @@ from cangauge.logs.column_map import (
     shown_headings,
     suggestion,
 )
-from cangauge.logs.draft import MAX_INCOMPLETE, DraftLog
+from cangauge.logs.columns import without_unit
+from cangauge.logs.draft import MAX_INCOMPLETE, PROBES_APART_K, DraftLog
 from cangauge.logs.headings import FIELDS
 from cangauge.logs.stamps import (
+    WITHOUT_ZONE,
     UnreadableStampError,
+    hour_jump,
     is_time_format,
     seconds_of_numbers,
     seconds_of_text,
 )
-from cangauge.logs.units import TemperatureSource, convert
+from cangauge.logs.units import TemperatureSource, convert, unit_of
 
 DOCS: Final = "docs/logs.md"
 """Page that explains the columns of a log."""
@@ -112,12 +116,19 @@ def fill_draft(
         if name == "time":
             values, unit = _time(draft, column, columns, headings)
             label = draft.labels["time_s"]
+            if unit.endswith(WITHOUT_ZONE):
+                _tell_hour_jump(draft, values)
         else:
             values, unit = quantity_values(draft, name, column, columns)
         draft.values[FIELDS[name]] = values
         factor = "" if column.factor == 1.0 else f" × {column.factor:g}"
         shown = label if len(label) <= SHOWN_HEADING else f"{label[:SHOWN_HEADING]}…"
         draft.assumed.append(f'{name} = "{shown}"{factor} [{unit}]')
+    chosen = {place for column in choice.chosen.values() for place in column.places}
+    draft.ignored = tuple(
+        heading for place, heading in enumerate(headings)
+        if heading and place not in chosen and heading != draft.labels["time_s"]
+    )  # fmt: skip
     _leaf_spy(draft, headings)
     current = choice.chosen["current"]
     draft.sign_unknown = current.factor > 0.0
@@ -139,12 +150,12 @@ def quantity_values(
     parts = [columns.numbers(f"{name} {k}") for k in range(len(column.places))]
     values = parts[0]
     if len(parts) > 1:
-        stacked = np.vstack(parts)
-        known = np.isfinite(stacked)
-        count = np.sum(known, axis=0)
-        total = np.sum(np.where(known, stacked, 0.0), axis=0)
-        values = np.where(count > 0, total / np.maximum(count, 1), np.nan)
         draft.remarks.append(f"{name}: mean of {len(parts)} columns")
+        apart = np.inf
+        if name == "temperature":
+            kelvin, _ = unit_of(field, column.unit) or (1.0, 0.0)
+            apart = PROBES_APART_K / abs(kelvin * column.factor)
+        values = draft.mean_of_probes([draft.headings[k] for k in column.places], parts, apart)
     values = values * column.factor
     unit = column.unit
     finite = values[np.isfinite(values)]
@@ -179,6 +190,21 @@ def _time(
     if not _increases(first[0]) and column.others:
         draft.labels["time_s"] = headings[column.places[0]]
     return first
+
+
+def _tell_hour_jump(draft: DraftLog, time_s: FloatArray) -> None:
+    """Remark on an hour that local time leaves out; raise InputError for one that it repeats."""
+    jump = hour_jump(time_s)
+    if jump is None:
+        return
+    row, forward = jump
+    cure = f"name its zone, e.g. --columns 'time={draft.labels['time_s']}[Europe/Berlin]'"
+    problem = f"local time jumps an hour {'ahead' if forward else 'back'} at row {row + 1}"
+    if not forward:
+        raise InputError(
+            problem, source=draft.source or draft.name, field=draft.labels["time_s"], cure=cure
+        )
+    draft.remarks.append(f"{problem}, as daylight saving time does: {cure}")
 
 
 def _increases(time_s: FloatArray) -> bool:
@@ -301,6 +327,10 @@ class ArrowColumns:
         """Return a column as numbers, NaN where missing."""
         column = self.table.column(self.place[name])
         label = self.table.column_names[self.place[name]]
+        if is_text(column.type):
+            text = pc.utf8_trim_whitespace(column.cast(pa.string()))
+            bare = without_unit(text)
+            column = text if bare is None else bare
         try:
             plain = column.cast(pa.float64(), safe=False)
         except (pa.ArrowException, OSError) as error:
@@ -323,7 +353,7 @@ class ArrowColumns:
             return np.asarray(counts.to_numpy(), dtype=np.float64) / per_second
         if pa.types.is_date(kind):
             return column.cast(pa.string())
-        if pa.types.is_string(kind) or pa.types.is_large_string(kind) or "string" in str(kind):
+        if is_text(kind):
             text = pc.utf8_trim_whitespace(column.cast(pa.string()))
             try:
                 return np.asarray(text.cast(pa.float64()).to_numpy(), dtype=np.float64)

@@ -117,6 +117,38 @@ def difference_from_reference(log: Log, capacity_ah: float) -> str | None:
     )
 
 
+def doubt_of_start(log: Log, given_pct: float, capacity_ah: float | None = None) -> str | None:
+    """Return what speaks against a given SoC at the first row, in a phrase, or None.
+
+    Parameters
+    ----------
+    log : Log
+    given_pct : float
+        [%].
+    capacity_ah : float, optional
+        Counts the log's first SoC back to the first row [Ah].
+
+    Returns
+    -------
+    str or None
+        That it differs from the log's own SoC by `DIFFERENT_PCT` or more, or is a fraction.
+    """
+    doubts = []
+    first = log.first_soc()
+    if first is not None:
+        row, own_pct = first
+        if row and capacity_ah is not None:
+            out_ah = discharged_ah(log.time_s[: row + 1], log.current_a[: row + 1])[-1]
+            own_pct += 100.0 * float(out_ah) / capacity_ah
+        if abs(own_pct - given_pct) >= DIFFERENT_PCT:
+            doubts.append(f"its own SoC is {own_pct:.1f} %")
+    if 0.0 < given_pct <= 1.0:
+        doubts.append(f"a fraction is given in percent, as {100.0 * given_pct:g}")
+    if not doubts:
+        return None
+    return f"{log.name}: the initial SoC is {given_pct:g} % as given; {', and '.join(doubts)}"
+
+
 def capacity_from_reference(logs: Sequence[Log]) -> float:
     """Return the charge per 100 % of reference SoC [Ah], by regression pooled over the logs.
 

@@ -11,27 +11,38 @@ from typing import Any, Final
 import numpy as np
 from bokeh.models import BoxAnnotation, ColorBar, FactorRange, Label, Span, Whisker
 
+from cangauge._io import open_regular
 from cangauge.report.page import Page
 
 _PX_PER_INCH: Final = 96.0
 """Of CSS."""
 _WIDTH_IN: Final = 10.0
 _PNG_DPI: Final = 200
+_HEAD_BYTES: Final = 4096
+"""Beginning of a file in which matplotlib writes its description [bytes]."""
 _DASHES: Final = {"dashed": (6.0, 4.0)}
 
 
-def write_figures(page: Page, folder: Path) -> list[Path]:
+def write_figures(page: Page, folder: Path, kind: str) -> list[Path]:
     """Write every figure of a page as PNG and as SVG, and return the files.
 
     Parameters
     ----------
     page : Page
     folder : Path
-        Made if it is missing.
+        Made if it is missing; figures of this kind that are in it are removed, nothing else.
+    kind : str
+        Of the page, such as "fit.fit_page"; noted in each file.
     """
     from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
 
     folder.mkdir(parents=True, exist_ok=True)
+    mark = f"figure of cangauge {kind}."
+    for earlier in (*folder.glob("[0-9][0-9]-*.png"), *folder.glob("[0-9][0-9]-*.svg")):
+        with open_regular(earlier) as file:
+            is_ours = mark.encode() in file.read(_HEAD_BYTES)
+        if is_ours:
+            earlier.unlink()
     written = []
     for count, item in enumerate(page.figures, start=1):
         plots = [child[0] for child in getattr(item.plot, "children", [])] or [item.plot]
@@ -43,9 +54,9 @@ def write_figures(page: Page, folder: Path) -> list[Path]:
         )  # fmt: skip
         for axes, plot in zip(rows[:, 0], plots, strict=True):
             _draw(drawing, axes, plot)
-        for kind in ("png", "svg"):
-            path = folder / f"{count:02d}-{item.anchor.removeprefix('figure-')}.{kind}"
-            drawing.savefig(path, dpi=_PNG_DPI)
+        for suffix in ("png", "svg"):
+            path = folder / f"{count:02d}-{item.anchor.removeprefix('figure-')}.{suffix}"
+            drawing.savefig(path, dpi=_PNG_DPI, metadata={"Description": mark})
             written.append(path)
     return written
 

@@ -20,10 +20,10 @@ import pyarrow as pa
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 
-from cangauge._io import atomic_path
+from cangauge._io import atomic_path, require_suffix
 from cangauge._logging import emit
 from cangauge._typing import FloatArray
-from cangauge.errors import CangaugeError, InputError
+from cangauge.errors import CangaugeError
 from cangauge.estimation.offline import NUMBERS, EstimateTable
 from cangauge.estimation.validity import Estimate, Reason, Status, reason_name, reason_names
 from cangauge.service.async_writer import AsyncWriter
@@ -47,14 +47,7 @@ _LOG = logging.getLogger(__name__)
 
 def require_table_suffix(output: Path, option: str = "--output") -> None:
     """Raise InputError unless the file is named .csv or .parquet."""
-    if output.suffix.lower() not in {".csv", ".parquet"}:
-        raise InputError(
-            "the suffix is neither .csv nor .parquet",
-            source=output,
-            field=option,
-            value=output.suffix,
-            cure="name it .csv or .parquet (`cangauge estimate` also writes .mcap)",
-        )
+    require_suffix(output, ".csv", ".parquet", field=option)
 
 
 def write_estimates(path: Path, time_s: FloatArray, table: EstimateTable) -> None:
