@@ -220,10 +220,11 @@ def test_a_worse_extended_model_is_a_caveat() -> None:
 
 
 @pytest.mark.parametrize(
-    ("baseline_pct", "extended_pct", "warned"),
-    [(1.0, 2.4, True), (2.4, 1.0, False), (None, 2.4, False)],
+    ("given_pct", "extended_pct", "stated_pct", "warned"),
+    [(1.0, 2.4, 1.1, True), (2.4, 1.0, 0.5, False), (0.7, 0.8, 1.0, False)],
 )
 def test_an_extended_model_with_a_worse_soc_is_not_silent(
-    baseline_pct: float | None, extended_pct: float | None, warned: bool
+    given_pct: float, extended_pct: float, stated_pct: float, warned: bool
 ) -> None:
-    assert ("farther" in extended_soc_caveat(baseline_pct, extended_pct)) is warned
+    caveat = extended_soc_caveat(given_pct, extended_pct, stated_pct)
+    assert ("farther" in caveat) is warned

@@ -11,7 +11,7 @@ import pytest
 from days import asymmetric, day, late, more_amperes, more_volts, resistance_step
 
 from cangauge.diagnosis import LIKELY, Diagnosis, diagnose
-from cangauge.diagnosis.cross_validation import soc_mae_pct
+from cangauge.diagnosis.cross_validation import soc_error_pct
 from cangauge.diagnosis.extended_model import extended_model_file
 from cangauge.diagnosis.problem import build_problem
 from cangauge.diagnosis.verdict import decide
@@ -243,10 +243,9 @@ def test_the_soc_error_needs_a_reference_soc_throughout(model: Model) -> None:
     assert log.soc_pct is not None
     rows = np.arange(len(log))
     slow, first = (np.where(keep, log.soc_pct, np.nan) for keep in (rows % 30 == 7, rows < 900))
-    assert soc_mae_pct([replace(log, soc_pct=slow)], model) == pytest.approx(
-        soc_mae_pct([log], model), rel=0.1
-    )
-    assert soc_mae_pct([replace(log, soc_pct=first)], model) is None
+    sparse, whole = (soc_error_pct([each], model) for each in (replace(log, soc_pct=slow), log))
+    assert sparse == pytest.approx(whole, rel=0.1)
+    assert soc_error_pct([replace(log, soc_pct=first)], model) is None
 
 
 def test_temperature_steps_of_a_fast_log_are_interpolated(model: Model) -> None:

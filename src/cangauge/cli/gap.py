@@ -175,7 +175,6 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     `cangauge gap day1.csv --simulated "V sim [V]" --capacity-ah 60 --reference good1.csv
     --reference good2.csv --reference good3.csv --corrected .`
     """
-    from cangauge.diagnosis.caveats import extended_soc_caveat
     from cangauge.report.summary import next_step
 
     given, added = list(reference or []), list(add_test or [])
@@ -210,9 +209,8 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     texts = next_test.texts(steps)
     if extended is not None:
         texts[extended] = found.extended_model.to_json()
-        soc = extended_soc_caveat(found.baseline_soc_mae_pct, found.extended_soc_mae_pct)
-        if soc:
-            note(f"warning: {soc}")
+        if found.extended_soc_caveat:
+            note(f"warning: {found.extended_soc_caveat}")
     if report is not None:
         texts[report] = _page(found, model, steps)
     write_texts_atomic(texts)

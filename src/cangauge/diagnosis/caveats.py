@@ -128,18 +128,24 @@ def extension_caveat(baseline_v: float, extended_v: float) -> str:
     )
 
 
-def extended_soc_caveat(baseline_pct: float | None, extended_pct: float | None) -> str:
-    """Return the caveat of an extended model with a larger SoC error on the diagnosed logs [%].
+def extended_soc_caveat(given_pct: float, extended_pct: float, stated_pct: float) -> str:
+    """Return the caveat of an extended model whose SoC error on the diagnosed logs is larger.
 
-    `None` where the logs have no reference SoC.
+    Parameters
+    ----------
+    given_pct, extended_pct : float
+        Mean absolute errors with the given and with the extended model [%].
+    stated_pct : float
+        Mean standard deviation that the estimator states with the extended model [%]: up to that
+        size the errors of one log are no evidence against it.
     """
-    if baseline_pct is None or extended_pct is None or extended_pct <= baseline_pct:
+    if extended_pct <= max(given_pct, stated_pct):
         return ""
     return (
         f"On these logs the extended model's SoC is farther from the logs' own SoC"
-        f" ({extended_pct:.1f} %) than the given model's ({baseline_pct:.1f} %). Compare both on a"
-        " log of another day with the same fault before you use it; where the fault can be mended"
-        " (a sensor, a time stamp), mend it instead."
+        f" ({extended_pct:.1f} %) than the given model's ({given_pct:.1f} %). Compare both on a log"
+        " of another day with the same fault before you use it; where the fault can be mended (a"
+        " sensor, a time stamp), mend it instead."
     )
 
 

@@ -173,8 +173,8 @@ def closed_fraction_interval(
     return float(low), float(high)
 
 
-def soc_mae_pct(logs: Sequence[Log], model: Model) -> float | None:
-    """Return the estimator's mean absolute SoC error with withheld initial SoC [%].
+def soc_error_pct(logs: Sequence[Log], model: Model) -> tuple[float, float] | None:
+    """Return the estimator's SoC error with withheld initial SoC, and what it states itself [%].
 
     The estimator runs at the model's rate.
 
@@ -186,18 +186,25 @@ def soc_mae_pct(logs: Sequence[Log], model: Model) -> float | None:
 
     Returns
     -------
-    float or None
+    mean_absolute, mean_std : float
         None without any reference SoC.
     """
-    errors = []
-    for log in (resample(log, model.rate_hz) for log in logs):
-        if log.soc_pct is None or not _has_reference_soc(log.time_s, log.soc_pct):
-            continue
-        found = run_estimator(samples_of(log), model, EstimatorSettings())
-        error = np.abs(found.soc_pct - log.soc_pct)
-        errors.append(error[np.isfinite(error) & (log.time_s - log.time_s[0] >= SETTLING_S)])
-    together = np.concatenate(errors) if errors else np.zeros(0)
-    return float(together.mean()) if together.size else None
+    found = [_soc_errors_pct(log, model) for log in (resample(log, model.rate_hz) for log in logs)]
+    together = np.concatenate([np.zeros((2, 0)), *found], axis=1)
+    if not together.size:
+        return None
+    mean_absolute, mean_std = together.mean(axis=1).tolist()
+    return mean_absolute, mean_std
+
+
+def _soc_errors_pct(log: Log, model: Model) -> FloatArray:
+    """Return absolute errors and standard deviations after settling, shape (2, n)."""
+    if log.soc_pct is None or not _has_reference_soc(log.time_s, log.soc_pct):
+        return np.zeros((2, 0))
+    found = run_estimator(samples_of(log), model, EstimatorSettings())
+    errors = np.array([np.abs(found.soc_pct - log.soc_pct), found.soc_std_pct])
+    known = np.isfinite(errors).all(axis=0) & (log.time_s - log.time_s[0] >= SETTLING_S)
+    return errors[:, known]
 
 
 def _has_reference_soc(time_s: FloatArray, soc_pct: FloatArray) -> bool:

@@ -15,6 +15,7 @@ from cangauge._display import figure, html
 from cangauge._io import file_sha256
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.caveats import (
+    extended_soc_caveat,
     extension_caveat,
     log_caveats,
     reference_fit_caveat,
@@ -28,7 +29,7 @@ from cangauge.diagnosis.cross_validation import (
     folds,
     held_out_errors,
     rms,
-    soc_mae_pct,
+    soc_error_pct,
 )
 from cangauge.diagnosis.error_breakdown import (
     ErrorShare,
@@ -118,19 +119,34 @@ class Diagnosis:
         """Model with the references' structure and the accepted effects, ready to save and run."""
         return extended_model_file(self.extension, self.model, self.extended_rmse_v)
 
-    @cached_property
+    @property
     def baseline_soc_mae_pct(self) -> float | None:
         """Mean absolute SoC error of the estimator with the given model [%].
 
         Runs the estimator over the diagnosed logs at the model's rate, with the initial SoC
         withheld; None if no log has a reference SoC.
         """
-        return soc_mae_pct(self.logs, self.model)
+        return None if self._given_soc_error is None else self._given_soc_error[0]
 
-    @cached_property
+    @property
     def extended_soc_mae_pct(self) -> float | None:
         """The same with the extended model [%]."""
-        return soc_mae_pct(self.logs, self.extended_model)
+        return None if self._extended_soc_error is None else self._extended_soc_error[0]
+
+    @property
+    def extended_soc_caveat(self) -> str:
+        """Caveat of an extended model with a larger SoC error; "" without. Runs the estimator."""
+        if self._given_soc_error is None or self._extended_soc_error is None:
+            return ""
+        return extended_soc_caveat(self._given_soc_error[0], *self._extended_soc_error)
+
+    @cached_property
+    def _given_soc_error(self) -> tuple[float, float] | None:
+        return soc_error_pct(self.logs, self.model)
+
+    @cached_property
+    def _extended_soc_error(self) -> tuple[float, float] | None:
+        return soc_error_pct(self.logs, self.extended_model)
 
     @property
     def summary(self) -> str:

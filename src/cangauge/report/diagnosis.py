@@ -9,7 +9,6 @@ import numpy as np
 
 from cangauge._formatting import number, significant, span
 from cangauge.diagnosis import NONE, UNKNOWN, Diagnosis, LogErrors, rms
-from cangauge.diagnosis.caveats import extended_soc_caveat
 from cangauge.diagnosis.next_test import NextSteps, Plan
 from cangauge.model.effects.library import LIBRARY
 from cangauge.report.charts import (
@@ -375,8 +374,7 @@ def _closing(diagnosis: Diagnosis) -> Paragraph:
             f" The extended model has {cause}what the references show: adjusted coefficients, and"
             " structure that logs without a fault share."
         )
-    soc = extended_soc_caveat(diagnosis.baseline_soc_mae_pct, diagnosis.extended_soc_mae_pct)
-    return Paragraph(f"{text} {soc}".rstrip())
+    return Paragraph(f"{text} {diagnosis.extended_soc_caveat}".rstrip())
 
 
 def _over_time(errors: Sequence[LogErrors], extended: str) -> tuple[Figure, Figure]:
