@@ -86,13 +86,13 @@ def test_a_test_without_information_changes_nothing() -> None:
 
 def test_a_test_that_sees_causes_apart_names_the_true_one() -> None:
     found = expected(information(60.0, 0.0))
-    assert min(found.expected.values()) > 0.95
+    assert min(found.expected.values()) > 0.9
 
 
 def test_more_of_what_cannot_separate_them_does_not_help() -> None:
     same, apart = expected(information(20.0, 0.999)), expected(information(20.0, 0.0))
     assert max(same.expected.values()) < 0.65
-    assert min(apart.expected.values()) > 0.85
+    assert min(apart.expected.values()) > max(same.expected.values()) + 0.2
     assert same.information_nats < 0.3 * apart.information_nats
 
 

@@ -350,9 +350,11 @@ def test_columns_that_are_not_read_are_told(tmp_path: Path) -> None:
         ("T1,T2,T3", "15,21,27", 21.0, ""),
         ("T1,T2", "31,-40", -4.5, "T1 and T2 are 31 and -40 in row 1: one of the probes fails"),
         ("T1,T2", "15,27", 21.0, ""),
+        ("T1,T2,T3", "20,127,", 73.5, "one of the probes fails"),
+        ("T1,T2,T3,T4", "20,21,127,127", 73.75, "one of the probes fails"),
     ],
 )
-def test_a_probe_far_from_the_others_is_told(
+def test_a_probe_far_from_the_others_has_a_remark(
     tmp_path: Path, head: str, row: str, mean_c: float, words: str
 ) -> None:
     log = read(tmp_path, Table(f"time,current,voltage,{head}", line("{t},{i},{u}," + row)))
@@ -605,3 +607,11 @@ def test_units_signs_and_factors_round_trip(
     )
     for field_name, values in wanted.items():
         assert getattr(log, field_name) == pytest.approx(values, rel=1e-9, abs=1e-9)
+
+
+def test_the_unit_in_cells_counts_unless_the_heading_has_another(tmp_path: Path) -> None:
+    table = Table("time,current,voltage,temperature", line("{t},{i},{u},68 °F"))
+    assert read(tmp_path, table).temperature_c == pytest.approx(20.0)
+    table = Table("time,current,voltage,temperature [°C]", line("{t},{i},{u},68 °F"))
+    with pytest.raises(InputError, match="another unit than the heading"):
+        read(tmp_path, table)

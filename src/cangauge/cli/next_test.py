@@ -74,20 +74,18 @@ class NextTestOptions:
             return NextSteps(added)
 
     def texts(self, steps: NextSteps) -> dict[Path, str]:
-        """Return the file to write with its content; none where no test is expected to help."""
+        """Return the file to write with its content."""
         if steps.plan is None or self.file is None:
             return {}
         if not steps.plan.helps:
-            note(f"{self.file}: not written, since no test is expected to help")
-            return {}
+            note(f"warning: {self.file}: the best of the tests, but none is expected to help")
         return {self.file: steps.plan.best.profile.to_csv()}
 
     def to_dict(self, steps: NextSteps) -> dict[str, Any]:
         """Return what `cangauge gap --json` adds."""
         result = {} if steps.added is None else {"added_test": steps.added.to_dict()}
         if steps.plan is not None:
-            written = self.file is not None and steps.plan.helps
-            result["plan"] = steps.plan.to_dict(str(self.file) if written else None)
+            result["plan"] = steps.plan.to_dict(None if self.file is None else str(self.file))
         return result
 
 

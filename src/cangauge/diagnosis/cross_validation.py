@@ -1,8 +1,8 @@
 """Cross-validation of the gap: errors on rows that the fit of the effects did not see.
 
 Of several logs each is left out in turn. A single log is divided into blocks of 240 s, of which
-every fourth is left out in turn, with 60 s on either side that neither fit nor evaluation uses; so
-each row is evaluated once.
+every fourth is left out in turn, with 60 s on either side that neither fit nor evaluation uses.
+Each row is evaluated once, but for rows of a log of few minutes that leave no others to fit.
 """
 
 from __future__ import annotations
@@ -73,8 +73,8 @@ def folds(problem: DiagnosisProblem) -> list[Fold]:
             held_out.append((rest, number, np.ones(matrix.residual_v.size, dtype=bool)))
     else:
         elapsed = logs[0].sampled.rows.time_s - logs[0].sampled.rows.time_s[0]
-        around = [elapsed - BLOCK_GUARD_S, elapsed, elapsed + BLOCK_GUARD_S]
-        fold_of = [(time_s // BLOCK_S) % FOLDS for time_s in around]
+        around = [elapsed + shift_s for shift_s in (-BLOCK_GUARD_S, 0.0, BLOCK_GUARD_S)]
+        fold_of = [np.clip(time_s, 0.0, elapsed[-1]) // BLOCK_S % FOLDS for time_s in around]
         for fold in range(FOLDS):
             rows = fold_of[1] == fold
             fitted = np.all([each != fold for each in fold_of], axis=0)

@@ -458,7 +458,7 @@ def _observability(problem: DiagnosisProblem) -> list[dict[str, object]]:
         if not effect.is_cause:
             continue
         at = problem.posterior.slice_of(k)
-        overdispersion = error.overdispersion.get(effect.id, 1.0)
+        overdispersion = error.overdispersion_of(effect.id)
         information = np.diag(problem.posterior.curvature[at, at]) / overdispersion
         largest = np.abs(candidate.bounds).max(axis=1)
         smallest = np.sqrt(2.0 * (MIN_LOG_BAYES + 2.0) / np.maximum(information, 1e-30)) / largest

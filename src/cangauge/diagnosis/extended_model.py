@@ -347,7 +347,7 @@ def _refine_amplitudes(
     prior = prior_precision(hypotheses.bounds_of(numbers))
     widths = [len(cause.candidate.amplitudes) for cause in causes]
     overdispersion = np.repeat(
-        [error.overdispersion.get(cause.candidate.effect.id, 1.0) for cause in causes], widths
+        [error.overdispersion_of(cause.candidate.effect.id) for cause in causes], widths
     )
     factor = 1.0 / np.sqrt(overdispersion)
 

@@ -65,7 +65,7 @@ def check_inputs(
         _check_alive(log)
         _check_pack(log, model)
     for one, other in itertools.combinations((*logs, *references), 2):
-        _check_distinct(one, other)
+        check_distinct(one, other)
     kept, sentences = [], []
     for log in (*logs, *references):
         clean, rows = without_outliers(log, model)
@@ -181,7 +181,8 @@ def _check_pack(log: Log, model: ExtendedModel) -> None:
         )
 
 
-def _check_distinct(one: Log, other: Log) -> None:
+def check_distinct(one: Log, other: Log) -> None:
+    """Raise InputError if two logs have the same rows."""
     if np.array_equal(one.current_a, other.current_a) and np.array_equal(
         one.voltage_v, other.voltage_v
     ):

@@ -5,6 +5,7 @@ Checks the logs, learns from the references (`references`), and linearises the d
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.design_matrix import DesignMatrix, candidates_for, design_matrix
 from cangauge.diagnosis.hypotheses import Hypotheses
-from cangauge.diagnosis.input_checks import check_count, check_inputs
+from cangauge.diagnosis.input_checks import check_count, check_distinct, check_inputs
 from cangauge.diagnosis.linear_gaussian import (
     ErrorModel,
     NormalEquations,
@@ -148,6 +149,8 @@ def build_problem(
     """
     given = model.extended_model()
     known = references if isinstance(references, LearnedReferences) else None
+    if known is not None:
+        known.check(logs, given, leave_out)
     own = () if isinstance(references, LearnedReferences) else references
     logs, own, outliers = check_inputs(logs, own, given)
     start_std_pct = SOC_STD_PCT
@@ -179,6 +182,8 @@ def build_problem(
             of_references, model, widened, choices, covered=covered, start_std_pct=start_std_pct
         )
     else:
+        for item, other in itertools.product(of_logs, known.references):
+            check_distinct(item.log, other.log)
         learned = _for_logs(known, logs, choices)
     diagnosed = []
     for item in of_logs:

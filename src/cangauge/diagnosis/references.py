@@ -105,7 +105,7 @@ class LearnedReferences:
     error: ErrorModel
     """Without overdispersion, which depends on where the diagnosed logs lie."""
     equations: SharedEquations
-    """Of all references, by `error`."""
+    """Of all references, by the error model expected of the diagnosed logs."""
     model: ExtendedModel
     """Given model with the references' coefficients, without their structure."""
     structured: ExtendedModel | None = None
@@ -127,6 +127,29 @@ class LearnedReferences:
         """
         stated = all(log.first_soc() is not None for log in logs)
         return stated and _temperatures_within([log.temperature_c for log in logs], self.references)
+
+    def check(self, logs: Sequence[Log], model: ExtendedModel, leave_out: Sequence[str]) -> None:
+        """Raise InputError for a diagnosis that it does not hold for.
+
+        Parameters
+        ----------
+        logs : sequence of Log
+            To diagnose.
+        model : ExtendedModel
+            Of the pack.
+        leave_out : sequence of str
+            Effects to leave out of the library.
+        """
+        learned_of = self.widened.model.coefficients
+        problem = ""
+        if leave_out:
+            problem = "the references were learned with the whole library"
+        elif not np.array_equal(learned_of, model.model.coefficients):
+            problem = "the references were learned for another model"
+        elif not self.covers(logs):
+            problem = "a log states no SoC, or lies at temperatures that no reference covers"
+        if problem:
+            raise InputError(problem, field="references", cure="give the references themselves")
 
     def error_for(self, diagnosed: Sequence[SampledLog]) -> ErrorModel:
         """Return the error model with the overdispersion where the diagnosed logs lie."""

@@ -119,13 +119,6 @@ class TimeError:
     lasting_std_v: float
     """Standard deviation of the part that lasts as long as a log [V]."""
 
-    @property
-    def independent_v2(self) -> float:
-        """Variance with which rows of 1 Hz count as independent for slow quantities [V²]."""
-        return self.fast_std_v**2 * (1.0 + 2.0 * self.fast_time_s) + self.slow_std_v**2 * (
-            1.0 + 2.0 * self.slow_time_s
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class CurveError:

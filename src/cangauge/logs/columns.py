@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -52,6 +52,8 @@ class Columns:
         Whether `391,4` means 391.4.
     remarks : tuple of str
         Lines that were omitted.
+    units : dict of str to str
+        Unit in the cells of a column that was read as numbers (`53.2 V`), by name.
     """
 
     text: dict[str, Any]
@@ -59,6 +61,7 @@ class Columns:
     source: str
     decimal_comma: bool
     remarks: tuple[str, ...]
+    units: dict[str, str] = field(default_factory=dict)
 
     def numbers(self, name: str) -> FloatArray:
         """Return a column as float64 of shape (rows,), NaN where the cell is empty.
@@ -76,7 +79,8 @@ class Columns:
         except pa.ArrowInvalid as error:
             bare = without_unit(trimmed)
             if bare is not None:
-                return np.asarray(pc.cast(bare, pa.float64()).to_numpy(), dtype=np.float64)
+                numbers, self.units[name] = bare
+                return np.asarray(pc.cast(numbers, pa.float64()).to_numpy(), dtype=np.float64)
             row, value = next(
                 (
                     (row, value)
@@ -106,11 +110,6 @@ class Columns:
         return pc.if_else(missing, pa.scalar(None, pa.string()), trimmed)
 
 
-_NUMBER_WITH_UNIT: Final = (
-    r"^(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(?P<unit>[^\d.]{1,4})$"
-)
-
-
 def _with_decimal_point(cells: Any) -> Any:
     """Return cells with `.` as the decimal mark; the other mark separates thousands."""
     both = pc.and_(pc.match_substring(cells, ","), pc.match_substring(cells, "."))
@@ -121,8 +120,8 @@ def _with_decimal_point(cells: Any) -> Any:
     return pc.replace_substring(cells, ",", ".")
 
 
-def without_unit(cells: Any) -> Any | None:
-    """Return cells without a unit that all of them carry (`53.2 V`), or None."""
+def without_unit(cells: Any) -> tuple[Any, str] | None:
+    """Return cells without a unit that all of them carry (`53.2 V`), and the unit, or None."""
     parts = pc.extract_regex(
         cells, r"^(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(?P<unit>\D{1,4})$"
     )
@@ -130,8 +129,8 @@ def without_unit(cells: Any) -> Any | None:
         return None
     if isinstance(parts, pa.ChunkedArray):
         parts = parts.combine_chunks()
-    units = pc.unique(parts.field("unit"))
-    return parts.field("number") if len(pc.drop_null(units)) == 1 else None
+    units = pc.drop_null(pc.unique(parts.field("unit"))).to_pylist()
+    return (parts.field("number"), units[0].strip()) if len(units) == 1 else None
 
 
 _SPELLINGS: Final = [

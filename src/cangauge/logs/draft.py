@@ -103,8 +103,8 @@ class DraftLog:
     ) -> FloatArray:
         """Return the mean of temperature probes, shape (n,); remark on those that are far off.
 
-        Of three probes or more, a value further from the median of its row is left out; of two,
-        none is known to be the good one.
+        A value further from the median of its row is left out where more than half of three or
+        more agree with the median. Else none is known to be the good one.
 
         Parameters
         ----------
@@ -117,28 +117,40 @@ class DraftLog:
         """
         stacked = np.vstack(parts)
         known = np.isfinite(stacked)
+        if np.isfinite(apart):
+            known &= ~self._failing(names, stacked, known, apart)
+        count = np.sum(known, axis=0)
+        total = np.sum(np.where(known, stacked, 0.0), axis=0)
+        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+    def _failing(
+        self, names: Sequence[str], stacked: FloatArray, known: BoolArray, apart: float
+    ) -> BoolArray:
+        """Return which values of probes are to be left out, with a remark on all that are far."""
         blank = ~known.any(axis=0)
         median = np.nanmedian(np.where(blank, 0.0, stacked), axis=0)
-        far = known & (np.abs(stacked - median) > (apart if len(parts) > 2 else 0.5 * apart))
-        if len(parts) > 2:
-            known &= ~far
-            for name, rows, values in zip(names, far, stacked, strict=True):
-                if rows.any():
-                    self.remarks.append(
-                        f"temperature: {name} left out in {counted(int(rows.sum()), 'row')}, where"
-                        f" it is over {PROBES_APART_K:g} K from the other probes (first"
-                        f" {values[rows][0]:g})"
-                    )
-        elif far.any():
-            row = int(np.argmax(far.any(axis=0)))
+        near = known & (np.abs(stacked - median) <= apart)
+        count = np.sum(known, axis=0)
+        is_decided = (count > 2) & (2 * np.sum(near, axis=0) > count)
+        far: BoolArray = known & ~near & is_decided
+        for name, rows, values in zip(names, far, stacked, strict=True):
+            if rows.any():
+                self.remarks.append(
+                    f"temperature: {name} left out in {counted(int(rows.sum()), 'row')}, where"
+                    f" it is over {PROBES_APART_K:g} K from the other probes (first"
+                    f" {values[rows][0]:g})"
+                )
+        lowest = np.min(np.where(known, stacked, np.inf), axis=0)
+        highest = np.max(np.where(known, stacked, -np.inf), axis=0)
+        undecided = ~blank & ~is_decided & (highest - lowest > apart)
+        if undecided.any():
+            row = int(np.argmax(undecided))
             shown = " and ".join(f"{values[row]:g}" for values in stacked)
             self.remarks.append(
                 f"temperature: {' and '.join(names)} are {shown} in row {row + 1}: one of the"
                 " probes fails; name the good one with --columns temperature=…"
             )
-        count = np.sum(known, axis=0)
-        total = np.sum(np.where(known, stacked, 0.0), axis=0)
-        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+        return far
 
     def checked(
         self, temperature_c: float | None = None, used: Sequence[str] = ()

@@ -9,7 +9,7 @@ Home Assistant).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, Final
 
@@ -360,6 +360,7 @@ class _Pivot:
     cells: list[Any]
     source: str
     wanted: dict[str, str] = None  # type: ignore[assignment] # set before each use
+    units: dict[str, str] = field(default_factory=dict)
 
     def numbers(self, name: str) -> FloatArray:
         entity = self.wanted[name]

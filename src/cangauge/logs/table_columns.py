@@ -6,8 +6,8 @@ changed (exports of measurement tools): then the latest voltage is held for a sh
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
 import numpy as np
@@ -68,6 +68,10 @@ class TableColumns(Protocol):
     def source(self) -> str:
         """File or table, for messages."""
 
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Unit that all cells of a column read as numbers carry, by name."""
+
     def numbers(self, name: str) -> FloatArray:
         """Return a column as numbers, NaN where missing."""
 
@@ -117,7 +121,7 @@ def fill_draft(
             values, unit = _time(draft, column, columns, headings)
             label = draft.labels["time_s"]
             if unit.endswith(WITHOUT_ZONE):
-                _tell_hour_jump(draft, values)
+                _remark_hour_jump(draft, values)
         else:
             values, unit = quantity_values(draft, name, column, columns)
         draft.values[FIELDS[name]] = values
@@ -148,16 +152,15 @@ def quantity_values(
     """Return a quantity in its canonical unit, and the unit that was read or assumed."""
     field = FIELDS[name]
     parts = [columns.numbers(f"{name} {k}") for k in range(len(column.places))]
-    values = parts[0]
+    values, unit = parts[0], _unit_of_cells(draft, name, column, columns)
     if len(parts) > 1:
         draft.remarks.append(f"{name}: mean of {len(parts)} columns")
         apart = np.inf
         if name == "temperature":
-            kelvin, _ = unit_of(field, column.unit) or (1.0, 0.0)
+            kelvin, _ = unit_of(field, unit) or (1.0, 0.0)
             apart = PROBES_APART_K / abs(kelvin * column.factor)
         values = draft.mean_of_probes([draft.headings[k] for k in column.places], parts, apart)
     values = values * column.factor
-    unit = column.unit
     finite = values[np.isfinite(values)]
     if (
         name == "soc"
@@ -170,6 +173,21 @@ def quantity_values(
     label = draft.labels[field]
     converted, _ = convert(values, field, unit, source=draft.source or draft.name, label=label)
     return converted, unit or f"{_QUANTITY_UNITS[name]}, assumed"
+
+
+def _unit_of_cells(draft: DraftLog, name: str, column: ChosenColumn, columns: TableColumns) -> str:
+    """Return the unit of a column, by its heading or by its cells (`53.2 V`)."""
+    in_cells = {columns.units.get(f"{name} {k}", "") for k in range(len(column.places))} - {""}
+    in_heading = unit_of(FIELDS[name], column.unit) if column.unit else None
+    for unit in sorted(in_cells):
+        if column.unit and unit_of(FIELDS[name], unit) != in_heading:
+            raise InputError(
+                "the cells have another unit than the heading",
+                source=draft.source or draft.name, field=draft.labels[FIELDS[name]],
+                value=f"{unit}, heading {column.unit}",
+                cure=f"state the right one: --columns '{name}=HEADING[UNIT]'",
+            )  # fmt: skip
+    return column.unit or min(in_cells, default="")
 
 
 def _time(
@@ -192,7 +210,7 @@ def _time(
     return first
 
 
-def _tell_hour_jump(draft: DraftLog, time_s: FloatArray) -> None:
+def _remark_hour_jump(draft: DraftLog, time_s: FloatArray) -> None:
     """Remark on an hour that local time leaves out; raise InputError for one that it repeats."""
     jump = hour_jump(time_s)
     if jump is None:
@@ -317,11 +335,14 @@ class ArrowColumns:
     place : dict of str to int
         Index by name.
     source : str
+    units : dict of str to str
+        Unit in the cells of a column that was read as numbers (`53.2 V`), by name.
     """
 
     table: Any
     place: dict[str, int]
     source: str
+    units: dict[str, str] = field(default_factory=dict)
 
     def numbers(self, name: str) -> FloatArray:
         """Return a column as numbers, NaN where missing."""
@@ -330,7 +351,9 @@ class ArrowColumns:
         if is_text(column.type):
             text = pc.utf8_trim_whitespace(column.cast(pa.string()))
             bare = without_unit(text)
-            column = text if bare is None else bare
+            column = text
+            if bare is not None:
+                column, self.units[name] = bare
         try:
             plain = column.cast(pa.float64(), safe=False)
         except (pa.ArrowException, OSError) as error:
