@@ -190,12 +190,7 @@ def learn_references(references: Sequence[Log], model: Model) -> LearnedReferenc
         candidates(list(LIBRARY.values()), widened.pack, started[0].time_s, for_diagnosis=True),
         start_std_pct=math.hypot(SOC_STD_PCT, std_pct),
     )
-    # The cache of a log is larger than the log.
-    bare = tuple(
-        replace(item, signals=replace(item.signals, cached_history=None))
-        for item in learned.references
-    )
-    return replace(learned, references=bare, outliers=(*outliers, *sentences))
+    return replace(learned, outliers=(*outliers, *sentences))
 
 
 def fit_options(model: Model) -> FitOptions:
@@ -265,7 +260,10 @@ def learn(
         equations=found.total + further,
         model=found.model,
         structured=found.structured,
-        references=tuple(references),
+        # The cache of a log is larger than the log.
+        references=tuple(
+            replace(item, signals=replace(item.signals, cached_history=None)) for item in references
+        ),
         errors_v=tuple(residual(item, given) for item in references),
         healthy=healthy,
     )
