@@ -79,7 +79,7 @@ def _row(
     sizes: dict[str, list[float]] = {name: [] for name in SHOWN}
     healthy = []
     for log in tested:
-        found = diagnose([log], model, learned)
+        found = diagnose([log], model, learned if learned.covers([log]) else references)
         healthy.append(found.verdict.probabilities["none"])
         for item in found.observability:
             name = str(item["effect"])
