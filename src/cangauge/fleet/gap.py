@@ -34,7 +34,7 @@ from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 
 REFERENCES: Final = 30
-"""References of a diagnosis by default; more gain little, and learning from a thousand takes 1.8 GB
+"""References of a diagnosis by default; more gain little, and learning from a thousand takes 1.9 GB
 (see docs/fleet.md)."""
 
 WITH_OWN: Final = 30
