@@ -7,7 +7,8 @@ cantools' generator, an example, and tests against this package on a drive with 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import os
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -45,6 +46,10 @@ GOLDEN_S: Final = 1200.0
 FAST_SAMPLES: Final = 200
 """Samples of it that are `period_s` apart."""
 
+_HEAD: Final = "/* {} - of the model "
+_MARK: Final = _HEAD.format("pack_model.h")
+"""Beginning of a header that shows that a folder is of an export."""
+
 _SIGNALS: Final = ("soc_pct", "soc_std_pct", "age_s")
 
 
@@ -65,7 +70,7 @@ def export_c(model: Model, folder: Path, *, period_s: float = PERIOD_S) -> Expor
     ----------
     model : Model
     folder : Path
-        Made if it is missing; its files are replaced.
+        Made if it is missing; files of an earlier export are replaced.
     period_s : float
         Time between two samples of the current [s]. More samples are taken too, but the delay line
         then keeps some of them only.
@@ -73,7 +78,8 @@ def export_c(model: Model, folder: Path, *, period_s: float = PERIOD_S) -> Expor
     Raises
     ------
     InputError
-        If the period is out of range, or the core lacks one of the model's effects.
+        If the period is out of range, the core lacks one of the model's effects, or a file of
+        the same name in the folder is not of an export.
     """
     if not 1e-3 <= period_s <= 60.0:
         raise InputError("must lie within 0.001 … 60 s", field="--period", value=period_s)
@@ -87,7 +93,7 @@ def export_c(model: Model, folder: Path, *, period_s: float = PERIOD_S) -> Expor
         )
     spacing_s = JITTER * 2.0 * period_s
     length = line_size(constants.longest_s, spacing_s)
-    head = f"/* {{}} - of the model {_comment(model.name)}, by cangauge {__version__}. */\n"
+    head = f"{_HEAD}{_comment(model.name)}, by cangauge {__version__}. */\n"
     folders = dict.fromkeys(CORE_HEADERS + CORE_SOURCES, "core")
     folders |= dict.fromkeys(EMBEDDED, "core/embedded")
     texts = {
@@ -103,9 +109,24 @@ def export_c(model: Model, folder: Path, *, period_s: float = PERIOD_S) -> Expor
     )
     texts |= _frames()
     texts["golden.h"] = head.format("golden.h") + _golden(model, period_s)
+    _refuse_foreign_names(folder, texts)
     folder.mkdir(parents=True, exist_ok=True)
     write_texts_atomic({folder / name: text for name, text in texts.items()})
     return Exported(folder, tuple(sorted(texts)), 16 * length)
+
+
+def _refuse_foreign_names(folder: Path, names: Iterable[str]) -> None:
+    """Raise InputError for a folder that has files of these names, but not from an export."""
+    taken = sorted(name for name in names if os.path.lexists(folder / name))
+    header = folder / "pack_model.h"
+    if not taken or (header.is_file() and header.read_bytes().startswith(_MARK.encode())):
+        return
+    raise InputError(
+        "the folder has files of these names that are not from an export",
+        source=folder,
+        value=taken,
+        cure="name an empty folder",
+    )
 
 
 def _comment(text: str) -> str:

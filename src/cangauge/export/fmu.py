@@ -95,6 +95,13 @@ AMPERE_HOURS: Final = (1e-3, 1e5)
 """Capacities that the commands take too [A h]."""
 TAU_S: Final = (1e-3, FINITE[1])
 """Time constants [s]: a shorter one is over within any step."""
+DIVISORS: Final = {
+    "capacity_ah": AMPERE_HOURS,
+    **dict.fromkeys(
+        ("width_pct", "mean_slope", "travel_as", "zero_a"), (sys.float_info.min, FINITE[1])
+    ),
+}
+"""Names of an effect's values by which the core divides → range."""
 
 
 @dataclass(frozen=True)
@@ -317,7 +324,8 @@ def _estimator_variables() -> tuple[Variable, ...]:
         Variable("soc_pct", "output", "%", None, "state of charge"),
         Variable(
             "initial_soc_pct", "parameter", "%", -1.0,
-            "state of charge at the start; -1: found from the first voltages", range=(-1.0, 100.0),
+            "state of charge at the start; negative: found from the first voltages",
+            range=(-1.0, 100.0),
         ),
         Variable("soc_std_pct", "output", "%", None, "its standard deviation"),
         Variable(
@@ -344,7 +352,7 @@ def _effect_parameters(
         for place, name, value in values:
             text = f"effect {number + 1} of the model, as in cangauge.h"
             full = f"effect_{number + 1}_{form.kind}.{name}"
-            bounds = TAU_S if name.startswith("tau_") else FINITE
+            bounds = TAU_S if name.startswith("tau_") else DIVISORS.get(name, FINITE)
             variables.append(Variable(full, "parameter", None, value, text, range=bounds))
             places.append((number, place))
     return variables, places
