@@ -16,7 +16,7 @@ from typing import Final
 from cantools.database.can import Message
 from cantools.database.can.c_source import generate
 
-from cangauge._io import write_texts_atomic
+from cangauge._io import text_sha256, write_texts_atomic
 from cangauge._resources import shared_file
 from cangauge._version import __version__
 from cangauge.bus.database import load_dbc, signal_codec
@@ -101,11 +101,14 @@ def export_c(model: Model, folder: Path, *, period_s: float = PERIOD_S) -> Expor
         for name, place in folders.items()
     }
     texts["cangauge_config.h"] = head.format("cangauge_config.h") + _config(constants, period_s)
-    texts["pack_model.h"] = head.format("pack_model.h") + _model_header(length, spacing_s)
+    definition = model_definition("pack_model", constants)
+    texts["pack_model.h"] = head.format("pack_model.h") + _model_header(
+        length, spacing_s, text_sha256(__version__ + definition)
+    )
     texts["pack_model.c"] = (
         head.format("pack_model.c")
         + '#include "pack_model.h"\n\n#include <math.h>\n\n'
-        + model_definition("pack_model", constants)
+        + definition
     )
     texts |= _frames()
     texts["golden.h"] = head.format("golden.h") + _golden(model, period_s)
@@ -145,7 +148,7 @@ def _config(constants: CoreConstants, period_s: float) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _model_header(length: int, spacing_s: float) -> str:
+def _model_header(length: int, spacing_s: float, sha256: str) -> str:
     return f"""#ifndef PACK_MODEL_H
 #define PACK_MODEL_H
 
@@ -154,6 +157,9 @@ def _model_header(length: int, spacing_s: float) -> str:
 /* Memory of the delay line, and least time between every second sample that it keeps. */
 #define PACK_LINE_SIZE {length}
 #define PACK_SPACING_S {spacing_s!r}
+
+/* Of the constants and of the core: a saved state is of no other model. Not 0. */
+#define PACK_MODEL_ID 0x{int(sha256[:8], 16) | 1:08x}U
 
 extern const cg_model pack_model;
 
