@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cangauge.cli.app import app
-from cangauge.errors import InputError
+from cangauge.errors import CangaugeError, InputError
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.validity import Sample
@@ -237,6 +237,15 @@ def test_a_missing_compiler_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     with pytest.raises(InputError, match="no C compiler"):
         export_fmu(leaf_2012_model_file(), tmp_path / "pack.fmu")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_options_in_cc_reach_the_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("CC", "cc --no-such-option")
+    with pytest.raises(CangaugeError, match="no-such-option"):
+        export_fmu(leaf_2012_model_file(), tmp_path / "pack.fmu")
+    monkeypatch.setenv("CC", "no-such-compiler -m64")
+    with pytest.raises(InputError, match="no-such-compiler"):
+        export_fmu(leaf_2012_model_file(), tmp_path / "pack.fmu")
 
 
 def test_the_command_writes_a_unit(tmp_path: Path) -> None:

@@ -22,11 +22,17 @@ from cangauge._version import __version__
 from cangauge.bus.database import load_dbc, signal_codec
 from cangauge.bus.publish import SocPublisher
 from cangauge.errors import InputError
-from cangauge.estimation.core_constants import CoreConstants, core_constants
+from cangauge.estimation.core_constants import CoreConstants
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.validity import Estimate, Sample
-from cangauge.export.c_source import CORE_HEADERS, CORE_SOURCES, line_size, model_definition
+from cangauge.export.c_source import (
+    CORE_HEADERS,
+    CORE_SOURCES,
+    exported_constants,
+    line_size,
+    model_definition,
+)
 from cangauge.model.model_file import Model
 
 EMBEDDED: Final = (
@@ -83,14 +89,7 @@ def export_c(model: Model, folder: Path, *, period_s: float = PERIOD_S) -> Expor
     """
     if not 1e-3 <= period_s <= 60.0:
         raise InputError("must lie within 0.001 … 60 s", field="--period", value=period_s)
-    constants = core_constants(model, EstimatorSettings())
-    if constants is None:
-        raise InputError(
-            "the core has no form of an effect, or the model has time_skew twice",
-            field="effects",
-            value=[entry["id"] for entry in model.effects],
-            cure="fit the model without it",
-        )
+    constants = exported_constants(model)
     spacing_s = JITTER * 2.0 * period_s
     length = line_size(constants.longest_s, spacing_s)
     head = f"{_HEAD}{_comment(model.name)}, by cangauge {__version__}. */\n"

@@ -15,6 +15,7 @@ import math
 import os
 import platform
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -30,11 +31,11 @@ from cangauge._io import atomic_path
 from cangauge._resources import shared_file
 from cangauge._version import __version__
 from cangauge.errors import CangaugeError, InputError
-from cangauge.estimation.core_constants import CoreConstants, core_constants
-from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.core_constants import CoreConstants
 from cangauge.export.c_source import (
     CORE_HEADERS,
     CORE_SOURCES,
+    exported_constants,
     initialiser,
     line_size,
     model_definition,
@@ -137,13 +138,7 @@ def export_fmu(model: Model, path: Path, *, kind: Kind = "pack", version: Versio
     CangaugeError
         If the compiler fails.
     """
-    constants = core_constants(model, EstimatorSettings())
-    if constants is None:
-        raise InputError(
-            "an effect of this model has no form in the C core", field="effects",
-            cure="export a model with effects of the library only",
-        )  # fmt: skip
-    unit = _Unit.of(model, constants, kind, version)
+    unit = _Unit.of(model, exported_constants(model), kind, version)
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         unit.write_sources(root / "sources")
@@ -237,7 +232,7 @@ class _Unit:
         binary = binary / f"{self.identifier}{suffix}"
         binary.parent.mkdir(parents=True)
         sources = [str(root / "sources" / name) for name in self.sources]
-        command = [_compiler(), *FLAGS, *sources, "-o", str(binary), "-lm"]
+        command = [*_compiler(), *FLAGS, *sources, "-o", str(binary), "-lm"]
         done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
         if done.returncode != 0:
             raise CangaugeError(f"the C compiler failed: {done.stderr.strip()[-400:]}")
@@ -402,8 +397,13 @@ def _bytes(root: ET.Element) -> bytes:
     return text
 
 
-def _compiler() -> str:
-    for name in (os.environ.get("CC"), "cc", "gcc", "clang"):
-        if name and (found := shutil.which(name)):
-            return found
-    raise InputError("no C compiler", cure="install gcc or clang, or name one in CC")
+def _compiler() -> list[str]:
+    """Return the command of the compiler: `CC` with its options, or the first that is found."""
+    given = shlex.split(os.environ.get("CC", ""))
+    for name, *options in [given] if given else [["cc"], ["gcc"], ["clang"]]:
+        if found := shutil.which(name):
+            return [found, *options]
+    raise InputError(
+        "no C compiler", value=" ".join(given) or None,
+        cure="install gcc or clang, or name one in CC",
+    )  # fmt: skip
