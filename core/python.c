@@ -443,14 +443,19 @@ static PyObject *Core_estimate(Core *self, PyObject *Py_UNUSED(none))
     item[8] = (bits == NULL) ? NULL : PyObject_GetItem(self->reasons, bits);
     item[9] = PyLong_FromLongLong(now.samples);
     Py_XDECREF(bits);
-    PyObject *found = PyErr_Occurred() ? NULL : self->estimate->tp_alloc(self->estimate, 10);
+    PyObject *plain = PyErr_Occurred() ? NULL : PyTuple_New(10);
     for (int k = 0; k < 10; ++k) {
-        if (found != NULL) {
-            PyTuple_SET_ITEM(found, k, item[k]);
+        if (plain != NULL) {
+            PyTuple_SET_ITEM(plain, k, item[k]);
         } else {
             Py_XDECREF(item[k]);
         }
     }
+    /* As tuple.__new__ does: `tp_alloc` leaves out what a later Python caches in a tuple. */
+    PyObject *args = (plain == NULL) ? NULL : PyTuple_Pack(1, plain);
+    PyObject *found = (args == NULL) ? NULL : PyTuple_Type.tp_new(self->estimate, args, NULL);
+    Py_XDECREF(args);
+    Py_XDECREF(plain);
     return found;
 }
 

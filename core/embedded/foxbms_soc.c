@@ -89,7 +89,7 @@ void SE_InitializeStateOfCharge(DATA_BLOCK_SOC_s *pSocValues, bool ccPresent, ui
     }
 #ifdef CANGAUGE_FRAM_BLOCK
     if ((FRAM_ReadData(CANGAUGE_FRAM_BLOCK) == FRAM_ACCESS_OK) &&
-        cangauge_fram.is_saved[stringNumber]) {
+        (cangauge_fram.model_id[stringNumber] == PACK_MODEL_ID)) {
         /* No clock measures how long the processor was off. False: it begins with the SoC. */
         (void)cg_restore(&string->estimator, &cangauge_fram.state[stringNumber], (cg_time)NAN);
     }
@@ -124,7 +124,7 @@ static void save(string_s *string, uint8_t s)
     if ((string->elapsed_ms - string->saved_ms) >= SAVE_EVERY_MS) {
         string->saved_ms = string->elapsed_ms;
         cangauge_fram.state[s] = string->estimator.state;
-        cangauge_fram.is_saved[s] = true;
+        cangauge_fram.model_id[s] = PACK_MODEL_ID;
         (void)FRAM_WriteData(CANGAUGE_FRAM_BLOCK);
     }
 }

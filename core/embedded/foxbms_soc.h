@@ -12,7 +12,7 @@
 #include "cangauge.h"
 
 typedef struct {
-    bool is_saved[BS_NR_OF_STRINGS];
+    uint32_t model_id[BS_NR_OF_STRINGS]; /* PACK_MODEL_ID of the saved state; 0: none */
     cg_state state[BS_NR_OF_STRINGS];
 } cangauge_fram_s;
 

@@ -635,6 +635,8 @@ def _create_beside(target: Path, *, shown: str | PathLike[str], rights: int = 0o
     # The suffix stays last: writers such as pyarrow and bokeh choose the format by it.
     part = target.with_name(f".{target.stem[:200]}.{secrets.token_hex(4)}{target.suffix}")
     try:
+        with suppress(FileNotFoundError):
+            target.lstat()  # its name can be too long where that of `part` is not
         part.touch(rights, exist_ok=False)
     except OSError as error:
         problem, cure = _WRITE_ERRORS.get(

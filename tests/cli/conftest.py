@@ -15,6 +15,7 @@ from cangauge.cli.estimate import estimate_command
 from cangauge.cli.fit import fit_command
 from cangauge.cli.gap import gap_command
 from cangauge.cli.gap_check import gap_check_command
+from cangauge.cli.inspect import inspect_command
 from cangauge.identify.fit import fit
 from cangauge.logs.canonical import write_log
 from synthetic import synthetic_log
@@ -24,6 +25,7 @@ app.command("fit")(fit_command)
 app.command("estimate")(estimate_command)
 app.command("gap")(gap_command)
 app.command("gap-check")(gap_check_command)
+app.command("inspect")(inspect_command)
 
 
 @dataclass

@@ -295,6 +295,15 @@ def test_a_capture_is_estimated_as_the_service_does(
         assert np.array_equal(table[name].to_numpy(), getattr(live, name), equal_nan=True)
 
 
+@pytest.mark.parametrize("command", ["estimate", "inspect"])
+def test_sign_of_a_capture_is_refused(
+    run: Run, made: Path, tmp_path: Path, capture: Path, command: str
+) -> None:
+    more = ("-m", made / "model.json", "-o", tmp_path / "soc.csv") if command == "estimate" else ()
+    ran = run(command, capture, "--vehicle", "generic", "--sign", "discharge", *more)
+    refused(ran, "drive.log", "--sign", "under [current]")
+
+
 def test_turned_current_in_a_capture_is_refused(
     run: Run, made: Path, tmp_path: Path, capture: Path
 ) -> None:

@@ -197,6 +197,25 @@ def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
     assert (tmp_path / "ecm.py").read_text() == "kept"
 
 
+@pytest.mark.parametrize("name", ["x" * 300, "x" * 300 + "/new"])
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path, name: str) -> None:
+    PLAIN.save(tmp_path / "pack.json")
+    arguments = ["export-c", str(tmp_path / "pack.json"), "-o", str(tmp_path / name)]
+    with pytest.raises(InputError, match="too long"):
+        CliRunner().invoke(app, arguments, catch_exceptions=False)
+
+
+def test_own_files_are_kept_and_an_export_is_renewed(tmp_path: Path) -> None:
+    (tmp_path / "Makefile").write_text("kept")
+    with pytest.raises(InputError, match="not from an export") as error:
+        export_c(PLAIN, tmp_path)
+    assert error.value.value == ["Makefile"]
+    assert [each.name for each in tmp_path.iterdir()] == ["Makefile"]
+    assert (tmp_path / "Makefile").read_text() == "kept"
+    export_c(PLAIN, tmp_path / "new")
+    export_c(PLAIN, tmp_path / "new", period_s=1.0)
+
+
 def test_period_out_of_range_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"0\.001"):
         export_c(PLAIN, tmp_path, period_s=0.0)

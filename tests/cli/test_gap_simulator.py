@@ -64,7 +64,7 @@ def given(drives: Path) -> list[object]:
 def test_a_column_is_diagnosed_and_corrected(run: Run, drives: Path, tmp_path: Path) -> None:
     ran = run(
         "gap", *given(drives), "--simulated", "U model [V]", "--sign", "discharge",
-        "--corrected", tmp_path / "corrected", "--json",
+        "--corrected", tmp_path / "new" / "corrected", "--json",
     )  # fmt: skip
     assert ran.code == 0, ran.err
     found = json.loads(ran.out)
@@ -75,7 +75,7 @@ def test_a_column_is_diagnosed_and_corrected(run: Run, drives: Path, tmp_path: P
     assert errors["corrected_rmse_v"] < 0.4
     assert "measured voltage" in found["simulator"]["correction"]
     assert "ignored: U model" not in ran.err
-    with (tmp_path / "corrected" / "trip.corrected.csv").open(encoding="utf-8") as file:
+    with (tmp_path / "new" / "corrected" / "trip.corrected.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     gap_v = [float(row["voltage_v"]) - float(row["corrected_v"]) for row in rows]
     assert np.sqrt(np.mean(np.square(gap_v))) == pytest.approx(errors["corrected_rmse_v"], rel=1e-6)
@@ -97,7 +97,7 @@ def test_a_function_gives_the_same_as_its_column(run: Run, drives: Path) -> None
     ("words", "problem"),
     [
         ([], "--model"),
-        (["--simulated", "U modell"], "no column has this heading"),
+        (["--simulated", "U modell", "--corrected", "new/sub"], "no column has this heading"),
         (["--simulated", "U model [V]", "--simulator", "a:b"], "two simulators"),
         (["--simulator", "nowhere_at_all:simulate"], "cannot be imported"),
         (["--simulator", "cell.py:other"], "no function other"),
@@ -119,6 +119,7 @@ def test_what_cannot_be_simulated_is_refused(
     ran = run("gap", *given(drives), "--sign", "discharge", *words)
     assert ran.code == 2
     assert problem in " ".join(ran.err.split())
+    assert not (drives / "new").exists()
 
 
 def test_what_is_diagnosed_and_from_where_is_told(run: Run, drives: Path, made: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cangauge.cli.app import app
-from cangauge.errors import InputError
+from cangauge.errors import CangaugeError, InputError
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.validity import Sample
@@ -143,7 +143,8 @@ def test_a_diagnosed_effect_is_a_parameter(units: dict[Any, Path]) -> None:
     [
         ("pack", "capacity_ah", -5.0), ("pack", "capacity_ah", 0.0),
         ("pack", "initial_soc_pct", 175.0), ("pack", "effect_3_rc.tau_1_s", 0.0),
-        ("pack", "effect_3_rc.ohm_1", float("inf")),
+        ("pack", "effect_3_rc.ohm_1", float("inf")), ("pack", "effect_3_rc.mean_slope", 0.0),
+        ("pack", "effect_2_resistance_soc.width_pct", 0.0),
         ("estimator", "initial_soc_pct", 150.0), ("estimator", "initial_soc_pct", float("nan")),
     ],
 )  # fmt: skip
@@ -168,6 +169,28 @@ def test_the_range_of_a_parameter_is_stated(units: dict[Any, Path]) -> None:
         assert [float(end) for end in limits["initial_soc_pct"]] == [0.0, 100.0]
         assert [float(end) for end in limits["capacity_ah"]] == [1e-3, 1e5]
         assert limits["effect_3_rc.ohm_1"] == (None, None)
+
+
+def test_what_the_core_divides_by_is_positive(tmp_path: Path) -> None:
+    values = {
+        "core_temperature": {"rise_k": 5.0, "late": 0.1, "tau_s": 900.0},
+        "charge_transfer": {
+            "scale_v": 0.01,
+            "exchange_a": 5.0,
+            "bend_only": 1.0,
+            "activation_k": 0.0,
+        },
+        "hysteresis": {"half_width_v": 0.005, "travel_pct": 4.0},
+    }
+    effects = [{"id": each, "parameters": numbers} for each, numbers in values.items()]
+    model = leaf_2012_model_file().model_copy(update={"effects": effects})
+    unit = export_fmu(model, tmp_path / "pack.fmu")
+    found = fmpy.read_model_description(str(unit)).modelVariables
+    divisors = ("effect_1_core_temperature.capacity_ah", "effect_2_charge_transfer.zero_a",
+                "effect_3_hysteresis.travel_as")  # fmt: skip
+    limits = {item.name: item.min for item in found if item.name in divisors}
+    assert set(limits) == set(divisors)
+    assert all(float(low) > 0.0 for low in limits.values())
 
 
 @pytest.mark.parametrize("version", [2, 3])
@@ -214,6 +237,15 @@ def test_a_missing_compiler_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     with pytest.raises(InputError, match="no C compiler"):
         export_fmu(leaf_2012_model_file(), tmp_path / "pack.fmu")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_options_in_cc_reach_the_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("CC", "cc --no-such-option")
+    with pytest.raises(CangaugeError, match="no-such-option"):
+        export_fmu(leaf_2012_model_file(), tmp_path / "pack.fmu")
+    monkeypatch.setenv("CC", "no-such-compiler -m64")
+    with pytest.raises(InputError, match="no-such-compiler"):
+        export_fmu(leaf_2012_model_file(), tmp_path / "pack.fmu")
 
 
 def test_the_command_writes_a_unit(tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ pytestmark = pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler")
 
 def built(folder: Path, model: Model, *defines: str, period_s: float = 0.1) -> Path:
     export_c(model, folder, period_s=period_s)
-    sources = ["foxbms_soc.c", *CORE_SOURCES, "pack_model.c", str(HERE / "driver.c")]
+    sources = [*CORE_SOURCES, "pack_model.c", str(HERE / "driver.c")]  # it includes foxbms_soc.c
     subprocess.run(
         ["cc", *STRICT, "-DCANGAUGE_CONFIG", *defines, f"-I{HERE}", "-I.", *sources, "-lm",
          "-o", "driver"],
@@ -46,11 +46,14 @@ def built(folder: Path, model: Model, *defines: str, period_s: float = 0.1) -> P
     return folder / "driver"
 
 
-def run(driver: Path, rows: Sequence[Row], reset: int = 0) -> tuple[FloatArray, float]:
+def run(
+    driver: Path, rows: Sequence[Row], reset: int = 0, fram: Path | None = None
+) -> tuple[FloatArray, float]:
     """Return average, minimum and maximum after each row [%], and the SoC of a cell at 3.9 V."""
     text = "\n".join(" ".join("x" if each is None else str(each) for each in row) for row in rows)
     done = subprocess.run(
-        [driver, str(reset)], check=True, input=text + "\n", capture_output=True, text=True,
+        [driver, str(reset), *([] if fram is None else [fram])], check=True,
+        input=text + "\n", capture_output=True, text=True,
         timeout=120,
     )  # fmt: skip
     *lines, cell = done.stdout.splitlines()
@@ -124,15 +127,23 @@ def test_time_stamps_may_wrap(driver: Path, drive: list[Row]) -> None:
     np.testing.assert_array_equal(found, estimated(later, MODEL, EstimatorSettings()))
 
 
+def from_zero(rows: list[Row]) -> list[Row]:
+    """Return the rows with the time stamps of a processor that starts before them."""
+    return [(row[0] - rows[0][0] + 100, *row[1:]) for row in rows]
+
+
+def settings_after(published: FloatArray) -> EstimatorSettings:
+    """Return the settings of a start with the SoC that was published last."""
+    average, low, high = published
+    spread = max(average - low, high - average, 2.0)
+    return EstimatorSettings(initial_soc_pct=average, initial_soc_std_pct=spread / 2.0)
+
+
 def test_reset_continues_from_the_soc_in_fram(driver: Path, drive: list[Row]) -> None:
     reset = 600
-    found, _ = run(driver, drive, reset)
-    average, low, high = found[reset - 2]
-    settings = EstimatorSettings(
-        initial_soc_pct=average,
-        initial_soc_std_pct=max(average - low, high - average, 2.0) / 2.0,
-    )
-    expected = estimated(drive[reset - 1 :], MODEL, settings)
+    later = from_zero(drive[reset - 1 :])
+    found, _ = run(driver, drive[: reset - 1] + later, reset)
+    expected = estimated(later, MODEL, settings_after(found[reset - 2]))
     np.testing.assert_array_equal(found[reset - 1 :], expected)
 
 
@@ -142,7 +153,8 @@ def test_own_fram_block_keeps_the_whole_state(
     """Written every 10 s, without the delay line."""
     keeping = built(tmp_path, MODEL, "-DCANGAUGE_FRAM_BLOCK=FRAM_BLOCK_ID_CANGAUGE")
     reset = 1000
-    found, _ = run(keeping, drive, reset)
+    later = from_zero(drive[reset - 1 :])
+    found, _ = run(keeping, drive[: reset - 1] + later, reset)
     np.testing.assert_array_equal(found[: reset - 1], run(driver, drive)[0][: reset - 1])
     before, saved_ms = Estimator(MODEL, EstimatorSettings()), 0
     for row in drive[: reset - 1]:
@@ -152,8 +164,21 @@ def test_own_fram_block_keeps_the_whole_state(
     without_line = {"line": DelayLineState([], [], state.line.since_s)}
     after = Estimator(MODEL, EstimatorSettings())
     after.restore(state.model_copy(update=without_line), math.nan)
-    expected = published(after.step(as_sample(row)) for row in drive[reset - 1 :])
+    expected = published(after.step(as_sample(row)) for row in later)
     np.testing.assert_array_equal(found[reset - 1 :], expected)
+
+
+def test_saved_state_of_another_model_is_not_used(drive: list[Row], tmp_path: Path) -> None:
+    fram, block = tmp_path / "fram", "-DCANGAUGE_FRAM_BLOCK=FRAM_BLOCK_ID_CANGAUGE"
+    other = MODEL.model_copy(update={"capacity_ah": 0.9 * MODEL.capacity_ah})
+    old, new = built(tmp_path / "old", MODEL, block), built(tmp_path / "new", other, block)
+    before, _ = run(old, drive[:1000], fram=fram)
+    kept = fram.read_bytes()
+    found, _ = run(new, drive, fram=fram)
+    np.testing.assert_array_equal(found, estimated(drive, other, settings_after(before[-1])))
+    fram.write_bytes(kept)
+    again, _ = run(old, drive, fram=fram)
+    assert np.any(again != estimated(drive, MODEL, settings_after(before[-1])))
 
 
 def test_sign_of_the_current_follows_foxbms(driver: Path, drive: list[Row], tmp_path: Path) -> None:

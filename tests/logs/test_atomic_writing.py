@@ -52,6 +52,7 @@ def test_absent_folder_folder_and_file_as_folder_are_named(tmp_path: Path) -> No
         (tmp_path, "this is a folder"),
         (tmp_path / "file" / "x.json", "is a file, not a folder"),
         (tmp_path / ("n" * 150 + "." + "s" * 250), "file name is too long"),
+        (tmp_path / ("n" * 300 + ".json"), "file name is too long"),
     ):
         with pytest.raises(InputError, match=words) as caught:
             write_text_atomic(path, "x")

@@ -21,7 +21,7 @@ def export_c_command(
             "--output",
             metavar="DIR",
             callback=folder_to_write,
-            help="Folder for the sources.",
+            help="Folder for the sources: empty, of an earlier export, or made.",
         ),
     ],
     period: Annotated[

@@ -190,7 +190,9 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     model_file = _model(model, options, corrected)
     outputs = corrected_paths(paths, corrected)
     check_outputs(
-        [report, extended, plan_file, *outputs], [*paths, *given, *([model] if model else [])]
+        [report, extended, plan_file, *outputs],
+        [*paths, *given, *([model] if model else [])],
+        made=corrected,
     )
     used = [] if simulated is None else [simulated]
     diagnosed = [_long_enough(reading.load(path, used)) for path in paths]

@@ -127,7 +127,10 @@ def folder_to_write(param: typer.CallbackParam, folder: Path | None) -> Path | N
             raise InputError(
                 "is a file", field=param.opts[-1], value=str(folder), cure="name a folder"
             )
-        check_writable(folder)
+        made = folder
+        while not os.path.exists(made.parent):  # noqa: PTH110 - likewise
+            made = made.parent
+        check_writable(made)
     return folder
 
 
@@ -224,14 +227,16 @@ class Reading:
         InputError
             If the file cannot be read, or an option is wrong.
         """
-        from cangauge.bus.recording import open_with_columns
+        from cangauge.bus.recording import open_with_columns, refuse_sign_of_capture
 
-        return open_with_columns(
+        recording = open_with_columns(
             path,
             columns=self.given_columns(),
             mapped=self.mapped_columns(),
             sign=cast("Sign | None", self.sign),
         )
+        refuse_sign_of_capture(recording, self.sign)
+        return recording
 
     def load(self, path: Path, used: Sequence[str] = ()) -> Log:
         """Read a log, or decode a capture; print the reader's remarks on stderr.
@@ -253,11 +258,7 @@ class Reading:
             If the input cannot be read or has a single row, an option has an unknown value, or the
             data show clearly that positive current charges, unless `sign` states it.
         """
-        from cangauge.bus.recording import (
-            log_of,
-            refuse_sign_of_capture,
-            refuse_single_row,
-        )
+        from cangauge.bus.recording import log_of, refuse_single_row
         from cangauge.logs.read import LogFile
 
         source = known_temperature_source(self.temperature_source)
@@ -268,7 +269,6 @@ class Reading:
         car = self.car() if is_capture and self.names_vehicle else None
         if not is_capture and self.names_vehicle and self.mapped_columns() is None:
             note(f"{path}: a log, not a capture: --vehicle, --dbc and --map do not apply to it")
-        refuse_sign_of_capture(recording, self.sign)
         log = log_of(recording, car, temperature_c=self.temperature, temperature_source=source)
         refuse_single_row(log)
         if self.sign is None:
@@ -337,13 +337,17 @@ def assumed_of(logs: Iterable[Log]) -> dict[str, list[str]]:
     return {log.source or log.name: list(log.assumed) for log in logs if log.assumed}
 
 
-def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> None:
+def check_outputs(
+    outputs: Iterable[Path | None], inputs: Iterable[Path], made: Path | None = None
+) -> None:
     """Refuse, before any long work, outputs that cannot be written or would overwrite input.
 
     Parameters
     ----------
     outputs, inputs : iterable of Path
         None stands for an output that is not wanted.
+    made : Path, optional
+        A folder that the command makes, of outputs; see `folder_to_write`.
 
     Raises
     ------
@@ -366,7 +370,8 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> Non
                 "two outputs have this name", source=output, cure="name two different files"
             )
         written.add(place)
-        check_writable(output)
+        if output.parent != made or made.is_dir():
+            check_writable(output)
 
 
 def within(value: _Value, low: float, high: float, *, option: str, unit: str) -> _Value:

@@ -171,10 +171,9 @@ def _file(path: Path) -> ModuleType:
 
 
 def corrected_paths(logs: Sequence[Path], folder: Path | None) -> list[Path]:
-    """Return where `--corrected` writes each log, `FOLDER/NAME.corrected.csv`; make the folder."""
+    """Return where `--corrected` writes each log, `FOLDER/NAME.corrected.csv`."""
     if folder is None:
         return []
-    folder.mkdir(exist_ok=True)
     return [folder / f"{log.stem}.corrected.csv" for log in logs]
 
 
@@ -182,6 +181,7 @@ def write_corrected(found: SimulatorDiagnosis, logs: list[Path], folder: Path) -
     """Write each diagnosed log with the simulated and the corrected voltage; return the files."""
     from cangauge.logs.canonical import write_table
 
+    folder.mkdir(parents=True, exist_ok=True)
     written = corrected_paths(logs, folder)
     for run, path in zip(found.runs, written, strict=True):
         columns = {

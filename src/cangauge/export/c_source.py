@@ -6,12 +6,34 @@ import math
 from collections.abc import Iterator
 from typing import Any, Final
 
-from cangauge.estimation.core_constants import CoreConstants, effect_fields
+from cangauge.errors import InputError
+from cangauge.estimation.core_constants import CoreConstants, core_constants, effect_fields
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.model.model_file import Model
 
 CORE_SOURCES: Final = ("cangauge.c", "cangauge_filter.c", "cangauge_model.c")
 CORE_HEADERS: Final = ("cangauge.h", "cangauge_internal.h")
 WIDE: Final = ("ocv_v", "epsilon", "skew_s")
 """Fields that are doubles where the others are floats."""
+
+
+def exported_constants(model: Model) -> CoreConstants:
+    """Return the constants of a model with the usual settings.
+
+    Raises
+    ------
+    InputError
+        If the core lacks one of the model's effects.
+    """
+    constants = core_constants(model, EstimatorSettings())
+    if constants is None:
+        raise InputError(
+            "the core has no form of an effect, or the model has time_skew twice",
+            field="effects",
+            value=[entry["id"] for entry in model.effects],
+            cure="fit the model without it",
+        )
+    return constants
 
 
 def line_size(longest_s: float, spacing_s: float) -> int:

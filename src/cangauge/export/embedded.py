@@ -7,7 +7,8 @@ cantools' generator, an example, and tests against this package on a drive with 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import os
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -15,17 +16,23 @@ from typing import Final
 from cantools.database.can import Message
 from cantools.database.can.c_source import generate
 
-from cangauge._io import write_texts_atomic
+from cangauge._io import text_sha256, write_texts_atomic
 from cangauge._resources import shared_file
 from cangauge._version import __version__
 from cangauge.bus.database import load_dbc, signal_codec
 from cangauge.bus.publish import SocPublisher
 from cangauge.errors import InputError
-from cangauge.estimation.core_constants import CoreConstants, core_constants
+from cangauge.estimation.core_constants import CoreConstants
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.validity import Estimate, Sample
-from cangauge.export.c_source import CORE_HEADERS, CORE_SOURCES, line_size, model_definition
+from cangauge.export.c_source import (
+    CORE_HEADERS,
+    CORE_SOURCES,
+    exported_constants,
+    line_size,
+    model_definition,
+)
 from cangauge.model.model_file import Model
 
 EMBEDDED: Final = (
@@ -44,6 +51,10 @@ GOLDEN_S: Final = 1200.0
 
 FAST_SAMPLES: Final = 200
 """Samples of it that are `period_s` apart."""
+
+_HEAD: Final = "/* {} - of the model "
+_MARK: Final = _HEAD.format("pack_model.h")
+"""Beginning of a header that shows that a folder is of an export."""
 
 _SIGNALS: Final = ("soc_pct", "soc_std_pct", "age_s")
 
@@ -65,7 +76,7 @@ def export_c(model: Model, folder: Path, *, period_s: float = PERIOD_S) -> Expor
     ----------
     model : Model
     folder : Path
-        Made if it is missing; its files are replaced.
+        Made if it is missing; files of an earlier export are replaced.
     period_s : float
         Time between two samples of the current [s]. More samples are taken too, but the delay line
         then keeps some of them only.
@@ -73,21 +84,15 @@ def export_c(model: Model, folder: Path, *, period_s: float = PERIOD_S) -> Expor
     Raises
     ------
     InputError
-        If the period is out of range, or the core lacks one of the model's effects.
+        If the period is out of range, the core lacks one of the model's effects, or a file of
+        the same name in the folder is not of an export.
     """
     if not 1e-3 <= period_s <= 60.0:
         raise InputError("must lie within 0.001 … 60 s", field="--period", value=period_s)
-    constants = core_constants(model, EstimatorSettings())
-    if constants is None:
-        raise InputError(
-            "the core has no form of an effect, or the model has time_skew twice",
-            field="effects",
-            value=[entry["id"] for entry in model.effects],
-            cure="fit the model without it",
-        )
+    constants = exported_constants(model)
     spacing_s = JITTER * 2.0 * period_s
     length = line_size(constants.longest_s, spacing_s)
-    head = f"/* {{}} - of the model {_comment(model.name)}, by cangauge {__version__}. */\n"
+    head = f"{_HEAD}{_comment(model.name)}, by cangauge {__version__}. */\n"
     folders = dict.fromkeys(CORE_HEADERS + CORE_SOURCES, "core")
     folders |= dict.fromkeys(EMBEDDED, "core/embedded")
     texts = {
@@ -95,17 +100,35 @@ def export_c(model: Model, folder: Path, *, period_s: float = PERIOD_S) -> Expor
         for name, place in folders.items()
     }
     texts["cangauge_config.h"] = head.format("cangauge_config.h") + _config(constants, period_s)
-    texts["pack_model.h"] = head.format("pack_model.h") + _model_header(length, spacing_s)
+    definition = model_definition("pack_model", constants)
+    texts["pack_model.h"] = head.format("pack_model.h") + _model_header(
+        length, spacing_s, text_sha256(__version__ + definition)
+    )
     texts["pack_model.c"] = (
         head.format("pack_model.c")
         + '#include "pack_model.h"\n\n#include <math.h>\n\n'
-        + model_definition("pack_model", constants)
+        + definition
     )
     texts |= _frames()
     texts["golden.h"] = head.format("golden.h") + _golden(model, period_s)
+    _refuse_foreign_names(folder, texts)
     folder.mkdir(parents=True, exist_ok=True)
     write_texts_atomic({folder / name: text for name, text in texts.items()})
     return Exported(folder, tuple(sorted(texts)), 16 * length)
+
+
+def _refuse_foreign_names(folder: Path, names: Iterable[str]) -> None:
+    """Raise InputError for a folder that has files of these names, but not from an export."""
+    taken = sorted(name for name in names if os.path.lexists(folder / name))
+    header = folder / "pack_model.h"
+    if not taken or (header.is_file() and header.read_bytes().startswith(_MARK.encode())):
+        return
+    raise InputError(
+        "the folder has files of these names that are not from an export",
+        source=folder,
+        value=taken,
+        cure="name an empty folder",
+    )
 
 
 def _comment(text: str) -> str:
@@ -124,7 +147,7 @@ def _config(constants: CoreConstants, period_s: float) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _model_header(length: int, spacing_s: float) -> str:
+def _model_header(length: int, spacing_s: float, sha256: str) -> str:
     return f"""#ifndef PACK_MODEL_H
 #define PACK_MODEL_H
 
@@ -133,6 +156,9 @@ def _model_header(length: int, spacing_s: float) -> str:
 /* Memory of the delay line, and least time between every second sample that it keeps. */
 #define PACK_LINE_SIZE {length}
 #define PACK_SPACING_S {spacing_s!r}
+
+/* Of the constants and of the core: a saved state is of no other model. Not 0. */
+#define PACK_MODEL_ID 0x{int(sha256[:8], 16) | 1:08x}U
 
 extern const cg_model pack_model;
 

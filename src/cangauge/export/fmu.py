@@ -15,6 +15,7 @@ import math
 import os
 import platform
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -30,11 +31,11 @@ from cangauge._io import atomic_path
 from cangauge._resources import shared_file
 from cangauge._version import __version__
 from cangauge.errors import CangaugeError, InputError
-from cangauge.estimation.core_constants import CoreConstants, core_constants
-from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.core_constants import CoreConstants
 from cangauge.export.c_source import (
     CORE_HEADERS,
     CORE_SOURCES,
+    exported_constants,
     initialiser,
     line_size,
     model_definition,
@@ -95,6 +96,13 @@ AMPERE_HOURS: Final = (1e-3, 1e5)
 """Capacities that the commands take too [A h]."""
 TAU_S: Final = (1e-3, FINITE[1])
 """Time constants [s]: a shorter one is over within any step."""
+DIVISORS: Final = {
+    "capacity_ah": AMPERE_HOURS,
+    **dict.fromkeys(
+        ("width_pct", "mean_slope", "travel_as", "zero_a"), (sys.float_info.min, FINITE[1])
+    ),
+}
+"""Names of an effect's values by which the core divides → range."""
 
 
 @dataclass(frozen=True)
@@ -130,13 +138,7 @@ def export_fmu(model: Model, path: Path, *, kind: Kind = "pack", version: Versio
     CangaugeError
         If the compiler fails.
     """
-    constants = core_constants(model, EstimatorSettings())
-    if constants is None:
-        raise InputError(
-            "an effect of this model has no form in the C core", field="effects",
-            cure="export a model with effects of the library only",
-        )  # fmt: skip
-    unit = _Unit.of(model, constants, kind, version)
+    unit = _Unit.of(model, exported_constants(model), kind, version)
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         unit.write_sources(root / "sources")
@@ -230,7 +232,7 @@ class _Unit:
         binary = binary / f"{self.identifier}{suffix}"
         binary.parent.mkdir(parents=True)
         sources = [str(root / "sources" / name) for name in self.sources]
-        command = [_compiler(), *FLAGS, *sources, "-o", str(binary), "-lm"]
+        command = [*_compiler(), *FLAGS, *sources, "-o", str(binary), "-lm"]
         done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
         if done.returncode != 0:
             raise CangaugeError(f"the C compiler failed: {done.stderr.strip()[-400:]}")
@@ -317,7 +319,8 @@ def _estimator_variables() -> tuple[Variable, ...]:
         Variable("soc_pct", "output", "%", None, "state of charge"),
         Variable(
             "initial_soc_pct", "parameter", "%", -1.0,
-            "state of charge at the start; -1: found from the first voltages", range=(-1.0, 100.0),
+            "state of charge at the start; negative: found from the first voltages",
+            range=(-1.0, 100.0),
         ),
         Variable("soc_std_pct", "output", "%", None, "its standard deviation"),
         Variable(
@@ -344,7 +347,7 @@ def _effect_parameters(
         for place, name, value in values:
             text = f"effect {number + 1} of the model, as in cangauge.h"
             full = f"effect_{number + 1}_{form.kind}.{name}"
-            bounds = TAU_S if name.startswith("tau_") else FINITE
+            bounds = TAU_S if name.startswith("tau_") else DIVISORS.get(name, FINITE)
             variables.append(Variable(full, "parameter", None, value, text, range=bounds))
             places.append((number, place))
     return variables, places
@@ -394,8 +397,13 @@ def _bytes(root: ET.Element) -> bytes:
     return text
 
 
-def _compiler() -> str:
-    for name in (os.environ.get("CC"), "cc", "gcc", "clang"):
-        if name and (found := shutil.which(name)):
-            return found
-    raise InputError("no C compiler", cure="install gcc or clang, or name one in CC")
+def _compiler() -> list[str]:
+    """Return the command of the compiler: `CC` with its options, or the first that is found."""
+    given = shlex.split(os.environ.get("CC", ""))
+    for name, *options in [given] if given else [["cc"], ["gcc"], ["clang"]]:
+        if found := shutil.which(name):
+            return [found, *options]
+    raise InputError(
+        "no C compiler", value=" ".join(given) or None,
+        cure="install gcc or clang, or name one in CC",
+    )  # fmt: skip

@@ -5,13 +5,15 @@ bokeh itself exports through a browser; this way needs none.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from bokeh.models import BoxAnnotation, ColorBar, FactorRange, Label, Span, Whisker
 
-from cangauge._io import open_regular
+from cangauge._io import atomic_path, open_regular
+from cangauge.errors import InputError
 from cangauge.report.page import Page
 
 _PX_PER_INCH: Final = 96.0
@@ -20,6 +22,8 @@ _WIDTH_IN: Final = 10.0
 _PNG_DPI: Final = 200
 _HEAD_BYTES: Final = 4096
 """Beginning of a file in which matplotlib writes its description [bytes]."""
+_MARK: Final = "figure of cangauge "
+_SUFFIXES: Final = (".png", ".svg")
 _DASHES: Final = {"dashed": (6.0, 4.0)}
 
 
@@ -30,21 +34,36 @@ def write_figures(page: Page, folder: Path, kind: str) -> list[Path]:
     ----------
     page : Page
     folder : Path
-        Made if it is missing; figures of this kind that are in it are removed, nothing else.
+        Made if it is missing; figures of this kind that are in it are replaced, nothing else.
     kind : str
         Of the page, such as "fit.fit_page"; noted in each file.
+
+    Raises
+    ------
+    InputError
+        If a file that is no figure of cangauge has the name of a figure; nothing is written then.
     """
     from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
 
     folder.mkdir(parents=True, exist_ok=True)
-    mark = f"figure of cangauge {kind}."
-    for earlier in (*folder.glob("[0-9][0-9]-*.png"), *folder.glob("[0-9][0-9]-*.svg")):
-        with open_regular(earlier) as file:
-            is_ours = mark.encode() in file.read(_HEAD_BYTES)
-        if is_ours:
-            earlier.unlink()
-    written = []
-    for count, item in enumerate(page.figures, start=1):
+    mark = f"{_MARK}{kind}."
+    earlier = {
+        path
+        for suffix in _SUFFIXES
+        for path in folder.glob(f"[0-9][0-9]-*{suffix}")
+        if _has_mark(path, mark)
+    }
+    names = [
+        f"{count:02d}-{item.anchor.removeprefix('figure-')}"
+        for count, item in enumerate(page.figures, start=1)
+    ]
+    written = [folder / f"{name}{suffix}" for name in names for suffix in _SUFFIXES]
+    for path in written:
+        if os.path.lexists(path) and not _has_mark(path, _MARK):
+            raise InputError(
+                "this is no figure of cangauge", source=path, cure="name another folder"
+            )
+    for name, item in zip(names, page.figures, strict=True):
         plots = [child[0] for child in getattr(item.plot, "children", [])] or [item.plot]
         heights = [plot.height / _PX_PER_INCH for plot in plots]
         drawing = Figure((_WIDTH_IN, sum(heights) + 0.4), layout="constrained")
@@ -54,11 +73,21 @@ def write_figures(page: Page, folder: Path, kind: str) -> list[Path]:
         )  # fmt: skip
         for axes, plot in zip(rows[:, 0], plots, strict=True):
             _draw(drawing, axes, plot)
-        for suffix in ("png", "svg"):
-            path = folder / f"{count:02d}-{item.anchor.removeprefix('figure-')}.{suffix}"
-            drawing.savefig(path, dpi=_PNG_DPI, metadata={"Description": mark})
-            written.append(path)
+        for suffix in _SUFFIXES:
+            with atomic_path(folder / f"{name}{suffix}") as part:
+                drawing.savefig(part, dpi=_PNG_DPI, metadata={"Description": mark})
+    for path in earlier.difference(written):
+        path.unlink()
     return written
+
+
+def _has_mark(path: Path, mark: str) -> bool:
+    """Tell whether a file can be read and has this mark."""
+    try:
+        with open_regular(path) as file:
+            return mark.encode() in file.read(_HEAD_BYTES)
+    except InputError:
+        return False
 
 
 def _draw(drawing: Any, axes: Any, plot: Any) -> None:

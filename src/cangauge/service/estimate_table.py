@@ -56,7 +56,7 @@ def write_estimates(path: Path, time_s: FloatArray, table: EstimateTable) -> Non
     Parameters
     ----------
     path : Path
-        Ends in .csv or .parquet.
+        Ends in .csv or .parquet; a device gets CSV.
     time_s : array of shape (n,)
         The samples' own time [s]: a refused sample's estimate is the one before.
     table : EstimateTable
@@ -104,7 +104,7 @@ class EstimateWriter:
     Parameters
     ----------
     path : path-like
-        `.parquet` or `.csv`.
+        `.parquet` or `.csv`; a device gets CSV.
 
     Attributes
     ----------
@@ -135,12 +135,12 @@ class EstimateWriter:
 
     def __enter__(self) -> Self:
         part = self._part = self._stack.enter_context(atomic_path(self._path))
-        if self._path.suffix.lower() == ".csv":
+        if self._path.suffix.lower() == ".parquet":
+            self._sink = pq.ParquetWriter(part, _SCHEMA)
+        else:
             file = self._stack.enter_context(part.open("wb"))
             _write_header(file)
             self._sink = pacsv.CSVWriter(file, _SCHEMA, write_options=_PLAIN_CSV)
-        else:
-            self._sink = pq.ParquetWriter(part, _SCHEMA)
         return self
 
     def __exit__(

@@ -48,7 +48,7 @@ class _OnlineRc(OnlineEffect):
         self.lags = [LowPass(tau_s, 0.0, rest_s=BRIDGE_S) for _, tau_s in elements]
 
     def core_form(self) -> CoreForm:
-        values = (self._activation_k, 0.0, 0.0, *self._ohm)
+        values = (self._activation_k, 0.0, 1.0, *self._ohm)
         return CoreForm("rc", values, tuple(tau_s for _, tau_s in self.memory))
 
     def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
