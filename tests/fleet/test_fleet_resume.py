@@ -6,11 +6,11 @@ import os
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import pytest
 
-from cangauge.errors import InputError
+from cangauge.errors import CangaugeError, InputError
 from cangauge.fleet import run as fleet_run
 from cangauge.fleet.dataset import Dataset
 from cangauge.fleet.fit import fit_fleet
@@ -105,6 +105,32 @@ def test_what_follows_a_failed_log_is_computed_again(fleet: Fleet) -> None:
     assert fleet.run(job).done == 2
     assert fleet.states(job) == ["a", "ab", "abc"]
     assert fleet.run(job).skipped == 3
+
+
+class Unprepared(NotingJob):
+    """The same table with other options, under which nothing can be computed."""
+
+    error: ClassVar[Exception] = InputError("no reference can be used", field="--reference")
+
+    def identity(self) -> dict[str, Any]:
+        return {"references": "other"}
+
+    def prepared(self) -> Self:
+        raise self.error
+
+
+@pytest.mark.parametrize("error", [Unprepared.error, MemoryError("full")])
+def test_a_job_that_cannot_be_prepared_writes_nothing(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    fleet.run(NotingJob())
+    before = sorted(fleet.root.rglob("*.parquet"))
+    monkeypatch.setattr(Unprepared, "error", error)
+    with pytest.raises(CangaugeError, match=r"no reference can|MemoryError: full") as caught:
+        fleet.run(Unprepared())
+    assert caught.value.exit_code == getattr(error, "exit_code", 1)
+    assert sorted(fleet.root.rglob("*.parquet")) == before
+    assert fleet.run(NotingJob()).skipped == 3
 
 
 def test_rows_are_written_while_a_task_takes_long(

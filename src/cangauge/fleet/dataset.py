@@ -4,7 +4,8 @@
     OUT/estimate-bad/vehicle=A17/91ab….parquet    logs set aside, with the reason
 
 Finished rows are added in new files, each written whole or not at all, so that a killed run keeps
-them. At the end of a run the files of each vehicle become one, with the latest row of each log.
+them. At the end of a run the files of each vehicle become one, with the latest row of each log. A
+row stays beside a later failure that does not lie in its log, such as of the storage.
 """
 
 from __future__ import annotations
@@ -148,16 +149,21 @@ class Dataset:
         files: Mapping[str, Sequence[str]],
         stamps: Mapping[tuple[str, str], str],
     ) -> None:
-        latest: dict[str, tuple[str, dict[str, Any]]] = {}
-        for table in self.tables:
+        latest: dict[str, dict[str, dict[str, Any]]] = {table: {} for table in self.tables}
+        for table, of_table in latest.items():
             for row in self._rows(table, self._schemas[table].names, None, files[table]):
                 row["stamp"] = stamps.get((row["log"], row["run"]), row["stamp"])
-                before = latest.get(row["log"])
-                if before is None or before[1]["made_at"] <= row["made_at"]:
-                    latest[row["log"]] = (table, row)
-        for table in self.tables:
-            kept = [row for of, row in latest.values() if of == table]
-            written = self._write(table, vehicle, kept) if kept else ""
+                before = of_table.get(row["log"])
+                if before is None or before["made_at"] <= row["made_at"]:
+                    of_table[row["log"]] = row
+        good, bad = latest.values()
+        for log in good.keys() & bad.keys():
+            if bad[log]["made_at"] < good[log]["made_at"]:
+                del bad[log]
+            elif bad[log]["is_final"]:
+                del good[log]
+        for table, of_table in latest.items():
+            written = self._write(table, vehicle, [*of_table.values()]) if of_table else ""
             for path in files[table]:
                 if path != written:
                     with suppress(FileNotFoundError):  # another run has settled it

@@ -211,7 +211,7 @@ def run_job(job: Job, logs: Sequence[FleetLog], dataset: Dataset, client: Any) -
     Raises
     ------
     CangaugeError
-        If the scheduler is lost; finished rows are kept.
+        If the scheduler is lost, or the job cannot be prepared; finished rows are kept.
     """
     run = _Run(job, logs, dataset, client)
     try:
@@ -316,6 +316,8 @@ class _Run:
             raise CangaugeError(LOST)
         if isinstance(result, Outcome):
             outcome = result
+        elif job.status == "error":  # no log has a result
+            raise _failure_of(job.exception())
         else:  # distributed gives type, error and traceback of a task that could not run
             error = result[1] if isinstance(result, tuple) else future.exception()
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
@@ -377,6 +379,13 @@ def _valid_for(row: dict[str, Any] | None, log: FleetLog) -> str:
     if row is None or "is_final" in row or row.get("stated") != log.stated:
         return ""
     return str(row["sha256"])
+
+
+def _failure_of(error: BaseException) -> CangaugeError:
+    """Return the error that keeps a job from being prepared, to be raised here."""
+    if isinstance(error, CangaugeError):
+        return error
+    return CangaugeError(f"the job cannot be prepared: {type(error).__name__}: {error}")
 
 
 def _prepared(job: Job) -> Job:
