@@ -208,7 +208,7 @@ def test_a_vehicle_without_own_references_has_the_common_ones(
     dead = tmp_path / "dead.parquet"
     still = read_log(logs[6].url)
     write_log(replace(still, current_a=np.zeros(len(still))), dead)
-    healthy = {"car2": (logs[5],), "car3": (logs[7], FleetLog(str(dead), "car3", "s"))}
+    healthy = {"car0": (FleetLog(str(dead), "car0", "s"),), "car2": (logs[5],), "car3": (logs[7],)}
     job = GapJob(ReadOptions(), model, references=3).with_common(suspect, healthy)
     (vehicle,) = job.vehicles(suspect, healthy)
     assert len(job.common) == 3

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, cast
 
 import typer
 
-from cangauge._formatting import number, significant
+from cangauge._formatting import counted, number, significant
 from cangauge._io import file_sha256, write_texts_atomic
 from cangauge.cli.fit import parse_delays
 from cangauge.cli.options import (
@@ -246,8 +246,8 @@ def _show_fit(result: FleetFit) -> None:
             [
                 [
                     name,
-                    number(float(by_log.mean_v[k]), 2),
-                    number(float(by_log.rmse_v[k]), 2),
+                    significant(float(by_log.mean_v[k]), 3),
+                    significant(float(by_log.rmse_v[k]), 3),
                     number(float(by_log.z[k]), 1),
                 ]
                 for name, k in zip(names, misfits, strict=True)
@@ -470,7 +470,7 @@ def _show(summary: Summary, found: FleetOverview) -> None:
         ]
         print_table("Vehicles with a gap", ["vehicle", "<cause", "probability", "P(none)"], rows)
     elif found.gaps:
-        typer.echo(f"No alarm in {len(found.gaps)} vehicles; {found.nearest_text}")
+        typer.echo(f"No alarm in {counted(len(found.gaps), 'vehicle')}; {found.nearest_text}")
     if found.outlying:
         rows = [[vehicle, quantity, number(z, 1)] for vehicle, quantity, z in found.outlying]
         print_table("Outliers in health", ["vehicle", "<quantity", "robust z"], rows)

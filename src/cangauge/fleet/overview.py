@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from cangauge._formatting import number
+from cangauge._formatting import counted, number
 from cangauge.diagnosis import NONE
 from cangauge.fleet.dataset import Dataset
 from cangauge.fleet.gap import GapJob
@@ -147,8 +147,8 @@ class FleetOverview:
         if not self.elsewhere:
             return ""
         return (
-            f"{self.elsewhere} rows in {self.name} are of logs that are not among LOGS (earlier"
-            " runs, or deleted or renamed since) and are not counted."
+            f"{self.name} holds {counted(self.elsewhere, 'row')} of logs that are not among LOGS"
+            " (earlier runs, or deleted or renamed since); not counted."
         )
 
     @property

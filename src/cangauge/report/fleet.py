@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from cangauge._formatting import number
+from cangauge._formatting import counted, number
 from cangauge.fleet.dataset import reason_of
 from cangauge.fleet.health import QUANTITIES
 from cangauge.fleet.outliers import OUTLIER_Z
@@ -63,7 +63,7 @@ def fleet_page(found: FleetOverview) -> Page:
         if blocks
     ]
     return Page(
-        title=f"Fleet of {len(found.vehicles)} vehicles",
+        title=f"Fleet of {counted(len(found.vehicles), 'vehicle')}",
         subtitle=found.name,
         lead=_lead(found),
         tiles=_tiles(found),
@@ -78,7 +78,8 @@ def _lead(found: FleetOverview) -> str:
         sentences.append(
             f"{len(causes)} of {len(found.gaps)} vehicles have a gap: {joined(causes, 5)}."
             if causes
-            else f"None of {len(found.gaps)} vehicles has a significant gap; {found.nearest_text}."
+            else f"No significant gap in {counted(len(found.gaps), 'vehicle')};"
+            f" {found.nearest_text}."
         )
     if found.health:
         names = list(dict.fromkeys(vehicle for vehicle, _, _ in found.outlying))

@@ -101,8 +101,8 @@ def _misfits(result: FleetFit) -> list[Block]:
         [
             by_log.vehicles[k],
             by_log.logs[k],
-            number(float(by_log.mean_v[k]), 2),
-            number(float(by_log.rmse_v[k]), 2),
+            significant(float(by_log.mean_v[k]), 3),
+            significant(float(by_log.rmse_v[k]), 3),
             number(float(z[k]), 1),
         ]
         for k in by_log.misfits[:SHOWN]
@@ -115,7 +115,7 @@ def _misfits(result: FleetFit) -> list[Block]:
             (name, float(by_log.mean_v[k]), ORANGE if k in marked else GREY)
             for name, k in zip(names, largest, strict=True)
         ],
-        decimals=2,
+        decimals=None,
     )  # fmt: skip
     return [
         *([Table(_HEAD, rows)] if rows else []),
