@@ -89,7 +89,7 @@ class NotingJob(Job):
         if path.stem in self.fails:
             raise OSError("connection reset")
         if path.stem in self.needs_soc and log.initial_soc_pct is None:
-            raise InputError("SoC at start unknown")
+            raise InputError("SoC at start unknown", value=path.stem)
         soc = "" if log.initial_soc_pct is None else f"{log.initial_soc_pct:.0f}"
         return {"state": f"{state or ''}{path.stem}{soc}"}
 

@@ -12,7 +12,7 @@ import pytest
 
 from cangauge.errors import CangaugeError, InputError
 from cangauge.fleet import run as fleet_run
-from cangauge.fleet.dataset import Dataset
+from cangauge.fleet.dataset import Dataset, by_kind
 from cangauge.fleet.fit import fit_fleet
 from cangauge.fleet.jobs import Job
 from cangauge.fleet.passes import ErrorsJob
@@ -65,6 +65,18 @@ def test_a_log_set_aside_is_tried_again_with_its_soc(fleet: Fleet) -> None:
     again = fleet.run(job, *with_soc(fleet.logs(), 90.0))
     assert (again.done, again.skipped, again.bad) == (1, 2, 0)
     assert fleet.states(job) == ["a90", "b", "c"]
+
+
+def test_reasons_that_differ_in_a_value_count_together(fleet: Fleet) -> None:
+    job = NotingJob()
+    job.needs_soc.update("ab")
+    job.fails.add("c")
+    assert fleet.run(job).reasons == {
+        "SoC at start unknown (got 'a')": 2,
+        "OSError: connection reset": 1,
+    }
+    counts = [(row["log"][-5:], number) for row, number in by_kind(fleet.data(job).rows(bad=True))]
+    assert counts == [("a.txt", 2), ("c.txt", 1)]
 
 
 def test_a_corrected_soc_is_computed_again(fleet: Fleet) -> None:

@@ -11,7 +11,8 @@ row stays beside a later failure that does not lie in its log, such as of the st
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -39,7 +40,7 @@ KEYS: Final = {
 }
 """Columns of every row, beside the partition's `vehicle`."""
 
-BAD: Final = {"reason": _TEXT, "is_final": pa.bool_()}
+BAD: Final = {"reason": _TEXT, "kind": _TEXT, "is_final": pa.bool_()}
 """Further columns of a log set aside; one that is not final is tried again by the next run."""
 
 BATCH_ROWS: Final = 4096
@@ -237,8 +238,32 @@ def _vehicle_of(path: str) -> str:
 
 
 def reason_of(row: Row) -> str:
-    """Return why a log was set aside, without its name: the same for all logs of a kind."""
+    """Return why a log was set aside, without its name."""
     return str(row["reason"]).removeprefix(f"{row['log']}: ")
+
+
+def by_kind(rows: Iterable[Row]) -> list[tuple[Row, int]]:
+    """Return one log, and the number, of those set aside for each kind of reason.
+
+    Reasons of a kind name the same problem of the same field; values and files in them differ.
+
+    Parameters
+    ----------
+    rows : iterable of mapping
+        Each with `log`, `reason`, `kind` (unknown in earlier versions) and maybe `table`.
+
+    Returns
+    -------
+    list of (row, number)
+        The most frequent first.
+    """
+    first: dict[tuple[str, str], Row] = {}
+    counts: Counter[tuple[str, str]] = Counter()
+    for row in rows:
+        kind = row.get("table", ""), row.get("kind") or reason_of(row)
+        first.setdefault(kind, row)
+        counts[kind] += 1
+    return [(first[kind], number) for kind, number in counts.most_common()]
 
 
 def keys_of(log: FleetLog, run: str, sha256: str, seconds: float) -> dict[str, Any]:

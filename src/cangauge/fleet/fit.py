@@ -15,7 +15,7 @@ import numpy as np
 
 from cangauge._formatting import counted
 from cangauge.errors import InputError
-from cangauge.fleet.dataset import Dataset
+from cangauge.fleet.dataset import Dataset, by_kind
 from cangauge.fleet.outliers import ErrorsByLog
 from cangauge.fleet.passes import (
     ErrorsJob,
@@ -72,9 +72,9 @@ class FleetFit:
         Of both passes.
     by_log : ErrorsByLog
     left_out : list of dict
-        Logs that could be read but are not of the fit, each with `log` and `reason`.
+        Logs that could be read but are not of the fit, each with `log`, `reason` and its `kind`.
     bad : list of dict
-        Logs set aside, each with `table`, `log` and `reason`.
+        Logs set aside, each with `table`, `log`, `reason` and its `kind`.
     """
 
     model: Model
@@ -84,8 +84,8 @@ class FleetFit:
     slope_expected_ohm: float
     summaries: tuple[Summary, ...]
     by_log: ErrorsByLog
-    left_out: list[dict[str, str]]
-    bad: list[dict[str, str]]
+    left_out: list[dict[str, Any]]
+    bad: list[dict[str, Any]]
 
     @property
     def logs_used(self) -> int:
@@ -202,10 +202,10 @@ def _is_of(row: Mapping[str, Any], used: _Used) -> bool:
     return found is not None and found[0].vehicle == row["vehicle"]
 
 
-def _bad(logs: Sequence[FleetLog], dataset: Dataset, run: str) -> list[dict[str, str]]:
+def _bad(logs: Sequence[FleetLog], dataset: Dataset, run: str) -> list[dict[str, Any]]:
     among = {(log.url, log.vehicle) for log in logs}
     return [
-        {"table": dataset.kind, "log": row["log"], "reason": row["reason"]}
+        {"table": dataset.kind, **{name: row.get(name) for name in ("log", "reason", "kind")}}
         for row in dataset.rows(run, bad=True)
         if (row["log"], row["vehicle"]) in among
     ]
@@ -213,7 +213,7 @@ def _bad(logs: Sequence[FleetLog], dataset: Dataset, run: str) -> list[dict[str,
 
 def _usable(
     logs: Sequence[FleetLog], dataset: Dataset, run: str
-) -> tuple[_Used, list[dict[str, str]]]:
+) -> tuple[_Used, list[dict[str, Any]]]:
     """Return the logs with information, by URL in their order, each with a fold; and the others.
 
     The others have temperatures measured elsewhere, or the same rows as one before.
@@ -223,14 +223,14 @@ def _usable(
     used: _Used = {log.url: (log, known[log.url]) for log in logs if log.url in known}
     left_out = [*_measured_elsewhere(used), *_twins(used)]
     if len(used) < LOGS_AT_LEAST:
-        reasons = Counter(each["reason"] for each in left_out)
+        most = [f"{n} left out: {row['reason']}" for row, n in by_kind(left_out)[:1]]
         raise InputError(
             f"only {counted(len(used), 'log')} can be used, {LOGS_AT_LEAST} are needed",
             source=dataset.out,
             cure="; ".join(
                 [
                     f"see the reasons in {dataset.tables[1]}; one or two logs: `cangauge fit`",
-                    *(f"{number} left out: {text}" for text, number in reasons.most_common(1)),
+                    *most,
                 ]
             ),
         )
@@ -240,7 +240,7 @@ def _usable(
     return used, left_out
 
 
-def _measured_elsewhere(used: _Used) -> list[dict[str, str]]:
+def _measured_elsewhere(used: _Used) -> list[dict[str, Any]]:
     """Take the logs out whose temperature source is not that of the most, and return them."""
     # The same rows count once.
     distinct = dict.fromkeys(
@@ -259,12 +259,13 @@ def _measured_elsewhere(used: _Used) -> list[dict[str, str]]:
             "log": url,
             "reason": f"its temperature source is {source}, that of {most_of_all} {most};"
             " --temperature-source states it where a log does not",
+            "kind": f"its temperature source is {source}",
         }
         for url, source in others.items()
     ]
 
 
-def _twins(used: _Used) -> list[dict[str, str]]:
+def _twins(used: _Used) -> list[dict[str, Any]]:
     """Take the logs out that have the same rows as one before, and return them."""
     firsts: dict[str, str] = {}
     others = {
@@ -274,7 +275,10 @@ def _twins(used: _Used) -> list[dict[str, str]]:
     }
     for url in others:
         del used[url]
-    return [{"log": url, "reason": f"same rows as {first}"} for url, first in others.items()]
+    return [
+        {"log": url, "reason": f"same rows as {first}", "kind": "same rows as another"}
+        for url, first in others.items()
+    ]
 
 
 def _pooled_by_fold(used: _Used, dataset: Dataset, run: str) -> list[LogInformation]:

@@ -175,7 +175,7 @@ class GapJob(Job):
         unread: list[str] = []
         logs = list(self._read(vehicle.logs, unread))
         if not logs:
-            raise InputError(f"none of its logs can be read: {unread[0]}")
+            raise InputError("none of its logs can be read", cure=f"the first: {unread[0]}")
         of = vehicle.references or self.common
         references: list[Log] | LearnedReferences
         if not vehicle.references and self.learned is not None and self.learned.covers(logs):

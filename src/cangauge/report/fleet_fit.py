@@ -48,10 +48,11 @@ def fleet_fit_report(result: FleetFit) -> str:
 def fleet_fit_page(result: FleetFit) -> Page:
     """Return the report's content (see `fleet_fit_report`)."""
     model = result.model
-    aside = [
-        *bad_table(result.bad),
-        *bad_table([{"table": "left out", **each} for each in result.left_out]),
+    unused = [
+        *(each | {"table": "set aside"} for each in result.bad),
+        *(each | {"table": "left out"} for each in result.left_out),
     ]
+    aside = bad_table(unused, "status")
     sections = [
         Section("Logs that do not fit the others", _misfits(result)),
         Section("Pseudo-OCV", [_curves(result)]),
