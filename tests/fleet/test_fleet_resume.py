@@ -20,7 +20,7 @@ from cangauge.fleet.run import Summary, run_id, run_job
 from cangauge.fleet.sources import FleetLog, ReadOptions, find_logs
 from cangauge.inference.rows import FitOptions
 from cangauge.validation.cases import Scenario
-from fleet_here import ChainedJob, Here, NotingJob
+from fleet_here import ChainedJob, Done, Here, NotingJob
 
 
 class Fleet:
@@ -143,6 +143,19 @@ def test_a_job_that_cannot_be_prepared_writes_nothing(
     assert caught.value.exit_code == getattr(error, "exit_code", 1)
     assert sorted(fleet.root.rglob("*.parquet")) == before
     assert fleet.run(NotingJob()).skipped == 3
+
+
+def test_a_result_counts_whose_worker_is_lost_after_it(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finished = Here.__next__
+
+    def lost(client: Here) -> tuple[Done, Any]:
+        done, result = finished(client)
+        return replace(done, status="lost"), result
+
+    monkeypatch.setattr(Here, "__next__", lost)
+    assert fleet.run(NotingJob()).done == 3
 
 
 def test_rows_are_written_while_a_task_takes_long(

@@ -315,10 +315,10 @@ class _Run:
 
     def _take(self, future: Any, result: Any, done: Any, job: Any) -> None:
         lane = self._in_flight.pop(future.key)
-        if future.status in {"cancelled", "lost"}:
-            raise CangaugeError(LOST)
-        if isinstance(result, Outcome):
+        if isinstance(result, Outcome):  # also where its worker is lost after it was fetched
             outcome = result
+        elif future.status in {"cancelled", "lost"}:
+            raise CangaugeError(LOST)
         elif job.status == "error":  # no log has a result
             raise _failure_of(job.exception())
         else:  # distributed gives type, error and traceback of a task that could not run
