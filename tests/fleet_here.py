@@ -23,6 +23,11 @@ class Done:
     result: Any
     status: str = "finished"
 
+    def exception(self) -> Exception:
+        error = self.result[1]
+        assert isinstance(error, Exception)
+        return error
+
 
 class Here:
     """Client, and iterator of the finished tasks."""
@@ -38,8 +43,14 @@ class Here:
 
     def submit(self, work: Callable[..., Any], *given: Any, key: str, pure: bool = True) -> Done:
         del pure
+        for each in given:
+            if isinstance(each, Done) and each.status == "error":
+                return Done(key, each.result, "error")
         plain = [each.result if isinstance(each, Done) else each for each in given]
-        return Done(key, work(*plain))
+        try:
+            return Done(key, work(*plain))
+        except Exception as error:  # noqa: BLE001 - kept in the future, as by distributed
+            return Done(key, (type(error), error, None), "error")
 
     def nthreads(self) -> dict[str, int]:
         return {"here": 1}
@@ -78,7 +89,7 @@ class NotingJob(Job):
         if path.stem in self.fails:
             raise OSError("connection reset")
         if path.stem in self.needs_soc and log.initial_soc_pct is None:
-            raise InputError("SoC at start unknown")
+            raise InputError("SoC at start unknown", value=path.stem)
         soc = "" if log.initial_soc_pct is None else f"{log.initial_soc_pct:.0f}"
         return {"state": f"{state or ''}{path.stem}{soc}"}
 

@@ -170,6 +170,29 @@ def test_logs_of_another_temperature_source_do_not_stop_the_fit(
     assert [each["log"][-9:] for each in found["left_out"]] == ["2.parquet", "3.parquet"]
 
 
+def test_a_log_of_another_source_leaves_its_twin_in_the_fit(logs: list[FleetLog], fit: Fit) -> None:
+    twin = copied(logs[3], fit.folder / "car0" / "a-twin.parquet")
+    write_log(replace(read_log(twin), temperature_source="coolant"), twin)
+    found = json.loads(fit("--json").out)
+    assert found["logs"] == len(logs)
+    assert [each["log"] for each in found["left_out"]] == [str(twin)]
+
+
+def test_a_log_set_aside_as_another_vehicle_is_no_longer_listed(
+    logs: list[FleetLog], fit: Fit
+) -> None:
+    recorded, changed = read_log(logs[4].url), fit.folder / "car1" / "changed.parquet"
+    write_log(replace(recorded, soc_pct=None), changed)
+    first = json.loads(fit("--json").out)
+    assert [(each["log"], each["table"]) for each in first["bad"]] == [
+        (str(changed), "information")
+    ]
+    assert json.loads(fit("--json").out)["bad"] == first["bad"]
+    write_log(replace(recorded, voltage_v=recorded.voltage_v + 0.01), changed)
+    again = json.loads(fit("--vehicle-pattern", "/(logs)/", "--json").out)
+    assert (again["logs"], again["bad"]) == (len(logs) + 1, [])
+
+
 def test_an_output_never_replaces_a_log(
     logs: list[FleetLog], fit: Fit, type_json: Path, tmp_path: Path
 ) -> None:

@@ -66,11 +66,26 @@ def test_a_log_is_either_done_or_set_aside(out: str) -> None:
     data.add([keyed(LOG, value=1.0)])
     data.settle()
     assert not [*data.rows(bad=True)]
-    data.add([keyed(LOG, reason="lost", is_final=False)], bad=True)
+    data.add([keyed(LOG, reason="cut off", is_final=True)], bad=True)
     data.settle()
     assert not [*data.rows()]
-    assert data.known("r") == {}
     assert data.known("another") == {}
+
+
+def test_a_failure_beside_the_log_keeps_its_row(out: str) -> None:
+    data = Dataset(out, "x", {"value": REAL})
+    data.add([keyed(LOG, value=1.0)])
+    for _ in range(2):
+        data.add([keyed(LOG, run="other", reason="lost", is_final=False)], bad=True)
+        data.settle()
+        assert [row["value"] for row in data.rows()] == [1.0]
+        assert [row["reason"] for row in data.rows(bad=True)] == ["lost"]
+        assert set(data.known("r")) == {"a.csv"}
+        assert data.known("other") == {}
+    data.add([keyed(LOG, run="other", value=2.0)])
+    data.settle()
+    assert [row["value"] for row in data.rows()] == [2.0]
+    assert not [*data.rows(bad=True)]
 
 
 def test_what_a_killed_run_was_writing_is_ignored(tmp_path: Path) -> None:
@@ -193,7 +208,7 @@ def test_a_vehicle_without_own_references_has_the_common_ones(
     dead = tmp_path / "dead.parquet"
     still = read_log(logs[6].url)
     write_log(replace(still, current_a=np.zeros(len(still))), dead)
-    healthy = {"car2": (logs[5],), "car3": (logs[7], FleetLog(str(dead), "car3", "s"))}
+    healthy = {"car0": (FleetLog(str(dead), "car0", "s"),), "car2": (logs[5],), "car3": (logs[7],)}
     job = GapJob(ReadOptions(), model, references=3).with_common(suspect, healthy)
     (vehicle,) = job.vehicles(suspect, healthy)
     assert len(job.common) == 3

@@ -6,13 +6,13 @@ import os
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import pytest
 
-from cangauge.errors import InputError
+from cangauge.errors import CangaugeError, InputError
 from cangauge.fleet import run as fleet_run
-from cangauge.fleet.dataset import Dataset
+from cangauge.fleet.dataset import Dataset, by_kind
 from cangauge.fleet.fit import fit_fleet
 from cangauge.fleet.jobs import Job
 from cangauge.fleet.passes import ErrorsJob
@@ -20,7 +20,7 @@ from cangauge.fleet.run import Summary, run_id, run_job
 from cangauge.fleet.sources import FleetLog, ReadOptions, find_logs
 from cangauge.inference.rows import FitOptions
 from cangauge.validation.cases import Scenario
-from fleet_here import ChainedJob, Here, NotingJob
+from fleet_here import ChainedJob, Done, Here, NotingJob
 
 
 class Fleet:
@@ -67,6 +67,18 @@ def test_a_log_set_aside_is_tried_again_with_its_soc(fleet: Fleet) -> None:
     assert fleet.states(job) == ["a90", "b", "c"]
 
 
+def test_reasons_that_differ_in_a_value_count_together(fleet: Fleet) -> None:
+    job = NotingJob()
+    job.needs_soc.update("ab")
+    job.fails.add("c")
+    assert fleet.run(job).reasons == {
+        "SoC at start unknown (got 'a')": 2,
+        "OSError: connection reset": 1,
+    }
+    counts = [(row["log"][-5:], number) for row, number in by_kind(fleet.data(job).rows(bad=True))]
+    assert counts == [("a.txt", 2), ("c.txt", 1)]
+
+
 def test_a_corrected_soc_is_computed_again(fleet: Fleet) -> None:
     job = NotingJob()
     fleet.run(job, *with_soc(fleet.logs(), 9.0))
@@ -105,6 +117,45 @@ def test_what_follows_a_failed_log_is_computed_again(fleet: Fleet) -> None:
     assert fleet.run(job).done == 2
     assert fleet.states(job) == ["a", "ab", "abc"]
     assert fleet.run(job).skipped == 3
+
+
+class Unprepared(NotingJob):
+    """The same table with other options, under which nothing can be computed."""
+
+    error: ClassVar[Exception] = InputError("no reference can be used", field="--reference")
+
+    def identity(self) -> dict[str, Any]:
+        return {"references": "other"}
+
+    def prepared(self) -> Self:
+        raise self.error
+
+
+@pytest.mark.parametrize("error", [Unprepared.error, MemoryError("full")])
+def test_a_job_that_cannot_be_prepared_writes_nothing(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    fleet.run(NotingJob())
+    before = sorted(fleet.root.rglob("*.parquet"))
+    monkeypatch.setattr(Unprepared, "error", error)
+    with pytest.raises(CangaugeError, match=r"no reference can|MemoryError: full") as caught:
+        fleet.run(Unprepared())
+    assert caught.value.exit_code == getattr(error, "exit_code", 1)
+    assert sorted(fleet.root.rglob("*.parquet")) == before
+    assert fleet.run(NotingJob()).skipped == 3
+
+
+def test_a_result_counts_whose_worker_is_lost_after_it(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finished = Here.__next__
+
+    def lost(client: Here) -> tuple[Done, Any]:
+        done, result = finished(client)
+        return replace(done, status="lost"), result
+
+    monkeypatch.setattr(Here, "__next__", lost)
+    assert fleet.run(NotingJob()).done == 3
 
 
 def test_rows_are_written_while_a_task_takes_long(

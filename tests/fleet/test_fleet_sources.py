@@ -55,6 +55,54 @@ def test_a_manifest_is_read_as_a_german_spreadsheet_writes_it(tmp_path: Path, co
     assert (Path(log.url).name, log.vehicle, log.initial_soc_pct) == ("a.csv", "Käfer", 90.5)
 
 
+@pytest.mark.parametrize("content", [b"log of a17\rt;I;U\r0;1;380\r", b"\x1f\x8b\x08\r\x00,\r"])
+def test_a_table_of_one_line_is_a_log(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a.csv").write_bytes(content)
+    (log,) = find_logs([str(tmp_path / "a.csv")])
+    assert Path(log.url).name == "a.csv"
+
+
+def test_a_manifest_may_end_its_lines_by_cr_only(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(HEAD)
+    (tmp_path / "manifest.csv").write_bytes(b"log,vehicle\ra.csv,X\r")
+    (log,) = find_logs([str(tmp_path / "manifest.csv")])
+    assert (Path(log.url).name, log.vehicle) == ("a.csv", "X")
+
+
+def test_rows_without_a_cell_are_left_out_of_a_manifest(tmp_path: Path) -> None:
+    manifest = tmp_path / "manifest.csv"
+    manifest.write_text('log;vehicle;start\n;;\n\na.csv;"X\nY";\n ; ;\nb.csv;Z;soon\n')
+    with pytest.raises(InputError, match=r"line 7.*soon"):
+        find_logs([str(manifest)])
+    manifest.write_text(manifest.read_text().replace("soon", "") + ";;\n")
+    assert [log.vehicle for log in find_logs([str(manifest)])] == ["X\nY", "Z"]
+
+
+def test_a_manifest_and_a_path_name_the_same_log(tmp_path: Path) -> None:
+    for folder in ("A", "m"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "A" / "x.csv").write_text(HEAD)
+    (tmp_path / "m" / "manifest.csv").write_text("log\n../A/x.csv\n")
+    manifest = str(tmp_path / "m" / "manifest.csv")
+    urls = {
+        find_logs([given])[0].url
+        for given in (manifest, f"{tmp_path}/A/x.csv", f"{tmp_path}/m/../A/*.csv")
+    }
+    assert urls == {f"{tmp_path}/A/x.csv"}
+    assert find_logs([manifest])[0].stamp != ABSENT
+    with pytest.raises(InputError, match="named twice"):
+        find_logs([manifest, f"{tmp_path}/A/x.csv"])
+
+
+def test_a_file_that_is_named_like_a_glob_is_found(tmp_path: Path) -> None:
+    for name in ("t[1].csv", "t1.csv"):
+        (tmp_path / name).write_text(HEAD)
+    (log,) = find_logs([f"{tmp_path}/t[1].csv"])
+    assert Path(log.url).name == "t[1].csv"
+    assert len(find_logs([f"{tmp_path}/t*.csv"])) == 2
+    assert Path(find_logs([f"{tmp_path}/t[12].csv"])[0].url).name == "t1.csv"
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -65,6 +113,7 @@ def test_a_manifest_is_read_as_a_german_spreadsheet_writes_it(tmp_path: Path, co
         ("log,healthy\na.csv,perhaps\n", "neither yes nor no"),
         ("log,vehicle\n,X\n", "names no log"),
         ("log,vehicle\na.csv,X\na.csv,X\n", "named twice"),
+        (f'log,vehicle\na.csv,"{"X" * 200_000}\n', "not a table: field larger"),
     ],
 )
 def test_a_wrong_manifest_is_refused(tmp_path: Path, text: str, words: str) -> None:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, cast
 
 import typer
 
-from cangauge._formatting import number, significant
+from cangauge._formatting import counted, number, significant
 from cangauge._io import file_sha256, write_texts_atomic
 from cangauge.cli.fit import parse_delays
 from cangauge.cli.options import (
@@ -218,7 +217,7 @@ def _without(logs: Sequence[FleetLog], left_out: Sequence[FleetLog]) -> list[Fle
 
 
 def _show_fit(result: FleetFit) -> None:
-    from cangauge.fleet.dataset import reason_of
+    from cangauge.fleet.dataset import by_kind, reason_of
     from cangauge.fleet.sources import short_names
 
     figures, by_log = result.to_dict(), result.by_log
@@ -236,8 +235,8 @@ def _show_fit(result: FleetFit) -> None:
             ["logs that do not fit", by_log.count_text, ""],
         ],
     )
-    _note_reasons("set aside", Counter(reason_of(each) for each in result.bad))
-    _note_reasons("left out", Counter(each["reason"] for each in result.left_out))
+    for what, rows in (("set aside", result.bad), ("left out", result.left_out)):
+        _note_reasons(what, [(reason_of(row), count) for row, count in by_kind(rows)])
     if misfits := by_log.misfits[:SHOWN_LOGS]:
         names = short_names([by_log.logs[k] for k in misfits])
         print_table(
@@ -246,8 +245,8 @@ def _show_fit(result: FleetFit) -> None:
             [
                 [
                     name,
-                    number(float(by_log.mean_v[k]), 2),
-                    number(float(by_log.rmse_v[k]), 2),
+                    significant(float(by_log.mean_v[k]), 3),
+                    significant(float(by_log.rmse_v[k]), 3),
                     number(float(by_log.z[k]), 1),
                 ]
                 for name, k in zip(names, misfits, strict=True)
@@ -443,8 +442,8 @@ def _run(
         raise typer.Exit(1)
 
 
-def _note_reasons(what: str, reasons: Mapping[str, int]) -> None:
-    ordered = sorted(reasons.items(), key=lambda item: -item[1])
+def _note_reasons(what: str, reasons: Iterable[tuple[str, int]]) -> None:
+    ordered = sorted(reasons, key=lambda item: -item[1])
     for reason, count in ordered[:SHOWN_REASONS]:
         note(f"{what}: {count} × {reason}")
     if len(ordered) > SHOWN_REASONS:
@@ -460,7 +459,7 @@ def _check_outputs(outputs: Sequence[Path | None], logs: Sequence[FleetLog], *fi
 
 def _show(summary: Summary, found: FleetOverview) -> None:
     typer.echo(f"{summary} ({summary.seconds:.0f} s, {summary.workers} workers)")
-    _note_reasons("set aside", summary.reasons)
+    _note_reasons("set aside", summary.reasons.items())
     if found.elsewhere_text:
         note(f"note: {found.elsewhere_text}")
     if found.alarms:
@@ -470,7 +469,7 @@ def _show(summary: Summary, found: FleetOverview) -> None:
         ]
         print_table("Vehicles with a gap", ["vehicle", "<cause", "probability", "P(none)"], rows)
     elif found.gaps:
-        typer.echo(f"No alarm in {len(found.gaps)} vehicles; {found.nearest_text}")
+        typer.echo(f"No alarm in {counted(len(found.gaps), 'vehicle')}; {found.nearest_text}")
     if found.outlying:
         rows = [[vehicle, quantity, number(z, 1)] for vehicle, quantity, z in found.outlying]
         print_table("Outliers in health", ["vehicle", "<quantity", "robust z"], rows)

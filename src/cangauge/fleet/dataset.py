@@ -4,13 +4,15 @@
     OUT/estimate-bad/vehicle=A17/91ab….parquet    logs set aside, with the reason
 
 Finished rows are added in new files, each written whole or not at all, so that a killed run keeps
-them. At the end of a run the files of each vehicle become one, with the latest row of each log.
+them. At the end of a run the files of each vehicle become one, with the latest row of each log. A
+row stays beside a later failure that does not lie in its log, such as of the storage.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -38,7 +40,7 @@ KEYS: Final = {
 }
 """Columns of every row, beside the partition's `vehicle`."""
 
-BAD: Final = {"reason": _TEXT, "is_final": pa.bool_()}
+BAD: Final = {"reason": _TEXT, "kind": _TEXT, "is_final": pa.bool_()}
 """Further columns of a log set aside; one that is not final is tried again by the next run."""
 
 BATCH_ROWS: Final = 4096
@@ -148,16 +150,21 @@ class Dataset:
         files: Mapping[str, Sequence[str]],
         stamps: Mapping[tuple[str, str], str],
     ) -> None:
-        latest: dict[str, tuple[str, dict[str, Any]]] = {}
-        for table in self.tables:
+        latest: dict[str, dict[str, dict[str, Any]]] = {table: {} for table in self.tables}
+        for table, of_table in latest.items():
             for row in self._rows(table, self._schemas[table].names, None, files[table]):
                 row["stamp"] = stamps.get((row["log"], row["run"]), row["stamp"])
-                before = latest.get(row["log"])
-                if before is None or before[1]["made_at"] <= row["made_at"]:
-                    latest[row["log"]] = (table, row)
-        for table in self.tables:
-            kept = [row for of, row in latest.values() if of == table]
-            written = self._write(table, vehicle, kept) if kept else ""
+                before = of_table.get(row["log"])
+                if before is None or before["made_at"] <= row["made_at"]:
+                    of_table[row["log"]] = row
+        good, bad = latest.values()
+        for log in good.keys() & bad.keys():
+            if bad[log]["made_at"] < good[log]["made_at"]:
+                del bad[log]
+            elif bad[log]["is_final"]:
+                del good[log]
+        for table, of_table in latest.items():
+            written = self._write(table, vehicle, [*of_table.values()]) if of_table else ""
             for path in files[table]:
                 if path != written:
                     with suppress(FileNotFoundError):  # another run has settled it
@@ -231,8 +238,32 @@ def _vehicle_of(path: str) -> str:
 
 
 def reason_of(row: Row) -> str:
-    """Return why a log was set aside, without its name: the same for all logs of a kind."""
+    """Return why a log was set aside, without its name."""
     return str(row["reason"]).removeprefix(f"{row['log']}: ")
+
+
+def by_kind(rows: Iterable[Row]) -> list[tuple[Row, int]]:
+    """Return one log, and the number, of those set aside for each kind of reason.
+
+    Reasons of a kind name the same problem of the same field; values and files in them differ.
+
+    Parameters
+    ----------
+    rows : iterable of mapping
+        Each with `log`, `reason`, `kind` (unknown in earlier versions) and maybe `table`.
+
+    Returns
+    -------
+    list of (row, number)
+        The most frequent first.
+    """
+    first: dict[tuple[str, str], Row] = {}
+    counts: Counter[tuple[str, str]] = Counter()
+    for row in rows:
+        kind = row.get("table", ""), row.get("kind") or reason_of(row)
+        first.setdefault(kind, row)
+        counts[kind] += 1
+    return [(first[kind], number) for kind, number in counts.most_common()]
 
 
 def keys_of(log: FleetLog, run: str, sha256: str, seconds: float) -> dict[str, Any]:

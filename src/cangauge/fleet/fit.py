@@ -13,8 +13,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from cangauge._formatting import counted
 from cangauge.errors import InputError
-from cangauge.fleet.dataset import Dataset
+from cangauge.fleet.dataset import Dataset, by_kind
 from cangauge.fleet.outliers import ErrorsByLog
 from cangauge.fleet.passes import (
     ErrorsJob,
@@ -71,9 +72,9 @@ class FleetFit:
         Of both passes.
     by_log : ErrorsByLog
     left_out : list of dict
-        Logs that could be read but are not of the fit, each with `log` and `reason`.
+        Logs that could be read but are not of the fit, each with `log`, `reason` and its `kind`.
     bad : list of dict
-        Logs set aside, each with `table`, `log` and `reason`.
+        Logs set aside, each with `table`, `log`, `reason` and its `kind`.
     """
 
     model: Model
@@ -83,8 +84,8 @@ class FleetFit:
     slope_expected_ohm: float
     summaries: tuple[Summary, ...]
     by_log: ErrorsByLog
-    left_out: list[dict[str, str]]
-    bad: list[dict[str, str]]
+    left_out: list[dict[str, Any]]
+    bad: list[dict[str, Any]]
 
     @property
     def logs_used(self) -> int:
@@ -116,6 +117,7 @@ class FleetFit:
             "passes": [summary.to_dict() for summary in self.summaries],
             "logs": self.logs_used,
             "left_out": self.left_out,
+            "bad": self.bad,
         }
 
 
@@ -159,7 +161,8 @@ def fit_fleet(
     errors = _summed(errors_set.rows(run_id(second)), used, solution)
     if errors is None or errors.sums["rows"] < whole.rows:
         raise InputError(
-            f"{later.bad + later.bad_before} logs of the first pass failed in the second",
+            f"{counted(later.bad + later.bad_before, 'log')} of the first pass failed in the"
+            " second",
             source=out,
             cure=f"see {second.kind}-bad in it, and run the same command again",
         )
@@ -199,46 +202,35 @@ def _is_of(row: Mapping[str, Any], used: _Used) -> bool:
     return found is not None and found[0].vehicle == row["vehicle"]
 
 
-def _bad(logs: Sequence[FleetLog], dataset: Dataset, run: str) -> list[dict[str, str]]:
-    among = {log.url for log in logs}
+def _bad(logs: Sequence[FleetLog], dataset: Dataset, run: str) -> list[dict[str, Any]]:
+    among = {(log.url, log.vehicle) for log in logs}
     return [
-        {"table": dataset.kind, "log": row["log"], "reason": row["reason"]}
+        {"table": dataset.kind, **{name: row.get(name) for name in ("log", "reason", "kind")}}
         for row in dataset.rows(run, bad=True)
-        if row["log"] in among
+        if (row["log"], row["vehicle"]) in among
     ]
 
 
 def _usable(
     logs: Sequence[FleetLog], dataset: Dataset, run: str
-) -> tuple[_Used, list[dict[str, str]]]:
+) -> tuple[_Used, list[dict[str, Any]]]:
     """Return the logs with information, by URL in their order, each with a fold; and the others.
 
-    The others have the same rows as one before, or temperatures measured elsewhere.
+    The others have temperatures measured elsewhere, or the same rows as one before.
     """
     wanted = ("name", "rows", "data_sha256", "signals_sha256", "temperature_source")
     known = {url: row for url, row in dataset.known(run, *wanted).items() if "data_sha256" in row}
-    used: _Used = {}
-    left_out: list[dict[str, str]] = []
-    by_signals: dict[str, str] = {}
-    for log in logs:
-        if log.url not in known:
-            continue
-        row = known[log.url]
-        twin = by_signals.setdefault(row["signals_sha256"], log.url)
-        if twin != log.url:
-            left_out.append({"log": log.url, "reason": f"same rows as {twin}"})
-            continue
-        used[log.url] = (log, row)
-    left_out += _measured_elsewhere(used)
+    used: _Used = {log.url: (log, known[log.url]) for log in logs if log.url in known}
+    left_out = [*_measured_elsewhere(used), *_twins(used)]
     if len(used) < LOGS_AT_LEAST:
-        reasons = Counter(each["reason"] for each in left_out)
+        most = [f"{n} left out: {row['reason']}" for row, n in by_kind(left_out)[:1]]
         raise InputError(
-            f"only {len(used)} logs can be used, {LOGS_AT_LEAST} are needed",
+            f"only {counted(len(used), 'log')} can be used, {LOGS_AT_LEAST} are needed",
             source=dataset.out,
             cure="; ".join(
                 [
                     f"see the reasons in {dataset.tables[1]}; one or two logs: `cangauge fit`",
-                    *(f"{number} left out: {text}" for text, number in reasons.most_common(1)),
+                    *most,
                 ]
             ),
         )
@@ -248,22 +240,44 @@ def _usable(
     return used, left_out
 
 
-def _measured_elsewhere(used: _Used) -> list[dict[str, str]]:
+def _measured_elsewhere(used: _Used) -> list[dict[str, Any]]:
     """Take the logs out whose temperature source is not that of the most, and return them."""
-    counts = Counter(row["temperature_source"] for _, row in used.values())
+    # The same rows count once.
+    distinct = dict.fromkeys(
+        (row["signals_sha256"], row["temperature_source"]) for _, row in used.values()
+    )
+    counts = Counter(source for _, source in distinct)
     # A known place before "unknown" where both are as frequent.
     most = max(counts, key=lambda name: (counts[name], name != "unknown"), default="")
     others = {url: row["temperature_source"] for url, (_, row) in used.items()}
     others = {url: source for url, source in others.items() if source != most}
     for url in others:
         del used[url]
+    most_of_all = counted(counts[most], "other")
     return [
         {
             "log": url,
-            "reason": f"its temperature source is {source}, that of {counts[most]} others {most};"
+            "reason": f"its temperature source is {source}, that of {most_of_all} {most};"
             " --temperature-source states it where a log does not",
+            "kind": f"its temperature source is {source}",
         }
         for url, source in others.items()
+    ]
+
+
+def _twins(used: _Used) -> list[dict[str, Any]]:
+    """Take the logs out that have the same rows as one before, and return them."""
+    firsts: dict[str, str] = {}
+    others = {
+        url: first
+        for url, (_, row) in used.items()
+        if (first := firsts.setdefault(row["signals_sha256"], url)) != url
+    }
+    for url in others:
+        del used[url]
+    return [
+        {"log": url, "reason": f"same rows as {first}", "kind": "same rows as another"}
+        for url, first in others.items()
     ]
 
 

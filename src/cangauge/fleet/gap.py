@@ -175,7 +175,7 @@ class GapJob(Job):
         unread: list[str] = []
         logs = list(self._read(vehicle.logs, unread))
         if not logs:
-            raise InputError(f"none of its logs can be read: {unread[0]}")
+            raise InputError("none of its logs can be read", cure=f"the first: {unread[0]}")
         of = vehicle.references or self.common
         references: list[Log] | LearnedReferences
         if not vehicle.references and self.learned is not None and self.learned.covers(logs):
@@ -185,10 +185,11 @@ class GapJob(Job):
             of = of[:WITH_OWN]
             references = list(self._read(of, unread))
         found = diagnose(logs, self.model, references, alarm_below=self.alarm_below)
+        used = {item.log.source for item in found.problem.references}
         return {
             "logs": [each.url for each in vehicle.logs],
             "references": len(found.problem.references),
-            "reference_vehicles": len({each.vehicle for each in of}),
+            "reference_vehicles": len({each.vehicle for each in of if each.url in used}),
             "unread": unread,
             **_columns_of(found),
         }

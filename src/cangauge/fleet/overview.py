@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from cangauge._formatting import number
+from cangauge._formatting import counted, number
 from cangauge.diagnosis import NONE
 from cangauge.fleet.dataset import Dataset
 from cangauge.fleet.gap import GapJob
@@ -64,7 +64,7 @@ class FleetOverview:
     gaps : dict of str to dict
         Rows of `fleet gap`.
     bad : list of dict
-        Logs set aside, each with `reason`, `log` and `table`.
+        Logs set aside, each with `reason`, its `kind`, `log` and `table`.
     elsewhere : int
         Rows of logs that are not among those asked for.
     """
@@ -104,7 +104,7 @@ class FleetOverview:
             z=outliers(last),
             gaps={row["vehicle"]: row for row in asked.only(tables["gap"].rows())},
             bad=[
-                {"table": kind, "log": row["log"], "reason": row["reason"]}
+                {"table": kind, **{name: row.get(name) for name in ("log", "reason", "kind")}}
                 for kind, table in tables.items()
                 for row in asked.only(table.rows(bad=True))
             ],
@@ -147,8 +147,8 @@ class FleetOverview:
         if not self.elsewhere:
             return ""
         return (
-            f"{self.elsewhere} rows in {self.name} are of logs that are not among LOGS (earlier"
-            " runs, or deleted or renamed since) and are not counted."
+            f"{self.name} holds {counted(self.elsewhere, 'row')} of logs that are not among LOGS"
+            " (earlier runs, or deleted or renamed since); not counted."
         )
 
     @property

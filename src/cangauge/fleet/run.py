@@ -22,7 +22,7 @@ from typing import Any, Final
 from cangauge._io import file_sha256, text_sha256
 from cangauge._version import __version__
 from cangauge.errors import CangaugeError, InputError
-from cangauge.fleet.dataset import Dataset, keys_of, reason_of
+from cangauge.fleet.dataset import BAD, Dataset, keys_of, reason_of
 from cangauge.fleet.jobs import Job
 from cangauge.fleet.sources import FleetLog, local_file
 
@@ -64,6 +64,8 @@ class Outcome:
     """Columns of the job; None for a log set aside, or the same as before."""
     reason: str = ""
     """Why it was set aside; "" if it was not."""
+    kind: str = ""
+    """Field and problem of the reason, without what differs from log to log."""
     is_final: bool = True
     """Whether the reason lies in the log, so that another run would find it again."""
 
@@ -86,7 +88,7 @@ class Summary:
     workers : int
         Largest number of workers at a time.
     reasons : dict
-        Of the logs set aside now, with their number.
+        Of the logs set aside now, with their number: the first one of each kind.
     of : str
         What is counted: logs, or vehicles.
     """
@@ -211,7 +213,7 @@ def run_job(job: Job, logs: Sequence[FleetLog], dataset: Dataset, client: Any) -
     Raises
     ------
     CangaugeError
-        If the scheduler is lost; finished rows are kept.
+        If the scheduler is lost, or the job cannot be prepared; finished rows are kept.
     """
     run = _Run(job, logs, dataset, client)
     try:
@@ -242,6 +244,7 @@ class _Run:
         self._in_flight: dict[str, _Lane] = {}
         self._rows: list[dict[str, Any]] = []
         self._bad: list[dict[str, Any]] = []
+        self._reasons: dict[str, str] = {}
         self._flushed = self._reported = self._asked = self.began
         self._threads = 0
 
@@ -312,14 +315,16 @@ class _Run:
 
     def _take(self, future: Any, result: Any, done: Any, job: Any) -> None:
         lane = self._in_flight.pop(future.key)
-        if future.status in {"cancelled", "lost"}:
-            raise CangaugeError(LOST)
-        if isinstance(result, Outcome):
+        if isinstance(result, Outcome):  # also where its worker is lost after it was fetched
             outcome = result
+        elif future.status in {"cancelled", "lost"}:
+            raise CangaugeError(LOST)
+        elif job.status == "error":  # no log has a result
+            raise _failure_of(job.exception())
         else:  # distributed gives type, error and traceback of a task that could not run
             error = result[1] if isinstance(result, tuple) else future.exception()
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
-            outcome = Outcome(lane.log, reason=reason, is_final=False)
+            outcome = Outcome(lane.log, reason=reason, kind=_kind_of(error), is_final=False)
         self._keep(outcome)
         if outcome.row is not None:
             lane.state = outcome.row.get("state")
@@ -330,9 +335,10 @@ class _Run:
         keys = keys_of(outcome.log, self._id, outcome.sha256, outcome.seconds)
         if outcome.reason:
             self.summary.bad += 1
-            self._bad.append(keys | {"reason": outcome.reason, "is_final": outcome.is_final})
-            kind = reason_of(self._bad[-1])
-            self.summary.reasons[kind] = self.summary.reasons.get(kind, 0) + 1
+            columns = {name: getattr(outcome, name) for name in BAD}
+            self._bad.append(keys | columns)
+            reason = self._reasons.setdefault(outcome.kind, reason_of(self._bad[-1]))
+            self.summary.reasons[reason] = self.summary.reasons.get(reason, 0) + 1
             _LOG.debug("set aside: %s", outcome.reason)
         elif outcome.row is None:
             self.summary.skipped += 1
@@ -379,6 +385,13 @@ def _valid_for(row: dict[str, Any] | None, log: FleetLog) -> str:
     return str(row["sha256"])
 
 
+def _failure_of(error: BaseException) -> CangaugeError:
+    """Return the error that keeps a job from being prepared, to be raised here."""
+    if isinstance(error, CangaugeError):
+        return error
+    return CangaugeError(f"the job cannot be prepared: {type(error).__name__}: {error}")
+
+
 def _prepared(job: Job) -> Job:
     return job.prepared()
 
@@ -396,7 +409,7 @@ def perform(job: Job, log: FleetLog, known_sha256: str, state: str | None) -> Ou
         Of the job after the log before.
     """
     began = time.monotonic()
-    sha256, reason, is_final = "", "", True
+    sha256, reason, kind, is_final = "", "", "", True
     row: dict[str, Any] | None = None
     try:
         with local_file(log.url) if job.reads_log else _nothing() as path:
@@ -406,10 +419,17 @@ def perform(job: Job, log: FleetLog, known_sha256: str, state: str | None) -> Ou
             if job.is_chained or sha256 != known_sha256:
                 row = job.row(log, path, state)
     except InputError as error:
-        reason = str(_about(error, log))
+        reason, kind = str(_about(error, log)), _kind_of(error)
     except Exception as error:  # noqa: BLE001 - one log never stops the others
-        reason, is_final = f"{log.url}: {type(error).__name__}: {error}", False
-    return Outcome(log, sha256, time.monotonic() - began, row, reason, is_final)
+        reason, kind = f"{log.url}: {type(error).__name__}: {error}", _kind_of(error)
+        is_final = False
+    return Outcome(log, sha256, time.monotonic() - began, row, reason, kind, is_final)
+
+
+def _kind_of(error: BaseException) -> str:
+    if isinstance(error, InputError):
+        return str(InputError(error.problem, field=error.field))
+    return f"{type(error).__name__} {getattr(error, 'strerror', None) or ''}".strip()
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import posixpath
 import re
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -100,8 +101,8 @@ def find_logs(given: Sequence[str], *, pattern: str = VEHICLE_PATTERN) -> list[F
     Parameters
     ----------
     given : sequence of str
-        Paths or URLs; `*`, `?` and `**` stand for names and folders, and a table with a column
-        `log` is a manifest. Paths in a manifest are relative to it.
+        Paths or URLs; `*`, `?` and `**` stand for names and folders (unless a file is named so),
+        and a table with a column `log` is a manifest. Paths in a manifest are relative to it.
     pattern : str
         Regular expression of which the first group finds the vehicle in a URL.
 
@@ -174,7 +175,10 @@ def _compiled(pattern: str) -> re.Pattern[str]:
 
 
 def _is_glob(text: str) -> bool:
-    return any(char in text for char in "*?[")
+    if not any(char in text for char in "*?["):
+        return False
+    fs, path = filesystem(text)
+    return not fs.isfile(path)  # a file may be named like a glob
 
 
 def _vehicle_of(url: str, expression: re.Pattern[str]) -> str:
@@ -220,7 +224,7 @@ def _of_file(text: str, expression: re.Pattern[str]) -> list[FleetLog]:
 
 
 def _url(fs: Any, given: str, name: str) -> str:
-    return str(fs.unstrip_protocol(name)) if "://" in given else str(name)
+    return str(fs.unstrip_protocol(name)) if "://" in given else posixpath.normpath(name)
 
 
 def _is_manifest(fs: Any, path: str) -> bool:
@@ -230,33 +234,50 @@ def _is_manifest(fs: Any, path: str) -> bool:
 
 def _headings(text: str) -> tuple[list[str], str]:
     """Return the headings of a table as spreadsheets write it, and its delimiter."""
-    first = text.partition("\n")[0]
+    first = _lines(text).readline().rstrip("\r\n")
     delimiter = delimiter_of(first) or ","
     return split_cells(first, delimiter), delimiter
 
 
-def _of_manifest(fs: Any, path: str, url: str, expression: re.Pattern[str]) -> list[FleetLog]:
-    if fs.size(path) > MAX_MANIFEST_BYTES:
-        raise InputError(f"larger than {MAX_MANIFEST_BYTES >> 20} MiB", source=url)
-    text = as_utf8(fs.cat_file(path)).decode()
+def _lines(text: str) -> io.StringIO:
+    """Return a text whose lines may end by LF, CR LF or CR."""
+    return io.StringIO(text, newline="")
+
+
+def _manifest_rows(text: str, url: str) -> Iterator[tuple[str, dict[str, str]]]:
+    """Yield the rows of a manifest that have a cell, each with its place, by column."""
     headings, delimiter = _headings(text)
-    rows_text = io.StringIO(text.partition("\n")[2], newline="")
-    reader = csv.DictReader(rows_text, headings, restkey="", delimiter=delimiter)
     unknown = sorted(set(headings) - set(MANIFEST_COLUMNS))
     if unknown:
         raise InputError(
             f"not a column of a manifest: {', '.join(unknown)}", source=url, field=unknown[0],
             cure=f"use {', '.join(MANIFEST_COLUMNS)}",
         )  # fmt: skip
+    table = _lines(text)
+    table.readline()
+    reader = csv.reader(table, delimiter=delimiter)
+    try:
+        for cells in reader:
+            row = {name: cell.strip() for name, cell in zip(headings, cells, strict=False)}
+            if any(row.values()):
+                yield f"{url} line {reader.line_num + 1}", row
+    except csv.Error as error:
+        raise InputError(f"not a table: {error}", source=url) from error
+
+
+def _of_manifest(fs: Any, path: str, url: str, expression: re.Pattern[str]) -> list[FleetLog]:
+    if fs.size(path) > MAX_MANIFEST_BYTES:
+        raise InputError(f"larger than {MAX_MANIFEST_BYTES >> 20} MiB", source=url)
+    text = as_utf8(fs.cat_file(path)).decode()
     folder = url.rpartition("/")[0]
     rows = []
-    for number, row in enumerate(reader, start=2):
-        at = f"{url} line {number}"
-        name = (row["log"] or "").strip()
+    for at, row in _manifest_rows(text, url):
+        name = row.get("log", "")
         if not name:
             raise InputError("names no log", source=at, field="log")
         is_whole = "://" in name or name.startswith("/")
-        rows.append(_manifest_log(row, name if is_whole or not folder else f"{folder}/{name}", at))
+        whole = name if is_whole or not folder else f"{folder}/{name}"
+        rows.append(_manifest_log(row, whole if "://" in whole else posixpath.normpath(whole), at))
     stamps = _stamps([log.url for log in rows])
     return [
         replace(
@@ -268,14 +289,13 @@ def _of_manifest(fs: Any, path: str, url: str, expression: re.Pattern[str]) -> l
     ]
 
 
-def _manifest_log(row: Mapping[str, str | None], url: str, at: str) -> FleetLog:
-    def cell(name: str) -> str:
-        return (row.get(name) or "").strip()
-
-    initial, healthy, start = cell("initial_soc_pct"), cell("healthy").lower(), cell("start")
+def _manifest_log(row: Mapping[str, str], url: str, at: str) -> FleetLog:
+    initial, start = row.get("initial_soc_pct", ""), row.get("start", "")
+    healthy = row.get("healthy", "").lower()
     if healthy not in TRUE | FALSE:
         raise InputError("neither yes nor no", source=at, field="healthy", value=healthy)
-    log = FleetLog(url, cell("vehicle"), "", start, _soc_pct(initial, at), healthy in TRUE)
+    vehicle = row.get("vehicle", "")
+    log = FleetLog(url, vehicle, "", start, _soc_pct(initial, at), healthy in TRUE)
     try:
         _ = log.start_s
     except ValueError as error:

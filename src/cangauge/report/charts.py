@@ -31,7 +31,7 @@ from bokeh.models import (
 from bokeh.plotting import figure
 from numpy.typing import NDArray
 
-from cangauge._formatting import number
+from cangauge._formatting import number, significant
 from cangauge._typing import FloatArray
 from cangauge.logs.gaps import usual_gap_s
 from cangauge.model.delay_line import GAP_S
@@ -220,17 +220,26 @@ def histogram(quantity: str, unit: str, parts: Sequence[tuple[str, FloatArray, s
 
 
 def bars(
-    quantity: str, unit: str, entries: Sequence[tuple[str, float, str]], *, decimals: int
+    quantity: str, unit: str, entries: Sequence[tuple[str, float, str]], *, decimals: int | None
 ) -> Plot:
-    """Return horizontal bars (name, value, color), each with its value beside it."""
+    """Return horizontal bars (name, value, color), each with its value beside it.
+
+    With `decimals` None a value has three significant digits.
+    """
     names = [name for name, _, _ in entries]
     values = np.array([value for _, value, _ in entries])
+
+    def shown(value: float) -> str:
+        if decimals is None:
+            return significant(value, 3, unit)
+        return number(value, decimals, unit)
+
     source = ColumnDataSource(
         {
             "name": names,
             "value": values,
             "color": [color for _, _, color in entries],
-            "text": [f" {number(value, decimals, unit)}" for value in values],
+            "text": [f" {shown(value)}" for value in values],
         }
     )
     low, high = min(0.0, float(values.min())), max(0.0, float(values.max()))

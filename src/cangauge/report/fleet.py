@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any, Final
 
 import numpy as np
 
-from cangauge._formatting import number
-from cangauge.fleet.dataset import reason_of
+from cangauge._formatting import counted, number
+from cangauge.fleet.dataset import by_kind, reason_of
 from cangauge.fleet.health import QUANTITIES
 from cangauge.fleet.outliers import OUTLIER_Z
 from cangauge.fleet.overview import FleetOverview
@@ -63,7 +62,7 @@ def fleet_page(found: FleetOverview) -> Page:
         if blocks
     ]
     return Page(
-        title=f"Fleet of {len(found.vehicles)} vehicles",
+        title=f"Fleet of {counted(len(found.vehicles), 'vehicle')}",
         subtitle=found.name,
         lead=_lead(found),
         tiles=_tiles(found),
@@ -78,7 +77,8 @@ def _lead(found: FleetOverview) -> str:
         sentences.append(
             f"{len(causes)} of {len(found.gaps)} vehicles have a gap: {joined(causes, 5)}."
             if causes
-            else f"None of {len(found.gaps)} vehicles has a significant gap; {found.nearest_text}."
+            else f"No significant gap in {counted(len(found.gaps), 'vehicle')};"
+            f" {found.nearest_text}."
         )
     if found.health:
         names = list(dict.fromkeys(vehicle for vehicle, _, _ in found.outlying))
@@ -245,27 +245,23 @@ def _bad(found: FleetOverview) -> list[Block]:
     return [*bad_table(found.bad), *([Paragraph(text)] if text else [])]
 
 
-def bad_table(bad: Sequence[Mapping[str, Any]]) -> list[Block]:
+def bad_table(bad: Sequence[Mapping[str, Any]], heading: str = "command") -> list[Block]:
     """Return a table of the reasons for which logs were set aside, if any were.
 
     Parameters
     ----------
     bad : sequence of mapping
-        Each with `table`, `log` and `reason`.
+        Each with `table`, `log`, `reason` and `kind`.
+    heading : str
+        Of the column with `table`.
     """
     if not bad:
         return []
-    kinds: Counter[tuple[str, str]] = Counter()
-    example: dict[tuple[str, str], str] = {}
-    for row in bad:
-        kind = row["table"], reason_of(row)
-        kinds[kind] += 1
-        example.setdefault(kind, row["log"])
     rows = [
-        [command, str(count), reason, example[command, reason]]
-        for (command, reason), count in kinds.most_common(SHOWN)
+        [row["table"], str(count), reason_of(row), row["log"]]
+        for row, count in by_kind(bad)[:SHOWN]
     ]
-    return [Table(["command", "logs", "reason", "for example"], rows)]
+    return [Table([heading, "logs", "reason", "for example"], rows)]
 
 
 def _shown(total: int) -> str:

@@ -48,10 +48,11 @@ def fleet_fit_report(result: FleetFit) -> str:
 def fleet_fit_page(result: FleetFit) -> Page:
     """Return the report's content (see `fleet_fit_report`)."""
     model = result.model
-    aside = [
-        *bad_table(result.bad),
-        *bad_table([{"table": "left out", **each} for each in result.left_out]),
+    unused = [
+        *(each | {"table": "set aside"} for each in result.bad),
+        *(each | {"table": "left out"} for each in result.left_out),
     ]
+    aside = bad_table(unused, "status")
     sections = [
         Section("Logs that do not fit the others", _misfits(result)),
         Section("Pseudo-OCV", [_curves(result)]),
@@ -101,8 +102,8 @@ def _misfits(result: FleetFit) -> list[Block]:
         [
             by_log.vehicles[k],
             by_log.logs[k],
-            number(float(by_log.mean_v[k]), 2),
-            number(float(by_log.rmse_v[k]), 2),
+            significant(float(by_log.mean_v[k]), 3),
+            significant(float(by_log.rmse_v[k]), 3),
             number(float(z[k]), 1),
         ]
         for k in by_log.misfits[:SHOWN]
@@ -115,7 +116,7 @@ def _misfits(result: FleetFit) -> list[Block]:
             (name, float(by_log.mean_v[k]), ORANGE if k in marked else GREY)
             for name, k in zip(names, largest, strict=True)
         ],
-        decimals=2,
+        decimals=None,
     )  # fmt: skip
     return [
         *([Table(_HEAD, rows)] if rows else []),
