@@ -4,8 +4,9 @@
 
 Prints for `fit` and `estimate`: logs a second by the wall clock, and processor time a log of all
 processes, both without the start of the cluster, and how much faster two workers are. The wall
-clock depends on what else the machine does, processor time hardly does. 600 logs take about four
-minutes on two idle cores; with few logs the start of the cluster, which is subtracted, hides them.
+clock depends on what else the machine does, processor time hardly does. 600 logs take about a
+minute and a half on two idle cores; with few logs the start of the cluster, which is subtracted,
+hides them.
 """
 
 from __future__ import annotations
