@@ -324,7 +324,7 @@ def note_reading(log: Log) -> None:
 
 
 def note_starts(logs: Iterable[Log], initial_soc_pct: float, capacity_ah: float | None) -> None:
-    """Print on stderr what speaks against a given SoC at the first row of logs."""
+    """Print on stderr why a given SoC at the first row of logs is doubtful."""
     from cangauge.model.coulomb_counting import doubt_of_start
 
     for log in logs:

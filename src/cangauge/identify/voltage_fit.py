@@ -64,7 +64,7 @@ def design_matrix(rows: FitRows, epsilon: float, t_ref_c: float) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class LogInformation:
-    """What the fit needs of one or more logs.
+    """Summary of one or more logs for the fit.
 
     Parameters
     ----------

@@ -413,7 +413,7 @@ def describe_error(
 
 
 def fast_scales(rate_hz: float) -> int:
-    """Return the number of scales that say nothing of the curve (`CURVE_FROM_S`)."""
+    """Return the number of scales too short for the curve's error (`CURVE_FROM_S`)."""
     return int(np.sum(2.0 ** np.arange(1, SCALES + 1) < CURVE_FROM_S * rate_hz))
 
 

@@ -159,7 +159,7 @@ def read_plain_numbers(
     -------
     dict of str to array of shape (rows,), or None
         None where the text holds anything else, such as decimal commas or a row that is cut off:
-        `read_columns` reads that, or says what is wrong.
+        `read_columns` reads that, or raises the error.
     """
     names = [f"c{index}" for index in range(_width(content, header, delimiter, skip_lines))]
     include = {name: names[index] for name, index in wanted.items()}

@@ -239,7 +239,7 @@ def _read_only(values: ArrayLike) -> FloatArray:
     if isinstance(values, np.ndarray) and values.dtype == np.float64:
         flags = values.flags
         if flags.owndata and flags.c_contiguous and not flags.writeable:
-            return values  # that of another log: nobody changes it
+            return values  # that of another log; it is never changed
     array = np.array(values, dtype=np.float64, copy=True)
     array.flags.writeable = False
     return array

@@ -118,7 +118,7 @@ def difference_from_reference(log: Log, capacity_ah: float) -> str | None:
 
 
 def doubt_of_start(log: Log, given_pct: float, capacity_ah: float | None = None) -> str | None:
-    """Return what speaks against a given SoC at the first row, in a phrase, or None.
+    """Return why a given SoC at the first row is doubtful, in a phrase, or None.
 
     Parameters
     ----------

@@ -82,7 +82,7 @@ def write_figures(page: Page, folder: Path, kind: str) -> list[Path]:
 
 
 def _has_mark(path: Path, mark: str) -> bool:
-    """Tell whether a file can be read and has this mark."""
+    """Return whether a file can be read and has this mark."""
     try:
         with open_regular(path) as file:
             return mark.encode() in file.read(_HEAD_BYTES)
