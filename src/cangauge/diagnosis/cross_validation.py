@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.bayes_factors import scores
+from cangauge.diagnosis.hypotheses import prior_precision
 from cangauge.diagnosis.linear_gaussian import NormalEquations, Posterior, marginalize
 from cangauge.diagnosis.problem import DiagnosisProblem
 from cangauge.estimation.offline import run_estimator, samples_of
@@ -122,10 +123,8 @@ def _solution(posterior: Posterior, effects: Sequence[str]) -> tuple[FloatArray,
     best = {score.effect_id: score.candidates for score in scores(posterior, leave_out=others)}
     chosen = [k for effect_id in effects for k in best[effect_id]]
     at, bounds = hypotheses.amplitudes_of(chosen), hypotheses.bounds_of(chosen)
-    precision = np.diag((4.0 / (bounds[:, 1] - bounds[:, 0])) ** 2)
-    amplitude = np.linalg.solve(
-        posterior.curvature[np.ix_(at, at)] + precision, posterior.gradient[at]
-    )
+    total = posterior.curvature[np.ix_(at, at)] + prior_precision(bounds)
+    amplitude = np.linalg.solve(total, posterior.gradient[at])
     amplitude = np.clip(amplitude, bounds[:, 0], bounds[:, 1])
     shared = posterior.mean - posterior.sensitivity[:, at] @ amplitude
     amplitudes = np.zeros(int(hypotheses.offsets[-1]))

@@ -30,7 +30,6 @@ from cangauge.diagnosis.references import (
     LEAST_COVERED,
     SOC_STD_PCT,
     LearnedReferences,
-    fit_options,
     learn,
     sampled_for_diagnosis,
     soc_weight,
@@ -170,13 +169,13 @@ def build_problem(
     widened = with_wider_range(given if known is None else known.widened, [*logs, *own])
     library = [effect for effect in LIBRARY.values() if effect.id not in leave_out]
     choices = candidates(library, widened.pack, logs[0].time_s, for_diagnosis=True)
-    options = replace(fit_options(model), initial_soc_pct=initial_soc_pct)
+    options = replace(FitOptions.of_model(model), initial_soc_pct=initial_soc_pct)
     # Steps of the temperature are visible only before averaging.
     for log in logs:
         check_count(log, options)
     of_logs = [sampled_for_diagnosis(log, options, soc_tolerance_pct=np.inf) for log in logs]
     if known is None:
-        of_references = [sampled_for_diagnosis(log, fit_options(model)) for log in own]
+        of_references = [sampled_for_diagnosis(log, FitOptions.of_model(model)) for log in own]
         covered = not of_references or temperatures_covered(of_references, of_logs)
         learned = learn(
             of_references, model, widened, choices, covered=covered, start_std_pct=start_std_pct

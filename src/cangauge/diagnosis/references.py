@@ -184,24 +184,13 @@ def learn_references(references: Sequence[Log], model: Model) -> LearnedReferenc
     started, std_pct, sentences = with_starts(checked, model)
     widened = with_wider_range(given, started)
     learned = learn(
-        [sampled_for_diagnosis(log, fit_options(model)) for log in started],
+        [sampled_for_diagnosis(log, FitOptions.of_model(model)) for log in started],
         model,
         widened,
         candidates(list(LIBRARY.values()), widened.pack, started[0].time_s, for_diagnosis=True),
         start_std_pct=math.hypot(SOC_STD_PCT, std_pct),
     )
     return replace(learned, outliers=(*outliers, *sentences))
-
-
-def fit_options(model: Model) -> FitOptions:
-    """Return the options by which logs become rows as those of the model did."""
-    return FitOptions(
-        capacity_ah=model.capacity_ah,
-        rate_hz=model.rate_hz,
-        delay_s=tuple(model.delays_s),
-        epsilon=model.epsilon,
-        t_ref_c=model.t_ref_c,
-    )
 
 
 def learn(

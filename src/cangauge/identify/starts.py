@@ -334,13 +334,7 @@ def start_by_model(log: Log, model: Model) -> Start:
         Its standard deviation follows from the lasting part of the model's error.
     """
     extended = model.extended_model()
-    options = FitOptions(
-        model.capacity_ah,
-        rate_hz=model.rate_hz,
-        delay_s=tuple(model.delays_s),
-        epsilon=model.epsilon,
-        t_ref_c=model.t_ref_c,
-    )
+    options = FitOptions.of_model(model)
     low, high = _limits(log, model.capacity_ah)
     rows = fit_rows(with_start(log, 0.5 * (low + high)), options)
     some = np.linspace(0, len(rows) - 1, min(len(rows), SEARCH_ROWS)).astype(np.intp)

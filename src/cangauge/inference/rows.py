@@ -29,6 +29,7 @@ from cangauge.logs.resample import dequantize
 from cangauge.model.coulomb_counting import counted_soc_pct, discharged_ah
 from cangauge.model.delay_line import GAP_S, delayed_currents, filled_at
 from cangauge.model.effects.base import Signals
+from cangauge.model.model_file import Model
 
 DELAYS_S = (0.0, 10.0, 30.0, 70.0)
 """The published delays [s]."""
@@ -49,7 +50,8 @@ FOLDS_AT_MOST = 12
 """With more logs, several are held out together."""
 
 BLOCK_S, BLOCK_GUARD_S = 240.0, 60.0
-"""Length of a held-out block, and the guard at either end that is not evaluated [s]."""
+"""Length of a held-out block, and of the guard at its ends: rows that are neither fitted nor
+evaluated, within the block in an identification, beside it in a diagnosis [s]."""
 
 BLOCK_FOLDS = 5
 """One block in this number is held out in turn."""
@@ -62,7 +64,7 @@ Mask = NDArray[np.bool_]
 
 
 def row_blocks(rows: int) -> Iterator[slice]:
-    """Yield the blocks of so many rows, in order."""
+    """Yield consecutive blocks of at most `BLOCK_ROWS` rows."""
     for start in range(0, rows, BLOCK_ROWS):
         yield slice(start, min(start + BLOCK_ROWS, rows))
 
@@ -85,6 +87,17 @@ class FitOptions:
     delay_s: tuple[float, ...] = DELAYS_S
     epsilon: float = 0.05
     t_ref_c: float = 20.0
+
+    @classmethod
+    def of_model(cls, model: Model) -> FitOptions:
+        """Return the options by which the logs of a model became rows."""
+        return cls(
+            capacity_ah=model.capacity_ah,
+            rate_hz=model.rate_hz,
+            delay_s=tuple(model.delays_s),
+            epsilon=model.epsilon,
+            t_ref_c=model.t_ref_c,
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -183,7 +183,7 @@ class RecordControl:
 
 
 def _full(path: Path, written_bytes: int) -> str | None:
-    """Return why a recording begun by a request ends here, None if it goes on."""
+    """Return the reason to end a recording that a viewer began: size or free space; else None."""
     if written_bytes >= REQUESTED_BYTES:
         return f"ended at {REQUESTED_BYTES / 1e9:.1f} GB; record_keep_mb sets another limit"
     try:

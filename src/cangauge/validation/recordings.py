@@ -305,11 +305,7 @@ def model_rmse_v(known: Identification, logs: Sequence[Log]) -> float:
     The SoC is counted from the initial SoC of each log.
     """
     model = known.voltage_model
-    options = FitOptions(
-        capacity_ah=known.model.capacity_ah,
-        rate_hz=known.model.rate_hz,
-        delay_s=tuple(known.model.delays_s),
-    )
+    options = FitOptions.of_model(known.model)
     errors = [
         rows.voltage_v - model.voltage(rows.soc_pct, rows.temperature_c, rows.delayed_current_a)
         for rows in (fit_rows(log, options) for log in logs)
