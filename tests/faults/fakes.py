@@ -17,7 +17,7 @@ import can
 import cantools
 
 from cangauge._resources import shared_file
-from cangauge.estimation.validity import Status
+from cangauge.types import Status
 
 AGE_S = 2.0
 """Age at which input counts as missing [s]; above the time that the harness listens on."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from cangauge.estimation.validity import Reason
+from cangauge.types import Reason
 from faults.criteria import (
     DEGRADED,
     INVALID,

@@ -16,11 +16,11 @@ import pytest
 
 from cangauge.errors import InputError
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.fleet import run as fleet_run
-from cangauge.fleet.dataset import Dataset
-from cangauge.fleet.jobs import EstimateJob
-from cangauge.fleet.run import Summary, connected, perform, run_job
-from cangauge.fleet.sources import FleetLog, ReadOptions, find_logs
+from cangauge.extras.fleet import run as fleet_run
+from cangauge.extras.fleet.dataset import Dataset
+from cangauge.extras.fleet.jobs import EstimateJob
+from cangauge.extras.fleet.run import Summary, connected, perform, run_job
+from cangauge.extras.fleet.sources import FleetLog, ReadOptions, find_logs
 from cangauge.model.model_file import Model, ModelNoise
 from fleet_cluster import Cluster, wait_until
 from live import in_process

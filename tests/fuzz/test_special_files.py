@@ -14,11 +14,11 @@ from cangauge.bus.captures.capture import is_capture, open_capture
 from cangauge.bus.database import load_dbc
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
+from cangauge.extras.validation.twin.drive import read_speed
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.service.addresses import read_token
 from cangauge.service.config import load_config
-from cangauge.validation.twin.drive import read_speed
 
 READERS: dict[str, Callable[[Path], object]] = {
     "log": read_log,

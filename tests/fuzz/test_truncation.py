@@ -17,10 +17,10 @@ from cangauge.bus.database import load_dbc
 from cangauge.bus.recording import capture_to_log
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
+from cangauge.extras.validation.twin.drive import read_speed
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.service.config import load_config
-from cangauge.validation.twin.drive import read_speed
 from fuzzing import corpus
 
 LOGS = ("log.parquet", "checked.parquet", "leaf.zip", "log.csv.gz", "utf16.csv")

@@ -33,7 +33,7 @@ def export_c_command(
     if os.path.isdir(output):  # noqa: PTH112 - pathlib raises for an impossible name
         check_outputs([output / "pack_model.c"], [model])
     # Deferred, so that the help page does not wait for numpy and scipy.
-    from cangauge.export.embedded import export_c
+    from cangauge.extras.embedded.embedded import export_c
     from cangauge.model.model_file import Model
 
     done = export_c(Model.load(model), output, period_s=period)

@@ -43,7 +43,7 @@ def export_ecm_command(
         )  # fmt: skip
     check_outputs([output], [model])
     # Deferred, so that the help page does not wait for numpy and scipy.
-    from cangauge.export.equivalent_circuit import equivalent_circuit
+    from cangauge.extras.embedded.equivalent_circuit import equivalent_circuit
     from cangauge.model.model_file import Model
 
     circuit = equivalent_circuit(Model.load(model))

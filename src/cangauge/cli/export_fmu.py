@@ -47,7 +47,7 @@ def export_fmu_command(
         raise InputError("neither 2 nor 3", field="--fmi", value=fmi)
     check_outputs([output], [model])
     # Deferred, so that the help page does not wait for numpy and scipy.
-    from cangauge.export.fmu import Kind, Version, export_fmu
+    from cangauge.extras.embedded.fmu import Kind, Version, export_fmu
     from cangauge.model.model_file import Model
 
     export_fmu(Model.load(model), output, kind=cast("Kind", kind), version=cast("Version", fmi))

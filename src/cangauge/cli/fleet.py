@@ -29,11 +29,11 @@ from cangauge.cli.shown import ALARM_BELOW, FLEET_LOGS, FLEET_REFERENCES, LOCAL,
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
-    from cangauge.fleet.fit import FleetFit
-    from cangauge.fleet.jobs import Job
-    from cangauge.fleet.overview import FleetOverview
-    from cangauge.fleet.run import Summary
-    from cangauge.fleet.sources import FleetLog, ReadOptions
+    from cangauge.extras.fleet.fit import FleetFit
+    from cangauge.extras.fleet.jobs import Job
+    from cangauge.extras.fleet.overview import FleetOverview
+    from cangauge.extras.fleet.run import Summary
+    from cangauge.extras.fleet.sources import FleetLog, ReadOptions
     from cangauge.logs.draft import Sign
 
 SHOWN_REASONS: Final = 10
@@ -97,13 +97,13 @@ class Cluster:
 
     def find(self, logs: Sequence[str]) -> list[FleetLog]:
         """Return the logs that paths, globs and manifests name (`find_logs`)."""
-        from cangauge.fleet.sources import find_logs
+        from cangauge.extras.fleet.sources import find_logs
 
         return find_logs(logs, pattern=self.pattern)
 
     def run(self, work: Callable[[Any], Any]) -> Any:
         """Return what a function of the Dask client returns; show its progress."""
-        from cangauge.fleet.run import connected
+        from cangauge.extras.fleet.run import connected
 
         workers = None if self.workers is None else float(self.workers)
         within(workers, 1, 1024, option="--workers", unit="")
@@ -113,7 +113,7 @@ class Cluster:
         with shown as status:
             step = None if status is None else status.update
             connection = connected(self.scheduler, self.workers)
-            with progress_shown("cangauge.fleet", step), connection as client:
+            with progress_shown("cangauge.extras.fleet", step), connection as client:
                 return work(client)
 
 
@@ -178,7 +178,7 @@ def fit_fleet_command(
     `cangauge fleet fit 'logs/*/*.parquet' -m type.json -o results --capacity-ah 51.5 --leave-out
     logs/A17/trip4.parquet`
     """
-    from cangauge.fleet.fit import fit_fleet
+    from cangauge.extras.fleet.fit import fit_fleet
     from cangauge.inference.rows import FitOptions
 
     within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
@@ -192,7 +192,7 @@ def fit_fleet_command(
     result = cluster.run(lambda client: fit_fleet(fitted, how, options, out, client, name=name))
     texts = {output: result.model.to_json()}
     if report is not None:
-        from cangauge.report.fleet_fit import fleet_fit_report
+        from cangauge.extras.report.fleet_fit import fleet_fit_report
 
         texts[report] = fleet_fit_report(result)
     write_texts_atomic(texts)
@@ -217,8 +217,8 @@ def _without(logs: Sequence[FleetLog], left_out: Sequence[FleetLog]) -> list[Fle
 
 
 def _show_fit(result: FleetFit) -> None:
-    from cangauge.fleet.dataset import by_kind, reason_of
-    from cangauge.fleet.sources import short_names
+    from cangauge.extras.fleet.dataset import by_kind, reason_of
+    from cangauge.extras.fleet.sources import short_names
 
     figures, by_log = result.to_dict(), result.by_log
     print_table(
@@ -277,7 +277,7 @@ def estimate_fleet_command(
     --scheduler tcp://10.0.0.5:8786`
     """
     from cangauge.estimation.settings import EstimatorSettings
-    from cangauge.fleet.jobs import EstimateJob
+    from cangauge.extras.fleet.jobs import EstimateJob
     from cangauge.model.model_file import Model
 
     found = cluster.find(logs)
@@ -309,7 +309,7 @@ def health_fleet_command(
     `cangauge fleet health manifest.csv -m type.json -o results --report fleet.html`
     """
     from cangauge.estimation.settings import EstimatorSettings
-    from cangauge.fleet.health import HealthJob
+    from cangauge.extras.fleet.health import HealthJob
     from cangauge.model.model_file import Model
 
     found = cluster.find(logs)
@@ -361,7 +361,7 @@ def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
     `cangauge fleet gap 'may/*/*.parquet' --reference 'april/*/*.parquet' -m type.json -o results
     --report fleet.html`
     """
-    from cangauge.fleet.gap import GapJob, suspect_and_healthy
+    from cangauge.extras.fleet.gap import GapJob, suspect_and_healthy
     from cangauge.model.model_file import Model
 
     within(float(references), 1, 1000, option="--references", unit="")
@@ -382,7 +382,7 @@ def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
 
 def _read_options(reading: Reading) -> ReadOptions:
     """Return how logs are read; files of the vehicle are read here, not by the workers."""
-    from cangauge.fleet.sources import ReadOptions
+    from cangauge.extras.fleet.sources import ReadOptions
 
     if reading.sign not in {None, "charge", "discharge"}:
         raise InputError("neither charge nor discharge", field="--sign", value=reading.sign)
@@ -420,15 +420,15 @@ def _run(
 
     Results are those of the logs in `among`; by default of all that the job reads.
     """
-    from cangauge.fleet.dataset import Dataset
-    from cangauge.fleet.overview import FleetOverview
-    from cangauge.fleet.run import run_job
+    from cangauge.extras.fleet.dataset import Dataset
+    from cangauge.extras.fleet.overview import FleetOverview
+    from cangauge.extras.fleet.run import run_job
 
     dataset = Dataset(out, job.kind, job.columns)
     summary = cluster.run(lambda client: run_job(job, logs, dataset, client))
     found = FleetOverview.read(out, logs if among is None else among)
     if report is not None:
-        from cangauge.report.fleet import fleet_report
+        from cangauge.extras.report.fleet import fleet_report
 
         write_texts_atomic({report: fleet_report(found)})
     if json_output:

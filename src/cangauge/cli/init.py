@@ -25,10 +25,10 @@ from cangauge.errors import CangaugeError, InputError
 if TYPE_CHECKING:
     import can
 
-    from cangauge.discovery.by_name import NamedSignal
-    from cangauge.discovery.pairs import Candidate
-    from cangauge.discovery.proposal import Proposal
-    from cangauge.discovery.search import Findings
+    from cangauge.extras.discovery.by_name import NamedSignal
+    from cangauge.extras.discovery.pairs import Candidate
+    from cangauge.extras.discovery.proposal import Proposal
+    from cangauge.extras.discovery.search import Findings
 
 ROLES: Final = {
     "current": "current",
@@ -231,8 +231,8 @@ class _Found:
     ) -> dict[Path, str]:
         """Return the texts by file."""
         from cangauge.bus.vehicle import PRESETS
-        from cangauge.discovery.pairs import Candidate
-        from cangauge.discovery.proposal import config_text, dbc_text, map_text, mapped
+        from cangauge.extras.discovery.pairs import Candidate
+        from cangauge.extras.discovery.proposal import config_text, dbc_text, map_text, mapped
 
         texts = {}
         if self.vehicle is not None:
@@ -259,7 +259,7 @@ class _Found:
         return texts
 
     def _by_name(self, targets: _Targets) -> Proposal:
-        from cangauge.discovery.proposal import Assignment, Proposal
+        from cangauge.extras.discovery.proposal import Assignment, Proposal
 
         roles = {}
         for role, number in self.chosen.items():
@@ -287,7 +287,7 @@ class _Found:
 def _by_physics(
     chosen: Mapping[str, Candidate], findings: Findings, dbc: str, nominal_v: float | None
 ) -> Proposal:
-    from cangauge.discovery.proposal import (
+    from cangauge.extras.discovery.proposal import (
         SIGNALS,
         UNITS,
         Assignment,
@@ -386,7 +386,7 @@ def _listen(address: Any, seconds: float, path: Path) -> Path:
 def _joined(paths: Sequence[Path]) -> Iterator[can.Message]:
     """Yield the frames of captures, one after the other in time."""
     from cangauge.bus.captures.capture import open_capture
-    from cangauge.discovery.search import BETWEEN_S
+    from cangauge.extras.discovery.search import BETWEEN_S
 
     end_s = None
     for path in paths:
@@ -412,8 +412,8 @@ def _find(
     nominal_v: float | None,
 ) -> _Found:
     from cangauge.bus.captures.capture import open_capture
-    from cangauge.discovery.by_name import named_signals
-    from cangauge.discovery.search import search
+    from cangauge.extras.discovery.by_name import named_signals
+    from cangauge.extras.discovery.search import search
 
     if dbc is not None:
         messages = chain.from_iterable(open_capture(path) for path in paths)
@@ -422,7 +422,7 @@ def _find(
         if presets and (known := _known(paths)) is not None:
             return _Found("preset", vehicle=known)
         status = console.status("reading frames")
-        with status, progress_shown("cangauge.discovery", status.update):
+        with status, progress_shown("cangauge.extras.discovery", status.update):
             findings = search(_joined(paths), nominal_v)
             found = _Found("physics", findings=findings, nominal_v=nominal_v)
     _choose(found, picks, targets, quiet=quiet)
@@ -555,8 +555,8 @@ def _show(found: _Found) -> None:
 
 
 def _show_role(found: _Found, role: str) -> None:
-    from cangauge.discovery.pairs import Candidate
-    from cangauge.discovery.proposal import UNITS
+    from cangauge.extras.discovery.pairs import Candidate
+    from cangauge.extras.discovery.proposal import UNITS
 
     rows = []
     for number, each in enumerate(found.candidates(role), 1):

@@ -15,7 +15,7 @@ from cangauge.cli.output import console, emit_json, note, print_table
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
-    from cangauge.validation.twin.simulation import PlantName
+    from cangauge.extras.validation.twin.simulation import PlantName
 
 
 def twin_command(  # noqa: PLR0917 - typer passes options by name
@@ -122,9 +122,9 @@ def twin_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge twin --list`
     """
+    from cangauge.extras.validation.twin.drive import read_speed
+    from cangauge.extras.validation.twin.simulation import simulate
     from cangauge.logs.canonical import write_log
-    from cangauge.validation.twin.drive import read_speed
-    from cangauge.validation.twin.simulation import simulate
 
     if list_effects:
         _list(json_output)
@@ -191,7 +191,7 @@ def _show(result: dict[str, Any]) -> None:
 
 
 def _list(json_output: bool) -> None:
-    from cangauge.validation.twin.faults import fault_kinds
+    from cangauge.extras.validation.twin.faults import fault_kinds
 
     kinds = (*fault_kinds(), *fault_kinds(outside=True))
     if json_output:
