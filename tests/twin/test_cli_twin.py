@@ -11,7 +11,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from cangauge.cli.twin import twin_command
+from cangauge.extras.validation.twin_command import twin_command
 from cangauge.errors import InputError
 from cangauge.extras.validation import simulate
 from cangauge.extras.validation.twin import simulation
