@@ -23,20 +23,18 @@ LOAD = np.array([1.0, -40.0])
 class LinearModel:
     """A voltage model that is linear in the SoC and in two functions."""
 
-    capacity_ah, n_functions = CAPACITY_AH, 2
-    theta_load = np.array([0.3, 0.1])
+    capacity_ah, functions = CAPACITY_AH, SimpleNamespace(number=2)
+    load_coefficients = np.array([0.3, 0.1])
     noise = SimpleNamespace(
-        level_std_v=0.8, slow_std_v=0.6, slow_time_s=300.0, fast_std_v=0.3, soc_std_pct=0.3
-    )
+        level_std_v=0.8, slow_std_v=0.6, slow_time_s=300.0, fast_std_v=0.3, soc_std_pct=0.3,
+        cold=lambda temperature_c: 1.0 if temperature_c > 10.0 else 1.4,
+    )  # fmt: skip
 
     def curve(self, soc_pct: float) -> tuple[float, float]:
         return 300.0 + 0.7 * soc_pct, 0.7
 
     def row(self, soc_pct: float, load: np.ndarray) -> np.ndarray:
         return np.array([0.9, 0.01 * load[1]])
-
-    def cold(self, temperature_c: float) -> float:
-        return 1.0 if temperature_c > 10.0 else 1.4
 
 
 def block(number: int, voltage_v: float, discharged_pct: float, load_a: float = 40.0) -> Block:
@@ -82,7 +80,7 @@ def augmented(
         level = np.hypot(noise.level_std_v, noise.soc_std_pct * slope)
         A[k] = [slope, slope * rate * (k + 1), level, 0.9, 0.01 * load[1], -slope * charge,
                 0.1 * load[1]]  # fmt: skip
-        expected[k] = 300.0 + slope * (start_pct - charge) + load @ LinearModel.theta_load
+        expected[k] = 300.0 + slope * (start_pct - charge) + load @ LinearModel.load_coefficients
     fast = noise.fast_std_v**2 + (noise.soc_std_pct * 0.7) ** 2
     covariance = (A * prior**2) @ A.T + slow + 0.7**2 * drift + fast * np.eye(count)
     gain = (A * prior**2).T @ np.linalg.inv(covariance)
@@ -144,7 +142,7 @@ def test_prediction_between_blocks_equals_the_filters_own() -> None:
 @pytest.mark.parametrize("wrong_pct", [0.0, 3.0, 30.0])
 def test_odds_of_a_given_start_are_those_of_all_voltages_at_once(wrong_pct: float) -> None:
     rows = [
-        (300.0 + 0.7 * (60.0 - 0.2 * k) + LOAD @ LinearModel.theta_load, 0.2, 40.0)
+        (300.0 + 0.7 * (60.0 - 0.2 * k) + LOAD @ LinearModel.load_coefficients, 0.2, 40.0)
         for k in range(1, 5)
     ]
     hypotheses = Hypotheses(LinearModel(), 60.0 + wrong_pct, 20.0)
@@ -181,16 +179,17 @@ class PrototypeModel:
     """The prototype's model with all its coefficients, behind the face of `OnlineModel`."""
 
     def __init__(self, fit: Any, model: Any) -> None:
-        self._fit, self.capacity_ah = fit, model.capacity_ah
+        self.capacity_ah = model.capacity_ah
         small = 1e-14 * np.diag(np.diag(model.covariance))
         root = np.linalg.cholesky(model.covariance * (1.0 + 1e-9) + small)
         self._of_curve, self._of_load = fit.BASIS @ root[: fit.N_KNOTS], root[fit.N_KNOTS :]
-        self.n_functions, self._chemistry = root.shape[1], model.chemistry
-        self.theta_load = model.coefficients[fit.N_KNOTS :]
+        self.functions = SimpleNamespace(number=root.shape[1])
+        self.load_coefficients = model.coefficients[fit.N_KNOTS :]
         self._table = fit.curve_table(model)
         self.noise = SimpleNamespace(
             level_std_v=model.level_v, slow_std_v=model.slow_v, slow_time_s=300.0,
             fast_std_v=model.fast_v, soc_std_pct=model.chemistry.soc_std_pct,
+            cold=lambda celsius: float(fit.noise_factor(celsius, model.chemistry)),
         )  # fmt: skip
 
     def _place(self, soc_pct: float) -> tuple[int, float]:
@@ -206,9 +205,6 @@ class PrototypeModel:
         i, f = self._place(soc_pct)
         curve = self._of_curve[i] * (1.0 - f) + self._of_curve[i + 1] * f
         return np.asarray(curve + load @ self._of_load)
-
-    def cold(self, temperature_c: float) -> float:
-        return float(self._fit.noise_factor(temperature_c, self._chemistry))
 
 
 def drive(fit: Any, seed: int, start_pct: float, capacity_ah: float) -> dict[str, Any]:

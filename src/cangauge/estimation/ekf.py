@@ -35,7 +35,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from cangauge._typing import FloatArray
 from cangauge.estimation.health import SeparateBias
 from cangauge.estimation.state import FilterState
-from cangauge.model.online import OnlineModel
+from cangauge.model.extended import OnlineModel
 
 OFFSET_STD_A: Final = 1.0
 """Prior standard deviation of the current sensor's offset [A]: data sheets of pack sensors state
@@ -101,7 +101,7 @@ class SocFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no t
     """
 
     def __init__(self, model: OnlineModel, soc_pct: float, soc_std_pct: float) -> None:
-        n = FUNCTIONS + model.n_functions
+        n = FUNCTIONS + model.functions.number
         super().__init__(dim_x=n, dim_z=1)
         noise = model.noise
         self.model = model
@@ -179,7 +179,7 @@ class SocFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no t
     def measurement(self, x: FloatArray, block: Block) -> tuple[float, FloatArray, float]:
         """Return the voltage at a state [V], its gradient H and the variance R [V²]."""
         model, noise = self.model, self.model.noise
-        A = model.cold(block.temperature_c)
+        A = model.noise.cold(block.temperature_c)
         volts, slope = model.curve(float(x[SOC]))
         slope = max(slope, LEAST_SLOPE)
         axis_v = noise.soc_std_pct * slope
@@ -187,7 +187,7 @@ class SocFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no t
         H[SOC], H[OFFSET], H[SLOW] = slope, 0.0, A
         H[LEVEL] = math.hypot(A * noise.level_std_v, axis_v)
         H[FUNCTIONS:] = model.row(float(x[SOC]), block.load)
-        volts += block.load @ model.theta_load + H[SLOW:] @ x[SLOW:]
+        volts += block.load @ model.load_coefficients + H[SLOW:] @ x[SLOW:]
         return float(volts), H, (A * noise.fast_std_v) ** 2 + axis_v**2
 
     def soc_after(
@@ -256,7 +256,7 @@ def inverse_std_pct(
     model: OnlineModel, soc_pct: float, temperature_c: float, load: FloatArray
 ) -> float:
     """Return the standard deviation of the SoC by inverse of one row's voltage [%]."""
-    noise, A = model.noise, model.cold(temperature_c)
+    noise, A = model.noise, model.noise.cold(temperature_c)
     slope = max(model.curve(soc_pct)[1], LEAST_SLOPE)
     row = model.row(soc_pct, load)
     variance = row @ row + A**2 * (

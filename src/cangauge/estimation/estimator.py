@@ -32,7 +32,7 @@ from cangauge.estimation.health import health_of
 from cangauge.estimation.power import PowerModel
 from cangauge.estimation.settings import EstimatorSettings, SocReference, detect_references
 from cangauge.estimation.start import UNKNOWN_STD_PCT, WRONG_PRIOR, WRONG_STD_PCT, Hypotheses
-from cangauge.estimation.state import EstimatorMemory, EstimatorState
+from cangauge.estimation.state import DelayLineState, EstimatorMemory, EstimatorState
 from cangauge.model.effects.base import Reading
 from cangauge.model.model_file import Model
 from cangauge.model.voltage_model import VoltageModel, soc_from_ocv
@@ -107,7 +107,7 @@ class Estimator:
     def __init__(self, model: Model, settings: EstimatorSettings | None = None) -> None:
         self.model = model
         self.settings = settings or EstimatorSettings()
-        self._online = model.online(self.settings.capacity_ah)
+        self._online = model.online(self.settings.capacity_ah, self.settings.gap_s)
         self.capacity_ah = self._online.capacity_ah
         self.voltage_model: VoltageModel = self._online.model
         self.hypotheses = Hypotheses(self._online)
@@ -120,7 +120,7 @@ class Estimator:
         )
         self._tested_blocks = max(round(MISMATCH_S / model.noise.block_s), 1)
         self._innovations_at_most = float(chdtri(self._tested_blocks, MISMATCH_ALARM))
-        self._strain_at_most = float(chdtri(self._online.n_functions + 4, MISMATCH_ALARM))
+        self._strain_at_most = float(chdtri(self._online.functions.number + 4, MISMATCH_ALARM))
         self._memory = EstimatorMemory()
         self._implausible = Reason.NONE
         self.is_refused = False
@@ -159,7 +159,7 @@ class Estimator:
             return
         stamp_s = sample.time_s
         sample, self._implausible = drop_implausible(
-            sample._replace(time_s=time_s), self._online.nominal_v
+            sample._replace(time_s=time_s), self.voltage_model.nominal_v
         )
         memory = self._memory
         if memory.samples == 0:
@@ -386,7 +386,7 @@ class Estimator:
 
     def _load(self) -> tuple[FloatArray, float, float]:
         """Return the load row at the latest sample, its voltage, and the resistances' part [V]."""
-        load, theta = self._online.load(), self._online.theta_load
+        load, theta = self._online.load(), self._online.load_coefficients
         return load, float(load @ theta), float(load[1:] @ theta[1:])
 
     def _evaluate(self) -> Estimate:
@@ -471,6 +471,7 @@ class Estimator:
             capacity_ah=self.capacity_ah,
             clock=replace(self._clock.state),
             counter=replace(self._counter.state),
+            line=DelayLineState(*self._online.delay_line.contents),
             online=self._online.state(),
             block=self._block.snapshot(),
             hypotheses=self.hypotheses.snapshot(),
@@ -502,6 +503,8 @@ class Estimator:
             If the state does not fit the model; the estimator must then not be used.
         """
         self._resume(state, age_s)
+        line = state.line
+        self._online.delay_line.fill(line.time_s, line.current_a, line.since_s)
         self._online.restore(state.online)
         if any(len(each.x) != self.hypotheses.size for each in state.hypotheses.filters):
             raise InputError(

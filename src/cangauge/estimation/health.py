@@ -133,7 +133,7 @@ def health_of(filter_: SocFilter, temperature_c: float) -> Health:
     lasting = model.load_at(temperature_c, np.ones(count))
     functions = model.row(50.0, lasting) - model.row(50.0, rest)
     row = np.zeros_like(x)  # of the ratio
-    row[-2 - functions.size : -2] = functions / ((lasting - rest) @ model.theta_load)
+    row[-2 - functions.size : -2] = functions / ((lasting - rest) @ model.load_coefficients)
     row[-1] = 1.0
     gain = 1.0 + float(bias.b[G])
     capacity_ah = model.capacity_ah / gain

@@ -22,7 +22,7 @@ from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.estimation.ekf import FUNCTIONS, LEAST_SLOPE, LEVEL, SLOW, SocFilter
 from cangauge.estimation.health import health_of
-from cangauge.model.online import OnlineModel
+from cangauge.model.extended import OnlineModel
 from cangauge.model.voltage_model import VoltageModel
 from cangauge.types import Health, Power
 
@@ -197,12 +197,12 @@ class _Ahead:
         x, self._P = filter_.joint()
         self._x, self.resistance = x[:-2], float(x[-1])
         self._model, self._temperature_c = model, temperature_c
-        noise, self._A = model.noise, model.cold(temperature_c)
+        noise, self._A = model.noise, model.noise.cold(temperature_c)
         slope = max(model.curve(soc_pct)[1], LEAST_SLOPE)
         self._level_v = math.hypot(self._A * noise.level_std_v, noise.soc_std_pct * slope)
         self.std_v = math.hypot(self._level_v, self._A * noise.slow_std_v)
         self._fixed_v = self._level_v * float(self._x[LEVEL]) + self._A * float(self._x[SLOW])
-        self._no_load = np.zeros_like(model.theta_load)
+        self._no_load = np.zeros_like(model.load_coefficients)
 
     def current_at(self, limit_v: float, seconds: float) -> tuple[float, float] | None:
         """Return the current that meets a voltage after a time [s], and its deviation [A].
@@ -229,7 +229,7 @@ class _Ahead:
         H = np.concatenate((
             [slope, 0.0, self._A, self._level_v],
             model.row(after_pct, load),
-            [0.0, load[1:] @ model.theta_load[1:]],
+            [0.0, load[1:] @ model.load_coefficients[1:]],
         ))  # fmt: skip
         variance = H @ self._P @ H + (self._A * model.noise.residual_std_v) ** 2 + unknown_v**2
         return current_a, math.sqrt(variance) / volt_per_a
@@ -248,7 +248,7 @@ class _Ahead:
 
     def _volts(self, load: FloatArray) -> float:
         """Return the voltage of a load row with what is learned of it [V]."""
-        theta, x = self._model.theta_load, self._x[FUNCTIONS:]
+        theta, x = self._model.load_coefficients, self._x[FUNCTIONS:]
         learned_v = float(self._model.row(self.soc_pct, load) @ x) - self._learned_v(self.soc_pct)
         return float(load @ theta) + self.resistance * float(load[1:] @ theta[1:]) + learned_v
 
@@ -266,9 +266,9 @@ class _Ahead:
             share.append(1.0 if is_ahead else 0.0)
             if delay_s - seconds > line.filled_s:
                 unknown_v += abs(ohm) * ENERGY_C_RATE * self.health.capacity_ah
-        for tau_s, value in zip(voltage.low_pass_s, model.lags, strict=True):
+        for tau_s, lag in zip(voltage.low_pass_s, model.lags, strict=True):
             keep = math.exp(-seconds / tau_s)
-            past.append(keep * value)
+            past.append(keep * lag.value)
             share.append(1.0 - keep)
         base = model.load_at(self._temperature_c, np.array(past))
         ones = model.load_at(self._temperature_c, np.array(past) + np.array(share))

@@ -18,7 +18,7 @@ from typing import Final
 
 from cangauge.estimation.ekf import UNKNOWN_STD_PCT, Block, SocFilter
 from cangauge.estimation.state import HypothesesState
-from cangauge.model.online import OnlineModel
+from cangauge.model.extended import OnlineModel
 
 UNKNOWN_PCT: Final = 50.0
 """Mean of an unknown start [%]."""

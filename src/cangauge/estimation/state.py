@@ -70,6 +70,17 @@ class CounterState:
 
 
 @dataclass
+class DelayLineState:
+    """Content of a `DelayLine`: increasing times [s] and currents [A]."""
+
+    __pydantic_config__: ClassVar[Any] = _NO_MORE
+    time_s: list[_Finite]
+    current_a: list[_Finite]
+    since_s: _Finite
+    """Start of the gap-free stretch [s]."""
+
+
+@dataclass
 class BlockState:
     """State of the open block: sums over its rows."""
 
@@ -181,8 +192,9 @@ class EstimatorState(BaseModel):
     capacity_ah: _NotNegative
     clock: ClockState
     counter: CounterState
+    line: DelayLineState
     online: list[list[_MaybeNan]]
-    """State of the voltage model: delay line, lags, effects."""
+    """State of the voltage model: low-passed currents, then each effect."""
     block: BlockState
     hypotheses: HypothesesState
     memory: EstimatorMemory
