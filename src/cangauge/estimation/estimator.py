@@ -16,7 +16,6 @@ from typing import ClassVar, Final
 from scipy.special import chdtri
 
 from cangauge._typing import FloatArray
-from cangauge.errors import InputError
 from cangauge.estimation.blocks import OpenBlock
 from cangauge.estimation.cells import PackTick
 from cangauge.estimation.counting import (
@@ -302,13 +301,13 @@ class Estimator:
             return
         memory, hypotheses = self._memory, self.hypotheses
         self._propagate(block.counted_s, block.discharged_pct)
-        was_wide = hypotheses.log_odds > 0.0
+        was_rejected = hypotheses.is_rejected
         hypotheses.update(block)
         if not hypotheses.is_valid():
             hypotheses = self.hypotheses = Hypotheses(self._online)
             memory.resets += 1
             memory.contradicted_until_s = time_s + CONTRADICTED_S
-        elif hypotheses.log_odds > 0.0 and not was_wide:
+        elif hypotheses.is_rejected and not was_rejected:
             memory.contradicted_until_s = time_s + CONTRADICTED_S
         memory.is_known = True
         self._test(time_s)
@@ -506,11 +505,6 @@ class Estimator:
         line = state.line
         self._online.delay_line.fill(line.time_s, line.current_a, line.since_s)
         self._online.restore(state.online)
-        if any(len(each.x) != self.hypotheses.size for each in state.hypotheses.filters):
-            raise InputError(
-                f"the model's filter has {self.hypotheses.size} states",
-                field="hypotheses.filters",
-            )
         if (state.method, state.capacity_ah) == (self.settings.method, self.capacity_ah):
             self._block.restore(state.block)
             self.hypotheses.restore(state.hypotheses)

@@ -19,7 +19,7 @@ from cangauge.types import Sample
 
 Method = Literal["ekf", "newton", "coulomb"]
 
-VALID_STD_PCT = 1.5
+VALID_STD_PCT = 3.0
 """Largest standard deviation of a valid SoC [%]: 19 of 20 such SoC lie within 3 %.
 
 On real trips of a vehicle with a fitted model (noise 1.4 V, a third of it lasting) the filter

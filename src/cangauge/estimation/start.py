@@ -16,6 +16,9 @@ from __future__ import annotations
 import math
 from typing import Final
 
+import numpy as np
+
+from cangauge.errors import InputError
 from cangauge.estimation.ekf import UNKNOWN_STD_PCT, Block, SocFilter
 from cangauge.estimation.state import HypothesesState
 from cangauge.model.extended import OnlineModel
@@ -85,14 +88,14 @@ class Hypotheses:
         return self.prior_log_odds + wide.evidence - narrow.evidence
 
     @property
+    def is_rejected(self) -> bool:
+        """Whether the narrow hypothesis is the less likely one."""
+        return self.log_odds > 0.0 if len(self.filters) == 2 else self.decision > 0
+
+    @property
     def likelier(self) -> SocFilter:
         """The filter of the likelier hypothesis."""
         return self.filters[-1 if self.log_odds > 0.0 else 0]
-
-    @property
-    def size(self) -> int:
-        """Number of states of a filter."""
-        return int(self.filters[0].x.size)
 
     def predict(self, seconds: float, discharged_pct: float, variance_pct2: float = 0.0) -> None:
         """Propagate all filters; see `SocFilter.predict`."""
@@ -170,7 +173,19 @@ class Hypotheses:
         return HypothesesState(filters, self.prior_log_odds, self.decision)
 
     def restore(self, state: HypothesesState) -> None:
-        """Continue from a state of the same model."""
+        """Continue from a state of the same model.
+
+        Raises
+        ------
+        InputError
+            If it has another number of states.
+        """
+        n = self.filters[0].x.size
+        for each in state.filters:
+            bias = each.bias
+            shapes = [np.shape(part) for part in (each.x, each.p, bias.b, bias.p, bias.v)]
+            if shapes != [(n,), (n, n), (2,), (2, 2), (n, 2)]:
+                raise InputError(f"the model's filter has {n} states", field="hypotheses.filters")
         self.filters = [
             SocFilter(self.model, UNKNOWN_PCT, UNKNOWN_STD_PCT).restore(each)
             for each in state.filters

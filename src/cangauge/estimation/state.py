@@ -8,9 +8,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    model_validator,
+)
 
 from cangauge.types import Reason
 
@@ -201,6 +208,12 @@ class EstimatorState(BaseModel):
     estimate: Annotated[list[_MaybeNan], Field(min_length=7, max_length=7)]
     """Numbers of the last `Estimate`, in its order, from `time_s` to `residual_v`."""
     reasons: Annotated[int, Field(strict=True, ge=0, lt=2 * max(Reason))]
+
+    @model_validator(mode="after")
+    def _check_line(self) -> Self:
+        if len(self.line.time_s) != len(self.line.current_a):
+            raise ValueError("the delay line needs one current per time")
+        return self
 
     @property
     def soc_pct(self) -> float:

@@ -342,7 +342,7 @@ class OnlineModel:
             size, odd = divmod(len(saved), max(len(memory), 1))
             numbers = iter(saved)
             try:
-                if odd:
+                if odd or (saved and not memory):
                     raise ValueError("not the state of this effect")
                 for item in memory:
                     item.restore(list(islice(numbers, size)))
