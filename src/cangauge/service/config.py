@@ -49,7 +49,6 @@ from cangauge.estimation.power import PackLimits
 from cangauge.estimation.settings import (
     VALID_STD_PCT,
     EstimatorSettings,
-    Filter,
     FullCharge,
     LongRest,
     Method,
@@ -78,7 +77,7 @@ from cangauge.service.recording import RecordLimits
 from cangauge.service.state import StateSettings, state_path
 
 if TYPE_CHECKING:
-    from cangauge.service.mqtt import MqttSettings
+    from cangauge.extras.live.mqtt import MqttSettings
 
 DEFAULT_VEHICLE: Final = "generic"
 """Default of `replay` as well, so that both commands work together without options."""
@@ -155,11 +154,6 @@ class RunConfig(Strict):
         "Published SoC: fusion (ekf), the inverse of the voltage model (newton), or Coulomb"
         " counting (coulomb).",
         "ekf|newton|coulomb",
-    )
-    filter: Filter = key(
-        "own",
-        "Arithmetic of the Kalman filter: our own, or filterpy's (reference), slower, to check it.",
-        "own|reference",
     )
     initial_soc: Annotated[FiniteFloat | None, BeforeValidator(_none_for_auto)] = key(
         None,
@@ -380,7 +374,6 @@ class RunConfig(Strict):
         return PipelineSettings(
             estimator=EstimatorSettings(
                 method=self.method,
-                filter=self.filter,
                 initial_soc_pct=self.initial_soc,
                 initial_soc_std_pct=self.initial_soc_std,
                 valid_std_pct=self.valid_std,
@@ -404,7 +397,7 @@ class RunConfig(Strict):
         if self.mqtt is None:
             return None
         # An optional dependency: the import raises the error if it is missing.
-        from cangauge.service.mqtt import MqttSettings  # noqa: PLC0415
+        from cangauge.extras.live.mqtt import MqttSettings  # noqa: PLC0415
 
         given = self.mqtt.model_dump(exclude={"password_file"})
         given["port"] = self.mqtt.port or (8883 if self.mqtt.tls else 1883)
