@@ -321,6 +321,22 @@ class OnlineModel:
         for lag in self.lags:
             lag.restore(known.get(lag.tau_s, []))
 
+    def resume(self, load: FloatArray, beside_v: float, drives: Sequence[float]) -> None:
+        """Continue after a reading that was advanced to elsewhere (the compiled step).
+
+        Parameters
+        ----------
+        load : array of shape (k,)
+            Load columns there.
+        beside_v : float
+            Voltage of the effects that do not depend on the SoC [V].
+        drives : sequence of float
+            `Effect.drive` of every effect there.
+        """
+        effects = zip(self.extended.effects, drives, strict=True)
+        self._row, self._beside_v = load, beside_v
+        self._over_soc = [(*of, drive) for of, drive in effects if of[0].uses_soc]
+
     def state(self) -> list[list[float]]:
         """Return the low-passed currents' state, then that of each effect, for `restore`."""
         lags = [number for lag in self.lags for number in lag.state()]
