@@ -9,7 +9,7 @@ gain is significant and worthwhile.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, Final
@@ -19,16 +19,20 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.identify.least_squares import (
+    BASE,
     LOGS_AT_LEAST,
     LogSums,
     P,
     Solution,
+    load_features,
     log_sums,
+    row_features,
     solve,
     solve_without,
 )
 from cangauge.identify.rows import FitRows
 from cangauge.logs.log import Log
+from cangauge.logs.resample import dequantize
 from cangauge.model.effects.base import Effect, Load, Signals, Values
 from cangauge.model.effects.library import LIBRARY, Candidate, candidates, effect_of
 from cangauge.model.extended import ExtendedModel, Prediction
@@ -161,6 +165,22 @@ class Selected:
         """Prior standard deviation of each amplitude: its widest bound."""
         return np.array([float(np.abs(b).max()) for c in self.chosen for b in c.bounds])
 
+    def clipped(self, solution: Solution) -> Solution:
+        """Return the solution with the amplitudes within their physical bounds."""
+        low, high = np.concatenate([item.bounds for item in self.chosen]).T
+        amplitudes = np.clip(solution.coefficients[P:], low, high)
+        return replace(solution, coefficients=np.r_[solution.coefficients[:P], amplitudes])
+
+    def at_bound(self, solution: Solution) -> list[Candidate]:
+        """Return the effects with an amplitude at or beyond a bound other than neutral."""
+        found = []
+        parts = _parts(self.chosen, solution.coefficients[P:])
+        for item, part in zip(self.chosen, parts, strict=True):
+            low, high = item.bounds.T
+            if np.any(((part <= low) & (low < 0.0)) | (part < low) | (part >= high)):
+                found.append(item)
+        return found
+
     def effects(self, solution: Solution) -> tuple[tuple[Effect, Values], ...]:
         """Return the effects with the amplitudes of a solution."""
         parts = _parts(self.chosen, solution.coefficients[P:])
@@ -174,55 +194,136 @@ def _parts(chosen: Sequence[Candidate], amplitudes: FloatArray) -> list[FloatArr
     return [amplitudes[end - len(c.amplitudes) : end] for c, end in zip(chosen, ends, strict=True)]
 
 
-def effect_columns(
-    model: ExtendedModel, log: Log, rows: FitRows, chosen: Sequence[Candidate]
-) -> FloatArray:
-    """Return dU/d(amplitude) about the neutral values on the rows of a log, shape (m, e).
+@dataclass(frozen=True, eq=False)
+class Linearized:
+    """A model with effects on the rows of one log, to first order.
+
+    Parameters
+    ----------
+    rows : FitRows
+        With the effects' signals and SoC; the voltage is that of the linear part plus the residual
+        once `with_voltage` has set it.
+    features : array of shape (m, BASE)
+        dU/d of knots, kt, resistances and their Arrhenius parts.
+    columns : array of shape (m, e)
+        dU/d(amplitude).
+    residual_v : array of shape (m,)
+    """
+
+    rows: FitRows
+    features: FloatArray
+    columns: FloatArray
+    residual_v: FloatArray
+
+    def with_voltage(self, coefficients: FloatArray, amplitudes: FloatArray) -> Linearized:
+        """Return the same with the voltage that the linear equation has to explain.
+
+        Parameters
+        ----------
+        coefficients : array of shape (BASE,)
+            Of `features`, and …
+        amplitudes : array of shape (e,)
+            … of `columns`, about which the model is linearized.
+        """
+        linear_v = self.features @ coefficients + self.columns @ amplitudes
+        return replace(self, rows=replace(self.rows, voltage_v=linear_v + self.residual_v))
+
+
+def linearize(
+    model: ExtendedModel,
+    log: Log,
+    rows: FitRows,
+    chosen: Sequence[Candidate],
+    amplitudes: FloatArray | None = None,
+) -> Linearized:
+    """Return the model's prediction of a log and its derivatives on the rows of the fit.
 
     Parameters
     ----------
     model : ExtendedModel
-        Without effects.
+        Without effects, or with those of `chosen`.
     log : Log
     rows : FitRows
     chosen : sequence of Candidate
+    amplitudes : array of shape (e,), optional
+        Of the model's effects, relative to neutral; neutral by default.
     """
     voltage, pack = model.model, model.pack
-    signals = Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
-    soc = rows.soc_pct
     first = log.first_soc()
     if first is None:
         raise ValueError("a log of a fit has a start")
     row, start_pct = first
+    signals = Signals(log.time_s, log.current_a, log.voltage_v, dequantize(log).temperature_c)
     currents = voltage.currents(log.time_s, log.current_a, slice(None))
-    load_columns = voltage.load_columns(log.temperature_c, currents)
-    drop_v = load_columns[:, 1:] @ voltage.load_coefficients[1:]
-    load = Load(log.time_s, log.current_a, log.temperature_c, drop_v)
-    plain_v: FloatArray | None = None
-    columns = []
+    # Added voltages are linear in their amplitudes, so their columns give them too.
+    correcting = replace(
+        model, effects=tuple(item for item in model.effects if not item[0].adds_voltage)
+    )
 
     def predict(changed: ExtendedModel) -> Prediction:
-        return changed.predict(
-            signals, start_pct, rows.at, initial_row=row, currents_a=currents[rows.at]
-        )
+        return changed.predict(signals, start_pct, rows.at, initial_row=row, currents_a=currents)
 
-    for item in chosen:
+    plain = predict(correcting)
+    true = plain.signals
+    load_columns = voltage.load_columns(true.temperature_c, currents)
+    drop_v = load_columns[:, 1:] @ voltage.load_coefficients[1:]
+    load = Load(true.time_s, true.current_a, true.temperature_c, drop_v)
+    soc = plain.soc_pct[rows.at]
+
+    def added_v(effect: Effect, values: Values, at_load: Load = load) -> FloatArray:
+        drive = effect.drive(at_load, values, voltage, pack, effect.memory(values, pack))
+        if drive is None:
+            raise ValueError("an effect of the voltage has a drive")
+        return np.asarray(drive[rows.at] * effect.over_soc(soc, values, voltage, pack))
+
+    at = replace(
+        rows,
+        soc_pct=soc,
+        currents_a=plain.currents_a,
+        dequantized_c=true.temperature_c[rows.at],
+    )
+    features, residual_v = row_features(at), plain.residual_v
+    parts = None if amplitudes is None else _parts(chosen, amplitudes)
+    columns = []
+    for place, item in enumerate(chosen):
         effect = item.effect
+        about = np.zeros(len(item.steps)) if parts is None else parts[place]
+        if parts is not None and effect.adds_voltage:
+            features = features + _by_drop(effect, item.values(about), added_v, load, currents)
         for number, step in enumerate(item.steps.tolist()):
-            amplitude = np.zeros(len(item.steps))
-            amplitude[number] = step
-            values = item.values(amplitude)
+            one = step * (np.arange(about.size) == number)
             if effect.adds_voltage:
-                drive = effect.drive(load, values, voltage, pack, effect.memory(values, pack))
-                if drive is None:
-                    raise ValueError("an effect of the voltage has a drive")
-                added = drive[rows.at] * effect.over_soc(soc, values, voltage, pack)
+                change_v = added_v(effect, item.values(one))
+                residual_v = residual_v - change_v * (about[number] / step)
             else:
-                if plain_v is None:
-                    plain_v = predict(model).residual_v
-                added = plain_v - predict(model.with_effect(effect, values)).residual_v
-            columns.append(added / step)
-    return np.column_stack(columns) if columns else np.empty((len(rows), 0))
+                others = tuple(other for other in correcting.effects if other[0] is not effect)
+                changed = (*others, (effect, item.values(about + one)))
+                change_v = plain.residual_v - predict(replace(model, effects=changed)).residual_v
+            columns.append(change_v / step)
+    table = np.column_stack(columns) if columns else np.empty((len(rows), 0))
+    return Linearized(at, features, table, residual_v)
+
+
+def _by_drop(
+    effect: Effect,
+    values: Values,
+    added_v: Callable[[Effect, Values, Load], FloatArray],
+    load: Load,
+    currents: FloatArray,
+) -> FloatArray:
+    """Return what an effect adds to the derivatives by the resistances, shape (m, BASE).
+
+    An effect of the drop is linear in it: its response to each current is that to a drop of 1 Ω.
+    """
+    if not effect.scales_drop:
+        return np.zeros((1, BASE))
+    nothing = added_v(effect, values, load._replace(drop_v=np.zeros_like(load.drop_v)))
+    added = np.zeros((nothing.size, BASE))
+    both = load_features(load.temperature_c, currents)[:, 1:]
+    for place, drop_v in enumerate(both.T):
+        response = added_v(effect, values, load._replace(drop_v=drop_v))
+        added[:, BASE - both.shape[1] + place] = response - nothing
+    return added
 
 
 def offered(effect_ids: Sequence[str], model: ExtendedModel, time_s: FloatArray) -> list[Candidate]:
@@ -271,11 +372,13 @@ class Search:
         self._places = [
             list(range(end - width, end)) for end, width in zip(ends.tolist(), widths, strict=True)
         ]
+        self.refused: list[Candidate] = []
+        """Candidates that are not offered any more."""
         self._sums: list[LogSums] = []
         for number, (log, of_log) in enumerate(zip(logs, rows, strict=True), start=1):
             _LOG.debug("columns of the effects: log %d of %d", number, len(logs))
-            extra = effect_columns(model, log, of_log, self._offered)
-            self._sums.append(log_sums(of_log, chemistry, extra))
+            linear = linearize(model, log, of_log, self._offered)
+            self._sums.append(log_sums(of_log, chemistry, linear.columns))
 
     def select(self) -> Selected:
         """Return the effects; those asked for by id are all taken, in their best shapes."""
@@ -323,11 +426,12 @@ class Search:
         taken = {self._offered[number].effect.id for number in chosen}
         fits: list[tuple[float, int]] = []
         for number, item in enumerate(self._offered):
-            if item.effect.id in taken:
+            if item.effect.id in taken or item in self.refused:
                 continue
             sums, options = self._solved([*chosen, number])
             solution = solve(sums, **options)
-            if self._within_bounds([*chosen, number], solution):
+            chosen_now = tuple(self._offered[place] for place in [*chosen, number])
+            if not Selected(chosen_now, ()).at_bound(solution):
                 fits.append((solution.residual_v, number))
         found = []
         for _, number in sorted(fits)[:COMPARED]:
@@ -344,12 +448,3 @@ class Search:
             )
             found.append((number, step, after))
         return sorted(found, key=lambda item: -item[1].gain)
-
-    def _within_bounds(self, chosen: Sequence[int], solution: Solution) -> bool:
-        items = [self._offered[number] for number in chosen]
-        for item, part in zip(items, _parts(items, solution.coefficients[P:]), strict=True):
-            low, high = item.bounds.T
-            rounding = 1e-9 * (high - low)
-            if np.any((part < low - rounding) | (part > high + rounding)):
-                return False
-        return True

@@ -22,19 +22,21 @@ from cangauge.errors import InputError
 from cangauge.identify.effect_search import (
     AUTO,
     AUTO_LOGS,
+    Linearized,
     Search,
     Selected,
-    effect_columns,
+    linearize,
     parse_effect_ids,
 )
 from cangauge.identify.evaluate import Energy, LogFit, energy_balance, evaluate, slope_resistances
 from cangauge.identify.least_squares import (
+    BASE,
     LOGS_AT_LEAST,
     N,
     P,
     Solution,
-    load_features,
     log_sums,
+    row_features,
     solve_scaled,
 )
 from cangauge.identify.published import (
@@ -53,7 +55,8 @@ from cangauge.model.coulomb_counting import (
     capacity_from_full_discharge,
     difference_from_reference,
 )
-from cangauge.model.effects.library import effect_entries
+from cangauge.model.effects.library import Candidate, effect_entries
+from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import (
     Information,
     Made,
@@ -72,7 +75,7 @@ from cangauge.model.prior import (
     ChemistryName,
     usual_loads,
 )
-from cangauge.model.voltage_model import KNOTS_PCT, hermite_basis
+from cangauge.model.voltage_model import KNOTS_PCT
 
 _LOG = logging.getLogger(__name__)
 
@@ -403,38 +406,76 @@ def _fit_knots(
     published = solve_published(pooled(factors), EPSILON)
     if usable_delays(logs, DELAYS_S) == DELAYS_S and published.identified:
         fields = fields | {"published": published.fields(EPSILON, REFERENCE_C, DELAYS_S)}
-    extra: list[FloatArray | None] = [None] * len(rows)
+    columns = [row_features(item) for item in rows]
     sums = [log_sums(item, chemistry) for item in rows]
     solution, without = solve_scaled(sums, capacity_ah, chemistry)
     selected: Selected | None = None
     if effect_ids:
         plain = knots_file(solution, chemistry, fields).extended_model()
-        selected = Search(plain, logs, rows, chemistry, effect_ids).select()
-        for _ in range(2 if selected.chosen else 0):  # the columns need the resistances: twice
-            extra = [
-                effect_columns(plain, log, item, selected.chosen)
-                for log, item in zip(logs, rows, strict=True)
-            ]
-            sums = [
-                log_sums(item, chemistry, of_log) for item, of_log in zip(rows, extra, strict=True)
-            ]
-            std = selected.amplitude_std
-            solution, without = solve_scaled(sums, capacity_ah, chemistry, std)
-            plain = knots_file(solution, chemistry, fields).extended_model()
-        entries = effect_entries(
-            [
-                (effect, effect.clipped(values, plain.pack))
-                for effect, values in selected.effects(solution)
-            ]
-        )
-        fields = fields | {"effects": entries}
+        search = Search(plain, logs, rows, chemistry, effect_ids)
+        joint: _WithEffects | None = None
+        selected = search.select()
+        while selected.chosen and joint is None:
+            start = solution, fields
+            joint = _fit_with_effects(logs, rows, chemistry, selected, start, search.refused)
+            selected = selected if joint is not None else search.select()
+        if joint is not None:
+            about, solution, without, fields = joint
+            rows = [item.rows for item in about]
+            columns = [np.column_stack([item.features, item.columns]) for item in about]
     errors = tuple(
-        _where_covered(number, rows, _error_v(other, rows[number], extra[number]))
+        _where_covered(number, rows, other.residual_v_of(columns[number], rows[number].voltage_v))
         for number, other in enumerate(without)
     )
     return _Fitted(
         knots_file(solution, chemistry, fields, errors, rows), published, errors, selected
     )
+
+
+RELINEARIZED: Final = 4
+"""Linearizations about the fitted effects: products of effects and resistances have converged."""
+
+
+_WithEffects = tuple[list[Linearized], Solution, list[Solution], dict[str, Any]]
+
+
+def _fit_with_effects(  # noqa: PLR0917
+    logs: Sequence[Log],
+    rows: Sequence[FitRows],
+    chemistry: Chemistry,
+    selected: Selected,
+    first: tuple[Solution, dict[str, Any]],
+    refused: list[Candidate],
+) -> _WithEffects | None:
+    """Return the rows about the fitted effects, the solutions there, and the file's fields.
+
+    Gauss–Newton from the solution without effects. None where amplitudes end at their physical
+    bounds; the effects that do are appended to `refused`.
+    """
+    solution, fields = first
+    std = selected.amplitude_std
+    amplitudes: FloatArray | None = None
+    model = knots_file(solution, chemistry, fields).extended_model()
+    for _ in range(RELINEARIZED):
+        coefficients = solution.select[:P, :BASE].T @ solution.coefficients[:P]
+        of_effects = np.zeros(std.size) if amplitudes is None else amplitudes
+        about = [
+            linearize(model, log, item, selected.chosen, amplitudes).with_voltage(
+                coefficients, of_effects
+            )
+            for log, item in zip(logs, rows, strict=True)
+        ]
+        sums = [log_sums(item.rows, chemistry, item.columns, item.features) for item in about]
+        solution, without = solve_scaled(sums, fields["capacity_ah"], chemistry, std)
+        solution = selected.clipped(solution)
+        amplitudes = solution.coefficients[P:]
+        effects = selected.effects(solution)
+        voltage = knots_file(solution, chemistry, fields).voltage_model()
+        model = ExtendedModel(voltage, fields["capacity_ah"], effects)
+    if at_bound := selected.at_bound(solution):
+        refused += at_bound
+        return None
+    return about, solution, without, fields | {"effects": effect_entries(effects)}
 
 
 def _where_covered(number: int, rows: Sequence[FitRows], error_v: FloatArray) -> FloatArray:
@@ -444,13 +485,6 @@ def _where_covered(number: int, rows: Sequence[FitRows], error_v: FloatArray) ->
     high = max(float(soc.max()) for soc in others)
     soc = rows[number].soc_pct
     return np.where((soc >= low) & (soc <= high), error_v, np.nan)
-
-
-def _error_v(solution: Solution, rows: FitRows, extra: FloatArray | None) -> FloatArray:
-    """Return measured minus predicted voltage of a log's rows by a solution [V]."""
-    features = [hermite_basis(rows.soc_pct), load_features(rows.temperature_c, rows.currents_a)]
-    columns = np.column_stack([*features, *([] if extra is None else [extra])])
-    return np.asarray(rows.voltage_v - columns @ (solution.select.T @ solution.coefficients))
 
 
 def knots_file(

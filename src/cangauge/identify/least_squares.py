@@ -105,7 +105,18 @@ def row_weights(soc_pct: FloatArray, seconds: FloatArray, chemistry: Chemistry) 
     return np.where((soc_pct > -1.0) & (soc_pct < 101.0), weight, 0.0)
 
 
-def log_sums(rows: FitRows, chemistry: Chemistry, extra: FloatArray | None = None) -> LogSums:
+def row_features(rows: FitRows) -> FloatArray:
+    """Return the columns of the moments before those of effects, shape (m, BASE)."""
+    loads = load_features(rows.dequantized_c, rows.currents_a)
+    return np.concatenate([hermite_basis(rows.soc_pct), loads], axis=1)
+
+
+def log_sums(
+    rows: FitRows,
+    chemistry: Chemistry,
+    extra: FloatArray | None = None,
+    features: FloatArray | None = None,
+) -> LogSums:
     """Return the sums of a log.
 
     Parameters
@@ -114,9 +125,11 @@ def log_sums(rows: FitRows, chemistry: Chemistry, extra: FloatArray | None = Non
     chemistry : Chemistry
     extra : array of shape (m, e), optional
         Columns of effects.
+    features : array of shape (m, BASE), optional
+        Instead of `row_features`.
     """
     weight = row_weights(rows.soc_pct, rows.seconds, chemistry)
-    columns = [hermite_basis(rows.soc_pct), load_features(rows.dequantized_c, rows.currents_a)]
+    columns = [row_features(rows) if features is None else features]
     if extra is not None:
         columns.append(extra)
     table = np.column_stack([*columns, np.ones(len(rows)), rows.voltage_v])
@@ -161,6 +174,17 @@ class Solution:
         row = self.select @ (sums.moments[:-2, -2] / sums.weight)
         error = float(sums.moments[-2, -1]) / sums.weight - float(row @ self.coefficients)
         return error, float(row @ self.covariance @ row)
+
+    def residual_v_of(self, columns: FloatArray, voltage_v: FloatArray) -> FloatArray:
+        """Return measured minus predicted voltage of rows [V], shape (m,).
+
+        Parameters
+        ----------
+        columns : array of shape (m, q − 2)
+            Those of the moments.
+        voltage_v : array of shape (m,)
+        """
+        return np.asarray(voltage_v - columns @ (self.select.T @ self.coefficients))
 
     def square_error(self, sums: LogSums) -> float:
         """Return the mean square residual of a log, its level included [V²]."""

@@ -116,8 +116,8 @@ class ExtendedModel:
             Rows at which to predict the voltage.
         initial_row : int
             Row at which the initial SoC holds.
-        currents_a : array of shape (m, M), optional
-            `VoltageModel.currents` of the measured current at `at_rows`, where it is known.
+        currents_a : array of shape (n, M), optional
+            `VoltageModel.currents` of the measured current at every row, where it is known.
         """
         model, effects, pack = self.model, self.effects, self.pack
         measured_a = signals.current_a
@@ -129,9 +129,8 @@ class ExtendedModel:
         soc = self.counted_soc(signals, initial_soc_pct, initial_row=initial_row)
         every = any(effect.adds_voltage for effect, _ in effects)
         rows = slice(None) if every else at_rows
-        is_known = currents_a is not None and signals.current_a is measured_a and not every
-        if currents_a is not None and is_known:
-            currents = currents_a
+        if currents_a is not None and signals.current_a is measured_a:
+            currents = currents_a[rows]
         else:
             currents = model.currents(signals.time_s, signals.current_a, rows)
         temperature_c = signals.temperature_c[rows]
