@@ -293,8 +293,8 @@ class _Found:
     @property
     def sign_line(self) -> str:
         """How the sign of the current was found, or what is left to do."""
-        sign = self.proof.get("sign")
-        if sign is None or sign["sign"] == 0:
+        sign = self.proof.get("sign", {})
+        if sign.get("sign", 0) == 0:
             return "Sign of the current: not proven; `cangauge inspect DRIVE --map FILE` proves it."
         if self.sign < 0:
             return f"Sign of the current: positive values charge on this bus ({sign['text']})."
