@@ -75,7 +75,7 @@ from cangauge.model.prior import (
     ChemistryName,
     usual_loads,
 )
-from cangauge.model.voltage_model import KNOTS_PCT
+from cangauge.model.voltage_model import KNOTS_PCT, VoltageModel
 
 _LOG = logging.getLogger(__name__)
 
@@ -134,6 +134,11 @@ class Identification:
     """Selected effects; None if none were asked for."""
     starts: tuple[Start, ...] = ()
     """SoC at the start of each log, and how it is known."""
+
+    @cached_property
+    def voltage_model(self) -> VoltageModel:
+        """The model's equation, without effects."""
+        return self.model.voltage_model()
 
     @cached_property
     def figures(self) -> tuple[LogFigures, ...]:
