@@ -40,13 +40,13 @@ from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import estimate_log
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Sample
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.replay.player import Pacer
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
+from cangauge.types import Sample
 from live_service import MODEL, command, service
 
 RATE_HZ = 4000

@@ -31,7 +31,6 @@ from cangauge.bus.publish import standard_filter
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Estimate
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from cangauge.replay.player import ReplaySettings, play
@@ -40,6 +39,7 @@ from cangauge.service.loop import LoopSettings, Outputs, serve
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
+from cangauge.types import Estimate
 from real_trips import DATA, JUDGED_S, TEST, TRAINING, identify, read_trips
 
 NUMBERS = ("soc_pct", "soc_std_pct", "soc_newton_pct", "soc_coulomb_pct", "residual_v")

@@ -34,12 +34,12 @@ from cangauge.estimation.compiled import CompiledEstimator, make_estimator
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Sample
-from cangauge.export.embedded import export_c
+from cangauge.extras.embedded.embedded import export_c
+from cangauge.extras.validation.packs import load
 from cangauge.identify.fit import fit
 from cangauge.model.coulomb_counting import capacity_from_reference
 from cangauge.model.published import leaf_2012_model_file
-from cangauge.validation.packs import load
+from cangauge.types import Sample
 
 MODEL: Final = leaf_2012_model_file()
 SETTINGS: Final = EstimatorSettings(initial_soc_pct=80.0)

@@ -46,8 +46,8 @@ from cangauge.estimation.cells import CellEstimator
 from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.offline import run_estimator
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Sample
-from cangauge.export.equivalent_circuit import equivalent_circuit
+from cangauge.extras.embedded.equivalent_circuit import equivalent_circuit
+from cangauge.extras.validation import simulate
 from cangauge.identify.fit import fit
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
@@ -55,7 +55,7 @@ from cangauge.logs.read import read_log
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Coefficient, Model
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.validation import simulate
+from cangauge.types import Sample
 from peer_filters import Circuit, bare_ekf, run
 from peers import step_us
 

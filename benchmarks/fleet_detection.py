@@ -20,10 +20,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cangauge.diagnosis import diagnose, learn_references
+from cangauge.extras.validation.cases import Scenario, draw_scenario
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
-from cangauge.validation.cases import Scenario, draw_scenario
 from fleet_twins import vehicle_logs
 
 SEED, HOURS, TESTED = 5, 0.4, 3

@@ -20,7 +20,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from cangauge.validation.cases import Scenario, draw_scenario
+from cangauge.extras.validation.cases import Scenario, draw_scenario
 from fleet_twins import write_fleet
 
 SEED = 5

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from cangauge.extras.validation.cases import Scenario
+from cangauge.extras.validation.twin.plant import TwinPlant
+from cangauge.extras.validation.twin.recording import record_drive
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
-from cangauge.validation.cases import Scenario
-from cangauge.validation.twin.plant import TwinPlant
-from cangauge.validation.twin.recording import record_drive
 
 CAPACITY_SPREAD, RESISTANCE_SPREAD = 0.01, 0.03
 """Standard deviations between new cells of one type, relative (Baumhöfer et al., J. Power Sources

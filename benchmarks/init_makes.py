@@ -26,8 +26,8 @@ from pathlib import Path
 import can
 import numpy as np
 
-from cangauge.discovery.pairs import Candidate
-from cangauge.discovery.search import Findings, search
+from cangauge.extras.discovery.pairs import Candidate
+from cangauge.extras.discovery.search import Findings, search
 from frame_layouts import STEP_S, Bits, Frame, encode
 
 SECONDS = 120.0

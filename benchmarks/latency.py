@@ -41,8 +41,8 @@ from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimation.validity import Sample
 from cangauge.replay.player import Pacer
+from cangauge.types import Sample
 from faults.line import udp
 from live_service import service
 

@@ -23,8 +23,8 @@ from cangauge.bus.recording import capture_to_log
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import estimate_log
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Reason
 from cangauge.model.published import leaf_2012_model_file
+from cangauge.types import Reason
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "leaf_can"
 CAPTURES = (

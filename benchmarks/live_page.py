@@ -32,8 +32,8 @@ from tornado.websocket import websocket_connect
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimation.validity import Sample
 from cangauge.replay.player import Pacer
+from cangauge.types import Sample
 from live_service import service
 
 FRAMES_PER_S: Final = 1000

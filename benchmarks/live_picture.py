@@ -20,7 +20,7 @@ from PIL import Image
 
 from cangauge._resources import shared_file
 from cangauge.bus.open import bus_address
-from cangauge.report.charts import AMBER, BLUE, GREEN, ORANGE
+from cangauge.extras.report.charts import AMBER, BLUE, GREEN, ORANGE
 from live_page import PAGE_PORT, chromium
 from live_service import command, service
 

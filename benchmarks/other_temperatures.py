@@ -18,13 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cangauge.errors import InputError
-from cangauge.identify.passes import fit_voltage_model
-from cangauge.inference.rows import FitOptions, fit_rows
-from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
-from cangauge.model.coulomb_counting import capacity_from_reference
-from cangauge.model.voltage_model import VoltageModel
-from cangauge.validation.recordings import (
+from cangauge.extras.validation.recordings import (
     LG_25C,
     LG_CAPACITY_AH,
     LG_PARALLEL,
@@ -32,7 +26,13 @@ from cangauge.validation.recordings import (
     summer_held_out,
     summer_training,
 )
-from cangauge.validation.twin.injection import scaled_to_pack, with_initial_soc
+from cangauge.extras.validation.twin.injection import scaled_to_pack, with_initial_soc
+from cangauge.identify.passes import fit_voltage_model
+from cangauge.inference.rows import FitOptions, fit_rows
+from cangauge.logs.log import Log
+from cangauge.logs.read import read_log
+from cangauge.model.coulomb_counting import capacity_from_reference
+from cangauge.model.voltage_model import VoltageModel
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 COLDER_AND_WARMER = ("0", "10", "40")

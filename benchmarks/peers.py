@@ -33,14 +33,14 @@ from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.export.equivalent_circuit import equivalent_circuit
+from cangauge.extras.embedded.equivalent_circuit import equivalent_circuit
+from cangauge.extras.validation.packs import RATE_HZ, load
 from cangauge.identify.fit import fit
 from cangauge.inference.rows import decimate
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import capacity_from_reference
 from cangauge.model.model_file import Model
-from cangauge.validation.packs import RATE_HZ, load
 
 PACKS = ("i3", "car1")
 TRAINING_LOGS, SEED = 10, 0

@@ -31,15 +31,15 @@ from cangauge.diagnosis.problem import DiagnosisProblem, build_problem
 from cangauge.diagnosis.profiles import Limits, Profile
 from cangauge.diagnosis.verdict import decide
 from cangauge.errors import InputError
+from cangauge.extras.validation.cases import CaseOptions, DrawnCase, Scenario, draw_case
+from cangauge.extras.validation.plan import EFFECTS
+from cangauge.extras.validation.recordings import model_rmse_v
+from cangauge.extras.validation.twin.drive import Drive
+from cangauge.extras.validation.twin.faults import Fault
+from cangauge.extras.validation.twin.recording import record_drive
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
-from cangauge.validation.cases import CaseOptions, DrawnCase, Scenario, draw_case
-from cangauge.validation.plan import EFFECTS
-from cangauge.validation.recordings import model_rmse_v
-from cangauge.validation.twin.drive import Drive
-from cangauge.validation.twin.faults import Fault
-from cangauge.validation.twin.recording import record_drive
 
 CASES_PER_PACK, CLEAN_DRIVES = 4, 3
 NOT_REPEATED = "resistance_step"

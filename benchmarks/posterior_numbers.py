@@ -41,10 +41,10 @@ from cangauge.diagnosis.posterior import (
 )
 from cangauge.diagnosis.problem import build_problem
 from cangauge.diagnosis.verdict import ALARM_BELOW, credible_set
+from cangauge.extras.validation.score import LEAST_GAP
 from cangauge.logs.read import read_log
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Model
-from cangauge.validation.score import LEAST_GAP
 
 OUTSIDE_WEIGHT = 0.25
 """Weight of a case without its cause: one fault in four is assumed to be outside the library."""

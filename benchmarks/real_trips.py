@@ -29,7 +29,6 @@ from rich.table import Table
 
 from cangauge.estimation.offline import EstimateTable, run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Sample
 from cangauge.identify.evaluate import LogFit, evaluate, evaluate_extended
 from cangauge.identify.fit import Identification, fit
 from cangauge.inference.rows import FitOptions, fit_rows, sample_log
@@ -37,6 +36,7 @@ from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import capacity_from_reference
 from cangauge.model.model_file import Model
+from cangauge.types import Sample
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "bmw_i3"
 TRAINING = [f"A{number:02d}" for number in range(1, 22, 2)]

@@ -42,11 +42,11 @@ from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.publish import FrameIds, SocEstimate, SocReader
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Estimate, Reason, Sample
 from cangauge.model.model_file import Model
 from cangauge.service.loop import CHECKPOINT_EVERY_S, FIRST_CHECKPOINT_S
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.state import StateKeeper, StateSettings
+from cangauge.types import Estimate, Reason, Sample
 from live_service import ENTRY
 
 EVERY_S = CHECKPOINT_EVERY_S

@@ -26,13 +26,13 @@ from rich.table import Table
 
 from cangauge.diagnosis.cross_validation import rms
 from cangauge.diagnosis.simulator import Run, diagnose_simulator
+from cangauge.extras.validation.recordings import LG_CAPACITY_AH, LG_PARALLEL, LG_SERIES
+from cangauge.extras.validation.twin.injection import scaled_to_pack, with_initial_soc
 from cangauge.identify.fit import fit
 from cangauge.identify.starts import with_start
 from cangauge.inference.rows import decimate
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
-from cangauge.validation.recordings import LG_CAPACITY_AH, LG_PARALLEL, LG_SERIES
-from cangauge.validation.twin.injection import scaled_to_pack, with_initial_soc
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 REFERENCES = ("551_LA92", "551_US06", "552_Mixed3", "552_Mixed5")

@@ -20,9 +20,9 @@ from mkdocs.structure.files import File, Files
 from typer.main import get_command
 
 from cangauge.cli.app import COMMANDS, LazyGroup, app
-from cangauge.estimation.validity import REASON_WORDS, reason_name
+from cangauge.extras.validation import simulate
 from cangauge.model.effects.library import LIBRARY
-from cangauge.validation import simulate
+from cangauge.types import REASON_WORDS, reason_name
 
 ROOT = Path(__file__).parent.parent
 OUTSIDE_LINK = re.compile(

@@ -11,8 +11,8 @@ from typing import Any, ClassVar
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.fleet.jobs import TEXT, Job
-from cangauge.fleet.sources import FleetLog, ReadOptions
+from cangauge.extras.fleet.jobs import TEXT, Job
+from cangauge.extras.fleet.sources import FleetLog, ReadOptions
 
 
 @dataclass(frozen=True)

@@ -26,11 +26,11 @@ from cangauge.bus.connection import BusConnection
 from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.app import main
-from cangauge.estimation.validity import Estimate
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from cangauge.service.loop import LoopSettings, Outputs, RunSummary, serve
 from cangauge.service.pipeline import Pipeline, PipelineSettings
+from cangauge.types import Estimate
 from synthetic import synthetic_log
 
 COMMAND = "from cangauge.__main__ import main; main()"

@@ -13,15 +13,15 @@ from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.mapping import SignalMap, TemperatureMap, VehicleMap
 from cangauge.bus.vehicle import PRESETS, Preset, Vehicle
-from cangauge.estimation.validity import Sample
+from cangauge.extras.report.charts import new_figure
+from cangauge.extras.report.page import Figure, Page, Paragraph, Section, Tile, render
 from cangauge.logs import read
 from cangauge.logs.draft import DraftLog
 from cangauge.logs.file_content import FileContent
 from cangauge.model.effects.base import Effect, OnlineEffect, Pack, PackState, Parameter, Values
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.voltage_model import VoltageModel
-from cangauge.report.charts import new_figure
-from cangauge.report.page import Figure, Page, Paragraph, Section, Tile, render
+from cangauge.types import Sample
 from synthetic import synthetic_log
 
 

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from cangauge._formatting import counted, duration, number, significant, span
-from cangauge.estimation.validity import REASON_WORDS, Reason, reason_names
+from cangauge.types import REASON_WORDS, Reason, reason_names
 
 
 @pytest.mark.parametrize(

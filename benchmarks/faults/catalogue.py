@@ -16,7 +16,7 @@ from pathlib import Path
 from random import Random
 from typing import Final
 
-from cangauge.estimation.validity import Reason
+from cangauge.types import Reason
 from faults import actions as do
 from faults import frames as change
 from faults import stamps

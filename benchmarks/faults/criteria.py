@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cangauge._typing import FloatArray
-from cangauge.estimation.validity import Reason, reason_name
+from cangauge.types import Reason, reason_name
 from faults.fault import Fault
 
 MAX_SOC_ERROR_PCT: Final = 1.0

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import Any, Final, Literal
 
-from cangauge.estimation.validity import Reason
+from cangauge.types import Reason
 from faults.bench import Bench
 from faults.frames import FAST, FrameChange, Profile, ValueChange
 from faults.process import Target

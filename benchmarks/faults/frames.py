@@ -20,8 +20,8 @@ from cangauge.bus.protection import ProtectionRule
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
-from cangauge.estimation.validity import Sample
 from cangauge.logs.read import read_log
+from cangauge.types import Sample
 
 LOG: Final = "leaf2012_reconstruction_10min.parquet"
 ROLES: Final = ("current", "voltage", "temperature")

@@ -23,10 +23,10 @@ from cangauge._resources import shared_file
 from cangauge.bus.captures.mcap import frame_content, frame_topic
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimation.validity import Sample
 from cangauge.model.effects.base import Pack, Parameter
 from cangauge.model.effects.library import LIBRARY, effect_entries
 from cangauge.model.model_file import Model
+from cangauge.types import Sample
 
 ROWS = 12
 

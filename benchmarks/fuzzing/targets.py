@@ -29,7 +29,7 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import estimate_log
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Estimate, Sample
+from cangauge.extras.validation.twin.drive import read_speed
 from cangauge.inspect.capture import inspect_capture
 from cangauge.inspect.log import inspect_log
 from cangauge.logs.log import Log
@@ -38,7 +38,7 @@ from cangauge.model.model_file import Model
 from cangauge.service import state as state_file
 from cangauge.service.config import load_config
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.validation.twin.drive import read_speed
+from cangauge.types import Estimate, Sample
 from fuzzing import corpus
 from fuzzing.mutate import json_bytes, mutate, mutate_json
 from fuzzing.target import FindingError, Target, refusable

@@ -39,12 +39,12 @@ if TYPE_CHECKING:
     from cangauge.errors import CangaugeError, InputError
     from cangauge.estimation.estimator import Estimator
     from cangauge.estimation.offline import EstimateTable, estimate
-    from cangauge.estimation.validity import Estimate, Sample
+    from cangauge.extras.validation import Simulation, simulate
     from cangauge.identify.fit import Identification, fit
     from cangauge.logs.log import Log
     from cangauge.model.model_file import Model
     from cangauge.service.run import Service
-    from cangauge.validation import Simulation, simulate
+    from cangauge.types import Estimate, Sample
 
 __all__ = [
     "CangaugeError",
@@ -71,22 +71,22 @@ __all__ = [
 _PLACES: Final = {
     "CangaugeError": "errors",
     "Diagnosis": "diagnosis",
-    "Estimate": "estimation.validity",
+    "Estimate": "types",
     "EstimateTable": "estimation.offline",
     "Estimator": "estimation.estimator",
     "Identification": "identify.fit",
     "InputError": "errors",
     "Log": "logs.log",
     "Model": "model.model_file",
-    "Sample": "estimation.validity",
+    "Sample": "types",
     "Service": "service.run",
-    "Simulation": "validation",
+    "Simulation": "extras.validation",
     "Vehicle": "bus.vehicle",
     "diagnose": "diagnosis",
     "estimate": "estimation.offline",
     "fit": "identify.fit",
     "read_log": "bus.recording:read_recording",
-    "simulate": "validation",
+    "simulate": "extras.validation",
 }
 """Module of each public name, and the name there where it differs."""
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from cangauge._resources import shared_file
 from cangauge.bus.database import signal_codec
 from cangauge.bus.protection import CRC_ONLY_RULE, GENERIC_RULE, LEAF_RULE, E2eRule
-from cangauge.estimation.validity import Reason, Status
+from cangauge.types import Reason, Status
 
 FILES = ("nissan_leaf.dbc", "generic_pack.dbc", "soc_estimate.dbc")
 

@@ -12,7 +12,7 @@ from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import LEAF_RULE
 from cangauge.bus.vehicle import EXTENDED, Vehicle
-from cangauge.estimation.validity import Sample
+from cangauge.types import Sample
 
 CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID, SOC_ID = 0x400, 0x401, 0x402, 0x403
 

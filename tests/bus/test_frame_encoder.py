@@ -14,8 +14,8 @@ from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimation.validity import Sample
 from cangauge.logs.log import Log
+from cangauge.types import Sample
 
 VEHICLES = {
     "generic": Vehicle.load("generic"),

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge.bus.decoder import Pairing
-from cangauge.estimation.validity import Sample
+from cangauge.types import Sample
 
 WITHIN_S = 0.020
 

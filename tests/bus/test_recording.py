@@ -22,11 +22,11 @@ from cangauge.bus.recording import (
 from cangauge.bus.time_source import ClockFrames, ReceiveTime
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimation.validity import Sample
 from cangauge.inspect.capture import inspect_capture
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
 from cangauge.logs.read import LogFile
+from cangauge.types import Sample
 
 CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID = 0x400, 0x401, 0x402
 

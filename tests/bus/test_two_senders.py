@@ -16,9 +16,9 @@ from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import Protection
 from cangauge.bus.recording import capture_samples, open_vehicle_capture
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimation.validity import Reason, Sample
 from cangauge.inspect.capture import inspect_capture
 from cangauge.service.recording import Recorder
+from cangauge.types import Reason, Sample
 
 LEAF, GENERIC = Vehicle.load("leaf_aze0"), Vehicle.load("generic")
 PERIODS_S = {LEAF.name: 0.01, GENERIC.name: 0.1}

@@ -16,13 +16,13 @@ from cangauge.cli.app import app
 from cangauge.errors import InputError
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Sample
-from cangauge.export.c_source import CORE_HEADERS, CORE_SOURCES
-from cangauge.export.embedded import drive_with_events, export_c
+from cangauge.extras.embedded.c_source import CORE_HEADERS, CORE_SOURCES
+from cangauge.extras.embedded.embedded import drive_with_events, export_c
+from cangauge.extras.validation.packs import load
 from cangauge.identify.fit import fit
 from cangauge.model.model_file import CurveNoise, Model
 from cangauge.model.published import leaf_2012_model_file
-from cangauge.validation.packs import load
+from cangauge.types import Sample
 from estimation.test_snapshot import extended_by
 
 PLAIN = leaf_2012_model_file()

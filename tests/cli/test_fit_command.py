@@ -104,7 +104,9 @@ def test_delays_by_search(run: Run, made: Path, tmp_path: Path) -> None:
 def test_several_logs_a_report_and_its_figures(
     run: Run, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cangauge.report.export._PNG_DPI", 20)  # what is drawn, not how finely
+    monkeypatch.setattr(
+        "cangauge.extras.report.export._PNG_DPI", 20
+    )  # what is drawn, not how finely
     logs = (made / "full.parquet", made / "part.csv")
     out = ("-o", tmp_path / "m.json", "--report", tmp_path / "m.html")
     figures = ("--figures", tmp_path / "figures")
@@ -242,7 +244,7 @@ def test_a_report_that_fails_leaves_no_model(
     def broken(_result: object) -> str:
         raise CangaugeError("no ink")
 
-    monkeypatch.setattr("cangauge.report.fit.fit_report", broken)
+    monkeypatch.setattr("cangauge.extras.report.fit.fit_report", broken)
     (tmp_path / "m.json").write_text("the model before", encoding="utf-8")
     out = ("-o", tmp_path / "m.json", "--report", tmp_path / "m.html")
     ran = run("fit", made / "full.parquet", *out)

@@ -45,7 +45,9 @@ def references(days: Path) -> list[object]:
 def test_json_report_figures_and_a_model_that_runs(
     run: Run, made: Path, days: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cangauge.report.export._PNG_DPI", 20)  # what is drawn, not how finely
+    monkeypatch.setattr(
+        "cangauge.extras.report.export._PNG_DPI", 20
+    )  # what is drawn, not how finely
     better, page, folder = tmp_path / "better.json", tmp_path / "gap.html", tmp_path / "figures"
     ran = run(
         "gap", days / "trip.csv", "-m", made / "model.json", *references(days),

@@ -11,11 +11,11 @@ from cangauge.cli import config_options, shown
 from cangauge.cli.app import COMMANDS
 from cangauge.diagnosis import ALARM_BELOW
 from cangauge.estimation.settings import VALID_STD_PCT
-from cangauge.fleet import gap, run, sources
+from cangauge.extras.fleet import gap, run, sources
+from cangauge.extras.validation import packs, packs_run
+from cangauge.extras.validation.check import OPEN_SET
+from cangauge.extras.validation.plan import FULL
 from cangauge.logs.units import TEMPERATURE_SOURCES
-from cangauge.validation import packs, packs_run
-from cangauge.validation.check import OPEN_SET
-from cangauge.validation.plan import FULL
 
 SLOW_TO_IMPORT = {
     "numpy", "scipy", "pandas", "pyarrow", "bokeh", "matplotlib", "clarabel", "can", "cantools",

@@ -16,9 +16,9 @@ import pytest
 from cangauge.cli.app import COMMANDS
 from cangauge.cli.monitor import status_line
 from cangauge.errors import InputError
-from cangauge.estimation.validity import Reason
 from cangauge.service.status import reason_ids
 from cangauge.service.status_feed import LONGEST_HISTORY, Point, StatusFeed
+from cangauge.types import Reason
 from live import Command, in_process, waits
 from running import RunningService
 

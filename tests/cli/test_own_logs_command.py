@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cangauge.extras.validation import own_logs
+from cangauge.extras.validation.own_logs import Finding, Healthy, summarize, table
+from cangauge.extras.validation.twin.faults import fault_kind
 from cangauge.logs.canonical import write_log
-from cangauge.validation import own_logs
-from cangauge.validation.own_logs import Finding, Healthy, summarize, table
-from cangauge.validation.twin.faults import fault_kind
 from synthetic import synthetic_log
 
 Run = Callable[..., object]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from cangauge.dashboard.history import History
+from cangauge.extras.live.history import History
 from live import leaf_model_path
 
 

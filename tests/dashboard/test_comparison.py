@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from statuses import Clock, status
 
-from cangauge.dashboard.comparison import LOG_NAME, REFERENCE, comparison, last_hour
-from cangauge.dashboard.history import History
 from cangauge.estimation.offline import samples_of
+from cangauge.extras.live.comparison import LOG_NAME, REFERENCE, comparison, last_hour
+from cangauge.extras.live.history import History
 from cangauge.logs.canonical import write_log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model

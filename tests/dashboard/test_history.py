@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from statuses import Clock, driven, status
 
-from cangauge.dashboard.history import COLUMNS, History, Span, column
+from cangauge.extras.live.history import COLUMNS, History, Span, column
 
 
 def row(time_s: float) -> np.ndarray:

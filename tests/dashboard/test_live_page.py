@@ -24,7 +24,7 @@ from cangauge.bus.captures.capture import open_capture
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimation.validity import Sample
+from cangauge.types import Sample
 from live import Command, leaf_model_path, waits
 
 pytestmark = MARKS

@@ -15,8 +15,8 @@ import pytest
 from tornado.websocket import websocket_connect
 
 from cangauge.bus.vehicle import Vehicle
-from cangauge.dashboard.launch import LivePage
 from cangauge.errors import InputError
+from cangauge.extras.live.launch import LivePage
 from cangauge.service.addresses import http_address
 from cangauge.service.config import load_config
 from cangauge.service.lifecycle import Notifier
@@ -265,7 +265,7 @@ def test_beyond_loopback_needs_a_token(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_page_that_dies_leaves_the_service_alone() -> None:
     with (
-        LoggedLines("cangauge.dashboard") as lines,
+        LoggedLines("cangauge.extras.live") as lines,
         LivePage(http_address("127.0.0.1:0", None, {})) as page,
     ):
         latest = snapshot()

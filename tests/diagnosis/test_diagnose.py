@@ -18,9 +18,9 @@ from cangauge.diagnosis.verdict import decide
 from cangauge.errors import InputError
 from cangauge.estimation.offline import estimate_log
 from cangauge.estimation.settings import EstimatorSettings
+from cangauge.extras.report.diagnosis import gap_report
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
-from cangauge.report.diagnosis import gap_report
 from synthetic import synthetic_log
 
 FAULTS = {

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.discovery.by_name import named_signals
+from cangauge.extras.discovery.by_name import named_signals
 
 # make: signals with their units; the first two are current and voltage of the pack
 PUBLIC = {

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from cangauge.bus.captures.capture import open_capture
-from cangauge.discovery.fields import collect
-from cangauge.discovery.pairs import Candidate
-from cangauge.discovery.search import search
+from cangauge.extras.discovery.fields import collect
+from cangauge.extras.discovery.pairs import Candidate
+from cangauge.extras.discovery.search import search
 from drive_captures import CARS, Bits, Car, Frame, capture
 from init_makes import HELD_OUT, evaluate
 

@@ -22,13 +22,13 @@ from cangauge.estimation.core_constants import core_constants, effect_fields
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Estimate, Sample, Status
+from cangauge.extras.validation.packs import BenchPack, load
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import capacity_from_reference
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Model
-from cangauge.validation.packs import BenchPack, load
+from cangauge.types import Estimate, Sample, Status
 from estimation.test_any_input import MODELS, RULES, inputs, odd, samples_of_rows
 from estimation.test_snapshot import eventful_samples
 

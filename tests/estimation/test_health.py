@@ -13,10 +13,10 @@ from cangauge.estimation.estimator import Estimator, EstimatorSettings
 from cangauge.estimation.health import Health, ResistanceEstimator
 from cangauge.estimation.settings import FullCharge
 from cangauge.estimation.state import EstimatorState
-from cangauge.estimation.validity import Sample
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
+from cangauge.types import Sample
 from synthetic import drive_current
 
 PACK = leaf_2012_model()

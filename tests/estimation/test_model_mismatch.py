@@ -13,10 +13,10 @@ from cangauge import simulate
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import estimate_log, samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Reason, Status
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
+from cangauge.types import Reason, Status
 
 SEED: dict[str, Any] = {"plant": "equation", "seed": 5}
 

@@ -17,11 +17,11 @@ from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings, FullCharge, LongRest
 from cangauge.estimation.state import EstimatorState
-from cangauge.estimation.validity import Estimate, Reason, Sample
 from cangauge.model.effects.base import Pack
 from cangauge.model.effects.library import LIBRARY, effect_entries
 from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
+from cangauge.types import Estimate, Reason, Sample
 from synthetic import synthetic_log
 
 PACK = Pack.of(leaf_2012_model(), CAPACITY_AH)

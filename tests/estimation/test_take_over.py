@@ -7,8 +7,8 @@ import pytest
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Estimate, Reason, Sample
 from cangauge.model.model_file import Model
+from cangauge.types import Estimate, Reason, Sample
 from live import leaf_model, short_log
 
 

@@ -13,8 +13,8 @@ from cangauge.estimation.counting import SET_BACK_SAMPLES, moved_log_odds
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings, FullCharge, LongRest
-from cangauge.estimation.validity import Estimate, Reason, Sample
 from cangauge.model.published import leaf_2012_model, leaf_2012_model_file
+from cangauge.types import Estimate, Reason, Sample
 from synthetic import synthetic_log
 
 MODEL = leaf_2012_model_file()

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from cangauge.cli.app import app
 from cangauge.errors import InputError
-from cangauge.export.equivalent_circuit import equivalent_circuit
+from cangauge.extras.embedded.equivalent_circuit import equivalent_circuit
 from cangauge.logs.log import Log
 from cangauge.model.effects.first_order import low_passed
 from cangauge.model.model_file import Model

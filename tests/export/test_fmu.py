@@ -14,12 +14,12 @@ from cangauge.cli.app import app
 from cangauge.errors import CangaugeError, InputError
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Sample
-from cangauge.export.fmu import Kind, Version, export_fmu
+from cangauge.extras.embedded.fmu import Kind, Version, export_fmu
 from cangauge.model.delay_line import DelayLine
 from cangauge.model.effects.base import Reading
 from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
+from cangauge.types import Sample
 
 fmpy = pytest.importorskip("fmpy", reason="needs the simulator fmpy")
 if shutil.which("cc") is None:

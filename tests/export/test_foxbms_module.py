@@ -17,13 +17,13 @@ from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.state import DelayLineState
-from cangauge.estimation.validity import Estimate, Sample
-from cangauge.export.c_source import CORE_SOURCES
-from cangauge.export.embedded import drive_with_events, export_c
+from cangauge.extras.embedded.c_source import CORE_SOURCES
+from cangauge.extras.embedded.embedded import drive_with_events, export_c
+from cangauge.extras.validation.packs import load
 from cangauge.identify.fit import fit
 from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
-from cangauge.validation.packs import load
+from cangauge.types import Estimate, Sample
 
 HERE = Path(__file__).parent / "foxbms"
 STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-ffp-contract=off"]

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cangauge.fleet.sources import FleetLog, find_logs
+from cangauge.extras.fleet.sources import FleetLog, find_logs
+from cangauge.extras.validation.cases import Scenario, draw_scenario
+from cangauge.extras.validation.twin.recording import record_drive
 from cangauge.identify.fit import fit
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import counted_soc_pct
 from cangauge.model.model_file import Model
-from cangauge.validation.cases import Scenario, draw_scenario
-from cangauge.validation.twin.recording import record_drive
 from fleet_cluster import Cluster, free_port
 
 VEHICLES, LOGS = 4, 2

@@ -16,11 +16,11 @@ import pytest
 
 from cangauge.errors import InputError
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.fleet import run as fleet_run
-from cangauge.fleet.dataset import Dataset
-from cangauge.fleet.jobs import EstimateJob
-from cangauge.fleet.run import Summary, connected, perform, run_job
-from cangauge.fleet.sources import FleetLog, ReadOptions, find_logs
+from cangauge.extras.fleet import run as fleet_run
+from cangauge.extras.fleet.dataset import Dataset
+from cangauge.extras.fleet.jobs import EstimateJob
+from cangauge.extras.fleet.run import Summary, connected, perform, run_job
+from cangauge.extras.fleet.sources import FleetLog, ReadOptions, find_logs
 from cangauge.model.model_file import Model, ModelNoise
 from fleet_cluster import Cluster, wait_until
 from live import in_process
@@ -206,7 +206,7 @@ def test_logs_and_results_live_in_object_storage(
 
 def test_help_imports_no_engine() -> None:
     code = (
-        "import sys; import cangauge, cangauge.cli.fleet\n"
+        "import sys; import cangauge, cangauge.extras.fleet.command\n"
         "print([m for m in sys.modules if m.split('.')[0] in {'dask', 'distributed', 'fsspec'}])"
     )
     done = subprocess.run(

@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from cangauge.fleet import run as fleet_run
-from cangauge.fleet.gap import GapJob
-from cangauge.fleet.sources import FleetLog
+from cangauge.extras.fleet import run as fleet_run
+from cangauge.extras.fleet.gap import GapJob
+from cangauge.extras.fleet.sources import FleetLog
+from cangauge.extras.validation.cases import Scenario
 from cangauge.logs.canonical import write_log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
-from cangauge.validation.cases import Scenario
 from fleet_here import Here
 from live import Ended, in_process
 from report_html import Html

@@ -12,18 +12,18 @@ import pytest
 
 from cangauge.errors import InputError
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.fleet.dataset import Dataset, keys_of
-from cangauge.fleet.gap import GapJob, suspect_and_healthy
-from cangauge.fleet.health import HealthJob, outliers
-from cangauge.fleet.jobs import REAL, EstimateJob
-from cangauge.fleet.outliers import ErrorsByLog
-from cangauge.fleet.overview import FleetOverview
-from cangauge.fleet.run import perform, run_id
-from cangauge.fleet.sources import FleetLog, ReadOptions
+from cangauge.extras.fleet.dataset import Dataset, keys_of
+from cangauge.extras.fleet.gap import GapJob, suspect_and_healthy
+from cangauge.extras.fleet.health import HealthJob, outliers
+from cangauge.extras.fleet.jobs import REAL, EstimateJob
+from cangauge.extras.fleet.outliers import ErrorsByLog
+from cangauge.extras.fleet.overview import FleetOverview
+from cangauge.extras.fleet.run import perform, run_id
+from cangauge.extras.fleet.sources import FleetLog, ReadOptions
+from cangauge.extras.report.fleet import fleet_page, fleet_report
 from cangauge.logs.canonical import write_log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
-from cangauge.report.fleet import fleet_page, fleet_report
 from report_html import Html
 
 LOG = FleetLog("a.csv", "A 1/7", "s1")

@@ -11,15 +11,15 @@ from typing import Any, ClassVar, Self
 import pytest
 
 from cangauge.errors import CangaugeError, InputError
-from cangauge.fleet import run as fleet_run
-from cangauge.fleet.dataset import Dataset, by_kind
-from cangauge.fleet.fit import fit_fleet
-from cangauge.fleet.jobs import Job
-from cangauge.fleet.passes import ErrorsJob
-from cangauge.fleet.run import Summary, run_id, run_job
-from cangauge.fleet.sources import FleetLog, ReadOptions, find_logs
+from cangauge.extras.fleet import run as fleet_run
+from cangauge.extras.fleet.dataset import Dataset, by_kind
+from cangauge.extras.fleet.fit import fit_fleet
+from cangauge.extras.fleet.jobs import Job
+from cangauge.extras.fleet.passes import ErrorsJob
+from cangauge.extras.fleet.run import Summary, run_id, run_job
+from cangauge.extras.fleet.sources import FleetLog, ReadOptions, find_logs
+from cangauge.extras.validation.cases import Scenario
 from cangauge.inference.rows import FitOptions
-from cangauge.validation.cases import Scenario
 from fleet_here import ChainedJob, Done, Here, NotingJob
 
 

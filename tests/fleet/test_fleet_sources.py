@@ -9,7 +9,7 @@ import fsspec
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.fleet.sources import ABSENT, FleetLog, ReadOptions, find_logs, local_file
+from cangauge.extras.fleet.sources import ABSENT, FleetLog, ReadOptions, find_logs, local_file
 from cangauge.logs.column_map import ColumnMap
 
 HEAD = "time_s,current_a,voltage_v,temperature_c\n"

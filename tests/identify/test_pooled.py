@@ -9,6 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cangauge.extras.validation.cases import Scenario, draw_scenario
+from cangauge.extras.validation.twin.recording import record_drive
 from cangauge.identify import passes
 from cangauge.identify.fit import Identification, fit
 from cangauge.identify.log_errors import (
@@ -32,8 +34,6 @@ from cangauge.inference.linearized import SLOPE_CHECKS
 from cangauge.inference.rows import FitOptions, FitRows, block_numbers, fit_rows
 from cangauge.logs.log import Log
 from cangauge.model.voltage_model import SLOPE_AT_LEAST, ocv_basis_slope
-from cangauge.validation.cases import Scenario, draw_scenario
-from cangauge.validation.twin.recording import record_drive
 
 SAME = 1e-9
 

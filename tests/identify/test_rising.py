@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from cangauge.errors import InputError
+from cangauge.extras.validation.cases import draw_scenario
 from cangauge.identify import voltage_fit
 from cangauge.identify.fit import fit
 from cangauge.model.voltage_model import SLOPE_POINTS
-from cangauge.validation.cases import draw_scenario
 
 
 def test_a_fall_between_two_points_is_constrained_too(

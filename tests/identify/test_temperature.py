@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from cangauge.extras.validation.recordings import LG_CAPACITY_AH, LG_PARALLEL, LG_SERIES
+from cangauge.extras.validation.twin.injection import scaled_to_pack, with_initial_soc
 from cangauge.identify.fit import fit
 from cangauge.identify.passes import fit_voltage_model
 from cangauge.inference.rows import FitOptions, fit_rows
@@ -17,8 +19,6 @@ from cangauge.logs.read import read_log
 from cangauge.model.effects.first_order import low_passed
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 from cangauge.model.voltage_model import VoltageModel
-from cangauge.validation.recordings import LG_CAPACITY_AH, LG_PARALLEL, LG_SERIES
-from cangauge.validation.twin.injection import scaled_to_pack, with_initial_soc
 from synthetic import synthetic_log
 
 OPTIONS = FitOptions(capacity_ah=CAPACITY_AH)

@@ -17,9 +17,9 @@ from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.inspect import _show, inspect_command
 from cangauge.errors import InputError
-from cangauge.estimation.validity import Sample
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
+from cangauge.types import Sample
 
 app = typer.Typer()
 app.command()(inspect_command)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cangauge.report.charts import envelope, extremes, sampling_slice
+from cangauge.extras.report.charts import envelope, extremes, sampling_slice
 
 VALUES = st.one_of(st.floats(-1e6, 1e6), st.just(float("nan")))
 SERIES = arrays(np.float64, st.integers(0, 400), elements=VALUES)

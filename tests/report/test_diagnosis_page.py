@@ -13,15 +13,24 @@ import pytest
 
 from cangauge.diagnosis import SEGMENTS, Diagnosis, ErrorShare, diagnose
 from cangauge.errors import InputError
+from cangauge.extras.report.diagnosis import gap_page
+from cangauge.extras.report.error_places import share_figures
+from cangauge.extras.report.page import (
+    Beside,
+    Bullets,
+    Figure,
+    InputFile,
+    Page,
+    Section,
+    Table,
+    render,
+)
+from cangauge.extras.report.summary import EXPLAINED, headline
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH
-from cangauge.report.diagnosis import gap_page
-from cangauge.report.error_places import share_figures
-from cangauge.report.page import Beside, Bullets, Figure, InputFile, Page, Section, Table, render
-from cangauge.report.summary import EXPLAINED, headline
 from report_html import MAX_PAGE_BYTES, Html, excess_width_px, title_after_scripts
 from synthetic import synthetic_log
 

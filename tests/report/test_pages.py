@@ -14,17 +14,17 @@ from markupsafe import escape
 from cangauge._version import __version__
 from cangauge.estimation.offline import estimate_log
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import REASON_WORDS, Reason
+from cangauge.extras.report.charts import Timeline
+from cangauge.extras.report.estimate import estimate_page, estimate_report
+from cangauge.extras.report.fit import fit_page, fit_report
+from cangauge.extras.report.page import Bullets, Figure, Page, Section, Table, Tile, joined, render
 from cangauge.identify.fit import Identification, fit
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
-from cangauge.report.charts import Timeline
-from cangauge.report.estimate import estimate_page, estimate_report
-from cangauge.report.fit import fit_page, fit_report
-from cangauge.report.page import Bullets, Figure, Page, Section, Table, Tile, joined, render
 from cangauge.service.offline import RecordedCapture, RecordedEstimate
+from cangauge.types import REASON_WORDS, Reason
 from report_html import MAX_PAGE_BYTES, Html, excess_width_px, title_after_scripts
 from synthetic import synthetic_log
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from cangauge.diagnosis import Ceiling, Verdict
-from cangauge.report.summary import (
+from cangauge.extras.report.summary import (
     headline,
     next_step,
     open_question,

@@ -15,16 +15,16 @@ from cangauge.cli.app import app
 from cangauge.errors import InputError
 from cangauge.estimation.offline import estimate_log
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Reason, Status
+from cangauge.extras.report.estimate import estimate_report
+from cangauge.extras.report.inspection import inspect_report
+from cangauge.extras.report.verdict import estimate_verdict, fit_verdict, inspect_verdict, periods
 from cangauge.identify.fit import Identification, fit
 from cangauge.inspect.log import inspect_log
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
 from cangauge.model.published import CAPACITY_AH
-from cangauge.report.estimate import estimate_report
-from cangauge.report.inspection import inspect_report
-from cangauge.report.verdict import estimate_verdict, fit_verdict, inspect_verdict, periods
 from cangauge.service.offline import RecordedEstimate
+from cangauge.types import Reason, Status
 from report_html import MAX_PAGE_BYTES, Html
 from synthetic import synthetic_log
 

@@ -21,9 +21,9 @@ import pytest
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import CangaugeError
-from cangauge.estimation.validity import Sample
 from cangauge.service.state import FILE_NAME
 from cangauge.service.status_client import fetch_status
+from cangauge.types import Sample
 from faults.large_dbc import write_large_dbc
 from live import Command, leaf_model_path, waits
 

@@ -18,14 +18,14 @@ from cangauge.bus.publish import FrameIds
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Reason, Status
+from cangauge.extras.live.metrics import Exposition
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.loop import DUPLICATE_WARN_EVERY_S, DuplicateSenderDetector
-from cangauge.service.metrics import Exposition
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
 from cangauge.service.status import Identity, Monitor, as_json
+from cangauge.types import Reason, Status
 from live import (
     Service,
     leaf_model,

@@ -339,6 +339,6 @@ def test_without_prometheus_client_one_line_says_so(
     watched: Watched, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "prometheus_client", None)
-    monkeypatch.delitem(sys.modules, "cangauge.service.metrics", raising=False)
+    monkeypatch.delitem(sys.modules, "cangauge.extras.live.metrics", raising=False)
     with pytest.raises(InputError, match=r"cangauge\[metrics\]"):
         Endpoint(lambda: watched.monitor.latest, http=http_address("127.0.0.1:0", None, {}))

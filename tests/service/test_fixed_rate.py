@@ -14,10 +14,10 @@ from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.publish import SocDetail, SocEstimate, SocReader
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Reason, Sample, Status
 from cangauge.service import loop
 from cangauge.service.loop import LoopSettings, Outputs, serve
 from cangauge.service.pipeline import Pipeline, PipelineSettings
+from cangauge.types import Reason, Sample, Status
 from live import leaf_model, never
 
 

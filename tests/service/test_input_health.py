@@ -16,8 +16,8 @@ from cangauge.bus.publish import SocEstimate, SocReader
 from cangauge.bus.vehicle import Vehicle, VehicleSignal
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Estimate, Reason, Sample, Status
 from cangauge.service.pipeline import Pipeline, PipelineSettings
+from cangauge.types import Estimate, Reason, Sample, Status
 from live import leaf_model, short_log
 
 START = EstimatorSettings(initial_soc_pct=80.0)

@@ -16,11 +16,11 @@ from cangauge.bus.publish import SocDetail, SocEstimate, SocReader
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
-from cangauge.estimation.validity import Reason, Status
 from cangauge.service.loop import LoopSettings
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
+from cangauge.types import Reason, Status
 from live import (
     BrokenBus,
     Service,

@@ -12,9 +12,9 @@ from watched import StandInPort, Watched
 
 from cangauge._logging import RateLimitFilter
 from cangauge.estimation.cells import CellReport
-from cangauge.estimation.validity import Reason, Status
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.status import BOUNDS_S, Histogram, as_json
+from cangauge.types import Reason, Status
 
 
 class CountingNotifier(Notifier):

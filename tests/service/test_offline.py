@@ -13,11 +13,11 @@ from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.offline import samples_of
-from cangauge.estimation.validity import Estimate
 from cangauge.service import recording as record
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
+from cangauge.types import Estimate
 from live import leaf_model, short_log
 
 NUMBERS = ("soc_pct", "soc_std_pct", "soc_newton_pct", "voltage_model_v", "residual_v")

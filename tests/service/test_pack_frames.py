@@ -30,10 +30,10 @@ from cangauge.estimation.health import Health
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.power import PackLimits, Power
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Estimate, Reason, Status
 from cangauge.logs.log import Log
 from cangauge.service.config import load_config
 from cangauge.service.pipeline import Pipeline, PipelineSettings
+from cangauge.types import Estimate, Reason, Status
 from cells_bus import ALL_CELLS, CAR, CELLS_DBC, CELLS_ON_BUS, all_cell_frames
 from live import collect, leaf_model, short_log, virtual_port, virtual_service
 

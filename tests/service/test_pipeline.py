@@ -14,9 +14,9 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Estimate, Reason, Status
 from cangauge.logs.log import Log
 from cangauge.service.pipeline import Pipeline, PipelineSettings
+from cangauge.types import Estimate, Reason, Status
 from live import leaf_model, short_log
 
 START = EstimatorSettings(initial_soc_pct=80.0)

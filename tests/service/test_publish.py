@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from cangauge.bus.publish import FrameIds, SocDetail, SocEstimate, SocPublisher, SocReader
 from cangauge.errors import InputError
-from cangauge.estimation.validity import Estimate, Reason, Status
+from cangauge.types import Estimate, Reason, Status
 
 numbers = st.floats(-1e4, 1e4) | st.just(math.nan)
 

@@ -16,9 +16,9 @@ from cangauge.bus.recording import open_vehicle_capture
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Estimate, Reason, Status
 from cangauge.logs.read import read_log
 from cangauge.service.pipeline import Pipeline, PipelineSettings
+from cangauge.types import Estimate, Reason, Status
 from live import leaf_model
 
 pytestmark = pytest.mark.real

@@ -15,9 +15,9 @@ from cangauge.bus.database import load_dbc
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
-from cangauge.estimation.validity import Reason
 from cangauge.service.loop import LoopSettings
 from cangauge.service.run import Service
+from cangauge.types import Reason
 from faults.large_dbc import SIGNALS
 from live import LoggedLines, leaf_model_path, short_log, waits
 

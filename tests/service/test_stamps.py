@@ -20,11 +20,11 @@ from cangauge.bus.recording import capture_samples
 from cangauge.bus.time_source import ClockFrames, ReceiveTime
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
-from cangauge.estimation.validity import Reason, Sample, Status
 from cangauge.service.loop import LoopSettings
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.recording import Recorder
+from cangauge.types import Reason, Sample, Status
 from live import Service, leaf_model, short_log, virtual_port, virtual_service, waits
 
 KERNEL = BackendCapabilities("kernel", echoes=False, has_error_classes=False)

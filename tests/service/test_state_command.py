@@ -15,9 +15,9 @@ from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.publish import SocEstimate, SocReader, standard_filter
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
-from cangauge.estimation.validity import Reason, Status
 from cangauge.service.loop import LoopSettings
 from cangauge.service.state import read_state
+from cangauge.types import Reason, Status
 from live import (
     Command,
     collect,

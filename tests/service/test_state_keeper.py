@@ -24,7 +24,6 @@ from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Estimate, Reason, Sample, Status
 from cangauge.model.model_file import Model
 from cangauge.service import state as state_keeper
 from cangauge.service.pipeline import Pipeline, PipelineSettings
@@ -36,6 +35,7 @@ from cangauge.service.state import (
     read_state,
     state_path,
 )
+from cangauge.types import Estimate, Reason, Sample, Status
 from live import LoggedLines, leaf_model, short_log
 
 MODEL = leaf_model()

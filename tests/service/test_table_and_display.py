@@ -16,8 +16,8 @@ from watched import Watched
 
 from cangauge.cli.run import LiveLine, live_text
 from cangauge.errors import InputError
-from cangauge.estimation.validity import Estimate, Reason, Status
 from cangauge.service.estimate_table import EstimateWriter
+from cangauge.types import Estimate, Reason, Status
 from live import LoggedLines
 
 ROW = Estimate(

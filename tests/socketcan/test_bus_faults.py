@@ -28,9 +28,9 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Reason, Status
 from cangauge.service.loop import LoopSettings
 from cangauge.service.pipeline import Pipeline, PipelineSettings
+from cangauge.types import Reason, Status
 from live import Command, Service, leaf_model, leaf_model_path, short_log, waits
 
 pytestmark = pytest.mark.socketcan

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cangauge.validation.twin.drive import Drive, draw_drive
-from cangauge.validation.twin.pack import Pack, draw_pack
-from cangauge.validation.twin.plant import TwinPlant
+from cangauge.extras.validation.twin.drive import Drive, draw_drive
+from cangauge.extras.validation.twin.pack import Pack, draw_pack
+from cangauge.extras.validation.twin.plant import TwinPlant
 
 
 @pytest.fixture(scope="session")

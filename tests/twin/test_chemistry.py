@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge.errors import InputError
-from cangauge.validation.twin.pack import CHEMISTRIES, chemistry
+from cangauge.extras.validation.twin.pack import CHEMISTRIES, chemistry
 
 PLATEAU_V = {"nmc": 3.745, "lmo": 3.835, "nca": 3.742, "lfp": 3.297}
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from cangauge.extras.validation.cases import Scenario, draw_scenario
+from cangauge.extras.validation.twin.faults import Fault, fault_kind, fault_kinds
+from cangauge.extras.validation.twin.recording import GroundTruth, record_drive, rms, simulate_truth
 from cangauge.identify.fit import fit
-from cangauge.validation.cases import Scenario, draw_scenario
-from cangauge.validation.twin.faults import Fault, fault_kind, fault_kinds
-from cangauge.validation.twin.recording import GroundTruth, record_drive, rms, simulate_truth
 
 
 @pytest.fixture(scope="module")

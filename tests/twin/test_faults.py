@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.validation.twin.condition import HEALTHY, Intermittent
-from cangauge.validation.twin.drive import Drive, draw_drive
-from cangauge.validation.twin.faults import (
+from cangauge.extras.validation.twin.condition import HEALTHY, Intermittent
+from cangauge.extras.validation.twin.drive import Drive, draw_drive
+from cangauge.extras.validation.twin.faults import (
     Fault,
     apply_faults,
     cole_cole,
@@ -16,10 +16,16 @@ from cangauge.validation.twin.faults import (
     fault_kinds,
     finite_warburg,
 )
-from cangauge.validation.twin.pack import Pack
-from cangauge.validation.twin.plant import TwinPlant
-from cangauge.validation.twin.recording import GroundTruth, gap_v, record_drive, rms, simulate_truth
-from cangauge.validation.twin.scaling import scale_to_gap
+from cangauge.extras.validation.twin.pack import Pack
+from cangauge.extras.validation.twin.plant import TwinPlant
+from cangauge.extras.validation.twin.recording import (
+    GroundTruth,
+    gap_v,
+    record_drive,
+    rms,
+    simulate_truth,
+)
+from cangauge.extras.validation.twin.scaling import scale_to_gap
 
 DESIGN_IDS = {
     "current_offset", "current_gain", "voltage_offset", "voltage_gain", "temperature_lag",

@@ -34,19 +34,19 @@ def imported(path: Path) -> set[str]:
 
 
 def test_twin_imports_nothing_under_test(project: Path) -> None:
-    for path in modules(project, "validation/twin"):
+    for path in modules(project, "extras/validation/twin"):
         bad = {name for name in imported(path) if name.startswith(UNDER_TEST)}
         assert not bad, f"{path.name} imports {bad}"
 
 
 def test_validation_imports_only_the_face_of_diagnosis(project: Path) -> None:
-    for path in modules(project, "validation"):
+    for path in modules(project, "extras/validation"):
         bad = {name for name in imported(path) if name.startswith("cangauge.diagnosis")} - FACE
         assert not bad, f"{path.name} imports {bad}"
 
 
 def test_validation_does_not_import_effects(project: Path) -> None:
-    for path in modules(project, "validation"):
+    for path in modules(project, "extras/validation"):
         assert not {n for n in imported(path) if n.startswith("cangauge.model.effects")}, path.name
 
 
@@ -55,7 +55,7 @@ def test_twin_loads_nothing_under_test(project: Path) -> None:
     folder = project / "src/cangauge"
     names = [
         ".".join(("cangauge", *path.relative_to(folder).with_suffix("").parts))
-        for path in modules(project, "validation/twin")
+        for path in modules(project, "extras/validation/twin")
         if path.stem != "__init__"
     ]
     code = (
@@ -70,7 +70,9 @@ def test_twin_loads_nothing_under_test(project: Path) -> None:
 
 @pytest.mark.slow
 def test_importing_validation_loads_nothing_heavy() -> None:
-    code = "import sys, cangauge.validation; print(any('numpy' in name for name in sys.modules))"
+    code = (
+        "import sys, cangauge.extras.validation;print(any('numpy' in name for name in sys.modules))"
+    )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     )

@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lsim
 
-from cangauge.validation.twin.condition import HEALTHY
-from cangauge.validation.twin.drive import Drive, draw_drive
-from cangauge.validation.twin.pack import KINDS, Pack, draw_pack
-from cangauge.validation.twin.plant import TwinPlant, lagged, relax, temperatures
-from cangauge.validation.twin.recording import simulate_truth, true_soc_pct
+from cangauge.extras.validation.twin.condition import HEALTHY
+from cangauge.extras.validation.twin.drive import Drive, draw_drive
+from cangauge.extras.validation.twin.pack import KINDS, Pack, draw_pack
+from cangauge.extras.validation.twin.plant import TwinPlant, lagged, relax, temperatures
+from cangauge.extras.validation.twin.recording import simulate_truth, true_soc_pct
 
 
 def constant_drive(

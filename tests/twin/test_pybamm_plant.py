@@ -8,11 +8,15 @@ import numpy as np
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.validation.twin.condition import HEALTHY, Condition, WeakCells
-from cangauge.validation.twin.drive import Drive, draw_drive
-from cangauge.validation.twin.pack import draw_pack
-from cangauge.validation.twin.pybamm_plant import PARAMETER_SETS, PybammPlant, draw_pybamm_plant
-from cangauge.validation.twin.recording import simulate_truth
+from cangauge.extras.validation.twin.condition import HEALTHY, Condition, WeakCells
+from cangauge.extras.validation.twin.drive import Drive, draw_drive
+from cangauge.extras.validation.twin.pack import draw_pack
+from cangauge.extras.validation.twin.pybamm_plant import (
+    PARAMETER_SETS,
+    PybammPlant,
+    draw_pybamm_plant,
+)
+from cangauge.extras.validation.twin.recording import simulate_truth
 
 needs_pybamm = pytest.mark.skipif(
     importlib.util.find_spec("pybamm") is None, reason="the extra pybamm is not installed"

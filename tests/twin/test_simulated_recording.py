@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cangauge.validation.twin.drive import Drive, draw_drive
-from cangauge.validation.twin.faults import Fault
-from cangauge.validation.twin.pack import Pack, draw_pack
-from cangauge.validation.twin.plant import TwinPlant
-from cangauge.validation.twin.recording import record_drive, rms
+from cangauge.extras.validation.twin.drive import Drive, draw_drive
+from cangauge.extras.validation.twin.faults import Fault
+from cangauge.extras.validation.twin.pack import Pack, draw_pack
+from cangauge.extras.validation.twin.plant import TwinPlant
+from cangauge.extras.validation.twin.recording import record_drive, rms
 
 
 def with_sensors(pack: Pack, **changes: float) -> Pack:

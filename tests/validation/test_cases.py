@@ -10,17 +10,15 @@ import numpy as np
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
-from cangauge.validation.cases import (
+from cangauge.extras.validation.cases import (
     CaseOptions,
     Scenario,
     draw_case,
     draw_recorded_case,
     draw_scenario,
 )
-from cangauge.validation.twin.faults import Fault
-from cangauge.validation.twin.injection import (
+from cangauge.extras.validation.twin.faults import Fault
+from cangauge.extras.validation.twin.injection import (
     fit_surrogate_pack,
     inject,
     scale_injection,
@@ -28,8 +26,10 @@ from cangauge.validation.twin.injection import (
     soc_of,
     with_initial_soc,
 )
-from cangauge.validation.twin.pack import Pack
-from cangauge.validation.twin.recording import rms
+from cangauge.extras.validation.twin.pack import Pack
+from cangauge.extras.validation.twin.recording import rms
+from cangauge.logs.log import Log
+from cangauge.logs.read import read_log
 
 OPTIONS = CaseOptions(kind="leaf24", hours=0.5, climate="mild")
 

@@ -12,8 +12,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from cangauge.cli.app import main
-from cangauge.validation.check import diagnose_tasks, draw_all, load_files, score_answers
-from cangauge.validation.plan import EFFECTS, Sizes, plan
+from cangauge.extras.validation.check import diagnose_tasks, draw_all, load_files, score_answers
+from cangauge.extras.validation.plan import EFFECTS, Sizes, plan
 
 SIZES = {"simulated": Sizes(per_effect=1, healthy=1, effects=1)}
 ABOUT = {"seed": 5, "final": False}

@@ -15,13 +15,13 @@ import pytest
 from cangauge.cli.app import main
 from cangauge.errors import InputError
 from cangauge.estimation.offline import EstimateTable
-from cangauge.estimation.validity import Status
+from cangauge.extras.validation import packs, packs_quantities, packs_run
+from cangauge.extras.validation.packs_quantities import Quantity, QuantityRow, pool_quantities
+from cangauge.extras.validation.packs_score import Bench, LogScore, Row, pool_scores, score_log
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import counted_soc_pct
 from cangauge.model.published import CAPACITY_AH
-from cangauge.validation import packs, packs_quantities, packs_run
-from cangauge.validation.packs_quantities import Quantity, QuantityRow, pool_quantities
-from cangauge.validation.packs_score import Bench, LogScore, Row, pool_scores, score_log
+from cangauge.types import Status
 from synthetic import synthetic_log
 
 CASES = {case.name: case for case in packs_run.CASES}

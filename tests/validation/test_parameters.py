@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from cangauge.extras.validation.cases import CaseOptions, Scenario
+from cangauge.extras.validation.score import COMPARABLE, expected_parameters
+from cangauge.extras.validation.twin.drive import Drive
+from cangauge.extras.validation.twin.faults import Fault, fault_kinds
+from cangauge.extras.validation.twin.recording import record_drive, rms
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.effects.base import Signals
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.extended import ExtendedModel
-from cangauge.validation.cases import CaseOptions, Scenario
-from cangauge.validation.score import COMPARABLE, expected_parameters
-from cangauge.validation.twin.drive import Drive
-from cangauge.validation.twin.faults import Fault, fault_kinds
-from cangauge.validation.twin.recording import record_drive, rms
 
 SIZES = {
     "current_offset": 4.0,

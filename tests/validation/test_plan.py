@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.validation.check import LABELS, read_labels, write_labels
-from cangauge.validation.final_seeds import FINAL_SEED
-from cangauge.validation.plan import EFFECTS, FULL, Group, Sizes, plan
+from cangauge.extras.validation.check import LABELS, read_labels, write_labels
+from cangauge.extras.validation.final_seeds import FINAL_SEED
+from cangauge.extras.validation.plan import EFFECTS, FULL, Group, Sizes, plan
 
 SIMULATED = {"simulated": FULL["simulated"]}
 

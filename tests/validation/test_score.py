@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cangauge.validation.score import Outcome, bootstrapped, outcome_of, proportion, score
-from cangauge.validation.tables import judge_targets
-from cangauge.validation.worker_pool import Task
+from cangauge.extras.validation.score import Outcome, bootstrapped, outcome_of, proportion, score
+from cangauge.extras.validation.tables import judge_targets
+from cangauge.extras.validation.worker_pool import Task
 
 
 def label(*effects: str, size: float = 0.0, gap_v: float = 2.0, **more: Any) -> dict[str, Any]:

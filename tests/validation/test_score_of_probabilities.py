@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from cangauge.validation.score import Outcome, score
+from cangauge.extras.validation.score import Outcome, score
 
 
 def outcome(truth: str, verdict: str, of_truth: float, *, alarm: bool, answers: int) -> Outcome:

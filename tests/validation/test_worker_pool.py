@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from cangauge.validation import worker_pool
-from cangauge.validation.plan import EFFECTS
-from cangauge.validation.worker_pool import Task, diagnose_all
+from cangauge.extras.validation import worker_pool
+from cangauge.extras.validation.plan import EFFECTS
+from cangauge.extras.validation.worker_pool import Task, diagnose_all
 
 SPY = """
 import json, os, sys

@@ -21,7 +21,7 @@ from cangauge.bus.plausibility import (
 )
 from cangauge.bus.protection import SUSPECTED_AT, FrameChecker, Verdict
 from cangauge.bus.vehicle import EXTENDED, Vehicle, VehicleSignal, pgn_mask
-from cangauge.estimation.validity import Reason, Sample
+from cangauge.types import Reason, Sample
 
 _MISSING: Final = {
     "current": Reason.CURRENT_MISSING,

@@ -16,8 +16,8 @@ from cangauge.bus.protection import Protection
 from cangauge.bus.time_source import MICROSECONDS
 from cangauge.bus.vehicle import LOG_COLUMNS, Vehicle, VehicleSignal
 from cangauge.errors import InputError
-from cangauge.estimation.validity import Sample
 from cangauge.logs.log import Log
+from cangauge.types import Sample
 
 SLOW_EVERY_S: Final = 1.0
 """Longest interval at which temperature and SoC are sent without a change, in log time [s]."""

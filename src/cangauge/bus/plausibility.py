@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from cangauge.bus.mapping import CheckMap
-from cangauge.estimation.validity import CURRENT_AT_MOST_A, TEMPERATURE_WITHIN_C, VOLTAGE_WITHIN
+from cangauge.types import CURRENT_AT_MOST_A, TEMPERATURE_WITHIN_C, VOLTAGE_WITHIN
 
 INVALID_AFTER: Final = 5
 VALID_AFTER: Final = 3

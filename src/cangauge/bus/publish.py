@@ -32,7 +32,7 @@ from cangauge.errors import InputError
 from cangauge.estimation.cells import CellReport
 from cangauge.estimation.health import Health
 from cangauge.estimation.power import Power
-from cangauge.estimation.validity import Estimate, Reason, Status
+from cangauge.types import Estimate, Reason, Status
 
 ESTIMATE_EVERY_S: Final = 0.1
 DETAIL_EVERY_S: Final = 1.0

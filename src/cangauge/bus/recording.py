@@ -30,13 +30,13 @@ from cangauge.bus.decoder import FrameStatistics, SampleDecoder
 from cangauge.bus.time_source import ReceiveTime, TimeSource, TimeSourceName, time_source
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimation.validity import Sample
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.draft import Sign
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.read import KNOWN_LOGS, LogFile, not_recognised, open_log
 from cangauge.logs.sign import resolve_sign
 from cangauge.logs.units import known_temperature_source, refuse_wrong_units
+from cangauge.types import Sample
 
 VOLTAGE_FILL_S: Final = 1.0
 """Longest time between two voltages for interpolation [s]; rows further from one are dropped."""

@@ -52,11 +52,11 @@ def demo_command(
     from cangauge.bus.vehicle import Vehicle
     from cangauge.estimation.offline import estimate_log, score
     from cangauge.estimation.settings import EstimatorSettings
+    from cangauge.extras.report.estimate import estimate_report
+    from cangauge.extras.report.fit import fit_report
     from cangauge.identify.fit import fit
     from cangauge.logs.read import read_log
     from cangauge.replay.steps import quantization_bound
-    from cangauge.report.estimate import estimate_report
-    from cangauge.report.fit import fit_report
     from cangauge.service.addresses import LOOPBACK
     from cangauge.service.estimate_table import read_estimates
     from cangauge.service.offline import RecordedEstimate

@@ -233,7 +233,7 @@ def _write_output(
     page = None
     if report is not None:
         # bokeh takes half a second to import.
-        from cangauge.report.estimate import estimate_report
+        from cangauge.extras.report.estimate import estimate_report
 
         page = estimate_report(done, model_path)
     with ExitStack() as both:

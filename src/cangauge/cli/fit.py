@@ -171,7 +171,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         if report is not None:
             status.update("writing the report")
             # bokeh takes half a second to import.
-            from cangauge.report.fit import fit_report
+            from cangauge.extras.report.fit import fit_report
 
             page = fit_report(result)
     write_texts_atomic(
@@ -258,7 +258,7 @@ def _best(search: DelaySearch) -> list[tuple[tuple[float, ...], float]]:
 
 
 def _show(result: Identification, search: DelaySearch | None) -> None:
-    from cangauge.report.summary import effect_rows, rounded, search_rows
+    from cangauge.extras.report.summary import effect_rows, rounded, search_rows
 
     model, energy = result.model, result.energy
     if search is not None:

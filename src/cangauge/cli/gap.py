@@ -175,7 +175,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     `cangauge gap day1.csv --simulated "V sim [V]" --capacity-ah 60 --reference good1.csv
     --reference good2.csv --reference good3.csv --corrected .`
     """
-    from cangauge.report.summary import next_step
+    from cangauge.extras.report.summary import next_step
 
     given, added = list(reference or []), list(add_test or [])
     paths = [*logs, *added]
@@ -280,8 +280,8 @@ def _note_differences(logs: list[Log], capacity_ah: float) -> None:
 
 def _page(found: Diagnosis, model: Path | None, steps: NextSteps) -> str:
     # bokeh takes half a second to import.
-    from cangauge.report.diagnosis import gap_report
-    from cangauge.report.page import InputFile
+    from cangauge.extras.report.diagnosis import gap_report
+    from cangauge.extras.report.page import InputFile
 
     return gap_report(found, InputFile.of_model(found.model, model), steps)
 
@@ -332,7 +332,7 @@ def _long_enough(log: Log) -> Log:
 
 def _show(found: Diagnosis, next_words: str) -> None:
     from cangauge.diagnosis import NONE, UNKNOWN
-    from cangauge.report.summary import headline, open_question, parameters_text
+    from cangauge.extras.report.summary import headline, open_question, parameters_text
 
     for sentence in (
         headline(found),

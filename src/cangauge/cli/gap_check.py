@@ -36,7 +36,7 @@ from cangauge.cli.shown import PROTOCOLS
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
-    from cangauge.validation.plan import Sizes
+    from cangauge.extras.validation.plan import Sizes
 
 
 @option_groups("temperature_source")
@@ -159,7 +159,7 @@ def gap_check_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge gap-check --logs mine/*.csv -m pack.json --report mine.html`
     """
-    from cangauge.validation.check import (
+    from cangauge.extras.validation.check import (
         OPEN_SET,
         diagnose_tasks,
         draw_all,
@@ -169,10 +169,10 @@ def gap_check_command(  # noqa: PLR0917 - typer passes options by name
         sample_tasks,
         score_answers,
     )
-    from cangauge.validation.final_seeds import FINAL_SEED
-    from cangauge.validation.plan import estimated_seconds, open_set_size, plan
-    from cangauge.validation.score import score
-    from cangauge.validation.tables import judge_targets
+    from cangauge.extras.validation.final_seeds import FINAL_SEED
+    from cangauge.extras.validation.plan import estimated_seconds, open_set_size, plan
+    from cangauge.extras.validation.score import score
+    from cangauge.extras.validation.tables import judge_targets
 
     _refuse_mixed(
         own=own is not None or own_logs,
@@ -261,12 +261,12 @@ def gap_check_command(  # noqa: PLR0917 - typer passes options by name
 
 
 def _show(result: dict[str, Any], report: Path | None, *, json_output: bool) -> None:
-    from cangauge.validation.tables import print_result
+    from cangauge.extras.validation.tables import print_result
 
     print_result(result, console)
     if report is not None:
         # Slow to import.
-        from cangauge.report.check import check_report
+        from cangauge.extras.report.check import check_report
 
         write_text_atomic(report, check_report(result))
         note(f"report: {report}")
@@ -320,8 +320,8 @@ def _sizes(
     healthy: int | None,
     data: Path | None,
 ) -> dict[str, Sizes]:
-    from cangauge.validation.check import OPEN_SET
-    from cangauge.validation.plan import FULL, NEEDS_DATA, SMALL
+    from cangauge.extras.validation.check import OPEN_SET
+    from cangauge.extras.validation.plan import FULL, NEEDS_DATA, SMALL
 
     table = {"full": FULL, "small": SMALL}.get(part)
     if table is None:
@@ -359,9 +359,9 @@ def _check_protocols(protocol: Sequence[str] | None) -> None:
 
 def _can_run(name: str, data: Path | None, *, required: bool) -> bool:
     """Whether a protocol can run here; raise InputError if it is required."""
-    from cangauge.validation.plan import NEEDS_DATA
-    from cangauge.validation.recordings import folder_of
-    from cangauge.validation.twin.pybamm_plant import import_pybamm
+    from cangauge.extras.validation.plan import NEEDS_DATA
+    from cangauge.extras.validation.recordings import folder_of
+    from cangauge.extras.validation.twin.pybamm_plant import import_pybamm
 
     try:
         if name == "pybamm":

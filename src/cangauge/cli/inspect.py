@@ -129,7 +129,7 @@ def _write_report(path: Path | None, found: LogInspection, log: Log) -> None:
     if path is None:
         return
     # bokeh takes half a second to import.
-    from cangauge.report.inspection import inspect_report
+    from cangauge.extras.report.inspection import inspect_report
 
     write_texts_atomic({path: inspect_report(found, log)})
     note(f"report: {path}")

@@ -11,7 +11,7 @@ from rich.text import Text
 from cangauge._formatting import NONE_KNOWN, duration, number, printable
 from cangauge.cli.status import with_std
 from cangauge.errors import InputError
-from cangauge.estimation.validity import REASON_WORDS, reason_name
+from cangauge.types import REASON_WORDS, reason_name
 
 if TYPE_CHECKING:
     from cangauge.service.status_feed import Point, StatusFeed, View

@@ -91,7 +91,7 @@ class NextTestOptions:
 
 def show_tests(steps: NextSteps) -> None:
     """Print what an added test changed, and the planned tests."""
-    from cangauge.report.summary import PLAN_TITLE, plan_rows
+    from cangauge.extras.report.summary import PLAN_TITLE, plan_rows
 
     if steps.added is not None:
         typer.echo(printable(steps.added.sentence))

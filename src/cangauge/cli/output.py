@@ -135,16 +135,16 @@ def save_figures(folder: Path | None, page: str, *result: Any) -> None:
     ----------
     folder : Path, optional
     page : str
-        Module of `cangauge.report` and function that makes the page, such as "fit.fit_page".
+        Module of `cangauge.extras.report` and function that makes the page, such as "fit.fit_page".
     *result
         Arguments of the function.
     """
     if folder is None:
         return
     # bokeh and matplotlib take a second to import.
-    from cangauge.report.export import write_figures
+    from cangauge.extras.report.export import write_figures
 
     module, function = page.split(".")
-    make_page = getattr(import_module(f"cangauge.report.{module}"), function)
+    make_page = getattr(import_module(f"cangauge.extras.report.{module}"), function)
     write_figures(make_page(*result), folder, page)
     note(f"figures: {folder}")

@@ -14,9 +14,9 @@ from cangauge.cli.options import assumed_of, check_outputs, within
 from cangauge.cli.output import emit_json, note, print_table
 
 if TYPE_CHECKING:
+    from cangauge.extras.validation.own_logs import Finding, Healthy
     from cangauge.logs.log import Log
     from cangauge.model.model_file import Model
-    from cangauge.validation.own_logs import Finding, Healthy
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class OwnLogsOptions:
         InputError
             If a log cannot be read or diagnosed, or there are too few.
         """
-        from cangauge.validation.own_logs import PER_LOG, OwnLogs, summarize
+        from cangauge.extras.validation.own_logs import PER_LOG, OwnLogs, summarize
 
         inputs = [*self.logs, *self.references, *([self.model] if self.model else [])]
         check_outputs([self.report], inputs)
@@ -84,11 +84,11 @@ class OwnLogsOptions:
         return model.model_copy(update={"capacity_ah": self.capacity_ah})
 
     def _show(self, result: dict[str, Any]) -> None:
-        from cangauge.validation.own_logs import summary, table
+        from cangauge.extras.validation.own_logs import summary, table
 
         if self.report is not None:
             # bokeh takes half a second to import.
-            from cangauge.report.check import own_logs_report
+            from cangauge.extras.report.check import own_logs_report
 
             write_text_atomic(self.report, own_logs_report(result))
             note(f"report: {self.report}")

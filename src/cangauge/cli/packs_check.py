@@ -92,9 +92,9 @@ def packs_check_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge packs-check --data recorded --json > packs.json 2> packs.txt`
     """
+    from cangauge.extras.validation import packs, packs_run
+    from cangauge.extras.validation.packs_score import WIDTH, print_bench
     from cangauge.identify.effect_search import parse_effect_ids
-    from cangauge.validation import packs, packs_run
-    from cangauge.validation.packs_score import WIDTH, print_bench
 
     by_name = {each.name: each for each in packs_run.CASES}
     for name in case or ():

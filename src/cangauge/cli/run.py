@@ -20,7 +20,7 @@ from cangauge.cli.config_options import config_options, config_values
 from cangauge.cli.options import JsonOption
 from cangauge.cli.output import console, emit_json
 from cangauge.errors import CangaugeError
-from cangauge.estimation.validity import Status
+from cangauge.types import Status
 
 if TYPE_CHECKING:
     from cangauge.service.status import Snapshot
@@ -78,7 +78,7 @@ def run_command(
         shown_on = [stack.enter_context(LiveLine(console)).show] if console.is_terminal else []
         if (address := loaded.dashboard_address()) is not None:
             # bokeh is slow to import, and few services serve the page.
-            from cangauge.dashboard.launch import LivePage
+            from cangauge.extras.live.launch import LivePage
 
             page = LivePage(address, lambda active: service.record(active=active))
             shown_on.append(stack.enter_context(page).show)
@@ -148,7 +148,7 @@ class LiveLine:
 
 def live_text(snapshot: Snapshot) -> Text:
     """Return the line."""
-    from cangauge.estimation.validity import reason_names
+    from cangauge.types import reason_names
 
     estimate, sample = snapshot.estimate, snapshot.sample
     text = Text("SoC ", no_wrap=True, overflow="ellipsis")

@@ -51,10 +51,10 @@ from cangauge.estimation.state import (
     ResistanceState,
     Verdict,
 )
-from cangauge.estimation.validity import REASONS, Estimate, Reason, Sample, Status
 from cangauge.model.delay_line import BLOCK, SPACING_S, DelayLine
 from cangauge.model.model_file import Model
 from cangauge.model.voltage_model import Curve
+from cangauge.types import REASONS, Estimate, Reason, Sample, Status
 
 _LOG = logging.getLogger(__name__)
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import temperature_mismatch
 from cangauge.model.effects.base import CoreForm
 from cangauge.model.model_file import Model, effective_error_std_v
+from cangauge.types import temperature_mismatch
 
 Fields = dict[str, object]
 """Field of a C structure → number or list of numbers."""

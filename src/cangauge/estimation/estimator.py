@@ -31,7 +31,11 @@ from cangauge.estimation.state import (
     EstimatorMemory,
     EstimatorState,
 )
-from cangauge.estimation.validity import (
+from cangauge.model.delay_line import DelayLine
+from cangauge.model.effects.base import Reading
+from cangauge.model.model_file import Model, effective_error_std_v
+from cangauge.model.voltage_model import TEMPERATURE_MARGIN_K, Curve, VoltageModel, soc_from_ocv
+from cangauge.types import (
     CURRENT_AT_MOST_A,
     REASONS,
     Estimate,
@@ -42,10 +46,6 @@ from cangauge.estimation.validity import (
     status_of,
     temperature_mismatch,
 )
-from cangauge.model.delay_line import DelayLine
-from cangauge.model.effects.base import Reading
-from cangauge.model.model_file import Model, effective_error_std_v
-from cangauge.model.voltage_model import TEMPERATURE_MARGIN_K, Curve, VoltageModel, soc_from_ocv
 
 __all__ = ["Estimator", "EstimatorSettings"]
 
@@ -90,7 +90,7 @@ class Estimator:
     Examples
     --------
     >>> from cangauge.estimation.estimator import Estimator, EstimatorSettings
-    >>> from cangauge.estimation.validity import Sample
+    >>> from cangauge.types import Sample
     >>> from cangauge.model.published import leaf_2012_model_file
     >>> estimator = Estimator(leaf_2012_model_file(), EstimatorSettings(initial_soc_pct=80.0))
     >>> estimate = estimator.step(

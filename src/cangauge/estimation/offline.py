@@ -24,12 +24,12 @@ from cangauge.estimation.settings import (
     Method,
 )
 from cangauge.estimation.smoothing import RecordingEkf, Smoother
-from cangauge.estimation.validity import Estimate, Sample, Status, reason_names
 from cangauge.logs.gaps import usual_gap_s
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import counted_soc_pct
 from cangauge.model.delay_line import GAP_S
 from cangauge.model.model_file import Model
+from cangauge.types import Estimate, Sample, Status, reason_names
 
 PROGRESS_EVERY = 5000
 """Samples between two calls of the progress callback."""

@@ -13,9 +13,9 @@ from typing import Literal, NamedTuple
 from cangauge.errors import InputError
 from cangauge.estimation.power import PackLimits
 from cangauge.estimation.state import ReferenceState
-from cangauge.estimation.validity import Sample
 from cangauge.logs.log import TemperatureSource
 from cangauge.model.delay_line import GAP_S
+from cangauge.types import Sample
 
 Method = Literal["ekf", "newton", "coulomb"]
 

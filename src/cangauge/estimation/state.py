@@ -22,7 +22,7 @@ from pydantic import (
     model_validator,
 )
 
-from cangauge.estimation.validity import Reason
+from cangauge.types import Reason
 
 LARGEST = 1e12
 """Upper bound of times [s], voltages, charges and counters in a state."""

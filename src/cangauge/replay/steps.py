@@ -21,9 +21,9 @@ from cangauge.bus.recording import open_vehicle_capture
 from cangauge.bus.time_source import MICROSECONDS, ReceiveTime, ReplayClock, is_clock, whole_us
 from cangauge.bus.vehicle import EXTENDED, Vehicle
 from cangauge.errors import InputError
-from cangauge.estimation.validity import Sample
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
+from cangauge.types import Sample
 
 _CAPTURE_LOOP_GAP_US = 10_000
 """Log time between the last frame of a capture and the first of its repetition [µs]."""

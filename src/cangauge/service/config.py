@@ -78,7 +78,7 @@ from cangauge.service.recording import RecordLimits
 from cangauge.service.state import StateSettings, state_path
 
 if TYPE_CHECKING:
-    from cangauge.service.mqtt import MqttSettings
+    from cangauge.extras.live.mqtt import MqttSettings
 
 DEFAULT_VEHICLE: Final = "generic"
 """Default of `replay` as well, so that both commands work together without options."""
@@ -404,7 +404,7 @@ class RunConfig(Strict):
         if self.mqtt is None:
             return None
         # An optional dependency: the import raises the error if it is missing.
-        from cangauge.service.mqtt import MqttSettings  # noqa: PLC0415
+        from cangauge.extras.live.mqtt import MqttSettings  # noqa: PLC0415
 
         given = self.mqtt.model_dump(exclude={"password_file"})
         given["port"] = self.mqtt.port or (8883 if self.mqtt.tls else 1883)

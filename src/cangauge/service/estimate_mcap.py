@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from cangauge._mcap import ESTIMATE, SAMPLE, McapTopics
-from cangauge.estimation.validity import Estimate, Sample, Status, reason_names
+from cangauge.types import Estimate, Sample, Status, reason_names
 
 if TYPE_CHECKING:
     from cangauge.estimation.offline import EstimateTable

@@ -25,8 +25,8 @@ from cangauge._logging import emit
 from cangauge._typing import FloatArray
 from cangauge.errors import CangaugeError
 from cangauge.estimation.offline import NUMBERS, EstimateTable
-from cangauge.estimation.validity import Estimate, Reason, Status, reason_name, reason_names
 from cangauge.service.async_writer import AsyncWriter
+from cangauge.types import Estimate, Reason, Status, reason_name, reason_names
 
 _SCHEMA: Final = pa.schema(
     [

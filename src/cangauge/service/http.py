@@ -32,7 +32,7 @@ from cangauge.service.addresses import HttpAddress, is_loopback_name, open_unix
 from cangauge.service.status import Snapshot, as_json
 
 if TYPE_CHECKING:
-    from cangauge.service.metrics import Exposition
+    from cangauge.extras.live.metrics import Exposition
 
 MAX_HEADER_BYTES: Final = 8192
 MAX_BODY_BYTES: Final = 1024
@@ -95,7 +95,7 @@ class Endpoint:
 
     def _add_http(self, latest: _Latest, http: HttpAddress) -> None:
         # An optional dependency: the import raises the error if it is missing.
-        from cangauge.service.metrics import Exposition  # noqa: PLC0415
+        from cangauge.extras.live.metrics import Exposition  # noqa: PLC0415
 
         sockets = open_tcp(http)
         self.port = int(sockets[0].getsockname()[1])

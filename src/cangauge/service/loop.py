@@ -33,8 +33,8 @@ from cangauge.bus.time_source import (
     steady_s,
 )
 from cangauge.errors import CangaugeError
-from cangauge.estimation.validity import Estimate, Reason
 from cangauge.service.pipeline import Pipeline
+from cangauge.types import Estimate, Reason
 
 _LOG = logging.getLogger(__name__)
 

@@ -38,12 +38,12 @@ from cangauge.estimation.offline import (
 )
 from cangauge.estimation.power import Power
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import Estimate, Reason, Sample, reason_name, reason_names
 from cangauge.logs.cells import CellColumns
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import difference_from_reference
 from cangauge.model.model_file import Model
 from cangauge.service.pipeline import FrameCounts, Pipeline, PipelineSettings
+from cangauge.types import Estimate, Reason, Sample, reason_name, reason_names
 
 PROGRESS_EVERY: Final = 50_000
 """Frames between two calls of the progress callback."""

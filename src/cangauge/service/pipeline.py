@@ -29,8 +29,8 @@ from cangauge.estimation.cells import CellEstimator
 from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.state import EstimatorState
-from cangauge.estimation.validity import Estimate, Reason, Sample, Status, status_of
 from cangauge.model.model_file import Model, effective_error_std_v
+from cangauge.types import Estimate, Reason, Sample, Status, status_of
 
 NOTHING_YET: Final = Estimate.unknown(Reason.NO_INITIAL_SOC | Reason.INPUT_STALE)
 """The estimate before the first sample."""

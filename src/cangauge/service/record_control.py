@@ -17,9 +17,9 @@ import can
 
 from cangauge._logging import emit
 from cangauge.errors import InputError
-from cangauge.estimation.validity import Estimate, Sample
 from cangauge.service.async_writer import AsyncWriter
 from cangauge.service.recording import CLOSE_WITHIN_S, Recorder, RecordLimits, RecordState
+from cangauge.types import Estimate, Sample
 
 REQUESTED_BYTES: Final = 4 << 30
 """Largest recording begun by a request [bytes]: half a day of a busy bus (2,000 frames/s of candump

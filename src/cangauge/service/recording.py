@@ -35,9 +35,9 @@ from cangauge.bus.captures.files import all_parts, part_path, run_path
 from cangauge.bus.captures.mcap import frame_content, frame_topic
 from cangauge.bus.time_source import whole_us
 from cangauge.errors import InputError
-from cangauge.estimation.validity import Estimate, Sample
 from cangauge.service.async_writer import AsyncWriter
 from cangauge.service.estimate_mcap import write_estimate
+from cangauge.types import Estimate, Sample
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer

@@ -20,7 +20,6 @@ from cangauge._logging import emit
 from cangauge.bus.publish import NO_REPORT
 from cangauge.bus.reconnect import ReconnectingBus
 from cangauge.errors import InputError
-from cangauge.estimation.validity import Estimate, reason_names
 from cangauge.service.addresses import default_path, has_unix_sockets
 from cangauge.service.config import RunConfig, config_keys, load_config
 from cangauge.service.http import Endpoint
@@ -31,6 +30,7 @@ from cangauge.service.reading import START_S, BackgroundReader, Reading
 from cangauge.service.record_control import RecordControl
 from cangauge.service.state import StateKeeper, check_state_path
 from cangauge.service.status import PAGE_EVERY_S, SHOW_EVERY_S, Identity, Monitor, Snapshot
+from cangauge.types import Estimate, reason_names
 
 if TYPE_CHECKING:
     from cangauge.service.estimate_table import EstimateWriter
@@ -394,7 +394,7 @@ def _publish_mqtt(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None
     settings = config.mqtt_settings(monitor.latest.identity.bus)
     if settings is not None:
         # An optional dependency.
-        from cangauge.service.mqtt import MqttPublisher  # noqa: PLC0415
+        from cangauge.extras.live.mqtt import MqttPublisher  # noqa: PLC0415
 
         stack.enter_context(MqttPublisher(lambda: monitor.latest, settings))
 

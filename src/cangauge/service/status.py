@@ -21,12 +21,12 @@ from cangauge.bus.connection import BusConnection
 from cangauge.bus.decoder import FrameStatistics
 from cangauge.bus.plausibility import MessageStatistics
 from cangauge.bus.publish import NO_REPORT, PackReport
-from cangauge.estimation.validity import Estimate, Reason, Sample, Status, reason_name, reason_names
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.record_control import RecordControl
 from cangauge.service.recording import RecordState
 from cangauge.service.status_client import SCHEMA
+from cangauge.types import Estimate, Reason, Sample, Status, reason_name, reason_names
 
 _LOG = logging.getLogger(__name__)
 

@@ -1,0 +1,69 @@
+"""`cangauge export-ecm`: a model as the equivalent circuit of other simulators."""
+
+from __future__ import annotations
+
+from keyword import iskeyword
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cangauge._formatting import number, significant
+from cangauge._io import write_text_atomic
+from cangauge.cli.options import JsonOption, check_outputs, suffixed
+from cangauge.cli.output import emit_json, note, print_table
+from cangauge.errors import InputError
+
+
+def export_ecm_command(
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file (JSON).")],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--output", metavar="FILE", callback=suffixed(".py", ".json"),
+            help=".py: a module with the parameters of PyBaMM's Thevenin model and of `thevenin`;"
+            " .json: the tables alone.",
+        ),
+    ],
+    json_output: JsonOption = False,
+) -> None:  # fmt: skip
+    """Write a model as an equivalent circuit: open-circuit voltage, R0 and RC pairs as tables.
+
+    The RC pairs are fitted to the model's step response; the error of that fit is printed.
+
+    Examples
+    --------
+    `cangauge export-ecm pack.json -o pack_ecm.py`
+    """
+    is_module = output.suffix.lower() == ".py"
+    if is_module and (not output.stem.isidentifier() or iskeyword(output.stem)):
+        raise InputError(
+            "Python cannot import a module of this name", field="--output", value=output.name,
+            cure="use letters, digits and _, as in pack_ecm.py",
+        )  # fmt: skip
+    check_outputs([output], [model])
+    # Deferred, so that the help page does not wait for numpy and scipy.
+    from cangauge.extras.embedded.equivalent_circuit import equivalent_circuit
+    from cangauge.model.model_file import Model
+
+    circuit = equivalent_circuit(Model.load(model))
+    text = circuit.to_module() if is_module else circuit.to_json()
+    write_text_atomic(output, text)
+    if json_output:
+        emit_json(
+            {
+                "output": str(output),
+                "pairs": len(circuit.pair_tau_s),
+                "pair_tau_s": circuit.pair_tau_s,
+                "step_error_pct": circuit.step_error_pct,
+            }
+        )
+        return
+    rows = [["capacity", number(circuit.capacity_ah, 2), "Ah"]]
+    rows += [
+        [f"time constant of RC pair {k}", significant(tau_s, 3), "s"]
+        for k, tau_s in enumerate(circuit.pair_tau_s, start=1)
+    ]
+    rows.append(["step response, RMS error", number(circuit.step_error_pct, 2), "%"])
+    print_table(f"Equivalent circuit of {circuit.name}", ["", "value", "<unit"], rows)
+    note(f"equivalent circuit: {output}")

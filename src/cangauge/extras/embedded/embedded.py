@@ -1,0 +1,357 @@
+"""Export of a model as C sources for a microcontroller: `cangauge export-c`.
+
+The folder holds the core (`core/`), the constants of the model, the frame SOC_ESTIMATE packed by
+cantools' generator, an example, and tests against this package on a drive with events.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from cantools.database.can import Message
+from cantools.database.can.c_source import generate
+
+from cangauge._io import text_sha256, write_texts_atomic
+from cangauge._resources import shared_file
+from cangauge._version import __version__
+from cangauge.bus.database import load_dbc, signal_codec
+from cangauge.bus.publish import SocPublisher
+from cangauge.errors import InputError
+from cangauge.estimation.core_constants import CoreConstants
+from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.extras.embedded.c_source import (
+    CORE_HEADERS,
+    CORE_SOURCES,
+    exported_constants,
+    line_size,
+    model_definition,
+)
+from cangauge.model.model_file import Model
+from cangauge.types import Estimate, Sample
+
+EMBEDDED: Final = (
+    "Makefile", "example.c", "test.c", "clock.h", "startup.c", "mps2.ld",
+    "foxbms_soc.c", "foxbms_soc.h",
+)  # fmt: skip
+
+PERIOD_S: Final = 0.1
+"""Time between two samples that the delay line has memory for [s]."""
+
+JITTER: Final = 0.9
+"""Part of the period from which a sample is kept: a task's jitter stays within a tenth of it."""
+
+GOLDEN_S: Final = 1200.0
+"""Duration of the drive of the tests [s]: several times the longest delay of most models."""
+
+FAST_SAMPLES: Final = 200
+"""Samples of it that are `period_s` apart."""
+
+_HEAD: Final = "/* {} - of the model "
+_MARK: Final = _HEAD.format("pack_model.h")
+"""Beginning of a header that shows that a folder is of an export."""
+
+_SIGNALS: Final = ("soc_pct", "soc_std_pct", "age_s")
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What was written."""
+
+    folder: Path
+    files: tuple[str, ...]
+    delay_line_bytes: int
+    """Memory of the delay line with floats [B]."""
+
+
+def export_c(model: Model, folder: Path, *, period_s: float = PERIOD_S) -> Exported:
+    """Write the C sources of a model.
+
+    Parameters
+    ----------
+    model : Model
+    folder : Path
+        Made if it is missing; files of an earlier export are replaced.
+    period_s : float
+        Time between two samples of the current [s]. More samples are taken too, but the delay line
+        then keeps some of them only.
+
+    Raises
+    ------
+    InputError
+        If the period is out of range, the core lacks one of the model's effects, or a file of
+        the same name in the folder is not of an export.
+    """
+    if not 1e-3 <= period_s <= 60.0:
+        raise InputError("must lie within 0.001 … 60 s", field="--period", value=period_s)
+    constants = exported_constants(model)
+    spacing_s = JITTER * 2.0 * period_s
+    length = line_size(constants.longest_s, spacing_s)
+    head = f"{_HEAD}{_comment(model.name)}, by cangauge {__version__}. */\n"
+    folders = dict.fromkeys(CORE_HEADERS + CORE_SOURCES, "core")
+    folders |= dict.fromkeys(EMBEDDED, "core/embedded")
+    texts = {
+        name: shared_file(place, name).read_text(encoding="utf-8")
+        for name, place in folders.items()
+    }
+    texts["cangauge_config.h"] = head.format("cangauge_config.h") + _config(constants, period_s)
+    definition = model_definition("pack_model", constants)
+    texts["pack_model.h"] = head.format("pack_model.h") + _model_header(
+        length, spacing_s, text_sha256(__version__ + definition)
+    )
+    texts["pack_model.c"] = (
+        head.format("pack_model.c")
+        + '#include "pack_model.h"\n\n#include <math.h>\n\n'
+        + definition
+    )
+    texts |= _frames()
+    texts["golden.h"] = head.format("golden.h") + _golden(model, period_s)
+    _refuse_foreign_names(folder, texts)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_texts_atomic({folder / name: text for name, text in texts.items()})
+    return Exported(folder, tuple(sorted(texts)), 16 * length)
+
+
+def _refuse_foreign_names(folder: Path, names: Iterable[str]) -> None:
+    """Raise InputError for a folder that has files of these names, but not from an export."""
+    taken = sorted(name for name in names if os.path.lexists(folder / name))
+    header = folder / "pack_model.h"
+    if not taken or (header.is_file() and header.read_bytes().startswith(_MARK.encode())):
+        return
+    raise InputError(
+        "the folder has files of these names that are not from an export",
+        source=folder,
+        value=taken,
+        cure="name an empty folder",
+    )
+
+
+def _comment(text: str) -> str:
+    """Return a text that cannot end a comment."""
+    return "".join(each if each.isalnum() or each in " .-_" else "_" for each in text)
+
+
+def _config(constants: CoreConstants, period_s: float) -> str:
+    """Return the sizes of the structures."""
+    model = constants.model
+    skews = [abs(form.values[0]) for form in constants.effects if form.kind == "time_skew"]
+    waiting = math.ceil(max(skews) / period_s) + 130 if skews else 1
+    sizes = {name: model[name] for name in ("delays", "knots", "functions", "effects")}
+    sizes["waiting"] = waiting
+    lines = [f"#define CG_{name.upper()} {max(int(str(sizes[name])), 1)}" for name in sizes]
+    return "\n".join(lines) + "\n"
+
+
+def _model_header(length: int, spacing_s: float, sha256: str) -> str:
+    return f"""#ifndef PACK_MODEL_H
+#define PACK_MODEL_H
+
+#include "cangauge.h"
+
+/* Memory of the delay line, and least time between every second sample that it keeps. */
+#define PACK_LINE_SIZE {length}
+#define PACK_SPACING_S {spacing_s!r}
+
+/* Of the constants and of the core: a saved state is of no other model. Not 0. */
+#define PACK_MODEL_ID 0x{int(sha256[:8], 16) | 1:08x}U
+
+extern const cg_model pack_model;
+
+#endif
+"""
+
+
+def _frames() -> dict[str, str]:
+    """Return the sources that pack SOC_ESTIMATE, with counter and CRC of its E2E profile 2."""
+    path = shared_file("dbc", "soc_estimate.dbc")
+    database = load_dbc(path)
+    message = database.get_message_by_name("SOC_ESTIMATE")
+    header, source, _, _ = generate(
+        database, "soc_frames", "soc_frames.h", "soc_frames.c", "fuzzer.c",
+        floating_point_numbers=False,
+    )  # fmt: skip
+    data_ids = bytes.fromhex(str(getattr(message.dbc, "attributes", {})["E2EDataIdList"].value))
+    lines = [_FRAMES_BEGIN, _raw_constants(message, path)]
+    lines.append(f"static const uint8_t DATA_IDS[16] = {{{', '.join(map(str, data_ids))}}};\n")
+    lines.append(_FRAMES_END)
+    return {
+        "soc_frames.h": header,
+        "soc_frames.c": source,
+        "frames.h": _FRAMES_HEADER,
+        "frames.c": "\n".join(lines),
+    }
+
+
+def _raw_constants(message: Message, path: Path) -> str:
+    """Return step, range and code of "not available" of the signals as constants."""
+    lines = []
+    for name in _SIGNALS:
+        codec = signal_codec(
+            message, message.get_signal_by_name(name), source=path, field="SOC_ESTIMATE"
+        )
+        low, high = codec.range
+        signal = message.get_signal_by_name(name)
+        lines.append(
+            f"static const signal_range {name.upper()} = {{{float(signal.scale)!r}, {low!r},"
+            f" {high!r}, {min(codec.not_available)}U}};"
+        )
+    return "\n".join(lines)
+
+
+_FRAMES_HEADER: Final = """\
+/* frames.h - the estimate as the frame SOC_ESTIMATE of soc_estimate.dbc. */
+#ifndef FRAMES_H
+#define FRAMES_H
+
+#include "cangauge.h"
+
+/* Pack an estimate. `age_s`: whole seconds since its sample; `counter`: 0 ... 15, one more each. */
+void frames_soc_estimate(const cg_estimate *estimate, uint32_t age_s, uint8_t counter,
+                         uint8_t data[8]);
+
+#endif
+"""
+
+_FRAMES_BEGIN: Final = """\
+/* frames.c - the estimate as a frame: signals by cantools, AUTOSAR's E2E profile 2 around. */
+#include "frames.h"
+
+#include <math.h>
+
+#include "soc_frames.h"
+
+typedef struct {
+    double scale;
+    double low;
+    double high;
+    uint32_t not_available;
+} signal_range;
+"""
+
+_FRAMES_END: Final = """static uint32_t raw_of(double value, const signal_range *range)
+{
+    if (isnan(value)) {
+        return range->not_available;
+    }
+    double within = (value < range->low) ? range->low : value;
+    within = (within > range->high) ? range->high : within;
+    return (uint32_t)rint(within / range->scale);
+}
+
+/* CRC-8 with the polynomial 0x2F, over one byte. */
+static uint8_t crc8_h2f(uint8_t crc, uint8_t byte)
+{
+    uint8_t rest = crc ^ byte;
+    for (int bit = 0; bit < 8; ++bit) {
+        const uint8_t carry = ((rest & 0x80U) != 0U) ? 0x2FU : 0U;
+        rest = (uint8_t)((uint8_t)(rest << 1) ^ carry);
+    }
+    return rest;
+}
+
+void frames_soc_estimate(const cg_estimate *estimate, uint32_t age_s, uint8_t counter,
+                         uint8_t data[8])
+{
+    const struct soc_frames_soc_estimate_t signals = {
+        .counter_estimate = counter & 0xFU,
+        .status = (uint8_t)estimate->status,
+        .age_s = (uint8_t)raw_of((double)age_s, &AGE_S),
+        .soc_pct = (uint16_t)raw_of((double)estimate->soc_pct, &SOC_PCT),
+        .soc_std_pct = (uint16_t)raw_of((double)estimate->soc_std_pct, &SOC_STD_PCT),
+        .reason = estimate->reasons,
+    };
+    uint8_t crc = 0xFFU;
+    (void)soc_frames_soc_estimate_pack(data, &signals, 8U);
+    for (int k = 1; k < 8; ++k) {
+        crc = crc8_h2f(crc, data[k]);
+    }
+    data[0] = crc8_h2f(crc, DATA_IDS[counter & 0xFU]) ^ 0xFFU;
+}
+"""
+
+
+def _golden(model: Model, period_s: float) -> str:
+    """Return the drive of the tests, and what this package estimates on it."""
+    reference = Estimator(model, EstimatorSettings())
+    publisher = SocPublisher()
+    rows = []
+    for sample in drive_with_events(model, period_s):
+        found = reference.step(sample)
+        rows.append(_golden_row(sample, found, publisher.estimate_frame(found).data))
+    return "\n".join([_GOLDEN.replace("NUMBER", str(len(rows))), *rows, "};", "", "#endif", ""])
+
+
+def _golden_row(sample: Sample, found: Estimate, frame: bytes | bytearray) -> str:
+    def plain(value: float) -> str:
+        return "NAN" if math.isnan(value) else repr(float(value))
+
+    estimated = (found.soc_pct, found.soc_std_pct, found.soc_newton_pct, found.soc_coulomb_pct)
+    inputs = ", ".join(map(plain, sample))
+    outputs = ", ".join(map(plain, estimated))
+    octets = ", ".join(map(str, frame))
+    flags = f"{int(found.status)}, {int(found.reasons)}U"
+    return f"    {{{inputs}, {{{outputs}}}, {flags}, {{{octets}}}}},"
+
+
+_GOLDEN: Final = """#ifndef GOLDEN_H
+#define GOLDEN_H
+
+#include <math.h>
+#include <stdint.h>
+
+typedef struct {
+    double time_s;
+    double current_a;
+    double voltage_v;
+    double temperature_c;
+    double number[4]; /* SoC, its deviation, by voltage, by counting [%] */
+    int32_t status;
+    uint32_t reasons;
+    uint8_t frame[8];
+} golden;
+
+#define GOLDEN_SAMPLES NUMBER
+static const golden golden_samples[GOLDEN_SAMPLES] = {"""
+
+
+def drive_with_events(model: Model, period_s: float) -> Iterator[Sample]:
+    """Yield a drive of the model's own pack with a gap, missing signals and an unobserved interval.
+
+    Numbers are those of a float, so that both precisions of the core read the same.
+    """
+    voltage = model.voltage_model()
+    low, high = voltage.soc_range_pct
+    soc_pct, capacity_ah = 0.25 * low + 0.75 * high, model.capacity_ah
+    usual_s = max(period_s, 1.0 / model.rate_hz)
+    steps = int(GOLDEN_S / usual_s)
+    time_s = 0.0
+    for k in range(steps):
+        # A few at the rate of the current, the others at that of the voltage.
+        spacing_s = period_s if k < FAST_SAMPLES else usual_s
+        time_s += spacing_s
+        time_s += {steps // 3: 7.0, 2 * steps // 3: 5400.0}.get(k, 0.0)
+        # Load steps of 20 s between a quarter of 1 C in and 1 C out.
+        rate = (0.2, 0.9, -0.25, 0.4, 0.0)[int(time_s / 20.0) % 5]
+        current_a = rate * capacity_ah
+        soc_pct -= 100.0 * current_a * spacing_s / (3600.0 * capacity_ah)
+        error_v = 5e-4 * voltage.pseudo_ocv_at(50.0)[0] * math.sin(0.7 * k)
+        volts = voltage.pseudo_ocv_at(soc_pct)[0] + error_v
+        volts += sum(voltage.resistance_ohm) * current_a
+        temperature_c = voltage.t_ref_c + 3.0 * math.sin(k / 400.0)
+        if k % 97 == 5:
+            volts = math.nan
+        if k % 61 == 3:
+            temperature_c = math.nan
+        if k % 301 == 7:
+            volts = 0.0
+        yield Sample(time_s, *(_as_float(each) for each in (current_a, volts, temperature_c)))
+
+
+def _as_float(value: float) -> float:
+    """Return the number with the precision of a sensor: 1/1024."""
+    return value if math.isnan(value) else round(value * 1024.0) / 1024.0

@@ -1,0 +1,409 @@
+"""Functional mock-up units (FMI 2.0 and 3.0, co-simulation) of a model, from the C core.
+
+The *pack* takes current and temperature and gives voltage and SoC: the voltage model, its delays,
+and the effects that a diagnosis found, whose constants are parameters of the unit. Effects of
+sensors are no part of a pack. The *estimator* takes voltage, current and temperature and gives SoC,
+its standard deviation and status, as `cangauge run` does on a bus, but for the learned capacity.
+
+A unit holds a binary for this platform and the sources for others. Its interface is `core/fmi`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import platform
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, Literal
+from xml.etree import ElementTree as ET
+
+from cangauge._io import atomic_path
+from cangauge._resources import shared_file
+from cangauge._version import __version__
+from cangauge.errors import CangaugeError, InputError
+from cangauge.estimation.core_constants import CoreConstants
+from cangauge.extras.embedded.c_source import (
+    CORE_HEADERS,
+    CORE_SOURCES,
+    exported_constants,
+    initialiser,
+    line_size,
+    model_definition,
+)
+from cangauge.model.delay_line import SPACING_S
+from cangauge.model.effects.base import CoreForm
+from cangauge.model.model_file import Model
+
+Kind = Literal["pack", "estimator"]
+Version = Literal[2, 3]
+
+FLAGS: Final = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-fvisibility=hidden")
+"""Without contraction: the same bits as the Python reference."""
+PLATFORMS: Final = {
+    ("Linux", "x86_64"): ("linux64", "x86_64-linux", ".so"),
+    ("Linux", "aarch64"): ("aarch64-linux", "aarch64-linux", ".so"),
+    ("Darwin", "x86_64"): ("darwin64", "x86_64-darwin", ".dylib"),
+    ("Darwin", "arm64"): ("darwin64", "aarch64-darwin", ".dylib"),
+    ("Windows", "AMD64"): ("win64", "x86_64-windows", ".dll"),
+}
+"""System and machine → folder of the binary in FMI 2 and FMI 3, and its suffix."""
+VALUES: Final = {
+    "temperature_lag": ("ahead",),
+    "core_temperature": ("rise_k", "late", "capacity_ah"),
+    "resistance_temperature": ("share", "activation_k", "delayed", "reference_per_k", "ohm"),
+    "resistance_soc": ("at_empty", "at_full", "width_pct", "delayed", "ohm"),
+    "resistance_asymmetry": ("charging_ohm",),
+    "resistance_step": ("step_ohm", "start_s"),
+    "charge_transfer": ("scale_v", "per_a", "bend_only", "activation_k", "zero_a"),
+    "rc": ("activation_k", "by_slope", "mean_slope", *(f"ohm_{k}" for k in range(1, 6))),
+    "hysteresis": ("half_width_v", "travel_as"),
+    "entropic": ("level", "slope", "curve", "t_ref_c"),
+    "inner_temperature": ("voltage_v_per_k", "drop_per_k"),
+    "ocv_shape": tuple(f"bump_{k}_v" for k in range(1, 12)),
+    "weak_cell": ("fraction", "ahead"),
+}
+"""Kind of effect → names of its values, in the order of `cg_effect_kind`."""
+SENSORS: Final = ("current_sensor", "voltage_sensor", "time_skew")
+"""Kinds that change what is measured, not the pack."""
+LONGEST_NAME: Final = 60
+"""Characters of a unit's name, a C identifier and the name of its binary."""
+UNITS: Final = {
+    "A": {"A": "1"},
+    "V": {"kg": "1", "m": "2", "s": "-3", "A": "-1"},
+    "degC": {"K": "1", "offset": "273.15"},
+    "%": {"factor": "0.01"},
+    "A.h": {"A": "1", "s": "1", "factor": "3600"},
+    "s": {"s": "1"},
+}
+"""Unit → its base units, in the attributes of FMI."""
+
+
+STEP_S: Final = 0.1
+"""Step that a unit proposes [s], the period of a current sensor: the inputs of a step are those of
+its beginning, so that outputs are late by one step."""
+FINITE: Final = (-sys.float_info.max, sys.float_info.max)
+AMPERE_HOURS: Final = (1e-3, 1e5)
+"""Capacities that the commands take too [A h]."""
+TAU_S: Final = (1e-3, FINITE[1])
+"""Time constants [s]: a shorter one is over within any step."""
+DIVISORS: Final = {
+    "capacity_ah": AMPERE_HOURS,
+    **dict.fromkeys(
+        ("width_pct", "mean_slope", "travel_as", "zero_a"), (sys.float_info.min, FINITE[1])
+    ),
+}
+"""Names of an effect's values by which the core divides → range."""
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A variable of a unit; its value reference is its place."""
+
+    name: str
+    causality: Literal["independent", "input", "output", "parameter", "local"]
+    unit: str | None
+    start: float | None
+    description: str
+    is_integer: bool = False
+    range: tuple[float, float] | None = None
+    """Lowest and highest value that can be set; None: any, NaN too."""
+
+
+def export_fmu(model: Model, path: Path, *, kind: Kind = "pack", version: Version = 3) -> Path:
+    """Write the functional mock-up unit of a model.
+
+    Parameters
+    ----------
+    model : Model
+    path : Path
+        File to write, `.fmu`.
+    kind : {"pack", "estimator"}
+    version : {2, 3}
+        Of the Functional Mock-up Interface.
+
+    Raises
+    ------
+    InputError
+        If there is no C compiler, or an effect of the model has no form in the core.
+    CangaugeError
+        If the compiler fails.
+    """
+    unit = _Unit.of(model, exported_constants(model), kind, version)
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        unit.write_sources(root / "sources")
+        unit.compile(root)
+        (root / "modelDescription.xml").write_bytes(unit.description())
+        if version == 3:
+            (root / "sources" / "buildDescription.xml").write_bytes(unit.build_description())
+        with atomic_path(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
+            for file in sorted(root.rglob("*")):
+                if file.is_file():
+                    archive.write(file, file.relative_to(root).as_posix())
+    return path
+
+
+@dataclass(frozen=True)
+class _Unit:
+    """What a unit is made of."""
+
+    identifier: str
+    kind: Kind
+    version: Version
+    constants: CoreConstants
+    variables: tuple[Variable, ...]
+    parameters: tuple[tuple[int, str], ...]
+    """Effect and place in C of each parameter of an effect: the last of the variables."""
+    token: str
+
+    @classmethod
+    def of(cls, model: Model, constants: CoreConstants, kind: Kind, version: Version) -> _Unit:
+        if kind == "pack":
+            forms = [
+                CoreForm("no_effect") if form.kind in SENSORS else form
+                for form in constants.effects
+            ]
+            constants = replace(constants, effects=forms)
+            names, parameters = _effect_parameters(forms)
+            variables = (*_pack_variables(model), *names)
+        else:
+            parameters, variables = [], _estimator_variables()
+        name = re.sub(r"\W+", "_", f"{kind} {model.name}", flags=re.ASCII).rstrip("_")
+        token = hashlib.sha256(f"{kind} {version} {__version__} {model.to_json()}".encode())
+        return cls(
+            name[:LONGEST_NAME], kind, version, constants, tuple(variables), tuple(parameters),
+            token.hexdigest(),
+        )  # fmt: skip
+
+    @property
+    def sources(self) -> list[str]:
+        """Names of the C files."""
+        return [*CORE_SOURCES, "fmu.c", f"{self.kind}.c", f"fmi{self.version}.c", "fmu_model.c"]
+
+    def write_sources(self, folder: Path) -> None:
+        """Write the sources, with the constants of the model."""
+        folder.mkdir()
+        for name in (*CORE_SOURCES, *CORE_HEADERS):
+            shutil.copyfile(shared_file("core", name), folder / name)
+        for name in ("fmu.h", "fmu.c", "fmi.h", f"{self.kind}.c", f"fmi{self.version}.c"):
+            shutil.copyfile(shared_file("core", f"fmi/{name}"), folder / name)
+        config = {
+            "FMU_TOKEN": f'"{self.token}"',
+            "FMU_VARIABLES": len(self.variables),
+            "FMU_PARAMETERS": len(self.parameters),
+            "FMU_SPACING_S": SPACING_S,
+            "FMU_LINE": line_size(self.constants.longest_s, SPACING_S),
+        }
+        lines = [f"#define {name} {value}" for name, value in config.items()]
+        (folder / "fmu_config.h").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        (folder / "fmu_model.c").write_text(self._constants(), encoding="utf-8")
+
+    def _constants(self) -> str:
+        ranges = [item.range or (math.nan, math.nan) for item in self.variables]
+        start = [0.0 if item.start is None else item.start for item in self.variables]
+        first = len(self.variables) - len(self.parameters)
+        table = [[first + k, *where] for k, where in enumerate(self.parameters)]
+        return (
+            '#include "fmu.h"\n\n'
+            f"{model_definition('FMU_MODEL', self.constants)}"
+            f"const cg_settings FMU_SETTINGS = {initialiser(self.constants.settings)};\n"
+            f"const double FMU_START[FMU_VARIABLES] = {initialiser(start)};\n"
+            f"const double FMU_RANGE[FMU_VARIABLES][2] = {initialiser(ranges)};\n"
+            f"const fmu_parameter FMU_PARAMETER[FMU_PARAMETERS + 1] = {initialiser(table)};\n"
+        )
+
+    def compile(self, root: Path) -> None:
+        """Compile the sources into the binary of this platform."""
+        key = platform.system(), platform.machine()
+        if key not in PLATFORMS:
+            raise InputError("no name in FMI for this platform", value=" ".join(key))
+        second, third, suffix = PLATFORMS[key]
+        binary = root / "binaries" / (second if self.version == 2 else third)
+        binary = binary / f"{self.identifier}{suffix}"
+        binary.parent.mkdir(parents=True)
+        sources = [str(root / "sources" / name) for name in self.sources]
+        command = [*_compiler(), *FLAGS, *sources, "-o", str(binary), "-lm"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
+        if done.returncode != 0:
+            raise CangaugeError(f"the C compiler failed: {done.stderr.strip()[-400:]}")
+
+    def description(self) -> bytes:
+        """Return modelDescription.xml."""
+        is_third = self.version == 3
+        root = ET.Element(
+            "fmiModelDescription",
+            {
+                "fmiVersion": "3.0" if is_third else "2.0",
+                "modelName": self.identifier,
+                "instantiationToken" if is_third else "guid": self.token,
+                "generationTool": f"cangauge {__version__}",
+                "variableNamingConvention": "structured",
+            },
+        )
+        state = "canGetAndSetFMUState" if is_third else "canGetAndSetFMUstate"
+        interface = ET.SubElement(
+            root, "CoSimulation",
+            {
+                "modelIdentifier": self.identifier,
+                "canHandleVariableCommunicationStepSize": "true", state: "true",
+            },
+        )  # fmt: skip
+        if not is_third:
+            files = ET.SubElement(interface, "SourceFiles")
+            for name in self.sources:
+                ET.SubElement(files, "File", name=name)
+        units = ET.SubElement(root, "UnitDefinitions")
+        for name, base in UNITS.items():
+            ET.SubElement(ET.SubElement(units, "Unit", name=name), "BaseUnit", base)
+        ET.SubElement(root, "DefaultExperiment", startTime="0", stepSize=str(STEP_S))
+        variables = ET.SubElement(root, "ModelVariables")
+        structure = ET.SubElement(root, "ModelStructure")
+        outputs = [k for k, item in enumerate(self.variables) if item.causality == "output"]
+        for reference, item in enumerate(self.variables):
+            (_third if is_third else _second)(variables, reference, item)
+        if is_third:
+            for tag in ("Output", "InitialUnknown"):
+                for reference in outputs:
+                    ET.SubElement(structure, tag, valueReference=str(reference))
+        else:
+            for tag in ("Outputs", "InitialUnknowns"):
+                parent = ET.SubElement(structure, tag)
+                for reference in outputs:
+                    ET.SubElement(parent, "Unknown", index=str(reference + 1))
+        return _bytes(root)
+
+    def build_description(self) -> bytes:
+        """Return buildDescription.xml of the sources, for other platforms (FMI 3)."""
+        root = ET.Element("fmiBuildDescription", fmiVersion="3.0")
+        build = ET.SubElement(root, "BuildConfiguration", modelIdentifier=self.identifier)
+        files = ET.SubElement(build, "SourceFileSet", language="C99")
+        for name in self.sources:
+            ET.SubElement(files, "SourceFile", name=name)
+        return _bytes(root)
+
+
+def _pack_variables(model: Model) -> tuple[Variable, ...]:
+    return (
+        Variable("time", "independent", "s", None, "time"),
+        Variable("current_a", "input", "A", 0.0, "current, positive = discharge"),
+        Variable("temperature_c", "input", "degC", model.t_ref_c, "measured temperature"),
+        Variable("voltage_v", "output", "V", None, "voltage at the terminals"),
+        Variable("soc_pct", "output", "%", None, "state of charge"),
+        Variable(
+            "initial_soc_pct", "parameter", "%", 50.0, "state of charge at the start",
+            range=(0.0, 100.0),
+        ),
+        Variable(
+            "capacity_ah", "parameter", "A.h", model.extended_model().counting(50.0).capacity_ah,
+            "charge from full to empty", range=AMPERE_HOURS,
+        ),
+    )  # fmt: skip
+
+
+def _estimator_variables() -> tuple[Variable, ...]:
+    return (
+        Variable("time", "independent", "s", None, "time"),
+        Variable("current_a", "input", "A", 0.0, "current, positive = discharge"),
+        Variable("temperature_c", "input", "degC", 20.0, "measured temperature"),
+        Variable("voltage_v", "input", "V", 0.0, "measured voltage"),
+        Variable("soc_pct", "output", "%", None, "state of charge"),
+        Variable(
+            "initial_soc_pct", "parameter", "%", -1.0,
+            "state of charge at the start; negative: found from the first voltages",
+            range=(-1.0, 100.0),
+        ),
+        Variable("soc_std_pct", "output", "%", None, "its standard deviation"),
+        Variable(
+            "status", "output", None, None, "0 initialising, 1 valid, 2 degraded, 3 invalid", True
+        ),
+        Variable("reasons", "output", None, None, "bits, as CG_… in cangauge.h", True),
+        Variable("soc_newton_pct", "output", "%", None, "by the voltage model alone"),
+        Variable("soc_coulomb_pct", "output", "%", None, "by counting alone"),
+        Variable("voltage_model_v", "output", "V", None, "predicted voltage"),
+    )  # fmt: skip
+
+
+def _effect_parameters(
+    forms: Sequence[CoreForm],
+) -> tuple[list[Variable], list[tuple[int, str]]]:
+    """Return the effects' constants as variables, and the effect and place in C of each."""
+    variables, places = [], []
+    for number, form in enumerate(forms):
+        names = VALUES.get(form.kind, ())
+        values = [
+            *((f"{k}", *pair) for k, pair in enumerate(zip(names, form.values, strict=False))),
+            *((f"CG_VALUES + {k}", f"tau_{k + 1}_s", tau_s) for k, tau_s in enumerate(form.tau_s)),
+        ]
+        for place, name, value in values:
+            text = f"effect {number + 1} of the model, as in cangauge.h"
+            full = f"effect_{number + 1}_{form.kind}.{name}"
+            bounds = TAU_S if name.startswith("tau_") else DIVISORS.get(name, FINITE)
+            variables.append(Variable(full, "parameter", None, value, text, range=bounds))
+            places.append((number, place))
+    return variables, places
+
+
+def _second(parent: ET.Element, reference: int, item: Variable) -> None:
+    """Add a variable as FMI 2 states it."""
+    attributes = _attributes(reference, item)
+    outer = ET.SubElement(parent, "ScalarVariable", attributes)
+    inner = _limits(item) | ({} if item.start is None else {"start": repr(item.start)})
+    if item.unit is not None:
+        inner["unit"] = item.unit
+    ET.SubElement(outer, "Integer" if item.is_integer else "Real", inner)
+
+
+def _third(parent: ET.Element, reference: int, item: Variable) -> None:
+    """Add a variable as FMI 3 states it."""
+    attributes = _attributes(reference, item) | _limits(item)
+    if item.start is not None:
+        attributes["start"] = repr(item.start)
+    if item.unit is not None:
+        attributes["unit"] = item.unit
+    ET.SubElement(parent, "Int32" if item.is_integer else "Float64", attributes)
+
+
+def _limits(item: Variable) -> dict[str, str]:
+    """Return the attributes min and max, as far as the range has ends."""
+    named = zip(("min", "max"), item.range or FINITE, FINITE, strict=True)
+    return {name: repr(value) for name, value, end in named if value != end}
+
+
+def _attributes(reference: int, item: Variable) -> dict[str, str]:
+    variability = {"parameter": "fixed"}.get(
+        item.causality, "discrete" if item.is_integer else "continuous"
+    )
+    initial = {"output": "calculated", "parameter": "exact"}.get(item.causality)
+    attributes = {
+        "name": item.name, "valueReference": str(reference), "causality": item.causality,
+        "variability": variability, "description": item.description,
+    }  # fmt: skip
+    return attributes if initial is None else attributes | {"initial": initial}
+
+
+def _bytes(root: ET.Element) -> bytes:
+    ET.indent(root)
+    text: bytes = ET.tostring(root, encoding="UTF-8", xml_declaration=True)
+    return text
+
+
+def _compiler() -> list[str]:
+    """Return the command of the compiler: `CC` with its options, or the first that is found."""
+    given = shlex.split(os.environ.get("CC", ""))
+    for name, *options in [given] if given else [["cc"], ["gcc"], ["clang"]]:
+        if found := shutil.which(name):
+            return [found, *options]
+    raise InputError(
+        "no C compiler", value=" ".join(given) or None,
+        cure="install gcc or clang, or name one in CC",
+    )  # fmt: skip

@@ -1,0 +1,480 @@
+"""`cangauge fleet`: fit, estimate, gap and health over the logs of a fleet, on Dask."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, cast
+
+import typer
+
+from cangauge._formatting import counted, number, significant
+from cangauge._io import file_sha256, write_texts_atomic
+from cangauge.cli.fit import parse_delays
+from cangauge.cli.options import (
+    JsonOption,
+    Reading,
+    ReportOption,
+    check_outputs,
+    known_temperature_source,
+    option_groups,
+    suffixed,
+    within,
+)
+from cangauge.cli.output import console, emit_json, note, print_table, progress_shown
+from cangauge.cli.shown import ALARM_BELOW, FLEET_LOGS, FLEET_REFERENCES, LOCAL, VEHICLE_PATTERN
+from cangauge.errors import InputError
+
+if TYPE_CHECKING:
+    from cangauge.extras.fleet.fit import FleetFit
+    from cangauge.extras.fleet.jobs import Job
+    from cangauge.extras.fleet.overview import FleetOverview
+    from cangauge.extras.fleet.run import Summary
+    from cangauge.extras.fleet.sources import FleetLog, ReadOptions
+    from cangauge.logs.draft import Sign
+
+SHOWN_REASONS: Final = 10
+"""Reasons that are printed, the most frequent first; a page has all."""
+
+SHOWN_LOGS: Final = 20
+"""Logs that are printed; a page and JSON have more."""
+
+fleet_app: Final = typer.Typer(
+    name="fleet", rich_markup_mode="markdown", add_completion=False, no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)  # fmt: skip
+
+LogsArgument = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="LOGS",
+        help="Logs or captures: paths or URLs with * and **, or a manifest (CSV with the columns"
+        " log, vehicle, start, initial_soc_pct, healthy).",
+    ),
+]
+ModelOption = Annotated[
+    Path, typer.Option("-m", "--model", metavar="MODEL", help="Model file of the vehicles' type.")
+]
+OutOption = Annotated[
+    str,
+    typer.Option(
+        "-o", "--output", metavar="OUT",
+        help="Folder or URL of the results: Parquet, one row a log, by vehicle. Logs that it holds"
+        " with the same model and options are skipped.",
+    ),
+]  # fmt: skip
+CapacityOption = Annotated[
+    float | None,
+    typer.Option("--capacity-ah", metavar="A", help="Charge from 100 to 0 % [Ah]."),
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Cluster:
+    """The options of every fleet command: what computes, and how logs name their vehicles."""
+
+    scheduler: Annotated[
+        str,
+        typer.Option(
+            metavar="ADDRESS|local",
+            help="Dask scheduler (tcp://10.0.0.5:8786), or this machine.",
+        ),
+    ] = LOCAL
+    workers: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Worker processes of `local`. Default: one a core."),
+    ] = None
+    pattern: Annotated[
+        str,
+        typer.Option(
+            "--vehicle-pattern", metavar="REGEX",
+            help="The first group finds the vehicle in the name of a log. Default: its folder.",
+        ),
+    ] = VEHICLE_PATTERN  # fmt: skip
+
+    def find(self, logs: Sequence[str]) -> list[FleetLog]:
+        """Return the logs that paths, globs and manifests name (`find_logs`)."""
+        from cangauge.extras.fleet.sources import find_logs
+
+        return find_logs(logs, pattern=self.pattern)
+
+    def run(self, work: Callable[[Any], Any]) -> Any:
+        """Return what a function of the Dask client returns; show its progress."""
+        from cangauge.extras.fleet.run import connected
+
+        workers = None if self.workers is None else float(self.workers)
+        within(workers, 1, 1024, option="--workers", unit="")
+        shown: AbstractContextManager[Any] = nullcontext()
+        if console.is_terminal:
+            shown = console.status("starting")
+        with shown as status:
+            step = None if status is None else status.update
+            connection = connected(self.scheduler, self.workers)
+            with progress_shown("cangauge.extras.fleet", step), connection as client:
+                return work(client)
+
+
+@fleet_app.callback()
+def fleet_command() -> None:
+    """Fit, estimate, diagnose and watch the health of a fleet's logs, on Dask.
+
+    Each log is a task of a Dask scheduler. Results are Parquet files by vehicle: a run that is
+    repeated or killed continues where it was, and logs that cannot be read are set aside with the
+    reason. Needs the extra `fleet`.
+    """
+
+
+fleet_command.group = fleet_app  # type: ignore[attr-defined] # read by the app
+
+
+@fleet_app.command("fit")
+@option_groups()
+def fit_fleet_command(
+    logs: LogsArgument,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-m",
+            "--model",
+            metavar="MODEL.json",
+            callback=suffixed(".json"),
+            help="Model file to write.",
+        ),
+    ],
+    out: OutOption,
+    capacity_ah: Annotated[
+        float, typer.Option(metavar="A", help="Charge from 100 to 0 % [Ah], e.g. 51.5.")
+    ],
+    *,
+    cluster: Cluster,
+    rate_hz: Annotated[
+        float, typer.Option(metavar="HZ", help="Rate of the fit [Hz]; faster logs are decimated.")
+    ] = 1.0,
+    delays: Annotated[
+        str, typer.Option(metavar="S,S,…", help="Delays of the current [s].")
+    ] = "0,10,30,70",
+    epsilon: Annotated[float, typer.Option(metavar="E", help="Margin ε of the scaled SoC.")] = 0.05,
+    t_ref: Annotated[float, typer.Option(metavar="C", help="Reference temperature [°C].")] = 20.0,
+    name: Annotated[str | None, typer.Option(help="Name of the model.")] = None,
+    leave_out: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="LOGS", help="Those of LOGS that are not fitted, as LOGS; repeat the option."
+        ),
+    ] = None,
+    reading: Reading,
+    report: ReportOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Identify one model from all logs: the fit of `cangauge fit`, out of core.
+
+    Each log is reduced to its information matrix, and these add up. Every log needs its SoC, or
+    initial_soc_pct in the manifest. Logs that do not fit the others are named.
+
+    Examples
+    --------
+    `cangauge fleet fit 'logs/*/*.parquet' -m type.json -o results --capacity-ah 51.5`
+
+    `cangauge fleet fit 'logs/*/*.parquet' -m type.json -o results --capacity-ah 51.5 --leave-out
+    logs/A17/trip4.parquet`
+    """
+    from cangauge.extras.fleet.fit import fit_fleet
+    from cangauge.inference.rows import FitOptions
+
+    within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
+    within(rate_hz, 0.01, 1000.0, option="--rate-hz", unit="Hz")
+    within(epsilon, 1e-4, 0.49, option="--epsilon", unit="")
+    within(t_ref, -60.0, 120.0, option="--t-ref", unit="°C")
+    options = FitOptions(capacity_ah, None, rate_hz, parse_delays(delays), epsilon, t_ref)
+    how, found = _read_options(reading), cluster.find(logs)
+    _check_outputs([output, report], found, *map(Path, logs))
+    fitted = _without(found, cluster.find(leave_out or []))
+    result = cluster.run(lambda client: fit_fleet(fitted, how, options, out, client, name=name))
+    texts = {output: result.model.to_json()}
+    if report is not None:
+        from cangauge.extras.report.fleet_fit import fleet_fit_report
+
+        texts[report] = fleet_fit_report(result)
+    write_texts_atomic(texts)
+    if json_output:
+        written = {"model": str(output), "output": out, "report": report and str(report)}
+        emit_json(result.to_dict() | written)
+        return
+    _show_fit(result)
+    note(f"model: {output}" + (f"\nreport: {report}" if report else ""))
+
+
+def _without(logs: Sequence[FleetLog], left_out: Sequence[FleetLog]) -> list[FleetLog]:
+    """Return the logs that are not left out; raise InputError for one that is not among them."""
+    among = {log.url for log in logs}
+    for log in left_out:
+        if log.url not in among:
+            raise InputError(
+                "is not among LOGS", source=log.url, field="--leave-out", cure="check its path"
+            )
+    names = {log.url for log in left_out}
+    return [log for log in logs if log.url not in names]
+
+
+def _show_fit(result: FleetFit) -> None:
+    from cangauge.extras.fleet.dataset import by_kind, reason_of
+    from cangauge.extras.fleet.sources import short_names
+
+    figures, by_log = result.to_dict(), result.by_log
+    print_table(
+        f"Model {result.model.name}",
+        ["", "value", "<unit"],
+        [
+            ["voltage error, MAE", number(figures["voltage_mae_pct"], 3), "%"],
+            ["voltage error, RMSE", significant(figures["voltage_rmse_v"], 3), "V"],
+            ["voltage error held out, MAE", number(result.model.noise.voltage_mae_pct, 3), "%"],
+            ["SoC from voltage, MAE", number(figures["soc_newton_mae_pct"], 2), "%"],
+            ["slope resistance", significant(result.slope_ohm, 3), "Ω"],
+            ["condition number", significant(result.solution.condition_number, 2), ""],
+            ["rows used", str(figures["rows"]), ""],
+            ["logs that do not fit", by_log.count_text, ""],
+        ],
+    )
+    for what, rows in (("set aside", result.bad), ("left out", result.left_out)):
+        _note_reasons(what, [(reason_of(row), count) for row, count in by_kind(rows)])
+    if misfits := by_log.misfits[:SHOWN_LOGS]:
+        names = short_names([by_log.logs[k] for k in misfits])
+        print_table(
+            "Logs that do not fit the others",
+            ["log", "mean error [V]", "RMSE [V]", "robust z"],
+            [
+                [
+                    name,
+                    significant(float(by_log.mean_v[k]), 3),
+                    significant(float(by_log.rmse_v[k]), 3),
+                    number(float(by_log.z[k]), 1),
+                ]
+                for name, k in zip(names, misfits, strict=True)
+            ],
+        )
+    if misfits or not by_log.is_known:
+        note(by_log.rule_text)
+
+
+@fleet_app.command("estimate")
+@option_groups()
+def estimate_fleet_command(
+    logs: LogsArgument,
+    model: ModelOption,
+    out: OutOption,
+    *,
+    cluster: Cluster,
+    capacity_ah: CapacityOption = None,
+    reading: Reading,
+    report: ReportOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Estimate the state of charge of every log, with its error where the log has SoC.
+
+    Examples
+    --------
+    `cangauge fleet estimate 's3://drives/*/*.parquet' -m type.json -o s3://results/may
+    --scheduler tcp://10.0.0.5:8786`
+    """
+    from cangauge.estimation.settings import EstimatorSettings
+    from cangauge.extras.fleet.jobs import EstimateJob
+    from cangauge.model.model_file import Model
+
+    found = cluster.find(logs)
+    _check_outputs([report], found, model, *map(Path, logs))
+    settings = EstimatorSettings(capacity_ah=capacity_ah)
+    job = EstimateJob(_read_options(reading), Model.load(model), settings)
+    _run(job, found, out, cluster, report, json_output=json_output)
+
+
+@fleet_app.command("health")
+@option_groups()
+def health_fleet_command(
+    logs: LogsArgument,
+    model: ModelOption,
+    out: OutOption,
+    *,
+    cluster: Cluster,
+    capacity_ah: CapacityOption = None,
+    reading: Reading,
+    report: ReportOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Follow capacity and resistance of each vehicle over its logs, and find outliers.
+
+    A vehicle's logs follow each other in order of their start (manifest), else of their names.
+
+    Examples
+    --------
+    `cangauge fleet health manifest.csv -m type.json -o results --report fleet.html`
+    """
+    from cangauge.estimation.settings import EstimatorSettings
+    from cangauge.extras.fleet.health import HealthJob
+    from cangauge.model.model_file import Model
+
+    found = cluster.find(logs)
+    _check_outputs([report], found, model, *map(Path, logs))
+    settings = EstimatorSettings(capacity_ah=capacity_ah)
+    job = HealthJob(_read_options(reading), Model.load(model), settings)
+    _run(job, found, out, cluster, report, json_output=json_output)
+
+
+@fleet_app.command("gap")
+@option_groups()
+def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
+    logs: LogsArgument,
+    model: ModelOption,
+    out: OutOption,
+    reference: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="LOGS",
+            help="Logs without a fault, of any vehicles of the type; repeat the option. Or the"
+            " column healthy of a manifest.",
+        ),
+    ] = None,
+    references: Annotated[
+        int, typer.Option(metavar="N", help="References at most of vehicles without own ones.")
+    ] = FLEET_REFERENCES,
+    latest: Annotated[
+        int, typer.Option(metavar="N", help="Latest logs of a vehicle, diagnosed together.")
+    ] = FLEET_LOGS,
+    alarm: Annotated[
+        float,
+        typer.Option(
+            metavar="P", help="Report a fault where the probability of none is at most this."
+        ),
+    ] = ALARM_BELOW,
+    *,
+    cluster: Cluster,
+    reading: Reading,
+    report: ReportOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Diagnose each vehicle against references of the whole fleet.
+
+    Its own healthy logs come first, then one of each other vehicle in turn, 30 at most. Vehicles
+    without healthy logs of their own have N common references, which are learned from once.
+
+    Examples
+    --------
+    `cangauge fleet gap 'may/*/*.parquet' --reference 'april/*/*.parquet' -m type.json -o results
+    --report fleet.html`
+    """
+    from cangauge.extras.fleet.gap import GapJob, suspect_and_healthy
+    from cangauge.model.model_file import Model
+
+    within(float(references), 1, 1000, option="--references", unit="")
+    within(float(latest), 1, 1000, option="--latest", unit="")
+    within(alarm, 0.0, 1.0, option="--alarm", unit="")
+    known = cluster.find(reference or [])
+    healthy = {log.url for log in known}
+    found = [log for log in cluster.find(logs) if log.url not in healthy]
+    _check_outputs([report], [*found, *known], model, *map(Path, [*logs, *(reference or [])]))
+    suspect, good = suspect_and_healthy(
+        [*found, *(replace(log, healthy=True) for log in known)], latest
+    )
+    options = _read_options(reading)
+    job = GapJob(options, Model.load(model), references, alarm).with_common(suspect, good)
+    vehicles = job.vehicles(suspect, good)
+    _run(job, vehicles, out, cluster, report, among=[*found, *known], json_output=json_output)
+
+
+def _read_options(reading: Reading) -> ReadOptions:
+    """Return how logs are read; files of the vehicle are read here, not by the workers."""
+    from cangauge.extras.fleet.sources import ReadOptions
+
+    if reading.sign not in {None, "charge", "discharge"}:
+        raise InputError("neither charge nor discharge", field="--sign", value=reading.sign)
+    mapped = reading.mapped_columns()
+    is_map_of_columns = mapped is not None and reading.vehicle is None and reading.dbc is None
+    car = reading.car() if reading.names_vehicle and not is_map_of_columns else None
+    paths = (reading.dbc, reading.map_file)
+    files = {str(path): file_sha256(path) for path in paths if path is not None}
+    given = [
+        reading.vehicle, files, reading.columns, reading.sign, reading.temperature,
+        reading.temperature_source,
+    ]  # fmt: skip
+    return ReadOptions(
+        vehicle=car,
+        columns=reading.given_columns(),
+        mapped=mapped,
+        sign=cast("Sign | None", reading.sign),
+        temperature_c=reading.temperature,
+        temperature_source=known_temperature_source(reading.temperature_source),
+        described=json.dumps(given),
+    )
+
+
+def _run(
+    job: Job,
+    logs: Sequence[FleetLog],
+    out: str,
+    cluster: Cluster,
+    report: Path | None,
+    *,
+    among: Sequence[FleetLog] | None = None,
+    json_output: bool,
+) -> None:
+    """Run a job over the logs, and print and write what it found of the fleet.
+
+    Results are those of the logs in `among`; by default of all that the job reads.
+    """
+    from cangauge.extras.fleet.dataset import Dataset
+    from cangauge.extras.fleet.overview import FleetOverview
+    from cangauge.extras.fleet.run import run_job
+
+    dataset = Dataset(out, job.kind, job.columns)
+    summary = cluster.run(lambda client: run_job(job, logs, dataset, client))
+    found = FleetOverview.read(out, logs if among is None else among)
+    if report is not None:
+        from cangauge.extras.report.fleet import fleet_report
+
+        write_texts_atomic({report: fleet_report(found)})
+    if json_output:
+        emit_json(
+            summary.to_dict() | found.to_dict() | {"output": out, "report": report and str(report)}
+        )
+    else:
+        _show(summary, found)
+    if not summary.done + summary.skipped:
+        note(f"error: no result; the reasons are in {out}/{dataset.tables[1]}")
+        raise typer.Exit(1)
+
+
+def _note_reasons(what: str, reasons: Iterable[tuple[str, int]]) -> None:
+    ordered = sorted(reasons, key=lambda item: -item[1])
+    for reason, count in ordered[:SHOWN_REASONS]:
+        note(f"{what}: {count} × {reason}")
+    if len(ordered) > SHOWN_REASONS:
+        note(f"{what}: {sum(n for _, n in ordered[SHOWN_REASONS:])} for other reasons")
+
+
+def _check_outputs(outputs: Sequence[Path | None], logs: Sequence[FleetLog], *files: Path) -> None:
+    """Refuse outputs that cannot be written, or would overwrite a log or another input."""
+    names = {output.name for output in outputs if output is not None}
+    read = [Path(log.url) for log in logs if log.url.rpartition("/")[2] in names]
+    check_outputs(outputs, [*read, *files])
+
+
+def _show(summary: Summary, found: FleetOverview) -> None:
+    typer.echo(f"{summary} ({summary.seconds:.0f} s, {summary.workers} workers)")
+    _note_reasons("set aside", summary.reasons.items())
+    if found.elsewhere_text:
+        note(f"note: {found.elsewhere_text}")
+    if found.alarms:
+        rows = [
+            [name, row["verdict"], number(row["probability"], 2), number(row["probability_none"])]
+            for name, row in ((name, found.gaps[name]) for name in found.alarms)
+        ]
+        print_table("Vehicles with a gap", ["vehicle", "<cause", "probability", "P(none)"], rows)
+    elif found.gaps:
+        typer.echo(f"No alarm in {counted(len(found.gaps), 'vehicle')}; {found.nearest_text}")
+    if found.outlying:
+        rows = [[vehicle, quantity, number(z, 1)] for vehicle, quantity, z in found.outlying]
+        print_table("Outliers in health", ["vehicle", "<quantity", "robust z"], rows)
+    elif found.health:
+        typer.echo(found.no_outlier_text)

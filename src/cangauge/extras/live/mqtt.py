@@ -1,0 +1,326 @@
+"""Publish a running service's state to an MQTT broker, with Home Assistant's discovery.
+
+Needs paho-mqtt (extra `mqtt`). Two threads do the work: one publishes the latest snapshot, paho's
+own one has the network. The receive loop never waits for either, and a state that cannot be sent
+is dropped, since the next one replaces it.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import ssl
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any, Final, Self
+
+from cangauge._logging import emit
+from cangauge._version import __version__
+from cangauge.errors import InputError
+from cangauge.service.addresses import is_loopback_name
+from cangauge.service.status import Snapshot, as_json
+from cangauge.types import Status
+
+try:
+    from paho.mqtt.client import Client, MQTTMessageInfo
+    from paho.mqtt.enums import CallbackAPIVersion
+except ImportError as error:
+    raise InputError(
+        "MQTT needs the package paho-mqtt, which is not installed",
+        field="mqtt",
+        cure="pip install 'cangauge[mqtt]'",
+    ) from error
+
+_LOG = logging.getLogger(__name__)
+
+KEEPALIVE_S: Final = 10
+"""A broker that is silent for this and half as long again counts as lost [s]."""
+CONNECT_WITHIN_S: Final = 3.0
+RETRY_S: Final = (1, 30)
+"""First and longest pause between attempts to connect, doubled each time [s]."""
+LEAVE_WITHIN_S: Final = 0.5
+"""Time limit for saying goodbye to the broker [s]."""
+
+
+@dataclass(frozen=True, slots=True)
+class MqttSettings:
+    """Broker and topics.
+
+    Parameters
+    ----------
+    broker : str
+    port : int
+    tls : bool
+    ca_file : str or None
+        Certificates that sign the broker's; None: the system's.
+    user, password : str or None
+    topic_prefix : str
+        Topics are `PREFIX/DEVICE/state` and `PREFIX/DEVICE/availability`.
+    discovery_prefix : str
+        Home Assistant's; "" without discovery.
+    device : str
+        Identifies this service among those of the broker: letters, digits, "_" and "-".
+    every_s : float
+        Interval of the states [s].
+    """
+
+    broker: str
+    port: int
+    tls: bool
+    ca_file: str | None
+    user: str | None
+    password: str | None = field(repr=False)
+    topic_prefix: str
+    discovery_prefix: str
+    device: str
+    every_s: float
+
+    @property
+    def state_topic(self) -> str:
+        """Topic of the state: one JSON object, retained."""
+        return f"{self.topic_prefix}/{self.device}/state"
+
+    @property
+    def availability_topic(self) -> str:
+        """Topic of "online" or "offline", retained; "offline" is the last will."""
+        return f"{self.topic_prefix}/{self.device}/availability"
+
+
+@dataclass(frozen=True, slots=True)
+class _Sensor:
+    """One sensor of Home Assistant: key of the state, name, unit and class."""
+
+    key: str
+    name: str
+    unit: str | None = None
+    device_class: str | None = None
+    digits: int | None = None
+    needs_soc: bool = False
+
+
+_SENSORS: Final = (
+    _Sensor("soc_pct", "State of charge", "%", "battery", 1, needs_soc=True),
+    # A class "battery" of the same unit would make two batteries of one pack.
+    _Sensor("soc_std_pct", "State of charge, standard deviation", "%", None, 2, needs_soc=True),
+    _Sensor("status", "Status", None, "enum"),
+    _Sensor("current_a", "Current", "A", "current", 1),
+    _Sensor("voltage_v", "Voltage", "V", "voltage", 1),
+    _Sensor("residual_v", "Voltage, measured less modelled", "V", "voltage", 3),
+    _Sensor("temperature_c", "Temperature", "°C", "temperature", 1),
+    _Sensor("capacity_ah", "Capacity", "Ah", None, 1),
+    _Sensor("resistance_ratio", "Resistance relative to the model's", None, None, 2),
+    _Sensor("current_offset_a", "Current sensor offset", "A", "current", 2),
+    _Sensor("discharge_a", "Discharge current possible for 10 s", "A", "current", 0),
+    _Sensor("charge_a", "Charge current possible for 10 s", "A", "current", 0),
+    _Sensor("energy_kwh", "Energy left", "kWh", "energy_storage", 2),
+    _Sensor("weakest_cell", "Weakest cell"),
+    _Sensor("weakest_soc_pct", "State of charge of the weakest cell", "%", None, 1),
+)
+
+
+def state(snapshot: Snapshot, now_s: float) -> dict[str, Any]:
+    """Return the state to publish at a monotonic time [s]: one flat JSON object."""
+    status = as_json(snapshot, now_s)
+    estimate, sample = status["estimate"], status["sample"] or {}
+    health, power = status["health"] or {}, status["power"] or {}
+    cells = status["cells"] or {}
+    energy_wh = power.get("energy_wh")
+    return {
+        "soc_pct": estimate["soc_pct"],
+        "soc_std_pct": estimate["soc_std_pct"],
+        "status": status["status"],
+        "reasons": status["reasons"],
+        "current_a": sample.get("current_a"),
+        "voltage_v": sample.get("voltage_v"),
+        "residual_v": estimate["residual_v"],
+        "temperature_c": sample.get("temperature_c"),
+        "capacity_ah": health.get("capacity_ah"),
+        "resistance_ratio": health.get("resistance_ratio"),
+        "current_offset_a": health.get("offset_a"),
+        "discharge_a": power.get("discharge_a"),
+        "charge_a": power.get("charge_a"),
+        "energy_kwh": None if energy_wh is None else 1e-3 * energy_wh,
+        "weakest_cell": cells.get("weakest"),
+        "weakest_soc_pct": cells.get("soc_pct"),
+    }
+
+
+def discovery(settings: MqttSettings, snapshot: Snapshot) -> dict[str, dict[str, Any]]:
+    """Return Home Assistant's configuration of each sensor by its topic."""
+    identity = snapshot.identity
+    about = {
+        "identifiers": [settings.device],
+        "name": f"Battery on {identity.bus}",
+        "manufacturer": "cangauge",
+        "model": identity.vehicle,
+        "sw_version": __version__,
+    }
+    online = {"topic": settings.availability_topic}
+    # An invalid SoC is shown as unavailable, never as a number that looks sound.
+    known = {
+        "topic": settings.state_topic,
+        "value_template": "{{ 'offline' if value_json.status == 'invalid' else 'online' }}",
+    }
+    found = {}
+    for sensor in _SENSORS:
+        content: dict[str, Any] = {
+            "name": sensor.name,
+            "unique_id": f"{settings.device}_{sensor.key}",
+            "state_topic": settings.state_topic,
+            "value_template": f"{{{{ value_json.{sensor.key} }}}}",
+            "availability": [online, known] if sensor.needs_soc else [online],
+            "availability_mode": "all",
+            "device": about,
+            "unit_of_measurement": sensor.unit,
+            "device_class": sensor.device_class,
+            "suggested_display_precision": sensor.digits,
+        }
+        if sensor.device_class == "enum":
+            content["options"] = [each.name.lower() for each in Status]
+            content["json_attributes_topic"] = settings.state_topic
+            content["json_attributes_template"] = "{{ {'reasons': value_json.reasons} | tojson }}"
+        elif sensor.key != "weakest_cell":
+            content["state_class"] = "measurement"
+        topic = f"{settings.discovery_prefix}/sensor/{settings.device}/{sensor.key}/config"
+        found[topic] = {key: value for key, value in content.items() if value is not None}
+    return found
+
+
+class MqttPublisher:
+    """Publish snapshots from a thread; use it in a `with` block.
+
+    Parameters
+    ----------
+    latest : callable
+        Returns the latest snapshot.
+    settings : MqttSettings
+
+    Raises
+    ------
+    InputError
+        If the certificates cannot be read.
+    """
+
+    def __init__(self, latest: Callable[[], Snapshot], settings: MqttSettings) -> None:
+        self._latest = latest
+        self._settings = settings
+        self._done = threading.Event()
+        self._is_new = threading.Event()
+        self._client = client = Client(
+            CallbackAPIVersion.VERSION2, client_id=f"cangauge-{settings.device}"
+        )
+        client.connect_timeout = CONNECT_WITHIN_S
+        client.reconnect_delay_set(*RETRY_S)
+        client.will_set(settings.availability_topic, "offline", qos=1, retain=True)
+        client.max_queued_messages_set(1)
+        if settings.user is not None:
+            client.username_pw_set(settings.user, settings.password)
+        if settings.tls:
+            client.tls_set_context(_tls_context(settings.ca_file))
+        elif settings.password is not None and not is_loopback_name(settings.broker):
+            emit(
+                _LOG,
+                logging.WARNING,
+                "mqtt.unencrypted",
+                f"the password for {self._place} is sent unencrypted: set tls = true in [mqtt]",
+            )
+        client.on_connect = self._on_connect
+        client.on_disconnect = self._on_disconnect
+        client.on_connect_fail = self._on_connect_fail
+        self._thread = threading.Thread(target=self._run, name="cangauge-mqtt", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._done.set()
+        self._thread.join(2.0 * LEAVE_WITHIN_S)
+
+    @property
+    def _place(self) -> str:
+        return f"{self._settings.broker}:{self._settings.port}"
+
+    def _run(self) -> None:
+        try:
+            self._client.connect_async(self._settings.broker, self._settings.port, KEEPALIVE_S)
+            self._client.loop_start()
+            while not self._done.wait(self._settings.every_s):
+                self._publish()
+            self._leave()
+        except Exception as error:  # noqa: BLE001 - an error here must not end the estimate
+            emit(_LOG, logging.ERROR, "mqtt.failed", f"MQTT has ended: {error!r}")
+
+    def _publish(self) -> None:
+        if not self._client.is_connected():
+            return
+        if self._is_new.is_set():
+            self._is_new.clear()
+            if self._settings.discovery_prefix:
+                for topic, content in discovery(self._settings, self._latest()).items():
+                    self._send(topic, json.dumps(content, ensure_ascii=False))
+            self._send(self._settings.availability_topic, "online")
+        content = state(self._latest(), time.monotonic())
+        self._send(self._settings.state_topic, json.dumps(content, ensure_ascii=False))
+
+    def _send(self, topic: str, text: str) -> MQTTMessageInfo:
+        # QoS 0: unlike the others it is never queued for a broker that is away.
+        return self._client.publish(topic, text, qos=0, retain=True)
+
+    def _leave(self) -> None:
+        if self._client.is_connected():
+            # A clean end makes the broker forget the last will.
+            self._send(self._settings.availability_topic, "offline").wait_for_publish(
+                LEAVE_WITHIN_S
+            )
+        self._client.disconnect()
+
+    def _on_connect(
+        self, client: Client, userdata: object, flags: object, reason: Any, properties: object
+    ) -> None:
+        del client, userdata, flags, properties
+        if reason.is_failure:
+            self._emit(logging.WARNING, "mqtt.refused", f"refused the connection: {reason}")
+            return
+        self._is_new.set()
+        self._emit(logging.INFO, "mqtt.connected", "connected")
+
+    def _on_disconnect(
+        self, client: Client, userdata: object, flags: object, reason: Any, properties: object
+    ) -> None:
+        del client, userdata, flags, properties
+        if not self._done.is_set():
+            self._emit(
+                logging.WARNING, "mqtt.lost", f"connection lost ({reason}); the estimate continues"
+            )
+
+    def _on_connect_fail(self, client: Client, userdata: object) -> None:
+        del client, userdata
+        self._emit(
+            logging.WARNING,
+            "mqtt.unreachable",
+            f"not reachable; tried again after at most {RETRY_S[1]} s",
+        )
+
+    def _emit(self, level: int, event: str, text: str) -> None:
+        emit(_LOG, level, event, f"MQTT broker {self._place}: {text}", limit="mqtt")
+
+
+def _tls_context(ca_file: str | None) -> ssl.SSLContext:
+    try:
+        return ssl.create_default_context(cafile=ca_file)
+    except (OSError, ssl.SSLError) as error:
+        raise InputError(
+            f"no certificates can be read: {error}",
+            field="mqtt.ca_file",
+            value=ca_file,
+            cure="name a PEM file",
+        ) from error

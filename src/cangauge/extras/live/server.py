@@ -1,0 +1,426 @@
+"""Answer the browsers of the live page; the service's status arrives as lines on stdin.
+
+`python -m cangauge.extras.live.server` is started by `launch`, with listening sockets that it
+inherits. Each viewer is sent what is new once it has taken what came before, so a slow or hidden
+one costs nothing, here or in the service. A line on stdout asks the service for a recording or for
+its end. End of stdin ends the process.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import hmac
+import json
+import math
+import os
+import secrets
+import signal
+import socket
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import IO, Any, Final, cast
+from urllib.parse import urlsplit
+
+from bokeh.resources import Resources
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from tornado.httpserver import HTTPServer
+from tornado.web import Application, RequestHandler
+from tornado.websocket import WebSocketClosedError, WebSocketHandler
+
+from cangauge._typing import FloatArray
+from cangauge.extras.live.charts import CHARTS, STATUS_COLOURS, STATUS_NAMES, chart_parts
+from cangauge.extras.live.comparison import LOG_NAME, comparison, last_hour
+from cangauge.extras.live.history import COLUMNS, REASONS, History, column, shown_columns
+from cangauge.service.addresses import is_loopback_name
+from cangauge.service.http import MAX_BODY_BYTES, MAX_HEADER_BYTES, has_token
+
+COOKIE: Final = "cangauge"
+IDLE_S: Final = 30.0
+"""Time after which a connection without a request is closed [s]."""
+ALIVE_S: Final = 0.25
+"""Longest time without a message to a viewer [s]."""
+PING_S: Final = 10.0
+"""Interval at which a viewer must show that it still listens [s]."""
+_LINE_BYTES: Final = 1 << 20
+_SCRIPTS: Final = ("bokeh.min.js",)
+_POLICY: Final = (
+    "default-src 'none'; script-src 'self'; connect-src 'self'; img-src 'self' data: blob:;"
+    " style-src 'self' 'unsafe-inline'; form-action 'self'; frame-ancestors 'none'; base-uri 'none'"
+)
+
+
+class Site:
+    """What all pages share.
+
+    Parameters
+    ----------
+    history : History
+    token : str or None
+        Token that a viewer must know.
+    ask : callable
+        Takes whether a recording shall run, once a viewer asks.
+    """
+
+    def __init__(self, history: History, token: str | None, ask: Callable[[bool], None]) -> None:
+        self.history = history
+        self.ask = ask
+        self.token = token
+        self.id = secrets.token_hex(8)
+        """Key of this run; another one means that the row numbers start again."""
+        # The same after a restart, so that an open page stays logged in; does not reveal the token.
+        self.pass_word = "" if token is None else _cookie_of(token)
+        environment = Environment(
+            loader=PackageLoader("cangauge.extras.live", "page"),
+            autoescape=True,
+            undefined=StrictUndefined,
+        )
+        self._news = asyncio.Event()
+        script, elements = chart_parts()
+        facts = {
+            "reasons": REASONS,
+            "statuses": STATUS_NAMES,
+            "colours": STATUS_COLOURS,
+            "rows_at_most": {name: span.rows_at_most for name, span in history.spans.items()},
+        }
+        self.texts = {
+            "live.html": environment.get_template("live.html").render(
+                charts=CHARTS, elements=elements, log_name=LOG_NAME
+            ),
+            "enter.html": environment.get_template("enter.html").render(),
+            "charts.js": f"window.FACTS = {json.dumps(facts)};\n{script}",
+            **{name: _own_file(name) for name in ("live.js", "live.css")},
+            **{name: _bokeh_file(name) for name in _SCRIPTS},
+        }
+
+    def add(self, status: dict[str, Any]) -> None:
+        """Add a status, and wake those who wait for it."""
+        self.history.add(status)
+        news, self._news = self._news, asyncio.Event()
+        news.set()
+
+    async def news(self) -> None:
+        """Wait for the next status, at most `ALIVE_S`."""
+        with suppress(TimeoutError):
+            await asyncio.wait_for(self._news.wait(), ALIVE_S)
+
+    def answer(self, name: str, key: str, after: int) -> dict[str, Any]:
+        """Return the status, what is wrong, and the rows of a span that are new to a viewer.
+
+        Parameters
+        ----------
+        name : str
+            Name of the span; another one for no rows.
+        key : str
+            Key of the answer that the viewer had last.
+        after : int
+            Number of rows ever added to the span then.
+        """
+        history = self.history
+        content: dict[str, Any] = {"status": history.status, "troubles": history.troubles()}
+        content["latest"] = history.latest()
+        span = history.spans.get(name)
+        if span is None:
+            return content
+        present = f"{self.id}-{span.generation}"
+        return content | {
+            "span": name,
+            "key": present,
+            "is_known": key == present,
+            "added": span.added,
+            "every_ms": 1e3 * span.every_s,
+            "columns": shown_columns(span.rows(after if key == present else 0)),
+        }
+
+    def application(self) -> Application:
+        """Return the pages by their paths."""
+        context = {"site": self}
+        return Application(
+            [
+                ("/", _Live, context),
+                ("/enter", _Enter, context),
+                (r"/files/([a-z.]+)", _File, context),
+                ("/rows", _Rows, context),
+                ("/stream", _Stream, context),
+                ("/comparison", _Comparison, context),
+                ("/range.csv", _Range, context),
+                ("/recording", _Recording, context),
+                (f"/{LOG_NAME}", _LastHour, context),
+            ],
+            default_handler_class=_Nothing,
+            default_handler_args=context,
+            log_function=lambda _: None,
+            websocket_ping_interval=PING_S,
+            websocket_max_message_size=MAX_BODY_BYTES,
+        )
+
+
+class _Page(RequestHandler):
+    """Access control of all pages."""
+
+    needs_token = True
+
+    def initialize(self, site: Site) -> None:
+        self.site = site
+
+    def set_default_headers(self) -> None:
+        self.clear_header("Server")
+        self.set_header("Cache-Control", "no-store")
+        self.set_header("X-Content-Type-Options", "nosniff")
+        self.set_header("Referrer-Policy", "no-referrer")
+        self.set_header("Content-Security-Policy", _POLICY)
+
+    def prepare(self) -> None:
+        token = self.site.token
+        if token is None:
+            # Against DNS rebinding: a web page could otherwise read this under another name.
+            if not is_loopback_name(self.request.host_name):
+                self.refuse(403, "request this by a loopback address")
+            return
+        given = self.get_cookie(COOKIE, "") or ""
+        is_known = hmac.compare_digest(given.encode(), self.site.pass_word.encode())
+        is_known = is_known or has_token(self.request.headers.get("Authorization", ""), token)
+        if self.needs_token and not is_known:
+            if self.request.path == "/":
+                self.redirect("/enter")
+            else:
+                self.refuse(401, "a token is required")
+
+    def refuse(self, code: int, text: str) -> None:
+        self.set_status(code)
+        self.set_header("Content-Type", "text/plain; charset=utf-8")
+        self.finish(text + "\n")
+
+    def write_error(self, status_code: int, **_: Any) -> None:
+        self.refuse(status_code, f"{status_code} {self._reason}")
+
+    def send_json(self, content: dict[str, Any]) -> None:
+        self.set_header("Content-Type", "application/json")
+        self.finish(json.dumps(content, ensure_ascii=False, allow_nan=False))
+
+    def send_csv(self, name: str, text: str) -> None:
+        self.set_header("Content-Type", "text/csv; charset=utf-8")
+        self.set_header("Content-Disposition", f'attachment; filename="{name}"')
+        self.finish(text)
+
+    def argument(self, name: str, default: float) -> float:
+        """Return a number of the query, or the default where it is none."""
+        try:
+            value = float(self.get_query_argument(name, ""))
+        except ValueError:
+            return default
+        return value if math.isfinite(value) else default
+
+
+class _Live(_Page):
+    def get(self) -> None:
+        self.finish(self.site.texts["live.html"])
+
+
+class _Enter(_Page):
+    needs_token = False
+
+    def get(self) -> None:
+        self.finish(self.site.texts["enter.html"])
+
+    def post(self) -> None:
+        token = self.site.token
+        given = self.get_body_argument("token", "")
+        if token is not None and not has_token(f"Bearer {given}", token):
+            self.set_status(401)
+            self.finish(self.site.texts["enter.html"])
+            return
+        self.set_cookie(
+            COOKIE, self.site.pass_word, httponly=True, samesite="Strict", expires_days=None
+        )
+        self.redirect("/")
+
+
+class _File(_Page):
+    needs_token = False
+    _TYPES: Final = {"js": "text/javascript; charset=utf-8", "css": "text/css; charset=utf-8"}
+
+    def get(self, name: str) -> None:
+        kind = self._TYPES.get(name.rpartition(".")[2])
+        if kind is None or name not in self.site.texts:
+            self.refuse(404, "no such file")
+            return
+        self.set_header("Content-Type", kind)
+        self.finish(self.site.texts[name])
+
+
+class _Rows(_Page):
+    def get(self) -> None:
+        """Return the status, what is wrong, and the rows of a span after those already known."""
+        key, after = self.get_query_argument("key", ""), int(self.argument("after", 0.0))
+        self.send_json(self.site.answer(self.get_query_argument("span", ""), key, after))
+
+
+class _Stream(_Page, WebSocketHandler):
+    """Send what `/rows` answers, as it comes: from each question of the viewer on.
+
+    The next message is made once the viewer's connection has taken the one before.
+    """
+
+    def open(self, *_: str, **__: str) -> None:
+        self._question: dict[str, Any] = {}
+        self._is_asked = asyncio.Event()
+        self._sending = asyncio.ensure_future(self._send())
+
+    def on_message(self, message: str | bytes) -> None:
+        """Take a question: `{"span": "10min", "key": "", "after": 0}`."""
+        try:
+            question = json.loads(message)
+        except (ValueError, RecursionError):
+            question = None
+        self._question = question if isinstance(question, dict) else {}
+        self._is_asked.set()
+
+    def on_close(self) -> None:
+        self._sending.cancel()
+
+    async def _send(self) -> None:
+        await self._is_asked.wait()
+        with suppress(WebSocketClosedError):
+            while True:
+                question = self._question
+                name, key, after = (question.get(part) for part in ("span", "key", "after"))
+                number = after if isinstance(after, int) and after >= 0 else 0
+                answer = self.site.answer(str(name), str(key), number)
+                self._question = question | {"key": answer.get("key"), "after": answer.get("added")}
+                await self.write_message(json.dumps(answer, ensure_ascii=False, allow_nan=False))
+                await self.site.news()
+
+
+class _Comparison(_Page):
+    def get(self) -> None:
+        self.send_json(comparison(self.site.history))
+
+
+class _Range(_Page):
+    def get(self) -> None:
+        """Return the rows of a span between two wall-clock times [ms] as CSV."""
+        history = self.site.history
+        span = history.spans.get(self.get_query_argument("span", ""), history.hour)
+        rows = span.rows()
+        time_ms = column(rows, "time_ms")
+        start, end = self.argument("from", -math.inf), self.argument("to", math.inf)
+        self.send_csv("cangauge-live.csv", _csv(rows[(time_ms >= start) & (time_ms <= end)]))
+
+
+class _Recording(_Page):
+    def post(self) -> None:
+        """Ask the service to begin or end its recording: `{"active": true}`.
+
+        Not for pages of other sites, of other ports of this machine neither: a browser states
+        whose page asks, and asks first before it sends JSON elsewhere, which is never allowed.
+        """
+        headers = self.request.headers
+        kind = headers.get("Content-Type", "").partition(";")[0].strip().lower()
+        origin = headers.get("Origin")
+        if origin is not None and urlsplit(origin).netloc != self.request.host:
+            self.refuse(403, "a page of another site may not ask for this")
+        elif kind != "application/json":
+            self.refuse(415, "send JSON")
+        elif (wanted := _wanted(self.request.body)) is None:
+            self.refuse(400, 'send {"active": true} or {"active": false}')
+        else:
+            self.site.ask(wanted)
+            self.set_status(202)
+            self.send_json({"active": wanted})
+
+
+class _LastHour(_Page):
+    def get(self) -> None:
+        self.send_csv(LOG_NAME, last_hour(self.site.history))
+
+
+class _Nothing(_Page):
+    needs_token = False
+
+    def get(self) -> None:
+        self.refuse(404, "there is nothing here: the live page is at /")
+
+
+def _wanted(body: bytes) -> bool | None:
+    try:
+        content = json.loads(body)
+    except (ValueError, RecursionError):
+        return None
+    wanted = content.get("active") if isinstance(content, dict) else None
+    return wanted if isinstance(wanted, bool) else None
+
+
+def _csv(rows: FloatArray) -> str:
+    """Return rows as CSV: UTC time, bus time, the values, status and reasons in words."""
+    names = [name for name in COLUMNS if name not in {"time_ms", "status", "reasons"}]
+    lines = [",".join(["utc", *names, "status", "reasons"])]
+    columns = shown_columns(rows)
+    for row in range(len(rows)):
+        stamp = datetime.fromtimestamp(1e-3 * cast("float", columns["time_ms"][row]), UTC)
+        values = [columns[name][row] for name in names]
+        reasons = int(columns["reasons"][row] or 0)
+        lines.append(
+            ",".join(
+                [
+                    stamp.isoformat(timespec="milliseconds"),
+                    *("" if value is None else str(value) for value in values),
+                    STATUS_NAMES[int(columns["status"][row] or 0)],
+                    '"' + "; ".join(w for bit, w in REASONS.items() if int(bit) & reasons) + '"',
+                ]
+            )
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _cookie_of(token: str) -> str:
+    return hmac.new(token.encode(), b"cangauge live page", hashlib.sha256).hexdigest()
+
+
+def _own_file(name: str) -> str:
+    return (Path(__file__).parent / "page" / name).read_text(encoding="utf-8")
+
+
+def _bokeh_file(name: str) -> str:
+    return Path(Resources(mode="server").base_dir, "js", name).read_text(encoding="utf-8")
+
+
+def _ask_service(active: bool) -> None:
+    sys.stdout.write(json.dumps({"active": active}) + "\n")
+    sys.stdout.flush()
+
+
+async def _serve(site: Site, sockets: Sequence[socket.socket], lines: IO[bytes]) -> None:
+    server = HTTPServer(
+        site.application(),
+        max_header_size=MAX_HEADER_BYTES,
+        max_body_size=MAX_BODY_BYTES,
+        idle_connection_timeout=IDLE_S,
+        body_timeout=IDLE_S,
+    )
+    server.add_sockets(sockets)
+    reader = asyncio.StreamReader(limit=_LINE_BYTES)
+    await asyncio.get_running_loop().connect_read_pipe(
+        lambda: asyncio.StreamReaderProtocol(reader), lines
+    )
+    while line := await reader.readline():
+        site.add(json.loads(line))
+
+
+def main() -> None:
+    """Serve until stdin ends; the first line says on which sockets, and the token."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the service ends this process, not Ctrl-C
+    lines = open(0, "rb", buffering=0)  # noqa: SIM115 - stdin, which ends with the process
+    settings: Mapping[str, Any] = json.loads(lines.readline())
+    sockets = [socket.socket(fileno=number) for number in settings["sockets"]]
+    for each in sockets:
+        each.setblocking(False)
+    os.nice(settings["nice"])
+    asyncio.run(_serve(Site(History(), settings["token"], _ask_service), sockets, lines))
+
+
+if __name__ == "__main__":
+    main()

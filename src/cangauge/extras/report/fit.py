@@ -1,0 +1,530 @@
+"""The page of `cangauge fit`: the model's error, curves and coefficients, and how it was made."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
+
+from cangauge._formatting import duration, number, significant, span
+from cangauge._typing import FloatArray
+from cangauge.extras.report.charts import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    Pen,
+    Plot,
+    TimeFigures,
+    add_cloud,
+    add_line,
+    add_zero,
+    bars,
+    histogram,
+    new_figure,
+    set_y_limits,
+    shade_outside,
+)
+from cangauge.extras.report.page import (
+    Beside,
+    Block,
+    Bullets,
+    Figure,
+    InputFile,
+    Page,
+    Paragraph,
+    Section,
+    Table,
+    Tile,
+    joined,
+    reconstruction_banners,
+    render,
+)
+from cangauge.extras.report.summary import effect_rows, rounded, search_rows
+from cangauge.extras.report.verdict import fit_verdict
+from cangauge.identify.evaluate import LogFit
+from cangauge.identify.fit import Identification
+from cangauge.inference.least_squares import Solution
+from cangauge.inference.rows import running_rows
+from cangauge.model.coulomb_counting import discharged_ah
+from cangauge.model.effects.library import LIBRARY
+from cangauge.model.model_file import Model
+from cangauge.model.voltage_model import VoltageModel
+
+_UNITS: Final = {"V": "V", "V/K": "V/K", "ohm": "Ω"}
+_REMOVED_BY: Final = {
+    "decimation": "not on the model's rate (decimation)",
+    "start_up_or_shut_down": "low voltage at start-up or shut-down, and 2 s around it",
+    "delay_line_filling": "delay line not yet full, at the start or after a gap",
+}
+
+
+def fit_report(result: Identification) -> str:
+    """Return the report of an identification as one self-contained HTML page."""
+    return render(fit_page(result))
+
+
+def fit_page(result: Identification) -> Page:
+    """Return the report's content; `figures` holds the bokeh figures."""
+    logs, model = result.logs, result.model
+    time = TimeFigures(logs)
+    rows = sum(len(item.rows) for item in result.fits)
+    sections = [
+        Section("Fit and pseudo-OCV", _fit_figures(result, time)),
+        Section("Voltage error", _voltage_error(result, time)),
+        Section("State of charge from voltage", _newton_figures(result, time)),
+        Section("Resistance", [_resistance_figure(result)]),
+        Section("Energy", _energy(result)),
+        Section("Coefficients", [coefficient_table(result.model, result.solution)]),
+        *([Section("Effects", _effects(result))] if result.effects is not None else []),
+        Section("Recorded data", _recorded_figures(result, time)),
+        Section("How the model was made", _method(result)),
+    ]
+    return Page(
+        title=f"Voltage model {model.name}",
+        lead=fit_verdict(result),
+        subtitle=f"Identified from {joined([log.name for log in logs])}:"
+        f" {duration(sum(log.duration_s for log in logs))}, {rows:,} rows used.",
+        tiles=_tiles(result),
+        sections=sections,
+        inputs=[
+            InputFile.of_model(model),
+            *(InputFile.of_path("log", log.name, log.source) for log in logs),
+        ],
+        banners=reconstruction_banners(
+            *(text for log in logs for text in (log.name, log.source, *log.remarks))
+        ),
+    )
+
+
+def _tiles(result: Identification) -> list[Tile]:
+    noise, energy = result.model.noise, result.energy
+    return [
+        Tile("Voltage error (MAE)", number(result.voltage_mae_pct, 3, "%"),
+             f"RMSE {significant(result.voltage_rmse_v, 3, 'V')}"),
+        Tile("Held out (MAE)", number(noise.voltage_mae_pct, 3, "%"),
+             f"RMSE {significant(noise.voltage_rmse_v, 3, 'V')}"),
+        Tile("SoC by Newton (MAE)", number(result.soc_newton_mae_pct, 2, "%"),
+             "against counting"),
+        Tile("Slope resistance", significant(result.slope_ohm, 3, "Ω"),
+             f"expected {significant(result.slope_expected_ohm, 3, 'Ω')}"),
+        Tile("Capacity", number(result.model.capacity_ah, 2, "Ah"), "100 → 0 %"),
+        Tile("Efficiency", number(energy.efficiency_pct, 1, "%"),
+             f"net {significant(energy.net_kwh, 3, 'kWh')},"
+             f" heat {significant(energy.heat_kwh, 3, 'kWh')}"),
+    ]  # fmt: skip
+
+
+def _fit_figures(result: Identification, time: TimeFigures) -> list[Block]:
+    over_time = time.plot("voltage", "V", height=320, names=True)
+    for name, pen, values in (
+        ("measured", Pen(BLACK, width=1.2), lambda item: item.rows.voltage_v),
+        ("model", Pen(ORANGE, width=1.0, alpha=0.85), lambda item: item.voltage_model_v),
+        ("pseudo-OCV", Pen(BLUE, width=1.8), lambda item: item.pseudo_ocv_v),
+    ):
+        time.line(over_time, name, _over_time(result, values), pen, gap_s=_gap_s(result))
+    low, high = result.voltage_model.soc_range_pct
+    has_effects = result.effects is not None and result.effects.model.effects
+    return [
+        Figure(
+            "Measured voltage, model and pseudo-OCV",
+            over_time,
+            "The model should lie on the measurement. The pseudo-OCV is its part without current."
+            " Rows that the fit did not use leave gaps.",
+        ),
+        Beside(
+            [
+                Figure(
+                    "Pseudo-OCV against SoC",
+                    _ocv_plot(result),
+                    "Dots: the measured voltage minus the model's resistances"
+                    f"{', effects' if has_effects else ''} and temperature term."
+                    f" The logs cover {span(low, high, 1, '%')}; the curve is extrapolated linearly"
+                    " into the shaded part.",
+                ),
+                Figure(
+                    "Slope of the pseudo-OCV",
+                    slope_plot(result.voltage_model),
+                    "A voltage error divided by this slope is the SoC error: where the slope is"
+                    " small, the voltage hardly determines the SoC.",
+                ),
+            ]
+        ),
+    ]
+
+
+def _over_time(
+    result: Identification, values: Callable[[LogFit], FloatArray]
+) -> list[tuple[FloatArray, FloatArray]]:
+    return [(item.rows.time_s, values(item)) for item in result.fits]
+
+
+def _gap_s(result: Identification) -> float:
+    """Return the step over which lines on the rows of the fit break [s]."""
+    step_s = max(float(np.median(np.diff(item.rows.time_s))) for item in result.fits)
+    return 3.0 * max(step_s, 1.0 / result.model.rate_hz)
+
+
+def _ocv_plot(result: Identification) -> Plot:
+    model = result.voltage_model
+    plot = new_figure(
+        ("state of charge", "voltage"),
+        "$name: @y{0.00} V<br>at @x{0.0} %",
+        units=("%", "V"),
+        height=340,
+    )
+    soc = np.concatenate([item.rows.soc_pct for item in result.fits])
+    residual = np.concatenate([item.residual_v for item in result.fits])
+    add_cloud(plot, "measured, less drop", soc, residual + model.pseudo_ocv(soc), GREY)
+    grid = np.linspace(min(0.0, soc.min()), max(100.0, soc.max()), 401)
+    add_line(plot, "pseudo-OCV", grid, model.pseudo_ocv(grid), Pen(BLUE, width=2.2))
+    shade_outside(plot, *model.soc_range_pct)
+    return plot
+
+
+def slope_plot(model: VoltageModel) -> Plot:
+    """Return the slope of the pseudo-OCV over SoC."""
+    plot = new_figure(
+        ("state of charge", "dU/dS"),
+        "@y{0.000} V per %<br>at @x{0.0} %",
+        units=("%", "V per %"),
+        height=340,
+    )
+    grid = np.linspace(0.0, 100.0, 401)
+    pen = Pen(BLUE, width=2.0, in_legend=False)
+    add_line(plot, "slope", grid, model.pseudo_ocv_slope(grid), pen)
+    low, high = model.soc_range_pct
+    shade_outside(plot, low, high)
+    inside = model.pseudo_ocv_slope(np.linspace(low, high, 201))
+    # The slope rises tenfold at the ends; the middle matters.
+    plot.y_range.end = float(min(inside.max(), 4.0 * np.median(inside))) * 1.1
+    plot.y_range.start = 0.0
+    return plot
+
+
+def _voltage_error(result: Identification, time: TimeFigures) -> list[Block]:
+    plot = time.plot("voltage error", "V", height=260, names=True)
+    gap_s = _gap_s(result)
+    fitted = _over_time(result, lambda item: item.residual_v)
+    time.line(plot, "fit", fitted, Pen(BLUE, width=1.0), gap_s=gap_s)
+    parts = [("fit", np.concatenate([values for _, values in fitted]), BLUE)]
+    held_out = [
+        (item.rows.time_s, values)
+        for item, values in zip(result.fits, result.held_out_error_v, strict=True)
+    ]
+    if any(np.isfinite(values).any() for _, values in held_out):
+        pen = Pen(ORANGE, width=1.0, alpha=0.75, visible=False)
+        time.line(plot, "held out", held_out, pen, gap_s=gap_s)
+        parts.append(("held out", np.concatenate([values for _, values in held_out]), ORANGE))
+    add_zero(plot)
+    return [
+        Figure(
+            "Measured minus modelled voltage",
+            plot,
+            "A good fit scatters about zero without lasting bias. “Held out” (click the legend) is"
+            f" the error on rows that the fit did not see: {result.model.noise.judged_on}.",
+        ),
+        Figure(
+            "Distribution of the error",
+            histogram("measured − model", "V", parts),
+            "Expect “held out” on a new log. Where it is much wider than “fit”, the model overfits"
+            " its logs. The outermost bars include everything beyond.",
+        ),
+        _error_table(result),
+    ]
+
+
+def _error_table(result: Identification) -> Table:
+    noise = result.model.noise
+    largest_v = max(float(np.abs(item.residual_v).max()) for item in result.fits)
+    return Table(
+        ["voltage error", "value", "unit", "meaning"],
+        [
+            ["MAE of the fit", number(result.voltage_mae_pct), "%", "relative to the voltage"],
+            ["RMSE of the fit", significant(result.voltage_rmse_v, 3), "V", ""],
+            ["largest of the fit", significant(largest_v, 3), "V", ""],
+            ["MAE held out", number(noise.voltage_mae_pct), "%", noise.judged_on],
+            ["RMSE held out", significant(noise.voltage_rmse_v, 3), "V", noise.judged_on],
+            ["fast part (σ)", significant(noise.fast_std_v, 3), "V",
+             f"correlated over {number(noise.fast_time_s, 1, 's')}: averages out"],
+            ["slow part (σ)", significant(noise.slow_std_v, 3), "V",
+             f"correlated over {number(noise.slow_time_s, 0, 's')}: averages out in longer times"],
+            ["lasting part (σ)", significant(noise.lasting_std_v, 3), "V",
+             "constant over a log: does not average out"],
+        ],
+        "The three parts are estimated from the error at each time scale, for a log to come, and"
+        " need not add up to the RMSE. The filter takes its measurement noise from them.",
+    )  # fmt: skip
+
+
+def _newton_figures(result: Identification, time: TimeFigures) -> list[Block]:
+    gap_s = _gap_s(result)
+    soc = time.plot("state of charge", "%", height=280, names=True)
+    newton = _over_time(result, lambda item: item.soc_newton_pct)
+    counted = _over_time(result, lambda item: item.rows.soc_pct)
+    time.line(soc, "Newton", newton, Pen(ORANGE, width=0.9, alpha=0.8), gap_s=gap_s)
+    time.line(soc, "counted", counted, Pen(BLACK, width=2.0), gap_s=gap_s)
+    error = time.plot("SoC error", "%", height=235)
+    time.line(
+        error, "Newton − counted",
+        _over_time(result, lambda item: item.soc_newton_pct - item.rows.soc_pct),
+        Pen(ORANGE, width=0.9, in_legend=False), gap_s=gap_s,
+    )  # fmt: skip
+    add_zero(error)
+    return [
+        Figure(
+            "SoC from voltage alone",
+            soc,
+            "The voltage equation solved for SoC at each row by Newton's method, without counting."
+            " It should scatter about the counted SoC.",
+        ),
+        Figure(
+            "Error of the SoC from voltage",
+            error,
+            f"Mean absolute error {number(result.soc_newton_mae_pct, 2, '%')}: the voltage error"
+            " divided by the slope of the pseudo-OCV, so it is large where that is flat.",
+        ),
+    ]
+
+
+def _resistance_figure(result: Identification) -> Figure:
+    current = np.concatenate([item.rows.delayed_current_a[:, 0] for item in result.fits])
+    drop = np.concatenate([item.rows.voltage_v - item.pseudo_ocv_v for item in result.fits])
+    delay_s = result.model.delays_s[0]
+    plot = new_figure(
+        (f"current {delay_s:g} s ago" if delay_s else "current", "voltage − pseudo-OCV"),
+        "$name<br>@x{0.0} A, @y{0.00} V",
+        units=("A", "V"),
+        height=360,
+    )
+    add_cloud(plot, "rows of the fit", current, drop, GREY)
+    ends = np.array([current.min(), current.max()])
+    line = float(drop.mean()) - result.slope_ohm * (ends - float(current.mean()))
+    slope = significant(result.slope_ohm, 3, "Ω")
+    add_line(plot, f"slope {slope}", ends, line, Pen(ORANGE, width=2.2))
+    return Figure(
+        "Voltage drop against current",
+        plot,
+        f"The slope is the resistance at the terminals, {slope}. The coefficients expect"
+        f" {significant(result.slope_expected_ohm, 3, 'Ω')}: R1 + Σ Rj·ρj with ρj the"
+        " autocorrelation of the current at the delays.",
+    )
+
+
+def _energy(result: Identification) -> list[Block]:
+    energy = result.energy
+
+    def share(part: float, whole: float) -> str:
+        return number(100.0 * part / whole if whole > 0.0 else None, 1, "%")
+
+    entries = [
+        ("driven", energy.driven_kwh, BLUE, "", "∫U·I over I > 0"),
+        ("regenerated", energy.regenerated_kwh, GREEN,
+         share(energy.regenerated_kwh, energy.driven_kwh), "of driven; over I < 0"),
+        ("net", energy.net_kwh, BLACK, "", "driven − regenerated"),
+        ("Joule heat", energy.heat_kwh, ORANGE,
+         share(energy.heat_kwh, energy.net_kwh), "of net; slope resistance × ∫I²"),
+    ]  # fmt: skip
+    return [
+        Figure(
+            "Energy at the terminals",
+            bars(
+                "energy",
+                "kWh",
+                [(name, kwh, color) for name, kwh, color, _, _ in entries],
+                decimals=2,
+            ),
+            "Net is driven minus regenerated energy; heat is the slope resistance times ∫I².",
+        ),
+        Table(
+            ["energy", "kWh", "share", "definition"],
+            [
+                *([name, significant(kwh, 3), part, of] for name, kwh, _, part, of in entries),
+                ["efficiency", "", number(energy.efficiency_pct, 1, "%"), "net / (net + heat)"],
+            ],
+        ),
+    ]
+
+
+def coefficient_table(model: Model, solution: Solution) -> Table:
+    """Return the coefficients of a model with their standard errors."""
+    factors = {
+        "k0": "1", "k1": "1/s", "k2": "1/s²", "k3": "1/s³", "k4": "1/s⁴", "k5": "s",
+        "k6": "ln s", "k7": "ln(1 − s)", "kt": f"T − {model.t_ref_c:g} °C",
+    }  # fmt: skip
+    for number_, delay_s in enumerate(model.delays_s, start=1):
+        factors[f"R{number_}"] = f"current {delay_s:g} s ago" if delay_s else "current"
+    rows = []
+    for name, item in model.coefficients.items():
+        ratio = abs(item.value) / item.std_error if item.std_error else math.nan
+        rows.append(
+            [
+                name,
+                *rounded(item.value, item.std_error),
+                number(ratio, 1),
+                _UNITS[item.unit],
+                factors[name],
+            ]
+        )
+    bounded = (
+        " The bounds that keep the pseudo-OCV rising are active; the standard errors ignore them."
+        if solution.constrained
+        else ""
+    )
+    return Table(
+        ["coefficient", "value", "std. error", "|value| / error", "unit", "multiplies"],
+        rows,
+        "U = k0 + k1/s + k2/s² + k3/s³ + k4/s⁴ + k5·s + k6·ln s + k7·ln(1 − s) + kt·(T − Tr)"
+        " + Σ Rj·I(t − dj),  s = S/100·(1 − 2ε) + ε. Standard errors allow for residuals that are"
+        " correlated within 300 s. k0 … k7 are strongly correlated (condition number"
+        f" {significant(solution.condition_number, 2)}): use their sum, the curve, not"
+        f" single values.{bounded}",
+    )
+
+
+def _effects(result: Identification) -> list[Block]:
+    found = result.effects
+    if found is None:
+        return []
+    ids = dict.fromkeys(effect_id for effect_id, _ in found.estimates)
+    equations = "; ".join(f"{effect_id}: {LIBRARY[effect_id].equation}" for effect_id in ids)
+    without_v, with_v = (significant(rmse_v, 3, "V") for rmse_v in found.held_out_rmse_v)
+    return [
+        _as_table(
+            *effect_rows(found),
+            f"{equations}. An effect is a signature at the terminals, not proof of a mechanism."
+            if ids
+            else "No effect is significant in these logs.",
+        ),
+        _as_table(
+            *search_rows(found),
+            f"RMSE on held-out data: {without_v} without effects, {with_v} with the effects above."
+            " An effect is added if the mean logarithm of the error ratio, log by log (or by half"
+            " logs), is significantly above zero (t above the value needed) and the error falls by"
+            " at least 1 %. The same data selected the effects, so the last figure is slightly"
+            " optimistic.",
+        ),
+    ]
+
+
+def _as_table(headings: Sequence[str], rows: Sequence[Sequence[str]], note: str) -> Table:
+    return Table([heading.removeprefix("<") for heading in headings], rows, note)
+
+
+def _recorded_figures(result: Identification, time: TimeFigures) -> list[Block]:
+    """Return current, voltage, temperature, power and charge of the whole logs."""
+    logs = result.logs
+
+    def over_time(
+        quantity: str, unit: str, color: str, values: Sequence[FloatArray], caption: str
+    ) -> Figure:
+        plot = time.plot(quantity, unit, height=235, names=quantity == "current")
+        pieces = [(log.time_s, item) for log, item in zip(logs, values, strict=True)]
+        time.line(plot, quantity, pieces, Pen(color, width=1.0, in_legend=False))
+        return Figure(quantity.capitalize(), plot, caption)
+
+    running = [log.voltage_v[running_rows(log.time_s, log.voltage_v)] for log in logs]
+    is_limited = sum(values.size for values in running) < sum(map(len, logs))
+    voltage = over_time(
+        "voltage", "V", BLACK, [log.voltage_v for log in logs],
+        "The voltage falls with the charge and dips under load."
+        + (" Start-up and shut-down rows lie below the figure." if is_limited else ""),
+    )  # fmt: skip
+    if is_limited:
+        shown = np.concatenate(running)
+        set_y_limits(voltage.plot, float(shown.min()), float(shown.max()))
+    return [
+        over_time("current", "A", BLUE, [log.current_a for log in logs],
+                  "Positive current discharges the pack, negative charges it (regeneration)."),
+        voltage,
+        over_time("temperature", "°C", ORANGE, [log.temperature_c for log in logs],
+                  f"Measured on: {result.model.temperature_source}. A temperature that hardly"
+                  " changes does not identify kt."),
+        over_time("power", "kW", PURPLE,
+                  [log.voltage_v * log.current_a / 1000.0 for log in logs],
+                  "Voltage times current at the terminals; its integral is the energy."),
+        over_time("charge taken out", "Ah", GREEN,
+                  [discharged_ah(log.time_s, log.current_a) for log in logs],
+                  "Current integrated by the trapezoidal rule from the start"
+                  f"{' of each log' if len(logs) > 1 else ''};"
+                  f" {number(result.model.capacity_ah, 2, 'Ah')} are 100 %."),
+    ]  # fmt: skip
+
+
+def _method(result: Identification) -> list[Block]:
+    blocks: list[Block] = [
+        settings_table(result.model, result.solution),
+        _logs(result),
+        _removed(result),
+    ]
+    by_text: dict[str, list[str]] = {}
+    for log in result.logs:
+        for remark in log.remarks:
+            by_text.setdefault(remark, []).append(log.name)
+    remarks = [*result.remarks, *(f"{', '.join(names)}: {text}" for text, names in by_text.items())]
+    if remarks:
+        blocks += [Paragraph("Remarks:"), Bullets(remarks)]
+    return blocks
+
+
+def settings_table(model: Model, solution: Solution) -> Table:
+    """Return how a model was made, and the range that it is known in."""
+    return Table(
+        ["model", ""],
+        [
+            ["capacity", number(model.capacity_ah, 2, "Ah")],
+            ["delays", ", ".join(f"{delay:g}" for delay in model.delays_s) + " s"],
+            ["rate", f"{model.rate_hz:g} Hz"],
+            ["ε", f"{model.epsilon:g}"],
+            ["Tr", f"{model.t_ref_c:g} °C"],
+            ["temperature measured on", model.temperature_source],
+            ["identified at SoC", span(*model.range.soc_pct, 1, "%")],
+            ["identified at temperature", span(*model.range.temperature_c, 1, "°C")],
+            ["identified at current", span(*model.range.current_a, 0, "A")],
+            ["condition number", significant(solution.condition_number, 2)],
+            ["rising pseudo-OCV", "enforced" if solution.constrained else "by itself"],
+            ["made by", model.made.by],
+        ],
+    )
+
+
+def _logs(result: Identification) -> Table:
+    rows = []
+    for log, item, held_out in zip(result.logs, result.fits, result.held_out_error_v, strict=True):
+        judged = np.isfinite(held_out)
+        relative = np.abs(held_out[judged]) / item.rows.voltage_v[judged]
+        rows.append(
+            [
+                log.name,
+                duration(log.duration_s),
+                str(len(log)),
+                str(len(item.rows)),
+                span(item.rows.soc_pct.max(), item.rows.soc_pct.min(), 1),
+                span(log.temperature_c.min(), log.temperature_c.max(), 1),
+                span(log.current_a.min(), log.current_a.max(), 0),
+                number(item.voltage_mae_pct, 2),
+                number(100.0 * float(relative.mean()) if judged.any() else None, 2),
+                number(item.soc_newton_mae_pct, 2),
+            ]
+        )
+    return Table(
+        [
+            "log", "duration", "rows", "rows used", "SoC [%]", "temperature [°C]", "current [A]",
+            "U MAE [%]", "U MAE held out [%]", "SoC by Newton MAE [%]",
+        ],
+        rows,
+    )  # fmt: skip
+
+
+def _removed(result: Identification) -> Table:
+    totals: Counter[str] = Counter()
+    for item in result.fits:
+        totals.update(item.rows.removed)
+    rows = [[_REMOVED_BY.get(rule, rule), str(count)] for rule, count in totals.items()]
+    rows.append(["used", str(sum(len(item.rows) for item in result.fits))])
+    return Table(["rows", "count"], rows)

@@ -1,0 +1,352 @@
+"""Simulated drives: speed trace → power → pack current, and the ambient temperature."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from os import PathLike
+from typing import Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pacsv
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lfilter
+
+from cangauge._io import MAX_SPEED_TRACE_BYTES, read_bounded
+from cangauge._typing import FloatArray
+from cangauge.errors import InputError
+from cangauge.extras.validation.twin.pack import Pack
+
+# Style → cruise speed [m/s], cruise duration [s], stop between micro-trips [s].
+_STYLES: Final = {
+    "town": ((6.0, 15.0), (8.0, 60.0), (3.0, 45.0)),
+    "country": ((15.0, 26.0), (30.0, 240.0), (2.0, 25.0)),
+    "motorway": ((24.0, 36.0), (120.0, 900.0), (2.0, 20.0)),
+}
+# Unit in the column name → factor to m/s.
+_UNITS: Final = {"kmh": 1.0 / 3.6, "kph": 1.0 / 3.6, "km/h": 1.0 / 3.6, "mph": 0.44704}
+_MAX_SPEED_MS: Final = 85.0
+_MAX_DURATION_S: Final = 1e6
+_CURE: Final = (
+    "give two columns with a header: time [s] and speed [m/s], or speed_kmh, or speed_mph"
+)
+
+_REFERENCE_KWH: Final = 38.0
+"""Pack of the car that the road load describes; packs below 15 kWh get a smaller car."""
+_G: Final = 9.81
+_CHARGING_PROBABILITY: Final = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """Load on a pack over one drive, on an even time grid.
+
+    Parameters
+    ----------
+    time_s : array of shape (n,)
+        From 0, evenly spaced.
+    current_a : array of shape (n,)
+        Current that the car draws [A], positive = discharge.
+    ambient_c : array of shape (n,)
+        Ambient temperature [°C].
+    start_c : float
+        Initial temperature of the pack [°C].
+    start_soc : float
+        Initial state of charge of the healthy pack [-].
+    conditioning_w, target_c : float
+        Heating or cooling power [W] until the surface reaches the target [°C].
+    history : float
+        Initial state of the hysteresis: −1 after a charge, 1 after a discharge.
+    seed : int
+        Seed of the sensor noise.
+    """
+
+    time_s: FloatArray
+    current_a: FloatArray
+    ambient_c: FloatArray
+    start_c: float
+    start_soc: float
+    conditioning_w: float = 0.0
+    target_c: float = 20.0
+    history: float = -1.0
+    seed: int = 0
+
+    @property
+    def step_s(self) -> float:
+        """Time step of the grid [s]."""
+        return float(self.time_s[1] - self.time_s[0])
+
+
+def draw_drive(
+    rng: np.random.Generator,
+    pack: Pack,
+    *,
+    hours: float | None = None,
+    ambient_c: float | None = None,
+    start_soc: float | None = None,
+    end_soc: float | None = None,
+    speed_ms: FloatArray | None = None,
+    discharge: bool = False,
+) -> Drive:
+    """Draw a drive; arguments replace drawn quantities.
+
+    Parameters
+    ----------
+    rng : Generator
+    pack : Pack
+    hours : float, optional
+        Duration [h], 0.05–12; by default 0.5–2.5. The drive ends early at `end_soc`.
+    ambient_c : float, optional
+        Initial ambient temperature [°C]; by default −10–35.
+    start_soc : float, optional
+        Initial SoC [-]; by default 0.45–1.
+    end_soc : float, optional
+        SoC at which the drive ends [-]; by default 0.05–0.2.
+    speed_ms : array of shape (m,), optional
+        Speed trace at 1 Hz [m/s], repeated as needed; by default a random one.
+    discharge : bool
+        Scale the power so that the drive runs from `start_soc` to `end_soc` within `hours`.
+
+    Raises
+    ------
+    InputError
+        For a value out of range.
+    """
+    hours = float(rng.uniform(0.5, 2.5)) if hours is None else hours
+    ambient = float(rng.uniform(-10.0, 35.0)) if ambient_c is None else ambient_c
+    top = 1.0 - 0.55 * float(rng.beta(1.0, 1.6))
+    start = top if start_soc is None else start_soc
+    end = min(float(rng.uniform(0.05, 0.20)), 0.6 * start) if end_soc is None else end_soc
+    _check(hours, ambient, start, end)
+    seconds = int(hours * 3600.0)
+    if speed_ms is None:
+        speed = _draw_speed(rng, seconds)
+    else:
+        speed = np.resize(np.asarray(speed_ms, dtype=np.float64), seconds)
+    if speed_ms is None and not discharge:
+        _park(rng, speed)
+    # Auxiliary power, with a cabin heater in the cold.
+    heater = max(0.0, 18.0 - ambient) * float(rng.uniform(20.0, 110.0))
+    auxiliary = float(rng.uniform(250.0, 900.0)) + heater
+    power = _battery_power(rng, speed, auxiliary)
+    power *= pack.energy_kwh / _REFERENCE_KWH if pack.energy_kwh < 15.0 else 1.0
+    if discharge:
+        wanted = (start - end) * pack.energy_kwh * 3.6e6
+        power *= 1.03 * wanted / max(float(np.sum(power)), 0.2 * wanted)
+    current, step = _current(rng, pack, power, start)
+    if not (discharge or speed_ms is not None) and rng.random() < _CHARGING_PROBABILITY:
+        current = _with_charging(rng, pack, current, step, start)
+    taken = np.concatenate(([0.0], np.cumsum(0.5 * (current[1:] + current[:-1])))) * step / 3600.0
+    empty = np.flatnonzero(start - taken / pack.capacity_ah < end)
+    rows = int(empty[0]) if empty.size else current.size
+    rows = max(rows, min(current.size, int(120.0 / step)))
+    time_s: FloatArray = np.arange(rows, dtype=np.float64) * step
+    conditioned = bool(rng.random() < 0.45) and not discharge
+    return Drive(
+        time_s=time_s,
+        current_a=current[:rows],
+        ambient_c=_weather(rng, time_s, ambient),
+        start_c=ambient + float(rng.normal(1.5, 2.0)),
+        start_soc=start,
+        conditioning_w=float(pack.energy_kwh * rng.uniform(25.0, 130.0)) if conditioned else 0.0,
+        target_c=float(rng.uniform(14.0, 26.0)),
+        history=float(rng.choice((-1.0, -1.0, rng.uniform(-1.0, 1.0), 1.0))),
+        seed=int(rng.integers(2**31)),
+    )
+
+
+def read_speed(path: str | PathLike[str]) -> FloatArray:
+    """Read a driving schedule and return its speed at 1 Hz [m/s], shape (n,).
+
+    Parameters
+    ----------
+    path : path-like
+        CSV with a header: time [s], then speed in m/s, or in km/h or mph if its name has the unit.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, time does not increase, or a speed is negative or above 85 m/s.
+    """
+    data = read_bounded(path, MAX_SPEED_TRACE_BYTES, "a speed trace")
+    try:
+        data.decode("utf-8")
+        table = pacsv.read_csv(pa.BufferReader(data))
+        if table.num_columns < 2 or table.num_rows < 2:
+            raise InputError("not a speed trace", source=path, cure=_CURE)
+        time_s = np.asarray(table.column(0).cast(pa.float64()).to_numpy())
+        speed = np.asarray(table.column(1).cast(pa.float64()).to_numpy())
+    except (pa.ArrowException, ValueError) as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise InputError(f"not a speed trace ({reason})", source=path, cure=_CURE) from error
+    heading = table.column_names[1]
+    compact = heading.lower().replace("_", "").replace(" ", "")
+    factor = next((value for unit, value in _UNITS.items() if unit in compact), 1.0)
+    speed = factor * speed
+    if not (np.all(np.isfinite(time_s)) and np.all(np.diff(time_s) > 0.0)):
+        raise InputError(
+            "time does not increase", source=path, field=table.column_names[0], cure=_CURE
+        )
+    if time_s[-1] - time_s[0] > _MAX_DURATION_S:
+        raise InputError(
+            f"longer than {_MAX_DURATION_S:g} s",
+            source=path,
+            field=table.column_names[0],
+            value=float(time_s[-1]),
+            cure=_CURE,
+        )
+    bad = np.flatnonzero(~((speed >= 0.0) & (speed < _MAX_SPEED_MS)))
+    if bad.size:
+        raise InputError(
+            f"row {bad[0] + 1}: speed outside 0–{_MAX_SPEED_MS:g} m/s",
+            source=path,
+            field=heading,
+            value=float(speed[bad[0]]),
+            cure=_CURE,
+        )
+    seconds = np.arange(time_s[0], time_s[-1] + 0.5)
+    trace: FloatArray = np.interp(seconds, time_s, speed)
+    return trace
+
+
+def _draw_speed(rng: np.random.Generator, seconds: int) -> FloatArray:
+    """Draw a speed trace at 1 Hz [m/s]: micro-trips in town, country and motorway, with stops."""
+    pieces: list[FloatArray] = []
+    length = 0
+    briskness = float(rng.uniform(0.7, 1.5))
+    while length < seconds:
+        style = str(rng.choice(list(_STYLES), p=(0.5, 0.3, 0.2)))
+        until = length + float(rng.uniform(240.0, 1200.0))
+        while length < min(until, seconds):
+            trip = _micro_trip(rng, style, briskness)
+            pieces.append(trip)
+            length += trip.size
+    return np.concatenate(pieces)[:seconds]
+
+
+def _micro_trip(rng: np.random.Generator, style: str, briskness: float) -> FloatArray:
+    (slow, fast), (short, long), (brief, wait) = _STYLES[style]
+    speeds, times = [0.0], [0.0]
+    for _ in range(int(rng.integers(1, 4))):
+        cruise = float(rng.uniform(slow, fast))
+        change = cruise - speeds[-1]
+        rate = briskness * float(rng.uniform(0.6, 2.2) if change > 0.0 else rng.uniform(0.5, 1.6))
+        # Acceleration fades with speed: power is limited.
+        rate /= 1.0 + max(cruise, speeds[-1]) / 25.0
+        times.append(times[-1] + abs(change) / rate + 1.0)
+        speeds.append(cruise)
+        times.append(times[-1] + float(np.exp(rng.uniform(np.log(short), np.log(long)))))
+        speeds.append(cruise)
+    times.append(times[-1] + speeds[-1] / (briskness * float(rng.uniform(0.7, 2.0))) + 1.0)
+    speeds.append(0.0)
+    times.append(times[-1] + float(rng.uniform(brief, wait)))
+    speeds.append(0.0)
+    seconds = np.arange(0.0, times[-1])
+    trace = np.interp(seconds, times, speeds)
+    # Driver and traffic: fluctuation that vanishes at standstill.
+    wobble = lfilter([1.0], [1.0, -1.72, 0.745], rng.normal(0.0, 0.025, seconds.size))
+    moving = np.minimum(trace / 5.0, 1.0)
+    smooth = np.convolve(np.pad(trace, 1, mode="edge"), (0.25, 0.5, 0.25), mode="valid")
+    result: FloatArray = np.maximum(smooth + moving * wobble, 0.0)
+    return result
+
+
+def _check(hours: float, ambient_c: float, start: float, end: float) -> None:
+    limits = (
+        ("hours", hours, 0.05, 12.0, "h"),
+        ("ambient", ambient_c, -30.0, 50.0, "°C"),
+        ("start SoC", 100.0 * start, 3.0, 100.0, "%"),
+        ("end SoC", 100.0 * end, 1.0, 99.0, "%"),
+    )
+    for name, value, low, high, unit in limits:
+        if not low <= value <= high:
+            raise InputError(f"must lie within {low:g} … {high:g} {unit}", field=name, value=value)
+    if end >= start:
+        raise InputError(
+            f"the drive starts at {100.0 * start:g} %, at or below its end",
+            field="end SoC",
+            value=100.0 * end,
+            cure="give a lower end or a higher start",
+        )
+
+
+def _park(rng: np.random.Generator, speed: FloatArray) -> None:
+    """Insert standstills at the start and on the way, at random (in place)."""
+    if rng.random() < 0.3:
+        speed[: int(rng.uniform(60.0, 900.0))] = 0.0
+    if rng.random() < 0.3:
+        first = int(rng.uniform(0.2, 0.8) * speed.size)
+        speed[first : first + int(rng.uniform(180.0, 900.0))] = 0.0
+
+
+def _battery_power(rng: np.random.Generator, speed: FloatArray, auxiliary_w: float) -> FloatArray:
+    """Return the battery power of a car that follows a speed trace [W]."""
+    mass = rng.uniform(1350.0, 1950.0)
+    drag = 0.5 * 1.2 * rng.uniform(0.60, 0.75)
+    rolling = rng.uniform(0.008, 0.012)
+    slope = gaussian_filter1d(rng.normal(0.0, 1.0, speed.size), 45.0, mode="nearest")
+    slope *= rng.uniform(0.0, 0.015) / max(float(np.std(slope)), 1e-9)
+    acceleration = np.gradient(speed)
+    force = mass * (1.04 * acceleration + _G * slope) + drag * speed**2
+    force += mass * _G * rolling * (speed > 0.1)
+    wheel = force * speed
+    driven = np.maximum(wheel, 0.0) / rng.uniform(0.82, 0.90)
+    # Friction brakes take over below walking pace and above 60 kW.
+    fade = np.clip((speed - 1.5) / 3.0, 0.0, 1.0)
+    recovered = np.maximum(np.minimum(wheel, 0.0) * rng.uniform(0.45, 0.80), -60e3) * fade
+    cycling = 1.0 + 0.4 * np.sign(np.sin(np.arange(speed.size) / rng.uniform(15.0, 60.0)))
+    power: FloatArray = driven + recovered + auxiliary_w * cycling
+    return power
+
+
+def _current(
+    rng: np.random.Generator, pack: Pack, power_w: FloatArray, start: float
+) -> tuple[FloatArray, float]:
+    """Return the current on the simulation grid [A], and the grid's step [s]."""
+    used = np.cumsum(power_w) / 3.6e6 / pack.energy_kwh
+    open_v = pack.cells * pack.chemistry.ocv(np.clip(start - used, 0.03, 1.0))
+    resistance = 1.3 * pack.resistance_ohm
+    inner = np.maximum(open_v**2 - 4.0 * resistance * power_w, (0.6 * open_v) ** 2)
+    current = (open_v - np.sqrt(inner)) / (2.0 * resistance)
+    # Charge acceptance: none when full, at most about 1.5C.
+    room = np.clip((0.985 - (start - used)) / 0.05, 0.02, 1.0)
+    limit = pack.one_c_a * rng.uniform(0.8, 1.6) * room
+    current = np.clip(current, -limit, pack.one_c_a * rng.uniform(2.5, 4.0))
+    rate = max(2.0, pack.sensors.rate_hz)
+    coarse = np.arange(power_w.size, dtype=np.float64)
+    fine = np.arange(0.0, coarse[-1], 1.0 / rate)
+    result = np.interp(fine, coarse, current)
+    # Traction control and pedal: fluctuation faster than the speed trace.
+    flutter = gaussian_filter1d(rng.normal(0.0, 1.0, fine.size), 0.35 * rate, mode="nearest")
+    flutter *= rng.uniform(0.01, 0.06) * np.abs(result) / max(float(np.std(flutter)), 1e-9)
+    return result + flutter, 1.0 / rate
+
+
+def _with_charging(
+    rng: np.random.Generator, pack: Pack, current: FloatArray, step_s: float, start: float
+) -> FloatArray:
+    """Insert a stop at a charger; same number of rows."""
+    row = int(rng.uniform(0.2, 0.7) * current.size)
+    soc = start - float(np.sum(current[:row])) * step_s / 3600.0 / pack.capacity_ah
+    gained = min(float(rng.uniform(0.05, 0.35)), 0.93 - soc)
+    if gained < 0.03:
+        return current
+    # At most a third of the drive.
+    most_s = 0.33 * current.size * step_s
+    rate = max(float(rng.uniform(0.25, 1.0)), 3600.0 * 0.03 / most_s)
+    seconds = min(3600.0 * gained / rate, most_s)
+    plugged = -rate * pack.one_c_a * np.ones(int(seconds / step_s))
+    ramp = np.minimum(1.0, np.arange(plugged.size) * step_s / 20.0)
+    idle = np.full(int(rng.uniform(20.0, 120.0) / step_s), 0.002 * pack.one_c_a)
+    parts = (current[:row], idle, plugged * ramp * ramp[::-1], idle, current[row:])
+    return np.concatenate(parts)[: current.size]
+
+
+def _weather(rng: np.random.Generator, time_s: FloatArray, ambient_c: float) -> FloatArray:
+    """Return the ambient temperature [°C]: slow drift, at times a step (leaving a garage)."""
+    period = rng.uniform(3000.0, 12000.0)
+    result = ambient_c + rng.uniform(0.0, 2.0) * np.sin(2.0 * np.pi * time_s / period)
+    if rng.random() < 0.4:
+        change = rng.normal(0.0, 6.0)
+        result[time_s > rng.uniform(0.1, 0.7) * time_s[-1]] += change
+    return result

@@ -1,0 +1,203 @@
+"""Simulate a pack, a drive, the weather and the sensors: a log whose truth is known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from cangauge._typing import FloatArray
+from cangauge.errors import InputError
+from cangauge.extras.validation.twin.drive import draw_drive
+from cangauge.extras.validation.twin.faults import Fault, parse_effect
+from cangauge.extras.validation.twin.pack import draw_pack
+from cangauge.extras.validation.twin.plant import Plant, TwinPlant, draw_equation_plant
+from cangauge.extras.validation.twin.recording import Recording, record_drive, rms, simulate_truth
+from cangauge.extras.validation.twin.scaling import ScaledFault, scale_to_gap
+from cangauge.logs.log import Log
+
+PlantName = Literal["twin", "equation", "published", "pybamm"]
+
+_DEFAULT_GAP: Final = 0.003
+"""RMS gap of an effect without a size, relative to the nominal voltage [-]."""
+_DISCHARGE_HOURS: Final = 2.5
+_EMPTY: Final = 0.015
+"""SoC at which a full discharge ends [-]; `fit` takes 2 % and less as empty."""
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """A simulated log with its truth.
+
+    Parameters
+    ----------
+    log : Log
+        As recorded by the sensors; `soc_pct` is the assumed initial SoC, then the true SoC.
+    recording : Recording
+        The same log with the assumed initial SoC alone, and the truth at its rows.
+    plant : Plant
+        Pack and cell model.
+    faults : tuple of Fault
+    limited : tuple of ScaledFault
+        Faults whose physical limits prevent the requested gap.
+    """
+
+    log: Log
+    recording: Recording
+    plant: Plant
+    faults: tuple[Fault, ...]
+    limited: tuple[ScaledFault, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return pack, ranges of the signals, RMS gap [V] and the effects with their sizes."""
+        log, pack, recording = self.log, self.plant.pack, self.recording
+        assumed = log.first_soc()
+        return {
+            "rows": len(log),
+            "hours": log.duration_s / 3600.0,
+            "plant": self.plant.name,
+            "pack": pack.name,
+            "chemistry": pack.chemistry.name,
+            "cells": pack.cells,
+            "capacity_ah": pack.capacity_ah,
+            "assumed_start_soc_pct": None if assumed is None else assumed[1],
+            "true_soc_pct": [float(recording.true_soc_pct[0]), float(recording.true_soc_pct[-1])],
+            "temperature_c": [float(log.temperature_c.min()), float(log.temperature_c.max())],
+            "floor_sensor_v": rms(recording.sensor_error_v),
+            "gap_v": rms(recording.gap_v),
+            "effects": [
+                {
+                    "effect": fault.id,
+                    "parameter": fault.kind.parameter,
+                    "value": fault.size,
+                    "unit": fault.kind.unit,
+                    "shape": fault.full_shape(),
+                }
+                for fault in self.faults
+            ],
+        }
+
+
+def simulate(
+    effects: str | Sequence[str] = (),
+    *,
+    seed: int = 0,
+    drive: int = 1,
+    hours: float | None = None,
+    ambient_c: float | None = None,
+    start_soc_pct: float | None = None,
+    end_soc_pct: float | None = None,
+    discharge: bool = False,
+    speed_ms: FloatArray | None = None,
+    pack: str | None = None,
+    chemistry: str | None = None,
+    plant: PlantName = "twin",
+    name: str = "log",
+) -> Simulation:
+    """Simulate a drive of a pack with known faults.
+
+    The same arguments give the same log. What is not given is drawn from the seed.
+
+    Parameters
+    ----------
+    effects : str or sequence of str
+        Faults, as `ID`, `ID:parameter=value` or `ID:gap_v=V` for the size that opens this RMS gap.
+        Without a size or a gap: a gap of 0.3 % of the nominal voltage.
+    seed : int
+        Selects the pack, and with `drive` the drive and the weather.
+    drive : int
+        Number of the drive, from 1.
+    hours : float, optional
+        Duration [h].
+    ambient_c : float, optional
+        Initial ambient temperature [°C].
+    start_soc_pct, end_soc_pct : float, optional
+        Initial SoC, and SoC at which the drive ends [%].
+    discharge : bool
+        Drive from full to empty, by default in 2.5 h: a log to identify a model on.
+    speed_ms : array of shape (m,), optional
+        Speed trace at 1 Hz [m/s], repeated as needed (see `cangauge.extras.validation.read_speed`).
+    pack : {"leaf24", "leaf40", "car60", "car60lfp", "compact", "module12"}, optional
+    chemistry : {"nmc", "lmo", "nca", "lfp"}, optional
+    plant : {"twin", "equation", "published", "pybamm"}
+        Model of the cells; `pybamm` needs the extra of that name.
+    name : str
+        Name of the log.
+
+    Raises
+    ------
+    InputError
+        For an unknown name or a value out of range.
+
+    Examples
+    --------
+    >>> from cangauge.extras.validation import simulate
+    >>> trip = simulate("current_offset:offset_a=4", seed=1, hours=0.2)
+    >>> trip.faults[0].size
+    4.0
+    """
+    if discharge:
+        hours = _DISCHARGE_HOURS if hours is None else hours
+        start_soc_pct = 100.0 if start_soc_pct is None else start_soc_pct
+        end_soc_pct = 100.0 * _EMPTY if end_soc_pct is None else end_soc_pct
+    model = draw_plant(np.random.default_rng([seed, 1]), pack, chemistry, plant)
+    load = draw_drive(
+        np.random.default_rng([seed, 4, drive]),
+        model.pack,
+        hours=hours,
+        ambient_c=ambient_c,
+        start_soc=None if start_soc_pct is None else start_soc_pct / 100.0,
+        end_soc=None if end_soc_pct is None else end_soc_pct / 100.0,
+        speed_ms=speed_ms,
+        discharge=discharge,
+    )
+    healthy = simulate_truth(model, load)
+    faults: list[Fault] = []
+    limited: list[ScaledFault] = []
+    for number, text in enumerate([effects] if isinstance(effects, str) else effects):
+        fault, gap_v = parse_effect(
+            text,
+            model.pack,
+            seed=seed + 7919 * number,
+            default_gap_v=_DEFAULT_GAP * model.pack.nominal_v,
+        )
+        if gap_v is not None:
+            scaled = scale_to_gap(model, [load], fault, gap_v, [healthy])
+            fault = scaled.fault
+            if scaled.limited:
+                limited.append(scaled)
+        faults.append(fault)
+    recording = record_drive(model, load, faults, name=name, healthy=healthy)
+    soc_pct = recording.true_soc_pct.copy()
+    if recording.log.soc_pct is not None:
+        soc_pct[0] = recording.log.soc_pct[0]  # assumed
+    log = replace(recording.log, soc_pct=soc_pct)
+    return Simulation(log, recording, model, tuple(faults), tuple(limited))
+
+
+def draw_plant(
+    rng: np.random.Generator,
+    kind: str | None = None,
+    chemistry_name: str | None = None,
+    name: PlantName = "twin",
+) -> Plant:
+    """Draw a pack and the model of its cells (parameters as in `simulate`).
+
+    Raises
+    ------
+    InputError
+        For an unknown name, or if PyBaMM is needed and not installed.
+    """
+    pack = draw_pack(rng, kind, chemistry_name)
+    if name == "twin":
+        return TwinPlant(pack)
+    if name in {"equation", "published"}:
+        return draw_equation_plant(rng, pack, reports_core=name == "published")
+    if name == "pybamm":
+        # An extra, and slow to import.
+        from cangauge.extras.validation.twin.pybamm_plant import draw_pybamm_plant  # noqa: PLC0415
+
+        return draw_pybamm_plant(rng, pack)
+    raise InputError("unknown plant", value=name, cure="use twin, equation, published or pybamm")
