@@ -18,12 +18,12 @@ import numpy as np
 
 from benchmarks.weights import engine, packs
 from cangauge.logs.log import Log
-from cangauge.validation.twin.drive import draw_drive
-from cangauge.validation.twin.faults import Fault, fault_kind, fault_kinds
-from cangauge.validation.twin.injection import fit_surrogate_pack, inject
-from cangauge.validation.twin.pack import Pack
-from cangauge.validation.twin.recording import record_drive, rms
-from cangauge.validation.twin.simulation import draw_plant
+from cangauge.extras.validation.twin.drive import draw_drive
+from cangauge.extras.validation.twin.faults import Fault, fault_kind, fault_kinds
+from cangauge.extras.validation.twin.injection import fit_surrogate_pack, inject
+from cangauge.extras.validation.twin.pack import Pack
+from cangauge.extras.validation.twin.recording import record_drive, rms
+from cangauge.extras.validation.twin.simulation import draw_plant
 
 FLOORS = (0.4, 5.0)
 """Sizes are drawn uniformly in the logarithm between these [floors]."""
