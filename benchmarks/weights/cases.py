@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import pickle
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -34,9 +34,9 @@ OUTSIDE = tuple(kind.id for kind in fault_kinds(outside=True))
 PER_SPLIT = 5
 NUMBERS = {
     "weights": dict(i3=(40, 12, 6), i3_winter=(20, 4, 0), lg_25=(40, 4, 4), lg_cold=(40, 6, 4),
-                    car1=(40, 12, 4), a123=(20, 6, 2), leaf=(14, 4, 0), simulated=(80, 20, 12), pybamm=(30, 8, 4)),
-    "frozen": dict(i3=(60, 24, 9), i3_winter=(20, 8, 0), lg_25=(40, 8, 4), lg_cold=(20, 10, 2), lg_40=(20, 8, 2),
-                   car1=(40, 18, 4), simulated=(80, 18, 12), pybamm=(40, 8, 3)),
+                    car1=(40, 12, 4), a123=(20, 6, 2), leaf=(14, 4, 0), simulated=(60, 16, 8), pybamm=(30, 8, 4)),
+    "frozen": dict(i3=(60, 24, 6), i3_winter=(20, 8, 0), lg_25=(20, 8, 3), lg_cold=(20, 10, 0), lg_40=(20, 8, 0),
+                   car1=(40, 18, 3), simulated=(60, 18, 8), pybamm=(20, 8, 2)),
 }  # fmt: skip
 """Cases of each data set: with an effect of the library, healthy, with an effect outside it."""
 
@@ -188,11 +188,13 @@ def made_pack(plant_name: str, seed: int, folder: Path) -> tuple[packs.PackLogs,
     return packs.PackLogs(plant_name, plant_name, logs, capacity_ah, cells, (4, 4)), own
 
 
-def draw_one(items: list[dict[str, Any]], number: int, part: str, data: Path, folder: Path) -> Iterator[Split]:
-    """Draw one split of a plan; a drawn one is read from the folder."""
+def draw_one(items: list[dict[str, Any]], number: int, part: str, data: Path, folder: Path) -> None:
+    """Draw one split of a plan into a folder, once."""
     folder.mkdir(parents=True, exist_ok=True)
     of_name = {x.name: x for x in packs.recorded(data, part)}
     item = items[number]
+    if not item["pack"]:
+        return
     file = folder / f"{number:03d}_{item['pack']}.pkl"
     if not file.exists():
         if item["pack"] in of_name:
@@ -204,4 +206,3 @@ def draw_one(items: list[dict[str, Any]], number: int, part: str, data: Path, fo
             few = item["references"]
             split = draw_recorded({**item, "references": names[:few], "logs": names[few : few + item["logs"]]}, pack, own)
         file.write_bytes(pickle.dumps(split))
-    yield pickle.loads(file.read_bytes())

@@ -13,21 +13,25 @@ from benchmarks.weights.fit import Example
 
 def examples_of(split: Split) -> list[Example]:
     """Analyse every case of a split; one with an effect counts again with its effect taken out."""
-    learned = engine.learn(split.references, split.capacity_ah)
+    known = engine.references(split.references, split.capacity_ah)
     out = []
     for case in split.cases:
         began = time.process_time()
-        found = engine.evidence(learned, case.logs)
+        found = engine.evidence(known, case.logs, split.capacity_ah)
         seconds = time.process_time() - began
         effect = case.truth["effect"]
         truth = "none" if effect is None else effect if effect in EFFECTS else "unknown"
+        more = dict(
+            case.truth,
+            seconds=seconds,
+            found={k: (e.size, e.std) for k, e in found.effects.items()},
+            left_over={k: (e.left_v2 / known.healthy_v2) ** 0.5 for k, e in found.effects.items()},
+        )
         for without in [(), (effect,)] if effect in EFFECTS else [()]:
-            f = engine.features(*found, without)
-            out.append(
-                Example(split.pack, split.world, f.names, f.inner, f.outer, "unknown" if without else truth,
-                        case.truth.get("reached", 0.0), bool(without),
-                        more={"size": case.truth.get("size"), "found": dict(zip(f.names, f.sizes, strict=True)), "seconds": seconds, "effect": effect})
-            )  # fmt: skip
+            f = engine.features_of(known, found, case.logs, without)
+            of = "unknown" if without else truth
+            floors = case.truth.get("reached", 0.0)
+            out.append(Example(split.pack, split.world, f.names, f.inner, f.outer, of, floors, bool(without), more=more))
     return out
 
 

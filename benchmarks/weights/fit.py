@@ -10,9 +10,8 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 
-from benchmarks.weights.engine import GROUPS
+from benchmarks.weights.engine import GROUP_OF, GROUPS
 
-GROUP_OF = {name: group for group, names in GROUPS.items() for name in names}
 START = np.array([2.051, 2.107, 4.0, 0.926, 0.3038, -2.1324, -0.421, 0.1766, -1.0014, -0.9682, 0.5264, 0.0353, 0.4589, -2.0301])
 """nats, volts, cold, group; library; none; unknown. The optimiser's start."""
 CENTRE = np.array([1.5, 1.5, 4.0, 1.0, 0.5, 0, 0, 0, 0, 0, 0, 0, 0, 0.0])

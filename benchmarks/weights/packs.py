@@ -48,7 +48,7 @@ LG = {
         " 40degC__557_Mixed3",
     },
 }
-SIMULATED = {"weights": range(100, 110), "frozen": range(200, 210)}
+SIMULATED = {"weights": range(100, 105), "frozen": range(200, 205)}
 """Seeds of the twin's packs."""
 PYBAMM = {"weights": range(300, 302), "frozen": range(400, 402)}
 

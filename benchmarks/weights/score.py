@@ -71,3 +71,15 @@ def table(examples: Sequence[Example], ps: Sequence[dict[str, float]]) -> str:
     inside = [m for x, m in marks if not x.cause_out and x.truth != "unknown"]
     lines.append(f"sets of 90 % hold {mean(inside, 'set_holds'):.2f}, mean size {mean(inside, 'set_size'):.1f}; log score {mean(inside, 'log'):.2f}; mean P(truth) {mean(inside, 'p_true'):.2f}")
     return "\n".join(lines)
+
+
+def trade(examples: Sequence[Example], ps: Sequence[dict[str, float]]) -> str:
+    """Return naming and the open set in a line."""
+    marks = [(x, one(x, p)) for x, p in zip(examples, ps, strict=True)]
+    known = [m for x, m in marks if x.truth in GROUP_OF and x.floors >= 1]
+    lost = [m for x, m in marks if x.truth == "unknown" and x.floors >= 1]
+    quiet = [m for x, m in marks if x.truth == "none"]
+    return (
+        f"named {mean(known, 'name'):.2f}, alarm {mean(known, 'alarm'):.2f}; open set misled"
+        f" {mean(lost, 'misled'):.2f}; healthy alarms {sum(m['alarm'] for m in quiet)} of {len(quiet)}"
+    )
