@@ -7,7 +7,8 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from cangauge.diagnosis.answer import GROUP_OF, GROUPS, Features, features
-from cangauge.diagnosis.evidence import Evidence, References, analyse, columns, learn, trace
+from cangauge.diagnosis.evidence import Evidence, References, analyse, columns, learn
+from cangauge.diagnosis.pack_fit import trace
 from cangauge.logs.log import Log
 
 __all__ = ["GROUPS", "GROUP_OF", "colder_k", "evidence", "features_of", "floor_v", "references"]
