@@ -33,8 +33,8 @@ EFFECTS = tuple(kind.id for kind in fault_kinds())
 OUTSIDE = tuple(kind.id for kind in fault_kinds(outside=True))
 PER_SPLIT = 5
 NUMBERS = {
-    "weights": dict(i3=(40, 12, 6), i3_winter=(20, 4, 0), lg_25=(40, 4, 4), lg_cold=(40, 6, 4),
-                    car1=(40, 12, 4), a123=(20, 6, 2), leaf=(14, 4, 0), simulated=(60, 16, 8), pybamm=(30, 8, 4)),
+    "weights": dict(i3=(80, 24, 8), i3_winter=(40, 8, 2), lg_25=(40, 8, 4), lg_cold=(60, 10, 6),
+                    car1=(60, 20, 6), a123=(40, 9, 4), leaf=(20, 4, 0), simulated=(80, 20, 8), pybamm=(40, 10, 4)),
     "frozen": dict(i3=(60, 24, 6), i3_winter=(20, 8, 0), lg_25=(20, 8, 3), lg_cold=(20, 10, 0), lg_40=(20, 8, 0),
                    car1=(40, 18, 3), simulated=(60, 18, 8), pybamm=(20, 8, 2)),
 }  # fmt: skip
