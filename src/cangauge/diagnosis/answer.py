@@ -115,10 +115,11 @@ class Weights:
     @classmethod
     def of(cls, numbers: Mapping[str, Any]) -> Self:
         """Return the weights of a mapping with these names."""
-        return cls(**{
+        fields: dict[str, Any] = {
             name: tuple(value) if isinstance(value, list) else value
             for name, value in numbers.items()
-        })  # fmt: skip
+        }
+        return cls(**fields)
 
     @classmethod
     def shipped(cls) -> Self:
@@ -147,7 +148,7 @@ class Features:
 def features(
     known: References, evidence: Evidence, colder_k: float = 0.0, without: Collection[str] = ()
 ) -> Features:
-    """Return the features of a case.
+    """Return what the posterior sees of a case.
 
     Parameters
     ----------

@@ -25,6 +25,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import log_ndtr, logsumexp
 
 from cangauge._typing import BoolArray, FloatArray, IntArray
@@ -56,6 +57,13 @@ VISIBLE_NATS = 6.0
 
 COVER_PCT = 2.0
 """References cover SoC this far beyond their own [%]."""
+
+COVER_K = 3.0
+"""References cover temperatures this far beyond their own [K]."""
+
+MAX_OUTLIERS, OUTLIER = 5, 0.1
+"""At most so many single rows, off by this part of the voltage, are faults of a bus and left out;
+more are diagnosed."""
 
 MIN_COVERED = 0.2
 """A log with less of its rows at SoC that references visit is judged on all of them."""
@@ -107,11 +115,23 @@ def soc_covered(pack: PackFit, log: Trace, others: Sequence[Trace]) -> BoolArray
     return covered
 
 
-def rows_that_count(pack: PackFit, log: Trace, others: Sequence[Trace]) -> IntArray:
-    """Return measured rows whose SoC other logs visit; all measured rows if those are few."""
+def rows_that_count(pack: PackFit, log: Trace, others: Sequence[Trace], r: FloatArray) -> IntArray:
+    """Return measured rows whose SoC other logs visit; all measured rows if those are few.
+
+    Parameters
+    ----------
+    pack : PackFit
+    log : Trace
+    others : sequence of Trace
+    r : array of shape (n,)
+        Residual, for single rows that no pack can have produced [V].
+    """
     covered = log.measured & soc_covered(pack, log, others)
     if covered.sum() < MIN_COVERED * log.measured.sum():
-        covered = log.measured
+        covered = log.measured.copy()
+    outliers = np.flatnonzero(np.abs(r - np.median(r)) > OUTLIER * pack.volts)
+    if 0 < outliers.size <= MAX_OUTLIERS:
+        covered[outliers] = False
     return np.flatnonzero(covered)
 
 
@@ -193,13 +213,26 @@ class References:
         return float(np.mean([one.gap_v2 for one in self.left_out]))
 
     @property
+    def healthy_rmse_v(self) -> float:
+        """RMS error of a healthy log [V]."""
+        return float(np.sqrt(self.healthy_v2))
+
+    @property
     def healthy_nats(self) -> FloatArray:
         """Most evidence of any effect in each left-out reference [nats]."""
         most = [
-            max(e.nats / self.excess_of(name) for name, e in one.effects.items())
+            max(float(e.nats) / self.excess_of(name) for name, e in one.effects.items())
             for one in self.left_out
         ]
         return np.maximum(np.array(most or [3.0]), 0.0)
+
+    def colder_k(self, logs: Sequence[Trace]) -> float:
+        """Return how far logs lie beyond the temperatures of the references [K]."""
+        low = min(float(log.temperature_c.min()) for log in self.logs)
+        high = max(float(log.temperature_c.max()) for log in self.logs)
+        lowest = min(float(log.temperature_c.min()) for log in logs)
+        highest = max(float(log.temperature_c.max()) for log in logs)
+        return max(0.0, low - COVER_K - lowest, highest - high - COVER_K)
 
     def excess_of(self, effect: str) -> float:
         """Return o_k of an effect."""
@@ -211,6 +244,9 @@ def learn(
 ) -> References:
     """Learn structure, noise and healthy evidence from reference logs.
 
+    The structure is linearised twice, the second time about what the references show: an effect
+    that moves the SoC would meet the correction of another SoC otherwise.
+
     Parameters
     ----------
     references : sequence of Trace
@@ -220,33 +256,24 @@ def learn(
         Error that the model file states [V]: the floor with fewer than two references.
     """
     pack = fit_pack(references, capacity_ah)
+    full, out = _of_references(pack, references, ())
+    s2 = _noise_v2(pack, full)
+    p = _prior(pack, full, out, s2)
+    pack = pack.moved(np.linalg.solve(*_normal(pack, p, _marginal(full, s2))))
+
     trials = library(pack)
-    full, out = [], []
-    for k, log in enumerate(references):
-        every = _all_columns(pack, log, trials)
-        others = [*references[:k], *references[k + 1 :]]
-        full.append(_on_rows(log, every, np.flatnonzero(log.measured)))
-        out.append(_on_rows(log, every, rows_that_count(pack, log, others)))
-    nx, rows = len(pack.theta), sum(len(log.rows) for log in full)
-    s2, p = (0.003 * pack.volts) ** 2, pack.precision()
-    for _ in range(3):  # noise as all references fit together
-        q = [without_own(log.products, log, s2) for log in full]
-        b = sum(x[:nx, -1] for x in q) - p @ pack.theta
-        explained = b @ np.linalg.solve(p + sum(x[:nx, :nx] for x in q), b)
-        chi2 = sum(x[-1, -1] for x in q) + pack.theta @ p @ pack.theta - explained
-        s2 *= float(chi2) / rows
-    s2 = max(s2, (1e-5 * pack.volts) ** 2)
-    q = [without_own(log.products, log, s2) for log in full]
-    p, left_v2 = _prior(pack, out, q, s2)
-    s2 = max(left_v2, s2)
+    full, out = _of_references(pack, references, trials)
+    s2 = _noise_v2(pack, full)
     if len(references) < 2:
         s2 = max(s2, stated_rmse_v**2)
-    q = [without_own(log.products, log, s2) for log in full]
-    a, b = p + sum(x[:nx, :nx] for x in q), sum(x[:nx, -1] for x in q) - p @ pack.theta
+    else:
+        s2 = max(s2, float(np.mean(_left_out_v2(pack, p, _marginal(full, s2), out))))
+    q = _marginal(full, s2)
+    a, b = _normal(pack, p, q)
     known = References(pack, trials, list(references), s2, a, b, stated_v2=stated_rmse_v**2)
     if len(references) < 2:
         return known
-    plain = replace(known, excess={"": 1.0})
+    plain, nx = replace(known, excess={"": 1.0}), len(b)
     left_out = tuple(
         analyse(replace(plain, a=a - x[:nx, :nx], b=b - x[:nx, -1]), [log], exact=False)
         for x, log in zip(q, out, strict=True)
@@ -257,42 +284,67 @@ def learn(
     return replace(known, left_out=left_out, excess=excess)
 
 
-def _prior(
-    pack: PackFit, out: Sequence[Columns], q: Sequence[FloatArray], s2: float
-) -> tuple[FloatArray, float]:
-    """Return the prior precision that predicts left-out references best, and their error [V²].
+def _of_references(
+    pack: PackFit, references: Sequence[Trace], trials: Sequence[Trial]
+) -> tuple[list[Columns], list[Columns]]:
+    """Return each reference on all its rows, and on those whose SoC the others visit."""
+    full, out = [], []
+    for k, log in enumerate(references):
+        every = _all_columns(pack, log, trials)
+        others, r = [*references[:k], *references[k + 1 :]], every[-1][:, 0]
+        full.append(_on_rows(log, every, rows_that_count(pack, log, [], r)))
+        out.append(_on_rows(log, every, rows_that_count(pack, log, others, r)))
+    return full, out
 
-    Parameters
-    ----------
-    pack : PackFit
-    out : sequence of Columns
-        Each reference on the rows whose SoC the others visit.
-    q : sequence of array
-        Products of each with its own deviations integrated out.
-    s2 : float
-        Noise [V²]; returned for a single reference.
-    """
-    nx, floor_v2 = len(pack.theta), (5e-4 * pack.volts) ** 2
-    best = np.inf, pack.precision(), s2
-    for size in (0.03, 0.1, 0.3, 1.0):
-        for rough in (0.2, 0.5, 1.5):
-            p = pack.precision(size, rough)
-            a, b = p + sum(x[:nx, :nx] for x in q), sum(x[:nx, -1] for x in q) - p @ pack.theta
-            errors = [
-                squares(log, np.linalg.solve(a - x[:nx, :nx], b - x[:nx, -1])) / len(log.rows)
-                for x, log in zip(q, out, strict=True)
-                if len(out) > 1
-            ]
-            score = float(np.sum(np.log(np.array(errors) + floor_v2)))
-            if errors and score < best[0]:
-                best = score, p, float(np.mean(errors))
-    return best[1:]
+
+def _marginal(logs: Sequence[Columns], s2: float) -> list[FloatArray]:
+    return [without_own(log.products, log, s2) for log in logs]
+
+
+def _normal(pack: PackFit, p: FloatArray, q: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Return precision and right side of θ's change, the prior's precision being p about zero."""
+    nx, total = len(pack.theta), np.sum(q, axis=0)
+    return p + total[:nx, :nx], total[:nx, -1] - p @ pack.theta
+
+
+def _noise_v2(pack: PackFit, full: Sequence[Columns]) -> float:
+    """Return the mean square error of all references together [V²]."""
+    s2, p, rows = (0.003 * pack.volts) ** 2, pack.precision(), sum(len(log.rows) for log in full)
+    for _ in range(3):
+        q = _marginal(full, s2)
+        a, b = _normal(pack, p, q)
+        chi2 = sum(x[-1, -1] for x in q) + pack.theta @ p @ pack.theta - b @ np.linalg.solve(a, b)
+        s2 *= float(chi2) / rows
+    return max(s2, (1e-5 * pack.volts) ** 2)
+
+
+def _left_out_v2(
+    pack: PackFit, p: FloatArray, q: Sequence[FloatArray], out: Sequence[Columns]
+) -> FloatArray:
+    """Return the mean square error of each reference by the others [V²]."""
+    (a, b), nx = _normal(pack, p, q), len(pack.theta)
+    return np.array([
+        squares(log, np.linalg.solve(a - x[:nx, :nx], b - x[:nx, -1])) / len(log.rows)
+        for x, log in zip(q, out, strict=True)
+    ])  # fmt: skip
+
+
+def _prior(pack: PackFit, full: Sequence[Columns], out: Sequence[Columns], s2: float) -> FloatArray:
+    """Return the prior precision of θ that predicts left-out references best."""
+    if len(out) < 2:
+        return pack.precision()
+    q, floor_v2 = _marginal(full, s2), (5e-4 * pack.volts) ** 2
+    grid = [
+        pack.precision(size, rough) for size in (0.03, 0.1, 0.3, 1.0) for rough in (0.2, 0.5, 1.5)
+    ]
+    return min(grid, key=lambda p: np.sum(np.log(_left_out_v2(pack, p, q, out) + floor_v2)))
 
 
 def columns(known: References, log: Trace) -> Columns:
     """Return the columns of a log on the rows whose SoC the references visit."""
     every = _all_columns(known.pack, log, known.trials)
-    return _on_rows(log, every, rows_that_count(known.pack, log, known.logs))
+    r = every[-1][:, 0]
+    return _on_rows(log, every, rows_that_count(known.pack, log, known.logs, r))
 
 
 def without_own(products: FloatArray, log: Columns, s2: float) -> FloatArray:
@@ -301,10 +353,12 @@ def without_own(products: FloatArray, log: Columns, s2: float) -> FloatArray:
     g, own = products / s2, slice(nx, nx + nb)
     others = np.r_[0:nx, nx + nb : len(g)]
     z = np.linalg.solve(np.linalg.cholesky(g[own, own] + np.eye(nb)), g[own][:, others])
-    return np.asarray(g[np.ix_(others, others)] - z.T @ z)
+    return np.asarray(g[np.ix_(others, others)] - z.T @ z, dtype=np.float64)
 
 
-def squares(log: Columns, theta: FloatArray, column: int | None = None, a: float = 0.0) -> float:
+def squares(
+    log: Columns, theta: NDArray[np.floating], column: int | None = None, a: float = 0.0
+) -> float:
     """Return a log's sum of squares [V²] with θ and an effect's column; b remains in it."""
     w = np.zeros(log.parts.shape[1])
     w[: len(theta)], w[-1] = -theta, 1.0
@@ -507,7 +561,8 @@ def held_out_sizes(
 ) -> list[FloatArray]:
     """Return the size of an effect for each row, found without that row's part of the data.
 
-    The part is the row's log, or a set of blocks of the only log.
+    The part is the row's log; a set of blocks, where there is only one log or the effect happens
+    at one moment.
 
     Returns
     -------
@@ -516,26 +571,27 @@ def held_out_sizes(
     """
     trial, size = evidence.trial, evidence.size / evidence.trial.bound
     low, high = trial.low / trial.bound, trial.high / trial.bound
-    parts = []
-    for k, log in enumerate(logs):
-        place = evidence.in_logs[k] if evidence.in_logs else trial.shape
-        if evidence.in_logs and place is None:
-            z = at_size(known, log, replace(trial, shape=1.0), size)
-        else:
-            z = at_size(known, log, replace(trial, shape=place), size)
-        parts.append(z)
+    places = evidence.in_logs or (trial.shape,) * len(logs)
+    parts = [
+        at_size(known, log, replace(trial, shape=1.0 if place is None else place), size)
+        if evidence.in_logs
+        else at_size(known, log, trial, size)
+        for log, place in zip(logs, places, strict=True)
+    ]
 
-    def without(kept: Sequence[tuple[Columns, FloatArray]]) -> float:
-        one = _OneEffect.of(known, [log for log, _ in kept], [z for _, z in kept])
+    def size_of(kept: Sequence[FloatArray], of: Sequence[Columns]) -> float:
+        one = _OneEffect.of(known, of, kept)
         change = (one.gradient - RIDGE * size) / (one.curvature + RIDGE)
         return float(np.clip(size + change, low, high)) * trial.bound
 
-    if len(logs) > 1:
-        all_parts = list(zip(logs, [z.sum(axis=0) for z in parts], strict=True))
+    whole = [z.sum(axis=0) for z in parts]
+    if len(logs) > 1 and not evidence.in_logs:
         return [
-            np.full(len(log.rows), without(all_parts[:k] + all_parts[k + 1 :]))
+            np.full(len(log.rows), size_of(whole[:k] + whole[k + 1 :], [*logs[:k], *logs[k + 1 :]]))
             for k, log in enumerate(logs)
         ]
-    (log,), (z,) = logs, parts
-    sizes = np.array([without([(log, z.sum(axis=0) - z[k])]) for k in range(FOLDS)])
-    return [sizes[log.fold]]
+    sizes = np.array([
+        size_of([z - z_part[k] for z, z_part in zip(whole, parts, strict=True)], logs)
+        for k in range(FOLDS)
+    ])  # fmt: skip
+    return [sizes[log.fold] for log in logs]

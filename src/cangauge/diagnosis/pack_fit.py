@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.signal import lfilter
 
@@ -31,6 +32,13 @@ MEMORY_S = 7200.0
 """A gap counts as a rest of at most this [s]: every state of the engine has decayed by then."""
 
 
+FAST = 3.0
+"""Samples in a second from which a log shows where within the second its current changes."""
+
+HELD_S = 10.0
+"""Time that the current is held beyond the ends of a log [s]: more than any skew."""
+
+
 @dataclass(frozen=True, eq=False)
 class Trace:
     """1 Hz signals of one log, shape (n,) each, and its assumed start."""
@@ -47,6 +55,21 @@ class Trace:
     """True capacity relative to the assumed one."""
     lost: float = 0.0
     """Part of the charging current that is not stored."""
+    charge_as: tuple[FloatArray, FloatArray] | None = None
+    """Times [s] and charge [As] of the samples of a log that has several in a second."""
+
+    def later_current_a(self, seconds: float) -> FloatArray:
+        """Return I(t + seconds), shape (n,), held at the ends of the log.
+
+        Of a fast log the means over shifted seconds; a 1 Hz log is interpolated.
+        """
+        row = np.arange(len(self.current_a))
+        if self.charge_as is None:
+            return np.asarray(np.interp(row + seconds, row, self.current_a))
+        time_s, charge_as = self.charge_as
+        edge = np.arange(len(row) + 1)
+        change = [np.diff(np.interp(edge + by, time_s, charge_as)) for by in (seconds, 0.0)]
+        return np.asarray(self.current_a + change[0] - change[1])
 
 
 def trace(log: Log, capacity_ah: float, start_pct: float | None = None) -> Trace:
@@ -75,7 +98,8 @@ def trace(log: Log, capacity_ah: float, start_pct: float | None = None) -> Trace
     steps_s = np.diff(log.time_s)
     gap = steps_s > bridge_s(log.time_s)
     steps_s = np.where(gap, np.minimum(steps_s, MEMORY_S), steps_s)
-    second = np.floor(np.concatenate([[0.0], np.cumsum(steps_s)]) + 1e-6).astype(np.intp)
+    time_s = np.concatenate([[0.0], np.cumsum(steps_s)])
+    second = np.floor(time_s + 1e-6).astype(np.intp)
     rows = np.arange(second[-1] + 1)
     counts = np.bincount(second)
     measured = counts > 0
@@ -88,7 +112,13 @@ def trace(log: Log, capacity_ah: float, start_pct: float | None = None) -> Trace
     for k in np.flatnonzero(gap):
         current_a[second[k] + 1 : second[k + 1]] = 0.0
     volts, celsius = mean(log.voltage_v), mean(log.temperature_c)
-    return Trace(current_a, volts, celsius, start_pct, measured)
+    charge_as = None
+    if len(log) >= FAST * measured.sum():
+        held = np.concatenate([[-HELD_S], time_s, [time_s[-1] + HELD_S]])
+        amperes = np.concatenate([log.current_a[:1], log.current_a, log.current_a[-1:]])
+        steps = np.diff(held) * 0.5 * (amperes[1:] + amperes[:-1])
+        charge_as = held, np.concatenate([[0.0], np.cumsum(steps)])
+    return Trace(current_a, volts, celsius, start_pct, measured, charge_as=charge_as)
 
 
 def lagged(values: FloatArray, tau_s: float) -> FloatArray:
@@ -139,6 +169,14 @@ class PackFit:
     def ohm(self) -> float:
         """Usual resistance [Ω]: 2 % of the voltage at 1 C."""
         return 0.02 * self.volts / self.capacity_ah
+
+    def moved(self, change: NDArray[np.floating]) -> PackFit:
+        """Return the fit with other coefficients; `change` is added to θ."""
+        theta = np.asarray(change + (self.theta if self.theta.size else 0.0), dtype=np.float64)
+        n = len(KNOTS)
+        least_v = 1e-4 * self.volts * np.arange(n) / n
+        rising = np.maximum.accumulate(theta[:n] + least_v)
+        return replace(self, theta=theta, curve=PchipInterpolator(KNOTS, rising))
 
     def soc(self, log: Trace) -> FloatArray:
         """Return the counted SoC [%], shape (n,)."""
@@ -209,7 +247,4 @@ def fit_pack(references: Sequence[Trace], capacity_ah: float) -> PackFit:
         x = np.column_stack([hats(s), pack.structure(log.current_a, s, log.temperature_c)])
         x = x[log.measured] * weight
         a, b = a + x.T @ x, b + x.T @ (log.voltage_v[log.measured] * weight)
-    theta = np.asarray(np.linalg.solve(a, b), dtype=np.float64)
-    n = len(KNOTS)
-    rising = np.maximum.accumulate(theta[:n] + 1e-4 * u * np.arange(n) / n)
-    return replace(pack, theta=theta, curve=PchipInterpolator(KNOTS, rising))
+    return pack.moved(np.linalg.solve(a, b))

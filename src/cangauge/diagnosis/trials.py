@@ -54,7 +54,6 @@ def library(pack: PackFit) -> list[Trial]:
         Trial("current_offset", None, -0.15 * q, 0.15 * q, True, "A"),
         Trial("current_gain", None, -0.2, 0.2, True, "1"),
         Trial("voltage_offset", None, -0.03 * u, 0.03 * u, True, "V"),
-        Trial("voltage_gain", None, -0.03, 0.03, True, "1"),
         *[Trial("time_skew", shape, low, high, True, "s") for shape, low, high in skews],
         Trial("temperature_lag", None, 0.0, 1500.0, True, "s"),
         Trial("capacity", None, -0.4, 0.15, True, "1"),
@@ -62,7 +61,8 @@ def library(pack: PackFit) -> list[Trial]:
         Trial("coulombic_efficiency", None, 0.0, 0.15, True, "1"),
         *[Trial("core_temperature", tau, -30.0, 30.0, True, "K") for tau in (400.0, 1500.0)],
     ]
-    additive = {
+    additive: dict[str, tuple[tuple[float | str | None, ...], float, float, str]] = {
+        "voltage_gain": ((None,), -0.03, 0.03, "1"),
         "resistance_temperature": ((1500.0, 4000.0), -1.0, 4.0, "1"),
         "resistance_soc": (tuple(_BENDS), -1.0, 4.0, "1"),
         "resistance_asymmetry": ((None,), -0.8, 0.8, "1"),
@@ -92,8 +92,7 @@ _UNDO: Final[dict[str, _Undo]] = {
     "current_offset": lambda _, log, __, a: {"current_a": log.current_a - a},
     "current_gain": lambda _, log, __, a: {"current_a": log.current_a / (1.0 + a)},
     "voltage_offset": lambda _, log, __, a: {"voltage_v": log.voltage_v - a},
-    "voltage_gain": lambda _, log, __, a: {"voltage_v": log.voltage_v / (1.0 + a)},
-    "time_skew": lambda _, log, __, a: {"current_a": _later(log.current_a, a)},
+    "time_skew": lambda _, log, __, a: {"current_a": log.later_current_a(a)},
     "temperature_lag": lambda _, log, __, a: {
         "temperature_c": log.temperature_c + a * np.gradient(log.temperature_c)
     },
@@ -106,11 +105,6 @@ _UNDO: Final[dict[str, _Undo]] = {
     "coulombic_efficiency": lambda _, __, ___, a: {"lost": a},
 }
 """Effect → the signals of a log without an effect of size a."""
-
-
-def _later(values: FloatArray, seconds: float) -> FloatArray:
-    row = np.arange(len(values))
-    return np.asarray(np.interp(row + seconds, row, values))
 
 
 def undone(pack: PackFit, log: Trace, trial: Trial, a: float) -> Trace:
@@ -150,12 +144,12 @@ def _bend(pack: PackFit, log: Trace, middle_pct: float) -> FloatArray:
 def _entropy(pack: PackFit, log: Trace, shape: str) -> FloatArray:
     s = pack.soc(log)
     over_soc = {
-        "level": lambda: np.ones_like(s),
-        "slope": lambda: (s - 50.0) / 50.0,
-        "cos": lambda: np.cos(s / 50.0 * np.pi),
-        "sin": lambda: np.sin(s / 50.0 * np.pi),
+        "level": np.ones_like(s),
+        "slope": (s - 50.0) / 50.0,
+        "cos": np.cos(s / 50.0 * np.pi),
+        "sin": np.sin(s / 50.0 * np.pi),
     }
-    return np.asarray((log.temperature_c - pack.mean_c) * over_soc[shape]())
+    return np.asarray((log.temperature_c - pack.mean_c) * over_soc[shape])
 
 
 def _charge_transfer(pack: PackFit, log: Trace, exchange: float) -> FloatArray:
@@ -165,6 +159,7 @@ def _charge_transfer(pack: PackFit, log: Trace, exchange: float) -> FloatArray:
 
 
 _ADDED: Final[dict[str, Callable[[PackFit, Trace, Trial], FloatArray]]] = {
+    "voltage_gain": lambda p, log, _: log.voltage_v - residual(p, log),
     "resistance_temperature": lambda p, log, t: -drop(p, log) * _colder(p, log, t.number),
     "resistance_soc": lambda p, log, t: -drop(p, log) * _bend(p, log, t.number),
     "resistance_asymmetry": lambda p, log, _: -drop(p, log) * (log.current_a < 0.0),
@@ -178,7 +173,8 @@ _ADDED: Final[dict[str, Callable[[PackFit, Trace, Trial], FloatArray]]] = {
     "entropic_coefficient": lambda p, log, t: _entropy(p, log, str(t.shape)),
     "weak_cell": lambda p, log, t: -np.exp(-np.clip(p.soc(log), -4.0, 100.0) / t.number),
 }
-"""Effect → the change of the voltage per unit [V]."""
+"""Effect → the change of the voltage per unit [V]. A gain scales the modelled voltage: the measured
+one has the noise of the residual, which would count as evidence of a positive gain."""
 
 
 def additive_column(pack: PackFit, log: Trace, trial: Trial) -> FloatArray:
@@ -204,6 +200,11 @@ def slope(
     return (r - residual(pack, log, trial, a + h)) / h
 
 
+ENTROPY: Final = 4e-4
+"""Usual temperature coefficient of a pack's voltage, relative to it [1/K]: a few tenths of a
+millivolt per kelvin and cell."""
+
+
 def healthy_columns(pack: PackFit, log: Trace, r: FloatArray) -> FloatArray:
     """Return what one healthy log may differ by, in standard deviations, shape (n, 12) [V].
 
@@ -223,13 +224,15 @@ def healthy_columns(pack: PackFit, log: Trace, r: FloatArray) -> FloatArray:
         (Trial("time_skew", None, -1.0, 1.0, True, "s"), 0.05),
         (Trial("capacity", None, -0.02, 0.02, True, "1"), 0.005),
     )
-    warmer = replace(log, temperature_c=log.temperature_c + 1.0)
+    per_k = r - residual(pack, replace(log, temperature_c=log.temperature_c + 1.0))
+    # A model may fit more per kelvin than any cell has; its sensor's error does not show it.
+    per_k *= min(1.0, ENTROPY * u / max(float(np.sqrt(np.mean(per_k**2))), 1e-12))
     return np.column_stack([
         np.full(len(n), 8e-4 * u),
         *[std * slope(pack, log, trial, 0.0, r) for trial, std in small],
         0.05 * drop(pack, log),
         0.1 * ohm * q * np.exp(-n / 150.0), 0.1 * ohm * q * np.exp(-n / 1200.0),
-        1.5 * (r - residual(pack, warmer)),
+        1.5 * per_k,
         0.15 * ohm * lagged(i, 8.0), 0.15 * ohm * lagged(i, 600.0),
         0.003 * u * np.exp(-np.clip(pack.soc(log), -4.0, 100.0) / 4.0),
     ])  # fmt: skip
