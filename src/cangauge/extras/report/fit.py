@@ -45,11 +45,11 @@ from cangauge.extras.report.page import (
     reconstruction_banners,
     render,
 )
-from cangauge.identify.tables import effect_rows, rounded, search_rows
 from cangauge.extras.report.verdict import fit_verdict
 from cangauge.identify.evaluate import LogFit
 from cangauge.identify.fit import Identification
 from cangauge.identify.rows import running_rows
+from cangauge.identify.tables import effect_rows, rounded, search_rows
 from cangauge.model.coulomb_counting import discharged_ah
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Model, Published
