@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,9 @@ from cangauge.model.effects.base import (
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.first_order import Lag
 from cangauge.model.voltage_model import SLOPE_AT_LEAST, Functions, VoltageModel, socs_from_ocv
+
+if TYPE_CHECKING:
+    from cangauge.model.model_file import Noise
 
 SLOPE_STEP_PCT = 0.05
 """Half step of the finite difference of the effects' voltage over SoC [%]."""
@@ -214,6 +218,8 @@ class OnlineModel:
     extended : ExtendedModel
     functions : Functions
         Covariance of the coefficients.
+    noise : Noise
+        Errors of the voltage.
     capacity_ah : float, optional
         Capacity set by the user [Ah].
     gap_s : float
@@ -224,12 +230,14 @@ class OnlineModel:
         self,
         extended: ExtendedModel,
         functions: Functions,
+        noise: Noise,
         capacity_ah: float | None = None,
         gap_s: float = GAP_S,
     ) -> None:
         self.extended = extended
         self.model = extended.model
         self.functions = functions
+        self.noise = noise
         # Capacity and efficiency do not depend on the SoC.
         self._counting = extended.counting(50.0)
         self.capacity_ah = capacity_ah or self._counting.capacity_ah
@@ -345,6 +353,16 @@ class OnlineModel:
     def row(self, soc_pct: float, load: FloatArray) -> FloatArray:
         """Return the change of voltage by each principal function [V], shape (n,)."""
         return self.functions.row(soc_pct, load)
+
+    def take_over(self, before: OnlineModel) -> None:
+        """Take over the currents of another model's form; low-passed ones where τ is the same."""
+        times, currents, since_s = before.delay_line.contents
+        if times and self.delay_line.longest_s > before.delay_line.longest_s:
+            since_s = max(since_s, times[0])  # the other line has dropped what this one needs
+        self.delay_line.fill(times, currents, since_s)
+        known = {lag.tau_s: lag.state() for lag in before.lags}
+        for lag in self.lags:
+            lag.restore(known.get(lag.tau_s, []))
 
     def state(self) -> list[list[float]]:
         """Return the low-passed currents' state, then that of each effect, for `restore`."""

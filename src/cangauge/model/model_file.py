@@ -318,9 +318,8 @@ class Model(_Strict):
         number = len(self.functions.curve_v)
         soc_pct = np.array(self.functions.soc_pct)
         value = np.array(self.functions.curve_v).reshape(number, soc_pct.size).T
-        load = np.array(self.functions.load).reshape(number, -1).T
-        if not number:
-            load = np.empty((len(self.voltage_model().load_coefficients), 0))
+        columns = len(self.voltage_model().load_coefficients)
+        load = np.array(self.functions.load).reshape(number, columns).T
         return Functions(soc_pct, value, hermite_slopes(soc_pct, value), load)
 
     def extended_model(self) -> ExtendedModel:
@@ -348,7 +347,7 @@ class Model(_Strict):
             A longer step between two samples empties the delay line [s].
         """
         functions = self.principal_functions()
-        return OnlineModel(self.extended_model(), functions, capacity_ah, gap_s)
+        return OnlineModel(self.extended_model(), functions, self.noise, capacity_ah, gap_s)
 
     @classmethod
     def prior(cls, chemistry: ChemistryName, cells: int, capacity_ah: float) -> Model:

@@ -41,6 +41,10 @@ EXPLAINED: Final = {
 """Answer → what it means, in a line."""
 
 
+SHOWN: Final = 5
+"""Causes that a terminal and a notebook show."""
+
+
 def candidate_rows(result: Mapping[str, Any], at_most: int | None = None) -> tuple[list[str], Rows]:
     """Return headings and rows: causes with probability, size and the error that they leave.
 
