@@ -138,9 +138,10 @@ def diagnosis_figure(found: Diagnosis) -> Plot:
     ----------
     found : Diagnosis
     """
-    ordered = sorted(found.verdict.probabilities.items(), key=lambda item: -item[1])
+    answer = found.posterior
+    ordered = sorted(answer.probabilities.items(), key=lambda item: -item[1])
     entries = [
-        (name, float(probability), BLUE if name == found.verdict.cause else GREY)
+        (name, float(probability), BLUE if name == answer.verdict else GREY)
         for name, probability in ordered[:SHOWN_CAUSES]
     ]
     return bars("probability", "", entries, decimals=2)
