@@ -654,14 +654,12 @@ cg_real cg_newton(const cg_estimator *self, cg_real ocv_v, cg_real guess_pct, bo
         } else {
             low = soc;
         }
-        cg_real following = soc - (error / slope);
-        if (!((low < following) && (following < high))) {
-            following = R(0.5) * (low + high);
-        }
+        const cg_real following = soc - (error / slope);
         if (cg_fabs(following - soc) < R(CG_CLOSE_PCT)) {
             return following;
         }
-        soc = following;
+        const bool is_between = (low < following) && (following < high);
+        soc = is_between ? following : (R(0.5) * (low + high));
     }
     return soc;
 }

@@ -104,11 +104,10 @@ class CompiledEstimator(Estimator):
 
     def __init__(self, model: Model, settings: EstimatorSettings, forms: list[CoreForm]) -> None:
         super().__init__(model, settings)
-        tests = self._tested_blocks, self._innovations_at_most, self._strain_at_most
         longest_s = self._online.delay_line.longest_s
         self._forms = forms
         self._core: Any = _core.Core(
-            layout.model_constants(model, self._online, forms, tests).tobytes(),
+            layout.model_constants(model, self._online, forms, self.tests).tobytes(),
             layout.settings_constants(model, settings).tobytes(),
             int(2.0 * longest_s / SPACING_S) + 2 * BLOCK,
             BLOCK,
@@ -233,7 +232,7 @@ class CompiledEstimator(Estimator):
         self._memory = EstimatorMemory(**memory)
         self.hypotheses.restore(self._hypotheses_state())
         drives = [
-            float(_constant_drive(form, state["volts"]))
+            float(_drive_over_soc(form, state["volts"]))
             for form, state in zip(self._forms, record["effect"], strict=False)
         ]
         beside_v = float(record["beside_soc_v"])
@@ -333,10 +332,12 @@ class CompiledEstimator(Estimator):
                 _set_lags(lags, state, 1 if kind == "resistance_step" else 3)
 
 
-def _constant_drive(form: CoreForm, drive: float) -> float:
-    """Return an effect's drive: the core keeps none where it is constant."""
+def _drive_over_soc(form: CoreForm, drive: float) -> float:
+    """Return an effect's drive over SoC: the core keeps none where it is constant."""
     if form.kind == "weak_cell":
         return form.values[0]
+    if form.kind == "rc" and not form.values[1]:  # not by slope: with what is beside the SoC
+        return 0.0
     return 1.0 if form.kind == "ocv_shape" else drive
 
 

@@ -37,6 +37,9 @@ from cangauge.model.voltage_model import SLOPE_AT_LEAST, Functions, VoltageModel
 if TYPE_CHECKING:
     from cangauge.model.model_file import Noise
 
+LAG_NUMBERS = 3
+"""Numbers of the state of a lag that has started."""
+
 SLOPE_STEP_PCT = 0.05
 """Half step of the finite difference of the effects' voltage over SoC [%]."""
 
@@ -398,7 +401,7 @@ class OnlineModel:
         for number, (memory, saved) in enumerate(
             zip([self.lags, *self._memory], state, strict=True)
         ):
-            size = len(saved) // max(len(memory), 1)
+            size = LAG_NUMBERS if len(memory) > 1 else len(saved)  # several are lags
             numbers = iter(saved)
             try:
                 for item in memory:

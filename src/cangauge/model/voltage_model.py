@@ -609,11 +609,9 @@ def soc_from_ocv(model: Invertible, ocv_v: float, guess_pct: float = 50.0) -> In
         else:
             low = soc
         following = soc - error / slope
-        if not low < following < high:
-            following = 0.5 * (low + high)
         if abs(following - soc) < TOLERANCE_PCT:
             return Inverse(following, inside=True)
-        soc = following
+        soc = following if low < following < high else 0.5 * (low + high)
     return Inverse(soc, inside=True)
 
 
