@@ -93,7 +93,7 @@ class Columns:
     r: FloatArray
     """Measured minus modelled voltage [V], shape (m,)."""
     parts: FloatArray
-    """Products of (x, b, effects, r) in each of `FOLDS` sets of blocks, shape (folds, k, k)."""
+    """Products of (x, b, effects, r) in each set of blocks, shape (folds, k, k)."""
 
     @property
     def products(self) -> FloatArray:
@@ -146,11 +146,14 @@ def _all_columns(pack: PackFit, log: Trace, trials: Sequence[Trial]) -> list[Flo
     return [x, healthy_columns(pack, log, r), np.column_stack(effects), r[:, None]]
 
 
-def _on_rows(log: Trace, columns: Sequence[FloatArray], rows: IntArray) -> Columns:
+def _on_rows(
+    log: Trace, columns: Sequence[FloatArray], rows: IntArray, folds: int = FOLDS
+) -> Columns:
+    """Return the columns of a log on some rows; in one part for a reference, never held out."""
     x, b, _, r = (part[rows] for part in columns)
-    every, fold = np.concatenate(columns, axis=1)[rows], rows // BLOCK_S % FOLDS
-    parts = np.array([every[fold == k].T @ every[fold == k] for k in range(FOLDS)])
-    return Columns(log, rows, x, b, r[:, 0], parts)
+    every, fold = np.concatenate(columns, axis=1)[rows], rows // BLOCK_S % folds
+    blocks = [every[fold == k] for k in range(folds)] if folds > 1 else [every]
+    return Columns(log, rows, x, b, r[:, 0], np.array([block.T @ block for block in blocks]))
 
 
 @dataclass(frozen=True)
@@ -224,7 +227,7 @@ class References:
             max(float(e.nats) / self.excess_of(name) for name, e in one.effects.items())
             for one in self.left_out
         ]
-        return np.maximum(np.array(most or [3.0]), 0.0)
+        return np.asarray(np.maximum(most or [3.0], 0.0), dtype=np.float64)
 
     def colder_k(self, logs: Sequence[Trace]) -> float:
         """Return how far logs lie beyond the temperatures of the references [K]."""
@@ -292,8 +295,10 @@ def _of_references(
     for k, log in enumerate(references):
         every = _all_columns(pack, log, trials)
         others, r = [*references[:k], *references[k + 1 :]], every[-1][:, 0]
-        full.append(_on_rows(log, every, rows_that_count(pack, log, [], r)))
-        out.append(_on_rows(log, every, rows_that_count(pack, log, others, r)))
+        own, covered = (rows_that_count(pack, log, some, r) for some in ([], others))
+        full.append(_on_rows(log, every, own, folds=1))
+        same = len(own) == len(covered)
+        out.append(full[-1] if same else _on_rows(log, every, covered, folds=1))
     return full, out
 
 
@@ -432,7 +437,8 @@ def analyse(known: References, logs: Sequence[Columns], *, exact: bool = True) -
         top = int(k[np.argmax(evidence[k])])
         trial, amplitude, nats, left_v2 = tried[top], float(size[top]), float(gain[top]), None
         if exact and _needs_resimulation(trial) and gain[top] > RESIMULATED_PART * gain.max():
-            amplitude, nats, left_v2 = _resimulated(known, logs, trial, amplitude)
+            start = trial.number / trial.bound if trial.effect == "time_skew" else 0.0
+            amplitude, nats, left_v2 = _resimulated(known, logs, trial, start or amplitude)
         if left_v2 is None:
             moved = theta - inverse @ u[:, top] * amplitude
             left_v2 = (

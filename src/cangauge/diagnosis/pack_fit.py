@@ -129,15 +129,14 @@ def lagged(values: FloatArray, tau_s: float) -> FloatArray:
 
 def turned(current_a: FloatArray, travel_as: float) -> FloatArray:
     """Return one-state hysteresis, −1 … 1: it follows −sign(I) over a charge [As], shape (n,)."""
-    charge = np.abs(current_a) / travel_as
-    drive = np.sign(current_a) * np.expm1(-charge)
-    out, state, k = np.empty(len(current_a)), 0.0, 0
-    while k < len(out):  # closed form, in stretches that do not overflow
-        total = np.cumsum(charge[k:])
-        n = max(int(np.searchsorted(total, 500.0)), 1)
-        grown = np.exp(np.minimum(total[:n], 700.0))
-        out[k : k + n] = (state + np.cumsum(drive[k : k + n] * grown)) / grown
-        state, k = float(out[k + n - 1]), k + n
+    charge = np.minimum(np.abs(current_a) / travel_as, 50.0)
+    drive, moved = np.sign(current_a) * np.expm1(-charge), np.cumsum(charge)
+    out, state, first, before = np.empty(len(current_a)), 0.0, 0, 0.0
+    while first < len(out):  # closed form, in stretches that do not overflow
+        after = int(np.searchsorted(moved, before + 500.0)) or 1
+        grown = np.exp(moved[first:after] - before)
+        out[first:after] = (state + np.cumsum(drive[first:after] * grown)) / grown
+        state, first, before = float(out[after - 1]), after, float(moved[after - 1])
     return out
 
 

@@ -204,13 +204,13 @@ def _beyond_references(
 ) -> list[str]:
     """Return sentences on temperatures and SoC that no reference covers."""
     sentences = []
-    ends = {
-        "temperature": ("°C", COVER_K, lambda log: log.temperature_c),
-        "SoC": ("%", COVER_PCT, found.known.pack.soc),
-    }
-    for quantity, (unit, margin, of) in ends.items():
-        low, high = _ends([of(log) for log in traces])
-        least, most = _ends([of(log) for log in references])
+    soc = found.known.pack.soc
+    for quantity, unit, margin, (low, high), (least, most) in (
+        ("temperature", "°C", COVER_K, _ends([log.temperature_c for log in traces]),
+         _ends([log.temperature_c for log in references])),
+        ("SoC", "%", COVER_PCT, _ends([soc(log) for log in traces]),
+         _ends([soc(log) for log in references])),
+    ):  # fmt: skip
         if low < least - margin or high > most + margin:
             sentences.append(
                 f"The logs' {quantity} of {low:.0f} … {high:.0f} {unit} goes beyond the references'"

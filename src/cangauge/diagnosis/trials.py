@@ -43,13 +43,9 @@ class Trial:
 def library(pack: PackFit) -> list[Trial]:
     """Return every effect at every shape; steps of resistance are added by `analyse`."""
     q, u = pack.capacity_ah, pack.volts
-    skews = (
-        (None, -0.4, 0.4),
-        (0.8, 0.0, 1.2),
-        (-0.8, -1.2, 0.0),
-        (2.0, 0.0, 3.0),
-        (-2.0, -3.0, 0.0),
-    )
+    skews: list[tuple[float | None, float, float]] = [(None, -0.4, 0.4)]
+    for seconds in (0.8, 2.0, 3.5):
+        skews += [(seconds, 0.0, 1.5 * seconds), (-seconds, -1.5 * seconds, 0.0)]
     signal = [
         Trial("current_offset", None, -0.15 * q, 0.15 * q, True, "A"),
         Trial("current_gain", None, -0.2, 0.2, True, "1"),
