@@ -45,7 +45,9 @@ def driven(plant: Plant, wanted: Trace, fault: Fault, seed: int) -> Log:
     return inject(record_drive(plant, drive, ()).log, [fault], plant.pack, seed=seed).log
 
 
-def after_drive(known: References, first: Log, second: Log, capacity_ah: float, effect: str) -> float:
+def after_drive(
+    known: References, first: Log, second: Log, capacity_ah: float, effect: str
+) -> float:
     """Return the probability of the truth by both logs."""
     both = [columns(known, trace(log, capacity_ah)) for log in (first, second)]
     return answer(known, analyse(known, both)).probabilities[effect]
@@ -53,7 +55,9 @@ def after_drive(known: References, first: Log, second: Log, capacity_ah: float, 
 
 def main() -> None:
     """Run the cases and print the means."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--packs", type=int, default=4)
     parser.add_argument("--seed", type=int, default=7)
     given = parser.parse_args()
@@ -62,7 +66,17 @@ def main() -> None:
         plant = draw_plant(np.random.default_rng([given.seed, number, 1]))
         rng, pack = np.random.default_rng([given.seed, number, 2]), plant.pack
         ambient = [float(x) for x in rng.uniform(10.0, 22.0) + np.linspace(-6.0, 6.0, 4)]
-        drives = [draw_drive(rng, pack, hours=2.0, ambient_c=ambient[1], start_soc=1.0, end_soc=0.05, discharge=True)]
+        drives = [
+            draw_drive(
+                rng,
+                pack,
+                hours=2.0,
+                ambient_c=ambient[1],
+                start_soc=1.0,
+                end_soc=0.05,
+                discharge=True,
+            )
+        ]
         drives += [draw_drive(rng, pack, hours=0.8, ambient_c=c) for c in ambient]
         refs = [record_drive(plant, x, ()).log for x in drives]
         known = learn([trace(x, pack.capacity_ah) for x in refs], pack.capacity_ah)
@@ -70,9 +84,13 @@ def main() -> None:
             if effect == "resistance_step":
                 continue
             seed = int(rng.integers(2**31))
-            clean = record_drive(plant, draw_drive(rng, pack, hours=0.8, ambient_c=ambient[2]), ()).log
+            clean = record_drive(
+                plant, draw_drive(rng, pack, hours=0.8, ambient_c=ambient[2]), ()
+            ).log
             sign = -1.0 if effect == "initial_soc" else 1.0
-            scaled = scale_injection([clean], Fault(effect, sign, seed=seed), FLOORS * known.healthy_v2**0.5, pack)
+            scaled = scale_injection(
+                [clean], Fault(effect, sign, seed=seed), FLOORS * known.healthy_v2**0.5, pack
+            )
             log = inject(clean, [scaled.fault], pack).log
             first = columns(known, trace(log, pack.capacity_ah))
             evidence = analyse(known, [first])
@@ -84,19 +102,40 @@ def main() -> None:
             best = proposed.steps[0]
             if best.kind == "drive":
                 profile = proposed_drives(known, [first.log])[best.name][1]
-                planned = after_drive(known, log, driven(plant, profile, scaled.fault, seed), pack.capacity_ah, effect)
+                planned = after_drive(
+                    known, log, driven(plant, profile, scaled.fault, seed), pack.capacity_ah, effect
+                )
             else:
                 one = next(x for x in MEASUREMENTS if x.name == best.name)
                 size = scaled.fault.size * IN_ENGINE.get(effect, 1.0)
                 reads = one.readings[effect](known.pack, size) if effect in one.readings else 0.0
                 reads += one.std(known.pack) * float(rng.normal())
                 planned = settled(known.pack, evidence, now.probabilities, one, reads)[effect]
-            other = record_drive(plant, draw_drive(rng, pack, hours=0.5, ambient_c=ambient[1]), ()).log
-            random = after_drive(known, log, inject(other, [scaled.fault], pack).log, pack.capacity_ah, effect)
-            rows.append((effect, best.name, best.gain, now.probabilities[effect], planned, random, fault_kind(effect).unit))
-            print(f"{number} {effect:24s} {best.name:38s} expected {best.gain:+.2f}: {rows[-1][3]:.2f} → {planned:.2f}; random {random:.2f}", flush=True)
+            other = record_drive(
+                plant, draw_drive(rng, pack, hours=0.5, ambient_c=ambient[1]), ()
+            ).log
+            random = after_drive(
+                known, log, inject(other, [scaled.fault], pack).log, pack.capacity_ah, effect
+            )
+            rows.append(
+                (
+                    effect,
+                    best.name,
+                    best.gain,
+                    now.probabilities[effect],
+                    planned,
+                    random,
+                    fault_kind(effect).unit,
+                )
+            )
+            print(
+                f"{number} {effect:24s} {best.name:38s} expected {best.gain:+.2f}: {rows[-1][3]:.2f} → {planned:.2f}; random {random:.2f}",
+                flush=True,
+            )
     table = np.array([row[2:6] for row in rows], dtype=float)
-    print(f"{len(rows)} ambiguous cases: before {table[:, 1].mean():.2f}, planned {table[:, 2].mean():.2f}, random drive {table[:, 3].mean():.2f}")
+    print(
+        f"{len(rows)} ambiguous cases: before {table[:, 1].mean():.2f}, planned {table[:, 2].mean():.2f}, random drive {table[:, 3].mean():.2f}"
+    )
 
 
 if __name__ == "__main__":

@@ -87,7 +87,10 @@ def thinned(log: Log, step_s: float) -> Log:
     """Return means over steps of time, so that a log of 10 Hz takes a fault quickly."""
     at = np.floor((log.time_s - log.time_s[0]) / step_s).astype(int)
     _, first, number = np.unique(at, return_index=True, return_counts=True)
-    mean = [np.add.reduceat(x, first) / number for x in (log.current_a, log.voltage_v, log.temperature_c)]
+    mean = [
+        np.add.reduceat(x, first) / number
+        for x in (log.current_a, log.voltage_v, log.temperature_c)
+    ]
     soc = None if log.soc_pct is None else log.soc_pct[first]
     time_s = (at[first] + 0.5) * step_s
     return Log(time_s, *mean, soc, name=log.name, source=log.source)
@@ -131,10 +134,14 @@ def _i3(data: Path, names: Sequence[str], name: str, references: tuple[int, int]
 
 def _lg(data: Path, part: str, name: str) -> PackLogs:
     logs = [
-        as_pack(thinned(read_log(data / "lg_hg2" / f"{x}.parquet"), 0.5), LG_SERIES, LG_PARALLEL, 100.0)
+        as_pack(
+            thinned(read_log(data / "lg_hg2" / f"{x}.parquet"), 0.5), LG_SERIES, LG_PARALLEL, 100.0
+        )
         for x in LG[part][name].split()
     ]
-    return PackLogs(name, "cells", logs, LG_AH * LG_PARALLEL, LG_SERIES, (3, 3 if name == "lg_25" else 4))
+    return PackLogs(
+        name, "cells", logs, LG_AH * LG_PARALLEL, LG_SERIES, (3, 3 if name == "lg_25" else 4)
+    )
 
 
 def _car1(data: Path, stretches: Sequence[str]) -> PackLogs:
@@ -148,8 +155,15 @@ def _car1(data: Path, stretches: Sequence[str]) -> PackLogs:
 def _a123(data: Path) -> PackLogs:
     logs = []
     for at in ("45_P05", "50_P25", "50_P45"):
-        log = as_pack(read_log(data / "a123_lfp" / f"A123_DYN_{at}_s1.csv.gz"), LG_SERIES, A123_PARALLEL, 100.0)
-        soc = 100 - np.cumsum(np.diff(log.time_s, prepend=log.time_s[0]) * log.current_a) / 36 / (A123_AH * A123_PARALLEL)
+        log = as_pack(
+            read_log(data / "a123_lfp" / f"A123_DYN_{at}_s1.csv.gz"),
+            LG_SERIES,
+            A123_PARALLEL,
+            100.0,
+        )
+        soc = 100 - np.cumsum(np.diff(log.time_s, prepend=log.time_s[0]) * log.current_a) / 36 / (
+            A123_AH * A123_PARALLEL
+        )
         edges = [0, len(soc) // 3, 2 * len(soc) // 3, len(soc)]
         logs += [
             replace(started(log.rows(slice(a, b)), float(soc[a])), name=f"{log.name}_{k}")

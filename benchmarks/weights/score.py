@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-
 from benchmarks.weights.fit import GROUP_OF, GROUPS, Example
 
 ALARM, STATED, NAMED = 0.05, 0.8, 0.6
@@ -26,11 +25,20 @@ def one(x: Example, p: dict[str, float]) -> dict[str, float]:
     member = max(inside, key=lambda k: inside[k])
     true_group = GROUP_OF.get(x.truth)
     return dict(
-        alarm=p["none"] <= ALARM, p_true=p.get(x.truth, 0.0), log=float(np.log(max(p.get(x.truth, 1e-12), 1e-12))),
-        group=order[0] == true_group, group2=true_group in order[:2], stated=share >= STATED,
-        stated_right=share >= STATED and order[0] == true_group, name=verdict == x.truth, rank=ranked[0] == x.truth,
-        member=inside[member] >= NAMED, member_right=inside[member] >= NAMED and member == x.truth,
-        set_size=size, set_holds=x.truth in names[:size], unknown=verdict == "unknown",
+        alarm=p["none"] <= ALARM,
+        p_true=p.get(x.truth, 0.0),
+        log=float(np.log(max(p.get(x.truth, 1e-12), 1e-12))),
+        group=order[0] == true_group,
+        group2=true_group in order[:2],
+        stated=share >= STATED,
+        stated_right=share >= STATED and order[0] == true_group,
+        name=verdict == x.truth,
+        rank=ranked[0] == x.truth,
+        member=inside[member] >= NAMED,
+        member_right=inside[member] >= NAMED and member == x.truth,
+        set_size=size,
+        set_holds=x.truth in names[:size],
+        unknown=verdict == "unknown",
         misled=max(effects.values()) >= 0.5,
     )
 
@@ -42,7 +50,9 @@ def mean(marks: Sequence[dict[str, float]], key: str) -> float:
 def table(examples: Sequence[Example], ps: Sequence[dict[str, float]]) -> str:
     """Return the table of all scores, by world and size."""
     marks = [(x, one(x, p)) for x, p in zip(examples, ps, strict=True)]
-    lines = ["where                n  group in2  stated right  name  rank member right alarm  set  log"]
+    lines = [
+        "where                n  group in2  stated right  name  rank member right alarm  set  log"
+    ]
 
     def row(label: str, kept: list[dict[str, float]]) -> None:
         if not kept:
@@ -65,11 +75,20 @@ def table(examples: Sequence[Example], ps: Sequence[dict[str, float]]) -> str:
     for label, low, high in (("< 1 floor", 0, 1), ("1-2", 1, 2), ("> 2", 2, 99)):
         row(label, [m for x, m in effects if low <= x.floors < high])
     healthy = [m for x, m in marks if x.truth == "none"]
-    lines.append(f"healthy {len(healthy)}: alarms {sum(m['alarm'] for m in healthy)}, unknown {sum(m['unknown'] for m in healthy)}, P(none) {mean(healthy, 'p_true'):.2f}, set {mean(healthy, 'set_size'):.1f}")
-    for label, kept in (("cause out", [m for x, m in marks if x.cause_out and x.floors >= 1]), ("outside", [m for x, m in marks if x.truth == "unknown" and not x.cause_out])):
-        lines.append(f"{label} {len(kept)}: misled {mean(kept, 'misled'):.2f}, unknown {mean(kept, 'unknown'):.2f}, alarm {mean(kept, 'alarm'):.2f}")
+    lines.append(
+        f"healthy {len(healthy)}: alarms {sum(m['alarm'] for m in healthy)}, unknown {sum(m['unknown'] for m in healthy)}, P(none) {mean(healthy, 'p_true'):.2f}, set {mean(healthy, 'set_size'):.1f}"
+    )
+    for label, kept in (
+        ("cause out", [m for x, m in marks if x.cause_out and x.floors >= 1]),
+        ("outside", [m for x, m in marks if x.truth == "unknown" and not x.cause_out]),
+    ):
+        lines.append(
+            f"{label} {len(kept)}: misled {mean(kept, 'misled'):.2f}, unknown {mean(kept, 'unknown'):.2f}, alarm {mean(kept, 'alarm'):.2f}"
+        )
     inside = [m for x, m in marks if not x.cause_out and x.truth != "unknown"]
-    lines.append(f"sets of 90 % hold {mean(inside, 'set_holds'):.2f}, mean size {mean(inside, 'set_size'):.1f}; log score {mean(inside, 'log'):.2f}; mean P(truth) {mean(inside, 'p_true'):.2f}")
+    lines.append(
+        f"sets of 90 % hold {mean(inside, 'set_holds'):.2f}, mean size {mean(inside, 'set_size'):.1f}; log score {mean(inside, 'log'):.2f}; mean P(truth) {mean(inside, 'p_true'):.2f}"
+    )
     return "\n".join(lines)
 
 
