@@ -19,7 +19,7 @@ from cangauge.diagnosis import sentences
 from cangauge.diagnosis.answer import ALARM, GROUP_OF, UNKNOWN, Posterior, answer
 from cangauge.diagnosis.checks import check_logs
 from cangauge.diagnosis.evidence import Columns, Evidence, References, analyse, columns, learn
-from cangauge.diagnosis.extended import Extension, Quantity, at_1_hz, residual_v
+from cangauge.diagnosis.extended import Extension, Quantity, residual_v
 from cangauge.diagnosis.pack_fit import Trace, trace
 from cangauge.diagnosis.simulator import Simulation, SimulatorGap, correction, simulator_gap
 from cangauge.diagnosis.where import ErrorShare, LogErrors, drawn_sums, error_shares, pieces, rms
@@ -100,18 +100,19 @@ class Diagnosis:
 
     @cached_property
     def _extensions(self) -> dict[str, Extension]:
+        model, before = self.model.extended_model(), [log.before_v for log in self._without]
         return {
-            name: Extension(self.model, self.known, self.columns, self.evidence.effects[name])
+            name: Extension(model, self.known, self.columns, before, self.evidence.effects[name])
             for name in self.posterior.effects
         }
 
     @cached_property
     def _without(self) -> tuple[LogErrors, ...]:
         """Errors of each log without a cause."""
-        errors = []
+        errors, model = [], self.model.extended_model()
         for log, of in zip(self.logs, self.columns, strict=True):
             at, signals = of.rows, of.log
-            before = residual_v(self.model, signals)[at]
+            before = residual_v(model, signals)[at]
             errors.append(
                 LogErrors(
                     log.name,
@@ -129,12 +130,11 @@ class Diagnosis:
     @cached_property
     def _with(self) -> dict[str, tuple[LogErrors, ...]]:
         """Errors of each log with each of the most probable effects."""
-        before = [log.before_v for log in self._without]
         return {
             name: tuple(
                 replace(log, after_v=after, judged=judged)
                 for log, after, judged in zip(
-                    self._without, *self._extensions[name].judge(before), strict=True
+                    self._without, *self._extensions[name].judge(), strict=True
                 )
             )
             for name in list(self.posterior.effects)[:CROSS_VALIDATED]
@@ -186,8 +186,9 @@ class Diagnosis:
         """Error of the given model on each reference [V]."""
         names = [log.name for log in self.references]
         names = names or [f"reference {k + 1}" for k in range(len(self.known.logs))]
+        model = self.model.extended_model()
         return {
-            name: float(np.sqrt(np.mean(residual_v(self.model, log)[log.measured] ** 2)))
+            name: float(np.sqrt(np.mean(residual_v(model, log)[log.measured] ** 2)))
             for name, log in zip(names, self.known.logs, strict=True)
         }
 
@@ -238,7 +239,9 @@ class Diagnosis:
             errors = self._with[effect]
             judged = rms(errors, after=True), self._closed(errors), self._closed_interval(errors)
         parameters = self._extensions[effect].parameters
-        return Candidate(effect, GROUP_OF[effect], probability, *judged, parameters)
+        rmse_v, closed, ci = judged
+        group = GROUP_OF[effect]
+        return Candidate(effect, group, probability, rmse_v, closed, ci, parameters)
 
     @cached_property
     def parameters(self) -> dict[str, dict[str, Quantity]]:
@@ -269,7 +272,7 @@ class Diagnosis:
         """The model with the accepted cause, ready to save and run; the given one without."""
         if self.accepted is None:
             return self.model
-        return self._extensions[self.accepted].model_file(self.extended_rmse_v)
+        return self._extensions[self.accepted].model_file(self.model, self.extended_rmse_v)
 
     @cached_property
     def baseline_soc_mae_pct(self) -> float | None:
@@ -289,8 +292,10 @@ class Diagnosis:
         for log, of in zip(self.logs, self.columns, strict=True):
             if log.soc_pct is None or np.isfinite(log.soc_pct).mean() < 0.5:
                 continue
-            at_rows, finite = at_1_hz(of.log), np.isfinite(log.soc_pct)
-            table = estimate(at_rows, model, initial_soc_pct="auto")
+            signals, finite = of.log, np.isfinite(log.soc_pct)
+            time_s = np.arange(len(signals.current_a), dtype=np.float64)
+            at_1_hz = Log(time_s, signals.current_a, signals.voltage_v, signals.temperature_c)
+            table = estimate(at_1_hz, model, initial_soc_pct="auto")
             own = np.interp(table.time_s, log.time_s[finite] - log.time_s[0], log.soc_pct[finite])
             kept = np.isfinite(table.soc_pct) & (table.time_s >= SETTLING_S) & of.log.measured
             errors.append(np.abs(table.soc_pct - own)[kept])
@@ -520,7 +525,7 @@ def _traces(
 
 def _of_model(model: Model, log: Trace) -> Trace:
     """Return a log with the model's voltage: the reference where none is given."""
-    return replace(log, voltage_v=log.voltage_v - residual_v(model, log))
+    return replace(log, voltage_v=log.voltage_v - residual_v(model.extended_model(), log))
 
 
 @cache
