@@ -20,11 +20,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from cangauge.diagnosis.cross_validation import rms
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from cangauge.diagnosis.cross_validation import rms
 from cangauge.diagnosis.simulator import Run, diagnose_simulator
 from cangauge.extras.validation.recordings import LG_CAPACITY_AH, LG_PARALLEL, LG_SERIES
 from cangauge.extras.validation.twin.injection import scaled_to_pack, with_initial_soc
