@@ -96,19 +96,6 @@ class Quantity:
         return {"value": self.value, "ci": ci, "unit": self.unit}
 
 
-@dataclass(frozen=True, eq=False)
-class JudgedRows:
-    """Errors of one log at 1 Hz; m rows that count."""
-
-    log: Columns
-    before_v: FloatArray
-    """Measured less given model, shape (m,) [V]."""
-    after_v: FloatArray
-    """With the cause, sized without these rows, shape (m,) [V]."""
-    judged: BoolArray
-    """Rows that the cause can change, shape (m,)."""
-
-
 def interval(evidence: EffectEvidence) -> tuple[float, float]:
     """Return the 95 % interval of an effect's size [unit of the trial]."""
     half = TWO_SIDED * float(np.hypot(evidence.std, TANGENT_STD * evidence.size))
@@ -198,21 +185,33 @@ class Extension:
             for item in self.effect.parameters
         }
 
-    def judge(self) -> list[JudgedRows]:
-        """Return the errors of each log, with the cause sized without the rows judged."""
+    def judge(self, before_v: Sequence[FloatArray]) -> tuple[list[FloatArray], list[BoolArray]]:
+        """Return the errors of each log with the cause, sized without the rows judged [V].
+
+        Parameters
+        ----------
+        before_v : sequence of array of shape (m,)
+            Errors of the given model on the rows that count [V].
+
+        Returns
+        -------
+        after_v : list of array of shape (m,)
+        judged : list of array of shape (m,)
+            Rows that the cause can change, at SoC that references visit with it undone.
+        """
         sizes = held_out_sizes(self.known, self.logs, self.evidence)
-        judged = []
-        for k, (log, of_rows) in enumerate(zip(self.logs, sizes, strict=True)):
-            before = residual_v(self.model, log.log)[log.rows]
-            after = np.empty_like(before)
-            for size in np.unique(of_rows):
-                at = of_rows == size
-                after[at] = self._residual_v(log.log, float(size), k)[log.rows][at]
-            change = np.abs(after - before)
+        after, judged = [], []
+        for k, (log, before) in enumerate(zip(self.logs, before_v, strict=True)):
+            errors = np.empty_like(before)
+            for size in np.unique(sizes[k]):
+                at = sizes[k] == size
+                values = self.values(float(size), k)
+                errors[at] = residual_v(self._with(values), log.log)[log.rows][at]
+            change = np.abs(errors - before)
             usual = float(np.quantile(change, 0.95)) if change.size else 0.0
-            rows = (change >= CHANGED_PART * usual) & self._covered_after(log)
-            judged.append(JudgedRows(log, before, after, rows))
-        return judged
+            judged.append((change >= CHANGED_PART * usual) & self._covered_after(log))
+            after.append(errors)
+        return after, judged
 
     def model_file(self, rmse_v: float) -> Model:
         """Return the extended model, ready to save and run.
@@ -267,9 +266,6 @@ class Extension:
                 total[item.name] += known[item.name] - neutral[item.name]
         added = self.effect, self.effect.clipped(total, extended.pack)
         return self.model.model_copy(update={"effects": effect_entries([*effects, added])})
-
-    def _residual_v(self, log: Trace, size: float, number: int) -> FloatArray:
-        return residual_v(self._with(self.values(size, number)), log)
 
     def _at_the_size(self) -> dict[str, float]:
         """Return the parameters whose voltage is nearest to the evidence's, at its size."""

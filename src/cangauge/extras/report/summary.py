@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from html import escape
 from typing import Any, Final
@@ -10,7 +9,6 @@ from typing import Any, Final
 from cangauge._formatting import NONE_KNOWN, number, significant
 from cangauge.diagnosis import NONE, UNKNOWN, Diagnosis
 from cangauge.diagnosis.planner import Plan
-from cangauge.identify.effect_search import FittedEffects
 
 Rows = list[list[str]]
 
@@ -41,45 +39,6 @@ EXPLAINED: Final = {
     UNKNOWN: "a gap that no effect of the library explains",
 }
 """Answer → what it means, in a line."""
-
-
-def rounded(value: float, std_error: float | None) -> tuple[str, str]:
-    """Return a value rounded to its standard error, and the error with two digits."""
-    if not std_error or not math.isfinite(std_error):
-        return significant(value, 3), significant(std_error, 2)
-    decimals = max(0, 1 - math.floor(math.log10(std_error)))
-    return number(value, decimals), significant(std_error, 2)
-
-
-def effect_rows(found: FittedEffects) -> tuple[list[str], Rows]:
-    """Return headings and rows: every parameter of every effect with its standard error."""
-    rows = [
-        [
-            effect_id if k == 0 else "",
-            item.name,
-            *rounded(item.value, item.std_error),
-            "" if item.unit == "1" else item.unit.replace("ohm", "Ω"),
-        ]
-        for effect_id, parameters in found.estimates
-        for k, item in enumerate(parameters)
-    ]
-    return ["<effect", "<parameter", "value", "std. error", "<unit"], rows
-
-
-def search_rows(found: FittedEffects) -> tuple[list[str], Rows]:
-    """Return headings and rows: the steps of the effect search with their held-out errors."""
-    rows = [
-        [
-            step.effect_id,
-            step.what,
-            significant(step.comparison.before_rmse_v, 3),
-            significant(step.comparison.after_rmse_v, 3),
-            number(step.comparison.t_value, 1),
-            number(step.comparison.t_critical, 1),
-        ]
-        for step in found.steps
-    ]
-    return ["<effect", "<step", "held out without [V]", "with [V]", "t", "t needed"], rows
 
 
 SHOWN: Final = 5
