@@ -1,25 +1,8 @@
-"""Rounding, and rows of a diagnosis."""
+"""Rows of a diagnosis."""
 
 from __future__ import annotations
 
-import pytest
-
-from cangauge.extras.report.summary import candidate_rows, rounded, size_text
-
-
-@pytest.mark.parametrize(
-    ("value", "std_error", "expected"),
-    [
-        (-18174.2, 9100.0, ("−18174", "9100")),
-        (0.00039339, 0.00045, ("0.00039", "0.00045")),
-        (3000.0, None, ("3000", "–")),
-        (2.0291, 0.484, ("2.03", "0.48")),
-    ],
-)
-def test_values_are_rounded_to_their_standard_error(
-    value: float, std_error: float | None, expected: tuple[str, str]
-) -> None:
-    assert rounded(value, std_error) == expected
+from cangauge.extras.report.summary import candidate_rows, size_text
 
 
 def quantity(value: float, ci: list[float] | None, unit: str) -> dict[str, object]:
