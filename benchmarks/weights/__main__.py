@@ -1,12 +1,12 @@
 """Fit the weights of the diagnosis to labelled cases, and score them on cases drawn beforehand.
 
-    python -m benchmarks.weights fit    [--data FOLDER] [--cases FOLDER]   minutes; seconds once drawn
+    python -m benchmarks.weights fit    [--data FOLDER] [--cases FOLDER]   seconds once drawn
     python -m benchmarks.weights plan                                      frozen.json, once
     python -m benchmarks.weights check  [--data FOLDER] [--cases FOLDER]   the frozen cases
 
-`fit` draws cases of the part "weights", prints the scores with every data set held out in turn, and
-writes `src/cangauge/diagnosis/weights.json`. `check` draws what `frozen.json` names and scores it by
-the weights that ship.
+`fit` draws cases of the part "weights", prints the scores with every data set held out in turn,
+and writes `src/cangauge/diagnosis/weights.json`. `check` draws what `frozen.json` names and scores
+it by the weights that ship. PyBaMM's cases are left out where it is not installed.
 """
 
 from __future__ import annotations
@@ -93,9 +93,8 @@ def main() -> None:
     table = score.table(found, out)
     print("Every data set held out in turn:\n" + table)
     for share in (0.0, 0.03, 0.1, 0.3, 1.0):  # open set against naming
-        print(
-            f"cause-out weight {share:4.2f}: {score.trade(found, fit.held_out(found, cause_out=share))}"
-        )
+        line = score.trade(found, fit.held_out(found, cause_out=share))
+        print(f"cause-out weight {share:4.2f}: {line}")
     w = fit.fit(found)
     logs = {x.name: [log.name for log in x.logs] for x in packs.recorded(given.data, part)}
     logs |= {

@@ -1,8 +1,8 @@
 """Draw cases: which logs, which references, which effect at which size, all from one seed.
 
-A *split* is a choice of diagnosed logs and references of one pack; its cases inject one effect each
-into those logs. The size of an effect is the RMS change of voltage that it makes, in floors: a floor
-is the RMS error of left-out references. Healthy cases are the logs as they are.
+A *split* is a choice of diagnosed logs and references of one pack. Its cases inject one effect each
+into those logs. The size of an effect is the RMS change of voltage that it makes, in floors; a
+floor is the RMS error of left-out references. Healthy cases are the logs as they are.
 """
 
 from __future__ import annotations
@@ -33,10 +33,15 @@ EFFECTS = tuple(kind.id for kind in fault_kinds())
 OUTSIDE = tuple(kind.id for kind in fault_kinds(outside=True))
 PER_SPLIT = 5
 NUMBERS = {
-    "weights": dict(i3=(80, 24, 8), i3_winter=(40, 8, 2), lg_25=(40, 8, 4), lg_cold=(60, 10, 6),
-                    car1=(60, 20, 6), a123=(40, 9, 4), leaf=(20, 4, 0), simulated=(80, 20, 8), pybamm=(40, 10, 4)),
-    "frozen": dict(i3=(60, 24, 6), i3_winter=(20, 8, 0), lg_25=(20, 8, 3), lg_cold=(20, 10, 0), lg_40=(20, 8, 0),
-                   car1=(40, 18, 3), simulated=(60, 18, 8), pybamm=(20, 8, 2)),
+    "weights": {
+        "i3": (80, 24, 8), "i3_winter": (40, 8, 2), "lg_25": (40, 8, 4), "lg_cold": (40, 6, 4),
+        "car1": (40, 12, 4), "a123": (20, 6, 2), "leaf": (14, 4, 0), "simulated": (60, 16, 8),
+        "pybamm": (30, 8, 4),
+    },
+    "frozen": {
+        "i3": (60, 24, 6), "i3_winter": (20, 8, 0), "lg_25": (20, 8, 3), "lg_cold": (20, 10, 0),
+        "lg_40": (20, 8, 0), "car1": (40, 18, 3), "simulated": (60, 18, 8), "pybamm": (20, 8, 2),
+    },
 }  # fmt: skip
 """Cases of each data set: with an effect of the library, healthy, with an effect outside it."""
 

@@ -18,7 +18,7 @@ SPREAD = np.array([1.5, 1.5, 1.0, 0.01, 0.5, 3, 1, 1, 1, 3, 1, 1, 1, 3])
 """Ridge: prior mean and deviation of each number. The cold is held: few cases lie outside the
 references' temperatures."""
 CAUSE_OUT = 0.1
-"""Weight of a case whose own effect was taken out of the library. It moves the outer numbers alone."""
+"""Weight of a case whose own effect was taken out of the library; it moves the outer numbers."""
 
 
 @dataclass

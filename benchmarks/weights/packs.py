@@ -1,8 +1,8 @@
 """Packs whose logs take faults: recorded and simulated, in two parts that share no log.
 
-The part "weights" is what `diagnosis/weights.json` is fitted to; the part "frozen" is drawn once and
-scored once (`frozen.json`). Both hold logs of the same real packs, except `a123` and `leaf`, which
-are in "weights" alone: the scores of `--held-out` leave a whole pack out instead.
+`diagnosis/weights.json` is fitted to the part "weights". The part "frozen" is scored once
+(`frozen.json`). Both hold logs of the same real packs, except `a123` and `leaf`, which are in
+"weights" alone; the held-out scores of the fit leave a whole data set out instead.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -122,7 +123,7 @@ def pieces(log: Log) -> list[Log]:
     bounds = [0, *np.searchsorted(log.time_s, edges).tolist(), len(log.time_s)]
     return [
         replace(log.rows(slice(a, b)), name=f"{log.name}_{k}")
-        for k, (a, b) in enumerate(zip(bounds, bounds[1:], strict=False))
+        for k, (a, b) in enumerate(pairwise(bounds))
     ]
 
 
@@ -147,8 +148,6 @@ def _lg(data: Path, part: str, name: str) -> PackLogs:
 def _car1(data: Path, stretches: Sequence[str]) -> PackLogs:
     every = [read_log(data / "batic_car1" / f"car1_{x}.csv.gz") for x in stretches]
     logs = [first_finite(x) for log in every for x in pieces(log)]
-    charge = sum(float(np.trapezoid(np.abs(x.current_a), x.time_s)) for x in every) / 3600
-    del charge
     return PackLogs("car1", "trips", logs, 110.0, 96, (4, 8))
 
 
@@ -167,7 +166,7 @@ def _a123(data: Path) -> PackLogs:
         edges = [0, len(soc) // 3, 2 * len(soc) // 3, len(soc)]
         logs += [
             replace(started(log.rows(slice(a, b)), float(soc[a])), name=f"{log.name}_{k}")
-            for k, (a, b) in enumerate(zip(edges, edges[1:], strict=False))
+            for k, (a, b) in enumerate(pairwise(edges))
         ]
     return PackLogs("a123", "cells", logs, A123_AH * A123_PARALLEL, LG_SERIES, (5, 7))
 
