@@ -12,11 +12,11 @@ import pytest
 from cangauge.errors import InputError
 from cangauge.estimation.estimator import Estimator, EstimatorSettings
 from cangauge.estimation.offline import samples_of
-from cangauge.estimation.power import PackLimits, Power
+from cangauge.estimation.power import PackLimits
 from cangauge.logs.log import Log
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
-from cangauge.types import Sample
+from cangauge.types import Power, Sample
 from synthetic import synthetic_log
 
 PACK = leaf_2012_model()

@@ -290,7 +290,8 @@ class Estimator:
             temperature_c = self._temperature_c
             memory.newton_std_pct = inverse_std_pct(online, newton.soc_pct, temperature_c, load)
             charge = counter.counted_s, counter.discharged_pct
-            self._block.add(Block(*charge, sample.voltage_v, temperature_c, drop_v, load))
+            volts = sample.voltage_v, temperature_c, drop_v
+            self._block.add(Block(*charge, *volts, load, online.drives()))
         for reference in detect_references(self.settings, memory, sample):
             self._correct(reference)
 
