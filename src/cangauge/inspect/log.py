@@ -9,9 +9,7 @@ import numpy as np
 
 from cangauge._formatting import counted, duration
 from cangauge.errors import InputError
-from cangauge.identify.voltage_fit import SOC_SPAN_AT_LEAST_PCT
-from cangauge.inference.rows import DELAYS_S as FIT_DELAYS_S
-from cangauge.inference.rows import usable_delays, usable_rows
+from cangauge.identify.rows import SOC_SPAN_AT_LEAST_PCT, usable_delays, usable_rows
 from cangauge.inspect.channels import (
     GAP_S,
     Channel,
@@ -30,6 +28,7 @@ from cangauge.logs.gaps import usual_gap_s
 from cangauge.logs.log import Log
 from cangauge.logs.sign import SignFinding, charge_ah, correlation, sign_of_current, spaced_rows
 from cangauge.model.coulomb_counting import capacity_from_full_discharge
+from cangauge.model.prior import DELAYS_S as FIT_DELAYS_S
 from cangauge.model.voltage_model import BASIS_NAMES
 
 Verdict = Literal["yes", "partly", "no"]

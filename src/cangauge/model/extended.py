@@ -32,7 +32,7 @@ from cangauge.model.effects.base import (
 )
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.first_order import Lag
-from cangauge.model.voltage_model import SLOPE_AT_LEAST, Functions, VoltageModel
+from cangauge.model.voltage_model import SLOPE_AT_LEAST, Functions, VoltageModel, socs_from_ocv
 
 if TYPE_CHECKING:
     from cangauge.model.model_file import Noise
@@ -59,6 +59,8 @@ class Prediction:
     """Delayed and low-passed currents at `rows` [A], shape (m, M)."""
     beside_v: FloatArray = field(repr=False)
     """Part of the voltage at `rows` that does not depend on SoC [V], shape (m,)."""
+    over_soc: list[tuple[Effect, Values, FloatArray]] = field(repr=False)
+    """Effects whose voltage depends on SoC, and their drive at `rows` [V], shape (m,)."""
 
     @property
     def residual_v(self) -> FloatArray:
@@ -104,6 +106,7 @@ class ExtendedModel:
         at_rows: NDArray[np.intp],
         *,
         initial_row: int = 0,
+        currents_a: FloatArray | None = None,
     ) -> Prediction:
         """Predict voltage and SoC of a log.
 
@@ -117,8 +120,11 @@ class ExtendedModel:
             Rows at which to predict the voltage.
         initial_row : int
             Row at which the initial SoC holds.
+        currents_a : array of shape (n, M), optional
+            `VoltageModel.currents` of the measured current at every row, where it is known.
         """
         model, effects, pack = self.model, self.effects, self.pack
+        measured_a = signals.current_a
         for effect, values in effects:
             memory = effect.memory(values, pack)
             for item in memory:
@@ -127,25 +133,58 @@ class ExtendedModel:
         soc = self.counted_soc(signals, initial_soc_pct, initial_row=initial_row)
         every = any(effect.adds_voltage for effect, _ in effects)
         rows = slice(None) if every else at_rows
-        currents = model.currents(signals.time_s, signals.current_a, rows)
+        if currents_a is not None and signals.current_a is measured_a:
+            currents = currents_a[rows]
+        else:
+            currents = model.currents(signals.time_s, signals.current_a, rows)
         temperature_c = signals.temperature_c[rows]
         columns = model.load_columns(temperature_c, currents)
         volts = columns @ model.load_coefficients
         drop_v = columns[:, 1:] @ model.load_coefficients[1:]
         load = Load(signals.time_s[rows], signals.current_a[rows], temperature_c, drop_v)
-        over_soc = np.zeros_like(volts)
+        over_soc = []
         for effect, values in effects:
             drive = effect.drive(load, values, model, pack, effect.memory(values, pack))
             if drive is None:
                 continue
             if effect.uses_soc:
-                over_soc += drive * effect.over_soc(soc[rows], values, model, pack)
+                over_soc.append((effect, values, drive[at_rows]))
             else:
                 volts = volts + drive
         if every:
-            volts, over_soc, currents = volts[at_rows], over_soc[at_rows], currents[at_rows]
-        predicted = model.pseudo_ocv(soc[at_rows]) + over_soc + volts
-        return Prediction(at_rows, predicted, signals, soc, currents, volts)
+            volts, currents = volts[at_rows], currents[at_rows]
+        prediction = Prediction(at_rows, volts, signals, soc, currents, volts, over_soc)
+        return replace(prediction, voltage_v=self.voltage_at(soc[at_rows], prediction))
+
+    def voltage_at(self, soc_pct: FloatArray, prediction: Prediction) -> FloatArray:
+        """Return the voltages at the rows of a prediction if the SoC were another [V].
+
+        Parameters
+        ----------
+        soc_pct : array of shape (m,)
+        prediction : Prediction
+        """
+        volts = self.model.pseudo_ocv(soc_pct) + prediction.beside_v
+        for effect, values, drive in prediction.over_soc:
+            volts = volts + drive * effect.over_soc(soc_pct, values, self.model, self.pack)
+        return np.asarray(volts)
+
+    def added_v(self, load: Load, soc_pct: FloatArray) -> FloatArray:
+        """Return the sum of the effects' voltages from the first sample on [V], shape (n,).
+
+        Parameters
+        ----------
+        load : Load
+            Of n samples in order.
+        soc_pct : array of shape (n,)
+        """
+        volts = np.zeros_like(soc_pct)
+        for effect, values in self.effects:
+            memory = effect.memory(values, self.pack)
+            drive = effect.drive(load, values, self.model, self.pack, memory)
+            if drive is not None:
+                volts += drive * effect.over_soc(soc_pct, values, self.model, self.pack)
+        return volts
 
     def counting(self, initial_soc_pct: float) -> Counting:
         """Return how charge is counted from an assumed initial SoC [%]."""
@@ -162,6 +201,27 @@ class ExtendedModel:
         out = discharged_ah(corrected.time_s, counting.counted(corrected.current_a))
         moved = 100.0 * (out - out[initial_row]) / counting.capacity_ah
         return np.asarray(counting.initial_soc_pct - moved)
+
+
+BISECTIONS = 45
+"""Halvings of 0–100 % down to 3e-12 %."""
+
+
+def newton_soc(model: ExtendedModel, prediction: Prediction) -> FloatArray:
+    """Return the SoC at which the model has the measured voltage at each row [%], shape (m,).
+
+    Newton's method where the curve alone depends on SoC; bisection with effects, whose slope is not
+    at hand.
+    """
+    measured = prediction.signals.voltage_v[prediction.rows]
+    if not prediction.over_soc:
+        return socs_from_ocv(model.model, measured - prediction.beside_v)
+    low, high = np.zeros_like(measured), np.full_like(measured, 100.0)
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        above = model.voltage_at(middle, prediction) > measured
+        low, high = np.where(above, low, middle), np.where(above, middle, high)
+    return 0.5 * (low + high)
 
 
 class OnlineModel:
@@ -351,12 +411,12 @@ class OnlineModel:
         for number, (memory, saved) in enumerate(
             zip([self.lags, *self._memory], state, strict=True)
         ):
-            size, odd = divmod(len(saved), max(len(memory), 1))
+            size = len(saved) // max(len(memory), 1)
             numbers = iter(saved)
             try:
-                if odd or (saved and not memory):
-                    raise ValueError("not the state of this effect")
                 for item in memory:
                     item.restore(list(islice(numbers, size)))
+                if next(numbers, None) is not None:
+                    raise InputError("longer than the state of this effect", field="effects")
             except (ValueError, TypeError) as error:
                 raise InputError(str(error), field=f"effects.{number - 1}") from error

@@ -28,6 +28,7 @@ from cangauge.model.prior import (
     ChemistryName,
     principal_functions,
     prior_of,
+    usual_loads,
 )
 from cangauge.model.voltage_model import (
     BASIS_NAMES,
@@ -524,7 +525,7 @@ def knots_model(
     mean_c: float,
     **fields: Any,
 ) -> Model:
-    """Return the model of fitted or prior coefficients.
+    """Return the model file of fitted or prior coefficients of the curve of knots.
 
     Parameters
     ----------
@@ -541,7 +542,7 @@ def knots_model(
     """
     n = KNOTS_PCT.size
     kt, *ohm, factor = coefficients[n:].tolist()
-    functions = principal_functions(covariance, fields["capacity_ah"], arrhenius_ohm)
+    loads = usual_loads(fields["capacity_ah"], len(ohm), arrhenius_ohm)
     return Model(
         equation="knots",
         curve=CurveKnots(soc_pct=KNOTS_PCT.tolist(), voltage_v=coefficients[:n].tolist()),
@@ -555,12 +556,19 @@ def knots_model(
                 factor=factor, resistance_ohm=arrhenius_ohm.tolist(), mean_c=mean_c
             ),
         ),
-        functions=FunctionFields(
-            soc_pct=KNOTS_PCT.tolist(),
-            curve_v=functions[:, :n].tolist(),
-            load=functions[:, n:].tolist(),
-        ),
+        functions=function_fields(covariance, loads),
         **fields,
+    )
+
+
+def function_fields(covariance: FloatArray, loads: FloatArray) -> FunctionFields:
+    """Return a covariance in reduced form (`prior.principal_functions`)."""
+    functions = principal_functions(covariance, loads)
+    n = KNOTS_PCT.size
+    return FunctionFields(
+        soc_pct=KNOTS_PCT.tolist(),
+        curve_v=functions[:, :n].tolist(),
+        load=functions[:, n:].tolist(),
     )
 
 

@@ -234,6 +234,9 @@ class Effect:
     is_cause: ClassVar[bool] = True
     """Whether a diagnosis may name it; otherwise it is structure, learned from references only."""
 
+    scales_drop: ClassVar[bool] = False
+    """Whether the added voltage follows the model's drop over the resistances."""
+
     @property
     def amplitudes(self) -> tuple[Parameter, ...]:
         """Parameters that enter the voltage nearly linearly."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -47,6 +47,7 @@ class ResistanceTemperature(Effect):
 
     id = "resistance_temperature"
     family = "resistance"
+    scales_drop: ClassVar[bool] = True
     parameters = (
         Parameter("share", "1", 0.0, 3.0),
         Parameter("activation_k", "K", 100.0, 8000.0, neutral=None, grid=(1000.0, 2500.0, 4500.0)),
@@ -92,6 +93,7 @@ class ResistanceSoc(Effect):
 
     id = "resistance_soc"
     family = "resistance"
+    scales_drop: ClassVar[bool] = True
     parameters = (
         Parameter("at_empty", "1", -0.4, 3.0),
         Parameter("at_full", "1", -0.4, 1.5),

@@ -110,6 +110,7 @@ class InnerTemperature(Effect):
 
     id = "inner_temperature"
     family = "thermal"
+    scales_drop: ClassVar[bool] = True
     is_cause: ClassVar[bool] = False
     parameters = (
         Parameter("voltage_v_per_k", "V/K", -5e-4, 5e-4, scale="voltage"),
