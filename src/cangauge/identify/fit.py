@@ -32,6 +32,7 @@ from cangauge.identify.evaluate import Energy, LogFit, energy_balance, evaluate,
 from cangauge.identify.least_squares import (
     BASE,
     LOGS_AT_LEAST,
+    LogSums,
     N,
     P,
     Solution,
@@ -529,6 +530,14 @@ def knots_file(
         information=_information(solution),
         **fields,
     )
+
+
+def model_rmse(solutions: Sequence[Solution], sums: Sequence[LogSums]) -> float:
+    """Return the rms error of logs [V], each by a solution, weighted by their time."""
+    weight = sum(item.weight for item in sums)
+    pairs = zip(solutions, sums, strict=True)
+    square = sum(a.square_error(item) * item.weight for a, item in pairs)
+    return float((square / weight) ** 0.5)
 
 
 def _judged(

@@ -107,7 +107,8 @@ def equivalent_circuit(model: Model) -> EquivalentCircuit:
     low_c, high_c = model.range.temperature_c
     half_c = max(0.5 * (high_c - low_c), 0.5 * NARROWEST_C)
     temperatures = 0.5 * (low_c + high_c) + half_c * np.linspace(-1.0, 1.0, TEMPERATURES)
-    if not extended.effects and extended.model.arrhenius is None:
+    is_plain = not extended.effects
+    if is_plain and extended.model.arrhenius is None:
         temperatures = temperatures[[0, -1]]
     curve_soc = np.linspace(0.0, 100.0, CURVE_POINTS)
     response = _StepResponse(extended)
@@ -115,7 +116,7 @@ def equivalent_circuit(model: Model) -> EquivalentCircuit:
     tau_s = response.time_constants(usual)
     _, error_ohm = response.resistances(usual, tau_s)
     amperes, socs = np.array(C_RATES) * extended.capacity_ah, np.array(RESISTANCE_SOC_PCT)
-    if not extended.effects:
+    if is_plain:
         amperes, socs = amperes[[0, -1]], socs[[0, -1]]
     ohm = np.array(
         [
@@ -143,33 +144,12 @@ def equivalent_circuit(model: Model) -> EquivalentCircuit:
     )
 
 
-def _volts(
-    extended: ExtendedModel,
-    time_s: FloatArray,
-    current_a: FloatArray,
-    currents_a: FloatArray,
-    temperature_c: float,
-    soc_pct: FloatArray,
-) -> FloatArray:
-    """Return the voltage at times since a rest [V], with delayed and low-passed currents given."""
-    model, pack = extended.model, extended.pack
-    celsius = np.full_like(time_s, temperature_c)
-    columns = model.load_columns(celsius, currents_a)
-    drop_v = columns[:, 1:] @ model.load_coefficients[1:]
-    volts = model.pseudo_ocv(soc_pct) + columns @ model.load_coefficients
-    load = Load(time_s, current_a, celsius, drop_v)
-    for effect, values in extended.effects:
-        drive = effect.drive(load, values, model, pack, effect.memory(values, pack))
-        if drive is not None:
-            volts = volts + drive * effect.over_soc(soc_pct, values, model, pack)
-    return np.asarray(volts)
-
-
 def _rest_v(extended: ExtendedModel, soc_pct: FloatArray, temperature_c: float) -> FloatArray:
     """Return the voltage after a long rest [V], shape (n,)."""
-    time_s, zero = np.arange(soc_pct.size, dtype=float), np.zeros_like(soc_pct)
-    none = np.zeros((soc_pct.size, len(extended.model.resistance_ohm)))
-    return _volts(extended, time_s, zero, none, temperature_c, soc_pct)
+    celsius = np.full_like(soc_pct, temperature_c)
+    zero = np.zeros_like(soc_pct)
+    load = Load(np.arange(soc_pct.size, dtype=np.float64), zero, celsius, zero)
+    return np.asarray(extended.model.pseudo_ocv(soc_pct, celsius) + extended.added_v(load, soc_pct))
 
 
 class _StepResponse:
@@ -177,10 +157,11 @@ class _StepResponse:
 
     def __init__(self, extended: ExtendedModel) -> None:
         self._extended = extended
-        of_effects = [effect.rc_elements(values) for effect, values in extended.effects]
-        taus = {tau_s for elements in of_effects for _, tau_s in elements}
-        taus |= set(extended.model.low_pass_s)
-        self._own_tau_s = sorted(tau_s for tau_s in taus if tau_s >= FASTEST_S)
+        elements = [
+            tau for effect, values in extended.effects for _, tau in effect.rc_elements(values)
+        ]
+        own = {*elements, *extended.model.low_pass_s}
+        self._own_tau_s = sorted(tau for tau in own if tau >= FASTEST_S)
         delays = [delay for delay in extended.model.delay_s if delay > 0.0]
         self._last_s = LASTING * max([FASTEST_S, *delays, *self._own_tau_s])
         edges = np.union1d([0.0, *delays], np.geomspace(0.1 * FASTEST_S, self._last_s, TIMES))
@@ -192,14 +173,16 @@ class _StepResponse:
         time_s = np.concatenate(([0.0], self.time_s))
         one = np.ones_like(time_s)
         model = self._extended.model
-        delayed = (time_s[:, None] >= np.array(model.delay_s)).astype(float)
-        smooth = -np.expm1(-time_s[:, None] / np.array(model.low_pass_s))
-        unit = np.concatenate([delayed, smooth], axis=1)
+        flows = [time_s >= delay for delay in model.delay_s]
+        smooth = [-np.expm1(-time_s / tau) for tau in model.low_pass_s]
+        currents = np.column_stack([*flows, *smooth]).astype(np.float64)
+        columns = model.load_columns(temperature_c * one, currents)[:, 1:]
+        unit_v = columns @ model.load_coefficients[1:]
 
         def volts(amperes: float) -> FloatArray:
-            return _volts(
-                self._extended, time_s, amperes * one, amperes * unit, temperature_c, soc_pct * one
-            )
+            load = Load(time_s, amperes * one, temperature_c * one, amperes * unit_v)
+            added_v = self._extended.added_v(load, soc_pct * one)
+            return np.asarray(amperes * unit_v + added_v)
 
         return np.asarray((volts(0.0) - volts(current_a))[1:] / current_a)
 

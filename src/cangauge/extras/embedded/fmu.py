@@ -300,7 +300,9 @@ def _pack_variables(model: Model) -> tuple[Variable, ...]:
     return (
         Variable("time", "independent", "s", None, "time"),
         Variable("current_a", "input", "A", 0.0, "current, positive = discharge"),
-        Variable("temperature_c", "input", "degC", model.t_ref_c, "measured temperature"),
+        Variable(
+            "temperature_c", "input", "degC", model.voltage_model().t_ref_c, "measured temperature"
+        ),
         Variable("voltage_v", "output", "V", None, "voltage at the terminals"),
         Variable("soc_pct", "output", "%", None, "state of charge"),
         Variable(

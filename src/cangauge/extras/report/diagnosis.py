@@ -156,9 +156,7 @@ def _widest(where: Sequence[Mapping[str, Any]]) -> str:
 def _places(where: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
     figures = {}
     for axis in dict.fromkeys(each["axis"] for each in where):
-        mine = [
-            each for each in where if each["axis"] == axis and each["share"] >= _SHOWN_SHARE
-        ]
+        mine = [each for each in where if each["axis"] == axis and each["share"] >= _SHOWN_SHARE]
         entries = [(_interval(each), each["rmse_v"], ORANGE) for each in mine]
         figures[axis] = Figure(
             f"Where: {_AXES.get(axis, axis)}",

@@ -124,7 +124,7 @@ def fit_figure(found: Identification, *, height: int = 240) -> Plot:
     pieces = [(item.rows.time_s, item.residual_v) for item in found.fits]
     time.line(residual, "measured − model", pieces, Pen(BLUE, in_legend=False))
     errors = np.concatenate([item.residual_v for item in found.fits])
-    held_out = np.concatenate(found.held_out_error_v)
+    held_out = np.concatenate([*found.held_out_error_v, np.empty(0)])
     shares = histogram(
         "measured − model", "V", [("fitted", errors, BLUE), ("held out", held_out, ORANGE)]
     )

@@ -136,7 +136,10 @@ def _gaps(found: FleetOverview) -> list[Block]:
         "of references [V]", "closed [%]", "90 % set",
     ]  # fmt: skip
     ratio = sorted(
-        ((name, row["baseline_rmse_v"] / row["healthy_rmse_v"]) for name, row in found.gaps.items()),
+        (
+            (name, row["baseline_rmse_v"] / row["healthy_rmse_v"])
+            for name, row in found.gaps.items()
+        ),
         key=lambda item: -item[1],
     )[:BARS]
     colors = [ORANGE if found.gaps[name]["detected"] else GREY for name, _ in ratio]
