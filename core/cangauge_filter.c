@@ -157,7 +157,7 @@ static void ekf_update(const cg_estimator *self, cg_ekf *ekf, const cg_means *bl
     const int32_t size = cg_states(self->model);
     const bool is_wide = ekf->p[CG_X_SOC][CG_X_SOC] > cg_square(R(LINEAR_PCT));
     cg_real x[CG_STATES];
-    linear at;
+    linear at = {{R(0.0)}, {R(0.0)}, {R(0.0)}, R(0.0), R(1.0)};
     for (int32_t k = 0; k < size; ++k) {
         x[k] = ekf->x[k];
     }
