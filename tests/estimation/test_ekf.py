@@ -18,6 +18,7 @@ from cangauge.estimation.start import WRONG_PRIOR, WRONG_STD_PCT, Hypotheses
 
 CAPACITY_AH = 60.0
 LOAD = np.array([1.0, -40.0])
+NO_EFFECTS = np.zeros(1)
 
 
 class LinearModel:
@@ -30,7 +31,7 @@ class LinearModel:
         cold=lambda temperature_c: 1.0 if temperature_c > 10.0 else 1.4,
     )  # fmt: skip
 
-    def curve(self, soc_pct: float) -> tuple[float, float]:
+    def curve(self, soc_pct: float, drives: Any = None) -> tuple[float, float]:
         return 300.0 + 0.7 * soc_pct, 0.7
 
     def row(self, soc_pct: float, load: np.ndarray) -> np.ndarray:
@@ -39,7 +40,7 @@ class LinearModel:
 
 def block(number: int, voltage_v: float, discharged_pct: float, load_a: float = 40.0) -> Block:
     load = np.array([1.0, -load_a])
-    return Block(30.0 * number, discharged_pct, voltage_v, 20.0, 0.1 * load[1], load)
+    return Block(30.0 * number, discharged_pct, voltage_v, 20.0, 0.1 * load[1], load, NO_EFFECTS)
 
 
 def voltages(count: int, seed: int) -> list[tuple[float, float, float]]:
@@ -196,7 +197,7 @@ class PrototypeModel:
         place = (min(max(soc_pct, -20.0), 119.9) + 20.0) * 4.0
         return int(place), place - int(place)
 
-    def curve(self, soc_pct: float) -> tuple[float, float]:
+    def curve(self, soc_pct: float, drives: Any = None) -> tuple[float, float]:
         i, f = self._place(soc_pct)
         step = self._table[i + 1] - self._table[i]
         return self._table[i] + f * step, step * 4.0
@@ -249,7 +250,8 @@ def test_filter_equals_the_prototype(
         theirs.update(each)
         seconds = 0.0 if time_s is None else each.time_s - time_s
         ours.predict(seconds, (each.charge_ah - charge_ah) / CAPACITY_AH * 100.0)
-        ours.update(Block(each.time_s, 0.0, each.voltage_v, each.temperature_c, 0.0, each.load))
+        volts = each.voltage_v, each.temperature_c, 0.0
+        ours.update(Block(each.time_s, 0.0, *volts, each.load, NO_EFFECTS))
         time_s, charge_ah = each.time_s, each.charge_ah
         if given_pct is None:
             expected = theirs.soc_pct, theirs.soc_std_pct

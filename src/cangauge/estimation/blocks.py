@@ -31,10 +31,10 @@ class OpenBlock:
 
     def add(self, row: Block) -> None:
         """Add one row, given as a block of its own."""
-        *numbers, load = row
-        values = (*numbers, *load.tolist())
+        values = (*row[:5], *row.load.tolist(), *row.drives.tolist())
         state = self.state
         sums = state.sums or [0.0] * len(values)
+        state.columns = row.load.size
         state.sums = [a + b for a, b in zip(sums, values, strict=True)]
         state.rows += 1
 
@@ -43,10 +43,9 @@ class OpenBlock:
         state = self.state
         if state.is_broken or not state.rows:
             return None
-        counted_s, discharged_pct, voltage_v, temperature_c, drop_v, *load = (
-            each / state.rows for each in state.sums
-        )
-        return Block(counted_s, discharged_pct, voltage_v, temperature_c, drop_v, np.array(load))
+        means = [each / state.rows for each in state.sums]
+        load, drives = np.split(np.array(means[5:]), [state.columns])
+        return Block(*means[:5], load, drives)
 
     def snapshot(self) -> BlockState:
         """Return a copy of the state."""

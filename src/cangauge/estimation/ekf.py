@@ -81,6 +81,8 @@ class Block(NamedTuple):
     """Part of the load voltage that is proportional to the resistances [V]."""
     load: FloatArray
     """Load row, shape (k,)."""
+    drives: FloatArray
+    """Drives of the model's effects."""
 
 
 class SocFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no types
@@ -180,7 +182,7 @@ class SocFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no t
         """Return the voltage at a state [V], its gradient H and the variance R [V²]."""
         model, noise = self.model, self.model.noise
         A = model.noise.cold(block.temperature_c)
-        volts, slope = model.curve(float(x[SOC]))
+        volts, slope = model.curve(float(x[SOC]), block.drives)
         slope = max(slope, LEAST_SLOPE)
         axis_v = noise.soc_std_pct * slope
         H = np.empty_like(x)

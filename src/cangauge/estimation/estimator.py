@@ -276,11 +276,6 @@ class Estimator:
         """Compare a row's voltage with the model, and add it to the open block."""
         memory, online, counter = self._memory, self._online, self._counter.state
         load, load_v, drop_v = self._load()
-        soc_pct = self._soc_and_std_pct()[0]
-        memory.voltage_model_v = math.nan
-        if not math.isnan(soc_pct):
-            memory.voltage_model_v = online.curve(soc_pct)[0] + load_v
-        memory.residual_v = sample.voltage_v - memory.voltage_model_v
         guess_pct = 50.0 if math.isnan(memory.newton_pct) else memory.newton_pct
         memory.newton_pct = memory.newton_std_pct = math.nan
         memory.newton_inside = True
@@ -290,7 +285,13 @@ class Estimator:
             temperature_c = self._temperature_c
             memory.newton_std_pct = inverse_std_pct(online, newton.soc_pct, temperature_c, load)
             charge = counter.counted_s, counter.discharged_pct
-            self._block.add(Block(*charge, sample.voltage_v, temperature_c, drop_v, load))
+            volts = sample.voltage_v, temperature_c, drop_v
+            self._block.add(Block(*charge, *volts, load, online.drives()))
+        soc_pct = self._soc_and_std_pct()[0]
+        memory.voltage_model_v = math.nan
+        if not math.isnan(soc_pct):
+            memory.voltage_model_v = online.curve(soc_pct)[0] + load_v
+        memory.residual_v = sample.voltage_v - memory.voltage_model_v
         for reference in detect_references(self.settings, memory, sample):
             self._correct(reference)
 

@@ -97,8 +97,10 @@ class BlockState:
     rows: _Count = 0
     is_broken: _Flag = False
     """Whether a gap in the current lies in it."""
+    columns: _Count = 0
+    """Columns of the load row."""
     sums: list[_Finite] = field(default_factory=list)
-    """Of the fields of a `Block`."""
+    """Of the fields of a `Block`, in their order."""
 
 
 @dataclass

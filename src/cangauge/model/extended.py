@@ -266,8 +266,8 @@ class OnlineModel:
             type(effect).correct is not Effect.correct for effect, _ in extended.effects
         ]
         self._row = np.empty(0)
-        self._beside_v = 0.0
-        self._over_soc: list[tuple[Effect, Values, float]] = []
+        self._over_soc = [each for each in extended.effects if each[0].uses_soc]
+        self._drives = np.zeros(1 + len(self._over_soc))
         self._slope_at_least = SLOPE_AT_LEAST * self.model.nominal_v
 
     @property
@@ -317,22 +317,21 @@ class OnlineModel:
         currents = [*self.delay_line.currents(), *smooth]
         known_c = self.model.t_ref_c if math.isnan(temperature_c) else temperature_c
         self._row = self.load_at(known_c, currents)
-        self._beside_v, self._over_soc = 0.0, []
+        self._drives = np.zeros_like(self._drives)
         if not self.extended.effects:
             return
         drop_v = self._row[1:] @ self.load_coefficients[1:]
+        over = 0
         for (effect, values), memory in zip(self.extended.effects, self._memory, strict=True):
             of_history = any(isinstance(lag, Lag) and lag.is_lagging for lag in memory)
             follows = of_history and not effect.rc_elements(values)
             celsius = np.array([temperature_c if follows else known_c])
             load = Load(at, now, celsius, np.array([drop_v]))
             drive = effect.drive(load, values, self.model, self.extended.pack, memory)
-            if drive is None or math.isnan(drive[0]):
-                continue
-            if effect.uses_soc:
-                self._over_soc.append((effect, values, float(drive[0])))
-            else:
-                self._beside_v += float(drive[0])
+            place = 1 + over if effect.uses_soc else 0
+            over += effect.uses_soc
+            if drive is not None and not math.isnan(drive[0]):
+                self._drives[place] += float(drive[0])
 
     def load_at(self, temperature_c: float, currents_a: Sequence[float]) -> FloatArray:
         """Return the load columns of given delayed and low-passed currents [A], shape (k,)."""
@@ -346,19 +345,32 @@ class OnlineModel:
         """Return the part of the voltage model that does not depend on SoC, without effects [V]."""
         return float(self._row @ self.load_coefficients)
 
-    def pseudo_ocv_at(self, soc_pct: float) -> tuple[float, float]:
+    def drives(self) -> FloatArray:
+        """Return the effects' drives at the latest reading, shape (1 + effects over SoC,).
+
+        The first is the voltage of effects that do not depend on the SoC [V]. The effects' voltage
+        is linear in the drives, so that a mean of readings has the mean of their drives.
+        """
+        return self._drives
+
+    def pseudo_ocv_at(
+        self, soc_pct: float, drives: FloatArray | None = None
+    ) -> tuple[float, float]:
         """Return curve and effects [V] at one SoC [%], and the slope [V per %].
+
+        The effects are those of given drives, by default of the latest reading.
 
         The slope is limited to positive values, for Newton's method and the filter: with an effect
         the voltage may fall over a few per cent of SoC (resistance that rises toward empty, while
         charging).
         """
         volts, slope = self.model.curve.at(soc_pct)
-        volts += self._beside_v
+        drives = self._drives if drives is None else drives
+        volts += float(drives[0])
         if self._over_soc:
             at = soc_pct + SLOPE_STEP_PCT * np.array([-1.0, 0.0, 1.0])
             extra = np.zeros(3)
-            for effect, values, drive in self._over_soc:
+            for (effect, values), drive in zip(self._over_soc, drives[1:], strict=True):
                 extra += drive * effect.over_soc(at, values, self.model, self.extended.pack)
             volts += float(extra[1])
             slope += float(extra[2] - extra[0]) / (2.0 * SLOPE_STEP_PCT)
