@@ -201,6 +201,11 @@ class Estimator:
         return {-1: "parked", 0: "open", 1: "moved"}[self.hypotheses.decision]
 
     @property
+    def tests(self) -> tuple[int, float, float]:
+        """Blocks that are tested together, and the limits of innovations and strain."""
+        return self._tested_blocks, self._innovations_at_most, self._strain_at_most
+
+    @property
     def time_s(self) -> float:
         """The estimator's own time at the latest sample [s]: it always increases."""
         return self._clock.state.last_s

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cangauge._dataframes import ArrowExport
 from cangauge._display import figure
 from cangauge._typing import FloatArray
-from cangauge.estimation.compiled import make_estimator
+from cangauge.estimation.compiled import CompiledEstimator, make_estimator
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import (
     VALID_STD_PCT,
@@ -268,17 +268,36 @@ def run_estimator(
         Called with the estimator after the last sample.
     """
     estimator = make_estimator(model, settings)
-    estimates = []
-    rows = samples_of(samples) if isinstance(samples, Log) else samples
-    for done, sample in enumerate(rows, start=1):
-        estimates.append(estimator.step(sample))
-        if observe is not None:
-            observe(estimator, sample)
-        if progress is not None and done % PROGRESS_EVERY == 0:
-            progress(done)
+    if isinstance(estimator, CompiledEstimator) and isinstance(samples, Log) and observe is None:
+        table = _run_columns(estimator, samples, progress)
+    else:
+        estimates = []
+        rows = samples_of(samples) if isinstance(samples, Log) else samples
+        for done, sample in enumerate(rows, start=1):
+            estimates.append(estimator.step(sample))
+            if observe is not None:
+                observe(estimator, sample)
+            if progress is not None and done % PROGRESS_EVERY == 0:
+                progress(done)
+        table = EstimateTable.of(estimates)
     if at_end is not None:
         at_end(estimator)
-    return EstimateTable.of(estimates)
+    return table
+
+
+def _run_columns(
+    estimator: CompiledEstimator, log: Log, progress: Callable[[int], None] | None
+) -> EstimateTable:
+    """Return the estimates of a log, in the compiled loop."""
+    parts = []
+    for first in range(0, len(log), PROGRESS_EVERY):
+        part = log.rows(slice(first, first + PROGRESS_EVERY))
+        columns = (part.time_s, part.current_a, part.voltage_v, part.temperature_c)
+        parts.append(estimator.run(columns))
+        if progress is not None and len(part) == PROGRESS_EVERY:
+            progress(first + PROGRESS_EVERY)
+    joined: list[Any] = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    return EstimateTable(*joined)
 
 
 def score(table: EstimateTable, log: Log, seconds: float = 0.0) -> Scores:

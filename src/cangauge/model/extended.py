@@ -37,6 +37,9 @@ from cangauge.model.voltage_model import SLOPE_AT_LEAST, Functions, VoltageModel
 if TYPE_CHECKING:
     from cangauge.model.model_file import Noise
 
+LAG_NUMBERS = 3
+"""Numbers of the state of a lag that has started."""
+
 SLOPE_STEP_PCT = 0.05
 """Half step of the finite difference of the effects' voltage over SoC [%]."""
 
@@ -393,6 +396,22 @@ class OnlineModel:
         for lag in self.lags:
             lag.restore(known.get(lag.tau_s, []))
 
+    def resume(self, load: FloatArray, beside_v: float, drives: Sequence[float]) -> None:
+        """Continue after a reading that was advanced to elsewhere (the compiled step).
+
+        Parameters
+        ----------
+        load : array of shape (k,)
+            Load columns there.
+        beside_v : float
+            Voltage of the effects that do not depend on the SoC [V].
+        drives : sequence of float
+            `Effect.drive` of every effect there.
+        """
+        effects = zip(self.extended.effects, drives, strict=True)
+        self._row, self._beside_v = load, beside_v
+        self._over_soc = [(*of, drive) for of, drive in effects if of[0].uses_soc]
+
     def state(self) -> list[list[float]]:
         """Return the low-passed currents' state, then that of each effect, for `restore`."""
         lags = [number for lag in self.lags for number in lag.state()]
@@ -411,7 +430,7 @@ class OnlineModel:
         for number, (memory, saved) in enumerate(
             zip([self.lags, *self._memory], state, strict=True)
         ):
-            size = len(saved) // max(len(memory), 1)
+            size = LAG_NUMBERS if len(memory) > 1 else len(saved)  # several are lags
             numbers = iter(saved)
             try:
                 for item in memory:

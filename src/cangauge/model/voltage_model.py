@@ -341,7 +341,7 @@ class PublishedCurve:
             )
 
     @cached_property
-    def _beyond(self) -> tuple[float, float]:
+    def beyond(self) -> tuple[float, float]:
         """Slopes of the straight lines below and above the identified SoC [V per %]."""
         low, high = self.soc_range_pct
         part = EDGE * (high - low)
@@ -362,13 +362,13 @@ class PublishedCurve:
             by_s = k5 + k6 * r - k7 / (1.0 - s)
             by_s -= r * r * (k1 + r * (2.0 * k2 + r * (3.0 * k3 + r * 4.0 * k4)))
             return volts, by_s * gain
-        slope = self._beyond[0] if soc_pct < at else self._beyond[1]
+        slope = self.beyond[0] if soc_pct < at else self.beyond[1]
         return volts + slope * (soc_pct - at), slope
 
     def values(self, soc_pct: FloatArray) -> FloatArray:
         """Return voltages [V] at SoC [%] of shape (n,)."""
         inside = np.clip(soc_pct, *self.soc_range_pct)
-        low, high = self._beyond
+        low, high = self.beyond
         straight = np.where(soc_pct < inside, low, high) * (soc_pct - inside)
         return np.asarray(ocv_basis(inside, self.epsilon) @ self.ocv_v + straight)
 
@@ -376,7 +376,7 @@ class PublishedCurve:
         """Return slopes [V per %] at SoC [%] of shape (n,)."""
         lo, hi = self.soc_range_pct
         inside = ocv_basis_slope(np.clip(soc_pct, lo, hi), self.epsilon) @ self.ocv_v
-        low, high = self._beyond
+        low, high = self.beyond
         return np.asarray(np.where(soc_pct < lo, low, np.where(soc_pct > hi, high, inside)))
 
 
@@ -609,11 +609,9 @@ def soc_from_ocv(model: Invertible, ocv_v: float, guess_pct: float = 50.0) -> In
         else:
             low = soc
         following = soc - error / slope
-        if not low < following < high:
-            following = 0.5 * (low + high)
         if abs(following - soc) < TOLERANCE_PCT:
             return Inverse(following, inside=True)
-        soc = following
+        soc = following if low < following < high else 0.5 * (low + high)
     return Inverse(soc, inside=True)
 
 

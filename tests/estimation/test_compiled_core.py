@@ -1,0 +1,172 @@
+"""The compiled core gives the numbers of the reference implementation, within 1e-9."""
+
+from __future__ import annotations
+
+import math
+import runpy
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from cangauge._core_digest import sources_digest
+from cangauge.estimation import compiled as compiled_module
+from cangauge.estimation.compiled import CompiledEstimator, make_estimator
+from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.model.effects.library import LIBRARY
+from cangauge.model.model_file import Model
+from cangauge.types import Sample
+from estimation.test_any_input import MODELS, RULES, inputs, samples_of_rows
+from estimation.test_snapshot import eventful_samples
+
+core = pytest.importorskip("cangauge._core", reason="the extension was not built: no C compiler")
+
+ROOT = Path(__file__).parents[2]
+TOLERANCE = 1e-9
+"""Largest error [%, V], relative above 1."""
+KNOTS = Model.prior("oxide", 96, 60.0)
+STARTS = st.sampled_from([None, 0.0, 50.0, 100.0])
+
+
+def pair(model: Model, chosen: EstimatorSettings) -> tuple[Estimator, CompiledEstimator]:
+    compiled = make_estimator(model, chosen)
+    assert isinstance(compiled, CompiledEstimator)
+    return Estimator(model, chosen), compiled
+
+
+def assert_same(found: Any, expected: Any, at: str = "", scale: float = 1.0) -> None:
+    """Compare numbers, and structures of them, within the tolerance."""
+    if isinstance(expected, dict):
+        assert found.keys() == expected.keys(), at
+        for name in expected:
+            assert_same(found[name], expected[name], f"{at}.{name}", scale)
+    elif isinstance(expected, list | tuple):
+        assert len(found) == len(expected), at
+        sizes = [abs(each) for each in expected if isinstance(each, float) and math.isfinite(each)]
+        for number, (one, other) in enumerate(zip(found, expected, strict=True)):
+            assert_same(one, other, f"{at}[{number}]", max([scale, *sizes]))
+    elif isinstance(expected, float):
+        close = abs(found - expected) <= TOLERANCE * max(1.0, scale, abs(expected))
+        assert close or found == expected or (math.isnan(found) and math.isnan(expected)), f"{at}: {found} {expected}"
+    else:
+        assert found == expected, at
+
+
+def follow(reference: Estimator, compiled: Estimator, samples: Iterable[Sample]) -> None:
+    """Hand the same samples to both and compare each estimate."""
+    for number, sample in enumerate(samples):
+        assert_same(compiled.step(sample), reference.step(sample), f"sample {number}: {sample}")
+
+
+def assert_same_state(reference: Estimator, compiled: Estimator) -> None:
+    assert_same(compiled.snapshot().model_dump(), reference.snapshot().model_dump())
+    assert_same(compiled.health, reference.health)
+    assert_same(compiled.power(), reference.power())
+    assert compiled.verdict == reference.verdict
+
+
+def test_extension_is_built_from_these_sources() -> None:
+    digest = sources_digest(ROOT / "core")
+    assert digest == core.SOURCES, "run `python hatch_build.py` again"
+
+
+def test_extension_of_other_sources_is_not_used(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert compiled_module._load(tmp_path) is core  # no sources there
+    shutil.copytree(ROOT / "core", tmp_path / "core")
+    assert compiled_module._load(tmp_path) is core
+    with (tmp_path / "core" / "cangauge.c").open("a", encoding="utf-8") as source:
+        source.write("/* changed */")
+    assert not caplog.records
+    assert compiled_module._load(tmp_path) is None
+    assert ["hatch_build.py" in record.getMessage() for record in caplog.records] == [True]
+
+
+def test_failed_build_leaves_no_earlier_extension(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    build = runpy.run_path(str(ROOT / "hatch_build.py"))["build_extension"]
+    monkeypatch.delenv("LDSHARED", raising=False)
+    monkeypatch.setenv("CC", "cc")
+    assert build(ROOT, tmp_path).is_file()
+    monkeypatch.setenv("CC", "no-such-compiler")
+    assert build(ROOT, tmp_path) is None
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
+@pytest.mark.parametrize("which", ["plain", "together"])
+@settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
+@given(drawn=inputs, with_rules=st.booleans(), start=STARTS)
+def test_any_input_gives_the_same_numbers(
+    which: str, method: Any, drawn: Any, with_rules: bool, start: Any
+) -> None:
+    chosen = EstimatorSettings(
+        method=method, initial_soc_pct=start, **(RULES if with_rules else {})
+    )
+    reference, compiled = pair(MODELS[which], chosen)
+    follow(reference, compiled, samples_of_rows(drawn))
+    assert_same(compiled.snapshot().model_dump(), reference.snapshot().model_dump())
+
+
+@pytest.mark.parametrize("effect_id", LIBRARY)
+def test_each_effect_and_a_state_of_the_other(effect_id: str) -> None:
+    chosen = EstimatorSettings(initial_soc_pct=85.0)
+    reference, compiled = pair(MODELS[effect_id], chosen)
+    samples = eventful_samples()
+    follow(reference, compiled, samples[:700])
+    assert_same_state(reference, compiled)
+    now = samples[699]
+    assert_same(compiled.pack_tick(now), reference.pack_tick(now))
+    stamps = [now.time_s - 3.0, math.nan]
+    assert_same(
+        compiled.current_changes(now.time_s, stamps), reference.current_changes(now.time_s, stamps)
+    )
+    after = pair(MODELS[effect_id], chosen)
+    after[0].restore(compiled.snapshot(), 5.0)
+    after[1].restore(reference.snapshot(), 5.0)
+    follow(*after, samples[700:])
+
+
+@pytest.mark.parametrize("start", [None, 85.0])
+def test_curve_of_knots(start: float | None) -> None:
+    reference, compiled = pair(KNOTS, EstimatorSettings(initial_soc_pct=start))
+    assert KNOTS.equation == "knots"
+    for first in range(0, 1400, 200):
+        follow(reference, compiled, eventful_samples()[first : first + 200])
+        assert_same_state(reference, compiled)
+
+
+def test_another_model_takes_over() -> None:
+    before = pair(MODELS["plain"], EstimatorSettings(initial_soc_pct=85.0))
+    after = pair(MODELS["together"], EstimatorSettings(method="coulomb"))
+    samples = eventful_samples()
+    follow(*before, samples[:500])
+    for old, new in zip(before, after, strict=True):
+        new.take_over(old)
+    follow(*after, samples[500:])
+
+
+def test_columns_give_the_same_bits_as_samples() -> None:
+    columns = np.array(eventful_samples()).T
+    (_, whole), (_, single) = (pair(KNOTS, EstimatorSettings()) for _ in range(2))
+    found = np.array(whole.run(columns)).T
+    expected = np.array([single.step(Sample._make(row))[:9] for row in columns.T.tolist()])
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_environment_switches_the_core_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CANGAUGE_PURE_PYTHON", "1")
+    assert type(make_estimator(KNOTS)) is Estimator
+
+
+def test_constants_of_another_layout_are_refused() -> None:
+    with pytest.raises(ValueError, match="layout"):
+        core.Core(b"", b"", 1, 0, 1.0, tuple, (), {})
